@@ -378,6 +378,25 @@ class HeadTold(TypedDict):
     moving: bool
 
 
+class HistoryEvent(TypedDict):
+    """Something that happened, and whether it is well."""
+
+    age_s: float
+    kind: Literal["state", "fault", "command"]
+    words: str
+    well: bool
+
+
+class HistoryTold(TypedDict):
+    """``GET /history``: oldest first; one number a sample, of the axes that tell their temperature °C."""
+
+    age_s: list[float]
+    pan_rad: list[float]
+    tilt_rad: list[float]
+    temperatures_c: dict[str, list[float | None]]
+    events: list[HistoryEvent]
+
+
 class JogTold(TypedDict):
     """``POST /jog``: the jog's operation, whether the heartbeat was taken, and what holds an axis."""
 
@@ -707,6 +726,12 @@ class RecorderTold(TypedDict):
     folder: str
 
 
+class RecordingDeleted(TypedDict):
+    """``DELETE /recordings/{name}``: those that are left."""
+
+    recordings: list[RecordingListed]
+
+
 class RecordingEnded(TypedDict):
     """``POST /recordings/stop``: the run, its file on the daemon's machine, what it lacks."""
 
@@ -717,12 +742,13 @@ class RecordingEnded(TypedDict):
 
 
 class RecordingListed(TypedDict):
-    """A recording on the disk: a run, what a fault kept, or the ring; size in 10⁶ bytes."""
+    """A recording on the disk: a run, what a fault kept, or the ring; size in 10⁶ bytes, its files' names."""
 
     name: str
     kind: Literal["run", "kept", "ring"]
     size_mb: float
     files: int
+    names: list[str]
 
 
 class Recordings(TypedDict):

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         EstopTold,
         Event,
         FaultSet,
+        HistoryTold,
         LeaseGranted,
         MastsTold,
         OperationListed,
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
         PoseTaken,
         PreviewTold,
         RecorderTold,
+        RecordingDeleted,
         RecordingEnded,
         Recordings,
         ReloadTold,
@@ -408,6 +410,10 @@ class AsyncClient:
         """Return a report, HTML."""
         return bytes((await self._daemon.ask("GET", f"/reports/{quote(name, safe='')}")).content)
 
+    async def history(self) -> HistoryTold:
+        """Return joints, temperatures and events of the last hours, oldest first."""
+        return cast("HistoryTold", await self._daemon.json("GET", "/history"))
+
     async def recordings(self) -> Recordings:
         """Return the daemon's recordings, and what it records now."""
         return cast("Recordings", await self._daemon.json("GET", "/recordings"))
@@ -419,6 +425,17 @@ class AsyncClient:
     async def stop_recording(self) -> RecordingEnded:
         """End the recording; return its file on the daemon's machine, its size and what was dropped."""
         return cast("RecordingEnded", await self._daemon.command("POST", "/recordings/stop"))
+
+    async def recording(self, name: str, file: str) -> bytes:
+        """Return a file of a recording whole, by the names that `recordings` tells."""
+        name, file = (quote(name, safe=""), quote(file, safe=""))
+        return bytes((await self._daemon.ask("GET", f"/recordings/{name}/{file}")).content)
+
+    async def delete_recording(self, name: str) -> RecordingDeleted:
+        """Delete a run, or what was kept at a fault; return what is left."""
+        return cast(
+            "RecordingDeleted", await self._daemon.command("DELETE", f"/recordings/{quote(name, safe='')}")
+        )
 
     async def stop(self) -> StopTold:
         """Stop the mast and the running operation."""

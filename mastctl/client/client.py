@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         EstopTold,
         Event,
         FaultSet,
+        HistoryTold,
         LeaseGranted,
         MastsTold,
         OperationListed,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
         PoseTaken,
         PreviewTold,
         RecorderTold,
+        RecordingDeleted,
         RecordingEnded,
         Recordings,
         ReloadTold,
@@ -400,6 +402,10 @@ class Client:
         """Return a report, HTML."""
         return bytes(self._daemon.ask("GET", f"/reports/{quote(name, safe='')}").content)
 
+    def history(self) -> HistoryTold:
+        """Return joints, temperatures and events of the last hours, oldest first."""
+        return cast("HistoryTold", self._daemon.json("GET", "/history"))
+
     def recordings(self) -> Recordings:
         """Return the daemon's recordings, and what it records now."""
         return cast("Recordings", self._daemon.json("GET", "/recordings"))
@@ -411,6 +417,15 @@ class Client:
     def stop_recording(self) -> RecordingEnded:
         """End the recording; return its file on the daemon's machine, its size and what was dropped."""
         return cast("RecordingEnded", self._daemon.command("POST", "/recordings/stop"))
+
+    def recording(self, name: str, file: str) -> bytes:
+        """Return a file of a recording whole, by the names that `recordings` tells."""
+        name, file = quote(name, safe=""), quote(file, safe="")
+        return bytes(self._daemon.ask("GET", f"/recordings/{name}/{file}").content)
+
+    def delete_recording(self, name: str) -> RecordingDeleted:
+        """Delete a run, or what was kept at a fault; return what is left."""
+        return cast("RecordingDeleted", self._daemon.command("DELETE", f"/recordings/{quote(name, safe='')}"))
 
     def stop(self) -> StopTold:
         """Stop the mast and the running operation."""

@@ -81,6 +81,7 @@ ESTOP = Command("estop", "view")
 RESET = Command("reset", need="latch")
 RECORD_START = Command("record.start")
 RECORD_STOP = Command("record.stop")
+RECORD_DELETE = Command("record.delete", "admin")  # of a fault, the evidence
 PLACE_KEEP = Command("place.keep")
 PLACE_FORGET = Command("place.forget")
 BENCH = Command("bench", steers=True, need="track")

@@ -133,6 +133,7 @@ class Devices:
         self._gate = threading.Lock()
         self._blocks: dict[object, Stopped] = {}  # who lets no move out, and why
         self._closed = False
+        self.temperatures_c: Mapping[str, float] = {}  # of the axes, replaced and never edited
         self._reported_s: Mapping[str, float] = {}  # what the head reports about itself, and since when
         # The last move's ticket and when it was taken, until the head was read at rest after it.
         self._moved: tuple[int, float] | None = None
@@ -431,7 +432,15 @@ class Devices:
 
     def _poll(self) -> float:
         self.on_turn()
-        return MOVING_PERIOD_S if self._read_once().moving else RESTING_PERIOD_S
+        moving = self._read_once().moving
+        try:
+            told = self._reported()
+        except Exception:  # of a driver from outside; the reading is good all the same
+            told = {}
+        self.temperatures_c = {
+            name: axis.temperature_C for name, axis in told.items() if axis.temperature_C is not None
+        }
+        return MOVING_PERIOD_S if moving else RESTING_PERIOD_S
 
     def _reported(self) -> Mapping[str, AxisReport]:
         head = self._pan_tilt

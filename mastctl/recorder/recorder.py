@@ -24,10 +24,10 @@ from typing import Any
 from calib.mast.rig import Rig
 from drivers.clock import Clock
 from mastctl.devices.frames import StampedFrame
-from mastctl.errors import MastctlError, NotNow, Unable
+from mastctl.errors import MastctlError, NotKnown, NotNow, Unable
 from mastctl.recorder.entries import Entries
 from mastctl.recorder.settings import RecordSettings
-from mastctl.recorder.shelf import MB, Shelf
+from mastctl.recorder.shelf import MB, Recorded, Shelf
 from mastctl.recorder.writer import Attached, Clocks, RecordFile
 from mastctl.state.faults import StandingFault
 
@@ -210,6 +210,50 @@ class Recorder:
         except OSError as error:
             words = f"{self._shelf.folder} cannot be read: {error.strerror or error}"
             raise Unable("unreadable", words) from None
+
+    def file(self, name: str, file: str) -> Path:
+        """Return a file of a recording, by the names that `recordings` tells.
+
+        Raises
+        ------
+        NotKnown
+            ``recording_unknown``.
+        NotNow
+            ``recording`` while it is written.
+        Unable
+            ``unreadable``.
+        """
+        found = next((path for path in self._found(name).files if path.name == file), None)
+        if found is None:
+            raise NotKnown("recording_unknown", f"the recording {name[:80]} has no file {file[:80]}")
+        now = self._now.file
+        if now is not None and now.path.name == file:
+            raise NotNow("recording", f"{file} is being written; it can be read when that has ended")
+        return found
+
+    def delete(self, name: str) -> dict[str, Any]:
+        """Delete a run, or what a fault kept; return what is left, as `recordings`.
+
+        Raises
+        ------
+        NotKnown
+            ``recording_unknown``.
+        NotNow
+            ``recording`` for a run that is recorded, and for the ring.
+        Unable
+            ``unwritable`` if the disk refuses, ``unreadable``; ``slow`` if it does not answer in time.
+        """
+        return self._asked(lambda: self._delete(name))
+
+    def _found(self, name: str) -> Recorded:
+        try:
+            found = next((one for one in self._shelf.all() if one.name == name), None)
+        except OSError as error:
+            words = f"{self._shelf.folder} cannot be read: {error.strerror or error}"
+            raise Unable("unreadable", words) from None
+        if found is None:
+            raise NotKnown("recording_unknown", f"there is no recording {name[:80]}")
+        return found
 
     def start_run(self, name: str) -> dict[str, Any]:
         """Begin a run and return `told`.
@@ -478,6 +522,20 @@ class Recorder:
             raise Unable("disk_low", "there is no room" if words is None else words.message)
         log.info("run %s is recorded", path.stem)
         return self.told()
+
+    def _delete(self, name: str) -> dict[str, Any]:
+        one = self._found(name)
+        if one.kind == "ring":
+            words = "the ring is written over and over; record.ring_s in the configuration says how long"
+            raise NotNow("recording", words)
+        if name == self._now.run:
+            raise NotNow("recording", f"the run {name} is recorded; end it first")
+        try:
+            self._shelf.delete(one)
+        except OSError as error:
+            raise Unable("unwritable", f"{name} cannot be deleted: {error.strerror or error}") from None
+        log.info("the recording %s was deleted", name)
+        return {"recordings": self.recordings()}
 
     def _stop_run(self) -> dict[str, Any]:
         file, run = self._now.file, self._now.run

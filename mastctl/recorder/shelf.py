@@ -42,6 +42,7 @@ class Recorded:
             "kind": self.kind,
             "size_mb": self.size_bytes / MB,
             "files": len(self.files),
+            "names": [path.name for path in self.files],
         }
 
 
@@ -126,6 +127,14 @@ class Shelf:
         while len(kept) > 1 and sum(one.size_bytes for one in kept) > kept_mb * MB:
             shutil.rmtree(self._kept / kept.pop(0).name, ignore_errors=True)
         return place.name
+
+    def delete(self, one: Recorded) -> None:
+        """Delete a run, or what was kept at a fault."""
+        if one.kind == "kept":
+            shutil.rmtree(self._kept / one.name)
+        else:
+            for path in one.files:
+                path.unlink()
 
     def all(self) -> list[Recorded]:
         """Return every recording, the oldest of each kind first."""

@@ -35,6 +35,7 @@ from mastctl.health.health import CalibrationHealth
 from mastctl.live.pictures import WatchedCameras
 from mastctl.live.settings import LiveSettings
 from mastctl.live.view import LiveView, check_installed
+from mastctl.metrics.history import History
 from mastctl.metrics.metrics import Metrics
 from mastctl.operations.operations import Operations
 from mastctl.operations.records import Operation, last_frame
@@ -112,6 +113,8 @@ class Service:
         Where each command passes, who steers, and what is recorded of it; of strangers' elsewhere.
     metrics
         What is counted, for Prometheus.
+    history
+        Joints, temperatures and events of the last hours.
     recording
         The recorder, and what it hears.
     live
@@ -195,6 +198,7 @@ class Service:
         self.reports = Reports(self.folder.path, self.guide.runs)
         self.sentinel = SentinelFindings(self.folder.path / SENTINEL_FOLDER, lambda: self.stored.digest)
         self.metrics = Metrics(lambda: self.state().told(), self.devices.errors, publisher)
+        self.history = History(publisher, lambda: self.devices.temperatures_c, self.clock)
         self.devices.fault_watch.also(self._own_faults)
         self.stop_socket: StopSocket | None = None
         self._socket_folder: StateFolder | None = None
@@ -377,6 +381,7 @@ class Service:
             self.devices.close,
             self.machine.publisher.close,
             self.metrics.close,
+            self.history.close,
             self.stop_threads.close,
             self.handoffs.close,
             self.health.close,

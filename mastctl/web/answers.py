@@ -456,13 +456,33 @@ class ResetTold(Told):
     left: list[EstopHeld]
 
 
+class HistoryEvent(Told):
+    """Something that happened, and whether it is well."""
+
+    age_s: Seconds
+    kind: Literal["state", "fault", "command"]
+    words: str
+    well: bool
+
+
+class HistoryTold(Told):
+    """``GET /history``: oldest first; one number a sample, of the axes that tell their temperature °C."""
+
+    age_s: list[Seconds]
+    pan_rad: list[float]
+    tilt_rad: list[float]
+    temperatures_c: dict[str, list[float | None]]
+    events: list[HistoryEvent]
+
+
 class RecordingListed(Told):
-    """A recording on the disk: a run, what a fault kept, or the ring; size in 10⁶ bytes."""
+    """A recording on the disk: a run, what a fault kept, or the ring; size in 10⁶ bytes, its files' names."""
 
     name: str
     kind: Literal["run", "kept", "ring"]
     size_mb: float
     files: Count
+    names: list[str]
 
 
 class RecorderTold(Told):
@@ -484,6 +504,12 @@ class Recordings(Told):
     recordings: list[RecordingListed]
     recorder: RecorderTold
     free_mb: float | None
+
+
+class RecordingDeleted(Told):
+    """``DELETE /recordings/{name}``: those that are left."""
+
+    recordings: list[RecordingListed]
 
 
 class RecordingEnded(Told):

@@ -11,7 +11,7 @@ import sys
 from functools import cache
 from importlib.metadata import version
 
-from fastapi import FastAPI, Response
+from fastapi import FastAPI, Request, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from mastctl.service.service import Service
@@ -25,6 +25,7 @@ from mastctl.web.guard import Guard
 from mastctl.web.images import add_images
 from mastctl.web.lease import add_lease
 from mastctl.web.limits import add_limits
+from mastctl.web.packed import text_answer
 from mastctl.web.page import add_page
 from mastctl.web.parts import Here, Parts
 from mastctl.web.pictures import add_pictures
@@ -91,11 +92,11 @@ def api() -> FastAPI:
         add(app)
 
     @app.get("/openapi.json", include_in_schema=False)
-    async def told(here: Here) -> Response:
+    async def told(request: Request, here: Here) -> Response:
         described = sys.modules.get("mastctl.web.described")
-        if described is not None and described.is_made():
-            return Response(_description(), media_type="application/json")
-        return Response(await here.waiting.run(_description), media_type="application/json")
+        made = described is not None and described.is_made()
+        text = _description() if made else await here.waiting.run(_description)
+        return text_answer(request.headers, text, "application/json")
 
     return app
 

@@ -35,9 +35,11 @@ ANSWERS: Mapping[str, type[BaseModel]] = {
     "POST /track/look": told.Started,
     "POST /track/stop": told.TrackTold,
     "POST /jog": told.JogTold,
+    "GET /history": told.HistoryTold,
     "GET /recordings": told.Recordings,
     "POST /recordings/start": told.RecorderTold,
     "POST /recordings/stop": told.RecordingEnded,
+    "DELETE /recordings/{name}": told.RecordingDeleted,
     "GET /limits/sun": told.SunTold,
     "POST /limits/sun": told.SunTold,
     "DELETE /limits/sun": told.SunTold,
@@ -84,6 +86,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "GET /mast": ("application/yaml",),
     "GET /metrics": ("text/plain",),
     "GET /reports/{name}": ("text/html",),
+    "GET /recordings/{name}/{file}": ("application/octet-stream",),
 }
 PICTURES = ("GET /snapshot/{camera}",)
 _ONE_MAKES_IT = threading.Lock()

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 from fastapi.responses import Response
 
 from calib.mast.rig import RigCamera
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
+from mastctl.web.packed import ASK_AGAIN, FOR_GOOD, digest, text_answer
 from mastctl.web.parts import Here
 
 FIRST = "index.html"
@@ -33,27 +34,31 @@ def page_files() -> dict[str, bytes]:
 
 
 def add_page(app: FastAPI) -> None:
-    """The page at ``/``, its files below ``/page/``, and ``GET /rig``."""
-    known = page_files()
+    """The page at ``/``, its files below ``/page/``, and ``GET /rig``.
 
-    def file(name: str) -> Response:
-        return Response(known[name], media_type=KINDS[name.rpartition(".")[2]])
+    The page names its files by an address that changes with any of them, so that a browser keeps them.
+    """
+    known = page_files()
+    version = digest(b"".join(known.values()))
+    first = known[FIRST].replace(b'"/page/', f'"/page/{version}/'.encode())
 
     @app.get("/", include_in_schema=False)
-    async def page() -> Response:
-        return file(FIRST)
+    async def page(request: Request) -> Response:
+        return text_answer(request.headers, first, KINDS["html"])
 
-    for name in known:
-        app.add_api_route(f"/page/{name}", _giver(file(name)), methods=["GET"], include_in_schema=False)
+    for name, data in known.items():
+        for place, keep in ((f"/page/{version}/{name}", FOR_GOOD), (f"/page/{name}", ASK_AGAIN)):
+            give = _giver(data, KINDS[name.rpartition(".")[2]], keep)
+            app.add_api_route(place, give, methods=["GET"], include_in_schema=False)
 
     @app.get(f"{PREFIX}/rig", summary="The configured cameras by the mast file in use")
     async def rig(here: Here) -> dict[str, Any]:
         return await here.waiting.run(lambda: rig_told(here.service))
 
 
-def _giver(answer: Response) -> Any:
-    async def give() -> Response:
-        return answer
+def _giver(data: bytes, kind: str, keep: str) -> Any:
+    async def give(request: Request) -> Response:
+        return text_answer(request.headers, data, kind, keep)
 
     return give
 

@@ -39,6 +39,10 @@ def add_watching(app: FastAPI) -> None:
             raise Unable("not_ready", f"{now.word}: {now.reason}" if now.reason else now.word)
         return {"ready": True, "state": now.word, "reason": now.reason}
 
+    @app.get(f"{PREFIX}/history", summary="Joints, temperatures and events of the last hours")
+    async def history(here: Here) -> dict[str, Any]:
+        return await here.waiting.run(here.service.history.told)
+
     @app.get(
         f"{PREFIX}/calibration/health",
         summary="Whether residuals of the last days are as the mast file predicts",

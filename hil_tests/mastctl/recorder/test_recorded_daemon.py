@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import httpx
 import pytest
 
 from drivers.mcap_file import Entry, read_items
@@ -138,6 +139,30 @@ def test_names_that_would_leave_the_folder_stay_in_it(client: Client, folder: Pa
     with pytest.raises(ClientError) as refused:
         client.start_recording("x" * 100)
     assert refused.value.code == "bad_request"
+
+
+def test_a_recording_is_read_and_deleted_by_its_name_only(client: Client, daemon: RunningDaemon) -> None:
+    with httpx.Client(base_url=f"{daemon.url}/api/v1/recordings", trust_env=False) as http:
+
+        def told(method: str, path: str) -> str:
+            answer = http.request(method, path)
+            return "" if answer.is_success else answer.json()["error"]["code"]
+
+        begun = client.start_recording("to go")
+        run, file = begun["run"], begun["file"]
+        assert told("GET", f"/{run}/{file}") == "recording"
+        assert told("DELETE", f"/{run}") == "recording"
+        ended = client.stop_recording()
+        whole = http.get(f"/{run}/{file}", headers={"Range": "bytes=0-9"})
+        assert (whole.status_code, whole.content) == (200, Path(ended["file"]).read_bytes())
+        assert client.recording(str(run), str(file)) == whole.content
+        for path in ("/nothing", "/..%2Fruns", "/%2E%2E"):
+            assert told("DELETE", path) in ("recording_unknown", "not_found", "method_not_allowed"), path
+        assert told("GET", f"/{run}/..%2F{file}") in ("recording_unknown", "not_found")
+        assert Path(ended["file"]).exists()
+        left = client.delete_recording(str(run))["recordings"]
+        assert run not in [one["name"] for one in left] and not Path(ended["file"]).exists()
+        assert told("DELETE", f"/{run}") == "recording_unknown"
 
 
 def test_a_fault_of_the_head_keeps_what_was_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

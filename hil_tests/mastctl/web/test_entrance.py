@@ -74,6 +74,12 @@ def test_every_route_but_the_stops_and_the_log_in_asks_for_a_token(net: Network)
     assert net.ask("POST", "/reset", "admin", json={"reason": "a test", "name": "a test"}).status_code == 200
 
 
+def test_a_recording_is_deleted_by_an_administrator_only(net: Network) -> None:
+    assert code(net.ask("DELETE", "/recordings/x", "view")) == (403, "role")
+    assert code(net.ask("DELETE", "/recordings/x", "operate")) == (403, "role")
+    assert code(net.ask("DELETE", "/recordings/x", "admin")) == (404, "recording_unknown")
+
+
 def test_what_is_no_route_asks_for_a_token_too(net: Network) -> None:
     for path in ("/openapi.json", "/api/v1/nothing", "/api/v1/../v1/status", "/docs", "/api/v1//status"):
         assert code(net.ask("GET", f"{net.url}{path}")) == (401, "no_token"), path

@@ -7,6 +7,7 @@ import { Control } from "./control.js";
 import { Events } from "./events.js";
 import { Faults, MastFile, Recording } from "./panels.js";
 import { HeadPanel } from "./head.js";
+import { History } from "./history.js";
 import { Jog } from "./jog.js";
 import { OperationList } from "./operations.js";
 import { Reports } from "./reports.js";
@@ -103,6 +104,7 @@ new Faults(events, announce);
 new OperationList(events);
 const bench = new Bench(events, speak);
 new Reports(events);
+new History();
 
 // What is pushed
 
@@ -214,7 +216,7 @@ function show(status) {
 function allow(role) {
   may = role !== "view";
   set(document.body, "data-role", role);
-  for (const part of [target, track, jog, control, recording, mastFile, simulation, bench]) part.allow(may);
+  for (const part of [target, track, jog, control, recording, mastFile, simulation, bench]) part.allow(may, role);
 }
 
 // Who one is

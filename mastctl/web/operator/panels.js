@@ -1,6 +1,6 @@
 // The quiet panels: faults, recording, mast file.
 import { byId, h, put, say, set } from "./dom.js";
-import { get, post } from "./api.js";
+import { ask, fileOf, get, post } from "./api.js";
 import { camera as called, forTime, inDegrees, moment, number, sentence } from "./words.js";
 
 /** A fault's message without the device's name, which stands before it. */
@@ -35,16 +35,17 @@ export class Recording {
     setInterval(() => this.look(), 15000);
   }
 
-  allow(may) {
-    this.may = may;
+  allow(may, role) {
     byId("record").disabled = !may;
+    this.deletes = role === "admin";
   }
 
   async look() {
     if (document.hidden) return;
     try {
-      const { recorder, free_mb: free } = await get("/recordings");
+      const { recorder, free_mb: free, recordings } = await get("/recordings");
       this.told(recorder, free);
+      this.list(recordings, recorder);
     } catch {
       say(byId("recording"), "not known");
     }
@@ -58,6 +59,40 @@ export class Recording {
     set(byId("recording"), "title", byId("recording").textContent);
     byId("recording").parentElement.dataset.on = recorder.recording;
     say(byId("record"), recorder.run ? "End run" : "Record");
+  }
+
+  /** What is kept on the daemon's disk, the newest first: each file can be had; what can be deleted wants two presses. */
+  list(recordings, recorder) {
+    this.all = [recordings, recorder];
+    const drawn = JSON.stringify([recordings.map((one) => [one.name, one.names, one.kind === "ring" || one.size_mb]), recorder.file, this.sure, this.deletes]);
+    if (drawn === this.drawn) return;
+    this.drawn = drawn;
+    const kinds = { run: "run", kept: "kept at a fault", ring: "the newest minutes" };
+    put(byId("recordings"), recordings.length ? h("table", { class: "figures list" }, recordings.toReversed().map((one) => h("tr", {},
+      h("td", {}, one.kind === "run" ? null : h("div", {}, one.name), one.names.map((file) => h("div", {}, file === recorder.file ? `${file}, being written` : h("a", { class: "save", href: fileOf(`/recordings/${encodeURIComponent(one.name)}/${encodeURIComponent(file)}`), download: file }, file)))),
+      h("td", { class: "n" }, kinds[one.kind]), h("td", { class: "n" }, `${number(one.size_mb, 1)} MB`),
+      h("td", { class: "n" }, !this.deletes || one.kind === "ring" || one.names.includes(recorder.file) ? null : this.remover(one.name)))))
+      : h("p", { class: "quiet" }, `None yet. They lie in ${recorder.folder}.`));
+  }
+
+  remover(name) {
+    const words = this.sure === name ? "Really delete" : "Delete";
+    return h("button", { type: "button", class: "quiet", "aria-label": `${words} ${name}`, onclick: () => this.remove(name) }, words);
+  }
+
+  async remove(name) {
+    if (this.sure !== name) {
+      this.sure = name;
+      setTimeout(() => { if (this.sure === name) { this.sure = null; this.list(...this.all); } }, 5000);
+      return this.list(...this.all);
+    }
+    this.sure = null;
+    try {
+      await ask("DELETE", `/recordings/${encodeURIComponent(name)}`);
+    } catch (error) {
+      this.alarm(error.message);
+    }
+    this.look();
   }
 
   async press() {

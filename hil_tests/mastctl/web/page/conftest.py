@@ -117,7 +117,7 @@ def visit(browser: Browser) -> Iterator[Callable[..., Visit]]:
         context = browser.new_context(**{"viewport": {"width": 1400, "height": 950}, **options})
         contexts.append(context)
         context.set_default_timeout(BOUND_MS)
-        context.route("**/page/eye.js", lambda to: to.fulfill(content_type="text/javascript", body=patient))
+        context.route("**/eye.js", lambda to: to.fulfill(content_type="text/javascript", body=patient))
         page = context.new_page()
         if turned:
             page.clock.install()

@@ -75,8 +75,24 @@ def test_the_page_is_its_own_files_and_light(pair: BOTH, visit: Visits) -> None:
     assert "default-src 'self'" in policy and "unsafe" not in policy
     assert one.page.locator("#hardware").inner_text() == "HARDWARE"
     assert "little.yaml" in one.page.locator("#mast").inner_text()
-    asked = {where for where, _ in one.asked}
-    assert {f"GET /page/{name}" for name in page_files() if name.endswith(".js")} <= asked
+    asked = {where.rpartition("/")[2] for where, _ in one.asked}
+    assert {name for name in page_files() if name.endswith(".js")} <= asked
+
+
+def test_the_page_comes_compressed_and_is_kept_by_the_browser(pair: BOTH) -> None:
+    with httpx.Client(base_url=pair[0].url, trust_env=False) as http:
+        page = http.get("/")
+        files = re.findall(r'"(/page/[0-9a-f]{16}/[a-z]+\.(?:js|css))"', page.text)
+        assert len(files) >= 6
+        for path in ("/", *files, "/openapi.json"):
+            packed, plain = http.get(path), http.get(path, headers={"Accept-Encoding": "identity"})
+            assert packed.headers["content-encoding"] == "gzip" and packed.content == plain.content
+            assert int(packed.headers["content-length"]) < 0.6 * len(plain.content), path
+            kept = "immutable" if path in files else "no-cache"
+            assert kept in packed.headers["cache-control"] and "Accept-Encoding" in packed.headers["vary"]
+            again = http.get(path, headers={"If-None-Match": packed.headers["etag"]})
+            assert (again.status_code, again.content) == (304, b"")
+        assert http.get("/api/v1/status").headers["cache-control"] == "no-store"
 
 
 def test_a_click_shows_range_and_sigma_before_anything_moves_and_a_key_sends_it(

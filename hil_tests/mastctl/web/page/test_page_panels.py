@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import httpx
 import pytest
 
+from drivers.interfaces import AxisReport
 from hil_tests.mastctl.service_fakes import (
     FakeHardware,
     FakePointing,
@@ -22,7 +24,7 @@ from hil_tests.mastctl.service_fakes import (
 )
 from hil_tests.mastctl.web.page.conftest import Visit
 from hil_tests.waiting import until
-from mastctl.client import Client
+from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 
 BOTH = tuple[RunningDaemon, FakeHardware]
@@ -275,3 +277,48 @@ def test_an_answer_from_before_a_stop_does_not_take_it_back(pair: BOTH, visit: V
         client.forget_place("chart")
     assert True not in one.page.evaluate("window.shown"), "it was never taken back"
     assert "by Ana: sparks" in one.page.locator("#estop").inner_text()
+
+
+def test_joints_temperatures_and_events_are_drawn_over_time(
+    pair: BOTH, visit: Visits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon, _ = pair
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(turns))
+    warm = AxisReport(None, 0, 0.0, 0, 0.0, "unknown", None, None, 41.5, None)
+    monkeypatch.setattr(daemon.service.devices, "_reported", lambda: {"pan": warm})
+    with Client(daemon.url, name="Ana") as client:
+        client.wait(client.point(pan_rad=0.2, tilt_rad=-0.1))
+        with pytest.raises(ClientError):
+            client.point(pan_rad=3.0, tilt_rad=0.0)
+        until(lambda: any("3 rad" in one["words"] for one in client.history()["events"]), "it is told")
+    one = visit(daemon.url)
+    one.page.locator("#history summary").first.click()
+    drawn = one.page.locator("#history svg")
+    drawn.first.wait_for()
+    assert re.search(r"now pan \+11.5°, tilt −5.7°", drawn.first.get_attribute("aria-label"))
+    assert "now pan +41.5 °C" in drawn.nth(1).get_attribute("aria-label")
+    words = one.page.locator("#history").inner_text()
+    assert "Ana: point: pan 171.89° is beyond" in words
+    assert one.page.locator("#history .tick.worse").count() > 0
+    assert not one.serious("#history")
+
+
+def test_recordings_are_listed_fetched_and_deleted_by_two_presses(pair: BOTH, visit: Visits) -> None:
+    daemon, _ = pair
+    with Client(daemon.url) as client:
+        client.start_recording("stone")
+        one = visit(daemon.url)
+        one.page.wait_for_selector("#recordings >> text=being written")
+        assert one.page.get_by_role("button", name="Delete").count() == 0
+        ended = client.stop_recording()
+        file = one.page.locator(f"#recordings a[download='{Path(ended['file']).name}']")
+        file.wait_for()
+        with one.page.expect_download() as fetched:
+            file.click()
+        assert fetched.value.path().read_bytes() == Path(ended["file"]).read_bytes()
+        assert fetched.value.suggested_filename == Path(ended["file"]).name
+        one.page.get_by_role("button", name=f"Delete {ended['run']}").click()
+        assert Path(ended["file"]).exists()
+        one.page.get_by_role("button", name=f"Really delete {ended['run']}").click()
+        file.wait_for(state="detached")
+        assert not Path(ended["file"]).exists()
