@@ -62,7 +62,7 @@ class CalibrationHealth:
     def use_mast(self, mast: StoredRig) -> None:
         """Judge by this mast file from now on."""
         self._mast = mast
-        self.verdict = NOTHING_YET
+        self.verdict, self._newest = NOTHING_YET, ()
         self._queue.put(self._mast)
 
     def told(self) -> dict[str, Any]:

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Protocol
 
+import cv2
+
 from drivers.clock import Clock
 from drivers.errors import DriverError
 from mastctl.devices.frames import StampedFrame
@@ -31,7 +33,9 @@ AGAIN_S = 0.25  # a picture that stays the newest, since its clock stands, is sh
 TIMEOUT_S = 1.0
 FAILING_S = 0.5  # how long a camera is left alone that gave none
 HELD = 4  # pictures of a camera that each watcher may click though newer ones came
-AHEAD = 2  # pictures on their way to a watcher: one being shown, one being sent
+REDUCED = ((1, 55), (1, 35), (2, 70), (2, 45), (2, 25), (4, 60), (4, 30))
+"""By what a picture's sides are divided, and the quality of its JPEG, the largest first: some 110 kB of
+gravel become 70, 50, 28, 18, 12, 7 and 4."""
 
 
 class CamerasLike(Protocol):
@@ -46,10 +50,25 @@ class CamerasLike(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A frame and its JPEG."""
+    """A frame and its JPEG, which may be ``reduced``: coarser, or of fewer pixels than the frame."""
 
     frame: StampedFrame
     jpeg: bytes
+    reduced: bool = False
+
+    def within(self, most_bytes: int | None) -> Picture:
+        """Return it with a JPEG of at most so many bytes, None: any, or the smallest that there is."""
+        if most_bytes is None or len(self.jpeg) <= most_bytes:
+            return self
+        image, jpeg = self.frame.image, self.jpeg
+        height, width = image.shape[:2]
+        for parts, quality in REDUCED:
+            size = max(1, width // parts), max(1, height // parts)
+            small = image if parts == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+            jpeg = encoded(small, "jpeg", quality)
+            if len(jpeg) <= most_bytes:
+                break
+        return Picture(self.frame, jpeg, reduced=True)
 
 
 class WatchedCameras:
@@ -70,7 +89,7 @@ class WatchedCameras:
         self._closed = False
         self._numbers = count(1)
 
-    def watch(self, cameras: Sequence[str], wake: Callable[[], None]) -> Watcher:
+    def watch(self, cameras: Sequence[str], wake: Callable[[], None], ready: bool = True) -> Watcher:
         """Begin to watch some cameras. Whoever does ends it by `Watcher.end`.
 
         Parameters
@@ -79,13 +98,15 @@ class WatchedCameras:
             Names of configured cameras.
         wake
             Called from another thread when a picture is there; must return at once.
+        ready
+            Whether a first picture of each is wanted before `Watcher.shown` asks for one.
 
         Raises
         ------
         RuntimeError
             If the system gives no thread; nobody watches then.
         """
-        watcher = Watcher(self, f"watcher {next(self._numbers)}", cameras, wake)
+        watcher = Watcher(self, f"watcher {next(self._numbers)}", cameras, wake, ready)
         with self._changed:
             self._watchers.add(watcher)
         try:
@@ -150,7 +171,7 @@ class WatchedCameras:
                 for watcher in self._ready(camera):
                     self._cameras.hold(frame, watcher.name, HELD)
                     if self._is_there(watcher):
-                        watcher.put(made)
+                        watcher.put(made.within(watcher.most_bytes(camera)))
                     else:  # it left before the frame was held, and would hold it for ever
                         self._cameras.let_go(watcher.name)
 
@@ -191,34 +212,46 @@ class Watcher:
     """
 
     def __init__(
-        self, owner: WatchedCameras, name: str, cameras: Sequence[str], wake: Callable[[], None]
+        self,
+        owner: WatchedCameras,
+        name: str,
+        cameras: Sequence[str],
+        wake: Callable[[], None],
+        ready: bool,
     ) -> None:
         self.name = name
         self.cameras = frozenset(cameras)
         self._owner = owner
         self._wake = wake
         self._lock = threading.Lock()
-        self._room = dict.fromkeys(self.cameras, AHEAD)
+        self._wanted = dict.fromkeys(self.cameras, ready)
+        self._most_bytes: dict[str, int | None] = dict.fromkeys(self.cameras)
         self._pictures: dict[str, Picture] = {}
 
-    def shown(self, camera: str) -> None:
-        """A picture of a camera was shown: there is room for another. What is not watched counts nothing."""
+    def shown(self, camera: str, most_bytes: int | None = None) -> None:
+        """A picture of a camera was shown: another is wanted, of at most so many bytes (None: any).
+
+        What is not watched counts nothing.
+        """
         with self._lock:
-            if camera not in self._room:
+            if camera not in self._wanted:
                 return
-            self._room[camera] = min(AHEAD, self._room[camera] + 1)
+            self._wanted[camera], self._most_bytes[camera] = True, most_bytes
         self._owner.stir()
 
     def ready(self, camera: str) -> bool:
         """Whether a picture of a camera would be taken."""
-        return self._room.get(camera, 0) > 0 or camera in self._pictures
+        return self._wanted.get(camera, False) or camera in self._pictures
+
+    def most_bytes(self, camera: str) -> int | None:
+        """Of a camera's next picture; None: any number."""
+        return self._most_bytes[camera]
 
     def put(self, picture: Picture) -> None:
         """Leave a picture to be taken, in the place of one that was not."""
         camera = picture.frame.camera
         with self._lock:
-            if camera not in self._pictures:
-                self._room[camera] -= 1
+            self._wanted[camera] = False
             self._pictures[camera] = picture
         self._wake()
 

@@ -1,8 +1,9 @@
 """Live pictures through one WebSocket: the newest of each camera, at the pace at which they are shown.
 
 A message is 4 bytes (the length of what follows, little-endian), the picture's facts as JSON, and the
-picture as JPEG. Who shows one sends the camera's name back, and is sent another one then: at most two of a
-camera are on their way, and none waits.
+picture as JPEG. Whoever has shown one sends ``CAMERA`` or ``CAMERA MOST_BYTES`` back, and is sent another one
+then: one of a camera is on its way, and none waits. ``? WORDS`` is answered with the clock by which pictures
+are stamped when they are sent: whoever asks can tell how long they were on their way.
 """
 
 from __future__ import annotations
@@ -27,6 +28,9 @@ from mastctl.web.models import ImagesQuery
 from mastctl.web.parts import Here
 from mastctl.web.refusals import told as refused
 from mastctl.web.sentences import sentence
+from mastctl.web.sockets import UNSUPPORTED
+
+ASKS = "?"
 
 
 def add_images(app: FastAPI) -> None:
@@ -35,12 +39,12 @@ def add_images(app: FastAPI) -> None:
     @app.websocket(IMAGES)
     async def socket(line: WebSocket, here: Here) -> None:
         try:
-            cameras = _asked(line).camera
-            for camera in cameras:
+            query = _asked(line)
+            for camera in query.camera:
                 here.service.check_camera(camera)
             with here.streams.listening((), frozenset()) as ending:  # counted as a listener, and ended as one
                 await line.accept()
-                await _Line(here.service, line, cameras).run(asyncio.ensure_future(ending.wait()))
+                await _Line(here.service, line, query).run(asyncio.ensure_future(ending.wait()))
         except ValidationError as error:
             words = sentence({**error.errors()[0], "loc": ("query", *error.errors()[0]["loc"])}, ImagesQuery)
             await line.send_denial_response(error_response(422, "bad_request", words))
@@ -60,12 +64,12 @@ def _asked(line: WebSocket) -> ImagesQuery:
 class _Line:
     """One WebSocket of pictures, until the daemon or the client ends."""
 
-    def __init__(self, service: Service, line: WebSocket, cameras: list[str]) -> None:
+    def __init__(self, service: Service, line: WebSocket, query: ImagesQuery) -> None:
         self._service = service
         self._line = line
         self._there = asyncio.Event()
         self._loop = asyncio.get_running_loop()
-        self._watcher: Watcher = service.watched.watch(cameras, self._wake)
+        self._watcher: Watcher = service.watched.watch(query.camera, self._wake, not query.on_request)
 
     async def run(self, ending: asyncio.Future[Any]) -> None:
         """Send pictures until ``ending`` is done."""
@@ -82,10 +86,18 @@ class _Line:
             self._watcher.end()
 
     async def _hear(self) -> None:
-        """Hear which pictures were shown."""
+        """Hear which pictures were shown, and who asks what the clock says."""
         with contextlib.suppress(WebSocketDisconnect):
             while True:
-                self._watcher.shown(await self._line.receive_text())
+                word, _, more = (await self._line.receive_text()).partition(" ")
+                if word == ASKS:
+                    told = {"asked": more, "now_s": self._loop.time()}
+                    await self._line.send_text(json.dumps(told))
+                elif more and not more.isdecimal():
+                    await self._line.close(UNSUPPORTED, "CAMERA, CAMERA MOST_BYTES or ? WORDS are taken here")
+                    return
+                else:
+                    self._watcher.shown(word, int(more) if more else None)
 
     async def _tell(self) -> None:
         """Send what is there."""
@@ -100,7 +112,8 @@ class _Line:
         frame = picture.frame
         height, width = frame.image.shape[:2]
         age_s = max(0.0, self._service.clock.now_s() - frame.mid_exposure_s)
-        facts = as_json(frame.facts) | {"size_px": [width, height], "age_s": age_s}
+        facts = as_json(frame.facts) | {"size_px": [width, height], "reduced": picture.reduced}
+        facts |= {"age_s": age_s, "sent_s": self._loop.time()}
         facts["track"] = self._service.track_in(frame)
         head = json.dumps(facts, allow_nan=False).encode()
         return b"".join((len(head).to_bytes(4, "little"), head, picture.jpeg))

@@ -451,11 +451,12 @@ class EventsQuery(BaseModel):
 
 
 class ImagesQuery(BaseModel):
-    """``GET /images``, a WebSocket: of which cameras."""
+    """``GET /images``, a WebSocket: of which cameras, and whether the first pictures are asked for too."""
 
     model_config = ConfigDict(extra="forbid")
 
     camera: Annotated[list[Name], Field(min_length=1, max_length=MOST_KEYS)]
+    on_request: bool = False
 
 
 class TruthQuery(BaseModel):

@@ -3,7 +3,7 @@
 uvicorn's protocol answers pings without waiting for its client to read, keeps what is sent to it, and bounds
 neither. Here a message from the client ends the connection with its first frame, pings are answered only
 while their answers are read, and a client that takes no bytes for some seconds is left. Where pictures are
-told, a client says by short words which of them it has shown.
+told, a client says by short words which of them it has shown, and asks for the time.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LARGEST_BYTES = 1024  # of what a client sends; it has nothing to say
 PING_S = 20.0
 STALLED_S = 10.0
 MOST_PINGS = 20  # of a client in a second
-LONGEST_WORD = 100  # a camera's name
+LONGEST_WORD = 100  # a camera's name, and how large its next picture may be
 MOST_WORDS = 400  # in a second: what six cameras at 30 frames/s need, twice
 UNSUPPORTED, BROKEN_RULES = 1003, 1008  # RFC 6455, 7.4.1
 
@@ -85,7 +85,7 @@ class Socket(WebSocketsSansIOProtocol):
         if self.scope["path"] != IMAGES:
             self._not_taken(event)
         elif not event.fin or len(event.data) > LONGEST_WORD or not bytes(event.data).isascii():
-            self._end(UNSUPPORTED, "the name of a camera whose picture was shown is taken here")
+            self._end(UNSUPPORTED, "CAMERA, CAMERA MOST_BYTES or ? WORDS are taken here")
         elif self._seldom():
             super().handle_text(event)
 

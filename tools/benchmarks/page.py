@@ -1,6 +1,7 @@
 """The operator page in chromium, of a simulated pair of 1024x768: first paint, frames, their age, STOP.
 
 .venv/bin/python -m tools.benchmarks.page [--seconds 10] [--rate 30]
+.venv/bin/python -m tools.benchmarks.page --link 50 0.4     50 kB/s and 0.4 s, each way: what it says of age
 """
 
 from __future__ import annotations
@@ -18,9 +19,33 @@ from mastctl.client import Client
 from tools.arguments import end
 from tools.browser import chromium
 from tools.living_daemon import simulated, started, vitals, written
+from tools.throttle import throttled
 
 PAIR = ("navcam_left", "navcam_right")
 STOPS = 10
+SAID = """seconds => new Promise(done => {
+  const shown = [], newest = {}, said = [];
+  const hear = ({ detail: one }) => {
+    newest[one.camera] = one.mid_exposure_s;
+    const age = document.querySelector(`[data-camera=${one.camera}] .age`).textContent;
+    const reduced = /reduced to (\\d+)/.exec(age);
+    shown.push([one.camera, one.mid_exposure_s, one.shown_ms, Number(reduced?.[1] ?? one.size_px[0])]);
+  };
+  const look = () => {
+    for (const eye of document.querySelectorAll(".eye")) {
+      const mid = newest[eye.dataset.camera];
+      const old = parseFloat(eye.querySelector(".age").textContent);
+      if (mid) said.push([mid, performance.timeOrigin + performance.now(), old, "stale" in eye.dataset]);
+    }
+  };
+  document.addEventListener("image-shown", hear);
+  const looking = setInterval(look, 50);
+  setTimeout(() => {
+    document.removeEventListener("image-shown", hear);
+    clearInterval(looking);
+    done([shown, said]);
+  }, 1000 * seconds);
+})"""
 SHOWN = """seconds => new Promise(done => {
   const shown = [];
   const hear = event => shown.push([event.detail.camera, event.detail.mid_exposure_s, event.detail.shown_ms]);
@@ -45,6 +70,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--rate", type=float, default=30.0, help="of the cameras, Hz")
+    parser.add_argument(
+        "--link", type=float, nargs=2, metavar=("KB_PER_S", "DELAY_S"), help="of a slow link, each way"
+    )
     asked = parser.parse_args()
     path = chromium()
     if path is None:
@@ -58,6 +86,11 @@ def main() -> int:
             browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
             page = browser.new_page(viewport={"width": 1500, "height": 1000})
             url = f"http://127.0.0.1:{port}"
+            if asked.link:
+                with throttled(port, 1e3 * asked.link[0], asked.link[1]) as far:
+                    slow(page, f"http://127.0.0.1:{far}", asked.seconds)
+                browser.close()
+                return 0
             page.goto(url)
             for name in PAIR:
                 page.wait_for_selector(f".eye[data-camera={name}]:not([data-stale])")
@@ -85,6 +118,34 @@ def images(page: Page, pid: int, seconds: float) -> None:
             f"95 % {np.percentile(ages, 95):.0f} ms"
         )
     print(f"daemon: {100 * used:.0f} % of a core")
+
+
+def slow(page: Page, url: str, seconds: float) -> None:
+    """How often images come over a slow link, how old they are, and how old the page says they are."""
+    began_s = time.monotonic()
+    page.goto(url, wait_until="commit")
+    for name in PAIR:
+        page.wait_for_selector(f".eye[data-camera={name}]:not([data-stale])", timeout=120_000)
+    print(f"first images after {time.monotonic() - began_s:.1f} s")
+    shown, said = page.evaluate(SAID, seconds)
+    ahead_s = time.time() - time.monotonic()
+    for name in PAIR:
+        mine = [(mid_s, shown_ms, width) for camera, mid_s, shown_ms, width in shown if camera == name]
+        apart_s = np.diff([1e-3 * shown_ms for _, shown_ms, _ in mine])
+        ages_s = [1e-3 * shown_ms - mid_s - ahead_s for mid_s, shown_ms, _ in mine]
+        print(
+            f"{name}: {len(mine)} images in {seconds:g} s, at most {max(apart_s, default=np.inf):.2f} s "
+            f"apart, {np.median(ages_s):.2f} s old when they come, {max(ages_s):.2f} s at most, "
+            f"{np.median([width for *_, width in mine]):.0f} px wide"
+        )
+    wrong_s = [old - (1e-3 * at_ms - mid_s - ahead_s) for mid_s, at_ms, old, _ in said]
+    hatched = np.mean([stale for *_, stale in said])
+    print(
+        f"the age that is told less the true one: {np.mean(wrong_s):+.3f} s on average, "
+        f"{min(wrong_s):+.3f} to {max(wrong_s):+.3f} s in {len(said)} looks, "
+        f"{100 * np.mean(np.abs(wrong_s) > 0.2):.1f} % of them more than 0.2 s; "
+        f"hatched in {100 * hatched:.0f} %"
+    )
 
 
 def stops(page: Page, url: str) -> None:

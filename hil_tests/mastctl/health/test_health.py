@@ -115,7 +115,7 @@ def test_a_drift_is_told_after_a_restart_and_ends_with_another_mast_file(tmp_pat
     assert "pancam_left" in told["sentence"] and "mrad" in told["sentence"]
     assert len(told["newest"]) == told["pointings"] == 6
     health.use_mast(replace(STORED, digest="0" * 64))
-    assert health.verdict.word == "few"
+    assert health.verdict.word == "few" and health.told()["newest"] == []
     health.use_mast(STORED)
     until(lambda: health.verdict.word == "drifts", "it drifts")
     health.close()

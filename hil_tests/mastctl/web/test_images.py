@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -58,12 +59,13 @@ def test_a_picture_comes_with_its_facts_and_uncompressed(pair: BOTH) -> None:
         assert facts[name] == getattr(frame, name)
     assert facts["size_px"] == [64, 48] and image.shape == frame.image.shape
     assert 0.0 <= facts["age_s"] < NET_S, "by the clock of its exposure"
+    assert not facts["reduced"]
 
 
-def test_who_shows_none_is_sent_two_and_then_none_until_it_says_so(pair: BOTH) -> None:
+def test_who_shows_none_is_sent_one_and_then_none_until_it_says_so(pair: BOTH) -> None:
     daemon, hardware = pair
     with watching(daemon.url, LEFT) as line:
-        first, second = received(line)[0], received(line)[0]
+        first = received(line)[0]
         with pytest.raises(TimeoutError):
             line.recv(timeout=0.2)
         asked = len(hardware.fake_cameras[LEFT].asked)
@@ -71,9 +73,29 @@ def test_who_shows_none_is_sent_two_and_then_none_until_it_says_so(pair: BOTH) -
             line.recv(timeout=0.2)
         assert len(hardware.fake_cameras[LEFT].asked) == asked, "nobody is ready, so the camera is not asked"
         line.send(LEFT)
-        third = received(line)[0]
-    assert first["sequence"] < second["sequence"] < third["sequence"]
-    assert third["mid_exposure_s"] - second["mid_exposure_s"] > 0.2, "the newest, not the next in a queue"
+        second = received(line)[0]
+    assert first["sequence"] < second["sequence"]
+    assert second["mid_exposure_s"] - first["mid_exposure_s"] > 0.2, "the newest, not the next in a queue"
+
+
+def test_a_slow_link_asks_for_the_time_first_and_then_for_small_pictures(pair: BOTH) -> None:
+    daemon, hardware = pair
+    with watching(f"{daemon.url}", f"{LEFT}&on_request=true") as line:
+        before_s = time.monotonic()
+        line.send("? 12.5")
+        answer = json.loads(line.recv(timeout=NET_S))
+        assert answer["asked"] == "12.5" and before_s <= answer["now_s"] <= time.monotonic()
+        assert not hardware.fake_cameras[LEFT].asked, "no picture was asked for"
+        sizes = []
+        for most in ("", " 2000", " 900", " 1"):
+            line.send(LEFT + most)
+            message = line.recv(timeout=NET_S)
+            length = int.from_bytes(message[:4], "little")
+            facts = json.loads(message[4 : 4 + length])
+            assert facts["reduced"] == bool(most) and facts["size_px"] == [64, 48]
+            assert before_s <= facts["sent_s"] - facts["age_s"] <= time.monotonic(), "when it was exposed"
+            sizes.append(len(message) - 4 - length)
+        assert sizes[0] > 2000 >= sizes[1] > 900 >= sizes[2] > sizes[3], "the smallest there is, at least"
 
 
 def test_the_clicked_picture_stays_known_while_it_is_shown_however_many_another_page_takes(
@@ -160,7 +182,9 @@ def test_what_makes_no_sense_is_refused_before_it_is_opened(standing: BOTH, quer
     assert b'"error"' in (refused.value.response.body or b"")
 
 
-@pytest.mark.parametrize("words, code", [("x" * 101, 1003), (b"navcam_left", 1003), ("é", 1003)])
+@pytest.mark.parametrize(
+    "words, code", [("x" * 101, 1003), (b"navcam_left", 1003), ("é", 1003), ("navcam_left -1", 1003)]
+)
 def test_what_is_no_camera_s_name_ends_it(pair: BOTH, words: str | bytes, code: int) -> None:
     with watching(pair[0].url, LEFT) as line:
         line.send(words)

@@ -5,6 +5,7 @@ import { forTime } from "./words.js";
 
 const FOR_S = 30;
 const RENEW_MS = 10000;
+const BENCH = "bench calibration"; // it takes the lease from nobody but from who begins it
 
 export class Control {
   constructor(alarm, taken) {
@@ -24,6 +25,8 @@ export class Control {
     if (other && control.holder !== this.control?.holder) this.taken(person(control.holder));
     this.control = control;
     this.toldMs = performance.now();
+    if (control?.holder === BENCH) held.lease = null;
+    if (held.lease && !this.own() && !this.leaving) this.renew(); // it says how ours has ended, if it has
     this.draw();
   }
 
@@ -32,11 +35,16 @@ export class Control {
     this.draw();
   }
 
+  /** Whether the lease is told to be this page's. */
+  own() {
+    return this.control?.kind === "lease" && this.control.holder.endsWith(client);
+  }
+
   draw() {
     const { control } = this;
     const left = control?.for_s == null ? null : control.for_s - (performance.now() - this.toldMs) / 1000;
     const gone = left !== null && left <= 0;
-    const mine = held.lease !== null;
+    const mine = held.lease !== null && this.own();
     const whose = control?.holder.endsWith(client) ? "you" : control && person(control.holder);
     if (mine) this.say("you", ", renewed");
     else if (!control || gone) this.say("nobody", "");
@@ -57,20 +65,26 @@ export class Control {
   async press() {
     try {
       if (held.lease) {
-        await ask("DELETE", "/lease");
+        this.leaving = true;
+        await ask("DELETE", "/lease").finally(() => { this.leaving = false; });
         held.lease = null;
       } else if (this.sure || this.button.textContent === "Take over") {
         if (!this.sure) return this.makeSure();
         this.sure = false;
-        held.lease = (await post("/lease/take", { for_s: FOR_S, reason: "taken over on the page" })).lease_id;
+        this.has(await post("/lease/take", { for_s: FOR_S, reason: "taken over on the page" }));
       } else {
-        held.lease = (await post("/lease", { for_s: FOR_S })).lease_id;
+        this.has(await post("/lease", { for_s: FOR_S }));
       }
     } catch (error) {
       if (error.code === "lease_over") held.lease = null;
       this.alarm(error.message);
     }
     this.draw();
+  }
+
+  has(lease) {
+    held.lease = lease.lease_id;
+    this.told({ ...lease, kind: "lease" });
   }
 
   /** A second press within some seconds takes over: a dialogue of the browser's would keep STOP out. */
@@ -86,10 +100,11 @@ export class Control {
   }
 
   async renew() {
+    const { lease } = held;
     try {
       await post("/lease/renew", { for_s: FOR_S });
     } catch (error) {
-      if (error.status === 0) return; // the next one may come through
+      if (error.status === 0 || held.lease !== lease) return; // the next one may come through
       held.lease = null;
       this.alarm(`You steer no longer: ${error.message}`);
       this.draw();

@@ -3,6 +3,7 @@ import { h, s, say, set } from "./dom.js";
 import { camera as called, deg, number } from "./words.js";
 
 const STALE_S = 1.0;
+const OLD_S = 1.0;
 const LOUPE_PX = 21; // image pixels across
 const ZOOM = 8;
 const SHAKES_PX = 10; // of the screen: a hand that clicks or a thumb that holds moves by less
@@ -36,7 +37,7 @@ export class Eye {
       h("figcaption", {}, h("strong", {}, called(name)), this.age, this.facing, this.where, this.save));
   }
 
-  show(facts, bitmap, cameMs) {
+  show(facts, bitmap) {
     const [width, height] = facts.size_px;
     if (this.canvas.width !== width || this.canvas.height !== height) {
       [this.canvas.width, this.canvas.height] = [width, height];
@@ -44,10 +45,10 @@ export class Eye {
       this.frame.style.aspectRatio = `${width} / ${height}`;
       this.element.style.setProperty("--ratio", width / height);
     }
-    this.pen.drawImage(bitmap, 0, 0);
+    this.pen.drawImage(bitmap, 0, 0, width, height);
+    this.coarse = facts.reduced ? `, reduced to ${bitmap.width} × ${bitmap.height} px` : "";
     if (this.facts) this.intervals = [...this.intervals.slice(-4), facts.mid_exposure_s - this.facts.mid_exposure_s];
     this.facts = facts;
-    this.exposedMs = cameMs - 1000 * facts.age_s;
     this.markTrack(facts.track);
     set(this.facing, "title", `frame ${facts.frame_id}, mast file ${facts.mast_digest.slice(0, 12)}`);
     this.fresh(performance.now());
@@ -57,12 +58,13 @@ export class Eye {
 
   /** Whether the image is of now; a slow camera's own period is allowed. */
   fresh(nowMs) {
-    const ageS = this.facts ? Math.max(0, (nowMs - this.exposedMs) / 1000) : Infinity;
+    const ageS = this.facts ? ageOf(this.facts, nowMs) : Infinity;
     const slow = this.intervals.length ? 2.5 * [...this.intervals].sort((a, b) => a - b)[Math.floor(this.intervals.length / 2)] : 0;
     this.isStale = !(ageS <= Math.max(STALE_S, Math.min(slow, 10)));
     set(this.element, "data-stale", this.isStale);
-    const told = this.facts ? `${number(ageS, 1)} s old` : "no image yet";
-    say(this.age, told);
+    const told = this.facts ? `${number(Math.ceil(10 * ageS) / 10, 1)} s old` : "no image yet"; // until it is told again
+    say(this.age, told + (this.facts ? this.coarse : ""));
+    set(this.age, "data-old", ageS > OLD_S);
     say(this.stale, this.facts ? `Image ${told}: not of now` : "No image yet");
     if (this.facts) say(this.facing, `${deg(this.facts.pan_rad)} ${deg(this.facts.tilt_rad)}`);
   }
@@ -214,6 +216,14 @@ export class Eye {
       s("ellipse", { class: "track", rx: Math.max(3 * track.major_px, 4), ry: Math.max(3 * track.minor_px, 4), transform: `translate(${x} ${y}) rotate(${(track.turn_rad * 180) / Math.PI})` }),
       cross(x, y, "track", 18)));
   }
+}
+
+const ageOf = (facts, nowMs) => Math.max(0, (nowMs - facts.exposed_ms) / 1000);
+
+/** What a click in an image that is no longer quite of now is told; "" of one that is. */
+export function ageWords(facts) {
+  const ageS = ageOf(facts, performance.now());
+  return ageS > OLD_S ? `The image was ${number(ageS, 1)} s old when it was chosen.` : "";
 }
 
 const clamp = (value, low, high) => Math.min(high, Math.max(low, value));

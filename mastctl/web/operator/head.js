@@ -1,8 +1,9 @@
 // Where the head is: figures against limits, a rose with each camera's field of view, a map of the joints.
-import { byId, h, put, s, say } from "./dom.js";
+import { byId, h, put, s, say, set } from "./dom.js";
 import { camera as called, deg, degrees, forTime, number } from "./words.js";
 
 const R = 78;
+const OLD_MS = 2000; // the joints are read several times a second
 
 export class HeadPanel {
   constructor(events) {
@@ -12,15 +13,32 @@ export class HeadPanel {
     this.map = s("svg", { class: "map", viewBox: "0 0 220 150", role: "img" });
     this.note = h("p", { class: "quiet" });
     this.sunNote = h("p", { class: "quiet", id: "sun-note" });
-    put(byId("head"), this.figures, h("div", { class: "drawings" }, this.rose, this.map), this.sunNote, this.note);
-    events.addEventListener("joints", (event) => { this.joints = event.detail.value; this.draw(); });
+    this.old = h("p", { class: "warn", id: "head-old", role: "status", hidden: true });
+    put(byId("head"), this.old, this.figures, h("div", { class: "drawings" }, this.rose, this.map), this.sunNote, this.note);
+    events.addEventListener("joints", (event) => this.read(event.detail.value));
+    setInterval(() => this.age(), 500);
     document.addEventListener("views-changed", () => this.draw());
   }
 
   use(status, rig, views) {
     [this.limits, this.rig, this.views] = [status.limits, rig, views];
-    this.joints ??= status.joints;
+    if (!this.joints && status.joints) this.read(status.joints);
+    else this.draw();
+  }
+
+  read(joints) {
+    this.joints = joints;
+    this.readMs = performance.now() - 1000 * joints.age_s;
+    this.age();
     this.draw();
+  }
+
+  /** Angles that nobody has read for a while are those of then. */
+  age() {
+    const ms = performance.now() - this.readMs;
+    this.old.hidden = !(ms > OLD_MS);
+    set(byId("head"), "data-old", !this.old.hidden);
+    if (!this.old.hidden) say(this.old, `Last read ${forTime(ms / 1000)} ago: where the head is now is not known.`);
   }
 
   keptOff({ sun, boxes }) {

@@ -5,7 +5,7 @@ import { forTime, inDegrees, sentence } from "./words.js";
 import { Bench } from "./bench.js";
 import { Control } from "./control.js";
 import { Events } from "./events.js";
-import { Faults, MastFile, Recording } from "./panels.js";
+import { Failure, Faults, MastFile, Recording } from "./panels.js";
 import { HeadPanel } from "./head.js";
 import { History } from "./history.js";
 import { Jog } from "./jog.js";
@@ -101,6 +101,7 @@ const mastFile = new MastFile(alarm);
 const residuals = new Residuals();
 const simulation = new Simulation();
 new Faults(events, announce);
+new Failure(events, announce);
 new OperationList(events);
 const bench = new Bench(events, speak);
 new Reports(events);
@@ -141,7 +142,7 @@ let pushed = 0; // an answer that was asked for before the last of these is olde
 events.addEventListener("state", (event) => { pushed += 1; standing(event.detail.value); });
 events.addEventListener("lease", (event) => { pushed += 1; control.told(event.detail.value.control); });
 events.addEventListener("joints", (event) => { jog.here = [event.detail.value.pan_rad, event.detail.value.tilt_rad]; });
-events.addEventListener("mast", () => refresh());
+events.addEventListener("mast", () => { refresh(); residuals.otherMast(); });
 events.addEventListener("fault", (event) => { if (event.detail.key === "sun") refresh(); });
 events.addEventListener("command", (event) => {
   const { command: kind = "", number, result, ended } = event.detail.value;

@@ -28,6 +28,47 @@ export class Faults {
   }
 }
 
+/** Why a move failed, an alarm until somebody has read it: the daemon itself is ready for the next. */
+export class Failure {
+  constructor(events, announce) {
+    [this.events, this.announce] = [events, announce];
+    this.words = h("span");
+    put(byId("failed"), this.words, " ", h("button", { type: "button", onclick: () => this.read() }, "Read"));
+    events.addEventListener("connected", () => { [this.newestS, this.sinceS] = [-Infinity, Infinity]; });
+    events.addEventListener("joints", ({ detail: { value } }) => { this.sinceS = Math.min(this.sinceS, value.measured_s + value.age_s); });
+    events.addEventListener("operation", (event) => this.told(event.detail.value));
+  }
+
+  told(record) {
+    const newest = record.created_s >= this.newestS;
+    if (newest) this.newestS = record.created_s;
+    if (record.state === "failed" && (newest || record.ended_s > this.sinceS) && !this.ofBench()) this.show(record);
+    else if (newest && !(this.endedS > this.sinceS)) this.hide(); // it failed before anybody looked here, and others went well since
+  }
+
+  /** It takes another attitude where one cannot be reached, and says why itself. */
+  ofBench() {
+    return ["running", "asking"].includes(this.events.newest("bench", "run")?.state);
+  }
+
+  show({ id, error, ended_s: endedS }) {
+    if (localStorage.getItem("mastctl read") === id) return;
+    [this.id, this.endedS] = [id, endedS];
+    say(this.words, `The last command failed: ${error?.message ?? "the daemon told no reason"}`);
+    byId("failed").hidden = false;
+    this.announce(this.words.textContent);
+  }
+
+  hide() {
+    byId("failed").hidden = true;
+  }
+
+  read() {
+    localStorage.setItem("mastctl read", this.id);
+    this.hide();
+  }
+}
+
 export class Recording {
   constructor(alarm) {
     this.alarm = alarm;

@@ -14,6 +14,7 @@ export class Residuals {
     this.scatter = s("svg", { class: "scatter", viewBox: "0 0 280 184", role: "img" });
     this.history = h("div", { class: "plots" });
     this.table = hiddenTable();
+    this.asked = 0;
     put(byId("residuals"), this.words, this.scatter, this.history, this.table.place);
   }
 
@@ -25,10 +26,17 @@ export class Residuals {
     }
   }
 
+  /** What was measured by a former mast file is none of this one's; a thread looks for what is. */
+  otherMast() {
+    this.look();
+    setTimeout(() => this.look(), WAITS_MS[1]);
+  }
+
   async look(operation = null) {
+    const mine = ++this.asked;
     try {
       const health = await get("/calibration/health");
-      this.told(health);
+      if (mine === this.asked) this.told(health); // else it may be of a former mast file
       return health.newest[0]?.operation === operation;
     } catch (error) {
       say(this.words, error.message);

@@ -2,6 +2,7 @@
 import { byId, h, put } from "./dom.js";
 import { fileOf, get, post } from "./api.js";
 import { camera as called, deg, inDegrees, metres, number, px } from "./words.js";
+import { ageWords } from "./eye.js";
 import { residualPicture } from "./residual.js";
 import { placeIn, shownBy } from "./truth.js";
 
@@ -106,12 +107,12 @@ export class Target {
   async choose(eye, pixel, facts) {
     if (!this.may) return this.refuse("You may look. To point, log in with a token of the role operate.", "role");
     const mine = ++this.number;
-    this.click = { camera: eye.name, pixel, facts };
+    this.click = { camera: eye.name, pixel, facts, old: facts ? ageWords(facts) : "" };
     this.preview = null;
-    if (!facts || eye.isStale) return this.refuse(`The image of ${called(eye.name)} is not of now, so nothing in it can be clicked.`, "stale");
+    if (!facts || eye.isStale) return this.refuse(`The image of ${called(eye.name)} is not of now, so nothing in it can be clicked. ${this.click.old}`, "stale");
     if (facts.moving) return this.refuse("The head moved while this image was exposed. Click when it rests.", "frame_moving");
     this.state = "asked";
-    this.say(`Chosen: ${called(eye.name)}, x ${number(pixel[0], 1)}, y ${number(pixel[1], 1)}. Looking for it.`);
+    this.say(`Chosen: ${called(eye.name)}, x ${number(pixel[0], 1)}, y ${number(pixel[1], 1)}. ${this.click.old} Looking for it.`);
     this.draw();
     this.render();
     try {
@@ -221,8 +222,8 @@ export class Target {
   }
 
   chosen() {
-    const { camera, pixel } = this.click;
-    return h("p", {}, `${called(camera)}  x ${number(pixel[0], 1)}  y ${number(pixel[1], 1)} px`);
+    const { camera, pixel, old } = this.click;
+    return [h("p", {}, `${called(camera)}  x ${number(pixel[0], 1)}  y ${number(pixel[1], 1)} px`), old ? h("p", { class: "warn", id: "old" }, old) : null];
   }
 
   seen() {

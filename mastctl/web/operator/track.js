@@ -3,6 +3,7 @@ import { byId, h, put, s, say } from "./dom.js";
 import { post } from "./api.js";
 import { camera as called, deg, forTime, inDegrees, metres, number } from "./words.js";
 import { hiddenTable, plot, roundUp, strip } from "./plots.js";
+import { ageWords } from "./eye.js";
 import { placeIn, shownBy } from "./truth.js";
 
 const KEPT = 200; // looks that are drawn
@@ -44,6 +45,8 @@ export class TrackPanel {
     else if (!facts || eye.isStale) this.said = "The image is not of now, so nothing in it can be followed.";
     else {
       try {
+        const old = ageWords(facts);
+        if (old) this.say(old);
         await post("/track", { pixel: { camera: eye.name, frame_id: facts.frame_id, x_px: pixel[0], y_px: pixel[1], mast_digest: facts.mast_digest } });
       } catch (error) {
         this.said = error.message;

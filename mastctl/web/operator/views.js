@@ -8,9 +8,9 @@ export class Views {
   constructor(choose) {
     this.choose = choose;
     this.eyes = new Map();
-    this.images = new Images((facts, bitmap, cameMs) => this.shown(facts, bitmap, cameMs));
+    this.images = new Images((facts, bitmap) => this.shown(facts, bitmap));
     this.groups = [];
-    setInterval(() => this.eyes.forEach((eye) => eye.fresh(performance.now())), 250);
+    setInterval(() => this.eyes.forEach((eye) => eye.fresh(performance.now())), 100);
     document.addEventListener("visibilitychange", () => this.watch());
   }
 
@@ -53,10 +53,10 @@ export class Views {
     return this.eyes.get(camera);
   }
 
-  shown(facts, bitmap, cameMs) {
+  shown(facts, bitmap) {
     const eye = this.eyes.get(facts.camera);
     if (!eye) return;
-    eye.show(facts, bitmap, cameMs);
+    eye.show(facts, bitmap);
     eye.save.hidden = false;
     eye.save.href = fileOf(`/snapshot/${encodeURIComponent(facts.camera)}?format=png&frame_id=${encodeURIComponent(facts.frame_id)}`);
   }

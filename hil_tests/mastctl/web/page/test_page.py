@@ -196,6 +196,41 @@ def test_a_stale_image_is_hatched_and_blocks_clicks(pair: BOTH, visit: Visits) -
     one.target("preview")
 
 
+def test_an_image_that_was_long_on_its_way_is_as_old_as_it_is_and_a_click_in_it_says_so(
+    pair: BOTH, visit: Visits
+) -> None:
+    lines: list[Any] = []
+    held: list[bytes] = []
+    slow = threading.Event()
+
+    def relay(line: Any) -> None:
+        """The way back takes long at last: pictures come when the test says so, answers not at all."""
+        server = line.connect_to_server()
+        lines.append(line)
+        server.on_message(
+            lambda told: (isinstance(told, bytes) and held.append(told)) if slow.is_set() else line.send(told)
+        )
+
+    one = visit("about:blank", turned=True)
+    one.page.route_web_socket(re.compile("/images"), relay)
+    one.url = pair[0].url
+    one.page.goto(one.url)
+    one.frame()
+    slow.set()
+    until(lambda: one.page.wait_for_timeout(20) or held, "a picture is on its way")
+    one.page.evaluate(
+        """() => { window.shown = new Promise((go) => document.addEventListener("image-shown", (event) =>
+          go([event.detail.camera, document.querySelector(`[data-camera=${event.detail.camera}] .age`)
+            .textContent]), { once: true })); }"""
+    )
+    one.page.clock.fast_forward(5000)
+    lines[-1].send(held[0])
+    camera, age = one.page.evaluate("window.shown")
+    assert 5.0 <= float(age.split()[0]) < NET_S, age
+    one.choose(camera)
+    assert re.search(r"was \d+\.\d s old when it was chosen", one.page.locator("#old").inner_text())
+
+
 def test_a_page_that_is_hidden_from_the_start_asks_for_no_picture_until_it_is_seen(
     pair: BOTH, visit: Visits
 ) -> None:

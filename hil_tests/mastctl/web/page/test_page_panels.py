@@ -13,6 +13,7 @@ from typing import Any
 import httpx
 import pytest
 
+from drivers.errors import NoReply
 from drivers.interfaces import AxisReport
 from hil_tests.mastctl.service_fakes import (
     FakeHardware,
@@ -26,6 +27,7 @@ from hil_tests.mastctl.web.page.conftest import Visit
 from hil_tests.waiting import until
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
+from mastctl.pointing.results import PointingError
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 Visits = Callable[..., Visit]
@@ -193,6 +195,8 @@ def test_a_lease_that_somebody_takes_ends_the_jog_and_is_told(pair: BOTH, visit:
     one.page.locator("#pad").focus()
     one.page.keyboard.down("ArrowRight")
     until(lambda: [call for call in hardware.head.calls if call[0] == "move"], "the head turns")
+    renewals: list[Any] = []
+    one.page.route("**/lease/renew", lambda route: renewals.append(route))
     with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
         http.post("/lease/take", json={"for_s": 60.0, "reason": "mine"}, headers={"Mastctl-Client": "Ben"})
     one.page.wait_for_selector("#jog .warn:not(:empty)")
@@ -200,8 +204,77 @@ def test_a_lease_that_somebody_takes_ends_the_jog_and_is_told(pair: BOTH, visit:
     moved = len(hardware.head.calls)
     one.page.wait_for_timeout(400)
     assert len(hardware.head.calls) == moved, "a held key moves nothing more"
-    one.page.wait_for_selector("#control >> text=Ben")
+    one.page.wait_for_selector("#control >> text=Ben")  # before any renewal was answered
     one.page.keyboard.up("ArrowRight")
+    assert renewals, "it asks at once how its lease ended"
+    for renewal in renewals:
+        renewal.continue_()
+    one.page.wait_for_selector("#alarm >> text=You steer no longer")
+
+
+def test_a_command_that_failed_is_an_alarm_until_it_was_read(
+    pair: BOTH, visit: Visits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon, _ = pair
+    one = visit(daemon.url)
+    one.word("ready")
+    edge = "getComputedStyle(document.getElementById('state')).borderLeftColor"
+    green = one.page.evaluate(edge)
+
+    def stuck(*_: Any) -> FakeResult:
+        raise PointingError("stuck", "pan is stuck at 12 degrees")
+
+    said = one.page.locator("#failed:not([hidden])")
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(stuck))
+    with Client(daemon.url) as client:
+        client.wait(client.point(pan_rad=0.2, tilt_rad=-0.1))
+        one.page.wait_for_selector("#failed >> text=pan is stuck at 12 degrees")
+        one.word("ready")
+        assert one.page.evaluate(edge) != green and "pan is stuck" in one.page.locator("#alarm").inner_text()
+        later = visit(daemon.url)
+        later.page.wait_for_selector("#failed >> text=pan is stuck")
+        monkeypatch.setattr(ScriptedLoop, "script", staticmethod(turns))
+        client.wait(client.point(pan_rad=0.1, tilt_rad=-0.1))
+    later.page.wait_for_selector("#failed", state="hidden")  # it came when the failure was of the past
+    assert said.is_visible(), "what went well afterwards does not take it back"
+    said.get_by_role("button", name="Read").click()
+    assert not said.is_visible() and one.page.evaluate(edge) == green
+
+
+def test_angles_of_a_head_that_is_not_read_are_told_as_of_then(pair: BOTH, visit: Visits) -> None:
+    daemon, hardware = pair
+    one = visit(daemon.url, turned=True)
+    one.page.wait_for_selector("#at-pan >> text=0.00°")
+    assert not one.page.locator("#head-old").is_visible()
+
+    def hook(name: str) -> None:
+        raise NoReply("no answer", device="pan_tilt")
+
+    hardware.head.hook = hook
+    one.page.wait_for_selector("#faults >> text=no answer")
+    one.page.clock.fast_forward(12_000)
+    one.page.wait_for_selector("#head-old >> text=/Last read 1\\d s ago/")
+    hardware.head.hook = lambda name: None
+    one.page.wait_for_selector("#head-old", state="hidden")
+
+
+def test_residuals_of_a_former_mast_file_leave_with_it(pair: BOTH, visit: Visits, tmp_path: Path) -> None:
+    daemon, _ = pair
+    (tmp_path / "other.yaml").write_text((tmp_path / "little.yaml").read_text().replace("little", "other"))
+    one = visit(daemon.url)
+    one.word("ready")
+    measured = {
+        "time_s": 1.0, "operation": "x", "camera": "navcam_left", "residual_px": [0.25, -0.5],
+        "match_sigma_px": [0.05, 0.05], "range_m": 6.0,
+    }  # fmt: skip
+    body = json.dumps({"sentence": "it holds", "newest": [measured]})
+    one.page.route("**/calibration/health", lambda route: route.fulfill(status=200, body=body))
+    one.page.reload()
+    one.page.wait_for_selector("#residuals .scatter:not([hidden])", state="attached")
+    one.page.unroute("**/calibration/health")
+    with Client(daemon.url) as client:
+        client.use_mast("other.yaml")
+    one.page.wait_for_selector("#residuals >> text=None has been measured by this mast file yet")
 
 
 def test_two_tabs_of_one_browser_are_two_parties(pair: BOTH, visit: Visits) -> None:
