@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -48,6 +49,7 @@ class Described:
         if kind not in content:
             yield f"{where} is {kind}, described are {', '.join(content)}"
         elif kind == "application/json":
+            body = gzip.decompress(body) if body.startswith(b"\x1f\x8b") else body
             validator = self._validator(f"{method} {path} {status}", content[kind]["schema"])
             for error in validator.iter_errors(json.loads(body)):
                 yield f"{where}, {'/'.join(map(str, error.instance_path))}: {error.message[:200]}"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
-from fastapi import FastAPI, Response
+from fastapi import FastAPI, Request, Response
 
 from mastctl.errors import Unable
 from mastctl.metrics.metrics import CONTENT_TYPE
@@ -12,6 +13,7 @@ from mastctl.sentinel.folder import SENTINEL_FOLDER
 from mastctl.sentinel.standing import findings
 from mastctl.state.standing import Word
 from mastctl.web import PREFIX
+from mastctl.web.packed import passing_answer
 from mastctl.web.parts import Here
 
 WELL: frozenset[Word] = frozenset({"ready", "moving", "tracking", "holding"})
@@ -39,9 +41,16 @@ def add_watching(app: FastAPI) -> None:
             raise Unable("not_ready", f"{now.word}: {now.reason}" if now.reason else now.word)
         return {"ready": True, "state": now.word, "reason": now.reason}
 
-    @app.get(f"{PREFIX}/history", summary="Joints, temperatures and events of the last hours")
-    async def history(here: Here) -> dict[str, Any]:
-        return await here.waiting.run(here.service.history.told)
+    @app.get(
+        f"{PREFIX}/history",
+        summary="Joints, temperatures and events of the last hours",
+        response_class=Response,
+    )
+    async def history(request: Request, here: Here) -> Response:
+        def told() -> bytes:
+            return json.dumps(here.service.history.told(), allow_nan=False).encode()
+
+        return await here.waiting.run(lambda: passing_answer(request.headers, told(), "application/json"))
 
     @app.get(
         f"{PREFIX}/calibration/health",

@@ -1,4 +1,4 @@
-"""The operator page in chromium, of a simulated pair of 1024x768: first paint, frames, their age, STOP.
+"""The operator page in chromium, of a simulated pair: its bytes, first paint, frames, their age, STOP.
 
 .venv/bin/python -m tools.benchmarks.page [--seconds 10] [--rate 30]
 .venv/bin/python -m tools.benchmarks.page --link 50 0.4     50 kB/s and 0.4 s, each way: what it says of age
@@ -52,6 +52,9 @@ SHOWN = """seconds => new Promise(done => {
   document.addEventListener("image-shown", hear);
   setTimeout(() => { document.removeEventListener("image-shown", hear); done(shown); }, 1000 * seconds);
 })"""
+CAME = """() => [...performance.getEntriesByType("navigation"), ...performance.getEntriesByType("resource")]
+  .filter(one => one.entryType === "navigation" || one.name.includes("/page/"))
+  .reduce((sum, one) => sum + one.transferSize, 0)"""
 PRESSED = """() => new Promise(done => {
   const button = document.getElementById("stop");
   const began = performance.now();
@@ -94,8 +97,13 @@ def main() -> int:
             page.goto(url)
             for name in PAIR:
                 page.wait_for_selector(f".eye[data-camera={name}]:not([data-stale])")
-            page.reload()
+            came = [page.evaluate(CAME)]
+            page.goto(url)
             page.wait_for_selector("#state[data-word=ready]")
+            came.append(page.evaluate(CAME))
+            print(
+                f"the page's files: {came[0] / 1e3:.1f} kB at first, {came[1] / 1e3:.1f} kB the second time"
+            )
             paint = "performance.getEntriesByName('first-contentful-paint')[0].startTime"
             print(f"first paint {page.evaluate(paint):.0f} ms")
             images(page, daemon.pid, asked.seconds)

@@ -14,14 +14,14 @@ export const client = `page-${words[0].toString(36)}`;
 export const NAME = "mastctl name";
 export const me = { name: kept(NAME) ?? "" };
 const called = () => (me.name ? `${me.name}, ${client}` : client);
-/** Who steers, for people: without what tells one page of theirs from another. */
-export const person = (holder) => holder.replace(/, page-[0-9a-z]+$/, "");
+/** A name, or words about people, without what tells one page of theirs from another. */
+export const person = (words) => words.replace(/, page-[0-9a-z]+/g, "");
 /** A header holds bytes: those of UTF-8. */
 const bytes = (text) => String.fromCharCode(...new TextEncoder().encode(text));
 
 export class Refusal extends Error {
   constructor(status, code, message, detail) {
-    super(code === "not_found" ? "The daemon does not know what the page asked for. Reload the page." : inDegrees(message));
+    super(code === "not_found" ? "The daemon does not know what the page asked for. Reload the page." : person(inDegrees(message)));
     this.status = status;
     this.code = code;
     this.detail = detail;

@@ -1,6 +1,6 @@
 // The last hours: joints and temperatures over time, and what happened; asked for while somebody has it open.
 import { byId, h, put, s, say } from "./dom.js";
-import { get } from "./api.js";
+import { get, person } from "./api.js";
 import { camera as called, degrees, forTime, inDegrees, number } from "./words.js";
 import { hiddenTable, plot } from "./plots.js";
 
@@ -43,7 +43,7 @@ export class History {
       axes.length ? this.over("Temperatures, °C", axes.map(([name, values], k) => [name, values, k ? "of-y" : "of-x"]), events, span, " °C") : h("p", { class: "quiet" }, "The driver of this head tells no temperatures."));
     const newest = events.slice(-SHOWN).reverse();
     say(this.said, events.length ? `${events.length} events, marked below the plots; the newest ${newest.length}:` : "Nothing has happened in this time.");
-    put(this.list, newest.map((one) => h("tr", {}, h("td", { class: "n" }, `${forTime(one.age_s)} ago`), h("td", { class: one.well ? "" : "bad" }, inDegrees(one.words)))));
+    put(this.list, newest.map((one) => h("tr", {}, h("td", { class: "n" }, `${forTime(one.age_s)} ago`), h("td", { class: one.well ? "" : "bad" }, person(inDegrees(one.words))))));
     this.table.fill(["s ago", "pan °", "tilt °", ...axes.map(([name]) => `${called(name)} °C`)], told.age_s.map((age, k) => [number(age, 0), number(pan[k], 2, true), number(tilt[k], 2, true), ...axes.map(([, values]) => number(values[k], 1))]).filter((_, k) => told.age_s[k] <= span).reverse().slice(0, 200));
   }
 

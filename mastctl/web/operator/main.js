@@ -1,6 +1,6 @@
 // The page: what is always in sight, and the panels told of what changes.
 import { byId, h, keep, kept, put, say, set } from "./dom.js";
-import { NAME, ask as request, estop, get, held, me, post, stop } from "./api.js";
+import { NAME, ask as request, estop, get, held, me, person, post, stop } from "./api.js";
 import { forTime, inDegrees, sentence } from "./words.js";
 import { Bench } from "./bench.js";
 import { Control } from "./control.js";
@@ -116,7 +116,7 @@ function standing(now) {
   set(byId("state"), "data-word", now.state);
   const before = byId("word").textContent;
   say(byId("word"), WORDS[now.state] ?? now.state);
-  say(byId("reason"), now.estop ? "" : sentence(inDegrees(now.reason ?? ""))); // the latch tells who and why itself
+  say(byId("reason"), now.estop ? "" : sentence(person(inDegrees(now.reason ?? "")))); // the latch tells who and why itself
   since = performance.now() - 1000 * now.state_for_s;
   if (before !== now.state) {
     if (["stopping", "stopped"].includes(now.state)) target.disarm("The head was stopped");
@@ -130,8 +130,8 @@ function standing(now) {
   byId("estop").hidden = !latch;
   set(byId("latch"), "aria-pressed", String(Boolean(latch)));
   const entries = now.estops ?? [];
-  const words = latch ? ` by ${entries.map((one) => `${one.name}: ${one.reason}`).join("; by ")}. Nothing moves until it is released, not even after a restart of the daemon. ` : "";
-  if (words !== latched) put(byId("estop"), h("span", {}, h("strong", {}, "Emergency stop"), words), ...entries.map((one, index) => h("button", { type: "button", id: index ? `release-${index}` : "release", onclick: () => { releasing = one.name; ask(byId("reset")); } }, index || entries.length > 1 ? `Release ${one.name}’s …` : "Release …")));
+  const words = latch ? ` by ${entries.map((one) => `${person(one.name)}: ${one.reason}`).join("; by ")}. Nothing moves until it is released, not even after a restart of the daemon. ` : "";
+  if (words !== latched) put(byId("estop"), h("span", {}, h("strong", {}, "Emergency stop"), words), ...entries.map((one, index) => h("button", { type: "button", id: index ? `release-${index}` : "release", onclick: () => { releasing = one.name; ask(byId("reset")); } }, index || entries.length > 1 ? `Release ${person(one.name)}’s …` : "Release …")));
   latched = words;
   for (const button of byId("estop").querySelectorAll("button")) button.disabled = !may;
   document.title = `${now.state} – mastctl`;

@@ -1,6 +1,6 @@
 // The last operations: what was asked by whom, what came of it, and each one's picture, opened by who wants it.
 import { byId, h, put } from "./dom.js";
-import { fileOf } from "./api.js";
+import { fileOf, person } from "./api.js";
 import { clock, deg, inDegrees, number } from "./words.js";
 import { residualPicture } from "./residual.js";
 import { steps } from "./target.js";
@@ -28,7 +28,7 @@ export class OperationList {
   /** Who began it, and when by the daemon's clock. */
   asked({ operation, who, time }) {
     if (!operation || !time) return;
-    this.by.set(operation, `${clock(time)}, ${who}`);
+    this.by.set(operation, `${clock(time)}, ${person(who)}`);
     this.items.delete(operation);
     this.soon();
   }

@@ -111,7 +111,7 @@ export class Recording {
     const kinds = { run: "run", kept: "kept at a fault", ring: "the newest minutes" };
     put(byId("recordings"), recordings.length ? h("table", { class: "figures list" }, recordings.toReversed().map((one) => h("tr", {},
       h("td", {}, one.kind === "run" ? null : h("div", {}, one.name), one.names.map((file) => h("div", {}, file === recorder.file ? `${file}, being written` : h("a", { class: "save", href: fileOf(`/recordings/${encodeURIComponent(one.name)}/${encodeURIComponent(file)}`), download: file }, file)))),
-      h("td", { class: "n" }, kinds[one.kind]), h("td", { class: "n" }, `${number(one.size_mb, 1)} MB`),
+      h("td", { class: "words" }, kinds[one.kind]), h("td", { class: "n" }, `${number(one.size_mb, 1)} MB`),
       h("td", { class: "n" }, !this.deletes || one.kind === "ring" || one.names.includes(recorder.file) ? null : this.remover(one.name)))))
       : h("p", { class: "quiet" }, `None yet. They lie in ${recorder.folder}.`));
   }

@@ -979,7 +979,10 @@ def test_who_steers_is_told_by_the_name_that_was_typed(pair: BOTH, visit: Visits
     one.page.wait_for_selector("#control >> text=you, renewed")
     other.page.wait_for_selector("#control >> text=/^Žofie 李, \\d+ s left/")
     other.page.locator("#home").click()
-    other.page.wait_for_selector("#jog .bad >> text=Žofie 李")
+    other.page.wait_for_selector("#jog .bad >> text=/^Žofie 李 steers/")
+    one.page.locator("#latch").click()
+    other.page.wait_for_selector("#estop >> text=by Žofie 李: pressed on the page")
+    assert "page-" not in other.page.locator("#state").inner_text()
 
 
 def test_refusals_speak_the_units_that_were_typed(pair: BOTH, visit: Visits) -> None:
