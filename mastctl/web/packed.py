@@ -32,7 +32,8 @@ def text_answer(asked: Mapping[str, str], data: bytes, kind: str, keep: str = AS
     tag = f'W/"{digest(data)}"'  # the same for both forms
     headers = {"Cache-Control": keep, "ETag": tag, "Vary": "Accept-Encoding"}
     if tag in asked.get("if-none-match", ""):
-        return Response(status_code=304, headers=headers)
+        # A browser takes its headers for those of what it has, the policy that goes by the kind too.
+        return Response(status_code=304, headers=headers, media_type=kind)
     if _takes_packed(asked):
         return Response(_packed(data), media_type=kind, headers=headers | PACKED)
     return Response(data, media_type=kind, headers=headers)

@@ -79,7 +79,11 @@ def test_the_page_is_its_own_files_and_light(pair: BOTH, visit: Visits) -> None:
     assert {name for name in page_files() if name.endswith(".js")} <= asked
 
 
-def test_the_page_comes_compressed_and_is_kept_by_the_browser(pair: BOTH) -> None:
+def test_the_page_comes_compressed_and_is_kept_by_the_browser(pair: BOTH, visit: Visits) -> None:
+    one = visit(pair[0].url)
+    one.word("ready")
+    one.page.goto(pair[0].url)
+    one.word("ready")  # of what the browser has kept
     with httpx.Client(base_url=pair[0].url, trust_env=False) as http:
         page = http.get("/")
         files = re.findall(r'"(/page/[0-9a-f]{16}/[a-z]+\.(?:js|css))"', page.text)
@@ -92,6 +96,8 @@ def test_the_page_comes_compressed_and_is_kept_by_the_browser(pair: BOTH) -> Non
             assert kept in packed.headers["cache-control"] and "Accept-Encoding" in packed.headers["vary"]
             again = http.get(path, headers={"If-None-Match": packed.headers["etag"]})
             assert (again.status_code, again.content) == (304, b"")
+            policies = {one.headers["content-security-policy"] for one in (packed, again)}
+            assert len(policies) == 1, "a browser takes it from the newest answer"
         assert http.get("/api/v1/status").headers["cache-control"] == "no-store"
 
 
