@@ -40,6 +40,7 @@ _STEEPEST_RAD_PER_S2 = 1000.0
 _WIDEST_MARGIN_RAD = 0.5
 _HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,252})|[0-9A-Fa-f:]*:[0-9A-Fa-f:.]*")
 _MOST_MB = 1e7
+_LATEST_REPEAT_S = 60.0
 _LONGEST_SOCKET_PATH = 100  # bytes; the kernel's own bound is 108
 
 
@@ -93,7 +94,10 @@ class Listen:
 
 @dataclass(frozen=True)
 class Config:
-    """A daemon's configuration; paths are absolute or relative to the working folder. ``data``: its bytes."""
+    """A daemon's configuration; paths are absolute or relative to the working folder. ``data``: its bytes.
+
+    ``repeat_after_s``: as `mastctl.pointing.settings.PointingSettings` has it, None for its default.
+    """
 
     path: Path
     mast_file: Path
@@ -102,6 +106,7 @@ class Config:
     limits: Limits
     sun: Sun | None = None
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    repeat_after_s: float | None = None
     record: RecordSettings = field(default_factory=RecordSettings)
     live: LiveSettings | None = None
     data: bytes = field(default=b"", repr=False)
@@ -138,7 +143,7 @@ def parse_config(data: bytes, path: str | Path) -> Config:
         "",
         document,
         ("schema", "mast_file", "pan_tilt", "limits"),
-        ("cameras", "foxglove", "listen", "record", "simulation", "tracking", "state"),
+        ("cameras", "foxglove", "listen", "pointing", "record", "simulation", "tracking", "state"),
     )
     folder = Path(path).resolve().parent
     cameras = {name: _camera(top, name) for name in top.mapping("cameras")}
@@ -155,6 +160,7 @@ def parse_config(data: bytes, path: str | Path) -> Config:
         limits=_limits(top),
         sun=_sun(top),
         tracking=_tracking(top, folder),
+        repeat_after_s=_repeat_after_s(top),
         record=_record(top, folder),
         live=_live(top),
         data=data,
@@ -360,6 +366,16 @@ def _tracking(top: Section, folder: Path) -> TrackingSettings:
         named_pairs=named,
         handoff_log=folder / section.text("handoff_log") if "handoff_log" in section else None,
     )
+
+
+def _repeat_after_s(top: Section) -> float | None:
+    """Read ``{repeat_after_s: SECONDS}`` of the key ``pointing``; None where it does not say."""
+    if "pointing" not in top:
+        return None
+    section = top.section("pointing", (), ("repeat_after_s",))
+    if "repeat_after_s" not in section:
+        return None
+    return _number_between(section, "repeat_after_s", 0.0, 0.0, _LATEST_REPEAT_S)
 
 
 def _state_folder(top: Section, folder: Path) -> Path | None:

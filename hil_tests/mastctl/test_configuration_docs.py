@@ -28,6 +28,7 @@ from drivers.sim.scene import SceneSettings
 from drivers.sim.warmth import TemperatureSettings
 from drivers.v4l2 import options as v4l2
 from mastctl import config
+from mastctl.pointing.settings import PointingSettings
 
 PAGE = Path("docs") / "configuration.md"
 
@@ -313,6 +314,7 @@ def test_defaults_of_the_configuration_itself_are_those_on_the_page(
     for key, value in {
         "listen.host": made.listen.host,
         "listen.port": made.listen.port,
+        "pointing.repeat_after_s": PointingSettings().repeat_after_s,
         "tracking.most_step": tracking.most_step,
         "tracking.start_error": tracking.start_error,
         "tracking.handoff.margin_px": tracking.handoff.margin_px,

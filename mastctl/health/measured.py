@@ -104,6 +104,7 @@ def measured_by(operation: Operation, mast: StoredRig, time_s: float) -> Measure
     steps = {step.name: step.detail for step in reversed(operation.steps)}  # the first of each name
     try:
         rest, seen, settled, found = (steps[name] for name in ("rest", "triangulate", "settle", "measure"))
+        found = steps.get("repeat", found)
         to_rad = settled["true_pan_rad"], settled["true_tilt_rad"]
         view = rig.camera_in_rover(found["camera"], *to_rad)
         predicted = view.project(seen["position_m"])[0].tolist()

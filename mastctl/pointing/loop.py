@@ -2,9 +2,9 @@
 
 Steps of a pixel request, as they stand in the record: ``rest``, ``frames``, ``target``, ``stereo``,
 ``triangulate``; then for each pointing ``solve``, ``limits``, ``move``, ``settle``, ``look``, ``measure``,
-``eyes`` (and ``triangulate``, ``rest`` before the second; ``before`` ahead of the first move if the aiming
-eye has no picture yet that the new one could be compared with). A position needs ``rest``, ``solve`` to
-``settle`` and ``look``; joint angles ``rest`` and ``limits`` to ``settle``, no picture.
+``eyes``, ``repeat`` (and ``triangulate``, ``rest`` before the second; ``before`` ahead of the first move if
+the aiming eye has no picture yet that the new one could be compared with). A position needs ``rest``,
+``solve`` to ``settle`` and ``look``; joint angles ``rest`` and ``limits`` to ``settle``, no picture.
 
 With one camera (its partner is not configured, or ``range_m`` or a plane says how far the target is)
 ``sight`` takes the place of ``stereo`` and ``triangulate``, ``range`` that of ``eyes``
@@ -14,7 +14,8 @@ A named frame's other eye may not be kept, and what was clicked may have been se
 fresh pair is always taken, the clicked patch is found in it, and range comes from that pair. The clicked
 patch itself, never a later copy of it, is what is looked for after each move, so nothing drifts.
 
-What the loop does not do: it does not retry, and it reports no residual on a match that is not good.
+What the loop does not do: it does not retry, and it reports no residual on a match that is not good, or that
+a later picture does not repeat (`mastctl.pointing.repeated`).
 """
 
 from __future__ import annotations
@@ -344,7 +345,8 @@ class _Run:
                 )
                 detail.update(predicted_px=rounded(expected.pixel_px), **eye.check(now, seen, expected))
             match_px = float(seen.sigma_px.max())
-            pointing = self._pointing(commanded, now, aim_px, seen)
+            later, again = self._steps.repeated(clicked, now, seen, settled, aim_px)
+            pointing = self._pointing(commanded, later, aim_px, again)
             known = expected.whole_px2(eye.sight.inverse_sigma_m) + match_px**2 * np.eye(2)
             self._done(
                 replace(
@@ -396,7 +398,8 @@ class _Run:
                         self._eyes.agree, clicked, now, seen, other, same_pair
                     )
                     confirmed.append((other, found))
-            self._done(self._pointing(commanded, now, aim_px, seen))
+            later, again = self._steps.repeated(clicked, now, seen, settled, aim_px)
+            self._done(self._pointing(commanded, later, aim_px, again))
             if number < pointings:
                 self._again(confirmed)
 

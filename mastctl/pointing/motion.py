@@ -18,6 +18,9 @@ from mastctl.pointing.reached import reached
 from mastctl.pointing.results import PointingError
 from mastctl.pointing.settings import PointingSettings
 
+WATCHED_S = 0.05
+"""How often a head at rest is read while a moment is waited for; a stop is noticed as soon."""
+
 
 class HeadLike(Protocol):
     """What of `mastctl.devices.devices.Devices` moves the head."""
@@ -150,6 +153,19 @@ class Head:
                 raise PointingError("did_not_arrive", words)
             words = f"at its deadline the head still moves, {where}: {watch.seen()}"
             raise PointingError("did_not_settle", words)
+
+    def watch_until(self, until_s: float) -> None:
+        """Read the head until a moment, clock time in seconds.
+
+        Raises
+        ------
+        PointingError, DriverError
+            ``stopped``; else as for a reading.
+        """
+        while (left_s := until_s - self._clock.now_s()) > 0.0:
+            self.check_not_stopped()
+            self.read()
+            self._clock.sleep(min(left_s, WATCHED_S))
 
     def read(self) -> HeadReading:
         """Return a reading that can be true.

@@ -56,7 +56,8 @@ class Pointing:
     note
         One sentence that says why there is no residual; empty otherwise.
     motion_evidence
-        By camera of the new pictures: whether they moved as the joints did, as a ``verdict`` with numbers.
+        By camera of the new pictures: whether they moved as the joints did, as a ``verdict`` with numbers; of
+        the one that measured also how a later picture repeated it (`mastctl.pointing.repeated`).
     """
 
     commanded_pan_rad: float
@@ -161,8 +162,8 @@ class PointingError(MastctlError):
         For programs. Own codes: ``stopped``, ``outside_image``, ``no_stereo``, ``head_fault``,
         ``head_moving``, ``bad_reading``, ``no_fresh_frame``, ``did_not_arrive``, ``did_not_settle``,
         ``not_in_view``, ``target_flat``, ``target_ambiguous``, ``target_border``, ``target_not_found``,
-        ``target_moving``, ``eyes_disagree``, ``off_the_line``. That of a request that does not fit
-        (`mastctl.pointing.wanted`), of a driver, of the limits or of the geometry passes through.
+        ``target_moving``, ``eyes_disagree``, ``off_the_line``, ``not_repeated``. That of a request that does
+        not fit (`mastctl.pointing.wanted`), of a driver, of the limits or of the geometry passes through.
     step
         The step that failed.
     result

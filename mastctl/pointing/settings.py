@@ -37,6 +37,10 @@ class PointingSettings:
         How long a request waits for a head that still moves.
     frame_timeout_s
         For a new picture: some frames of a slow camera, on a busy machine.
+    repeat_after_s
+        How much later a second picture is taken, which has to repeat a residual before it is told; 0: none.
+        Pictures older than their stamps by up to that are found out: what is told was measured in one that
+        was exposed by a head at rest.
     same_pose_rad
         Joint angles nearer than this are one pose: a tenth of a Pancam pixel.
     same_moment_s
@@ -77,6 +81,7 @@ class PointingSettings:
     jump_rad: float = 0.035
     rest_wait_s: float = 2.0
     frame_timeout_s: float = 8.0
+    repeat_after_s: float = 1.0
     same_pose_rad: float = 3e-5
     same_moment_s: float = 1e-4
     between_eyes_px: float = 0.5

@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 import numpy as np
 
 from calib.mast.rig import Rig
+from calib.pictures.patch_verdict import PatchMatch
 from calib.rigid import FloatArray
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import DriverError
@@ -22,11 +23,12 @@ from mastctl.devices.limits import Limits
 from mastctl.errors import NotNow
 from mastctl.pointing.abandoned import result_unless
 from mastctl.pointing.counts import counts_told
-from mastctl.pointing.looking import CamerasLike, Eyes, View, match_facts
+from mastctl.pointing.looking import CamerasLike, Clicked, Eyes, View, match_facts
 from mastctl.pointing.motion import Head, HeadLike
 from mastctl.pointing.motion_seen import MotionSeen
 from mastctl.pointing.one_moment import apart, check_one_moment
 from mastctl.pointing.record import Recorder
+from mastctl.pointing.repeated import repeated
 from mastctl.pointing.requests import PixelTarget
 from mastctl.pointing.results import Step, rounded
 from mastctl.pointing.settings import PointingSettings
@@ -258,6 +260,27 @@ class Steps:
             self._motion_seen.check(views, detail)
             self.motion_evidence = detail["motion_evidence"]
         return views
+
+    def repeated(
+        self, clicked: Clicked, first: View, seen: PatchMatch, settled: HeadReading, aim_px: FloatArray
+    ) -> tuple[View, PatchMatch]:
+        """Measure once more in a later picture, as `repeated` says; return what is to be told.
+
+        That is what the later picture shows; the first one's, if the settings want no second.
+        """
+        if not self._settings.repeat_after_s:
+            return first, seen
+        with self.step("repeat") as detail:
+            self.head.watch_until(first.frame.exposure_began_s + self._settings.repeat_after_s)
+            later, again, proven = self.unless_stopped(
+                repeated, self.eyes, self._settings, clicked, first, seen, settled
+            )
+            residual_px = rounded(again.pixel_px - aim_px)
+            detail.update(camera=first.frame.camera, frame_ids=[later.frame.frame_id], **match_facts(again))
+            detail.update(residual_px=residual_px, **proven)
+            name = first.frame.camera
+            self.motion_evidence = {**self.motion_evidence, name: {**self.motion_evidence[name], **proven}}
+        return later, again
 
     def one_moment(
         self, view: View, pixel_px: FloatArray, others: Sequence[View], resting: HeadReading

@@ -171,7 +171,7 @@ def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) 
             pixels = [before["pixel_px"], eyes[pair[1]]["pixel_px"]]
             sigmas = [before["sigma_px"], before["sigma_px"]]
             last = results[number - 2]
-            pair_facts = frames.get(last["frame_id"])
+            pair_facts = frames.get(steps["look", number - 1]["frame_ids"][0])
             otherwise = last["measured_pan_rad"], last["measured_tilt_rad"]
         where, pair_approach = _joints(pair_facts, otherwise)
         facts = frames.get(result["frame_id"])

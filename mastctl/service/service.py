@@ -237,7 +237,14 @@ class Service:
         self.stopping = Stopping(self.devices, self.operations, self.tracker, machine, self.latch)
         self.masts = Masts(config, mast, self.devices, self.operations, machine, self._use_mast)
         self.steering = Steering(
-            self.masts, rig, self.devices, clock, self.operations, self.tracker, self.health
+            self.masts,
+            rig,
+            self.devices,
+            clock,
+            self.operations,
+            self.tracker,
+            self.health,
+            config.repeat_after_s,
         )
         self.jogs = Jogs(
             self.operations,
@@ -421,6 +428,7 @@ class Service:
         if config.sun != self.config.sun:
             self.devices.door.use_sun(config.sun)
         self.config = config
+        self.steering.repeat_after_s = config.repeat_after_s
         self.steering.use_rig(configured(self.stored.rig, config.hardware.cameras))
         self.tracker.use_settings(config.limits, config.tracking)
         self.recording.use_config(config)

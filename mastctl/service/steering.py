@@ -21,6 +21,7 @@ from mastctl.operations.records import Operation
 from mastctl.pointing.loop import PointingLoop
 from mastctl.pointing.requests import AnglesTarget, PixelTarget, PointRequest, PositionTarget
 from mastctl.pointing.results import Preview
+from mastctl.pointing.settings import PointingSettings
 from mastctl.pointing.wanted import aim_of, check_pair, clicked_frame
 from mastctl.service.masts import Masts
 from mastctl.tracking.pose import RoverPose
@@ -44,6 +45,8 @@ class Steering:
         What runs, and what is followed.
     health
         Is told of each pointing's end.
+    repeat_after_s
+        Of pointings, as `mastctl.pointing.settings.PointingSettings` has it; None for its default.
     """
 
     def __init__(
@@ -55,6 +58,7 @@ class Steering:
         operations: Operations,
         tracker: Tracker,
         health: CalibrationHealth,
+        repeat_after_s: float | None = None,
     ) -> None:
         self._masts = masts
         self._devices = devices
@@ -62,12 +66,16 @@ class Steering:
         self._operations = operations
         self._tracker = tracker
         self._health = health
+        self.repeat_after_s = repeat_after_s
         self.use_rig(rig)
 
     def use_rig(self, rig: Rig) -> None:
-        """Point by another mast file from now on."""
+        """Point by another mast file, and by what is set now, from now on."""
         self._rig = rig
-        self._loop = PointingLoop(rig, self._devices, self._devices.door.limits, self._clock)
+        settings = PointingSettings()
+        if self.repeat_after_s is not None:
+            settings = replace(settings, repeat_after_s=self.repeat_after_s)
+        self._loop = PointingLoop(rig, self._devices, self._devices.door.limits, self._clock, settings)
 
     def point(self, request: PointRequest, told: Mapping[str, Any]) -> Operation:
         """Start a pointing operation and return its first record.

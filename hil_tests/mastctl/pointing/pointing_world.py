@@ -26,6 +26,7 @@ from mastctl.devices.limits import Limits
 from mastctl.devices.ways import Way, duration_s
 from mastctl.errors import NotKnown
 from mastctl.pointing.loop import PixelTarget, PointingLoop, PointingResult, PointRequest, Step
+from mastctl.pointing.settings import PointingSettings
 
 SIZE_PX = (300, 240)
 MAST_M = np.array([0.34, 0.0, -1.46])
@@ -218,10 +219,11 @@ def run(
     request: PointRequest,
     believed: Rig | None = None,
     cancelled: threading.Event | None = None,
+    settings: PointingSettings | None = None,
 ) -> tuple[PointingResult, list[Step]]:
     """Run a request and return its result and steps."""
     steps: list[Step] = []
-    loop = PointingLoop(believed or rig(), world, LIMITS, world.clock)
+    loop = PointingLoop(believed or rig(), world, LIMITS, world.clock, settings)
     return loop.run(request, steps.append, cancelled or threading.Event()), steps
 
 

@@ -1,11 +1,14 @@
 """A picture that did not move as the joints say is no evidence: the pointing ends in `bad_frame`.
 
+Nor is one that a later picture does not repeat: `not_repeated`.
+
 The small world's geometry, pictures and motion are its own; what its cameras do wrong is written here.
 """
 
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -14,9 +17,11 @@ import pytest
 from calib.pictures.same_patches import Posed
 from calib.pictures.shown_view import shown_view
 from drivers.errors import NoReply
-from hil_tests.mastctl.pointing.pointing_world import SIZE_PX, World, clean, click, rig, run
+from hil_tests.mastctl.pointing.pointing_world import SIZE_PX, World, clean, click, moving_world, rig, run
 from mastctl.devices.frames import StampedFrame
-from mastctl.pointing.loop import Aim, PointingError, PointRequest, PositionTarget
+from mastctl.devices.joint_history import HeadReading
+from mastctl.pointing.loop import Aim, PointingError, PointingResult, PointRequest, PositionTarget
+from mastctl.pointing.settings import PointingSettings
 
 MIDDLE_PX = (np.array(SIZE_PX) - 1) / 2
 LATE_S = 0.3
@@ -39,12 +44,12 @@ def buffered(world: World) -> None:
     world.view = view
 
 
-def late(world: World) -> list[tuple[float, float]]:
+def late(world: World, late_s: float = LATE_S) -> list[tuple[float, float]]:
     """Every camera stamps its pictures too new; returned is the list that the views they show are put in."""
     shown: list[tuple[float, float]] = []
 
     def view(camera: str, time_s: float, joints: tuple[float, float]) -> tuple[float, float]:
-        shown.append(world.true_joints(time_s - LATE_S))
+        shown.append(world.true_joints(time_s - late_s))
         return shown[-1]
 
     world.view = view
@@ -106,6 +111,134 @@ def test_an_honest_world_is_seen_to_move(clicked_px: tuple[float, float]) -> Non
 
 
 CLICK_PX = (90.0, 70.0)
+NEAR_PX = (153.0, 121.0)
+"""The head moves by 6 mrad: less than play may be."""
+
+
+@pytest.mark.parametrize("clicked_px", [CLICK_PX, NEAR_PX])
+@pytest.mark.parametrize("late_s", [0.05, 0.215, 0.22, 0.3, 1.0])
+def test_pictures_older_than_their_stamps_by_up_to_a_second_give_no_false_residual(
+    late_s: float, clicked_px: tuple[float, float]
+) -> None:
+    world = World()
+    late(world, late_s)
+    frame = world.shoot()
+    point = world.true_point(frame, *clicked_px)
+    try:
+        result: PointingResult | None = run(world, click(frame, *clicked_px, pointings=2))[0]
+    except PointingError as error:
+        assert error.code in ("bad_frame", "not_repeated"), str(error)
+        assert late_s > 0.15, "the head was at rest for so long: nothing was wrong"
+        result = error.result
+    for pointing in () if result is None else result.pointings:
+        assert pointing.residual_px is not None
+        truth = world.true_pixel(pointing.frame_id, point) - MIDDLE_PX  # where the head stood by the stamp
+        assert np.abs(np.array(pointing.residual_px) - truth).max() < TRUE_PX
+
+
+def test_a_residual_is_told_with_how_old_the_pictures_behind_it_may_be() -> None:
+    world = World()
+    result, steps = run(world, click(world.shoot(), *CLICK_PX))
+    told = result.pointings[0].motion_evidence["navcam_left"]
+    assert told["repeated_after_s"] >= 1.0 and np.abs(told["apart_px"]).max() < 0.2
+    settled = next(step for step in steps if step.name == "settle")
+    began_s = world.frame_by_id(result.pointings[0].frame_id).exposure_began_s
+    assert told["fresh_to_s"] == pytest.approx(began_s - settled.started_s - settled.duration_s, abs=0.01)
+    once, steps = run(world, click(world.shoot(), *CLICK_PX), settings=PointingSettings(repeat_after_s=0.0))
+    assert "repeat" not in [step.name for step in steps]
+    assert "fresh_to_s" not in once.pointings[0].motion_evidence["navcam_left"]
+
+
+def test_a_target_or_a_rover_that_moves_is_told_as_that() -> None:
+    world = moving_world(1.0, late_s=0.0)
+    error = refusal(world, click(world.shoot(), *CLICK_PX))
+    assert (error.code, error.step) == ("not_repeated", "repeat")
+    assert re.match(
+        r"1\.\d\d s later navcam_left shows the target \+[01]\.\d\d, [+-]0\.0\d px elsewhere", str(error)
+    )
+    assert str(error).endswith("or the target or the rover moves")
+
+
+def between_the_pictures(world: World, act: Callable[[], object]) -> None:
+    """Do something when the second picture of a pointing is asked for."""
+    frames = world.frames
+
+    def later(cameras: Sequence[str], exposed_after_s: float, timeout_s: float) -> dict[str, StampedFrame]:
+        if world.moves and len(cameras) == 1:
+            act()
+        return frames(cameras, exposed_after_s, timeout_s)
+
+    world.frames = later  # type: ignore[method-assign]
+
+
+def test_a_camera_that_fails_before_its_second_picture_gives_no_residual() -> None:
+    world = World()
+
+    def unplugged() -> None:
+        raise NoReply("unplugged", device="navcam_left")
+
+    between_the_pictures(world, unplugged)
+    error = refusal(world, click(world.shoot(), *CLICK_PX))
+    assert (error.code, error.step, error.result) == ("no_reply", "repeat", None)
+
+
+def test_a_target_that_is_covered_before_the_second_picture_gives_no_residual() -> None:
+    world = World()
+
+    def cover() -> None:
+        world.image = lambda camera, number, image: np.full_like(image, 90)
+
+    between_the_pictures(world, cover)
+    error = refusal(world, click(world.shoot(), *CLICK_PX))
+    assert (error.code, error.step) == ("not_repeated", "repeat")
+    assert "s later navcam_left does not see the target any more" in str(error)
+
+
+def test_a_head_that_dithers_by_a_count_between_the_two_repeats_what_it_shows() -> None:
+    world, count_rad = World(), 0.0015
+    frame = world.shoot()
+    point = world.true_point(frame, *CLICK_PX)
+    between_the_pictures(world, lambda: world.place(world.moves[0][0] + count_rad, world.moves[0][1]))
+    (pointing,) = run(world, click(frame, *CLICK_PX))[0].pointings
+    assert pointing.residual_px is not None
+    truth = world.true_pixel(pointing.frame_id, point) - MIDDLE_PX
+    assert abs(truth[0]) > 0.8 and np.abs(np.array(pointing.residual_px) - truth).max() < TRUE_PX
+
+
+def test_the_same_picture_again_proves_no_age() -> None:
+    world = World()
+    held: dict[str, np.ndarray] = {}
+
+    def freeze() -> None:
+        world.image = lambda camera, number, image: held[camera]
+
+    world.image = lambda camera, number, image: held.setdefault(camera, image) if world.moves else image
+    between_the_pictures(world, freeze)
+    (pointing,) = run(world, click(world.shoot(), *CLICK_PX))[0].pointings
+    assert pointing.motion_evidence["navcam_left"]["fresh_to_s"] == 0.0
+
+
+@pytest.mark.parametrize("during", ["the head is watched", "the picture is waited for"])
+def test_a_stop_before_the_second_picture_ends_the_pointing_at_once(during: str) -> None:
+    world, cancelled, go_on = World(), threading.Event(), threading.Event()
+    reads = world.read
+
+    def stop() -> None:
+        cancelled.set()
+        go_on.wait(60.0)
+
+    def read() -> HeadReading:
+        if world.moves and world.clock.now_s() > world._begun_s + 1.0:  # the move takes 0.2 s
+            cancelled.set()
+        return reads()
+
+    if during == "the head is watched":
+        world.read = read  # type: ignore[method-assign]
+    between_the_pictures(world, stop)
+    with pytest.raises(PointingError) as refused:
+        run(world, click(world.shoot(), *CLICK_PX), cancelled=cancelled)
+    go_on.set()
+    assert (refused.value.code, refused.value.step, refused.value.result) == ("stopped", "repeat", None)
 
 
 def moved(world: World, change: Callable[[str, tuple[float, float]], tuple[float, float]]) -> None:

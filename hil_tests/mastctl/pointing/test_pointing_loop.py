@@ -152,7 +152,7 @@ def test_joint_angles_are_taken_up_without_a_picture() -> None:
 def test_the_record_names_every_step_in_order_with_plain_numbers() -> None:
     world = World()
     result, steps = run(world, click(world.shoot(), 120.0, 90.0, pointings=2))
-    one = ["solve", "limits", "move", "settle", "look", "measure", "eyes"]
+    one = ["solve", "limits", "move", "settle", "look", "measure", "eyes", "repeat"]
     assert [step.name for step in steps] == [
         "rest", "frames", "target", "stereo", "triangulate", *one, "triangulate", "rest", *one
     ]  # fmt: skip
@@ -258,7 +258,7 @@ def test_a_failure_after_the_first_pointing_keeps_its_result() -> None:
     frame = world.shoot()
 
     def lost(camera: str, number: int, image: np.ndarray) -> np.ndarray:
-        return np.full_like(image, 90) if number > frame.sequence + 4 else image
+        return np.full_like(image, 90) if number > frame.sequence + 5 else image
 
     world.image = lost
     with pytest.raises(PointingError) as refusal:

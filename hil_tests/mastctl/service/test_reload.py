@@ -18,7 +18,9 @@ from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.limits import Limits, OutsideLimits
 from mastctl.errors import Stopped
+from mastctl.pointing.settings import PointingSettings
 from mastctl.service import reload as reload_module
+from mastctl.service import steering as steering_module
 from mastctl.service.reload import FIXED
 
 Pair = tuple[RunningDaemon, FakeHardware]
@@ -64,6 +66,24 @@ def test_limits_come_into_use_with_the_next_command(pair: Pair, client: Client) 
         client.point(pan_rad=1.5, tilt_rad=0.0)
     with pytest.raises(OutsideLimits):
         pair[0].service.devices.move(1.5, 0.0)
+
+
+def test_pointings_repeat_a_residual_when_the_new_configuration_says(
+    pair: Pair, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used: list[float] = []
+
+    class Loop(ScriptedLoop):
+        def __init__(self, *given: Any) -> None:
+            used.append(given[-1].repeat_after_s)
+            super().__init__(*given)
+
+    monkeypatch.setattr(steering_module, "PointingLoop", Loop)
+    write(pair, "pan_tilt", "pointing: {repeat_after_s: 0.25}\npan_tilt")
+    client.reload()
+    write(pair)
+    client.reload()
+    assert used == [0.25, PointingSettings().repeat_after_s]
 
 
 def test_a_head_that_stands_outside_new_limits_may_go_back_in_and_no_further(

@@ -46,7 +46,6 @@ def pointed(service: Service, pixel_px: tuple[float, float]) -> tuple[dict[str, 
     ).id
     until(lambda: service.operations.get(name).ended_s is not None, f"the end of operation {name}")
     told = service.operations.get(name).told()
-    assert told["state"] == "done", told.get("error")
     service.clock.sleep(30.0)  # until nothing rings any more
     later = service.snapshot("navcam_left", fresh=True)
     return told, np.asarray(rover.true_pixel("navcam_left", later.sequence, point_m)) - AIM_PX
@@ -56,15 +55,16 @@ def test_on_the_worst_day_the_second_pointing_lands_and_tells_the_truth() -> Non
     with worst_day() as service:
         for pixel_px in CLICKS:
             told, truly_px = pointed(service, pixel_px)
+            assert told["state"] == "done", told["error"]
             assert np.abs(truly_px).max() < 0.3
             assert np.abs(truly_px - told["residual_px"]).max() < 0.2
 
 
-def test_who_does_not_let_the_mast_settle_points_beside_and_is_told_another_residual() -> None:
+def test_who_does_not_let_the_mast_settle_is_told_no_residual() -> None:
     with worst_day(settle_s=0.0) as service:
-        found = [pointed(service, pixel_px) for pixel_px in CLICKS]
-    assert max(np.abs(truly_px).max() for _, truly_px in found) > 0.6
-    assert max(np.abs(truly_px - told["residual_px"]).max() for told, truly_px in found) > 0.6
+        for pixel_px in CLICKS:
+            told, _ = pointed(service, pixel_px)
+            assert told["state"] == "failed" and told["error"]["code"] == "not_repeated", told
 
 
 @pytest.mark.long(1, "draws the worst day twice more; a kind day is drawn twice in the quick run")

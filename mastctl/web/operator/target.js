@@ -9,7 +9,7 @@ import { placeIn, shownBy } from "./truth.js";
 const STEPS = {
   rest: "the head rests", frames: "a fresh pair is taken", target: "what was clicked is found again", stereo: "found in the other eye", triangulate: "range",
   before: "pictures from before the move", solve: "joint angles", limits: "limits", corner: "round a keep-out", move: "the head is sent", settle: "it has arrived and rests",
-  look: "new pictures", measure: "the target is found in them", eyes: "the other eye confirms it",
+  look: "new pictures", measure: "the target is found in them", eyes: "the other eye confirms it", repeat: "a later picture repeats it",
 };
 
 const SMALL = matchMedia("(max-width: 599px) and (max-height: 499px)");
