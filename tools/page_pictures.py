@@ -103,6 +103,7 @@ def followed(page: Page, url: str, client: Client, out: Path) -> None:
     page.mouse.down()
     page.mouse.move(x + 20, y + 20, steps=4)
     page.mouse.up()
+    page.get_by_role("button", name="Follow it").click()
     page.wait_for_selector("#track .word.tracking", timeout=90_000)
     for ahead_m in STEPS_M:
         client.stand(ahead_m, 0.0, 0.0)
