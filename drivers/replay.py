@@ -205,8 +205,8 @@ class ReplayedCamera:
                 return self._frame(wanted)
             if ready_s > deadline_s and now_s >= deadline_s:
                 raise NoFreshFrame(
-                    f"no frame exposed after {exposed_after_s:.3f} s came within {timeout_s:.3g} s; "
-                    f"the next one ends at {ready_s:.3f} s",
+                    f"no frame exposed after the asked moment came within {timeout_s:.3g} s; "
+                    f"the next one ends {ready_s - now_s:.3f} s from now",
                     device=self._name,
                 )
             # A little longer, so that rounding does not leave the frame a hair unfinished.

@@ -109,9 +109,9 @@ def followed(page: Page, url: str, client: Client, out: Path) -> None:
         client.stand(ahead_m, 0.0, 0.0)
         client.wait_track(client.pose(**client.true_pose(), sigma=(0.01, 0.009))["operation"])
     page.wait_for_selector("#track .errors[aria-label*=truly]")
-    page.locator(".panel.reports").evaluate(
-        "panel => { panel.hidden = true; }"
-    )  # names a folder for a minute
+    page.locator("#simulation").evaluate(  # those below it name a folder for a minute
+        "panel => { while (panel = panel.nextElementSibling) panel.hidden = true; }"
+    )
     page.mouse.move(10, TALL["height"] - 10)
     page.wait_for_timeout(1500)
     kept(page, out / "page_track.jpg")

@@ -255,7 +255,7 @@ class SimulatedCamera:
         """What to say when no fresh frame came."""
         if self._closed.is_set():
             return "it is closed"
-        message = f"no frame exposed after {exposed_after_s:.3f} s came within {timeout_s:.3g} s"
+        message = f"no frame exposed after the asked moment came within {timeout_s:.3g} s"
         now_s = self._clock.now_s()
         if stuck := self._faults.find(self.name, "stuck", now_s):
             epoch = self._epoch(now_s)

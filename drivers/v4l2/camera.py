@@ -270,7 +270,7 @@ class V4l2Camera:
     def _instead(self, exposed_after_s: float, timeout_s: float, damaged_before: int) -> str:
         """What to say when no fresh frame came."""
         counters = self.counters
-        message = f"no frame exposed after {exposed_after_s:.3f} s came within {timeout_s:.3g} s"
+        message = f"no frame exposed after the asked moment came within {timeout_s:.3g} s"
         damaged = counters.damaged - damaged_before
         if damaged:
             message += f"; {damaged} came damaged ({counters.last_damage})"

@@ -188,6 +188,8 @@ def test_a_fault_from_the_drawer_is_set_told_and_cleared(rover: RunningDaemon, v
     one.page.get_by_label("Fault", exact=True).select_option("off")
     one.page.get_by_role("button", name="Set", exact=True).click()
     one.page.wait_for_selector("#faults li")
+    told = one.page.locator("#faults").inner_text()
+    assert not re.search(r"after \d+\.\d+ s", told), f"no clock's reading: {told}"
     one.wait_long()
     one.page.wait_for_selector(".eye[data-camera=navcam_left][data-stale]")
     one.page.get_by_role("button", name="Clear all").click()
