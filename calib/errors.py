@@ -74,7 +74,7 @@ class NoCorrection(CalibError):
     """Hand-offs or a scene that give no correction of a rig; ``code`` names the cause for programs.
 
     Codes: ``too_few``, ``one_sided``, ``inconsistent``, ``not_significant``, ``not_settled``,
-    ``not_predictive``, ``changed_halfway``.
+    ``not_predictive``, ``changed_halfway``, ``errs_by_reading``.
     """
 
     def __init__(self, code: str, message: str) -> None:

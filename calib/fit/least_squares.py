@@ -18,6 +18,11 @@ State = TypeVar("State")
 
 FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e9
 
+POOR, FAIR = 0.25, 0.5
+"""Parts of the expected gain: a step that brings less than the first is damped more the next time, one that
+brings more than the second less (Marquardt 1963; Moré 1978). Where residuals are large, undamped steps
+overshoot from one side of the minimum to the other, each a little better: that took more than 500 steps."""
+
 NOTHING = 1e-18
 """A gain in the weighted sum of squares that is none, whatever the cost: noise-free data have none left."""
 
@@ -79,7 +84,7 @@ def minimise(
         It has settled when a step is expected to lower the cost by less than this part of it.
     """
     state, normal = start, problem.normal(start)
-    damping, rejected_in_a_row = FIRST_DAMPING, 0
+    damping = FIRST_DAMPING
     extra = np.zeros(len(normal.gradient)) if weak is None else weak
     for count in range(steps):
         if not np.isfinite(normal.cost):
@@ -90,23 +95,26 @@ def minimise(
         moved = None
         while moved is None and damping <= LARGEST_DAMPING:
             try:
-                factor = cho_factor(scaled + damping * np.eye(len(scale)), check_finite=False)
+                step, expected = _step(scaled, scaled_gradient, damping)
             except np.linalg.LinAlgError:
                 damping = max(10 * damping, 1e-12)
                 continue
-            step = -cho_solve(factor, scaled_gradient, check_finite=False)
-            expected = float(-step @ (2 * scaled_gradient + scaled @ step))
-            if expected <= gain * normal.cost + NOTHING and damping <= FIRST_DAMPING:
-                moved = _try(problem, state, scale * step, normal.cost)
+            least = gain * normal.cost + NOTHING
+            nothing_left = expected <= least
+            if nothing_left and damping > FIRST_DAMPING:  # or is it the damping that keeps the step short?
+                nothing_left = _step(scaled, scaled_gradient, FIRST_DAMPING)[1] <= least
+            tried = _try(problem, state, scale * step, normal.cost)
+            moved, cost = tried
+            if nothing_left:
                 if moved is not None:
                     state, normal = moved, problem.normal(moved)
                 return Minimum(state, normal, True, count)
-            moved = _try(problem, state, scale * step, normal.cost)
             if moved is None:
-                damping, rejected_in_a_row = max(10 * damping, 1e-12), rejected_in_a_row + 1
-            else:
-                damping = damping / 10 if damping > 1e-14 else damping
-                rejected_in_a_row = 0
+                damping = max(10 * damping, 1e-12)
+            elif normal.cost - cost < POOR * expected:
+                damping = 10 * damping
+            elif normal.cost - cost > FAIR * expected and damping > 1e-14:
+                damping = damping / 10
         if moved is None:
             # No step of any size lowers the cost any more: rounding, or a place where it has a kink.
             return Minimum(state, normal, expected <= 1e-6 * normal.cost + 1e6 * NOTHING, count)
@@ -115,13 +123,21 @@ def minimise(
     return Minimum(state, normal, False, steps)
 
 
-def _try(problem: Problem[State], state: State, step: FloatArray, cost: float) -> State | None:
-    """The state a step leads to, or None if that is no better."""
+def _step(matrix: FloatArray, gradient: FloatArray, damping: float) -> tuple[FloatArray, float]:
+    """A damped step, and by how much it lowers a cost that is quadratic; LinAlgError if there is none."""
+    factor = cho_factor(matrix + damping * np.eye(len(gradient)), check_finite=False)
+    step = -cho_solve(factor, gradient, check_finite=False)
+    return step, float(-step @ (2 * gradient + matrix @ step))
+
+
+def _try(problem: Problem[State], state: State, step: FloatArray, cost: float) -> tuple[State | None, float]:
+    """The state a step leads to, or None if that is no better; and its cost."""
     try:
         moved = problem.stepped(state, step)
     except ValueError:
-        return None
-    return moved if problem.cost(moved) < cost else None
+        return None, float("inf")
+    there = problem.cost(moved)
+    return (moved if there < cost else None), there
 
 
 def covariance_of(matrix: FloatArray, weak: FloatArray | None = None) -> FloatArray:

@@ -24,10 +24,11 @@ FALSE_ALARMS = 0.01
 """Chance that a survey without blunders loses any dot."""
 
 DEGREES = ((60, 4), (30, 3))
-"""Fewest dots for a polynomial of that degree; with fewer than the last nothing is tested."""
+"""Fewest dots for a polynomial of that degree."""
 
 FEWER = ((16, 2),)
-"""The same for corners of a partly seen board, where only gross errors are looked for."""
+"""The same for a small or partly seen board, where only gross errors are looked for; with still fewer dots
+nothing is tested."""
 
 GROSS = 100.0
 """A statistic beyond so many times the typical one's is gross: ten sigma."""
@@ -52,16 +53,17 @@ def without_stray_dots(survey: Survey) -> tuple[Survey, tuple[Outlier, ...]]:
     tested = {}
     for image in survey.images:
         dots = survey.dots.get(image.name)
-        degree = 0 if dots is None else next((d for n, d in DEGREES if len(dots.rows) >= n), 0)
+        degree = 0 if dots is None else _degree(len(dots.rows))
         if dots is not None and degree:
             tested[image.name] = _test(survey, dots, degree)
-    if not tested:
-        return survey, ()
-    every = np.concatenate([statistic for statistic, _ in tested.values()])
-    scale = max(1.0, float(np.median(every) / MEDIAN_OF_TWO))
-    limit = float(chdtri(2, FALSE_ALARMS / len(every))) * scale
+    every = [statistic for statistic, _ in tested.values() if len(statistic) >= DEGREES[-1][0]]
+    fine = 0.0
+    if every:
+        scale = _typical(np.concatenate(every))
+        fine = float(chdtri(2, FALSE_ALARMS / sum(map(len, every)))) * scale
     kept, outliers = dict(survey.dots), list[Outlier]()
     for name, (statistic, off_px) in tested.items():
+        limit = fine if len(statistic) >= DEGREES[-1][0] else GROSS * _typical(statistic)
         bad = statistic > limit
         if not bad.any() or bad.mean() > MANY:
             continue
@@ -85,15 +87,24 @@ def stray_points(places_m: FloatArray, pixels_px: FloatArray, sigma_px: FloatArr
 
     None where there are too few to tell. ``places_m`` (n, 2) on the board; it may be partly seen.
     """
-    degree = next((d for n, d in (*DEGREES, *FEWER) if len(places_m) >= n), 0)
+    degree = _degree(len(places_m))
     if not degree:
         return np.zeros(len(places_m), dtype=bool)
     middle = places_m.mean(axis=0)
     scale = max(float(np.abs(places_m - middle).max()), 1e-9)
     sigma = np.hypot(sigma_px, POLYNOMIAL_PX)
     statistic, _ = _off_polynomial((places_m - middle) / scale, pixels_px, sigma, degree)
-    typical = max(1.0, float(np.median(statistic) / MEDIAN_OF_TWO))
-    return np.asarray(statistic > GROSS * typical)
+    return np.asarray(statistic > GROSS * _typical(statistic))
+
+
+def _degree(dots: int) -> int:
+    """Of the polynomial for so many dots; 0 if they are too few."""
+    return next((degree for fewest, degree in (*DEGREES, *FEWER) if dots >= fewest), 0)
+
+
+def _typical(statistic: FloatArray) -> float:
+    """By how much the typical statistic is larger than it should be; at least 1."""
+    return max(1.0, float(np.median(statistic) / MEDIAN_OF_TWO))
 
 
 def _off_polynomial(

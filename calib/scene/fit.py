@@ -17,11 +17,11 @@ from calib.fit.significance import THREE_SIGMAS, sigmas
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from calib.scene.features import Feature
-from calib.scene.halfway import change_halfway
+from calib.scene.halfway import change_halfway, errs_by_reading
 from calib.scene.predicted import predicted_px
 from calib.scene.problem import SceneProblem, State
 from calib.scene.spread import Fitted, Quadratic
-from calib.scene.terms import Term, corrected, terms_of
+from calib.scene.terms import LEAST_RESTS_TWICE, LEAST_SPAN_TWICE_RAD, Term, corrected, terms_of
 from calib.scene.views import View
 
 JOINT_SIGMA_RAD = 2e-4
@@ -101,7 +101,8 @@ def fit_scene(
     ------
     NoCorrection
         ``too_few``: fewer than twelve features; ``not_significant``: nothing is beyond three sigma;
-        ``changed_halfway``: the rover moved or a joint slipped between two rests.
+        ``changed_halfway``: the rover moved or a joint slipped between two rests; ``errs_by_reading``: a
+        joint errs by its angle otherwise than the terms have it.
     """
     _enough(features)
     terms = terms_of(rig, views)
@@ -121,6 +122,15 @@ def fit_scene(
         raise NoCorrection(
             "not_significant",
             f"{len(problem.features)} features tell no correction: {most:.1f} sigma where 3 are asked for",
+        )
+    errs = errs_by_reading(problem, state)
+    if errs is not None:
+        raise NoCorrection(
+            "errs_by_reading",
+            f"at its {errs.readings} readings {errs.joint} is off by {1e3 * errs.size_rad:.1f} mrad rms "
+            f"({errs.sigmas:.0f} sigma beyond what rests scatter by), which no term explains: a correction "
+            f"would look surer than it is. Take pictures at {LEAST_RESTS_TWICE} or more {errs.joint} angles "
+            f"over {LEAST_SPAN_TWICE_RAD:g} rad; if the joint repeats no better, tell --joint-sigma-rad",
         )
     predicted = predicted_px(problem, state, taken, fitted.joint_sigma_rad)
     return _told(problem, state, taken, gains, fitted, outliers, predicted)
@@ -233,14 +243,16 @@ def _without_outliers(
         spread = max(1.0, float(np.median(np.abs(rest)) / 0.6745))
         worst = np.zeros(len(kept))
         np.maximum.at(worst, owners, np.abs(rest) / spread)
-        good = worst <= OUTLIER_SIGMAS
+        lost = ~np.isfinite(worst)
+        good = ~lost if lost.any() else worst <= OUTLIER_SIGMAS  # with any lost, nothing was fitted yet
         if good.all():
             break
         for at in np.flatnonzero(~good).tolist():
             feature = kept[at]
             x, y = feature.pixels_px[0]
             names_of = ", ".join(views[number].name for number in feature.views)
-            sentences.append(f"the feature at ({x:.0f}, {y:.0f}) of {names_of}: {worst[at]:.1f} sigma off")
+            why = "no place is before all of these cameras" if lost[at] else f"{worst[at]:.1f} sigma off"
+            sentences.append(f"the feature at ({x:.0f}, {y:.0f}) of {names_of}: {why}")
         kept = [feature for feature, stays in zip(kept, good, strict=True) if stays]
         _enough(kept)
         state = State(state.numbers, state.places[good])

@@ -1,4 +1,8 @@
-"""Something changed between two rests: the rover moved, or a joint slipped; pictures of both contradict."""
+"""What no correction of a rig holds: a change between two rests, a joint that reads wrong by its angle.
+
+The rover moved, or a joint slipped: pictures of both sides contradict. Or a joint errs alike wherever it
+reads the same, otherwise than the terms have it.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.fit.significance import sigmas
+from calib.fit.significance import THREE_SIGMAS, sigmas
 from calib.rigid import FloatArray
-from calib.scene.problem import SceneProblem, State
-from calib.scene.spread import Quadratic
+from calib.scene.problem import Linear, SceneProblem, State
+from calib.scene.spread import Fitted, Quadratic
+from calib.scene.terms import PRIOR
 
 ALARM_SIGMAS = 6.0
 LEAST_RESTS = 2
@@ -19,6 +24,9 @@ LEAST_JOINED = 3
 """Pairs of rests across it that features join: one pair alone that contradicts may err by itself."""
 
 PRIOR_TURN_RAD, PRIOR_SHIFT_M = 0.05, 0.2
+
+SAME_READING_RAD = 0.01
+"""Rests whose readings of a joint differ by less than some such angle err alike."""
 
 
 class Change(NamedTuple):
@@ -30,13 +38,21 @@ class Change(NamedTuple):
     sigmas: float
 
 
+class ByReading(NamedTuple):
+    """A joint that errs by its angle: which, by how much (rms about the mean), at how many readings."""
+
+    joint: str
+    size_rad: float
+    readings: int
+    sigmas: float
+
+
 def change_halfway(problem: SceneProblem, state: State) -> Change | None:
     """Return the change between two rests, in the order of their numbers, that is certain; None if none is.
 
     ``state`` is where all of the problem's numbers fit best.
     """
     linear = problem.linear(state)
-    off = linear.gradient - linear.matrix @ state.numbers
     pose = np.array([view.pose for view in problem.views])[problem.sights.view_of]
     by_what = _rates(problem, state)
     seen = np.unique(pose)
@@ -51,32 +67,75 @@ def change_halfway(problem: SceneProblem, state: State) -> Change | None:
             continue
         after = (pose >= first)[:, None, None]
         for what, (rates, held) in by_what.items():
-            mixed, own, gradient = linear.beside(np.where(after, rates, 0.0))
-            gradient = gradient - mixed.T @ state.numbers
-            terms, more = problem.terms, len(held)
-            quadratic = Quadratic(
-                np.block([[own, mixed.T], [mixed, linear.matrix]]),
-                np.concatenate([gradient, off]),
-                np.concatenate([held, problem.prior[:terms]]),
-                problem.joint_sigma_rad,
-            )
-            old = np.arange(more + terms) >= more
-            by_chance, found = quadratic.chance(old, ~old)
+            every = np.ones(problem.terms, dtype=bool)
+            by_chance, found = _chance(problem, state, linear, np.where(after, rates, 0.0), held, every)
             if by_chance < least:
-                least, size_rad = by_chance, float(np.linalg.norm(found.numbers[: min(more, 3)]))
+                least = by_chance
+                size_rad = float(np.linalg.norm(found.numbers[: min(len(held), 3)]))
                 before = int(seen[np.searchsorted(seen, first) - 1])
                 best = Change(what, size_rad, before, sigmas(by_chance * tries))
     return best if best is not None and best.sigmas >= ALARM_SIGMAS else None
 
 
+def errs_by_reading(problem: SceneProblem, state: State) -> ByReading | None:
+    """Return which joint errs by what it reads, beyond what the free terms explain; None if none does.
+
+    ``state`` is where the free terms and the rests fit best.
+    """
+    linear, by_joint = problem.linear(state), _joint_rates(problem, state)
+    seen = [problem.views[number] for number in problem.sights.view_of]
+    rests = len({view.pose for view in seen})
+    found: list[ByReading] = []
+    for axis, joint in enumerate(("pan", "tilt")):
+        read = np.rint([(view.pan_rad, view.tilt_rad)[axis] / SAME_READING_RAD for view in seen])
+        readings = np.unique(read)
+        if not 1 < len(readings) < rests:  # an angle that no two rests share: that is their scatter
+            continue
+        there = read[:, None] == readings[1:]
+        rates = by_joint[:, :, axis, None] * there[:, None, :]
+        held = np.full(there.shape[1], PRIOR["joints"])
+        by_chance, fitted = _chance(problem, state, linear, rates, held, problem.free[: problem.terms])
+        by_chance *= 2
+        if by_chance < THREE_SIGMAS:
+            size_rad = float(np.std([0.0, *fitted.numbers[: len(held)]]))
+            found.append(ByReading(joint, size_rad, len(held) + 1, sigmas(by_chance)))
+    return max(found, key=lambda one: one.sigmas, default=None)
+
+
+def _chance(
+    problem: SceneProblem,
+    state: State,
+    linear: Linear,
+    rates: FloatArray,
+    held: FloatArray,
+    free: np.ndarray,
+) -> tuple[float, Fitted]:
+    """The chance of what further numbers of given rates (o, 2, s) gain, and the fit with them, they first."""
+    mixed, own, gradient = linear.beside(rates)
+    more = len(held)
+    quadratic = Quadratic(
+        np.block([[own, mixed.T], [mixed, linear.matrix]]),
+        np.concatenate([gradient - mixed.T @ state.numbers, linear.gradient - linear.matrix @ state.numbers]),
+        np.concatenate([held, problem.prior[: problem.terms]]),
+        problem.joint_sigma_rad,
+    )
+    further = np.arange(more + problem.terms) < more
+    return quadratic.chance(np.concatenate([np.zeros(more, dtype=bool), free]), further)
+
+
+def _joint_rates(problem: SceneProblem, state: State) -> FloatArray:
+    """Whitened rates (o, 2, 2) of each sight by its rest's pan and tilt."""
+    _, _, by_number = problem.rates(state)
+    joints = np.zeros((len(by_number), 2, 2))
+    for number, view in enumerate(problem.views):
+        rows, rest = problem.sights.rows[number], problem.terms + 2 * view.pose
+        joints[rows] = by_number[rows][:, :, rest : rest + 2]
+    return joints
+
+
 def _rates(problem: SceneProblem, state: State) -> dict[str, tuple[FloatArray, FloatArray]]:
     """By what may change: whitened rates (o, 2, s), and sigmas beforehand (s,)."""
-    _, _, by_number = problem.rates(state)
-    sights, terms = problem.sights, problem.terms
-    joints = np.zeros((len(sights.pixels), 2, 2))
-    for number, view in enumerate(problem.views):
-        rows = sights.rows[number]
-        joints[rows] = by_number[rows][:, :, terms + 2 * view.pose : terms + 2 * view.pose + 2]
+    sights, joints = problem.sights, _joint_rates(problem, state)
     models = problem.models(state.numbers)
     _, _, (by_point, arm) = sights.off(models, state.places)
     back = arm + np.array([model.C for model in models])[sights.view_of] - sights.origin

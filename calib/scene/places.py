@@ -1,6 +1,8 @@
 """Where features are: unknown places, settled for given cameras, and what no place can explain.
 
-A place is a bearing and an inverse range from the mast's origin, so that what is far away stays finite.
+A place is a bearing and an inverse range from the mast's origin, so that what is far away stays finite. An
+inverse range is below 0 where a rig that is wrong yet sees lines of sight diverge: nothing bounds it but that
+each camera has the feature before it. Where one has not, the feature is *lost*: its numbers are infinite.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ PRIOR_INVERSE_M = (0.2, 1.0)
 
 NEAREST_INVERSE_M, TRIED = 0.7, 24
 LEAST_INVERSE_M = 1e-3
-_STEPS = 3
+_STEPS, _LEAST = 3, 1e-9
 
 
 class Sights:
@@ -58,7 +60,10 @@ class Sights:
         self.basis = np.stack([across[:, 0], across[:, 1], ahead], axis=1)
 
     def start(self, models: Sequence[CameraModel]) -> FloatArray:
-        """Return places (n, 3) that fit best, inverse ranges tried one after another."""
+        """Return places (n, 3) that fit best, inverse ranges tried one after another.
+
+        A feature that no place puts before all its cameras stays lost.
+        """
         best, cost = np.zeros((self.count, 3)), np.full(self.count, np.inf)
         for inverse in np.linspace(LEAST_INVERSE_M, NEAREST_INVERSE_M, TRIED):
             # the ray begins at the camera: the bearing from the mast's origin is a little beside it
@@ -67,7 +72,7 @@ class Sights:
             depth = np.maximum(local[:, 2], 1e-3)
             places = np.stack([local[:, 0] / depth, local[:, 1] / depth, 1.0 / depth], axis=1)
             off, _, _ = self.off(models, places)
-            now = np.add.reduceat((off**2).sum(axis=1), self.first)
+            now = self.sums((off**2).sum(axis=1))
             better = now < cost
             best[better], cost[better] = places[better], now[better]
         return self.settled(models, best)
@@ -77,9 +82,11 @@ class Sights:
     ) -> tuple[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
         """Return whitened pixels off (o, 2), their rates by the places (o, 2, 3), and how they come about.
 
-        The last are the whitened rates by the point itself (o, 2, 3), and the point from C (o, 3), metres.
+        The last are the whitened rates by the point itself (o, 2, 3), and the point from C (o, 3), metres. A
+        sight whose camera has no pixel for its place is infinitely off, with rates of 0.
         """
         count = len(self.pixels)
+        lost = np.zeros(count, dtype=bool)
         off, by_point, arm = np.empty((count, 2)), np.empty((count, 2, 3)), np.empty((count, 3))
         by_inverse = np.empty((count, 3))
         bearing = self.basis[:, 2] + np.einsum("ni,nij->nj", places[:, :2], self.basis[:, :2])
@@ -92,10 +99,10 @@ class Sights:
             from_center = self.origin - model.C
             by_inverse[rows] = from_center
             arm[rows] = stretch[which, None] * (from_center * places[which, 2, None] + bearing[which])
-            pixels, jacobian, _ = model.project_jacobian(model.C + arm[rows])
-            off[rows] = np.nan_to_num(pixels - self.pixels[rows], nan=1e4)
-            by_point[rows] = np.nan_to_num(jacobian)
-        off = np.einsum("nij,nj->ni", self.whiten, off)
+            pixels, by_point[rows], valid = model.project_jacobian(model.C + arm[rows])
+            off[rows], lost[rows] = pixels - self.pixels[rows], ~valid
+        by_point[lost] = 0.0
+        off = np.where(lost[:, None], np.inf, np.einsum("nij,nj->ni", self.whiten, off))
         by_point = self.whiten @ by_point
         by_place = by_point @ np.concatenate(
             [self.basis[self.feature_of, :2].transpose(0, 2, 1), by_inverse[:, :, None]], axis=2
@@ -110,7 +117,7 @@ class Sights:
         mean, sigma = PRIOR_INVERSE_M
         matrix = self.sums(by_place.transpose(0, 2, 1) @ by_place)
         gradient = self.sums(np.einsum("nij,ni->nj", by_place, off))
-        matrix[:, 2, 2] += sigma**-2
+        matrix[:, [0, 1, 2], [0, 1, 2]] += [_LEAST, _LEAST, sigma**-2]
         gradient[:, 2] += (places[:, 2] - mean) / sigma**2
         return matrix, gradient
 
@@ -119,23 +126,47 @@ class Sights:
         return np.asarray(np.add.reduceat(by_sight, self.first, axis=0), dtype=np.float64)
 
     def settled(self, models: Sequence[CameraModel], places: FloatArray) -> FloatArray:
-        """Return the places that fit given cameras best."""
+        """Return the places that fit given cameras best: never worse, a feature each, than those given.
+
+        A step that leads behind a camera, or to a worse place, is taken again by a quarter.
+        """
+        share = np.ones(self.count)
+        off, by_place, _ = self.off(models, places)
+        cost = self._cost(off, places)
         for _ in range(_STEPS):
-            off, by_place, _ = self.off(models, places)
-            matrix, gradient = self.normal(off, by_place, places)
-            places = places - np.linalg.solve(matrix, gradient[..., None])[..., 0]
-            places[:, 2] = np.clip(places[:, 2], -0.01, 2.0)
+            matrix, gradient = self.normal(np.where(np.isfinite(off), off, 0.0), by_place, places)
+            step = np.linalg.solve(matrix, gradient[..., None])[..., 0]
+            tried = places - share[:, None] * step
+            off_there, by_place_there, _ = self.off(models, tried)
+            cost_there = self._cost(off_there, tried)
+            better = cost_there < cost
+            share = np.where(better, 1.0, share / 4.0)
+            places, cost = np.where(better[:, None], tried, places), np.where(better, cost_there, cost)
+            sights = better[self.feature_of]
+            off = np.where(sights[:, None], off_there, off)
+            by_place = np.where(sights[:, None, None], by_place_there, by_place)
         return places
 
+    def _cost(self, off: FloatArray, places: FloatArray) -> FloatArray:
+        """What each feature (n,) costs at its place, its prior among it; infinite where it is lost."""
+        mean, sigma = PRIOR_INVERSE_M
+        return self.sums((off**2).sum(axis=1)) + ((places[:, 2] - mean) / sigma) ** 2
+
     def rest(self, models: Sequence[CameraModel], places: FloatArray) -> tuple[FloatArray, np.ndarray]:
-        """Return what no place explains (q,), 2 m - 3 numbers of a feature in m pictures, and whose (q,)."""
+        """Return what no place explains (q,), 2 m - 3 numbers of a feature in m pictures, and whose (q,).
+
+        Those of a lost feature are infinite.
+        """
         off, by_place, _ = self.off(models, places)
+        lost = ~np.isfinite(self.sums(off.sum(axis=1)))
+        off = np.where(lost[self.feature_of][:, None], 0.0, off)
         rests, owners = [], []
         for length in np.unique(self.lengths):
             which = np.flatnonzero(self.lengths == length)
             rows = (self.first[which, None] + np.arange(length)).ravel()
             whole, _ = np.linalg.qr(by_place[rows].reshape(len(which), 2 * length, 3), mode="complete")
             rest = np.einsum("nij,ni->nj", whole[..., 3:], off[rows].reshape(len(which), -1))
+            rest[lost[which]] = np.inf
             rests.append(rest.ravel())
             owners.append(np.repeat(which, rest.shape[1]))
         return np.concatenate(rests), np.concatenate(owners)

@@ -144,16 +144,19 @@ class SceneProblem:
 
     def normal(self, state: State) -> Normal:
         """Cost and normal equations of the free numbers, priors among them."""
-        linear, prior = self.linear(state), self.prior
+        cost, prior = self.cost(state), self.prior
+        if not np.isfinite(cost):
+            return Normal(cost, np.eye(len(prior)), np.zeros(len(prior)))
+        linear = self.linear(state)
         matrix = linear.matrix + np.diag(prior**-2)
         gradient = linear.gradient + state.numbers / prior**2
         matrix[~self.free] = matrix[:, ~self.free] = 0.0
         matrix[~self.free, ~self.free] = 1.0
         gradient[~self.free] = 0.0
-        return Normal(self.cost(state), matrix, gradient)
+        return Normal(cost, matrix, gradient)
 
     def cost(self, state: State) -> float:
-        """The cost alone."""
+        """The cost alone; infinite where a camera has a feature behind it."""
         off, _, _ = self.sights.off(self.models(state.numbers), state.places)
         held = state.numbers / self.prior
         return float(((off**2).sum() + self.sights.prior_cost(state.places)) / self.scale + held @ held)

@@ -17,11 +17,11 @@ from calib.scene.views import View
 PRIOR = {"turn": 0.02, "scale": 0.01, "r1": 0.02, "mast": 0.005, "joints": 0.005}
 """Sigma of each kind of number beforehand: radians, part of the focal length, R1."""
 
-LEAST_RESTS, LEAST_SPAN_RAD = 8, 1.0
-"""How many rests over how wide an angle tell what an axis reads wrong in the course of a turn."""
+LEAST_RESTS, LEAST_SPAN_RAD = 5, 1.0
+"""How many readings over how wide an angle tell what an axis reads wrong in the course of a turn."""
 
-LEAST_SPAN_TWICE_RAD = 2.0
-"""Over how wide an angle what it reads wrong twice a turn can be told from that."""
+LEAST_RESTS_TWICE, LEAST_SPAN_TWICE_RAD = 8, 2.0
+"""How many over how wide an angle tell what it reads wrong twice a turn from that."""
 
 LEAST_A_SIDE = 4
 """Rests from either side that tell an axis's backlash."""
@@ -49,11 +49,11 @@ def terms_of(rig: Rig, views: Sequence[View]) -> tuple[Term, ...]:
     rests = {view.pose: (view.pan_rad, view.tilt_rad, *view.approach) for view in views}
     pan, tilt, pan_side, tilt_side = np.array(list(rests.values())).T
     for axis, read, side in (("pan", pan, pan_side), ("tilt", tilt, tilt_side)):
-        joint, many = f"joints.{axis}", len(np.unique(read)) >= LEAST_RESTS
+        joint, many = f"joints.{axis}", len(np.unique(read))
         once, twice = (f"{axis} reads wrong {often} a turn" for often in ("once", "twice"))
-        if many and np.ptp(read) >= LEAST_SPAN_RAD:
+        if many >= LEAST_RESTS and np.ptp(read) >= LEAST_SPAN_RAD:
             found.append(Term((f"{joint}.c1", f"{joint}.s1"), once))
-        if many and np.ptp(read) >= LEAST_SPAN_TWICE_RAD:
+        if many >= LEAST_RESTS_TWICE and np.ptp(read) >= LEAST_SPAN_TWICE_RAD:
             found.append(Term((f"{joint}.c2", f"{joint}.s2"), twice, after=once))
         if min((side > 0).sum(), (side < 0).sum()) >= LEAST_A_SIDE:
             found.append(Term((f"{joint}.backlash_rad",), f"{axis} has play"))

@@ -70,8 +70,38 @@ def with_outlier_dots(
     dots = survey.dots[image]
     chosen = rng.choice(len(dots.rows), count, replace=False)
     angle = rng.uniform(-np.pi, np.pi, count)
+    aside_px = distance_px * np.column_stack([np.cos(angle), np.sin(angle)])
+    return _found_elsewhere(survey, image, chosen, dots.pixels_px[chosen] + aside_px)
+
+
+def with_fewer_dots(survey: Survey, every: int) -> Survey:
+    """Return the survey with the dots of each ``every``-th row and column alone."""
+    seen = {}
+    for name, dots in survey.dots.items():
+        stay = (dots.rows % every == 0) & (dots.columns % every == 0)
+        seen[name] = replace(
+            dots, rows=dots.rows[stay], columns=dots.columns[stay], pixels_px=dots.pixels_px[stay]
+        )
+    return replace(survey, dots=seen)
+
+
+def with_scattered_dots(
+    survey: Survey, image: str, count: int, rng: np.random.Generator
+) -> tuple[Survey, tuple[tuple[int, int], ...]]:
+    """Return the survey with dots found anywhere in an image, and which. Arguments, errors as above."""
+    row = next(i for i in survey.images if i.name == image)
+    chosen = rng.choice(len(survey.dots[image].rows), count, replace=False)
+    anywhere_px = rng.uniform(0.0, np.array(survey.cameras[row.camera].size_px) - 1.0, (count, 2))
+    return _found_elsewhere(survey, image, chosen, anywhere_px)
+
+
+def _found_elsewhere(
+    survey: Survey, image: str, chosen: np.ndarray, pixels_px: FloatArray
+) -> tuple[Survey, tuple[tuple[int, int], ...]]:
+    """The survey with some dots of an image at other pixels, and the (row, column) of each."""
+    dots = survey.dots[image]
     pixels = dots.pixels_px.copy()
-    pixels[chosen] += distance_px * np.column_stack([np.cos(angle), np.sin(angle)])
+    pixels[chosen] = pixels_px
     changed: Mapping[str, Dots] = {**survey.dots, image: replace(dots, pixels_px=pixels)}
     places = tuple((int(dots.rows[i]), int(dots.columns[i])) for i in chosen)
     return replace(survey, dots=changed), places

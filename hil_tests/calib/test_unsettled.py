@@ -1,4 +1,4 @@
-"""A fit that was stopped before it settled is told as none, by every fitter."""
+"""A fit that was stopped before it settled is told as none, by every fitter; one that can settle does."""
 
 from __future__ import annotations
 
@@ -23,6 +23,31 @@ from calib.rigid import FloatArray
 from hil_tests.calib.fit.small_surveys import survey_of
 from hil_tests.calib.fit.test_fit_camera import boards
 from hil_tests.calib.handoff.handed_over import HAZCAMS, hand_offs, moved_hazcams, plain_rig, targets
+
+
+@pytest.mark.parametrize("curve", [-0.5, -0.9, -0.98, -3.0])
+def test_a_fit_with_large_residuals_settles(curve: float) -> None:
+    """Undamped steps go from an error e to ``curve`` times e (Dennis and Schnabel 1983, section 10.2)."""
+
+    class Parabola:
+        def normal(self, x: FloatArray) -> least_squares.Normal:
+            residual, slope = self._residual(x), np.array([[1.0], [2.0 * curve * x[0] + 1.0]])
+            return least_squares.Normal(self.cost(x), slope.T @ slope, slope.T @ residual)
+
+        def cost(self, x: FloatArray) -> float:
+            return float(self._residual(x) @ self._residual(x))
+
+        def stepped(self, x: FloatArray, step: FloatArray) -> FloatArray:
+            return x + step
+
+        @staticmethod
+        def _residual(x: FloatArray) -> FloatArray:
+            return np.array([x[0] + 1.0, curve * x[0] ** 2 + x[0] - 1.0])
+
+    found = least_squares.minimise(Parabola(), np.array([0.1]))
+    assert found.settled
+    assert found.steps < 30
+    assert found.state[0] == pytest.approx(0.0, abs=1e-5)
 
 
 @pytest.fixture

@@ -135,8 +135,9 @@ def propose_scene(
     Raises
     ------
     NoCorrection
-        If it tells no correction: ``too_few`` features, ``not_significant``, ``changed_halfway``, or
-        ``not_predictive``: what explains some of the pictures does not hold for the others.
+        If it tells no correction: ``too_few`` features, ``not_significant``, ``changed_halfway``,
+        ``errs_by_reading``, or ``not_predictive``: what explains some of the pictures does not hold for the
+        others.
     """
     views = scene_views(mast.rig, record, camera)
     other = _other_mast(mast, _pointings(mast.rig, record, camera))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import Literal
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import CalibError
 from calib.fit.bench_calibration import BenchCalibration
-from calib.fit.calibration import Calibration
+from calib.fit.calibration import Calibration, ImageResiduals
 from calib.fit.components import Component, as_one
 from calib.fit.terms import PRISMS, TAPES
 from calib.fit.uncertainty import pointing_covariance
@@ -113,6 +114,7 @@ def judge_calibration(
         *_turned(calibration),
         *_pointing(calibration),
         *_left_out(calibration),
+        *_at_the_end(calibration),
         *(Reason("care", sentence) for sentence in exchanged_boards(survey, calibration)),
     ]
     if undetected:
@@ -359,6 +361,29 @@ def _left_out(calibration: Calibration) -> list[Reason]:
         reasons.append(Reason("care", f"measure again: {names}"))
     if not reasons and calibration.outliers:
         reasons.append(Reason("good", f"{len(calibration.outliers)} measurements were left out, each named"))
+    return reasons
+
+
+def _at_the_end(calibration: Calibration) -> list[Reason]:
+    """Whether the last images of a camera were left out: what changed before them still holds, untold.
+
+    Were they kept, the fit would test such a change; an image that was left out takes its evidence along.
+    """
+    fitted: dict[str, list[ImageResiduals]] = {}
+    for image in calibration.images:
+        if image.purpose != "check":
+            fitted.setdefault(image.camera, []).append(image)
+    reasons = []
+    for camera, images in fitted.items():
+        last = list(takewhile(lambda image: not image.used.any(), reversed(images)))
+        if 0 < len(last) < len(images):
+            words = f"the last {len(last)} of {len(images)} images of {camera} were left out"
+            if len(last) == 1:
+                words = f"the last of {len(images)} images of {camera} was left out"
+            since = (
+                f"{words}: if focus, mount or a joint changed before {last[-1].name}, the result is of before"
+            )
+            reasons.append(Reason("care", f"{since}; take some images again"))
     return reasons
 
 

@@ -3,6 +3,7 @@
     .venv/bin/python -m tools.campaigns.coverage --surveys 400 --seed 1
     .venv/bin/python -m tools.campaigns.coverage --surveys 100 --seed 1 --method paper
     .venv/bin/python -m tools.campaigns.coverage --surveys 100 --seed 1 --mast 8
+    .venv/bin/python -m tools.campaigns.coverage --surveys 200 --seed 1 --gross 0.05
 
 Surveys are simulated (`drivers.sim_survey.survey`). Prints, over the surveys, how often the 95 % interval of
 each mast parameter and of predicted pixels (points at 2 to 10 m, three directions, every camera) holds the
@@ -11,6 +12,10 @@ truth, both pooled, and how the weighted sum of squares compares with its chi-sq
 Errors of one survey go together (a shift of the mast is seen by all its pixels), so a pooled rate scatters
 far more than so many independent intervals would: behind ± stands its standard error, from the scatter of
 whole surveys. ``--mast 8`` gives the true mast skew axes (10 mm apart, 5 mrad of twist).
+
+``--gross PART`` throws so many of each image's dots anywhere in the image and one tape 5 cm aside; every
+other survey has a board of 25 dots where the others have 100. It prints besides how many of these errors were
+named, and the errors of predicted pixels over those of the same surveys without them.
 """
 
 from __future__ import annotations
@@ -32,6 +37,7 @@ from calib.fit.uncertainty import pixel_covariance
 from calib.mast.rig import Rig
 from calib.rigid import rigid_rates
 from calib.survey import Sigma, Survey
+from drivers.sim_survey.blunders import with_fewer_dots, with_moved_tape, with_scattered_dots
 from drivers.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
 from mastctl.calibration.run import FITS, Method
 from mastctl.cli.output import at_least, not_negative
@@ -45,7 +51,19 @@ PLACES = ((0.5, 0.5), (0.2, 0.7))
 
 LEVEL = 0.95
 Z = 1.959964
+TAPE_ASIDE_M = 0.05
 SKEW = {"axis_offset_m": 0.010, "axis_twist_rad": 0.005}
+
+
+class Gross(NamedTuple):
+    """What came of gross errors: how many there were, which were not named, and what else was; squares of the
+    predicted pixels' errors (mean over all of them) with and without the gross ones."""
+
+    count: int
+    unnamed: tuple[str, ...]
+    besides: int
+    square_px2: float
+    clean_px2: float
 
 
 class Score(NamedTuple):
@@ -60,6 +78,7 @@ class Score(NamedTuple):
     reduced: float
     outliers: tuple[str, ...]
     seconds: float
+    gross: Gross | None
 
 
 class SurveyTask(NamedTuple):
@@ -70,13 +89,19 @@ class SurveyTask(NamedTuple):
     plan: SurveyPlan
     method: Method
     mast_parameters: int
+    gross_part: float
 
 
 def score(task: SurveyTask) -> Score | str:
     """Return how far one survey's fit is from the truth, in its own sigmas, or why there is none."""
     true = task.true
     survey, of_truth = simulate_survey(true, task.seed, task.plan)
+    gross, clean_px2 = frozenset[str](), float("nan")
     try:
+        if task.gross_part:
+            survey = with_fewer_dots(survey, 1 + task.seed % 2)
+            clean_px2 = _square_px2(true, FITS[task.method](survey, task.mast_parameters))
+            survey, gross = with_gross_errors(survey, task.gross_part, np.random.default_rng([task.seed, 11]))
         fit = FITS[task.method](survey, task.mast_parameters)
     except CalibError as refused:
         return f"seed {task.seed}: {refused}"
@@ -87,16 +112,33 @@ def score(task: SurveyTask) -> Score | str:
     error = np.array([fit.estimate[i] - truth[fit.parameter_names[i]] for i in at])
     covariance = fit.covariance[np.ix_(at, at)]
     in_sigmas = error / np.sqrt(np.diag(covariance))
+    named = {outlier.name for outlier in fit.outliers}
+    unnamed, besides = tuple(sorted(gross - named)), len(named - gross)
     return Score(
         {fit.parameter_names[i]: float(e) for i, e in zip(at, in_sigmas, strict=True)},
         float(error @ np.linalg.solve(covariance, error)),
         _prisms_alone(true, survey, of_truth),
-        {name: _pixel_errors(true, name, fit) for name in true.cameras},
+        {name: _pixel_errors(true, name, fit)[0] for name in true.cameras},
         fit.chi2_probability,
         fit.chi2 / fit.degrees_of_freedom,
         tuple(outlier.name for outlier in fit.outliers),
         fit.seconds,
+        Gross(len(gross), unnamed, besides, _square_px2(true, fit), clean_px2) if gross else None,
     )
+
+
+def with_gross_errors(survey: Survey, part: float, rng: np.random.Generator) -> tuple[Survey, frozenset[str]]:
+    """Return the survey with a part of each image's dots anywhere and a tape 5 cm aside, and their names."""
+    wrong = set[str]()
+    for image in survey.images:
+        count = round(part * len(survey.dots[image.name].rows))
+        survey, places = with_scattered_dots(survey, image.name, count, rng)
+        wrong |= {f"image {image.name} dot (row {row}, column {column})" for row, column in places}
+    tapes = [point for point in survey.station if point.kind == "tape"]
+    tape, aside = tapes[rng.integers(len(tapes))], rng.standard_normal(3)
+    aside_m = TAPE_ASIDE_M * aside / np.linalg.norm(aside)
+    wrong.add(f"tape {tape.point} of placement {tape.placement} (set-up {tape.setup})")
+    return with_moved_tape(survey, tape.setup, tape.placement, tape.point, aside_m), frozenset(wrong)
 
 
 def _prisms_alone(true: Rig, survey: Survey, of_truth: SurveyTruth) -> np.ndarray:
@@ -116,9 +158,14 @@ def _prisms_alone(true: Rig, survey: Survey, of_truth: SurveyTruth) -> np.ndarra
     return np.asarray(carry @ error / spread)
 
 
-def _pixel_errors(true: Rig, name: str, fit: Calibration) -> np.ndarray:
-    """Predicted less true pixels of fixed points of the rover frame, in sigmas."""
-    errors = []
+def _square_px2(true: Rig, fit: Calibration) -> float:
+    """Mean square of predicted less true pixels over all cameras."""
+    return float(np.mean([np.mean(_pixel_errors(true, name, fit)[1] ** 2) for name in true.cameras]))
+
+
+def _pixel_errors(true: Rig, name: str, fit: Calibration) -> tuple[np.ndarray, np.ndarray]:
+    """Predicted less true pixels of fixed points of the rover frame, in sigmas and in pixels."""
+    errors, off_px = [], []
     on_head = true.cameras[name].on == "head"
     for pan, tilt in DIRECTIONS_RAD if on_head else ((0.0, 0.0),):
         model = true.camera_in_rover(name, pan, tilt)
@@ -127,8 +174,9 @@ def _pixel_errors(true: Rig, name: str, fit: Calibration) -> np.ndarray:
             points = rays.origins_m + range_m * rays.directions
             at, _ = model.project(points)
             predicted, covariance = pixel_covariance(fit, name, pan, tilt, points)
-            errors.append((predicted - at) / np.sqrt(np.einsum("nii->ni", covariance)))
-    return np.concatenate(errors).ravel()
+            off_px.append(predicted - at)
+            errors.append(off_px[-1] / np.sqrt(np.einsum("nii->ni", covariance)))
+    return np.concatenate(errors).ravel(), np.concatenate(off_px).ravel()
 
 
 def main() -> int:
@@ -143,6 +191,7 @@ def main() -> int:
     parser.add_argument(
         "--prism-cad-sigma-m", type=not_negative, default=0.0, help="noise of the prisms' drawing"
     )
+    parser.add_argument("--gross", type=not_negative, default=0.0, help="part of the dots thrown anywhere")
     add_task_options(parser)
     root = Path(__file__).resolve().parents[2]
     parser.add_argument("--rig", type=Path, default=root / "configs" / "sim" / "rocky8.yaml")
@@ -153,7 +202,7 @@ def main() -> int:
     plan = SurveyPlan(sigma=Sigma(0.001, 0.1, options.joint_sigma_rad, options.prism_cad_sigma_m))
     seeds = range(options.seed, options.seed + options.surveys)
     began = time.monotonic()
-    tasks = [SurveyTask(true, seed, plan, options.method, options.mast) for seed in seeds]
+    tasks = [SurveyTask(true, seed, plan, options.method, options.mast, options.gross) for seed in seeds]
     found = results_of(options, "surveys", score, tasks, lambda task: f"seed {task.seed}")
     if found is None:
         return 0
@@ -199,7 +248,27 @@ def report(scores: list[Score]) -> None:
         print(f"its probabilities against uniform (Kolmogorov-Smirnov): p = {uniform:.3f}")
     lost = [s.outliers for s in scores if s.outliers]
     print(f"surveys that lost any measurement: {len(lost)}")
+    if gross := [s.gross for s in scores if s.gross]:
+        report_gross(gross)
     print(f"fit: {np.mean([s.seconds for s in scores]):.2f} s on average")
+
+
+def report_gross(gross: list[Gross]) -> None:
+    """Print what came of gross errors."""
+    count, unnamed = sum(one.count for one in gross), [name for one in gross for name in one.unnamed]
+    print(
+        f"gross errors named: {count - len(unnamed)} of {count}; left out besides: "
+        f"{sum(one.besides for one in gross)}"
+    )
+    with_px, without_px = (
+        float(np.sqrt(np.mean([getattr(one, key) for one in gross]))) for key in ("square_px2", "clean_px2")
+    )
+    worst = max(np.sqrt(one.square_px2 / one.clean_px2) for one in gross)
+    print(
+        f"predicted pixels are off by {with_px:.4f} px rms, without gross errors by {without_px:.4f}: "
+        f"{with_px / without_px:.3f} times, in the worst survey {worst:.2f} times"
+    )
+    print("\n".join(f"not named: {name}" for name in unnamed[:20]))
 
 
 def _held(errors: np.ndarray) -> str:

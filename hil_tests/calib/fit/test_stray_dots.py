@@ -13,7 +13,7 @@ from calib.fit.paper import fit_paper
 from calib.fit.stray_dots import without_stray_dots
 from calib.mast.rig import Rig
 from calib.survey import Dots, Survey
-from drivers.sim_survey.blunders import with_outlier_dots
+from drivers.sim_survey.blunders import with_fewer_dots, with_outlier_dots, with_scattered_dots
 from drivers.sim_survey.survey import simulate_survey
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -63,9 +63,16 @@ def test_check_images_lose_theirs_too(good: Survey) -> None:
     }
 
 
-def test_few_dots_are_left_alone(good: Survey) -> None:
-    few = {n: Dots(d.rows[:20], d.columns[:20], d.pixels_px[:20]) for n, d in good.dots.items()}
-    assert without_stray_dots(replace(good, dots=few))[1] == ()
+def test_of_few_dots_the_gross_ones_are_named_and_of_fewer_none(good: Survey) -> None:
+    few = with_fewer_dots(good, 2)  # 25 an image, check images among them
+    assert without_stray_dots(few)[1] == ()
+    wrong, spoiled = set[str](), few
+    for image in good.images:
+        spoiled, places = with_scattered_dots(spoiled, image.name, 1, np.random.default_rng(image.row))
+        wrong |= {f"image {image.name} dot (row {r}, column {c})" for r, c in places}
+    assert {s.name for s in without_stray_dots(spoiled)[1]} == wrong
+    fewer = {n: Dots(d.rows[:15], d.columns[:15], d.pixels_px[:15]) for n, d in spoiled.dots.items()}
+    assert without_stray_dots(replace(good, dots=fewer))[1] == ()
     assert without_stray_dots(replace(good, dots={}))[1] == ()
 
 

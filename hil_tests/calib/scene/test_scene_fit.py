@@ -12,6 +12,7 @@ from calib.errors import NoCorrection
 from calib.mast.rig import Mast, Rig, RigCamera
 from calib.scene.features import Feature
 from calib.scene.fit import fit_scene
+from calib.scene.places import Sights
 from calib.scene.terms import PRIOR, terms_of
 from calib.scene.views import View
 
@@ -69,16 +70,20 @@ def scene(
     repeat: float = 5e-5,
     play: float = 0.0,
     moved: tuple[int, float] | None = None,
+    round_by: float = 2 * np.pi,
+    twice: float = 0.0,
 ) -> tuple[list[View], list[Feature]]:
     """Rests all round at two tilts, and features on rough ground, each seen where the true rig shows it.
 
     From the rest that ``moved`` names on, the rover stands so many metres farther ahead and turned by a
     hundredth of that, in radians, about its forward axis. With ``play`` each other rest is reached from
-    larger angles of pan.
+    larger angles of pan. ``pan_harmonic`` and ``twice`` are what pan reads wrong once and twice a turn.
     """
     rng = np.random.default_rng(seed)
     reads = [
-        (pan, tilt) for tilt in (-0.15, -0.45) for pan in np.linspace(-np.pi, np.pi, pans, endpoint=False)
+        (pan, tilt)
+        for tilt in (-0.15, -0.45)
+        for pan in np.linspace(-round_by / 2, round_by / 2, pans, endpoint=False)
     ]
     views = [
         View(
@@ -96,6 +101,7 @@ def scene(
     true = []
     for pose, (pan, tilt) in enumerate(reads):
         wrong = pan_harmonic[0] * np.cos(pan) + pan_harmonic[1] * np.sin(pan) + (pose % 2 - 0.5) * play
+        wrong += twice * np.sin(2 * pan)
         true.append((pan + wrong + rng.normal(0, repeat), tilt + rng.normal(0, repeat)))
     bearing, far = rng.uniform(-np.pi, np.pi, count), rng.uniform(1.8, 15.0, count)
     points = np.stack([far * np.cos(bearing), far * np.sin(bearing), rng.normal(0, 0.15, count)], axis=1)
@@ -168,6 +174,55 @@ def test_an_encoder_off_its_centre_is_told_by_pictures_all_round() -> None:
     np.testing.assert_allclose(found, [2e-3, -1e-3], atol=3e-4)
 
 
+BUMP = {"eye_left": np.array([1.2e-3, -1.8e-3, 0.9e-3])}
+
+
+def test_an_encoder_wrong_seen_from_five_pans_beside_a_turned_eye_is_told_too() -> None:
+    views, features = scene(1, BUMP, pan_harmonic=(1.5e-3, -1.5e-3), pans=5, round_by=3.0, count=400)
+    fit = fit_scene(believed(), views, features)
+    assert "pan reads wrong once a turn" in fit.taken
+    off = [
+        (fit.values[at] - {"c1": 1.5e-3, "s1": -1.5e-3}[name[-2:]]) / np.sqrt(fit.covariance[at, at])
+        for at, name in enumerate(fit.names)
+        if name.startswith("joints.pan")
+    ]
+    assert np.abs(off).max() < 4.0
+
+
+def test_a_joint_wrong_at_too_few_readings_to_tell_how_is_refused_by_name() -> None:
+    views, features = scene(1, BUMP, twice=3e-3, pans=5, round_by=3.0, count=400)
+    with pytest.raises(NoCorrection, match=r"at its 5 readings pan is off by .* mrad rms") as refused:
+        fit_scene(believed(), views, features)
+    assert refused.value.code == "errs_by_reading"
+
+
+def test_features_that_a_wrong_eye_sees_beyond_infinity_have_a_place() -> None:
+    """Two eyes 0.2 m apart turned towards each other by 30 mrad see lines of sight diverge by 38 px."""
+    rig, nothing = believed(), np.zeros((2, 2), np.float32)
+    views = [View(name, name, nothing, 0.0, 0.0, 0) for name in EYES_M]
+    pixels = np.array([[500.0, 380.0], [538.0, 380.0]])
+    sights = Sights(
+        [Feature((0, 1), pixels, np.array([np.eye(2)] * 2))], [view.model(rig) for view in views], MAST_M
+    )
+    models = [view.model(rig) for view in views]
+    off, _, _ = sights.off(models, sights.start(models))
+    assert np.abs(off).max() < 0.1
+
+
+def test_a_feature_behind_a_camera_is_named_and_never_a_number() -> None:
+    views, features = scene(5, BUMP, count=250)
+    views.append(replace(views[0], name="behind", pan_rad=views[0].pan_rad + np.pi, pose=views[-1].pose + 1))
+    seen = next(feature for feature in features if feature.views[0] == 0)
+    lost = Feature((0, len(views) - 1), seen.pixels_px[:2], seen.covariances_px2[:2])
+    fit = fit_scene(believed(), views, [*features, lost])
+    x, y = lost.pixels_px[0]
+    named = (
+        f"the feature at ({x:.0f}, {y:.0f}) of eye_left 0, behind: no place is before all of these cameras"
+    )
+    assert named in fit.outliers
+    assert fit.taken == fit_scene(believed(), views, features).taken
+
+
 def test_a_rig_that_is_as_believed_is_left_as_it_is() -> None:
     views, features = scene(4)
     with pytest.raises(NoCorrection, match="tell no correction") as refused:
@@ -224,7 +279,7 @@ def test_what_few_rests_cannot_tell_is_not_asked() -> None:
     words = [term.words for term in terms_of(believed(), views)]
     assert "pan reads wrong once a turn" in words
     assert "tilt reads wrong once a turn" not in words
-    few = [term.words for term in terms_of(believed(), [view for view in views if view.pose < 5])]
+    few = [term.words for term in terms_of(believed(), [view for view in views if view.pose < 4])]
     assert "pan reads wrong once a turn" not in few
 
 

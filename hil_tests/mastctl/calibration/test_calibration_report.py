@@ -116,6 +116,21 @@ def test_the_worst_reason_decides(fitted: tuple[Survey, Calibration]) -> None:
     assert any(r.grade == "bad" and "check images of navcam_left" in r.sentence for r in bad.reasons)
 
 
+@pytest.mark.parametrize(("count", "first_too"), [(1, False), (2, False), (2, True)])
+def test_the_last_images_of_a_camera_left_out_cost_trust(
+    fitted: tuple[Survey, Calibration], count: int, first_too: bool
+) -> None:
+    survey, fit = fitted
+    mine = [i.name for i in fit.images if i.camera == "navcam_right" and i.purpose != "check"]
+    for names, said in ((mine[-count:], True), (mine[:count], False)):
+        lost = {*names, *(mine[:1] if first_too else [])}
+        images = [replace(i, used=i.used & (i.name not in lost)) for i in fit.images]
+        verdict = judge_calibration(survey, replace(fit, images=tuple(images)))
+        last = [r for r in verdict.reasons if "of navcam_right w" in r.sentence]
+        assert [r.grade for r in last] == ["care"] * said
+        assert all(f"changed before {names[0]}, the result is of before" in r.sentence for r in last)
+
+
 def test_prisms_that_scatter_more_than_the_tapes_of_their_station_cost_trust(
     fitted: tuple[Survey, Calibration],
 ) -> None:
