@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.bench.knowledge import Knowledge, Shot, View
 from calib.bench.workspace import Pointing
@@ -76,23 +77,31 @@ class Choice:
 
 def seen(known: Knowledge, sought: Sought, shot: Shot) -> Shot | None:
     """Return the shot with the corners that each camera is expected to see, or None if none sees enough."""
-    board = known.boards[shot.placement]
-    points = board.points(sought.in_board_m)
-    head = known.head(shot)
     views = []
-    for name, camera in known.rig.cameras.items():
-        here = points if camera.on == "rover" else (points - head.translation_m) @ head.rotation
-        normal = board.rotation[:, 2] if camera.on == "rover" else board.rotation[:, 2] @ head.rotation
-        sight = here.mean(axis=0) - camera.model.C
-        if sight @ normal < FLATTEST * float(np.linalg.norm(sight)):
-            continue
-        pixels, valid = camera.model.project(here)
-        size = np.array(camera.model.size_px)
-        inside = valid & ((pixels > EDGE_PX) & (pixels < size - 1 - EDGE_PX)).all(axis=1)
+    for name in known.rig.cameras:
+        inside = shown(known, sought, shot, name)
         if int(inside.sum()) >= sought.least:
             corners = sought.in_board_m[inside]
             views.append(View(name, corners, np.full(len(corners), sought.sigma_px)))
     return replace(shot, views=tuple(views)) if views else None
+
+
+def shown(
+    known: Knowledge, sought: Sought, shot: Shot, name: str, edge_px: float = EDGE_PX
+) -> NDArray[np.bool_]:
+    """Return which of the board's corners (n,) a camera is expected to see, farther than ``edge_px`` from its
+    picture's edges; negative: those too that lie so far outside."""
+    board, camera = known.boards[shot.placement], known.rig.cameras[name]
+    here, normal = board.points(sought.in_board_m), board.rotation[:, 2]
+    if camera.on == "head":
+        head = known.head(shot)
+        here, normal = (here - head.translation_m) @ head.rotation, normal @ head.rotation
+    sight = here.mean(axis=0) - camera.model.C
+    if sight @ normal < FLATTEST * float(np.linalg.norm(sight)):
+        return np.zeros(len(here), dtype=bool)
+    pixels, valid = camera.model.project(here)
+    size = np.array(camera.model.size_px)
+    return np.asarray(valid & ((pixels > edge_px) & (pixels < size - 1 - edge_px)).all(axis=1))
 
 
 def readings(
@@ -163,11 +172,12 @@ def next_shot(
         How many more shots there will be of this placement, this one among them. They are chosen together:
         the best one by itself is seldom the beginning of the best few.
     """
+    base = with_board(known, shots, placement)
+    known, base, aim = _of_head(known, base, aim)
     here = [shot for shot in shots if shot.placement == placement]
     choices = list(candidates(known, sought, here, placement, avoid))
     if not choices:
         return None
-    base = with_board(known, shots, placement)
     told = np.array([known.of_shot(shot) for shot in choices])
     plan = _together(base, told, aim, ahead)
     first = min(plan, key=dict(zip(plan, _left_px(base, told[plan], aim), strict=True)).__getitem__)
@@ -182,6 +192,24 @@ def next_shot(
         tried = [*best, *range(len(choices) - len(sides), len(choices))]
         first = tried[int(np.argmin(_left_px(beside, told[tried], aim)))]
     return Choice(choices[first], float(_left_px(base, told[[first]], aim)[0]))
+
+
+def _of_head(known: Knowledge, base: FloatArray, aim: Pointing) -> tuple[Knowledge, FloatArray, Pointing]:
+    """The same without the cameras on the body, which see a board alike from every attitude: what was told of
+    them and of all else together (p + 6, p + 6) stays told of all else."""
+    cameras = {name: camera for name, camera in known.rig.cameras.items() if camera.on == "head"}
+    if len(cameras) == len(known.rig.cameras):
+        return known, base, aim
+    rig = replace(known.rig, cameras=cameras, stereo={})
+    of_head = Knowledge(rig, known.boards, known.joint_sigma_rad)
+    names = set(of_head.names)
+    left = np.array([name in names for name in known.names])
+    mine = np.concatenate([left, np.ones(6, dtype=bool)])
+    scale = 1.0 / np.sqrt(np.diag(base)[~mine])
+    across = base[np.ix_(mine, ~mine)] * scale
+    own = base[np.ix_(~mine, ~mine)] * np.outer(scale, scale)
+    rest = base[np.ix_(mine, mine)] - across @ np.linalg.solve(own, across.T)
+    return of_head, rest, replace(aim, to_rig=aim.to_rig[:, left])
 
 
 def _together(base: FloatArray, told: FloatArray, aim: Pointing, count: int) -> list[int]:

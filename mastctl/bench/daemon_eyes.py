@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -81,7 +81,13 @@ class DaemonEyes:
         """What is known of it."""
         return self._head
 
-    def look(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> Look:
+    def look(
+        self,
+        pan_rad: float,
+        tilt_rad: float,
+        approach: tuple[int, int] = (0, 0),
+        cameras: Collection[str] | None = None,
+    ) -> Look:
         """See `mastctl.bench.eyes.Eyes`.
 
         Raises
@@ -97,7 +103,7 @@ class DaemonEyes:
         begun = time.monotonic()
         while True:
             try:
-                return self._look(pan_rad, tilt_rad, approach)
+                return self._look(pan_rad, tilt_rad, approach, cameras)
             except ClientError as error:
                 if error.code in ("outside_limits", "keep_out", "sun", "unreachable", "no_way"):
                     raise NotThere(str(error)) from None
@@ -108,33 +114,49 @@ class DaemonEyes:
                     raise Interrupted(f"{_sentence(error)}") from None
                 time.sleep(AGAIN_S)
 
-    def _pictures(self) -> tuple[dict[str, Snapshot], dict[str, ClientError]]:
-        """A new picture of each camera that gives one, and why the others give none."""
-        shots: dict[str, Snapshot] = {}
-        failed: dict[str, ClientError] = {}
-        for camera in self._cameras:
-            try:
-                shots[camera] = self._client.snapshot(camera)
-            except ClientError as error:
-                failed[camera] = error
-                if error.code in LASTING:
-                    raise
-        if not shots and failed:
-            raise max(failed.values(), key=_unlit)
-        return shots, failed
+    def seconds_each(self) -> dict[str, float]:
+        """Return how long a picture and finding its corners take of each camera, seconds; the head rests.
 
-    def _look(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int]) -> Look:
+        Cameras that give no picture are left out.
+        """
+        took_s: dict[str, float] = {}
+        for camera in self._cameras:
+            begun = time.monotonic()
+            with suppress(ClientError):
+                self._seen(self._client.snapshot(camera))
+                took_s[camera] = time.monotonic() - begun
+        return took_s
+
+    def _look(
+        self, pan_rad: float, tilt_rad: float, approach: tuple[int, int], cameras: Collection[str] | None
+    ) -> Look:
+        names = [name for name in self._cameras if cameras is None or name in cameras]
         begun_s = self._now_s()
         self._turn(pan_rad, tilt_rad, approach)
-        shots, failed = self._pictures()
+        shots: dict[str, Snapshot] = {}
+        failed: dict[str, ClientError] = {}
+        found: dict[str, Future[Seen]] = {}
+        for name in names:
+            try:
+                shots[name] = self._client.snapshot(name)
+            except ClientError as error:
+                failed[name] = error
+                if error.code in LASTING:
+                    raise
+            else:  # its corners are found while the next one is taken
+                found[name] = self._pool.submit(self._seen, shots[name])
+        if not shots:
+            raise max(failed.values(), key=_unlit)
         seconds = self._now_s() - begun_s
         if any(shot.moving for shot in shots.values()):
             raise ClientError("moving", "the head moved while the pictures were taken")
-        found = dict(zip(shots, self._pool.map(self._seen, shots.values()), strict=True))
         one = next(iter(shots.values()))
-        for name, error in failed.items():
-            found[name] = Seen(name, one.pan_rad, one.tilt_rad, None, _without_picture(name, error))
-        seen = [found[name] for name in self._cameras]
+        seen = [
+            found[name].result()
+            if name in found
+            else Seen(name, one.pan_rad, one.tilt_rad, None, _without_picture(name, failed[name]))
+            for name in names
+        ]
         return Look(tuple(seen), _side(one, "pan_approach"), _side(one, "tilt_approach"), seconds)
 
     def _turn(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int]) -> None:

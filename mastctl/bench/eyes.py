@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -56,7 +57,7 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """All cameras' pictures at one attitude, from which side each joint came (1, -1, 0 unknown), and how long
+    """Cameras' pictures at one attitude, from which side each joint came (1, -1, 0 unknown), and how long
     it took, seconds of the rover's clock."""
 
     seen: tuple[Seen, ...]
@@ -73,6 +74,11 @@ class Look:
     def tilt_rad(self) -> float:
         """What tilt read, the cameras' mean."""
         return sum(one.tilt_rad for one in self.seen) / len(self.seen)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Those that were to take a picture."""
+        return tuple(one.camera for one in self.seen)
 
     @property
     def found(self) -> tuple[Seen, ...]:
@@ -111,8 +117,15 @@ class Eyes(Protocol):
         """What is known of it."""
         ...
 
-    def look(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> Look:
-        """Turn to joint readings, radians, from the sides asked for (0: any), and take all cameras at rest.
+    def look(
+        self,
+        pan_rad: float,
+        tilt_rad: float,
+        approach: tuple[int, int] = (0, 0),
+        cameras: Collection[str] | None = None,
+    ) -> Look:
+        """Turn to joint readings, radians, from the sides asked for (0: any), and take some cameras at rest,
+        all of them by default.
 
         Raises
         ------

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from calib.bench.board_pose import rover_from_board
 from calib.bench.body import FEWEST, body_cameras
 from calib.bench.knowledge import Knowledge, Shot, View
-from calib.bench.poses import Sought, expected_px, with_board
+from calib.bench.poses import Sought, expected_px, shown, with_board
 from calib.bench.workspace import Pointing, Workspace, pointing
 from calib.boards import AnyBoard
 from calib.errors import CalibError
@@ -31,6 +31,12 @@ from mastctl.errors import MastctlError
 
 USUAL_PAN_RAD, USUAL_TILT_RAD = (-1.2, 1.2), (-0.9, 0.3)
 """Where a rig points, as far as the limits let it."""
+
+STILL = 4
+"""Pictures of a placement by a camera on the body: it stands still before it, and more only halve noise."""
+
+BESIDE, BESIDE_AT_FIRST = 0.1, 0.5
+"""So far outside a picture, in parts of its width, corners may be in it after all: after, before a fit."""
 
 
 class Known:
@@ -132,6 +138,22 @@ class Known:
             for one in look.found:
                 counts[one.camera] = counts.get(one.camera, 0) + 1
         return max(counts.values(), default=0)
+
+    def cameras_for(self, shot: Shot, check: bool = False) -> tuple[str, ...]:
+        """Return the cameras whose pictures of a shot may tell something: those that point, those that may
+        see the board, and those on the body that have not seen it stand there yet."""
+        beside = BESIDE if self.fitted is not None else BESIDE_AT_FIRST
+        return tuple(
+            name
+            for name, camera in self.now.rig.cameras.items()
+            if name in self.workspace.cameras
+            or (
+                sum(name in look.cameras for look in self.of(shot.placement, check)) < STILL
+                if camera.on == "rover"
+                else shown(self.now, self.sought, shot, name, -beside * camera.model.size_px[0]).sum()
+                >= self.sought.least
+            )
+        )
 
     def cells(self) -> dict[str, tuple[int, ...]]:
         """Return how many corners were seen in each of `CELLS` of each camera's picture, row by row."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 
 import numpy as np
 
@@ -13,11 +14,8 @@ from mastctl.bench.eyes import Eyes, Look, NotThere
 from mastctl.bench.known import Known
 from mastctl.bench.search import Search
 from mastctl.bench.teller import Progress, Teller
-from mastctl.bench.wanted import Wanted
+from mastctl.bench.wanted import FEWEST_LOOKS, Wanted
 from mastctl.errors import MastctlError
-
-FEWEST_LOOKS = 8
-"""Of a placement: fewer leave the board's own place, and so what it tells, to chance."""
 
 LITTLE_GAIN, LAST_GAIN = 0.12, 0.01
 """A look that promises less than this part of the predicted error is not worth its time at a placement, or at
@@ -106,10 +104,10 @@ class Looks:
                 )
         self._end(name)
 
-    def look_at(self, shot: Shot) -> Look | None:
+    def look_at(self, shot: Shot, check: bool = False) -> Look | None:
         """Take a shot; None where the head must not go."""
         try:
-            return self._eyes.look(shot.pan_rad, shot.tilt_rad, (shot.pan_approach, shot.tilt_approach))
+            return self._look(shot, self._known.cameras_for(shot, check))
         except NotThere as reason:
             self._teller.say(f"not looked there: {reason}")
             return None
@@ -121,8 +119,13 @@ class Looks:
 
     def _again_px(self, then: Look) -> float | None:
         """How far aside a look shows the board when it is taken again."""
-        now = self._eyes.look(then.pan_rad, then.tilt_rad, (then.pan_approach, then.tilt_approach))
+        now = self._look(then, {*self._known.workspace.cameras, *(one.camera for one in then.found)})
         return corners_apart_px(then, now)
+
+    def _look(self, where: Shot | Look, cameras: Collection[str]) -> Look:
+        at = where.pan_rad, where.tilt_rad, (where.pan_approach, where.tilt_approach)
+        every = len(cameras) == len(self._known.head.rig.cameras)
+        return self._eyes.look(*at) if every else self._eyes.look(*at, cameras)
 
     def _suffices(self, here: int, choice: Choice) -> bool:
         if here < FEWEST_LOOKS:

@@ -7,10 +7,12 @@ moment goes on from there.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+import time
+from dataclasses import asdict, replace
 
 from calib.bench.body import advise_for_body
 from calib.bench.placements import Advice, Placement, advise, first_placement
+from calib.bench.poses import next_shot
 from calib.boards import AnyBoard
 from calib.errors import CalibError
 from calib.fit.bench import SomethingChanged
@@ -19,9 +21,9 @@ from mastctl.bench.final import Checked, point_at_corners, unvisited
 from mastctl.bench.fitting import FitSurvey, Fitted
 from mastctl.bench.folder import Kept
 from mastctl.bench.known import Known
-from mastctl.bench.looks import FEWEST_LOOKS, Looks, deg
+from mastctl.bench.looks import Looks, deg
 from mastctl.bench.teller import Teller
-from mastctl.bench.wanted import Wanted
+from mastctl.bench.wanted import FEWEST_LOOKS, Wanted
 from mastctl.errors import MastctlError
 
 
@@ -87,6 +89,15 @@ class BenchRun:
         finally:
             self.known.end()
 
+    def choice_s(self) -> float:
+        """Return how long it takes to choose a look in the middle of a placement's first ones, seconds."""
+        now, sought = self.known.now, self.known.sought
+        pose = first_placement(now, sought).rover_from_board(now.rig.mast.rover_from_head(0.0, 0.0))
+        stands = replace(now, boards={**now.boards, "": pose})
+        begun_s = time.monotonic()
+        next_shot(stands, sought, self.known.shots, "", self.known.aim, ahead=FEWEST_LOOKS // 2)
+        return time.monotonic() - begun_s
+
     def check(self) -> Checked:
         """Look where nothing was fitted, and point at corners, where the board stands now.
 
@@ -105,7 +116,7 @@ class BenchRun:
             self._teller.say(
                 f"a picture that is not fitted, at pan {deg(shot.pan_rad)}, tilt {deg(shot.tilt_rad)}"
             )
-            look = self._looks.look_at(shot)
+            look = self._looks.look_at(shot, check=True)
             if look is not None and look.found:
                 known.take(name, look, check=True)
         checks = known.of(name, check=True)

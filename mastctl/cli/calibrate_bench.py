@@ -283,7 +283,12 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
         wanted = Wanted(args.wanted_px, args.pictures)
         kept.begin(client.mast_file(), _frame(args))
         fit = fit_in_rover(kept_frame(folder), head.rig, kept.moved)
-        yield BenchRun(eyes, kept, "board", board, teller, fit, wanted), teller
+        bench = BenchRun(eyes, kept, "board", board, teller, fit, wanted)
+        pointing = bench.known.workspace.cameras
+        took_s = eyes.seconds_each() if len(cameras) > len(pointing) else {}
+        if set(pointing) <= took_s.keys():
+            teller.say(wanted.will_take(took_s, pointing, bench.choice_s()))
+        yield bench, teller
 
 
 @contextmanager

@@ -31,7 +31,7 @@ from calib.files.mast_file import load_rig
 from calib.mast.pointing import solve
 from calib.mast.rig import Rig
 from calib.mast.solutions import choose
-from mastctl.bench.looks import FEWEST_LOOKS
+from mastctl.bench.wanted import FEWEST_LOOKS
 from mastctl.cli.output import at_least
 from tools.arguments import end
 

@@ -6,6 +6,7 @@ The joints' errors are the simulator's own (`drivers.sim`), the kinematics SciPy
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -79,6 +80,7 @@ class CornerBench:
     rover_from_board: Rigid | None = None
     seconds: float = 0.0
     looks: int = 0
+    pictures: int = 0
 
     def stand(self, placement: Placement) -> None:
         """Place the board where it was asked for, as exactly as a person does: the same each time."""
@@ -87,7 +89,13 @@ class CornerBench:
         pose = pose @ Rigid(_small_turn(rng.normal(0.0, 0.08, 3)), np.zeros(3))
         self.rover_from_board = Rigid(pose.rotation, pose.translation_m + rng.normal(0.0, 0.04, 3))
 
-    def look(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> Look:
+    def look(
+        self,
+        pan_rad: float,
+        tilt_rad: float,
+        approach: tuple[int, int] = (0, 0),
+        cameras: Collection[str] | None = None,
+    ) -> Look:
         """See `mastctl.bench.eyes.Eyes`."""
         begun = self.pan.read_rad, self.tilt.read_rad
         for axis, wanted, side in ((self.pan, pan_rad, approach[0]), (self.tilt, tilt_rad, approach[1])):
@@ -98,7 +106,9 @@ class CornerBench:
         seconds = way_rad / 1.0 + 1.2
         self.seconds += seconds
         self.looks += 1
-        seen = [self._seen(name, true_rad) for name in self.head.rig.cameras]
+        names = [name for name in self.head.rig.cameras if cameras is None or name in cameras]
+        self.pictures += len(names)
+        seen = [self._seen(name, true_rad) for name in names]
         return Look(tuple(seen), self._side(self.pan), self._side(self.tilt), seconds)
 
     def _side(self, axis: TrueAxis) -> int:

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from calib.bench.board_pose import rover_from_board
 from calib.bench.knowledge import Knowledge, Shot
 from calib.bench.placements import Placement, advise, first_placement
-from calib.bench.poses import Sought, candidates, expected_px, next_shot
-from calib.bench.workspace import CLICKS, Workspace, pointing
+from calib.bench.poses import Sought, _of_head, candidates, expected_px, next_shot, seen, with_board
+from calib.bench.workspace import CLICKS, Pointing, Workspace, pointing
 from calib.boards import Charuco
 from calib.camera.stereo import triangulate
 from calib.errors import CalibError
@@ -212,3 +212,28 @@ def test_a_board_is_placed_from_one_picture_where_opencv_drew_it(rig: Rig) -> No
     assert turn < 1e-3
     with pytest.raises(CalibError, match="corners"):
         rover_from_board(rig, "navcam_left", 0.3, -0.2, points[:3], pixels[:3])
+
+
+def test_what_pictures_told_of_body_cameras_stays_told_of_the_rest_where_attitudes_are_chosen(
+    repository: Path,
+) -> None:
+    rig = replace(load_rig(repository / "configs/sim/rocky8.yaml").rig, provenance={})
+    low = Placement(1.4, 0.0, -40.0, (10.0, 0.0))
+    known, where = standing(rig, low), sought(one_sided=True)
+    shots = [seen(known, where, Shot("p1", pan, -0.7 + pan, ())) for pan in (-0.2, 0.0, 0.25)]
+    shots = [shot for shot in shots if shot is not None]
+    assert {"hazcam_left", "navcam_left"} <= {view.camera for shot in shots for view in shot.views}
+    aim = pointing(known, Workspace(PAIR, (-0.7, 0.7), (-0.5, 0.1), one_sided=True))
+    whole = with_board(known, shots, "p1")
+    whole[-6:, -6:] += np.eye(6)
+    of_head, rest, aim_of_head = _of_head(known, whole, aim)
+    assert not any("hazcam" in name for name in of_head.names)
+
+    def left_px(told: np.ndarray, what: Pointing) -> float:
+        scale = 1.0 / np.sqrt(np.diag(told))
+        covariance = np.linalg.inv(told * np.outer(scale, scale)) * np.outer(scale, scale)
+        return what.rms_px(covariance[:-6, :-6])
+
+    assert left_px(rest, aim_of_head) == pytest.approx(left_px(whole, aim), rel=1e-6)
+    choice = next_shot(known, where, shots, "p1", aim)
+    assert choice is not None and not any("hazcam" in view.camera for view in choice.shot.views)

@@ -14,10 +14,13 @@ import numpy as np
 import pytest
 from bench_world import corner_bench, one_camera, run_of
 
-from calib.bench.knowledge import Knowledge
+from calib.bench.knowledge import Knowledge, Shot
+from calib.bench.placements import Placement
 from calib.bench.workspace import Workspace, pointing
 from calib.errors import CalibError
+from calib.files.mast_file import load_rig
 from calib.fit.bench import SomethingChanged
+from calib.mast.rig import Rig
 from calib.rigid import Rigid
 from calib.survey import read_survey
 from mastctl.bench.eyes import Look
@@ -61,6 +64,44 @@ def test_a_single_camera_is_calibrated_the_same_way_and_pointed_by_the_range_of_
     assert len(checked.pointings) >= 3
     x, y = checked.pointing_rms_px or (9.0, 9.0)
     assert max(x, y) < 3.0 * (checked.pointing_promised_px or 0.0) < 1.0
+
+
+def whole_rover(repository: Path) -> tuple[Rig, Rig]:
+    """Three pairs: two on the head, one of them of a narrow view, and one on the body."""
+    true = load_rig(repository / "configs/sim/rocky8.yaml").rig
+    believed = load_rig(repository / "configs/masts/rocky8_simulated.yaml").rig
+    return replace(true, provenance={}), replace(believed, provenance={}, fit={})
+
+
+def test_a_camera_that_cannot_show_the_board_or_has_seen_it_stand_takes_no_picture(
+    repository: Path, tmp_path: Path
+) -> None:
+    bench = corner_bench(repository, of=whole_rover)
+    run, _ = run_of(bench, tmp_path / "bench")
+    known, looks, every = run.known, run._looks, tuple(bench.head.rig.cameras)
+    bench.stand(Placement(1.3, 0.0, -35.0, (10.0, 0.0)))
+    known.take("p1", bench.look(0.0, -0.6))
+    beside, at_it = Shot("p1", 0.7, -0.6, ()), Shot("p1", 0.0, -0.6, ())
+    navcams, pancams = ({name for name in every if kind in name} for kind in ("nav", "pan"))
+    assert run.choice_s() > 0.0
+    for shot in (at_it, beside, at_it):
+        look = looks.look_at(shot)
+        assert look is not None and {"hazcam_left", *navcams} <= set(look.cameras)
+        known.take("p1", look)
+    assert set(looks.look_at(at_it).cameras) == navcams | pancams, "hazcams stand still before it"
+    known.fitted = object()  # type: ignore[assignment]  # the estimate is good now
+    assert set(looks.look_at(beside).cameras) == navcams, "it is beside the narrow view"
+    assert set(looks.look_at(at_it, check=True).cameras) == set(every), "a check is of each of them"
+
+
+def test_before_a_run_it_is_told_what_its_pictures_take() -> None:
+    took_s = {"navcam_left": 1.0, "navcam_right": 1.0, "pancam_left": 2.0}
+    words = Wanted(pictures=60).will_take(took_s, ("navcam_left", "navcam_right"), 0.5)
+    # 21 looks of 1.5 s to turn, 0.5 s to choose and two pictures; 60 looks with all three
+    assert words.startswith("21 to 60 looks will take 1.4 to 6 minutes here: one of all 3 cameras 6.0 s")
+    assert (
+        "(pancam_left 2.0 s, the choice of the next 0.5 s), of navcam_left, navcam_right alone 4.0 s" in words
+    )
 
 
 class Dying(RuntimeError):

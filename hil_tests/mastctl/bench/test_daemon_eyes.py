@@ -56,6 +56,8 @@ def test_a_look_shows_the_board_with_one_reading_and_tells_what_the_head_is(eyes
     assert [one.camera for one in look.found] == list(CAMERAS)
     assert look.pan_rad == pytest.approx(0.05, abs=1e-4) and look.seconds > 0.0
     assert all(one.corners is not None and len(one.corners) > 20 and one.data for one in look.found)
+    assert eyes.look(0.05, -0.02, cameras=CAMERAS[1:]).cameras == CAMERAS[1:]
+    assert eyes.seconds_each().keys() == set(CAMERAS)
 
 
 def test_a_head_whose_mast_file_has_joints_is_turned_to_the_readings_that_are_wanted(

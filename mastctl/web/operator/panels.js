@@ -54,7 +54,7 @@ export class Failure {
   show({ id, error, ended_s: endedS }) {
     if (localStorage.getItem("mastctl read") === id) return;
     [this.id, this.endedS] = [id, endedS];
-    say(this.words, `The last command failed: ${error?.message ?? "the daemon told no reason"}`);
+    say(this.words, `Failed: ${error?.message ?? "the daemon told no reason"}`);
     byId("failed").hidden = false;
     this.announce(this.words.textContent);
   }

@@ -61,6 +61,12 @@ def opened(one: Visit) -> None:
         one.page.click("#bench > details:first-child > summary")
 
 
+def above(one: Visit, first: str, second: str) -> bool:
+    """Whether a part of the page begins above another one."""
+    tops = [one.page.locator(part).bounding_box()["y"] for part in (first, second)]
+    return bool(tops[0] < tops[1])
+
+
 def shown(one: Visit) -> str:
     return str(one.page.locator("#bench").inner_text())
 
@@ -71,9 +77,13 @@ def test_from_the_button_over_two_placements_to_the_verdict_its_report_and_its_m
     daemon, _ = pair
     scripted(daemon, WHOLE)
     one, other = visit(daemon.url), visit(daemon.url, viewport={"width": 820, "height": 1180}, has_touch=True)
+    for each in (one, other):
+        each.word("ready")
+        assert above(each, ".panel.last", ".panel.bench"), "it is below the rest until one runs"
     begin(one)
     for each in (one, other):
         each.page.wait_for_selector(".bench-place[data-asking=true]")
+        assert above(each, ".images", ".panel.bench") and above(each, ".panel.bench", ".panel.last")
         assert "put the board straight ahead. It need not be exact" in shown(each)
         assert each.page.locator(".sketches svg[role=img]").count() == 2
     assert one.page.locator(".bench-steps [aria-current=step]").inner_text().startswith("Place the board")
