@@ -6,7 +6,7 @@ What is seen goes to the disk first. It is fitted beside the next moves, wheneve
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from calib.bench.board_pose import rover_from_board
 from calib.bench.body import FEWEST, body_cameras
 from calib.bench.knowledge import Knowledge, Shot, View
-from calib.bench.poses import Sought, expected_px, shown, with_board
+from calib.bench.poses import Sought, expected_px, readings, shown, with_board
 from calib.bench.workspace import Pointing, Workspace, pointing
 from calib.boards import AnyBoard
-from calib.errors import CalibError
+from calib.errors import CalibError, Unreachable
 from calib.fit.least_squares import covariance_of
 from calib.mast.rig import Rig
 from calib.rigid import Rigid, rigid_rates
@@ -34,6 +34,10 @@ USUAL_PAN_RAD, USUAL_TILT_RAD = (-1.2, 1.2), (-0.9, 0.3)
 
 STILL = 4
 """Pictures of a placement by a camera on the body: it stands still before it, and more only halve noise."""
+
+CORNERS, APART = ((0.05, 0.05), (0.95, 0.95), (0.95, 0.05), (0.05, 0.95)), 0.15
+"""Where in the picture of a camera that does not point the board's middle should have been, in parts of width
+and height, and how far from there, in parts of the view, it may have been instead."""
 
 BESIDE, BESIDE_AT_FIRST = 0.1, 0.5
 """So far outside a picture, in parts of its width, corners may be in it after all: after, before a fit."""
@@ -154,6 +158,27 @@ class Known:
                 >= self.sought.least
             )
         )
+
+    def round_others(self, name: str) -> Iterator[Shot]:
+        """Yield attitudes at which a placement's board is at the corners of the picture of each camera on the
+        head that does not point, apart from those that were taken: what tells most of pointing need not show
+        the board to a camera of a narrow view, and its own place in the head follows from such alone."""
+        board = self.now.boards[name].translation_m
+        for camera, held in self.now.rig.cameras.items():
+            if held.on != "head" or camera in self.workspace.cameras:
+                continue
+            size, model = np.array(held.model.size_px), held.model
+            apart = APART * size / (np.linalg.norm(model.H), np.linalg.norm(model.V))
+            for place in CORNERS:
+                try:
+                    at = readings(
+                        self.now.rig, self.sought, model, board, (place[0] * size[0], place[1] * size[1])
+                    )
+                except (Unreachable, CalibError, ValueError):
+                    continue
+                mine = [look for look in self.of(name) if any(one.camera == camera for one in look.found)]
+                if all((np.abs(np.subtract((one.pan_rad, one.tilt_rad), at)) > apart).any() for one in mine):
+                    yield Shot(name, *at, ())
 
     def cells(self) -> dict[str, tuple[int, ...]]:
         """Return how many corners were seen in each of `CELLS` of each camera's picture, row by row."""

@@ -102,6 +102,11 @@ class Looks:
                     f"the board of placement {name} was not seen in {missed} looks in a row where it stood "
                     f"({_whys(look)}); put it back or place it anew, and start the same command again"
                 )
+        for shot in known.round_others(name):
+            if known.pictures() < self._wanted.pictures - self._wanted.checks:
+                look = self.look_at(shot)
+                if look is not None and look.found:
+                    known.take(name, look)
         self._end(name)
 
     def look_at(self, shot: Shot, check: bool = False) -> Look | None:

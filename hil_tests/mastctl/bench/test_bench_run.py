@@ -89,6 +89,15 @@ def test_a_camera_that_cannot_show_the_board_or_has_seen_it_stand_takes_no_pictu
         assert look is not None and {"hazcam_left", *navcams} <= set(look.cameras)
         known.take("p1", look)
     assert set(looks.look_at(at_it).cameras) == navcams | pancams, "hazcams stand still before it"
+    for shot in known.round_others("p1"):
+        look = looks.look_at(shot)
+        assert look is not None
+        known.take("p1", look)
+    for pancam in pancams:
+        tilts = [look.tilt_rad for look in known.of("p1") if pancam in {one.camera for one in look.found}]
+        assert len(tilts) >= 4 and np.ptp(tilts) > np.radians(11.0), "what a fit of its place needs"
+    assert not list(known.round_others("p1"))
+    known.end()
     known.fitted = object()  # type: ignore[assignment]  # the estimate is good now
     assert set(looks.look_at(beside).cameras) == navcams, "it is beside the narrow view"
     assert set(looks.look_at(at_it, check=True).cameras) == set(every), "a check is of each of them"
