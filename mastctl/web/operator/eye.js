@@ -46,7 +46,7 @@ export class Eye {
       this.element.style.setProperty("--ratio", width / height);
     }
     this.pen.drawImage(bitmap, 0, 0, width, height);
-    this.coarse = facts.reduced ? `, reduced to ${bitmap.width} × ${bitmap.height} px` : "";
+    this.coarse = !facts.reduced ? "" : bitmap.width < width ? `, reduced to ${bitmap.width} × ${bitmap.height} px` : ", coarse";
     if (this.facts) this.intervals = [...this.intervals.slice(-4), facts.mid_exposure_s - this.facts.mid_exposure_s];
     this.facts = facts;
     this.markTrack(facts.track);

@@ -33,7 +33,7 @@ export class Failure {
   constructor(events, announce) {
     [this.events, this.announce] = [events, announce];
     this.words = h("span");
-    put(byId("failed"), this.words, " ", h("button", { type: "button", onclick: () => this.read() }, "Read"));
+    put(byId("failed"), h("button", { type: "button", onclick: () => this.read() }, "Read"), this.words);
     events.addEventListener("connected", () => { [this.newestS, this.sinceS] = [-Infinity, Infinity]; });
     events.addEventListener("joints", ({ detail: { value } }) => { this.sinceS = Math.min(this.sinceS, value.measured_s + value.age_s); });
     events.addEventListener("operation", (event) => this.told(event.detail.value));
