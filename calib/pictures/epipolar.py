@@ -1,7 +1,8 @@
 """Find a pixel's partner in the other eye, and the surface that two eyes see there.
 
-The best place of a sweep along the pixel's ray (`calib.pictures.epipolar_sweep`) is matched freely in both
-directions (`calib.pictures.patch_match`), so the offset across the epipolar line is measured, not assumed:
+Around the best place of a sweep along the pixel's ray (`calib.pictures.epipolar_sweep`) the surface is seen
+pixel by pixel (`calib.pictures.relief`); carried over it, the patch is matched freely in both directions
+(`calib.pictures.patch_match`), so the offset across the epipolar line is measured, not assumed:
 eyes that disagree there are out of calibration, or a picture is not what it claims to be.
 """
 
@@ -14,9 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.camera.cahvor import CameraModel
-from calib.camera.stereo import triangulate, triangulate_many
-from calib.errors import NoStereoPoint
-from calib.pictures.epipolar_sweep import sweep
+from calib.camera.stereo import triangulate_many
+from calib.pictures.epipolar_sweep import Swept, sweep
 from calib.pictures.patch_match import match_patch
 from calib.pictures.patch_verdict import (
     MatchSettings,
@@ -24,10 +24,13 @@ from calib.pictures.patch_verdict import (
     no_match,
     rivalled,
 )
-from calib.pictures.warp import GRAZING, SIDES, Grey, Plane, carry
+from calib.pictures.relief import surface_seen
+from calib.pictures.warp import GRAZING, SIDES, Grey, Plane, Relief, carry
 from calib.rigid import FloatArray, finite_float
 
 LAST_SEARCH_PX = 4.0
+
+AROUND_PX = 3  # the surface is seen as far beyond the patch: another view turns and slants it
 
 MATCHED_BACK_PX = 2.0  # the way back is not refined: half a pixel of the sweep, and slope
 
@@ -41,15 +44,18 @@ class StereoMatch:
     match
         The partner pixel with its verdict; nothing below counts unless it is ``good``.
     plane
-        The local surface: the triangulated point and the slope that the patch's deformation tells.
+        The local surface: a plane that fits what both eyes see near the pixel.
     across_px, across_sigma_px
         Distance of the partner from the epipolar line, signed, and one sigma of the matching alone.
+    relief
+        What stands off the plane around the pixel, and what belongs to no surface there.
     """
 
     match: PatchMatch
     plane: Plane | None = None
     across_px: float = math.nan
     across_sigma_px: float = math.nan
+    relief: Relief | None = None
 
 
 def find_partner(
@@ -83,57 +89,67 @@ def find_partner(
         raise ValueError(f"nearest_m is {nearest_m} where a distance above 0 is expected")
     settings = settings or MatchSettings()
     pixel = np.asarray(pixel_px, dtype=np.float64)
-    swept = sweep(image, camera, pixel, partner_image, partner, nearest_m, settings)
+    # Most of the patch may lie on something nearer or farther than the target: then a smaller one tells.
+    sizes = [settings, *(_smaller(settings, settings.half_px // part) for part in (2, 3))]
+    refused: PatchMatch | None = None
+    for size in sizes:
+        swept = sweep(image, camera, pixel, partner_image, partner, nearest_m, size)
+        surface = _surface(image, camera, pixel, partner_image, partner, swept, settings)
+        if not isinstance(surface, PatchMatch):
+            break
+        refused = refused or surface
+        if surface.verdict in ("border", "flat"):
+            return StereoMatch(refused)
+    else:
+        assert refused is not None
+        return StereoMatch(refused)
+    plane, relief, second = surface
+    found = match_patch(image, camera, pixel, plane, partner_image, partner, LAST_SEARCH_PX, settings, relief)
+    if found.verdict != "good":
+        return StereoMatch(found)
+    across, sigma = _across(camera, pixel, partner, plane, found)
+    apart = math.inf
+    for size in sizes:
+        back = sweep(partner_image, partner, found.pixel_px, image, camera, nearest_m, size)
+        if not isinstance(back, PatchMatch):
+            apart = min(apart, float(np.linalg.norm(back.pixel_px - pixel)))
+        if apart <= MATCHED_BACK_PX + abs(across):
+            return StereoMatch(replace(found, second=max(found.second, second)), plane, across, sigma, relief)
+    told = "nowhere" if math.isinf(apart) else f"{apart:.0f} px from where it came"
+    words = f"matched back from the other eye it lands {told}: probably hidden from one eye"
+    return StereoMatch(no_match("weak", words, found.predicted_px, found.correlation, second))
+
+
+def _surface(
+    image: Grey,
+    camera: CameraModel,
+    pixel: FloatArray,
+    partner_image: Grey,
+    partner: CameraModel,
+    swept: Swept | PatchMatch,
+    settings: MatchSettings,
+) -> tuple[Plane, Relief, float] | PatchMatch:
+    """Return the surface at a sweep's best place and how well the next best fits, or why there is none."""
     if isinstance(swept, PatchMatch):
-        return StereoMatch(swept)
+        return swept
+    facts = (swept.pixel_px, swept.score, swept.second)
     if rivalled(swept.score, swept.second, settings):
         words = (
             f"a second place along the epipolar line fits nearly as well: {swept.second:.2f} "
             f"beside {swept.score:.2f}"
         )
-        return StereoMatch(no_match("ambiguous", words, swept.pixel_px, swept.score, swept.second))
-    found = match_patch(image, camera, pixel, swept.plane, partner_image, partner, LAST_SEARCH_PX, settings)
-    if found.verdict != "good":
-        return StereoMatch(found)
-    try:
-        plane = local_plane(camera, pixel, partner, swept.plane, found)
-    except NoStereoPoint as error:
-        return StereoMatch(no_match("weak", f"the two eyes see no point together: {error}", swept.pixel_px))
-    again = match_patch(image, camera, pixel, plane, partner_image, partner, LAST_SEARCH_PX, settings)
-    if again.verdict == "good":
-        found = again
-        plane = local_plane(camera, pixel, partner, plane, found)
-    across, sigma = _across(camera, pixel, partner, plane, found)
-    back = sweep(partner_image, partner, found.pixel_px, image, camera, nearest_m, settings)
-    apart = math.inf if isinstance(back, PatchMatch) else float(np.linalg.norm(back.pixel_px - pixel))
-    if apart > MATCHED_BACK_PX + abs(across):
-        told = "nowhere" if math.isinf(apart) else f"{apart:.0f} px from where it came"
-        words = f"matched back from the other eye it lands {told}: probably hidden from one eye"
-        return StereoMatch(no_match("weak", words, found.predicted_px, found.correlation, swept.second))
-    return StereoMatch(replace(found, second=max(found.second, swept.second)), plane, across, sigma)
+        return no_match("ambiguous", words, *facts)
+    half = settings.half_px + AROUND_PX
+    seen = surface_seen(image, camera, pixel, partner_image, partner, swept.plane, half, settings.noise_dn)
+    if seen is None:
+        words = "the two eyes see no surface together there: an edge, or hidden from one of them"
+        return no_match("weak", words, *facts)
+    return *seen, swept.second
 
 
-def local_plane(
-    camera: CameraModel, pixel: FloatArray, partner: CameraModel, plane: Plane, found: PatchMatch
-) -> Plane:
-    """Return the surface that two eyes tell: the target triangulated, its slope from the deformation found.
-
-    Parameters
-    ----------
-    pixel
-        (2,) the target in ``camera``.
-    plane
-        The surface over which the searched patch was warped.
-    found
-        What was found in ``partner``.
-
-    Raises
-    ------
-    NoStereoPoint
-        If the two eyes' rays have no point in common.
-    """
-    target = triangulate(camera, partner, pixel, found.pixel_px).position_m
-    return Plane(target, normal_seen(target, camera, partner, plane, found))
+def _smaller(settings: MatchSettings, half_px: int) -> MatchSettings:
+    """The same matching with a smaller patch."""
+    return replace(settings, half_px=half_px, smallest_half_px=half_px)
 
 
 def normal_seen(

@@ -71,6 +71,7 @@ def match_least_squares(
     deforming: bool = True,
     correlated_px: int = 3,
     near_px2: FloatArray | None = None,
+    counts: FloatArray | None = None,
 ) -> LeastSquaresMatch | None:
     """Find where the image shows the template, from a start good to about a pixel.
 
@@ -90,6 +91,8 @@ def match_least_squares(
         Over how many pixels grey differences depend on each other.
     near_px2
         (2, 2) covariance of a Gaussian around the target by which pixels count; all alike if not given.
+    counts
+        (h, w) by how much the template's pixels count, 0 to 1, beside that; all alike if not given.
 
     Returns
     -------
@@ -111,27 +114,33 @@ def match_least_squares(
 
     def settled(fit: _PatchFit, counts: FloatArray, deforms: bool, enough_px: float) -> _PatchFit | None:
         part = _counting(counts)
+        if part is None:
+            return None
         free = slice(None) if deforms else _RIGID
         rates, steps = (one[part][..., free].reshape(-1, 8 if deforms else 4) for one in (jacobian, weights))
         return _settled(fit, surface, q[part], t[part], rates, steps, counts[part], enough_px)
 
     first = _PatchFit(start, np.zeros((2, 2)))
-    if near_px2 is None:
+    if near_px2 is None and counts is None:
         whole = settled(first, np.ones(t.shape), deforming, STEP_ENOUGH_PX)
         return _refined(whole, correlated_px) if whole else None
-    wide = gaussian(q, near_px2)
+    held = np.ones(t.shape) if counts is None else np.asarray(counts, dtype=np.float64)[inner]
+    wide = held if near_px2 is None else held * gaussian(q, near_px2)
     begun = settled(first, wide, False, 0.05)
     # What bends and hides more than the deformation can follow still has a place.
     whole = (settled(begun, wide, deforming, 10 * STEP_ENOUGH_PX) or begun) if begun else None
-    if whole is None or (refined := _refined(whole, correlated_px)) is None:
-        return None
-    middle = settled(whole, gaussian(q, NARROW**2 * near_px2), False, 10 * STEP_ENOUGH_PX)
+    refined = _refined(whole, correlated_px) if whole else None
+    if whole is None or refined is None or near_px2 is None:
+        return refined
+    middle = settled(whole, held * gaussian(q, NARROW**2 * near_px2), False, 10 * STEP_ENOUGH_PX)
     return replace(refined, middle=_refined(middle, correlated_px) if middle else None)
 
 
-def _counting(counts: FloatArray) -> tuple[slice, slice]:
-    """The rows and columns of weights (h, w) that count."""
+def _counting(counts: FloatArray) -> tuple[slice, slice] | None:
+    """The rows and columns of weights (h, w) that count; None if none does."""
     held = counts > LEAST_COUNT
+    if not held.any():
+        return None
     rows, columns = np.flatnonzero(held.any(axis=1)), np.flatnonzero(held.any(axis=0))
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 

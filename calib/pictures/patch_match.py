@@ -21,7 +21,17 @@ from calib.pictures.patch_verdict import (
     texture_lacks,
     worst_px2,
 )
-from calib.pictures.warp import SIDES, Grey, Plane, Template, blurred_to, carry, warp_patch
+from calib.pictures.warp import (
+    SIDES,
+    Grey,
+    Plane,
+    Relief,
+    Template,
+    blurred_to,
+    carry,
+    parallax_px_m,
+    warp_patch,
+)
 from calib.rigid import FloatArray
 
 MOST_ASPECT = 5.0  # of a weight that is round on a surface seen flat
@@ -38,6 +48,7 @@ def match_patch(
     destination: CameraModel,
     search_px: float,
     settings: MatchSettings | None = None,
+    relief: Relief | None = None,
 ) -> PatchMatch:
     """Find the target at ``source_px`` of one picture in another.
 
@@ -53,6 +64,9 @@ def match_patch(
         The scene around the target, in the common frame.
     search_px
         Half side of the window around the predicted place, destination pixels.
+    relief
+        What stands off the plane around the target, if two eyes saw it: it is carried over as it stands, and
+        what is not seen to belong to the surface does not count.
 
     Raises
     ------
@@ -71,12 +85,12 @@ def match_patch(
         -search_px <= seen[0] <= width - 1 + search_px and -search_px <= seen[1] <= height - 1 + search_px
     ):
         return no_match("border", f"the target is expected at {_at(seen)}, outside the picture", seen)
-    cut = _template(source_image, source, target, plane, destination, seen, settings)
+    cut = _template(source_image, source, target, plane, destination, seen, settings, relief)
     if cut is None:
         return no_match("border", f"the patch around {_at(target)} is cut by the picture's border", seen)
     template, near_px2 = cut
     half = int(template.half_px.min())
-    lacking = texture_lacks(template.values, settings)
+    lacking = texture_lacks(template.values, settings, template.counts)
     if lacking:
         return no_match("flat", lacking, seen, half_px=half)
     found = _search(template, destination_image, search_px, settings, near_px2)
@@ -86,7 +100,11 @@ def match_patch(
     if settings.relief > 0:
         explained = found.refined.correlation / expected_correlation(template.values, settings)
         roughness *= 1.0 + max(0.0, 1.0 - explained) / settings.relief
-    surface = _surface_term(source, target, plane, destination, template, near_px2, roughness)
+    if relief is None:
+        surface = _surface_term(source, target, plane, destination, template, near_px2, roughness)
+    else:
+        off = relief.sigma_inverse_m * parallax_px_m(source, target, plane, destination)
+        surface = np.outer(off, off)
     middle = found.refined.middle
     if middle is not None:
         # The middle is noisier, but the target is nearer to its plane.
@@ -140,6 +158,7 @@ def _template(
     destination: CameraModel,
     seen: FloatArray,
     settings: MatchSettings,
+    relief: Relief | None = None,
 ) -> tuple[Template, FloatArray | None] | None:
     """Warp the largest patch that both pictures hold, sized by the coarser of the two; with its weight."""
     around, ok = carry(seen + SIDES, destination, plane, source)
@@ -158,7 +177,7 @@ def _template(
     edge = np.minimum(seen, np.array(destination.size_px) - 1 - seen).astype(int) - 4
     half = np.minimum(half, np.maximum(edge, least))
     while True:
-        template = warp_patch(image, source, target, plane, destination, (int(half[0]), int(half[1])))
+        template = warp_patch(image, source, target, plane, destination, (int(half[0]), int(half[1])), relief)
         if template is not None:
             return template, near_px2
         if (half == least).all():
@@ -198,7 +217,7 @@ def _search(
     cut = np.ascontiguousarray(blurred_to(cut, template.magnification))
     inner = low - cut_low
     searched = cut[inner[1] : inner[1] + high[1] - low[1] + 1, inner[0] : inner[0] + high[0] - low[0] + 1]
-    scores = cv2.matchTemplate(searched, template.values, cv2.TM_CCOEFF_NORMED).astype(np.float32)
+    scores = correlations(searched, template.values, template.counts)
     (x, y), best, second, _ = peaks(
         scores, max(settings.apart_px, round(settings.apart_px * template.magnification))
     )
@@ -224,6 +243,7 @@ def _search(
         start,
         correlated_px=correlated_px(template.magnification),
         near_px2=near_px2,
+        counts=template.counts,
     )
     if refined is None or float(np.abs(refined.pixel_px - start).max()) > 2.0 * max(
         1.0, template.magnification
@@ -232,6 +252,25 @@ def _search(
         return no_match("weak", words, template.target_px, *facts)
     middle = refined.middle and replace(refined.middle, pixel_px=refined.middle.pixel_px + cut_low)
     return PatchFound(replace(refined, pixel_px=refined.pixel_px + cut_low, middle=middle), best, second)
+
+
+def correlations(image: Grey, patch: Grey, counts: FloatArray | None) -> NDArray[np.float32]:
+    """Return the correlations of a patch with all places of an image, its pixels weighted by ``counts``.
+
+    Not OpenCV's own mask, with which it may return what is no number.
+    """
+    if counts is None:
+        return np.asarray(cv2.matchTemplate(image, patch, cv2.TM_CCOEFF_NORMED), dtype=np.float32)
+    weights = counts.astype(np.float32)
+    total, shifted = max(float(weights.sum()), 1e-6), image - image.mean()
+    weighted = weights * (patch - np.float32((weights * patch).sum() / total))
+
+    def summed(one: Grey, by: Grey) -> FloatArray:
+        return cv2.matchTemplate(one, by, cv2.TM_CCORR).astype(np.float64)
+
+    spread = summed(shifted * shifted, weights) - summed(shifted, weights) ** 2 / total
+    length = np.sqrt(np.maximum(spread * float((weighted * patch).sum()), 1e-3))
+    return np.asarray(summed(shifted, weighted) / length, dtype=np.float32)
 
 
 def peaks(

@@ -25,6 +25,7 @@ SIDES = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])  # left, ri
 GRAZING = 0.03  # sine of the flattest view of a plane that is still believed (1.7 degrees)
 KNOTS = np.array([-1.0, -1 / 3, 1 / 3, 1.0])  # across a patch, in units of its half side
 MOST_SAMPLES = 8  # per axis and destination pixel; shrinking further than 8 times is not asked of this module
+LIFT_STEPS = 3  # a relief changes slowly against the pixels it shifts
 SPLINE_MARGIN_PX = 12  # a cubic spline's memory of its border is below 1e-6 after 11 samples
 
 
@@ -131,17 +132,80 @@ class Template:
         (2,) where the plane's geometry puts the target in the destination; within half a pixel of the centre.
     magnification
         Destination pixels per source pixel: above 1 the template is blurred against the destination.
+    counts
+        (h, w) by how much each pixel counts, 0 to 1; None if all do alike.
     """
 
     values: Grey
     centre_px: NDArray[np.intp]
     target_px: FloatArray
     magnification: float
+    counts: FloatArray | None = None
 
     @property
     def half_px(self) -> NDArray[np.intp]:
         """(2,), whole pixels from the middle to the right and to the lower side."""
         return np.array(self.values.shape[::-1]) // 2
+
+
+@dataclass(frozen=True, eq=False)
+class Relief:
+    """What of a patch stands off its plane, and what of it is no part of the surface there.
+
+    Attributes
+    ----------
+    pixel_px
+        (2,) the pixel of a camera that the patch surrounds.
+    inverse_m
+        (n, n) float32, n odd: by how much the inverse range of each of the camera's pixels there is larger
+        than the plane's, 1/m.
+    counts
+        (n, n) float32, 1 for pixels that belong to the surface, 0 for others.
+    sigma_inverse_m
+        One sigma of ``inverse_m`` at ``pixel_px``, 1/m.
+    """
+
+    pixel_px: FloatArray
+    inverse_m: Grey
+    counts: Grey
+    sigma_inverse_m: float
+
+    @property
+    def half_px(self) -> int:
+        """Pixels from the middle to the border."""
+        return len(self.counts) // 2
+
+    def at(self, pixels_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return ``inverse_m`` and ``counts`` (h, w) at pixels (h, w, 2); beyond the patch 0 and 1."""
+        x, y = np.moveaxis((pixels_px - self.pixel_px + self.half_px).astype(np.float32), -1, 0)
+        inverse, counts = (
+            cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=beyond)
+            for values, beyond in ((self.inverse_m, 0.0), (self.counts, 1.0))
+        )
+        return inverse.astype(np.float64), counts.astype(np.float64)
+
+    def seen_by(self, camera: CameraModel, pixel_px: FloatArray, plane: Plane, own: CameraModel) -> Relief:
+        """Return the same around the target's pixel (2,) of a camera that stands nearly where ``own`` did."""
+        places, valid = carry(pixel_px + square_grid(self.half_px), camera, plane, own)
+        inverse, counts = self.at(np.where(valid[..., None], places, -1e6))
+        return Relief(pixel_px, inverse.astype(np.float32), counts.astype(np.float32), self.sigma_inverse_m)
+
+
+def parallax_px_m(camera: CameraModel, pixel_px: FloatArray, plane: Plane, other: CameraModel) -> FloatArray:
+    """Return by how much (2,) px another camera sees a pixel's point elsewhere for each 1/m of inverse range.
+
+    Parameters
+    ----------
+    pixel_px
+        (2,) of ``camera``.
+    plane
+        Where the pixel's ray meets it the point is.
+    """
+    ray = camera.ray(pixel_px)
+    inverse_m = float(ray.directions @ plane.normal) / float((plane.point_m - ray.origins_m) @ plane.normal)
+    step = 1e-3 * inverse_m
+    ends, _ = other.project(ray.origins_m + ray.directions / (inverse_m + np.array([[-step], [step]])))
+    return np.asarray((ends[1] - ends[0]) / (2.0 * step))
 
 
 def warp_patch(
@@ -151,6 +215,7 @@ def warp_patch(
     plane: Plane,
     destination: CameraModel,
     half_px: int | tuple[int, int],
+    relief: Relief | None = None,
 ) -> Template | None:
     """Warp the source's patch around ``source_px`` (2,) over the plane into the destination's pixel grid.
 
@@ -161,6 +226,8 @@ def warp_patch(
     ----------
     half_px
         Half of the patch's side, or of its sides in x and y, destination pixels.
+    relief
+        Of the source camera around ``source_px``, beside the plane; a plane if not given.
 
     Returns
     -------
@@ -172,6 +239,9 @@ def warp_patch(
         return None
     half = (half_px, half_px) if isinstance(half_px, int) else half_px
     centre = np.rint(target).astype(np.intp)
+    parallax = np.zeros(2) if relief is None else parallax_px_m(source, relief.pixel_px, plane, destination)
+    if relief is not None:
+        target = target + parallax * float(relief.inverse_m[relief.half_px, relief.half_px])
     reach = np.array(half) + 0.5  # to the outer pixels' far sides
     knots, ok = carry(
         centre + reach * np.stack(np.meshgrid(KNOTS, KNOTS), axis=-1), destination, plane, source
@@ -183,12 +253,27 @@ def warp_patch(
     many, tall = (int(n) for n in np.clip(np.ceil(steps - 0.25), 1, MOST_SAMPLES))
     columns, rows = _cubic(half[0], many), _cubic(half[1], tall)
     maps = np.stack([rows @ knots[..., axis] @ columns.T for axis in (0, 1)], axis=-1)
+    span = np.stack([(knots[:, -1] - knots[:, 0]).mean(axis=0), (knots[-1] - knots[0]).mean(axis=0)], axis=-1)
+    counts = None
+    if relief is not None:
+        maps, counts = _lifted(maps, relief, span / (2.0 * reach) @ parallax)
+        counts = counts.reshape(2 * half[1] + 1, tall, 2 * half[0] + 1, many).mean(axis=(1, 3))
     values = sample(source_image, maps)
     if many > 1 or tall > 1:
         values = values.reshape(2 * half[1] + 1, tall, 2 * half[0] + 1, many).mean(axis=(1, 3))
-    span = np.stack([(knots[:, -1] - knots[:, 0]).mean(axis=0), (knots[-1] - knots[0]).mean(axis=0)], axis=-1)
     shrink = float(np.sqrt(max(abs(np.linalg.det(span / (2.0 * reach))), 1e-6)))
-    return Template(values.astype(np.float32), centre, target, 1.0 / shrink)
+    return Template(values.astype(np.float32), centre, target, 1.0 / shrink, counts)
+
+
+def _lifted(maps: FloatArray, relief: Relief, shift_px_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the source pixels (h, w, 2) that a relief puts where the plane puts ``maps``, and their counts.
+
+    Source pixels that stand off the plane by 1/m are seen ``shift_px_m`` (2,) source pixels elsewhere.
+    """
+    places = maps
+    for _ in range(LIFT_STEPS):
+        places = maps - relief.at(places)[0][..., None] * shift_px_m
+    return places, relief.at(places)[1]
 
 
 @cache

@@ -17,7 +17,7 @@ from calib.pictures.epipolar import StereoMatch, find_partner
 from calib.pictures.epipolar_sweep import UP
 from calib.pictures.patch_match import match_patch
 from calib.pictures.patch_verdict import MatchSettings, PatchMatch
-from calib.pictures.warp import Grey, Plane, carry, facing_plane, grey
+from calib.pictures.warp import Grey, Plane, Relief, carry, facing_plane, grey
 from calib.rigid import FloatArray
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
@@ -47,13 +47,15 @@ class View:
 class Clicked:
     """The thing that was clicked: where in which view, and the surface around it in the rover frame.
 
-    ``others``: where else that may be, if its range is not known.
+    ``relief``: what stands off that plane, if two eyes saw it. ``others``: where else the surface may be, if
+    its range is not known.
     """
 
     view: View
     pixel_px: FloatArray
     plane: Plane
     others: tuple[Plane, ...] = ()
+    relief: Relief | None = None
 
 
 class Eyes:
@@ -164,12 +166,9 @@ class Eyes:
             ``target_...`` if the match is not good, ``eyes_disagree`` if it lies off the line.
         """
         settings = self._settings
-        for sizes in self._sizes():
-            found = find_partner(
-                view.image, view.camera, pixel_px, other.image, other.camera, settings.nearest_m, sizes
-            )
-            if found.match.verdict != "weak":
-                break
+        found = find_partner(
+            view.image, view.camera, pixel_px, other.image, other.camera, settings.nearest_m, settings.match
+        )
         _good(found.match, other)
         if abs(found.across_px) > settings.eyes_px + 5.0 * found.across_sigma_px:
             raise PointingError(
@@ -199,6 +198,7 @@ class Eyes:
                     match_patch(
                         clicked.view.image, clicked.view.camera, clicked.pixel_px, plane,
                         now.image, now.camera, search, sizes,
+                        clicked.relief if plane is clicked.plane else None,
                     )
                 )  # fmt: skip
                 if found[-1].verdict == "good":

@@ -292,8 +292,10 @@ class _Run:
     def _see(self, target: PixelTarget) -> Clicked:
         """From the clicked pixel to a position in the rover frame."""
         found, partnered = self._seen(target)
-        assert partnered.plane is not None
-        return Clicked(found.view, found.clicked_px, partnered.plane)
+        plane, relief = partnered.plane, partnered.relief
+        assert plane is not None and relief is not None
+        relief = relief.seen_by(found.view.camera, found.clicked_px, plane, found.now.camera)
+        return Clicked(found.view, found.clicked_px, plane, relief=relief)
 
     def _seen(self, target: PixelTarget) -> tuple[FoundAgain, StereoMatch]:
         """Find the clicked thing in a fresh pair, and its position."""

@@ -65,10 +65,10 @@ class PointingSettings:
     view
         What may lie between the view that joints tell and the one that a picture shows.
     match, small_half_px
-        Of the matching itself, whose sigmas allow for rough ground and rocks seen by the other eye
-        (``roughness``, ``relief``: they decide sigmas only, no place and no verdict;
-        `tools.campaigns.match_sigma`); and the half patch that is tried where the usual one fits nowhere,
-        because part of it lies on something nearer or farther.
+        Of the matching itself; and the half patch that is tried after a move where the usual one fits
+        nowhere. ``roughness`` and ``relief`` decide sigmas only, and only where no second eye saw the
+        surface. A second place may fit a little better than elsewhere, as along a rock's smooth edge: the
+        prediction and the other eye must confirm the best.
     """
 
     poll_s: float = 0.02
@@ -94,4 +94,6 @@ class PointingSettings:
     triangulation_sigma_px: float = 0.2
     small_half_px: int = 12
     view: ViewLimits = field(default_factory=ViewLimits)
-    match: MatchSettings = field(default_factory=partial(MatchSettings, roughness=0.02, relief=0.01))
+    match: MatchSettings = field(
+        default_factory=partial(MatchSettings, roughness=0.02, relief=0.01, least_lead=0.03)
+    )

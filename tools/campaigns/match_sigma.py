@@ -3,7 +3,7 @@
 The simulated rover's Navcams look at ground and rocks; a pixel is matched as the loop does it: in the other
 eye, and, with the surface found so, in pictures after a turn of the head. Truth is geometry: the pixel's ray
 meets the scene (`Scene.cast`), and the point is projected into the other picture. Targets that the other
-picture does not show are left out. Rows: the matcher's own settings, the loop's, the tracker's. Errors are
+picture does not show are left out. Rows: the loop's settings, the tracker's. Errors are
 found minus true, px along x (where ranges show in the other eye) and y; a true sigma has error/sigma 1.
 
     .venv/bin/python -m tools.campaigns.match_sigma [--views 4] [--relief 0.15 0.5] [--seeds 3] [--json]
@@ -23,7 +23,7 @@ import numpy as np
 from calib.camera.cahvor import CameraModel
 from calib.files.mast_file import load_rig
 from calib.mast.rig import Rig
-from calib.pictures.patch_verdict import MatchSettings, PatchMatch
+from calib.pictures.patch_verdict import PatchMatch
 from calib.pictures.warp import grey
 from calib.rigid import FloatArray
 from calib.tracking.track import SIZES
@@ -47,7 +47,6 @@ HIDDEN = 0.01
 """A point is hidden from an eye whose ray ends earlier by more than this part of the way."""
 
 SETTINGS = {
-    "the matcher's own": MatchSettings(),
     "the loop's": PointingSettings().match,
     "the tracker's": SIZES,
 }
@@ -168,7 +167,9 @@ def matched(
         return None, None
     assert stereo.plane is not None
     try:
-        return stereo.match, eyes.look_for(Clicked(view, pixel, stereo.plane), second.views[LEFT])
+        return stereo.match, eyes.look_for(
+            Clicked(view, pixel, stereo.plane, relief=stereo.relief), second.views[LEFT]
+        )
     except PointingError:
         return stereo.match, None
 

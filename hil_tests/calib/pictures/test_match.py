@@ -13,7 +13,13 @@ from calib.pictures.least_squares_matching import LeastSquaresMatch
 from calib.pictures.patch_match import match_patch
 from calib.pictures.patch_verdict import MatchSettings, PatchFound, PatchMatch, judged, texture_lacks
 from calib.pictures.warp import Plane, Template, carry, facing_plane, grey
-from hil_tests.calib.pictures.textured_planes import Pinhole, TexturedPlane, picture, random_texture
+from hil_tests.calib.pictures.textured_planes import (
+    Edge,
+    Pinhole,
+    TexturedPlane,
+    picture,
+    random_texture,
+)
 
 FOCAL_PX = 1290.0  # the paper's Navcam
 SIZE_PX = (360, 280)
@@ -349,3 +355,44 @@ def test_what_lies_far_from_the_target_does_not_pull_it() -> None:
         off[near_px] = float(np.linalg.norm(found.pixel_px - there))
     assert off[0.0] > 0.6
     assert off[6.0] < 0.15
+
+
+TILTED = Pinhole(np.array([0.0, 0.0, 0.02]), 0.0, 0.04, FOCAL_PX, SIZE_PX)
+"""As a head's camera after a tilt: 6 cm ahead of the axis, it has moved by 2 cm."""
+
+
+def step(seed: int) -> Edge:
+    """A face 4 m away that ends where the left eye has pixel x = 180, and ground 0.5 m behind it."""
+    behind = TexturedPlane(
+        np.array([4.5, 0.0, 0.0]), np.array([-1.0, 0.0, -0.5]), random_texture(seed + 50, 8.0), 0.0012
+    )
+    face = TexturedPlane(
+        np.array([4.0, 0.0, 0.0]), np.array([-1.0, 0.1, 0.1]), random_texture(seed, 8.0), 0.0012
+    )
+    return Edge(face, behind, 0.0)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_lies_behind_an_edge_does_not_pull_a_place_beside_it(seed: int) -> None:
+    """The patch of 41 px shows face and ground; after a tilt the ground has shifted by 0.7 px against it."""
+    scene = step(seed)
+    left, right, tilted = (
+        picture(camera, scene, 2, NOISE_DN, seed + k) for k, camera in enumerate((LEFT, RIGHT, TILTED))
+    )
+    rng = np.random.default_rng(seed)
+    matches = []
+    for pixel in np.column_stack([rng.uniform(150, 176, 16), rng.uniform(60, 180, 16)]):
+        point = scene.hit(LEFT.position_m, LEFT.rays(pixel))
+        stereo = find_partner(left, LEFT.model, pixel, right, RIGHT.model)
+        assert stereo.match.verdict == "good", stereo.match.reason
+        assert stereo.plane is not None
+        assert abs(stereo.match.pixel_px[0] - RIGHT.pixel(point)[0]) < 1.0
+        found = match_patch(
+            left, LEFT.model, pixel, stereo.plane, tilted, TILTED.model, 20, relief=stereo.relief
+        )
+        assert found.verdict == "good", found.reason
+        matches.append((found, TILTED.pixel(point)))
+    errors, normalised = errors_of(matches)
+    assert np.sqrt((errors**2).mean()) < 0.03
+    assert np.sqrt((normalised**2).mean()) < 1.4
+    assert np.abs(normalised).max() < 4.0

@@ -91,6 +91,24 @@ class TexturedPlane:
         return ndimage.map_coordinates(self.grey, np.moveaxis(places, -1, 0), order=1, mode="grid-wrap")
 
 
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """One plane up to a vertical edge at ``edge_y_m``, and to the right of it what lies behind."""
+
+    near: TexturedPlane
+    far: TexturedPlane
+    edge_y_m: float
+
+    def hit(self, origin_m: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        near = self.near.hit(origin_m, directions)
+        behind = near[..., 1:2] > self.edge_y_m
+        return np.where(behind, self.far.hit(origin_m, directions), near)
+
+    def look(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        off_m = (points_m - self.near.point_m) @ self.near.normal
+        return np.where(np.abs(off_m) < 1e-6, self.near.look(points_m), self.far.look(points_m))
+
+
 def random_texture(
     seed: int, shortest_texels: float = 10.0, size: int = 1024, contrast_dn: float = 25.0
 ) -> NDArray[np.float64]:
@@ -104,7 +122,7 @@ def random_texture(
 
 
 def picture(
-    camera: Pinhole, plane: TexturedPlane, samples: int = 3, noise_dn: float = 0.0, seed: int = 0
+    camera: Pinhole, plane: TexturedPlane | Edge, samples: int = 3, noise_dn: float = 0.0, seed: int = 0
 ) -> NDArray[np.float32]:
     """The plane as the camera sees it: the mean of ``samples``² exact rays a pixel, noise, no rounding."""
     width, height = camera.size_px

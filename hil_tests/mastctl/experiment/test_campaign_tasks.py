@@ -21,6 +21,7 @@ from tools.campaigns import (
     pointing,
     refine,
     render_bias,
+    residuals,
     stop,
 )
 from tools.campaigns.motion import Tally, together
@@ -65,6 +66,7 @@ def test_a_campaign_tells_the_same_of_one_process_two_and_its_tasks_one_by_one(
         (life, [], 5),
         (life_of_light, [], 9),
         (keep_out, ["--cases", "7"], 7),
+        (residuals, ["--cases", "12"], 2 * 2 * 2),
         (match_sigma, ["--views", "2", "--seeds", "2", "--relief", "0", "0.3", "0.6"], 2 * 2 * 3),
     ],
 )

@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 from calib.mast.rig import Mast, Rig, RigCamera
 from drivers.clock import ManualClock
 from drivers.interfaces import Reading
-from hil_tests.calib.pictures.textured_planes import Pinhole, TexturedPlane, picture, random_texture
+from hil_tests.calib.pictures.textured_planes import (
+    Edge,
+    Pinhole,
+    TexturedPlane,
+    picture,
+    random_texture,
+)
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.keep_out import Pair
@@ -77,9 +83,20 @@ def ground() -> TexturedPlane:
 
 
 @cache
-def clean(name: str, pan_rad: float, tilt_rad: float) -> NDArray[np.float32]:
+def rock() -> Edge:
+    """A face across the way, 2 m ahead of the mast, that ends straight ahead; the ground beside it."""
+    face = TexturedPlane(
+        np.array([2.34, 0.0, 0.0]), np.array([-1.0, 0.0, 0.0]), random_texture(12, 8.0, 1024, 30.0), 0.0012
+    )
+    return Edge(face, ground(), 0.0)
+
+
+@cache
+def clean(
+    name: str, pan_rad: float, tilt_rad: float, scene: Callable[[], TexturedPlane | Edge] = ground
+) -> NDArray[np.float32]:
     """The picture without noise; kept, because many tests begin at the same place."""
-    return picture(true_camera(name, pan_rad, tilt_rad), ground(), samples=2)
+    return picture(true_camera(name, pan_rad, tilt_rad), scene(), samples=2)
 
 
 @dataclass
@@ -104,6 +121,7 @@ class World:
     moves: list[tuple[float, float]] = field(default_factory=list)
     stops: int = 0
     digest: str = "0" * 64
+    scene: Callable[[], TexturedPlane | Edge] = ground
 
     def __post_init__(self) -> None:
         self._from = self._to = (0.0, -0.45)
@@ -179,7 +197,7 @@ class World:
 
     def true_point(self, frame: StampedFrame, x_px: float, y_px: float) -> NDArray[np.float64]:
         camera = true_camera(frame.camera, *self.true_joints(frame.mid_exposure_s))
-        return ground().hit(camera.position_m, camera.rays(np.array([x_px, y_px])))
+        return self.scene().hit(camera.position_m, camera.rays(np.array([x_px, y_px])))
 
     def true_pixel(self, frame_id: str, point_m: NDArray[np.float64]) -> NDArray[np.float64]:
         frame = self._frames[frame_id]
@@ -193,7 +211,7 @@ class World:
         (pan, tilt), moving = self.joints(now_s)
         noise = np.random.default_rng(self._count).normal(scale=NOISE_DN, size=SIZE_PX[::-1])
         seen_from = self.view(name, now_s, self.true_joints(now_s))
-        shown = np.clip(np.rint(clean(name, *seen_from) + noise), 0, 255).astype(np.uint8)
+        shown = np.clip(np.rint(clean(name, *seen_from, self.scene) + noise), 0, 255).astype(np.uint8)
         shown = self.image(name, self._count, shown)
         frame_id = f"{name}-{self._count:06d}"
         self._truth[frame_id] = self.true_joints(now_s)

@@ -21,10 +21,7 @@ def rows_on(relief_m: float) -> Rows:
     return together([run_look(Look(rig, relief_m, seed, 0, TARGETS)) for seed in SEEDS])
 
 
-def test_the_loops_matches_tell_on_rough_ground_what_they_are_off_by_and_lie_where_they_did() -> None:
-    rows = rows_on(0.5)
-    plain, loop = rows["the matcher's own", "other eye"], rows["the loop's", "other eye"]
-    assert len(loop.error_px) > TARGETS
-    np.testing.assert_array_equal(loop.error_px, plain.error_px)
-    assert of_sigma(plain) > 2.0, "where nothing is wrong nothing is shown"
-    assert 0.4 < of_sigma(loop) < 2.0
+def test_the_loops_matches_on_rough_ground_are_off_by_what_they_tell() -> None:
+    found = rows_on(0.5)["the loop's", "other eye"]
+    assert len(found.error_px) > TARGETS
+    assert 0.4 < of_sigma(found) < 2.0

@@ -10,8 +10,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.pictures.patch_verdict import MatchSettings
-from hil_tests.mastctl.pointing.pointing_world import LIMITS, SIZE_PX, World, click, rig, run
+from hil_tests.mastctl.pointing.pointing_world import (
+    LIMITS,
+    SIZE_PX,
+    World,
+    click,
+    rig,
+    rock,
+    run,
+    true_camera,
+)
 from mastctl.as_json import as_json
 from mastctl.pointing.loop import (
     Aim,
@@ -57,23 +65,37 @@ def test_a_clicked_pixel_lands_on_the_aim_and_the_residual_is_the_true_one(
 
 
 def test_a_position_is_told_as_sure_as_the_pixels_and_the_match_it_comes_from() -> None:
-    """Of range, by hand: the disparity's sigma (two pixels of 0.2 px, and the match) times r² / (f b)."""
-    told_m = {}
-    for roughness in (0.0, 0.3):
+    """Of range, by hand: the disparity's sigma (two pixels, and the match) times r² / (f b)."""
+    for pixel_sigma_px in (0.2, 0.02):
         world = World()
         frame = world.shoot()
-        settings = PointingSettings(match=MatchSettings(roughness=roughness))
+        settings = PointingSettings(triangulation_sigma_px=pixel_sigma_px)
         steps: list[Step] = []
         loop = PointingLoop(rig(), world, LIMITS, world.clock, settings)
         loop.run(click(frame, 150.0, 120.0), steps.append, threading.Event())
         stereo, place = (
             next(s.detail for s in steps if s.name == name) for name in ("stereo", "triangulate")
         )
-        disparity_px = np.sqrt(2 * 0.2**2 + max(stereo["sigma_px"]) ** 2)
+        match_px = max(stereo["sigma_px"])
+        assert match_px > 0.04, "where the match adds nothing, nothing is shown"
+        disparity_px = np.sqrt(2 * pixel_sigma_px**2 + match_px**2)
         expected_m = disparity_px * place["range_m"] ** 2 / (645.0 * 0.2)
-        told_m[roughness] = np.linalg.norm(place["sigma_m"])
-        assert told_m[roughness] == pytest.approx(expected_m, rel=0.05)
-    assert told_m[0.3] > 2.0 * told_m[0.0]
+        assert np.linalg.norm(place["sigma_m"]) == pytest.approx(expected_m, rel=0.05)
+
+
+@pytest.mark.parametrize("from_edge_px", [-6.0, -10.0])
+def test_the_ground_behind_a_rocks_edge_does_not_pull_the_residual(from_edge_px: float) -> None:
+    """Cameras stand 6 cm ahead of the tilt axis: a tilt of 0.1 rad shifts the ground by half a pixel."""
+    world = World(scene=rock)
+    frame = world.shoot()
+    edge = true_camera("navcam_left", *world.true_joints(0.0)).pixel(np.array([2.34, 0.0, -0.2]))
+    pixel = float(edge[0] + from_edge_px), 190.0
+    point = world.true_point(frame, *pixel)
+    result, _ = run(world, click(frame, *pixel))
+    (pointing,) = result.pointings
+    off = np.array(pointing.residual_px) - true_residual_px(world, pointing.frame_id, point, MIDDLE_PX)
+    assert np.abs(off).max() < 0.04
+    assert (np.abs(off) < 3.0 * np.array(pointing.residual_sigma_px)).all()
 
 
 def test_a_wrong_mast_file_shows_as_a_residual_and_not_as_nothing() -> None:

@@ -1,0 +1,318 @@
+"""How true the residuals are that the daemon tells, of clicks at random pixels of rocks and of ground.
+
+    .venv/bin/python -m tools.campaigns.residuals [--cases 200] [--seed 1] [--day kind worst] [--json]
+
+The packaged rover in scenes drawn anew, through a daemon. A case turns the head to a random view, clicks a
+random pixel of the left Navcam that shows a rock (or ground) 2 to 10 m away, and points once. No texture is
+asked for and nothing is left out. Truth is the simulator's geometry: the clicked pixel's ray meets the scene,
+and the point is projected into the new picture. Told are the cases, those refused, in percent, and how many
+of these the other eye cannot see; z, which is the measured minus the true residual over the told sigma, of
+both axes together (rms, of x and y, the worst); what is beyond three sigmas, percent of targets; the error in
+px; medians of sigma.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.camera.cahvor import CameraModel
+from calib.rigid import FloatArray
+from drivers.sim.rover import SimulatedRover
+from drivers.simulation_clock import MAX
+from mastctl.cli.output import at_least
+from mastctl.cli.tasks import add_task_options, results_of
+from mastctl.client import Client, ClientError, Snapshot
+from mastctl.config import Config, load_config
+from mastctl.daemon import RunningDaemon
+from mastctl.devices.frames import camera_and_sequence
+from mastctl.experiment.demo import own_config
+from mastctl.experiment.targets import BORDER_PX
+from mastctl.experiment.views import pointed
+from mastctl.packaged import config_folder
+from tools.arguments import end
+
+DAYS = {"kind": "default.yaml", "worst": "worst_day.yaml", "still": "worst_day.yaml"}
+RINGING = ("ring_hz", "ring_damping", "settle_s")
+"""Of the head's options, which the still day is without."""
+GROUPS = ("rocks", "ground")
+LEFT, RIGHT = "navcam_left", "navcam_right"
+NEAR_M, FAR_M = 2.0, 10.0
+PAN_RAD = 1.3
+EYE_HEIGHT_M = 1.46
+STEP_PX = 4
+"""Of which pixels the scene is asked whether they show a rock."""
+ABOVE_M = 0.005
+"""What stands this much over the ground is a rock."""
+HIDDEN = 0.01
+"""A point is hidden from an eye whose ray ends earlier by more than this part of the way."""
+MOMENTS = 8
+"""Of an exposure, at which the truth is asked where the head stood."""
+HEADING = (
+    "| day | on | cases | refused, % | of these hidden | z rms | of x, y | worst | beyond 3, % "
+    "| error rms, px | worst | sigma, px |"
+)
+A_TASK = 10
+VIEWS = 40
+
+
+@dataclass(frozen=True)
+class Task:
+    """So many clicks of one group, in one scene of its own."""
+
+    day: str
+    group: str
+    seed: int
+    number: int
+    cases: int
+
+
+@dataclass(frozen=True)
+class Click:
+    """One click: how far away, what was refused, or the error and the sigma (x, y) in px.
+
+    Attributes
+    ----------
+    view_rad
+        Pan and tilt of the view that was clicked in.
+    hidden
+        Whether the other eye cannot see what was clicked.
+    refused
+        Code and sentence; empty for a residual.
+    """
+
+    view_rad: tuple[float, float]
+    pixel_px: tuple[float, float]
+    range_m: float
+    hidden: bool
+    refused: str
+    error_px: tuple[float, float] | None = None
+    sigma_px: tuple[float, float] | None = None
+
+
+def config_of(day: str, scene_seed: int) -> Config:
+    """The packaged rover with its Navcams on such a day, in a scene of its own."""
+    config = own_config(load_config(config_folder() / DAYS[day]), head=None, wire=None, speed=MAX)
+    simulation = {**config.hardware.simulation, "seed": scene_seed}
+    if day == "still":
+        head = simulation["head"].items()
+        simulation["head"] = {key: value for key, value in head if key not in RINGING}
+    cameras = {name: config.hardware.cameras[name] for name in (LEFT, RIGHT)}
+    return replace(config, hardware=replace(config.hardware, simulation=simulation, cameras=cameras))
+
+
+def click_all(task: Task) -> list[Click]:
+    """Click in random views of a scene of the task's own."""
+    scene_seed = int(np.random.default_rng([task.seed, task.number, 1]).integers(1, 2**31))
+    rng = np.random.default_rng([task.seed, task.number, GROUPS.index(task.group), 2])
+    with (
+        RunningDaemon(config_of(task.day, scene_seed)) as daemon,
+        Client(daemon.url, timeout_s=120.0) as client,
+    ):
+        rover = daemon.hardware.simulation
+        assert rover is not None
+        return [click(client, rover, task.group, rng) for _ in range(task.cases)]
+
+
+def click(client: Client, rover: SimulatedRover, group: str, rng: np.random.Generator) -> Click:
+    """Click a random pixel of the group in a random view, and hold the residual against the truth."""
+    shot, pixel = random_click(client, rover, group, rng)
+    seen_by = camera_of(rover, shot, pixel[1])
+    point = hit(rover, seen_by, np.array([pixel]))[0]
+    truth = rover.frame_truth(*camera_and_sequence(shot.frame_id))
+    other = rover.rig.camera_in_rover(RIGHT, truth.pan_rad, truth.tilt_rad)
+    about: dict[str, Any] = {
+        "view_rad": (shot.pan_rad, shot.tilt_rad),
+        "pixel_px": pixel,
+        "range_m": float(np.linalg.norm(point - seen_by.C)),
+        "hidden": not shown(rover, other, point),
+    }
+    try:
+        record = pointed(client, pixel=(LEFT, shot.frame_id, *pixel))
+    except ClientError as error:
+        return Click(**about, refused=f"{error.code}: {error}")
+    if record["state"] != "done":
+        told = record["error"] or {"code": record["state"], "message": ""}
+        return Click(**about, refused=f"{told['code']}: {told['message']}")
+    (row,) = record["pointings"]
+    measured = np.array(row["target_px"])
+    landed = client.snapshot(LEFT, frame_id=row["frame_id"])
+    true, _ = camera_of(rover, landed, float(measured[1])).project(point)
+    error_px, sigma_px = measured - true, row["residual_sigma_px"]
+    return Click(**about, refused="", error_px=tuple(error_px.tolist()), sigma_px=tuple(sigma_px))
+
+
+def camera_of(rover: SimulatedRover, shot: Snapshot, row_px: float) -> CameraModel:
+    """The true camera of a picture in the rover frame, the mean over the exposure of one of its rows.
+
+    Of a rolling shutter each row has a time of its own, and the mast may ring.
+    """
+    truth = rover.frame_truth(*camera_and_sequence(shot.frame_id))
+    row_s = (row_px - (truth.camera_in_rover.size_px[1] - 1) / 2) * rover.settings.camera.row_time_s
+    parts = ((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5) * shot.exposure_s
+    joints = np.mean([rover.true_joints(truth.mid_exposure_s + row_s + part) for part in parts], axis=0)
+    pose, then = (
+        rover.rig.mast.rover_from_head(*angles) for angles in (joints, (truth.pan_rad, truth.tilt_rad))
+    )
+    return truth.camera_in_rover.moved(pose @ then.inverse)
+
+
+def random_click(
+    client: Client, rover: SimulatedRover, group: str, rng: np.random.Generator
+) -> tuple[Snapshot, tuple[float, float]]:
+    """A picture of a random view with something of the group in it, and a random pixel of that."""
+    model = rover.rig.cameras[LEFT].model
+    axes = (np.arange(BORDER_PX, side - BORDER_PX, STEP_PX, dtype=float) for side in model.size_px)
+    pixels = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    for _ in range(VIEWS):
+        pan = float(rng.uniform(-PAN_RAD, PAN_RAD))
+        tilt = -math.atan2(EYE_HEIGHT_M, math.exp(rng.uniform(math.log(NEAR_M), math.log(FAR_M))))
+        seen = pixels[of_group(rover, rover.rig.camera_in_rover(LEFT, pan, tilt), pixels, group)]
+        if not len(seen):
+            continue
+        pixel = np.round(seen[rng.integers(len(seen))] + rng.uniform(-0.5, 0.5, 2) * STEP_PX, 1)
+        pointed(client, pan_rad=pan, tilt_rad=tilt)
+        shot = client.snapshot(LEFT)
+        camera = camera_of(rover, shot, float(pixel[1]))
+        if of_group(rover, camera, pixel[None], group)[0]:  # where the head truly stands
+            return shot, (float(pixel[0]), float(pixel[1]))
+    raise RuntimeError(f"no view of {VIEWS} has {group} {NEAR_M:g} to {FAR_M:g} m away")
+
+
+def of_group(rover: SimulatedRover, camera: CameraModel, pixels: FloatArray, group: str) -> NDArray[np.bool_]:
+    """Which pixels (n, 2) of a camera in the rover frame show a rock (or ground) in range."""
+    points = hit(rover, camera, pixels)
+    ranges_m = np.linalg.norm(points - camera.C, axis=1)
+    inside = (ranges_m >= NEAR_M) & (ranges_m <= FAR_M)
+    points = rover.site_from_rover.points(points[inside])
+    ground_z = np.array([rover.scene.ground_z_m(x, y) for x, y in points[:, :2]])
+    rock = points[:, 2] < ground_z - ABOVE_M
+    inside[inside] = rock if group == "rocks" else ~rock
+    return np.asarray(inside)
+
+
+def hit(rover: SimulatedRover, camera: CameraModel, pixels: FloatArray) -> FloatArray:
+    """Where the rays of a camera's pixels (n, 2) meet the scene, (n, 3) in the rover frame; nan for sky."""
+    rays, site = camera.ray(pixels), rover.site_from_rover
+    ranges_m = rover.scene.cast(site.points(rays.origins_m), site.vectors(rays.directions))
+    return np.asarray(rays.origins_m + ranges_m[:, None] * rays.directions)
+
+
+def shown(rover: SimulatedRover, camera: CameraModel, point_m: FloatArray) -> bool:
+    """Whether a camera sees a point (3,) of the rover frame: inside, and hidden by nothing nearer."""
+    pixel, valid = camera.project(point_m)
+    if not (valid and camera.holds(pixel, 0.0)):
+        return False
+    ray, site = camera.ray(pixel), rover.site_from_rover
+    ends_m = float(rover.scene.cast(site.points(ray.origins_m), site.vectors(ray.directions)))
+    return ends_m > (1.0 - HIDDEN) * float((point_m - ray.origins_m) @ ray.directions)
+
+
+def told(day: str, group: str, clicks: Sequence[Click]) -> dict[str, Any]:
+    """A row of the table."""
+    refused = [one for one in clicks if one.refused]
+    good = [one for one in clicks if not one.refused]
+    row: dict[str, Any] = {
+        "day": day,
+        "group": group,
+        "cases": len(clicks),
+        "refused_percent": 100.0 * len(refused) / max(len(clicks), 1),
+        "refused_hidden": sum(one.hidden for one in refused),
+        "reasons": dict(Counter(one.refused.split(":")[0] for one in refused).most_common()),
+    }
+    if not good:
+        return row
+    error = np.array([one.error_px for one in good])
+    sigma = np.array([one.sigma_px for one in good])
+    z = error / sigma
+    return row | {
+        "z_rms": _rms(z),
+        "z_rms_x_y": [_rms(z[:, 0]), _rms(z[:, 1])],
+        "worst_z": float(np.abs(z).max()),
+        "beyond_3_percent": 100.0 * float((np.abs(z).max(axis=1) > 3.0).mean()),
+        "error_rms_px": [_rms(error[:, 0]), _rms(error[:, 1])],
+        "worst_error_px": float(np.abs(error).max()),
+        "median_sigma_px": np.median(sigma, axis=0).tolist(),
+    }
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def line(row: dict[str, Any]) -> str:
+    """A row as a person reads it, as a line of the docs' table."""
+    cells = [row["day"], row["group"], str(row["cases"]), f"{row['refused_percent']:.0f}"]
+    cells.append(str(row["refused_hidden"]))
+    if "z_rms" in row:
+        cells += [f"{row['z_rms']:.2f}", "{:.2f}, {:.2f}".format(*row["z_rms_x_y"]), f"{row['worst_z']:.1f}"]
+        cells += [f"{row['beyond_3_percent']:.1f}", "{:.3f}, {:.3f}".format(*row["error_rms_px"])]
+        cells += [f"{row['worst_error_px']:.2f}", "{:.3f}, {:.3f}".format(*row["median_sigma_px"])]
+    return f"| {' | '.join(cells)} |"
+
+
+def main() -> int:
+    """Click, and print a table or a document."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--cases", type=at_least(1), default=200, metavar="N", help="a group and day (default 200)"
+    )
+    parser.add_argument(
+        "--seed", type=at_least(0), default=1, metavar="S", help="of scenes and clicks (default 1)"
+    )
+    parser.add_argument(
+        "--day",
+        choices=DAYS,
+        nargs="+",
+        default=["kind", "worst"],
+        metavar="DAY",
+        help="kind, worst, or still: the worst with a mast that does not ring (default kind worst)",
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON document, with every click")
+    add_task_options(parser)
+    args = parser.parse_args()
+    tasks = [
+        Task(day, group, args.seed, number, min(A_TASK, args.cases - number * A_TASK))
+        for number in range(math.ceil(args.cases / A_TASK))
+        for day in args.day
+        for group in GROUPS
+    ]
+    found = results_of(
+        args, "scenes", click_all, tasks, lambda one: f"{one.day} day, {one.group}, scene {one.number}"
+    )
+    if found is None:
+        return 0
+    rows, clicks = [], []
+    for day in args.day:
+        for group in GROUPS:
+            mine = [
+                one
+                for task, row in zip(tasks, found, strict=True)
+                if (task.day, task.group) == (day, group)
+                for one in row
+            ]
+            rows.append(told(day, group, mine))
+            clicks += [{"day": day, "group": group, **vars(one)} for one in mine]
+    if args.json:
+        print(json.dumps({"rows": rows, "clicks": clicks}))
+        return 0
+    print(HEADING)
+    for row in rows:
+        print(line(row))
+        for reason, count in row["reasons"].items():
+            print(f"    {count} {reason}")
+    return 0
+
+
+if __name__ == "__main__":
+    end(main)
