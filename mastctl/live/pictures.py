@@ -248,9 +248,11 @@ class Watcher:
         return self._most_bytes[camera]
 
     def put(self, picture: Picture) -> None:
-        """Leave a picture to be taken, in the place of one that was not."""
+        """Leave a picture to be taken, in the place of one that was not; none if that was taken meanwhile."""
         camera = picture.frame.camera
         with self._lock:
+            if not self.ready(camera):
+                return
             self._wanted[camera] = False
             self._pictures[camera] = picture
         self._wake()

@@ -115,10 +115,10 @@ class History:
         last = self._samples[-1] if self._samples else None
         if last is not None:
             apart_s = reading.time_s - last.time_s
-            moved = max(abs(reading.pan_rad - last.pan_rad), abs(reading.tilt_rad - last.tilt_rad))
-            if apart_s < (APART_S if moved > MOVED_RAD else REST_S):
+            moved = _moved(reading, last)
+            if apart_s < (APART_S if moved else REST_S):
                 return
-            if moved > MOVED_RAD and before is not None and before.time_s > last.time_s:
+            if moved and before is not None and before.time_s > last.time_s and not _moved(before, last):
                 self._keep(before)  # until then it stood
         self._keep(reading)
 
@@ -145,6 +145,10 @@ class History:
                 yield Event(now_s, "fault", f"{one.key}: nothing is wrong any more", True)
         elif one.topic == "command":
             yield from _command(now_s, value)
+
+
+def _moved(one: HeadReading, last: Sample) -> bool:
+    return max(abs(one.pan_rad - last.pan_rad), abs(one.tilt_rad - last.tilt_rad)) > MOVED_RAD
 
 
 def _command(now_s: float, record: Mapping[str, Any]) -> Iterator[Event]:

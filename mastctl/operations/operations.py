@@ -224,9 +224,11 @@ class Operations:
             words = f"operation {name} was ended, since nothing could watch its deadline: {error}"
             self._end_by(name, Unable("no_thread", words))
 
-    def end_stopped(self, name: str) -> None:
-        """Stop the mast and end an operation that began after a stop which came before it was let begin."""
-        self._end_by(name, Stopped(STOP_ASKED))
+    def end_stopped(self, name: str, reason: str = STOP_ASKED) -> None:
+        """Stop the mast and end an operation if it runs: one that began after a stop which came before it was
+        let begin, or one that is for nothing any more.
+        """
+        self._end_by(name, Stopped(reason))
 
     def get(self, name: str) -> Operation:
         """Return one record.

@@ -25,6 +25,7 @@ from mastctl.pointing.settings import PointingSettings
 from mastctl.pointing.wanted import aim_of, check_pair, clicked_frame
 from mastctl.service.masts import Masts
 from mastctl.tracking.pose import RoverPose
+from mastctl.tracking.status import ACTIVE
 from mastctl.tracking.tracker import Tracker
 
 CLICK_AGE_S = 300.0  # a person may look at a picture for minutes before clicking; the sun moves meanwhile
@@ -160,8 +161,13 @@ class Steering:
         """
         if look:
             self._operations.let_stopped_end()
+        running = self._tracker.status.operation
         with self._masts.unchanged():
-            return self._tracker.take_pose(pose, look, self._stands)
+            begun = self._tracker.take_pose(pose, look, self._stands)
+        ended = self._tracker.status
+        if running is not None and ended.state not in ACTIVE:
+            self._operations.end_stopped(running, ended.reason)
+        return begun
 
     def _stands(self, pose: RoverPose) -> None:
         """Have the sun of the site frame kept out by a pose."""

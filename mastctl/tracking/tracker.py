@@ -102,6 +102,7 @@ class Tracker:
         self._carried: Carried | None = None  # what is followed; None without a track
         self._waiting: list[RoverPose] = []  # poses that came while a look runs
         self._look_again = False
+        self._left = False  # whether the rover left, by a refused pose, where what runs takes its pictures
         self._moved_s: float | None = None
 
     @property
@@ -273,7 +274,10 @@ class Tracker:
 
     def _doubted(self, motion: Rigid) -> None:
         """Say that the target is lost if the rover moved by a pose that says too little to be followed."""
-        if self._carried is None or stands(motion):
+        if stands(motion):
+            return
+        self._left = True
+        if self._carried is None:  # its start ends by that
             return
         # Whatever is found after this must be confirmed by both eyes.
         self._carried = replace(self._carried, track=replace(self._carried.track, state="lost"))
@@ -284,6 +288,7 @@ class Tracker:
     def _run(self, told: Told, work: Callable[[Looker], Outcome]) -> Operation:
         """Start an operation that looks; its outcome comes to `_ended`."""
         rig, outcomes = self._rig, list[Outcome]()
+        self._left = False
 
         def run(record: Callable[[Any], None], cancelled: threading.Event) -> Sighting:
             steps = Steps(
@@ -358,7 +363,9 @@ class Tracker:
             stood = status.stands_at
             left = any(stood is not None and not stands(motion_between(stood, one)) for one in waiting)
             if status.state == "starting":
-                status = self._take(started(status, operation, outcome, left))
+                status = self._take(started(status, operation, outcome, left or self._left))
+            elif self._left:
+                pass  # it is lost, and says by what
             elif left:
                 words = "the rover moved while the pictures were taken, so that they belong to no one pose"
                 status = replace(status, reason=words)

@@ -13,7 +13,7 @@ from hil_tests.mastctl.recorder.recorder_world import frame
 from hil_tests.waiting import until
 from mastctl.devices.frames import StampedFrame
 from mastctl.live import pictures
-from mastctl.live.pictures import WatchedCameras
+from mastctl.live.pictures import Picture, WatchedCameras, Watcher
 
 LEFT, RIGHT = "navcam_left", "navcam_right"
 
@@ -65,6 +65,19 @@ def test_a_watcher_who_leaves_as_a_picture_comes_holds_none(others: set[threadin
     until(lambda: not pictures_threads() - others, "the camera is asked no more")
     assert cameras.held == Counter() and watcher.take() == [] and woken == []
     watched.close()
+
+
+def test_a_picture_that_comes_as_the_one_before_is_taken_is_not_sent_after_it() -> None:
+    watched = WatchedCameras(FakeCameras(), SystemClock())
+    watcher = Watcher(watched, "slow", (LEFT,), lambda: None, ready=True)
+    first, second, third = (Picture(frame(k, np.zeros((4, 4), np.uint8), b"", LEFT), b"") for k in range(3))
+    watcher.put(first)  # not taken yet: its camera is asked for a newer one
+    assert watcher.ready(LEFT) and watcher.take() == [first]
+    watcher.put(second)
+    assert watcher.take() == [], "one is on its way until it is shown"
+    watcher.shown(LEFT)
+    watcher.put(third)
+    assert watcher.take() == [third]
 
 
 def test_a_watcher_whose_second_camera_has_no_thread_is_none(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from drivers.clock import SystemClock
 from hil_tests.waiting import until
 from mastctl.devices.joint_history import HeadReading
@@ -33,6 +35,16 @@ def test_a_motion_is_kept_where_it_was_and_rest_costs_next_to_nothing() -> None:
     assert 100.0 in times, "until then it stood"
     assert len(times) < 20 and told["pan_rad"][-1] == 0.5, "the newest reading is told, kept or not"
     assert told["temperatures_c"] == {"pan": [31.5] * len(told["age_s"])}
+
+
+def test_a_long_motion_is_kept_for_as_long_as_is_said() -> None:
+    publisher = Publisher()
+    kept = History(publisher, dict, SystemClock())
+    for k in range(1001):  # 200 s
+        publisher.publish("joints", "pan_tilt", reading(0.2 * k, 0.001 * k))
+    until(lambda: kept._before is not None and kept._before.time_s == 200.0, "all is heard")
+    kept.close()
+    assert len(kept._samples) == pytest.approx(200.0 / history_module.APART_S, abs=2)
 
 
 def test_faults_come_and_go_once_and_the_oldest_events_give_way() -> None:

@@ -389,12 +389,15 @@ def test_a_first_pose_ends_a_track_that_began_without_one(client: Client) -> Non
     assert drive(client, 0.2, 3.0)["state"] == "tracking"
 
 
-def test_a_first_pose_while_a_track_begins_ends_it(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_first_pose_while_a_track_begins_ends_it_and_its_motion(
+    client: Client, pair: tuple[RunningDaemon, FakeHardware], monkeypatch: pytest.MonkeyPatch
+) -> None:
     told, goes_on = threading.Event(), threading.Event()
     monkeypatch.setattr(ScriptedLooker, "begin", staticmethod(lambda: (told.set(), goes_on.wait(NET_S))))
     operation = client.start_track(pixel=click(client))
     assert told.wait(NET_S)
     assert client.pose([0.1, 0, 0], [1, 0, 0, 0])["track"]["state"] == "stopped"
+    assert ("stop",) in pair[1].head.calls, "nothing turns for a track that has ended"
     goes_on.set()
     client.wait(operation)
     assert client.track()["state"] == "stopped"
@@ -515,6 +518,29 @@ def test_poses_that_come_during_a_look_make_its_pictures_worthless(
     track = client.track()
     assert track["position_m"] == pytest.approx([4.5, 0.5, 0.0]), "the first look counts for nothing"
     assert (track["state"], track["predicted"], track["reason"]) == ("tracking", False, "")
+
+
+@pytest.mark.parametrize("begins", [True, False])
+def test_a_refused_pose_during_a_look_makes_its_pictures_worthless_too(
+    client: Client, monkeypatch: pytest.MonkeyPatch, begins: bool
+) -> None:
+    hang = Hang()
+    if begins:
+        client.pose([0, 0, 0], [1, 0, 0, 0], time_s=1.0)
+        monkeypatch.setattr(ScriptedLooker, "begin", staticmethod(hang))
+        operation = client.start_track(pixel=click(client))
+    else:
+        started(client)
+        monkeypatch.setattr(ScriptedLooker, "script", staticmethod(lambda track: (hang(), found(track))[1]))
+        operation = client.look()
+    assert hang.entered.wait(10.0)
+    refusal(lambda: client.pose([0.5, 0, 0], [1, 0, 0, 0], time_s=2.0), "pose_without_covariance")
+    hang.let_go()
+    client.wait(operation)
+    until(lambda: client.track()["operation"] is None, "its outcome was taken")
+    track = client.track()
+    assert track["state"] == ("idle" if begins else "lost"), "what was seen is of a place that was left"
+    assert "moved" in track["reason"]
 
 
 def test_poses_of_a_standing_rover_leave_a_look_its_worth(

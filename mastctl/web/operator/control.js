@@ -65,9 +65,7 @@ export class Control {
   async press() {
     try {
       if (held.lease) {
-        this.leaving = true;
-        await ask("DELETE", "/lease").finally(() => { this.leaving = false; });
-        held.lease = null;
+        await this.leave();
       } else if (this.sure || this.button.textContent === "Take over") {
         if (!this.sure) return this.makeSure();
         this.sure = false;
@@ -76,10 +74,23 @@ export class Control {
         this.has(await post("/lease", { for_s: FOR_S }));
       }
     } catch (error) {
-      if (error.code === "lease_over") held.lease = null;
       this.alarm(error.message);
     }
     this.draw();
+  }
+
+  /** Give the lease back; one that has ended is given back already. */
+  async leave() {
+    if (!held.lease) return;
+    this.leaving = true;
+    try {
+      await ask("DELETE", "/lease");
+    } catch (error) {
+      if (!["lease_over", "lease_unknown"].includes(error.code)) throw error;
+    } finally {
+      this.leaving = false;
+    }
+    held.lease = null;
   }
 
   has(lease) {

@@ -7,6 +7,8 @@ const KEPT_MS = 60000; // clocks of two machines part by some milliseconds in th
 const FIRST_BYTES = 16000;
 const FEWEST_BYTES = 4000;
 const LINK_S = 0.6; // so long the pictures of all cameras in view may be on the link together
+const LOOK_MS = 5000;
+const SILENT_LOOKS = 4; // the line is dead, though nobody told: begin another
 const text = new TextDecoder();
 
 /** The daemon's clock on this page's: each answer says between which two of our moments one of its moments lay. */
@@ -32,6 +34,7 @@ export class Images {
   constructor(show) {
     this.show = show;
     this.cameras = [];
+    setInterval(() => this.look(), LOOK_MS);
   }
 
   /** Watch these cameras, and no others. */
@@ -51,9 +54,23 @@ export class Images {
     this.line = line;
     this.clock = new DaemonClock();
     this.rate = null; // bytes/s of the link
+    this.silent = 0; // looks since anything was heard
     line.onopen = () => this.ask(line);
-    line.onmessage = ({ data }) => (typeof data === "string" ? this.answered(line, JSON.parse(data)) : this.came(line, data, performance.now()));
+    line.onmessage = ({ data }) => {
+      this.silent = 0;
+      if (typeof data === "string") this.answered(line, JSON.parse(data));
+      else this.came(line, data, performance.now());
+    };
     line.onclose = () => setTimeout(() => this.line === line && this.connect(), AGAIN_MS);
+  }
+
+  /** Where no picture comes an answer tells a camera that gives none from a line that is dead. */
+  look() {
+    const { line } = this;
+    if (!line || line.readyState > WebSocket.OPEN) return;
+    this.silent += 1;
+    if (this.silent > SILENT_LOOKS) this.connect();
+    else if (this.silent > 1 && line.readyState === WebSocket.OPEN) this.ask(line);
   }
 
   ask(line) {

@@ -1,6 +1,6 @@
 // The page: what is always in sight, and the panels told of what changes.
 import { byId, h, keep, kept, put, say, set } from "./dom.js";
-import { NAME, ask as request, estop, get, held, me, person, post, stop } from "./api.js";
+import { NAME, estop, get, me, person, post, stop } from "./api.js";
 import { forTime, inDegrees, sentence } from "./words.js";
 import { Bench } from "./bench.js";
 import { Control } from "./control.js";
@@ -250,7 +250,7 @@ byId("login-form").addEventListener("submit", async (event) => {
 });
 byId("logout").addEventListener("click", async () => {
   try {
-    if (held.lease) await request("DELETE", "/lease");
+    await control.leave();
     await post("/logout");
     location.reload();
   } catch (error) {

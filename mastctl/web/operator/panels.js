@@ -1,7 +1,9 @@
 // The quiet panels: faults, recording, mast file.
-import { byId, h, put, say, set } from "./dom.js";
+import { byId, h, keep, kept, put, say, set } from "./dom.js";
 import { ask, fileOf, get, post } from "./api.js";
 import { camera as called, forTime, inDegrees, moment, number, sentence } from "./words.js";
+
+const READ = "mastctl read";
 
 /** A fault's message without the device's name, which stands before it. */
 const plain = ({ device, message: told }, message = inDegrees(told)) => (message.startsWith(`${device}: `) ? message.slice(device.length + 2) : message).replace(/\.$/, "");
@@ -52,9 +54,9 @@ export class Failure {
   }
 
   show({ id, error, ended_s: endedS }) {
-    if (localStorage.getItem("mastctl read") === id) return;
+    if (kept(READ) === id) return;
     [this.id, this.endedS] = [id, endedS];
-    say(this.words, `Failed: ${error?.message ?? "the daemon told no reason"}`);
+    say(this.words, `Failed: ${error ? inDegrees(error.message) : "the daemon told no reason"}`);
     byId("failed").hidden = false;
     this.announce(this.words.textContent);
   }
@@ -64,7 +66,7 @@ export class Failure {
   }
 
   read() {
-    localStorage.setItem("mastctl read", this.id);
+    keep(READ, this.id);
     this.hide();
   }
 }

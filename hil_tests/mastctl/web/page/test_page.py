@@ -30,6 +30,7 @@ from hil_tests.mastctl.web.network import network_daemon
 from hil_tests.mastctl.web.page.conftest import Visit
 from hil_tests.waiting import NET_S, until
 from mastctl.client import Client
+from mastctl.commands.caller import Caller
 from mastctl.daemon import RunningDaemon
 from mastctl.pointing.requests import Aim
 from mastctl.pointing.results import Preview
@@ -415,6 +416,25 @@ def test_a_page_that_is_closed_gives_its_lease_back(pair: BOTH, visit: Visits) -
     until(lambda: daemon.service.leases.told() is None, "it is given back")
 
 
+def test_pictures_whose_line_died_in_silence_come_by_another(pair: BOTH, visit: Visits) -> None:
+    lines: list[Any] = []
+    cut = threading.Event()
+
+    def relay(line: Any) -> None:
+        server, first = line.connect_to_server(), not lines
+        lines.append(line)
+        server.on_message(lambda told: None if first and cut.is_set() else line.send(told))
+
+    one = visit("about:blank", turned=True)
+    one.page.route_web_socket(re.compile("/images"), relay)
+    one.url = pair[0].url
+    one.page.goto(one.url)
+    one.frame()
+    cut.set()
+    until(lambda: one.wait_long() or len(lines) == 2, "another is opened")
+    one.frame()
+
+
 def test_a_stream_that_died_in_silence_while_the_daemon_answers_is_begun_again(
     pair: BOTH, visit: Visits
 ) -> None:
@@ -493,6 +513,14 @@ def test_a_token_is_asked_for_and_who_may_look_cannot_move(
         one.page.get_by_role("button", name="Log out").click()
         one.page.locator("#login").wait_for(state="visible")
         assert one.page.evaluate("fetch('/api/v1/status').then((answer) => answer.status)") == 401
+        one.page.locator("#token").fill(net.token("operate"))
+        one.page.get_by_role("button", name="Log in").click()
+        one.page.get_by_role("button", name="Take", exact=True).click()
+        one.page.get_by_role("button", name="Release", exact=True).wait_for()
+        one.page.route("**/lease/renew", lambda held: None)  # the page does not know yet
+        net.daemon.service.leases.take(Caller("Ben"), "to try it")
+        one.page.get_by_role("button", name="Log out").click()
+        one.page.locator("#login").wait_for(state="visible")
 
 
 def test_a_jog_ends_when_its_key_its_window_or_its_focus_is_gone(pair: BOTH, visit: Visits) -> None:

@@ -31,6 +31,8 @@ from mastctl.pointing.results import PointingError
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 Visits = Callable[..., Visit]
+KEEPS_NOTHING = """Object.defineProperty(window, 'localStorage', {
+  get: () => { throw new DOMException('denied', 'SecurityError'); } })"""
 
 
 @pytest.fixture
@@ -222,16 +224,19 @@ def test_a_command_that_failed_is_an_alarm_until_it_was_read(
     green = one.page.evaluate(edge)
 
     def stuck(*_: Any) -> FakeResult:
-        raise PointingError("stuck", "pan is stuck at 12 degrees")
+        raise PointingError("stuck", "pan is stuck at 0.21 rad")
 
     said = one.page.locator("#failed:not([hidden])")
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(stuck))
     with Client(daemon.url) as client:
         client.wait(client.point(pan_rad=0.2, tilt_rad=-0.1))
-        one.page.wait_for_selector("#failed >> text=pan is stuck at 12 degrees")
+        one.page.wait_for_selector("#failed >> text=pan is stuck at 12.03°")
         one.word("ready")
         assert one.page.evaluate(edge) != green and "pan is stuck" in one.page.locator("#alarm").inner_text()
-        later = visit(daemon.url)
+        later = visit("about:blank")
+        later.page.add_init_script(KEEPS_NOTHING)
+        later.url = daemon.url
+        later.page.goto(daemon.url)
         later.page.wait_for_selector("#failed >> text=pan is stuck")
         monkeypatch.setattr(ScriptedLoop, "script", staticmethod(turns))
         client.wait(client.point(pan_rad=0.1, tilt_rad=-0.1))
