@@ -266,10 +266,7 @@ class Adjustment:
             residual, jacobian = block.residual, block.jacobian
             cost += self._loss(residual, block.width)
             if self.huber is not None and block.width > 1:
-                length = np.linalg.norm(residual.reshape(-1, block.width), axis=1)
-                weight = np.repeat(
-                    np.sqrt(np.minimum(1.0, self.huber / np.maximum(length, 1e-300))), block.width
-                )
+                weight = np.sqrt(bounded_weights(residual, block.width, self.huber))
                 residual, jacobian = residual * weight, jacobian * weight[:, None]
             columns = block.columns
             matrix[np.ix_(columns, columns)] += jacobian.T @ jacobian
@@ -465,6 +462,15 @@ class Adjustment:
         """Return the indices of an unknown's numbers."""
         part = self.parts[key]
         return np.arange(part.start, part.stop)
+
+
+def bounded_weights(residual: FloatArray, width: int, huber: float | None) -> FloatArray:
+    """Return the weights (m,) of the squares of residuals (m,), ``width`` of them a measurement, whose pull
+    no longer grows from a length of ``huber`` on."""
+    if huber is None:
+        return np.ones(len(residual))
+    length = np.linalg.norm(residual.reshape(-1, width), axis=1)
+    return np.repeat(np.minimum(1.0, huber / np.maximum(length, 1e-300)), width)
 
 
 def bowed_points(state: Estimate, image: ImageTerm) -> FloatArray:

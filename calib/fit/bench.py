@@ -19,9 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from calib.fit.adjustment import HUBER, Adjustment, Estimate
 from calib.fit.bench_calibration import BenchCalibration
-from calib.fit.bench_changes import find_change
+from calib.fit.bench_changes import Change, find_change
 from calib.fit.bench_problem import BenchOptions, BenchProblem, without_terms
 from calib.fit.bench_start import BenchNotFitted, SomethingChanged
+from calib.fit.bench_tests import find_drifts
 from calib.fit.bench_told import choose, told
 from calib.fit.joint import typical_length, weigh, without_blunders
 from calib.fit.least_squares import Minimum, minimise
@@ -41,6 +42,9 @@ SCAN_HUBER = 100.0
 SLIP_RAD, SLIP_ASIDE = 0.003, 0.1
 """A board that moved by more than this about the pan axis, and by less than this part of it otherwise
 (radians and metres), did not move: pan slipped."""
+
+MENDS = 0.5
+"""A change that is tried where the fit is far off counts if the sum of squares falls to this part."""
 
 LONE = 6.0
 """While changes are looked for, a corner so many times farther off than its image's median counts as
@@ -82,7 +86,7 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     named = chosen = tuple(bench.options.terms or ())
     tests: dict[str, Tested] = {}
     every = bench.candidates()
-    problem, start = _look_for_changes(bench, every)
+    bench, problem, start = _look_for_changes(bench, every)
     _refuse_far(bench, problem, start)  # before blunders are looked for one by one where nothing fits
     chooses = bench.options.terms is None
     if chooses:
@@ -105,10 +109,13 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     return told(bench, (problem, fit), weighed, named, chosen, tests, began)
 
 
-def _look_for_changes(bench: BenchProblem, chosen: Sequence[str]) -> tuple[Adjustment, Estimate]:
-    """Return the problem with some terms, lone wrong corners left out, and its fit.
+def _look_for_changes(
+    bench: BenchProblem, chosen: Sequence[str]
+) -> tuple[BenchProblem, Adjustment, Estimate]:
+    """Return the bench, its problem with some terms, lone wrong corners left out, and its fit.
 
-    A board that moved counts as two placements.
+    A board that moved counts as two placements. A change that is not sure is tried, and counts if the fit is
+    the better for it.
 
     Raises
     ------
@@ -116,24 +123,44 @@ def _look_for_changes(bench: BenchProblem, chosen: Sequence[str]) -> tuple[Adjus
         If a joint slipped, or a camera changed: nothing says which of its two states is the one to come.
     """
     strays = {n: s for view in bench.views.values() for n, s in view.strays.items()}
+    tried: tuple[Change, BenchProblem, Adjustment, Minimum[Estimate]] | None = None
     for left in range(CHANGES, -1, -1):
         problem, fit = _roughly(bench, chosen, strays, bench.start)
         if np.isfinite(fit.normal.cost) and bench.allow_inexact(problem, fit.state):
             problem, fit = _roughly(bench, chosen, strays, fit.state)
         problem = _without_lone_strays(problem, fit.state).with_huber(SCAN_HUBER)
         fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-6)
+        if tried is not None:
+            if not fit.normal.cost < MENDS * tried[3].normal.cost:
+                _, bench, problem, fit = tried
+                break
+            _refuse(tried[0])
+            tried = None
         if not np.isfinite(fit.normal.cost) or not left:
             break
         change = find_change(problem, fit.state)
         _refuse_slip(bench, fit.state)
         if change is None:
             break
+        if change.sure:
+            if any(drift.chi2 > change.chi2 for drift in find_drifts(problem, fit.state)):
+                break  # the verdict names it, with its size
+            _refuse(change)
+        else:
+            tried, bench = (change, bench, problem, fit), bench.copied()
         if change.board is None:
-            raise SomethingChanged(change.sentence)
-        bench.notes.append(f"{change.sentence}; from there on it counts as another placement")
-        bench.split_placement(change.board, change.after)
+            bench.read_otherwise(change.what, change.after, float(change.step[0]))
+        else:
+            bench.notes.append(f"{change.sentence}; from there on it counts as another placement")
+            bench.split_placement(change.board, change.after)
         bench.begin()
-    return problem.with_huber(HUBER), fit.state
+    return bench, problem.with_huber(HUBER), fit.state
+
+
+def _refuse(change: Change) -> None:
+    """Raise if it was no board that moved."""
+    if change.board is None:
+        raise SomethingChanged(change.sentence)
 
 
 def _roughly(

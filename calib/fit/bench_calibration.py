@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from calib.fit.bench_tests import Drift, OtherPlacements
 from calib.fit.calibration import Degenerate, ImageResiduals, Outlier
 from calib.fit.components import Component
 from calib.fit.model_terms import ModelTerm
@@ -70,6 +71,15 @@ class TermGain:
         return f"{told}, moves pixels by {self.moves_px:.2f} px rms, lowers chi-square by {self.chi2:.0f}"
 
 
+class CheckExpected(NamedTuple):
+    """What a camera's check images should be off by, rms per axis, pixels: expected, and the most that chance
+    allows; and the chance of more than they are."""
+
+    rms_px: float
+    most_px: float
+    chance: float
+
+
 @dataclass(frozen=True, eq=False)
 class BenchCalibration:
     """A rig fitted to pictures of boards that stood anywhere.
@@ -85,8 +95,8 @@ class BenchCalibration:
         Every term that could have entered.
     rms_px, check_rms_px
         Camera to (x, y) rms of the corners that were fitted, and of those of check images.
-    check_expected_px
-        Camera to what check images should be off by (rms per axis) and the most that chance allows.
+    checks
+        Camera to what check images should be off by, and how likely it is that they are off by more.
     images
         What remains of every image.
     outliers
@@ -97,6 +107,10 @@ class BenchCalibration:
         What pictures cannot know and how it was fixed; what else a person should know. Sentences.
     chi2, degrees_of_freedom, chi2_probability
         Weighted sum of squares, what it is expected to be, and the chance of a larger one, by stated sigmas.
+    placements
+        Each placement held against the others, the least likely first.
+    drifts
+        How far each joint and each camera drifts, the least likely first.
     components
         How large errors were against what was stated; the covariance is by what they were.
     joint_rad
@@ -116,7 +130,7 @@ class BenchCalibration:
     terms: tuple[TermGain, ...]
     rms_px: Mapping[str, tuple[float, float]]
     check_rms_px: Mapping[str, tuple[float, float]]
-    check_expected_px: Mapping[str, tuple[float, float]]
+    checks: Mapping[str, CheckExpected]
     images: tuple[ImageResiduals, ...]
     outliers: tuple[Outlier, ...]
     degenerate: tuple[Degenerate, ...]
@@ -125,6 +139,8 @@ class BenchCalibration:
     chi2: float
     degrees_of_freedom: float
     chi2_probability: float
+    placements: tuple[OtherPlacements, ...]
+    drifts: tuple[Drift, ...]
     components: tuple[Component, ...]
     joint_rad: float
     inexact_m: float

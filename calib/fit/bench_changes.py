@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.camera.cahvor import CameraModel
-from calib.fit.adjustment import Adjustment, Estimate
+from calib.fit.adjustment import Adjustment, Estimate, bounded_weights
 from calib.fit.joint import goodness
 from calib.fit.least_squares import covariance_of
 from calib.fit.significance import chance
@@ -36,8 +36,8 @@ model's."""
 STILL_FAR = 9.0
 """Chi-square over its degrees of freedom that a cause leaves at most, or it explains half of it at least."""
 
-SIDE = 3
-"""Pictures at least on either side of a change, at different standstills."""
+SIDE = 2
+"""Pictures at least on either side of a change, at different standstills: one is a blunder."""
 
 UNSEEN = 1e-3
 """A direction of a change is not looked at if the other unknowns take up all but this part of it."""
@@ -65,6 +65,8 @@ class Change:
         focal length (1), turn of the camera (3).
     chi2
         What it explains of the weighted sum of squares.
+    sure
+        Whether little would be left then; else only another fit tells, for far from it nothing is linear.
     """
 
     what: str
@@ -74,6 +76,7 @@ class Change:
     after: str
     step: FloatArray
     chi2: float
+    sure: bool = True
 
     @property
     def sentence(self) -> str:
@@ -83,12 +86,12 @@ class Change:
             turn, shift = np.linalg.norm(self.step[:3]), np.linalg.norm(self.step[3:])
             return (
                 f"board {self.board[0]} moved during placement {self.board[1]}, {between}, by about "
-                f"{1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad"
+                f"{_milli(shift)} mm and {_milli(turn)} mrad"
             )
         size = float(np.linalg.norm(self.step))
         if self.what in ("pan", "tilt"):
             return (
-                f"{self.what} slipped by about {1e3 * size:.1f} mrad {between}: the head no longer points "
+                f"{self.what} slipped by about {_milli(size)} mrad {between}: the head no longer points "
                 "where it read before; tighten what holds it on its axis and take the pictures again"
             )
         if self.what == "focus":
@@ -97,13 +100,18 @@ class Change:
                 f"{100 * size:.2f} %; fix the lens and take the pictures again"
             )
         return (
-            f"camera {self.camera} was knocked {between}: it turned by about {1e3 * size:.1f} mrad in its "
+            f"camera {self.camera} was knocked {between}: it turned by about {_milli(size)} mrad in its "
             "mount; fasten it and take the pictures again"
         )
 
 
+def _milli(size: float | np.floating) -> str:
+    """A size in thousandths, with two digits at least."""
+    return f"{1e3 * size:.1f}" if 1e3 * size >= 1.0 else f"{1e3 * size:.2g}"
+
+
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class Rows:
     """One image's weighted residuals (m,), Jacobian (m, k) on columns (k,), and rates (m, e) by what may
     change."""
 
@@ -122,7 +130,7 @@ def find_change(problem: Adjustment, state: Estimate) -> Change | None:
     problem, state
         A fit with pulls bounded.
     """
-    rows = [_rows(problem, state, image) for image in problem.images if image.keep.any()]
+    rows = [rows_of(problem, state, image) for image in problem.images if image.keep.any()]
     # Of this very state: what is left of a change that others nearly take up is a small difference.
     chi2, matrix, gradient = problem.normal(state)
     covariance = covariance_of(matrix, problem.weak)
@@ -130,7 +138,7 @@ def find_change(problem: Adjustment, state: Estimate) -> Change | None:
     settling = covariance @ gradient
     found: list[Change] = []
     count = 0
-    for what, board, camera, mine in _subjects(rows, problem):
+    for what, board, camera, mine in _subjects(problem, state, rows):
         changes = _tried(what, board, camera, mine, covariance, settling)
         count += len(changes)
         found += [change for change in changes if change.chi2 < chi2]
@@ -141,25 +149,28 @@ def find_change(problem: Adjustment, state: Estimate) -> Change | None:
     best = min(as_good, key=lambda c: (len(c.step), -c.chi2))
     _, freedom = goodness(problem, state, covariance)
     scale = max((chi2 - best.chi2) / max(freedom, 1.0), 0.1)
-    if scale > STILL_FAR and best.chi2 < 0.5 * chi2:  # it is the model that is wrong
+    sure = scale <= STILL_FAR or best.chi2 >= 0.5 * chi2
+    if not sure and best.what in ("focus", "knock"):  # it is the model that is wrong
         return None
+    if best.what in ("pan", "tilt"):
+        scale = max(scale, scatter(reading_rows(problem, state, rows), best.what, covariance, best.chi2))
     if chance(best.chi2, len(best.step), scale, max(freedom, 1.0)) * count > UNLIKELY:
         return None
     if len(best.step) > 1 and best.chi2 < LEAST_PART * chi2:
         return None
-    return best
+    return replace(best, sure=sure)
 
 
 def _subjects(
-    rows: Sequence[_Rows], problem: Adjustment
-) -> Iterator[tuple[str, tuple[str, str] | None, str, list[_Rows]]]:
+    problem: Adjustment, state: Estimate, rows: Sequence[Rows]
+) -> Iterator[tuple[str, tuple[str, str] | None, str, list[Rows]]]:
     """What may have changed: its name, board, camera, and the images that would show it."""
     for board in dict.fromkeys(r.image.board for r in rows):
         if board not in problem.held:
             yield "board", board, "", [r for r in rows if r.image.board == board]
-    on_head = [r for r in rows if r.image.attitude is not None]
+    readings = reading_rows(problem, state, rows)
     for axis in ("pan", "tilt"):
-        yield axis, None, "", on_head
+        yield axis, None, "", readings
     for camera in dict.fromkeys(r.image.camera for r in rows):
         mine = [r for r in rows if r.image.camera == camera]
         for what in ("focus", "knock"):
@@ -170,7 +181,7 @@ def _tried(
     what: str,
     board: tuple[str, str] | None,
     camera: str,
-    rows: Sequence[_Rows],
+    rows: Sequence[Rows],
     covariance: FloatArray,
     settling: FloatArray,
 ) -> list[Change]:
@@ -190,15 +201,19 @@ def _tried(
         if min(_standstills(rows[:index]), _standstills(rows[index:])) < SIDE:
             continue
         left = own - shared @ covariance @ shared.T
-        gain, step = _gain(left, own, pull - shared @ settling)
+        gain, step = gain_of(left, own, pull - shared @ settling)
         if what != "board" and np.linalg.norm(step) > LARGEST:
             continue
         found.append(Change(what, board, camera, before.image.name, row.image.name, step, gain))
     return found
 
 
-def _gain(left: FloatArray, own: FloatArray, pull: FloatArray) -> tuple[float, FloatArray]:
-    """What numbers explain, and their values, without the directions that the other unknowns take up."""
+def gain_of(left: FloatArray, own: FloatArray, pull: FloatArray) -> tuple[float, FloatArray]:
+    """Return what numbers (k,) explain, and their values, without directions that the other unknowns take up.
+
+    ``own`` and ``left`` (k, k) are their normal equations without and with the other unknowns giving way,
+    ``pull`` (k,) is their gradient.
+    """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(own), 1e-300))
     if not np.isfinite(left).all() or not np.isfinite(pull).all():
         return 0.0, np.zeros(len(pull))
@@ -216,17 +231,14 @@ def _same_standstill(one: ImageTerm, other: ImageTerm) -> bool:
     return one.attitude == other.attitude
 
 
-def _standstills(rows: Sequence[_Rows]) -> int:
+def _standstills(rows: Sequence[Rows]) -> int:
     return len({r.image.name if r.image.attitude is None else r.image.attitude for r in rows})
 
 
-def _rows(problem: Adjustment, state: Estimate, image: ImageTerm) -> _Rows:
-    """One image as the fit weighs it."""
+def rows_of(problem: Adjustment, state: Estimate, image: ImageTerm) -> Rows:
+    """Return one image as the fit weighs it."""
     block = problem.image_block(state, image)
-    weight = np.ones(len(block.residual))
-    if problem.huber is not None:
-        length = np.linalg.norm(block.residual.reshape(-1, 2), axis=1)
-        weight = np.repeat(np.sqrt(np.minimum(1.0, problem.huber / np.maximum(length, 1e-300))), 2)
+    weight = np.sqrt(bounded_weights(block.residual, 2, problem.huber))
     rates: dict[str, FloatArray] = {}
     if image.board not in problem.held:
         rates["board"] = block.jacobian[:, -6:]  # a board's pose comes last
@@ -242,13 +254,51 @@ def _rows(problem: Adjustment, state: Estimate, image: ImageTerm) -> _Rows:
         for axis in np.eye(3)
     ]
     rates["knock"] = np.stack(turned, axis=1)
-    return _Rows(
+    return Rows(
         image,
         weight * block.residual,
         weight[:, None] * block.jacobian,
         block.columns,
         {what: weight[:, None] * rate for what, rate in rates.items()},
     )
+
+
+def reading_rows(problem: Adjustment, state: Estimate, rows: Sequence[Rows]) -> list[Rows]:
+    """Return the rows of head images that show what the joints read.
+
+    Where readings have a sigma it is that measurement which changes, and images only tell where the head
+    was: sharp ones leave of a reading's rates in pixels next to nothing that no other unknown takes up. The
+    first image of a standstill has the reading then, and the others have no rows.
+    """
+    on_head = [row for row in rows if row.image.attitude is not None]
+    if problem.joint_rad == 0.0:
+        return on_head
+    blocks = {what: block for what, block in problem.known(state) if what.startswith("attitude ")}
+    found = []
+    for row in on_head:
+        block = blocks.pop(f"attitude {row.image.attitude}", None)
+        columns = problem.at(("attitude", row.image.attitude))
+        residual = np.zeros(0) if block is None else block.residual
+        jacobian = np.zeros((0, 2)) if block is None else block.jacobian
+        rates = {"pan": -jacobian[:, :1], "tilt": -jacobian[:, 1:]}
+        found.append(Rows(row.image, residual, jacobian, columns, rates))
+    return found
+
+
+def scatter(readings: Sequence[Rows], axis: str, covariance: FloatArray, gain: float) -> float:
+    """Return how much larger the squares of a joint's readings are than their sigma allows, less a gain.
+
+    A joint whose readings scatter more than stated, by a play that nobody knew of, has not slipped.
+    """
+    squares = redundancy = 0.0
+    for row in readings:
+        rates = row.rates[axis]
+        size = float(np.sum(rates**2))
+        if size:
+            taken = row.jacobian @ covariance[np.ix_(row.columns, row.columns)] @ row.jacobian.T
+            squares += float((rates.T @ row.residual)[0] ** 2) / size
+            redundancy += 1.0 - float((rates.T @ taken @ rates)[0, 0]) / size
+    return (squares - gain) / max(redundancy - 1.0, 1.0)
 
 
 def reading_rates(problem: Adjustment, state: Estimate, image: ImageTerm) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,6 +85,12 @@ class BenchProblem:
         self.views = self._views()
         self.begin()
 
+    def copied(self) -> BenchProblem:
+        """Return the same bench; a board that moves there has not moved here."""
+        other = copy(self)
+        other.notes, other.split = [*self.notes], [*self.split]
+        return other
+
     def begin(self) -> None:
         """Find where to start, and leave out placements that no head camera shows.
 
@@ -147,6 +154,21 @@ class BenchProblem:
         self.terms = replace(
             self.terms, images=relabelled(self.terms.images), checks=relabelled(self.terms.checks)
         )
+
+    def read_otherwise(self, joint: str, after: str, step_rad: float) -> None:
+        """Take a joint to have been further on than it read, in the images from one on."""
+        names = [i.name for i in self.survey.images]
+        first, key = names.index(after), f"{joint}_rad"
+
+        def turned(terms: Sequence[ImageTerm]) -> tuple[ImageTerm, ...]:
+            return tuple(
+                t
+                if t.attitude is None or names.index(t.name) < first
+                else replace(t, **{key: getattr(t, key) + step_rad})
+                for t in terms
+            )
+
+        self.terms = replace(self.terms, images=turned(self.terms.images), checks=turned(self.terms.checks))
 
     def _views(self) -> dict[str, ViewPoses]:
         """What each camera says by itself."""

@@ -10,15 +10,17 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calib.fit.adjustment import MAST, Adjustment, Estimate
-from calib.fit.bench_calibration import BenchCalibration, TermGain
+from calib.fit.bench_calibration import BenchCalibration, CheckExpected, TermGain
 from calib.fit.bench_changes import reading_rates
 from calib.fit.bench_problem import BenchProblem, term_values
+from calib.fit.bench_tests import by_other_placements, find_drifts
 from calib.fit.calibration import ImageResiduals
 from calib.fit.joint import Weighed, goodness
 from calib.fit.least_squares import Minimum, covariance_of
 from calib.fit.model_terms import Tested, candidate_terms, choose_terms
 from calib.fit.outliers import name_outliers
 from calib.fit.residuals import image_residuals, rms_by_camera
+from calib.fit.significance import chance_of_sum, rare_sum
 from calib.fit.stray_dots import stray_points
 from calib.fit.term_motions import moves_px, term_motions
 from calib.fit.terms import ImageTerm
@@ -28,8 +30,8 @@ from calib.mast.covariance import RigCovariance
 from calib.mast.rig import Rig, RigCamera
 from calib.rigid import FloatArray
 
-CHECK_SIGMAS = 4.0
-"""Check images that are off by so many sigmas more than expected were not predicted."""
+UNPREDICTED = 3e-5
+"""Check images of a camera were not predicted if chance makes them so far off in fewer benches than this."""
 
 
 def choose(
@@ -75,6 +77,7 @@ def told(
     known = _part(problem.names, covariance, mine)
     sigma = sigma_by_key(rig, known.names, known.covariance)
     images = image_residuals(bench.survey, problem, state, bench.terms.images, bench.terms.checks)
+    checked = _checked(images, bench.terms.checks)
     size = problem.parts[MAST].stop
     return BenchCalibration(
         rig=rig,
@@ -83,8 +86,8 @@ def told(
         sigma=sigma,
         terms=_gains(bench, candidates, chosen, tests, problem, state),
         rms_px=rms_by_camera(images),
-        check_rms_px=rms_by_camera(_checked(images, bench.terms.checks)),
-        check_expected_px=_expected(bench, weighed),
+        check_rms_px=rms_by_camera(checked),
+        checks=_expected(bench, weighed, checked),
         images=images,
         outliers=name_outliers(problem, state, covariance, weighed.images),
         degenerate=open_directions(problem, problem.names[:size], covariance[:size, :size]),
@@ -93,6 +96,8 @@ def told(
         chi2=total,
         degrees_of_freedom=freedom,
         chi2_probability=float(chdtrc(freedom, total)) if freedom > 0 else float("nan"),
+        placements=by_other_placements(problem, state),
+        drifts=find_drifts(problem, state),
         components=weighed.components,
         joint_rad=problem.joint_rad,
         inexact_m=bench.inexact_m,
@@ -102,32 +107,56 @@ def told(
     )
 
 
-def _expected(bench: BenchProblem, weighed: Weighed) -> dict[str, tuple[float, float]]:
-    """By camera what check images should be off by, rms per axis, and the most that chance allows: their
-    corners scatter as those that were fitted."""
+def _expected(
+    bench: BenchProblem, weighed: Weighed, checked: Sequence[ImageResiduals]
+) -> dict[str, CheckExpected]:
+    """By camera what check images should be off by."""
+    used = {image.name: image.used for image in checked}
+    terms = [replace(t, keep=used[t.name]) for t in bench.terms.checks if used[t.name].any()]
+    expected = {}
+    for camera in dict.fromkeys(t.camera for t in terms):
+        mine = [t for t in terms if t.camera == camera]
+        weights = check_weights(weighed, mine)
+        names = {t.name for t in mine}
+        square = sum(float(np.sum(i.residuals_px[i.used] ** 2)) for i in checked if i.name in names)
+        expected[camera] = CheckExpected(
+            float(np.sqrt(weights.mean())),
+            float(np.sqrt(rare_sum(UNPREDICTED, weights) / len(weights))),
+            chance_of_sum(square, weights),
+        )
+    return expected
+
+
+def check_weights(weighed: Weighed, terms: Sequence[ImageTerm]) -> FloatArray:
+    """Return what the squares of independent unit errors count in the sum of squares of a camera's check
+    images, (m,), px²: their corners, m numbers in all, scatter as those that were fitted; all images hang on
+    one calibration and share its error; on one reading, all of one standstill.
+    """
     problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
     scatter = {c.kind: c.weighed for c in weighed.components}
-    squares: dict[str, list[FloatArray]] = {}
     exact = problem.at_rest()
-    for term in bench.terms.checks:
+    standstills = list(dict.fromkeys((t.pan_rad, t.tilt_rad, t.approach) for t in terms))
+    by_all, by_readings, own_px = [], [], []
+    for term in terms:
         block = exact.image_block(state, term)
-        moved = [block.jacobian @ _root(covariance[np.ix_(block.columns, block.columns)])]
+        sigma_px = np.repeat(term.sigma_px[term.keep], 2)[:, None]
+        rates = np.zeros((len(sigma_px), len(covariance)))
+        rates[:, block.columns] = sigma_px * block.jacobian
+        readings = np.zeros((len(sigma_px), len(standstills), 2))
         if term.attitude is not None and problem.joint_rad > 0:
-            moved.append(problem.joint_rad * reading_rates(exact, state, term))
-        rates = np.repeat(term.sigma_px, 2)[:, None] * np.concatenate(moved, axis=1)
-        # What moves a whole image counts once for it, not once for every corner.
-        together = np.linalg.svd(rates, compute_uv=False) ** 2
-        own = 2.0 * float(np.sum((scatter.get(term.kind, 1.0) * term.sigma_px) ** 2))
-        found = squares.setdefault(term.camera, [])
-        found.append(
-            np.array([2.0 * len(term.sigma_px), own, float(together.sum()), float(np.sum(together**2))])
-        )
-    expected = {}
-    for camera, found in squares.items():
-        count, own, shared, fourth = np.sum(found, axis=0)
-        mean, spread = (own + shared) / count, np.sqrt(2 * fourth + 2 * own**2 / count) / count
-        expected[camera] = (float(np.sqrt(mean)), float(np.sqrt(mean + CHECK_SIGMAS * spread)))
-    return expected
+            at = standstills.index((term.pan_rad, term.tilt_rad, term.approach))
+            readings[:, at] = sigma_px * problem.joint_rad * reading_rates(exact, state, term)
+        by_all.append(rates)
+        by_readings.append(readings.reshape(len(rates), -1))
+        own_px.append(scatter.get(term.kind, 1.0) * sigma_px)
+    rates = np.concatenate(by_all)
+    touched = rates.any(axis=0)
+    root = _root(covariance[np.ix_(touched, touched)])
+    shared = np.hstack([rates[:, touched] @ root, np.concatenate(by_readings)])
+    together = np.linalg.svd(shared, compute_uv=False) ** 2
+    weights = np.full(len(rates), float(np.mean(np.concatenate(own_px) ** 2)))
+    weights[: len(together)] += together
+    return weights
 
 
 def _rig(bench: BenchProblem, state: Estimate) -> Rig:

@@ -48,6 +48,50 @@ def sigmas(probability: float) -> float:
     return min(float(-ndtri(min(probability, 1.0) / 2)), MOST_SIGMAS)
 
 
+def chance_of_sum(total: float, weights: FloatArray) -> float:
+    """Return the chance of a larger weighted sum of squares of independent unit normals.
+
+    Parameters
+    ----------
+    total, weights
+        The sum, and what each square counts in it (n,), positive.
+
+    Notes
+    -----
+    Lugannani and Rice's saddle point as in Kuonen, Biometrika 86 (1999). A chi-square of the same mean and
+    variance is wrong by orders of magnitude far out, where the largest weight decides.
+    """
+    from scipy.optimize import brentq  # slow to load, and a daemon that starts does not need it
+    from scipy.special import ndtr
+
+    if total <= 0.0:
+        return 1.0
+    w = weights / weights.max()
+    t = total / float(weights.max())
+
+    def slope(at: float) -> float:
+        return float(np.sum(w / (1.0 - 2.0 * at * w))) - t
+
+    # One square alone, and all of them with the largest weight, have their saddle points to either side.
+    at = float(brentq(slope, -0.5 * len(w) / t - 1e-9, 0.5 - 0.5 / t + 1e-9 / t, xtol=1e-15))
+    rise = w / (1.0 - 2.0 * at * w)
+    deviance = at * t + 0.5 * float(np.sum(np.log1p(-2.0 * at * w)))
+    r = math.copysign(math.sqrt(2.0 * max(deviance, 0.0)), at)
+    if abs(r) < 1e-4:  # at the mean the formula is a quotient of noughts, whose limit is this
+        return float(ndtr(-(r + math.sqrt(2.0) / 3.0 * float(np.sum(w**3) / np.sum(w**2) ** 1.5))))
+    return float(ndtr(-(r + math.log(at * math.sqrt(2.0 * float(np.sum(rise**2))) / r) / r)))
+
+
+def rare_sum(probability: float, weights: FloatArray) -> float:
+    """Return what such a weighted sum of squares (`chance_of_sum`) exceeds with a probability below 0.5."""
+    from scipy.optimize import brentq
+
+    low = high = float(weights.sum())
+    while chance_of_sum(high, weights) > probability:
+        low, high = high, 2.0 * high
+    return float(brentq(lambda total: chance_of_sum(total, weights) - probability, low, high, rtol=1e-9))
+
+
 def typical_px(residuals_px: FloatArray) -> float:
     """Return the sigma of a coordinate that the median length of residuals (n, 2) tells, pixels."""
     square = np.nan_to_num((residuals_px**2).sum(axis=1), nan=np.inf)

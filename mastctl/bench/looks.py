@@ -119,13 +119,13 @@ class Looks:
 
     def stands_still(self, name: str) -> bool:
         """Return whether the last attitude of a placement shows now what it showed then."""
-        apart_px = self._again_px(self._known.of(name)[-1])
+        then = self._known.of(name)[-1]
+        apart_px = corners_apart_px(then, self._again(then))
         return apart_px is not None and apart_px <= MOVED_PX
 
-    def _again_px(self, then: Look) -> float | None:
-        """How far aside a look shows the board when it is taken again."""
-        now = self._look(then, {*self._known.workspace.cameras, *(one.camera for one in then.found)})
-        return corners_apart_px(then, now)
+    def _again(self, then: Look) -> Look:
+        """A look taken again, by the cameras that showed the board and those that point."""
+        return self._look(then, {*self._known.workspace.cameras, *(one.camera for one in then.found)})
 
     def _look(self, where: Shot | Look, cameras: Collection[str]) -> Look:
         at = where.pan_rad, where.tilt_rad, (where.pan_approach, where.tilt_approach)
@@ -146,13 +146,16 @@ class Looks:
 
     def _end(self, name: str) -> None:
         """Look once more where the placement began: did the board, or the head, stay as it was?"""
-        apart_px = self._again_px(self._known.of(name)[0])
+        then = self._known.of(name)[0]
+        now = self._again(then)
+        apart_px = corners_apart_px(then, now)
         if apart_px is not None and apart_px > self._allowed_px():
             self._teller.say(
                 f"placement {name}: its first picture taken again shows the board {apart_px:.1f} px aside: "
-                "the board or the head moved meanwhile; the fit will tell which pictures to leave out"
+                "the board or the head moved meanwhile; the fit will tell what it was, and when"
             )
             self._known.kept.note(event="moved", name=name, apart_px=round(apart_px, 2))
+            self._known.take(name, now)  # one more picture of how it is now
         self._known.kept.note(event="done", name=name)
 
     def _allowed_px(self) -> float:

@@ -34,6 +34,8 @@ def judge_bench(survey: Survey, calibration: BenchCalibration) -> Verdict:
         *(Reason("care", note) for note in calibration.notes if " moved during placement " in note),
         *_inexact(survey, calibration),
         *_placements(calibration),
+        *_others(calibration),
+        *_drifts(calibration),
         *_checks(calibration),
         *(Reason("bad", direction.sentence) for direction in calibration.degenerate),
         *_pointing(calibration),
@@ -101,12 +103,35 @@ def _placements(calibration: BenchCalibration) -> Iterator[Reason]:
         )
 
 
+def _others(calibration: BenchCalibration) -> Iterator[Reason]:
+    """Whether placements agree with one another."""
+    odd = [one for one in calibration.placements if one.chance < RARELY]
+    if len(calibration.placements) == 2:  # either contradicts the other
+        odd = odd[:1]
+    yield from (Reason("care", one.sentence) for one in odd)
+    if calibration.placements and not odd:
+        worst = calibration.placements[0]
+        yield Reason(
+            "good",
+            f"each of {len(calibration.placements)} placements says what the others say of cameras, axes and "
+            f"joints; {worst.board[1]} of board {worst.board[0]} differs most, chi-square {worst.chi2:.0f} "
+            f"for {worst.freedom} numbers",
+        )
+
+
+def _drifts(calibration: BenchCalibration) -> Iterator[Reason]:
+    """Whether joints and cameras stayed what they were."""
+    for drift in calibration.drifts:
+        if drift.chance < RARELY:
+            yield Reason("bad" if drift.moves_px > POINTING_GOOD_PX else "care", drift.sentence)
+
+
 def _checks(calibration: BenchCalibration) -> Iterator[Reason]:
     """Whether pictures that were not fitted are predicted as well as they should be."""
     if not calibration.check_rms_px:
         yield Reason("care", "there is no check picture: nothing shows how well the result predicts")
     for camera, xy in calibration.check_rms_px.items():
-        expected, most = calibration.check_expected_px[camera]
+        expected, most, _ = calibration.checks[camera]
         seen = float(np.sqrt(np.mean(np.square(xy))))
         yield Reason(
             "good" if seen <= most else "bad",

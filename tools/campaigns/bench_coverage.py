@@ -3,14 +3,21 @@ points.
 
     .venv/bin/python -m tools.campaigns.bench_coverage --benches 200 --seed 1
     .venv/bin/python -m tools.campaigns.bench_coverage --benches 200 --seed 1 --head servo
+    .venv/bin/python -m tools.campaigns.bench_coverage --benches 100 --head driven --attitudes 8 --checks 3
 
 Benches are simulated (`drivers.sim_survey.bench`): a Navcam pair, an A2 board at three placements, corners
 with 0.1 px noise and some of them wrong. ``--head ptu`` reads true but for counts of 0.05 mrad; ``--head
 servo`` has 4096 counts a turn, harmonics of 6 and 2 mrad, 4 mrad of backlash and a board that bends by 1 mm.
+``--head driven`` has what a driven bench has: two placements, corners with 0.01 px noise and none wrong;
+and counts of 0.05 mrad, harmonics of 5 and 3.5 mrad, 4 mrad of backlash, and axes that pass each other by up
+to 20 mm and are skew by up to 10 mrad. ``--doubts 5`` has the fit begin without the pictures of five head
+positions.
 Prints, over the benches, how often the 95 % interval of each parameter and of predicted pixels (points at 2
 to 10 m, three directions, both cameras, at what the joints read) holds the truth; and how far first pointings
 land from targets at 10, 6 and 2 m that were clicked without noise, with the fitted file, with a file fitted
-without joints' errors, and with the truth for a file: what counts alone allow.
+without joints' errors, and with the truth for a file: what counts alone allow. Last, how many pictures were
+left out as a whole, and with ``--checks`` how often the check pictures of a camera are called bad, and how
+their chances are spread: a right one is below 0.1 in a tenth of all.
 
 Errors of one bench go together, so a pooled rate scatters far more than so many independent intervals would:
 behind ± stands its standard error, from the scatter of whole benches.
@@ -20,9 +27,11 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import NamedTuple
+from unittest import mock
 
 import numpy as np
 
@@ -31,11 +40,12 @@ from calib.camera.stereo import triangulate
 from calib.errors import CalibError
 from calib.fit.bench import BenchOptions, fit_bench
 from calib.fit.bench_calibration import BenchCalibration
+from calib.fit.bench_problem import BenchProblem
 from calib.mast.gimbal import numbers_of
 from calib.mast.joints import JOINTS_NAMES
 from calib.mast.joints import numbers_of as joint_numbers
 from calib.mast.pointing import solve
-from calib.mast.rig import Rig
+from calib.mast.rig import Mast, Rig
 from calib.mast.rig_rates import pixel_rates
 from calib.rigid import tangents
 from drivers.sim_survey.bench import BenchPlan, Placement, simulate_bench
@@ -68,14 +78,20 @@ HEADS = {
         backlash_rad=0.004,
         bow_m=(0.001, -0.0005),
     ),
+    "driven": BenchPlan(placements=PLACEMENTS[:2], own_px=0.01, count_rad=5e-5, backlash_rad=0.004),
 }
 
 
-HARMONICS_RAD = {"ptu": (), "servo": (0.006, 0.002)}
+HARMONICS_RAD = {"ptu": (), "servo": (0.006, 0.002), "driven": (0.005, 0.0035)}
 """Amplitudes of the harmonics of either joint; where their waves begin is drawn for each bench."""
 
+SKEW = {"driven": (0.02, 0.01)}
+"""Most that the axes pass each other by, metres, and are off a right angle, radians; drawn for each bench."""
 
-def plan_of(head: str, attitudes: int, seed: int) -> BenchPlan:
+CHANCES = (0.5, 0.1, 0.01, 0.001)
+
+
+def plan_of(head: str, attitudes: int, seed: int, checks: int = 0) -> BenchPlan:
     """Return the plan of one bench."""
     rng = np.random.default_rng([seed, 5])
     pan, tilt = (
@@ -85,19 +101,45 @@ def plan_of(head: str, attitudes: int, seed: int) -> BenchPlan:
         )
         for _ in range(2)
     )
-    return replace(HEADS[head], attitudes=attitudes, checks=0, pan_harmonics=pan, tilt_harmonics=tilt)
+    offset_m, twist_rad = (rng.uniform(-1, 1, 2) * SKEW.get(head, (0.0, 0.0))).tolist()
+    return replace(
+        HEADS[head],
+        mast=Mast(np.zeros(3), np.zeros(3), offset_m, twist_rad),
+        attitudes=attitudes,
+        checks=checks,
+        pan_harmonics=pan,
+        tilt_harmonics=tilt,
+    )
 
 
 class BenchTask(NamedTuple):
-    """One bench."""
+    """One bench, and how many standstills its start is made to doubt."""
 
     plan: BenchPlan
     seed: int
+    doubts: int = 0
+
+
+@contextmanager
+def doubting(task: BenchTask) -> Iterator[None]:
+    """Have fits begin without the pictures of some standstills, as those do whose start is far off."""
+    begin = BenchProblem.begin
+
+    def begin_without(bench: BenchProblem) -> None:
+        begin(bench)
+        rng = np.random.default_rng([task.seed, 13])
+        out = rng.permutation(bench.terms.attitudes)[: task.doubts].tolist()
+        bench.doubtful |= {term.name for term in bench.terms.images if term.attitude in out}
+
+    with mock.patch.object(BenchProblem, "begin", begin_without):
+        yield
 
 
 class Score(NamedTuple):
     """Errors over sigmas, of parameters by name and of pixels; how far pointings land (3 files, ranges,
-    targets, 2), px; what entered; chi-square's probability and quotient; seconds."""
+    targets, 2), px; what entered; chi-square's probability and quotient; pictures that were fitted and how
+    many of them were left out; of each camera whether its check pictures are bad, and their chance; seconds.
+    """
 
     parameters: dict[str, float]
     pixels: np.ndarray
@@ -105,6 +147,9 @@ class Score(NamedTuple):
     entered: tuple[str, ...]
     probability: float
     reduced: float
+    pictures: int
+    left_out: int
+    checks: tuple[tuple[bool, float], ...]
     seconds: float
 
 
@@ -112,7 +157,8 @@ def score(task: BenchTask) -> Score | str:
     """Return how far one bench's fit is from the truth, or why there is none."""
     survey = simulate_bench(task.seed, task.plan)
     try:
-        fit = fit_bench(survey)
+        with doubting(task):
+            fit = fit_bench(survey)
         entered = tuple(t.name for t in fit.terms if t.entered)
         without = [t for t in entered if not t.startswith(("pan ", "tilt "))]
         plain = fit
@@ -135,6 +181,12 @@ def score(task: BenchTask) -> Score | str:
         entered,
         fit.chi2_probability,
         fit.chi2 / fit.degrees_of_freedom,
+        sum(image.purpose != "check" for image in fit.images),
+        sum(outlier.kind == "image" for outlier in fit.outliers),
+        tuple(
+            (float(np.sqrt(np.mean(np.square(xy)))) > fit.checks[name].most_px, fit.checks[name].chance)
+            for name, xy in fit.check_rms_px.items()
+        ),
         fit.seconds,
     )
 
@@ -250,11 +302,20 @@ def main() -> int:
     parser.add_argument("--seed", type=at_least(0), default=1, help="of the first bench; the others follow")
     parser.add_argument("--head", choices=sorted(HEADS), default="ptu")
     parser.add_argument("--attitudes", type=at_least(4), default=20, help="head positions per placement")
+    parser.add_argument(
+        "--checks", type=at_least(0), default=0, help="head positions per placement that are not fitted"
+    )
+    parser.add_argument(
+        "--doubts", type=at_least(0), default=0, help="head positions that the start is made to doubt"
+    )
     add_task_options(parser)
     options = parser.parse_args()
     seeds = range(options.seed, options.seed + options.benches)
     began = time.monotonic()
-    tasks = [BenchTask(plan_of(options.head, options.attitudes, seed), seed) for seed in seeds]
+    tasks = [
+        BenchTask(plan_of(options.head, options.attitudes, seed, options.checks), seed, options.doubts)
+        for seed in seeds
+    ]
     found = results_of(options, "benches", score, tasks, lambda task: f"seed {task.seed}")
     if found is None:
         return 0
@@ -303,6 +364,16 @@ def report(scores: Sequence[Score]) -> None:
     print("terms that entered: " + (", ".join(f"{t} {n}" for t, n in counts.items()) or "none"))
     reduced = np.array([s.reduced for s in scores])
     print(f"chi-square over its degrees of freedom: mean {reduced.mean():.4f}, sd {reduced.std():.4f}")
+    pictures, left_out = sum(s.pictures for s in scores), sum(s.left_out for s in scores)
+    most = max(s.left_out for s in scores)
+    print(
+        f"pictures left out: {left_out} of {pictures}, {100 * left_out / pictures:.2f} %; at most {most} of "
+        f"a bench, none of {sum(not s.left_out for s in scores)} benches"
+    )
+    checks = [check for s in scores for check in s.checks]
+    if checks:
+        below = ", ".join(f"{100 * np.mean([c < p for _, c in checks]):.1f} % below {p:g}" for p in CHANCES)
+        print(f"check pictures: {sum(bad for bad, _ in checks)} of {len(checks)} bad; chances {below}")
     print(f"fit: {np.mean([s.seconds for s in scores]):.2f} s on average")
 
 

@@ -173,6 +173,35 @@ def test_a_dot_that_few_others_check_is_judged_by_what_the_fit_leaves_of_it(
     term = ImageTerm(
         "one", "left", ("s", "p"), None, 0, 0, counts, counts, places, residual, np.ones(23), keep
     )
-    problem: Any = SimpleNamespace(images=[term], station=[], image_block=lambda state, whole: block)
-    left = judge(problem, None, np.eye(2) / keep[20:].sum(), [term])  # type: ignore[arg-type]
+    left = judge(problem_of(term, block), None, np.eye(2) / keep[20:].sum(), [term])  # type: ignore[arg-type]
     assert left.images[0].keep.tolist() == [True] * 22 + [good]
+
+
+@pytest.mark.parametrize(
+    ("common_sigmas", "own_sigmas", "comes_back"), [(12.0, 0.5, True), (30.0, 0.5, False), (0.0, 3.0, False)]
+)
+def test_an_image_left_out_is_judged_by_what_its_dots_share_and_by_what_they_do_not(
+    common_sigmas: float, own_sigmas: float, comes_back: bool
+) -> None:
+    """Twenty dots under one place, which is known to five sigma of a dot (covariance 25).
+
+    Off together by 12 they are off by 2.4 sigma of the prediction: 12² 20 / (1 + 25 · 20) = 5.7 and no
+    reason, though each by itself is at 12² / 26 and their sum at 111, where 82 is the limit of forty numbers.
+    Off together by 30, each is beyond 2 ln 2000 = 15.2. Off by 3 to either side in turn they are no one
+    place: 3² 20 = 180, though each by itself is at 9 / 26.
+    """
+    jacobian = np.tile(np.eye(2), (20, 1, 1))
+    residual = np.zeros((20, 2))
+    residual[:, 0] = common_sigmas + own_sigmas * np.resize([1.0, -1.0], 20)
+    block = Block(residual.ravel(), jacobian.reshape(40, 2), np.arange(2), 2)
+    counts = np.arange(20)
+    none = np.zeros(20, dtype=bool)
+    term = ImageTerm(
+        "one", "left", ("s", "p"), None, 0, 0, counts, counts, np.zeros((20, 3)), residual, np.ones(20), none
+    )
+    left = judge(problem_of(term, block), None, 25.0 * np.eye(2), [term])  # type: ignore[arg-type]
+    assert left.images[0].keep.tolist() == [comes_back] * 20
+
+
+def problem_of(term: ImageTerm, block: Block) -> Any:
+    return SimpleNamespace(images=[term], station=[], huber=None, image_block=lambda state, whole: block)

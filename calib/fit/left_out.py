@@ -1,0 +1,123 @@
+"""Some dots as the other measurements predict them, and how far off these are, all together.
+
+Taken out of the normal equations, the dots of an image leave the others with another minimum and the
+covariance C = (N - JᵀJ)⁻¹. The error of that prediction moves the dots together: their residuals r have
+the covariance I + J C Jᵀ, and with A = J L, L Lᵀ = C, Woodbury's identity gives
+
+    rᵀ (I + A Aᵀ)⁻¹ r = rᵀr - bᵀ (I + AᵀA)⁻¹ b,    b = Aᵀr.
+
+That is chi-square, and what the sum of squares falls by if the image is left out. It is the same number
+whether the image was fitted or not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.fit.adjustment import Block, bounded_weights
+from calib.rigid import FloatArray
+
+REDUNDANT = 0.02
+"""Directions of a residual with less than this part of the noise left in them cannot be tested."""
+
+SOLE = 1e-6
+"""Part of what is known of an unknown that the others are taken to contribute at least: it is inverted."""
+
+TOLD = 1e-3
+"""A direction of whose variance some dots take away less than this part is not theirs to tell."""
+
+REPEATS = 3
+"""Times that the dots of an image are judged by one another."""
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """An image's residuals (2n,) as the others predict it, in sigmas, and their rates A (2n, k) by k
+    independent unit errors of that prediction; not-a-number where a dot has no pixel."""
+
+    residual: FloatArray
+    rates: FloatArray
+
+    def statistic(self, good: np.ndarray) -> tuple[float, int]:
+        """Return chi-square of some of the dots (n,) taken together, and its degrees of freedom.
+
+        Directions that the image itself tells and the others hardly do cannot be tested, and count as free.
+        """
+        rows = np.repeat(good, 2)
+        rates, residual = self.rates[rows], self.residual[rows]
+        told, along = np.linalg.eigh(rates.T @ rates)
+        told = np.maximum(told, 0.0)
+        free = REDUNDANT * (1.0 + told) > 1.0
+        taken = (along.T @ (rates.T @ residual)) ** 2 / np.where(free, told, 1.0 + told)
+        return float(residual @ residual - taken.sum()), int(rows.sum() - free.sum())
+
+    def pull(self) -> tuple[float, int]:
+        """Return chi-square of what these dots say of the unknowns against what the others say, and of how
+        many numbers; those that either hardly tells are not compared."""
+        told, along = np.linalg.eigh(self.rates.T @ self.rates)
+        compared = (told > TOLD) & (REDUNDANT * (1.0 + told) <= 1.0)
+        told, gradient = told[compared], along[:, compared].T @ (self.rates.T @ self.residual)
+        return float(np.sum(gradient**2 / (told * (1.0 + told)))), int(compared.sum())
+
+    def agreeing(self, good: np.ndarray, limit: float) -> np.ndarray:
+        """Return which of the good dots (n,) stay so beside one another: of those the others' error cannot be
+        the cause."""
+        for _ in range(REPEATS):
+            rows = np.repeat(good, 2)
+            rates = self.rates[rows]
+            spread = np.linalg.inv(np.eye(rates.shape[1]) + rates.T @ rates)
+            residual = self.residual - self.rates @ (spread @ (rates.T @ self.residual[rows]))
+            statistic = dot_statistics(residual, self.rates, spread, good)
+            if (statistic[good] <= limit).all():
+                break
+            good = good & (statistic <= limit)
+        return good
+
+
+def left_out(block: Block, covariance: FloatArray, keep: np.ndarray, huber: float | None) -> LeftOut:
+    """Return an image as the others predict it.
+
+    Parameters
+    ----------
+    block
+        All its dots at the minimum.
+    covariance
+        (k, k) of the unknowns that it touches.
+    keep, huber
+        Which dots (n,) were fitted, and from what length in sigmas on with bounded pulls.
+    """
+    scale = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    rates = (block.jacobian * scale) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    fitted = np.repeat(keep, 2)
+    own, residual = rates[fitted], block.residual[fitted]
+    weighed = own * bounded_weights(residual, 2, huber)[:, None]
+    left, turned = np.linalg.eigh(np.eye(len(scale)) - weighed.T @ own)
+    rates = rates @ turned
+    known = left > REDUNDANT
+    step = (turned.T @ (weighed.T @ residual))[known] / left[known]
+    return LeftOut(block.residual + rates[:, known] @ step, rates / np.sqrt(np.maximum(left, SOLE)))
+
+
+def dot_statistics(
+    residual: FloatArray, jacobian: FloatArray, covariance: FloatArray, fitted: np.ndarray
+) -> FloatArray:
+    """Return chi-square of each dot by itself (n,), infinite where it has no pixel.
+
+    Parameters
+    ----------
+    residual, jacobian
+        (2n,) and (2n, k), in sigmas.
+    covariance
+        (k, k) of the unknowns.
+    fitted
+        Which dots (n,) were.
+    """
+    rates = jacobian.reshape(len(fitted), 2, -1)
+    spread = np.einsum("nik,nkj->nij", rates @ covariance, rates.transpose(0, 2, 1))
+    sign = np.where(fitted, -1.0, 1.0)[:, None, None]
+    values, vectors = np.linalg.eigh(np.eye(2) + sign * np.nan_to_num(spread))
+    along = np.einsum("nji,nj->ni", vectors, residual.reshape(-1, 2))
+    return np.asarray(np.nan_to_num((along**2 / np.maximum(values, REDUNDANT)).sum(axis=1), nan=np.inf))

@@ -1,0 +1,146 @@
+"""How often check pictures of a bench that is right are called bad.
+
+    .venv/bin/python -m tools.campaigns.bench_checks --benches 300 --seed 1
+
+Benches as `tools.campaigns.bench_coverage` has them are linearised at the truth: each of twelve is simulated
+without noise and fitted; errors of all that is measured are then drawn anew for every bench (corners normal,
+readings anywhere within a count), and its calibration is off by the linear least-squares step that they make.
+That is honest where errors are small against the bends of the model, as on benches, and leaves out the choice
+of terms and of outliers; `bench_coverage --checks` has these too, on fewer benches. Printed is how often the
+check pictures of a camera are called bad, and how their chances are spread: a right one is below 0.1 in a
+tenth of all.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+from unittest import mock
+
+import numpy as np
+
+from calib.fit.adjustment import KNOWN_BEFOREHAND
+from calib.fit.bench import fit_bench
+from calib.fit.bench_changes import reading_rates
+from calib.fit.bench_problem import BenchProblem
+from calib.fit.bench_told import UNPREDICTED, check_weights
+from calib.fit.joint import Weighed
+from calib.fit.significance import chance_of_sum
+from calib.fit.terms import ImageTerm
+from drivers.sim_survey.bench import simulate_bench
+from mastctl.cli.output import at_least
+from mastctl.cli.tasks import add_task_options, results_of
+from tools.arguments import end
+from tools.campaigns.bench_coverage import CHANCES, HEADS, plan_of
+
+GEOMETRIES = 12
+
+
+class Task(NamedTuple):
+    """Benches of one geometry: head, head positions a placement, fitted and not, how many benches, seed."""
+
+    head: str
+    attitudes: int
+    checks: int
+    benches: int
+    seed: int
+
+
+class Found(NamedTuple):
+    """Chances of the check pictures (benches, cameras), and the part of their expected squares that is the
+    calibration's, by camera."""
+
+    chances: np.ndarray
+    part: np.ndarray
+
+
+def found(task: Task) -> Found:
+    """Return the chances of the check pictures of some benches."""
+    plan = replace(plan_of(task.head, task.attitudes, task.seed, task.checks), gross=0.0)
+    survey = simulate_bench(task.seed, replace(plan, noise=0.0))
+    with mock.patch("calib.fit.bench.told") as told:
+        fit_bench(survey)
+    bench: BenchProblem = told.call_args.args[0]
+    weighed: Weighed = told.call_args.args[2]
+    rng = np.random.default_rng([task.seed, 17])
+    steps = drawn_steps(weighed, task.benches, rng)
+    chances, part = [], []
+    for camera in weighed.fit.state.cameras:
+        mine = [term for term in bench.terms.checks if term.camera == camera]
+        weights = check_weights(weighed, mine)
+        exact = replace(weighed, covariance=np.zeros_like(weighed.covariance))
+        part.append(1.0 - check_weights(exact, mine).sum() / weights.sum())
+        squares = drawn_squares(
+            weighed, mine, steps, np.random.default_rng([task.seed, 19, *camera.encode()])
+        )
+        chances.append([chance_of_sum(float(square), weights) for square in squares])
+    return Found(np.array(chances).T, np.array(part))
+
+
+def drawn_steps(weighed: Weighed, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return what drawn errors of all measurements make of the unknowns, (count, p)."""
+    pull = np.zeros((count, len(weighed.covariance)))
+    for what, block in weighed.problem.blocks(weighed.fit.state):
+        if isinstance(what, str) and what.startswith(KNOWN_BEFOREHAND):
+            continue
+        size = (count, len(block.residual))
+        reading = isinstance(what, str) and what.startswith("attitude")
+        errors = rng.uniform(-(3**0.5), 3**0.5, size) if reading else rng.standard_normal(size)
+        pull[:, block.columns] += errors @ block.jacobian
+    return np.asarray(pull @ weighed.covariance)
+
+
+def drawn_squares(
+    weighed: Weighed, terms: Sequence[ImageTerm], steps: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Return the sums of squares, px², of a camera's check pictures (benches,)."""
+    squares = np.zeros(len(steps))
+    exact, state = weighed.problem.at_rest(), weighed.fit.state
+    for term in terms:
+        block = exact.image_block(state, term)
+        readings = rng.uniform(-(3**0.5), 3**0.5, (len(steps), 2)) * weighed.problem.joint_rad
+        off = rng.standard_normal((len(steps), len(block.residual)))
+        off += steps[:, block.columns] @ block.jacobian.T + readings @ reading_rates(exact, state, term).T
+        squares += np.sum((off * np.repeat(term.sigma_px, 2)) ** 2, axis=1)
+    return squares
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--benches", type=at_least(1), default=300)
+    parser.add_argument(
+        "--seed", type=at_least(0), default=1, help="of the first geometry; the others follow"
+    )
+    parser.add_argument("--head", choices=sorted(HEADS), default="driven")
+    parser.add_argument("--attitudes", type=at_least(4), default=8, help="head positions per placement")
+    parser.add_argument("--checks", type=at_least(1), default=3, help="the same that are not fitted")
+    add_task_options(parser)
+    options = parser.parse_args(words)
+    each = -(-options.benches // GEOMETRIES)
+    tasks = [
+        Task(options.head, options.attitudes, options.checks, each, seed)
+        for seed in range(options.seed, options.seed + GEOMETRIES)
+    ]
+    results = results_of(options, "checks", found, tasks, lambda task: f"seed {task.seed}")
+    if results is None:
+        return 0
+    chances = np.concatenate([one.chances for one in results]).ravel()
+    part = np.concatenate([one.part for one in results])
+    below = ", ".join(f"{100 * np.mean(chances < p):.2f} % below {p:g}" for p in CHANCES)
+    bad = int(np.sum(chances < UNPREDICTED))
+    print(
+        f"check pictures of {len(chances)} cameras of {each * GEOMETRIES} benches ({options.head}): {bad} "
+        f"called bad, {len(chances) * UNPREDICTED:.2g} meant\n"
+        f"chances: {below}\n"
+        f"calibration's part of the squares: {part.min():.2f} to {part.max():.2f}"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    end(main)
