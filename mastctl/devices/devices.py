@@ -437,8 +437,11 @@ class Devices:
             told = self._reported()
         except Exception:  # of a driver from outside; the reading is good all the same
             told = {}
+        warm = {name: axis.temperature_C for name, axis in told.items()}
         self.temperatures_c = {
-            name: axis.temperature_C for name, axis in told.items() if axis.temperature_C is not None
+            name: value
+            for name, value in warm.items()
+            if isinstance(value, int | float) and math.isfinite(value)
         }
         return MOVING_PERIOD_S if moving else RESTING_PERIOD_S
 

@@ -45,6 +45,7 @@ class CalibrationHealth:
         self._mast = mast
         self._known: deque[Measured] = deque(maxlen=KEPT)
         self._windows: Windows | None = None
+        self._judges_by = mast  # in the thread: it comes to the one in use by and by
         self._newest: tuple[Judged, ...] = ()
         self._not_kept = ""
         self.verdict = NOTHING_YET
@@ -107,11 +108,12 @@ class CalibrationHealth:
             if self._windows is not None:
                 self._windows.add(news)
         else:
+            self._judges_by = news
             try:
                 self._windows = Windows(news.rig, news.digest)
             except CalibError as error:
                 self._windows = None
-                self._say(Verdict("unknown", f"residuals are kept, and judged by nothing: {error}"), news)
+                self._say(Verdict("unknown", f"residuals are kept, and judged by nothing: {error}"), ())
             else:
                 for one in self._known:
                     self._windows.add(one)
@@ -119,15 +121,13 @@ class CalibrationHealth:
         if windows is not None:
             windows.forget(now_s)
             pointings = windows.pointings
-            self._newest = tuple(pointings[-TOLD:])
-            mast = self._mast if isinstance(news, Measured) else news
-            self._say(verdict_of(windows.evidence(), len(pointings)), mast)
+            self._say(verdict_of(windows.evidence(), len(pointings)), tuple(pointings[-TOLD:]))
 
-    def _say(self, verdict: Verdict, mast: StoredRig) -> None:
+    def _say(self, verdict: Verdict, newest: tuple[Judged, ...]) -> None:
         """Let a verdict be known, unless another mast file is in use by now."""
-        if mast is not self._mast:
+        if self._judges_by is not self._mast:
             return
-        before, self.verdict = self.verdict, verdict
+        before, self.verdict, self._newest = self.verdict, verdict, newest
         if verdict.word == "drifts" and before.word != "drifts":
             log.warning("the calibration drifts: %s", verdict.sentence)
         elif before.word == "drifts" and verdict.word != "drifts":

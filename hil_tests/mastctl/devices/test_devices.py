@@ -16,7 +16,7 @@ import pytest
 
 from drivers.clock import SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, LineLost, NoFreshFrame, NoReply
-from drivers.interfaces import Frame, FrameTime, Reading
+from drivers.interfaces import AxisReport, Frame, FrameTime, Reading
 from drivers.simulation_clock import SimulationClock
 from hil_tests.mastctl.devices.turned import Hang, Turned
 from hil_tests.mastctl.service_fakes import FakeCamera, FakeHardware, rig
@@ -101,6 +101,16 @@ JUNK_READINGS: list[tuple[str, Any]] = [
     ("old", lambda head: Reading(0.0, 0.0, False, head.clock.now_s() - 1.5)),
     ("backwards", lambda head: Reading(0.0, 0.0, False, head.clock.now_s() - 0.5)),
 ]
+
+
+@pytest.mark.parametrize("told", [math.nan, math.inf, "hot"])
+def test_a_temperature_that_is_none_is_not_told(
+    devices: Devices, clock: Turned, monkeypatch: pytest.MonkeyPatch, told: Any
+) -> None:
+    pan, tilt = (AxisReport(None, 0, 0.0, 0, 0.0, "unknown", None, None, c, None) for c in (told, 41.5))
+    monkeypatch.setattr(devices, "_reported", lambda: {"pan": pan, "tilt": tilt})
+    clock.until(lambda: devices.temperatures_c, "one is told")
+    assert devices.temperatures_c == {"tilt": 41.5}
 
 
 @pytest.mark.parametrize("answer", [a for _, a in JUNK_READINGS], ids=[n for n, _ in JUNK_READINGS])

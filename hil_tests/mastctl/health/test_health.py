@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 
 from calib.errors import BadFile
+from calib.mast.rig import Rig
 from drivers.interfaces import COARSE_COUNT_RAD
 from hil_tests.mastctl.health.histories import DAY_S, NOON_S, bumped, pointing, stored_rig
-from hil_tests.waiting import until
+from hil_tests.mastctl.service_fakes import Hang
+from hil_tests.waiting import NET_S, until
+from mastctl.health import health as health_module
 from mastctl.health import journal as journal_module
 from mastctl.health.health import CalibrationHealth
 from mastctl.health.journal import FILE, Journal
 from mastctl.health.measured import Measured, measured_by, measured_of
+from mastctl.health.windows import Windows
 from mastctl.operations.records import Operation
 from mastctl.pointing.results import Step
 
@@ -118,6 +122,31 @@ def test_a_drift_is_told_after_a_restart_and_ends_with_another_mast_file(tmp_pat
     assert health.verdict.word == "few" and health.told()["newest"] == []
     health.use_mast(STORED)
     until(lambda: health.verdict.word == "drifts", "it drifts")
+    health.close()
+
+
+def test_a_pointing_that_ends_as_the_mast_file_is_exchanged_is_judged_by_neither(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for one in history(6, 2e-3):
+        Journal(tmp_path / FILE).add(one, [])
+    health = CalibrationHealth(tmp_path, STORED, lambda: NOON_S + 600.0)
+    until(lambda: health.verdict.word == "drifts", "it drifts")
+    kept, judged, seen = Hang(), Hang(), Windows
+
+    def windows(rig: Rig, digest: str) -> Windows:
+        judged()
+        return seen(rig, digest)
+
+    monkeypatch.setattr(health_module, "Windows", windows)
+    monkeypatch.setattr(Journal, "add", kept)
+    health._queue.put(history(1)[0])
+    assert kept.entered.wait(NET_S)
+    health.use_mast(replace(STORED, digest="0" * 64))
+    kept.let_go()
+    assert judged.entered.wait(NET_S)
+    assert health.verdict.word == "few" and health.told()["newest"] == []
+    judged.let_go()
     health.close()
 
 
