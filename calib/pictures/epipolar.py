@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.camera.cahvor import CameraModel
-from calib.camera.stereo import triangulate_many
+from calib.camera.stereo import triangulate, triangulate_many
+from calib.errors import NoStereoPoint
 from calib.pictures.epipolar_sweep import Swept, sweep
 from calib.pictures.patch_match import match_patch
 from calib.pictures.patch_verdict import (
@@ -107,6 +108,10 @@ def find_partner(
     found = match_patch(image, camera, pixel, plane, partner_image, partner, LAST_SEARCH_PX, settings, relief)
     if found.verdict != "good":
         return StereoMatch(found)
+    try:
+        triangulate(camera, partner, pixel, found.pixel_px)
+    except NoStereoPoint as error:
+        return StereoMatch(no_match("weak", f"the two eyes see no point together: {error}", found.pixel_px))
     across, sigma = _across(camera, pixel, partner, plane, found)
     apart = math.inf
     for size in sizes:

@@ -100,11 +100,10 @@ def match_patch(
     if settings.relief > 0:
         explained = found.refined.correlation / expected_correlation(template.values, settings)
         roughness *= 1.0 + max(0.0, 1.0 - explained) / settings.relief
-    if relief is None:
-        surface = _surface_term(source, target, plane, destination, template, near_px2, roughness)
-    else:
+    surface = _surface_term(source, target, plane, destination, template, near_px2, roughness)
+    if relief is not None:
         off = relief.sigma_inverse_m * parallax_px_m(source, target, plane, destination)
-        surface = np.outer(off, off)
+        surface += np.outer(off, off)
     middle = found.refined.middle
     if middle is not None:
         # The middle is noisier, but the target is nearer to its plane.

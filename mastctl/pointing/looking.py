@@ -166,8 +166,9 @@ class Eyes:
             ``target_...`` if the match is not good, ``eyes_disagree`` if it lies off the line.
         """
         settings = self._settings
+        sizes = replace(settings.match, roughness=0.0)  # the eyes see how rough it is
         found = find_partner(
-            view.image, view.camera, pixel_px, other.image, other.camera, settings.nearest_m, settings.match
+            view.image, view.camera, pixel_px, other.image, other.camera, settings.nearest_m, sizes
         )
         _good(found.match, other)
         if abs(found.across_px) > settings.eyes_px + 5.0 * found.across_sigma_px:
@@ -194,11 +195,12 @@ class Eyes:
         found: list[PatchMatch] = []
         for search in (settings.search_px, settings.wide_search_px):
             for plane, sizes in product(planes, self._sizes()):
+                relief = clicked.relief if plane is clicked.plane else None
                 found.append(
                     match_patch(
                         clicked.view.image, clicked.view.camera, clicked.pixel_px, plane,
-                        now.image, now.camera, search, sizes,
-                        clicked.relief if plane is clicked.plane else None,
+                        now.image, now.camera, search,
+                        sizes if relief is None else replace(sizes, roughness=0.0), relief,
                     )
                 )  # fmt: skip
                 if found[-1].verdict == "good":

@@ -260,6 +260,15 @@ def test_arrays_that_are_no_picture_are_refused_in_a_sentence() -> None:
         Plane(np.zeros(3), np.zeros(3))
 
 
+def test_a_partner_beyond_infinity_is_no_match() -> None:
+    pixel = np.array([200.0, 140.0])
+    point = wall(5).hit(LEFT.position_m, LEFT.rays(pixel))
+    far_px = RIGHT.pixel(LEFT.position_m + 1e6 * (point - LEFT.position_m))
+    beyond = np.roll(seen(RIGHT, 5), round(far_px[0] - RIGHT.pixel(point)[0]) + 2, axis=1)
+    found = find_partner(seen(LEFT, 5), LEFT.model, pixel, beyond, RIGHT.model)
+    assert found.match.verdict == "weak" and "see no point together" in found.match.reason, found.match
+
+
 def test_a_picture_that_is_nothing_but_not_a_number_matches_nowhere() -> None:
     nothing = np.full_like(seen(RIGHT, 5), np.nan)
     found = find_partner(seen(LEFT, 5), LEFT.model, (200.0, 140.0), nothing, RIGHT.model)

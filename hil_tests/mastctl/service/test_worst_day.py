@@ -56,8 +56,9 @@ def test_on_the_worst_day_the_second_pointing_lands_and_tells_the_truth() -> Non
         for pixel_px in CLICKS:
             told, truly_px = pointed(service, pixel_px)
             assert told["state"] == "done", told["error"]
-            assert np.abs(truly_px).max() < 0.3
-            assert np.abs(truly_px - told["residual_px"]).max() < 0.2
+            assert np.abs(truly_px).max() < 0.4
+            off_px = np.abs(truly_px - told["residual_px"])
+            assert (off_px < 3.0 * np.array(told["residual_sigma_px"])).all()
 
 
 def test_who_does_not_let_the_mast_settle_is_told_no_residual() -> None:
