@@ -68,6 +68,8 @@ def chance_of_sum(total: float, weights: FloatArray) -> float:
         return 1.0
     w = weights / weights.max()
     t = total / float(weights.max())
+    if 0.25 * t - 0.5 * len(w) > MOST_SIGMAS**2:  # Chernoff's bound, beyond what a computer holds
+        return 0.0
 
     def slope(at: float) -> float:
         return float(np.sum(w / (1.0 - 2.0 * at * w))) - t

@@ -36,6 +36,8 @@ from calib.rigid import FloatArray
 
 MOST_ASPECT = 5.0  # of a weight that is round on a surface seen flat
 
+FLAT_DN2 = 0.1  # grey variance below which there is no noise either, and sums of single precision tell none
+
 COUNTS_TO = 2.2  # sigmas of that weight, beyond which pixels are left out
 
 
@@ -256,7 +258,8 @@ def _search(
 def correlations(image: Grey, patch: Grey, counts: FloatArray | None) -> NDArray[np.float32]:
     """Return the correlations of a patch with all places of an image, its pixels weighted by ``counts``.
 
-    Not OpenCV's own mask, with which it may return what is no number.
+    Not OpenCV's own mask, with which it may return what is no number. Where the image is one grey value
+    (black, saturated) it correlates by 0.
     """
     if counts is None:
         return np.asarray(cv2.matchTemplate(image, patch, cv2.TM_CCOEFF_NORMED), dtype=np.float32)
@@ -269,7 +272,8 @@ def correlations(image: Grey, patch: Grey, counts: FloatArray | None) -> NDArray
 
     spread = summed(shifted * shifted, weights) - summed(shifted, weights) ** 2 / total
     length = np.sqrt(np.maximum(spread * float((weighted * patch).sum()), 1e-3))
-    return np.asarray(summed(shifted, weighted) / length, dtype=np.float32)
+    scores = np.where(spread > FLAT_DN2 * total, summed(shifted, weighted) / length, 0.0)
+    return scores.astype(np.float32)
 
 
 def peaks(

@@ -168,9 +168,11 @@ def _off_plane(
         ]
     )[:, inner, inner]
     variance = variance[inner, inner]
-    best = np.clip(scores.argmax(axis=0), 1, len(steps) - 2)
+    # The last of equals: from beyond the farthest range on all steps look at one place.
+    best = np.clip(len(steps) - 1 - scores[::-1].argmax(axis=0), 1, len(steps) - 2)
     before, best_score, after = (np.take_along_axis(scores, best[None] + d, 0)[0] for d in (-1, 0, 1))
     off_px = (best + _summit(before, best_score, after)) * np.float32(STEP_PX) - np.float32(REACH_PX)
+    off_px = np.maximum(off_px, np.float32(px_m * (1.0 / FARTHEST_M - 1.0 / ranges[4])))  # nor beyond it
     within = (best_score >= before) & (best_score >= after)
     fits = within & (best_score >= FITS * variance / (variance + noise_dn**2))
     held = cv2.medianBlur(fits.astype(np.uint8), SPECKS_PX)
@@ -221,6 +223,8 @@ def _fitted(camera: CameraModel, pixel_px: FloatArray, plane: Plane, seen: _Seen
     points = rays.origins_m + rays.directions / inverse[:, None]
     normal_m = np.cross(points[1] - points[0], points[2] - points[0])
     length = float(np.linalg.norm(normal_m))
-    if not abs(float(normal_m @ rays.directions[0])) > GRAZING * length:
-        return plane
+    # Far away noise alone slopes a plane so that a part of the patch looks along or past it.
+    met = camera.ray(pixel_px + square_grid(1).reshape(9, 2) * half).directions @ normal_m
+    if not (met * np.sign(met[4])).min() > GRAZING * length:
+        return Plane(points[0], -rays.directions[0])
     return Plane(points[0], normal_m / length)

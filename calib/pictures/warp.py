@@ -185,9 +185,13 @@ class Relief:
         return inverse.astype(np.float64), counts.astype(np.float64)
 
     def seen_by(self, camera: CameraModel, pixel_px: FloatArray, plane: Plane, own: CameraModel) -> Relief:
-        """Return the same around the target's pixel (2,) of a camera that stands nearly where ``own`` did."""
-        places, valid = carry(pixel_px + square_grid(self.half_px), camera, plane, own)
-        inverse, counts = self.at(np.where(valid[..., None], places, -1e6))
+        """Return the same around the target's pixel (2,) of a camera that stands nearly where ``own`` did.
+
+        Both pixels show the target; where the cameras' poses say otherwise, the pixels are believed.
+        """
+        places, _ = carry(pixel_px + square_grid(self.half_px), camera, plane, own)
+        places += self.pixel_px - places[self.half_px, self.half_px]
+        inverse, counts = self.at(np.nan_to_num(places, nan=-1e6))
         return Relief(pixel_px, inverse.astype(np.float32), counts.astype(np.float32), self.sigma_inverse_m)
 
 

@@ -34,3 +34,10 @@ def test_equal_weights_are_chi_square(freedom: int) -> None:
     for total in np.array([0.3, 1.0 - 1e-9, 1.0, 1.0 + 1e-9, 1.5, 3.0]) * freedom:
         exact = float(chdtrc(freedom, total))
         assert chance_of_sum(2.0 * total, np.full(freedom, 2.0)) == pytest.approx(exact, rel=0.06)
+
+
+@pytest.mark.parametrize("total", [1e4, 1e8, 5e9, 5e10])
+@pytest.mark.parametrize("others", [0, 40])
+def test_a_sum_that_nothing_explains_has_no_chance(total: float, others: int) -> None:
+    """Check pictures of another placement are hundreds of pixels off, a sum 1e10 times the largest weight."""
+    assert chance_of_sum(total, np.array([1.0, *[0.1] * others])) == 0.0

@@ -10,9 +10,9 @@ import pytest
 from calib.errors import CalibError
 from calib.pictures.epipolar import find_partner
 from calib.pictures.least_squares_matching import LeastSquaresMatch
-from calib.pictures.patch_match import match_patch
+from calib.pictures.patch_match import correlations, match_patch
 from calib.pictures.patch_verdict import MatchSettings, PatchFound, PatchMatch, judged, texture_lacks
-from calib.pictures.warp import Plane, Template, carry, facing_plane, grey
+from calib.pictures.warp import Plane, Relief, Template, carry, facing_plane, grey
 from hil_tests.calib.pictures.textured_planes import (
     Edge,
     Pinhole,
@@ -405,3 +405,45 @@ def test_what_lies_behind_an_edge_does_not_pull_a_place_beside_it(seed: int) -> 
     assert np.sqrt((errors**2).mean()) < 0.03
     assert np.sqrt((normalised**2).mean()) < 1.4
     assert np.abs(normalised).max() < 4.0
+
+
+@pytest.mark.parametrize("flat_dn", [0.0, 20.0, 250.0, 255.0])
+@pytest.mark.parametrize("side_px", [45, 60, 70])
+def test_a_shadow_or_a_glare_without_noise_is_like_no_patch(flat_dn: float, side_px: int) -> None:
+    image = np.rint(seen(LEFT, 0)[60:201, 60:201])
+    patch = image[20:61, 20:61].copy()
+    image[140 - side_px : 140, 140 - side_px : 140] = flat_dn
+    counts = np.ones(patch.shape)
+    counts[:, 30:] = 0.0
+    scores = correlations(image, patch, counts)
+    assert np.unravel_index(scores.argmax(), scores.shape) == (20, 20)
+    assert np.abs(scores).max() < 1.001
+
+
+@pytest.mark.parametrize("range_m", [1000.0, 30000.0])
+def test_what_is_as_good_as_infinitely_far_has_a_partner(range_m: float) -> None:
+    """It is 0.3 px from where infinity is, and nearer: nothing can be looked up beyond."""
+    hill = TexturedPlane(
+        np.array([range_m, 0.0, 0.0]), np.array([-1.0, 0.05, 0.05]), random_texture(3, 8.0), 3e-4 * range_m
+    )
+    left, right = (picture(camera, hill, 2, NOISE_DN, k) for k, camera in enumerate((LEFT, RIGHT)))
+    pixel = np.array([170.3, 140.2])
+    found = find_partner(left, LEFT.model, pixel, right, RIGHT.model).match
+    assert found.verdict == "good", found.reason
+    off_px = found.pixel_px - RIGHT.pixel(hill.hit(LEFT.position_m, LEFT.rays(pixel)))
+    assert (np.abs(off_px) < 3.0 * found.sigma_px).all()
+    assert found.sigma_px.max() < 0.2
+
+
+def test_a_relief_stays_on_the_target_where_the_head_turned_otherwise_than_was_read() -> None:
+    """The encoder errs by 4 mrad, 5 px, between click and new picture: the mask moves with the target."""
+    counts = np.ones((47, 47), np.float32)
+    counts[:, 30:] = 0.0  # an edge 7 px right of the target
+    told = Pinhole(np.zeros(3), 0.1, 0.0, FOCAL_PX, SIZE_PX)
+    true = Pinhole(np.zeros(3), 0.104, 0.0, FOCAL_PX, SIZE_PX)
+    target = np.array([4.0, 0.2, 0.0])
+    relief = Relief(LEFT.pixel(target), np.zeros((47, 47), np.float32), counts, 0.0)
+    plane = facing_plane(LEFT.model, relief.pixel_px, float(np.linalg.norm(target)))
+    clicked = relief.seen_by(told.model, true.pixel(target), plane, LEFT.model)
+    assert clicked.counts[23, 29] > 0.5
+    assert clicked.counts[23, 31] < 0.5
