@@ -75,11 +75,10 @@ def find_drifts(problem: Adjustment, state: Estimate) -> tuple[Drift, ...]:
     _, freedom = goodness(problem, state, covariance)
     on_head = [row for row in rows if row.image.attitude is not None]
     readings = reading_rows(problem, state, rows)
-    asked: list[tuple[str, tuple[str, ...], list[Rows], list[Rows]]] = [
-        ("pan", ("pan",), on_head, readings),
-        ("tilt", ("tilt",), on_head, readings),
-    ]
-    for camera in state.cameras:
+    asked: list[tuple[str, tuple[str, ...], list[Rows], list[Rows]]] = []
+    if on_head:
+        asked += [("pan", ("pan",), on_head, readings), ("tilt", ("tilt",), on_head, readings)]
+    for camera in dict.fromkeys(row.image.camera for row in rows):  # one may have no picture left
         mine = [row for row in rows if row.image.camera == camera]
         asked.append((camera, ("focus", "knock"), mine, mine))
     found = []

@@ -15,6 +15,7 @@ from calib.fit.bench import BenchOptions, fit_bench
 from calib.fit.bench_calibration import BenchCalibration
 from calib.fit.bench_problem import BenchProblem
 from calib.fit.bench_start import BenchNotFitted
+from calib.fit.bench_tests import find_drifts
 from calib.fit.bench_told import check_weights
 from calib.fit.model_terms import candidate_terms, entering_together
 from calib.fit.terms import ImageTerm
@@ -237,6 +238,15 @@ def test_what_drifts_is_named_with_its_size_and_is_no_slip() -> None:
     assert "pan drifts off its reading, by +0." in drifts["pan"].sentence
     # what the second placement says of the camera is not what the first one says
     assert fit.placements[0].chance < 1e-6
+
+
+def test_a_camera_without_a_picture_left_is_asked_for_no_drift() -> None:
+    plan = BenchPlan(attitudes=8, checks=0)
+    bench = BenchProblem(simulate_bench(1, replace(plan, placements=plan.placements[:2])), BenchOptions())
+    problem = bench.seen((), bench.start)
+    left = [replace(t, keep=t.keep & (t.camera == "navcam_left")) for t in problem.images]
+    drifts = find_drifts(problem.with_terms(left, ()), bench.start)
+    assert {drift.what for drift in drifts} == {"pan", "tilt", "navcam_left"}
 
 
 @pytest.mark.parametrize(("size_m", "look"), [(0.05, 6), (0.5, 6), (0.02, 8)])
