@@ -176,11 +176,11 @@ class Relief:
         return len(self.counts) // 2
 
     def at(self, pixels_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``inverse_m`` and ``counts`` (h, w) at pixels (h, w, 2); beyond the patch 0 and 1."""
+        """Return ``inverse_m`` and ``counts`` (h, w) at pixels (h, w, 2); 0 beyond what was seen."""
         x, y = np.moveaxis((pixels_px - self.pixel_px + self.half_px).astype(np.float32), -1, 0)
         inverse, counts = (
-            cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=beyond)
-            for values, beyond in ((self.inverse_m, 0.0), (self.counts, 1.0))
+            cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
+            for values in (self.inverse_m, self.counts)
         )
         return inverse.astype(np.float64), counts.astype(np.float64)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -447,3 +448,24 @@ def test_a_relief_stays_on_the_target_where_the_head_turned_otherwise_than_was_r
     clicked = relief.seen_by(told.model, true.pixel(target), plane, LEFT.model)
     assert clicked.counts[23, 29] > 0.5
     assert clicked.counts[23, 31] < 0.5
+
+
+def test_a_wide_eye_looks_for_what_a_narrow_pair_saw_of_a_rocks_edge_and_no_further() -> None:
+    """41 px of a Navcam are 109 px of a Pancam, of which its pair has looked up 47."""
+    narrow = Pinhole(np.zeros(3), 0.0, 0.0, 3000.0, SIZE_PX)
+    partner = Pinhole(np.array([0.0, 0.2, 0.0]), -0.05, 0.0, 3000.0, SIZE_PX)
+    wide = Pinhole(np.array([0.0, 0.1, 0.05]), -0.025, 0.0, 3000.0 / 2.67, SIZE_PX)
+    scene, rng, matches = replace(step(4), edge_y_m=0.02), np.random.default_rng(4), []
+    images = [picture(camera, scene, 2, NOISE_DN, 4 + k) for k, camera in enumerate((narrow, partner, wide))]
+    for _ in range(8):
+        pixel = np.array([rng.uniform(130, 180), rng.uniform(90, 190)])
+        stereo = find_partner(images[0], narrow.model, pixel, images[1], partner.model)
+        assert stereo.plane is not None, stereo.match.reason
+        found = match_patch(
+            images[0], narrow.model, pixel, stereo.plane, images[2], wide.model, 20,
+            MatchSettings(least_lead=0.03), stereo.relief,
+        )  # fmt: skip
+        assert found.verdict == "good", found.reason
+        matches.append((found, wide.pixel(scene.hit(narrow.position_m, narrow.rays(pixel)))))
+    _, normalised = errors_of(matches)
+    assert np.sqrt((normalised**2).mean()) < 1.5
