@@ -265,7 +265,7 @@ def test_a_partner_beyond_infinity_is_no_match() -> None:
     pixel = np.array([200.0, 140.0])
     point = wall(5).hit(LEFT.position_m, LEFT.rays(pixel))
     far_px = RIGHT.pixel(LEFT.position_m + 1e6 * (point - LEFT.position_m))
-    beyond = np.roll(seen(RIGHT, 5), round(far_px[0] - RIGHT.pixel(point)[0]) + 2, axis=1)
+    beyond = np.roll(seen(RIGHT, 5), round(far_px[0] - RIGHT.pixel(point)[0]) + 1, axis=1)
     found = find_partner(seen(LEFT, 5), LEFT.model, pixel, beyond, RIGHT.model)
     assert found.match.verdict == "weak" and "see no point together" in found.match.reason, found.match
 
