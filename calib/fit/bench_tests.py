@@ -143,14 +143,14 @@ def by_other_placements(problem: Adjustment, state: Estimate) -> tuple[OtherPlac
     for board in boards if len(boards) > 1 else ():
         blocks = [problem.image_block(state, image) for image in images if image.board == board]
         columns = np.unique(np.concatenate([block.columns for block in blocks]))
-        every = Block(np.concatenate([block.residual for block in blocks]), np.zeros((0, 0)), columns, 2)
-        jacobian = np.zeros((len(every.residual), len(columns)))
+        residual = np.concatenate([block.residual for block in blocks])
+        jacobian = np.zeros((len(residual), len(columns)))
         first = 0
         for block in blocks:
             last = first + len(block.residual)
             jacobian[first:last, np.searchsorted(columns, block.columns)] = block.jacobian
             first = last
-        every = Block(every.residual, jacobian, columns, 2)
+        every = Block(residual, jacobian, columns, 2)
         keep = np.ones(len(jacobian) // 2, dtype=bool)
         pull, numbers = left_out(every, covariance[np.ix_(columns, columns)], keep, problem.huber).pull()
         likely = chance(pull, numbers, chi2 / max(freedom, 1.0), max(freedom, 1.0))

@@ -92,17 +92,19 @@ def minimise(
         scale = 1.0 / np.sqrt(np.maximum(np.diag(normal.matrix) + extra, 1e-300))
         scaled = (normal.matrix + np.diag(extra)) * np.outer(scale, scale)
         scaled_gradient = scale * normal.gradient
-        moved = None
+        moved, expected = None, np.inf
+        least = gain * normal.cost + NOTHING
         while moved is None and damping <= LARGEST_DAMPING:
             try:
                 step, expected = _step(scaled, scaled_gradient, damping)
+                nothing_left = expected <= least
+                if (
+                    nothing_left and damping > FIRST_DAMPING
+                ):  # or is it the damping that keeps the step short?
+                    nothing_left = _step(scaled, scaled_gradient, FIRST_DAMPING)[1] <= least
             except np.linalg.LinAlgError:
                 damping = max(10 * damping, 1e-12)
                 continue
-            least = gain * normal.cost + NOTHING
-            nothing_left = expected <= least
-            if nothing_left and damping > FIRST_DAMPING:  # or is it the damping that keeps the step short?
-                nothing_left = _step(scaled, scaled_gradient, FIRST_DAMPING)[1] <= least
             tried = _try(problem, state, scale * step, normal.cost)
             moved, cost = tried
             if nothing_left:

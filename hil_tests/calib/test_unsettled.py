@@ -25,6 +25,21 @@ from hil_tests.calib.fit.test_fit_camera import boards
 from hil_tests.calib.handoff.handed_over import HAZCAMS, hand_offs, moved_hazcams, plain_rig, targets
 
 
+def test_a_fit_whose_equations_have_a_factor_at_a_large_damping_only_stays_where_it_is() -> None:
+    class Unsolvable:
+        def normal(self, x: FloatArray) -> least_squares.Normal:
+            return least_squares.Normal(1.0, np.array([[1.0, 2.0], [2.0, 1.0]]), np.zeros(2))
+
+        def cost(self, x: FloatArray) -> float:
+            return 1.0
+
+        def stepped(self, x: FloatArray, step: FloatArray) -> FloatArray:
+            return x + step
+
+    start = np.zeros(2)
+    assert least_squares.minimise(Unsolvable(), start).state is start
+
+
 @pytest.mark.parametrize("curve", [-0.5, -0.9, -0.98, -3.0])
 def test_a_fit_with_large_residuals_settles(curve: float) -> None:
     """Undamped steps go from an error e to ``curve`` times e (Dennis and Schnabel 1983, section 10.2)."""

@@ -60,7 +60,7 @@ class Search:
             try:
                 look = self._eyes.look(*at_rad)
             except NotThere as reason:
-                instead.refused(str(reason), at_rad)
+                instead.keep(str(reason), at_rad)
                 continue
             except NoLight as reason:
                 instead.looked([str(reason).partition("; ")[0]], at_rad)
@@ -120,8 +120,8 @@ class _Instead:
         self._told: dict[str, str] = {}
         self._where: dict[str, list[tuple[float, float]]] = {}
 
-    def refused(self, reason: str, at_rad: tuple[float, float]) -> None:
-        """Keep an attitude that the head does not turn to."""
+    def keep(self, reason: str, at_rad: tuple[float, float]) -> None:
+        """Keep why an attitude showed no board."""
         kind = _NUMBERS.sub("", reason)  # the same thing with other numbers is the same
         self._told.setdefault(kind, reason)
         self._where.setdefault(kind, []).append(at_rad)
@@ -130,7 +130,7 @@ class _Instead:
         """Keep why a look does not show the board, camera by camera."""
         self.looks += 1
         for why in {_NUMBERS.sub("", why): why for why in whys}.values():
-            self.refused(why, at_rad)
+            self.keep(why, at_rad)
         if not self._first_other and any(_is_another(why) for why in whys):
             self._first_other = self.looks
 
