@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import random
 import sys
@@ -365,6 +364,20 @@ class Storm:
             if chance.random() < 0.2:
                 machine.head_faults(chance.choice(((), (), (HOT,), (SILENT, HOT))))
 
+    def still_stop(self) -> None:
+        """One stop alone: each storm meets every word and refusal, whichever thread had which turn."""
+        self.machine.stop_asked()
+        self.machine.estop_asked(LATCH)
+        self.is_refused()
+        self.machine.stop_ended()
+        self.is_refused()
+        asked_reset(self.machine, "a")
+
+    def is_refused(self) -> None:
+        with pytest.raises(MastctlError) as refusal:
+            self.machine.operation_began("late", {})
+        self.refused.append(refusal.value)
+
     def blow(self) -> None:
         defects: list[BaseException] = []
 
@@ -382,8 +395,7 @@ class Storm:
         self.over.set()
         joined(*threads)
         assert not defects, f"{self.words}: {defects}"
-        with contextlib.suppress(MastctlError):  # nothing may be latched
-            asked_reset(self.machine, "a")
+        self.still_stop()
         for faults in ((), (HOT,), ()):
             self.machine.head_faults(faults)
 
