@@ -66,7 +66,10 @@ HEAD_WORDS: Mapping[str, Word] = MappingProxyType(
         "wrong": Word(
             "read-out angles are off by a constant, the motion is right", {"offset_rad": 0.0349, **_AXIS}
         ),
-        "slow": Word("speed and acceleration are this fraction of what was asked", {"factor": 0.05, **_AXIS}),
+        "slow": Word(
+            "speed is this fraction of what was asked, and acceleration from rest; it brakes as ever",
+            {"factor": 0.05, **_AXIS},
+        ),
         "delayed": Word("commands are executed at once, every reply comes this much late", {"delay_s": 0.5}),
         "intermittent": Word("each call fails with NoReply with this probability", _P),
         "drifting": Word(

@@ -114,15 +114,19 @@ class Axis:
         return replace(self, motion=motion, loads_rad=tuple(loads))
 
     def moved(self, time_s: float, goal_rad: float, speed_rad_per_s: float, factor: float) -> Axis:
-        """Commanded to a goal, rounded to the nearest count, by way of the approach if there is one."""
+        """Commanded to a goal, rounded to the nearest count, by way of the approach if there is one.
+
+        ``factor`` slows it down, and from rest also its acceleration: an axis under way brakes as ever.
+        """
         s = self.settings
         goal = round(goal_rad / s.count_rad) * s.count_rad
         position, velocity = self.motion.at(time_s)
+        acceleration = s.acceleration_rad_per_s2 * (1.0 if velocity else factor)
         goals = [goal]
         if s.approach_rad > 0 and not (position == goal and velocity == 0):
-            stop_rad = position + velocity * abs(velocity) / (2 * factor * s.acceleration_rad_per_s2)
+            stop_rad = position + velocity * abs(velocity) / (2 * acceleration)
             if max(position, stop_rad) > goal - s.approach_rad:
                 goals = [goal - s.approach_rad, goal]
         speed = factor * min(speed_rad_per_s, s.speed_rad_per_s)
-        motion = self.motion.moved(time_s, goals, speed, factor * s.acceleration_rad_per_s2)
+        motion = self.motion.moved(time_s, goals, speed, acceleration)
         return self.followed_by(motion, time_s)

@@ -90,7 +90,8 @@ class WireAxis:
 
         def drive(now_s: float) -> Motion:
             motion, factor = self._axis.motion, self._factor
-            return motion.moved(now_s, [angle_rad], factor * speed, factor * acceleration)
+            steepest = acceleration if motion.at(now_s)[1] else factor * acceleration  # it brakes as ever
+            return motion.moved(now_s, [angle_rad], factor * speed, steepest)
 
         self._take(time_s, drive)
 
@@ -121,7 +122,7 @@ class WireAxis:
                 acceleration_rad_per_s2 or self.settings.acceleration_rad_per_s2, _STEEPEST_RAD_PER_S2
             )
             if not self._jammed:
-                self._continue(self._axis.motion.stopped(time_s, self._factor * acceleration), time_s)
+                self._continue(self._axis.motion.stopped(time_s, acceleration), time_s)
 
     def limp(self, time_s: float) -> None:
         """Let the motor go: friction brakes it, or it falls."""

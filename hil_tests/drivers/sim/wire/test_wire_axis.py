@@ -96,6 +96,22 @@ def test_slow_takes_a_fraction_of_speed_and_acceleration(bench: Bench) -> None:
     assert bench.at(10.25) == pytest.approx(0.05 * 10.25 - 0.00625)
 
 
+@pytest.mark.parametrize("order", ["none", "goal", "to_count", "halt", "velocity"])
+def test_slow_under_way_brakes_as_ever_and_passes_no_goal(bench: Bench, order: str) -> None:
+    bench.axis.goal(0.0, 1.0, 1.0, 2.0)
+    assert bench.at(0.9) == pytest.approx(0.65) and bench.axis.velocity_rad_per_s(0.9) == pytest.approx(1.0)
+    bench.panel.set(PAN_TILT, "slow", factor=0.05)
+    {
+        "none": lambda: None,
+        "goal": lambda: bench.axis.goal(0.9, 1.0, 1.0, 2.0),
+        "to_count": lambda: bench.axis.to_count(0.9, 1.0, 1.0),
+        "halt": lambda: bench.axis.halt(0.9),
+        "velocity": lambda: bench.axis.velocity(0.9, 0.0, 2.0),
+    }[order]()
+    furthest = max(bench.at(0.9 + 0.1 * step) for step in range(1, 100))
+    assert 0.899 < furthest <= 1.0, "1 rad/s is braked within 0.25 rad, at a twentieth of 2 rad/s2 within 5"
+
+
 @pytest.mark.parametrize("goal", [1.0, -1.0])
 def test_an_obstacle_is_not_passed_from_either_side_and_can_be_left(bench: Bench, goal: float) -> None:
     at_rad = goal / 2
