@@ -77,7 +77,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers",
         "long(part, why): left out of the quick run; belongs to one of the four parts of the long run that "
-        "CI takes in turns. docs/testing.md lists these tests with their reasons",
+        "CI takes in turns. docs/contribute/testing.md lists these tests with their reasons",
     )
 
 

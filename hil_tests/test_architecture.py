@@ -1,4 +1,4 @@
-"""The house as docs/architecture.md tells it: files that are there, tools that answer, a true picture."""
+"""What docs/explanation/architecture.md says: its files exist, its tools answer, its picture is true."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TOOLS = sorted(
 
 
 def page(repository: Path) -> str:
-    return (repository / "docs" / "architecture.md").read_text()
+    return (repository / "docs" / "explanation" / "architecture.md").read_text()
 
 
 def test_every_file_that_the_page_names_is_there(repository: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from tools import long_tests
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-PAGE = REPOSITORY / "docs" / "testing.md"
+PAGE = REPOSITORY / "docs" / "contribute" / "testing.md"
 
 CASES = """\
 from pathlib import Path
@@ -45,7 +45,7 @@ def test_always():
 
 def test_the_page_lists_every_long_test_with_its_reason() -> None:
     text = PAGE.read_text()
-    assert text == long_tests.with_table(text), "python -m tools.long_tests --page docs/testing.md"
+    assert text == long_tests.with_table(text), "python -m tools.long_tests --page docs/contribute/testing.md"
 
 
 def _run(folder: Path, text: str, *options: str) -> subprocess.CompletedProcess[str]:

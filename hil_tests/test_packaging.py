@@ -190,8 +190,8 @@ def test_stays(mast_daemon):
 
 @pytest.fixture
 def project(repository: Path, tmp_path: Path) -> Path:
-    """The project of docs/testing-with-mastctl.md, with a test for each row of its table of faults."""
-    page = (repository / "docs" / "testing-with-mastctl.md").read_text()
+    """The project of docs/how-to/testing-with-mastctl.md, with a test for each row of its table of faults."""
+    page = (repository / "docs" / "how-to" / "testing-with-mastctl.md").read_text()
     blocks = re.findall(r"(?:`([\w/]+\.py)`)?[^\n`]*:\n\n```python\n(.*?)```", page, re.DOTALL)
     named = {name: text for name, text in blocks if name}
     assert set(named) == {"lookout.py", "test_lookout.py"} and len(blocks) == 4

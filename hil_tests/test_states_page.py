@@ -1,4 +1,4 @@
-"""docs/safety.md tells the states as the code has them, in its tables and in its picture."""
+"""docs/explanation/safety.md tells the states as the code has them, in its tables and in its picture."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from mastctl.state.table import TABLE, WORDS
 from tools import states
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-PAGE = REPOSITORY / "docs" / "safety.md"
+PAGE = REPOSITORY / "docs" / "explanation" / "safety.md"
 
 
 def test_the_page_agrees_with_the_code() -> None:
     text = PAGE.read_text()
-    assert text == states.with_tables(text), "python -m tools.states --page docs/safety.md"
+    assert text == states.with_tables(text), "python -m tools.states --page docs/explanation/safety.md"
     assert all(f"| `{word}` |" in text for word in WORDS)
 
 

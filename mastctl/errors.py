@@ -31,7 +31,7 @@ class _Family(MastctlError):
     Parameters
     ----------
     code
-        What programs read; a row of the table in docs/http.md.
+        What programs read; a row of the table in docs/reference/http.md.
     message
         One plain sentence.
     """

@@ -1,7 +1,7 @@
 """List the tests of the long run: each file, its part, and why it is not in the quick run.
 
-    .venv/bin/python -m tools.long_tests                           # the table, in Markdown
-    .venv/bin/python -m tools.long_tests --page docs/testing.md    # the table in its place in the page
+    .venv/bin/python -m tools.long_tests                                        # the table, in Markdown
+    .venv/bin/python -m tools.long_tests --page docs/contribute/testing.md      # the table in the page
 
 Read from the markers ``pytest.mark.long(part, why)`` in the text of hil_tests; nothing is imported.
 """

@@ -1,8 +1,8 @@
-"""Draw the daemon's states from their table: the picture, and the tables of docs/safety.md.
+"""Draw the daemon's states from their table: the picture, and the tables of docs/explanation/safety.md.
 
     .venv/bin/python -m tools.states                                 # the tables, in Markdown
     .venv/bin/python -m tools.states --svg docs/img/states.svg       # the picture
-    .venv/bin/python -m tools.states --page docs/safety.md           # the tables in their place in the page
+    .venv/bin/python -m tools.states --page docs/explanation/safety.md  # the tables in the page
 
 Both come from `mastctl.state.table`; only where a state stands in the picture is said here.
 """

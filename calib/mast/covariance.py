@@ -1,8 +1,8 @@
 """The covariance that a mast file carries, and a rig moved along it.
 
-A calibration leaves ``fit.parameters`` and ``fit.covariance`` in the mast file (docs/calibration.md). The
-parameters are ``mast.KEY.x``, ``joints.pan.c1`` (`calib.mast.joints`) and ``cameras.NAME.C.x``, as
-`calib.camera.parameters` orders a camera's step.
+A calibration leaves ``fit.parameters`` and ``fit.covariance`` in the mast file
+(docs/how-to/survey-calibration.md). The parameters are ``mast.KEY.x``, ``joints.pan.c1``
+(`calib.mast.joints`) and ``cameras.NAME.C.x``, as `calib.camera.parameters` orders a camera's step.
 """
 
 from __future__ import annotations

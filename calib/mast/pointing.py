@@ -78,7 +78,7 @@ def solve(
 
     Notes
     -----
-    Extends section IV of the paper, eqs. (11)-(25); see docs/pointing.md.
+    Extends section IV of the paper, eqs. (11)-(25); see docs/explanation/pointing.md.
 
     Examples
     --------

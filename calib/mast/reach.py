@@ -10,8 +10,8 @@ and three lengths that no joint changes fix everything else:
 
     u_z = z,    u_x² + u_y² = rho²,    w_y = u_y cos k + z sin k,    |w|² = rho² + z² + a² - 2 a u_x.
 
-For a = 0 the last is a quadratic in s, the paper's eq. (25). For a ≠ 0 they make a quartic. docs/pointing.md
-has the derivation.
+For a = 0 the last is a quadratic in s, the paper's eq. (25). For a ≠ 0 they make a quartic.
+docs/explanation/pointing.md has the derivation.
 """
 
 from __future__ import annotations

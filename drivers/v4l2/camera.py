@@ -53,7 +53,7 @@ class V4l2Frame(Frame):
 
 
 def open_camera(options: Mapping[str, Any], clock: Clock | None = None, name: str = "v4l2") -> V4l2Camera:
-    """Open a camera by a configuration's options (docs/cameras.md).
+    """Open a camera by a configuration's options (docs/how-to/cameras.md).
 
     Raises
     ------

@@ -336,7 +336,7 @@ def _who_may(path: Path) -> str:
     except KeyError:
         group = str(status.st_gid)
     if status.st_mode & 0o060 != 0o060 or status.st_gid == 0:
-        return "; its mode lets root alone do so, a udev rule (docs/cameras.md) gives it to the group video"
+        return "; only root may; a udev rule (docs/how-to/cameras.md) gives it to the group video"
     return f"; the group {group} may: add the user to it (usermod -aG {group} USER) and log in again"
 
 

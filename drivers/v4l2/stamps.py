@@ -1,6 +1,6 @@
 """When a frame was exposed, from its stamp; and whether the stamp can be true.
 
-The kernel stamps a buffer at the start or at the end of a frame (docs/cameras.md). What is sure is a
+The kernel stamps a buffer at the start or at the end of a frame (docs/how-to/cameras.md). What is sure is a
 *window*: the whole exposure, of all rows, lay inside it. A frame counts as fresh only if its window began
 late enough, so every uncertainty makes the window longer and never lets an old frame pass.
 """

@@ -1,8 +1,8 @@
 """The checks of heads on a real one: ``pytest hil_tests/bench --hardware FILE``.
 
 FILE is a configuration with narrow limits and a low speed; the head moves over all of them
-(docs/hardware.md). Each test ends with a look at the device's own error registers. The checks are those of
-`mastctl conform`.
+(docs/how-to/hardware.md). Each test ends with a look at the device's own error registers. The checks are
+those of `mastctl conform`.
 """
 
 from __future__ import annotations

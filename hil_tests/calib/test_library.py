@@ -17,7 +17,7 @@ HEAVY = ("numpy", "scipy", "cv2", "yaml")
 
 
 def page(repository: Path) -> str:
-    return (repository / "docs" / "api.md").read_text()
+    return (repository / "docs" / "reference" / "calib.md").read_text()
 
 
 def in_blocks(text: str) -> str:
@@ -94,7 +94,9 @@ def test_every_example_of_the_page_gives_what_it_says(
     (tmp_path / "configs").symlink_to(repository / "configs")
     monkeypatch.chdir(tmp_path)
     text = in_blocks(page(repository))
-    test = doctest.DocTestParser().get_doctest(text, {}, "docs/api.md", "docs/api.md", 0)
+    test = doctest.DocTestParser().get_doctest(
+        text, {}, "docs/reference/calib.md", "docs/reference/calib.md", 0
+    )
     assert len(test.examples) > 50
     told: list[str] = []
     runner = doctest.DocTestRunner()

@@ -1,4 +1,4 @@
-"""What docs/hardware.md says happens after a fault: pointing on simulated bytes, on a turned clock."""
+"""What docs/how-to/hardware.md says happens after a fault: pointing on simulated bytes, on a turned clock."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def configuration(folder: Path, pan_tilt: str) -> Path:
 
 
 def bench(repository: Path, file: Path, *path: Path) -> str:
-    """Run the suite as docs/hardware.md says; return its last line."""
+    """Run the suite as docs/how-to/hardware.md says; return its last line."""
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "--no-header", "-p", "no:cacheprovider", "hil_tests/bench",
          "--hardware", str(file)],

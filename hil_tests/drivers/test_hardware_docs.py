@@ -1,4 +1,4 @@
-"""The examples of docs/hardware.md are options that the drivers take, and its tables name every option."""
+"""The drivers take the examples of docs/how-to/hardware.md, and its tables name every option."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from drivers.flir_ptu.options import AxisOptions, Options, options_from
 
 def examples(repository: Path) -> dict[str, dict[str, Any]]:
     """The configurations in the page, by driver."""
-    text = (repository / "docs" / "hardware.md").read_text(encoding="utf-8")
+    text = (repository / "docs" / "how-to" / "hardware.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
     heads = [yaml.safe_load(block)["pan_tilt"] for block in blocks]
     return {head["driver"]: head["options"] for head in heads}
@@ -31,13 +31,13 @@ def test_the_examples_are_taken(repository: Path) -> None:
 
 @pytest.mark.parametrize("option", [*Options.__dataclass_fields__, *AxisOptions.__dataclass_fields__])
 def test_every_option_of_the_ptu_is_on_the_page(repository: Path, option: str) -> None:
-    text = (repository / "docs" / "hardware.md").read_text(encoding="utf-8")
+    text = (repository / "docs" / "how-to" / "hardware.md").read_text(encoding="utf-8")
     table = text[text.index("| PTU | default") : text.index("The PTU's user limits")]
     assert f"`{option}`" in table or f"`pan.{option}`" in table or option in ("pan", "tilt")
 
 
 def test_pixels_of_a_count_are_the_models_own(repository: Path) -> None:
-    text = (repository / "docs" / "hardware.md").read_text(encoding="utf-8")
+    text = (repository / "docs" / "how-to" / "hardware.md").read_text(encoding="utf-8")
     for row, model in (("Dynamixel X, MX | one", "XM430-W350"), ("Dynamixel PH42 | one", "PH42-020-S300")):
         cells = [cell.strip() for cell in text[text.index(row) :].split("\n")[0].split("|")]
         count_rad = model_named(model).count_rad

@@ -1,4 +1,4 @@
-"""What the drivers change for good is what docs/hardware.md lists, as simulated devices see it."""
+"""What the drivers change for good is what docs/how-to/hardware.md lists, as simulated devices see it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from hil_tests.drivers.turned import turned
 @pytest.fixture(scope="module")
 def listed(repository: Path) -> dict[str, set[str]]:
     """Register names by what writes them, from the page's table."""
-    page = (repository / "docs" / "hardware.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "how-to" / "hardware.md").read_text(encoding="utf-8")
     part = page.split("\n## What is changed for good\n", 1)[1].split("\n## ", 1)[0]
     found: dict[str, set[str]] = {}
     for line in part.splitlines():

@@ -1,4 +1,4 @@
-"""The measuring parts of `tools.flight.validation`, so that tests repeat what docs/validation.md reports."""
+"""The measuring parts of `tools.flight.validation`, as docs/evidence/validation.md reports them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Opportunity: what docs/validation.md reports, with room for other versions of the libraries."""
+"""Opportunity: what docs/evidence/validation.md reports, with room for other versions of the libraries."""
 
 from __future__ import annotations
 

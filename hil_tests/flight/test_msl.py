@@ -1,4 +1,4 @@
-"""Curiosity's labels: a mast fitted to twelve predicts the other 306 of camera A (docs/validation.md)."""
+"""Curiosity: a mast fitted to twelve labels predicts the other 306 (docs/evidence/validation.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Targets carried between two frames of Opportunity, as docs/tracking.md reports, on some of the targets."""
+"""Targets carried between two frames of Opportunity, as docs/how-to/tracking.md reports; some of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/configuration.md: its examples are read, every known key is on it, its defaults and bounds hold."""
+"""docs/reference/configuration.md: its examples, its keys, their defaults and bounds."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from drivers.v4l2 import options as v4l2
 from mastctl import config
 from mastctl.pointing.settings import PointingSettings
 
-PAGE = Path("docs") / "configuration.md"
+PAGE = Path("docs") / "reference" / "configuration.md"
 
 
 @pytest.fixture(scope="module")

@@ -41,7 +41,7 @@ def test_every_command_says_what_it_does() -> None:
 
 
 def test_every_command_is_in_readme_or_docs(repository: Path) -> None:
-    pages = [repository / "README.md", *(repository / "docs").glob("*.md")]
+    pages = [repository / "README.md", *(repository / "docs").rglob("*.md")]
     text = " ".join(" ".join(page.read_text(encoding="utf-8") for page in pages).split())
     missing = [
         f"{words} {name}"
@@ -71,7 +71,7 @@ def routes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> set[tuple[str, st
 
 
 def test_every_route_has_its_row_and_no_other(routes: set[tuple[str, str]], repository: Path) -> None:
-    text = (repository / "docs" / "http.md").read_text(encoding="utf-8").split("\n## ", 1)[0]
+    text = (repository / "docs" / "reference" / "http.md").read_text(encoding="utf-8").split("\n## ", 1)[0]
     told = set()
     for line in text.splitlines():
         methods: list[str] = []

@@ -1,4 +1,4 @@
-"""What a camera of any driver really delivers, held against what a driver promises (docs/drivers.md)."""
+"""What a camera of any driver really delivers, beside what a driver promises (docs/how-to/drivers.md)."""
 
 from __future__ import annotations
 

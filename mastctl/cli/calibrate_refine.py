@@ -145,7 +145,7 @@ def _show_saved(proposal: Proposal, saved: StoredRig, previous: Path | None) -> 
         "its covariance is that after the correction"
         if covariance
         else "it has no covariance, as the former file has none",
-        "nothing uses it before a daemon is told to (docs/calibration.md, Using it)",
+        "nothing uses it before a daemon is told to (docs/how-to/survey-calibration.md, Using it)",
     ]
     notes += [f"kept from before: {previous}"] if previous is not None else []
     output.print_table(

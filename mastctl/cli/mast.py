@@ -33,7 +33,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     every = switches.add_parser("list", help="show which are switched on")
     every.set_defaults(run=_faults)
     begin = switches.add_parser("set", help="switch one on")
-    begin.add_argument("device", metavar="DEVICE", help="pan_tilt, a camera, ... (docs/simulation.md)")
+    begin.add_argument("device", metavar="DEVICE", help="pan_tilt, a camera, ... (docs/how-to/simulation.md)")
     begin.add_argument("word", metavar="WORD", help="what goes wrong: off, stuck, noise, ...")
     begin.add_argument("parameters", nargs="*", metavar="NAME=VALUE", help="how much of it")
     begin.set_defaults(run=_set)

@@ -21,7 +21,9 @@ Result = TypeVar("Result")
 
 def add_task_options(parser: argparse.ArgumentParser) -> None:
     """Add --executor, --workers, --results, --list-tasks and --task."""
-    group = parser.add_argument_group("tasks", "where they run, and how a run goes on (docs/campaigns.md)")
+    group = parser.add_argument_group(
+        "tasks", "where they run, and how a run goes on (docs/how-to/campaigns.md)"
+    )
     group.add_argument(
         "--executor", default="local", metavar="WHERE",
         help="local: processes of this machine (default); dask:ADDRESS: a Dask cluster",

@@ -40,7 +40,9 @@ def examine(path: str | None, asked: Asked, machine: Machine | None = None) -> I
     try:
         config = load_config(path)
     except BadFile as error:
-        yield Finding("configuration", "bad", str(error), "correct it; docs/configuration.md has every key")
+        yield Finding(
+            "configuration", "bad", str(error), "correct it; docs/reference/configuration.md has every key"
+        )
         yield examine_clock()
         yield examine_descriptors()
         return
@@ -96,7 +98,7 @@ def _calibration(told: Mapping[str, Any] | None) -> Iterator[Finding]:
     what, sentence = "residuals", f"{told['sentence']} ({told['pointings']} pointings)"
     if told["verdict"] == "drifts":
         yield Finding(
-            what, "unsure", told["sentence"], "calibrate again; docs/operations.md says where to look"
+            what, "unsure", told["sentence"], "calibrate again; docs/how-to/operations.md says where to look"
         )
     elif told["verdict"] == "unknown":
         yield Finding(what, "unsure", sentence, "calibrate again: mastctl calibrate writes it")
@@ -112,7 +114,7 @@ def _head(config: Config, machine: Machine) -> Iterator[Finding]:
         yield from examine_port(port, machine)
     elif head.driver in HEADS:
         words = f"driver {head.driver} has no 'port' in its options"
-        yield Finding("port", "bad", words, "name the serial device; docs/configuration.md")
+        yield Finding("port", "bad", words, "name the serial device; docs/reference/configuration.md")
     elif ":" in head.driver:
         yield Finding("head", "unsure", f"{head.driver} is from outside; it is not looked at", "")
 

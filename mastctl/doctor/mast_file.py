@@ -27,7 +27,7 @@ def examine_mast_file(
     about = f"{config.mast_file.name} ({stored.digest[:8]}...), {len(stored.rig.cameras)} cameras"
     yield Finding("mast file", "good", about)
     for note in stored.notes:
-        yield Finding("mast file", "unsure", note, "see docs/configuration.md")
+        yield Finding("mast file", "unsure", note, "see docs/reference/configuration.md")
     yield _age(stored.rig.provenance, now())
     yield _verdict(stored.rig.fit)
 

@@ -61,7 +61,7 @@ class Standing:
     Attributes
     ----------
     word
-        The state in one word (docs/safety.md).
+        The state in one word (docs/explanation/safety.md).
     reason
         One sentence that says why; empty where nothing needs to be said.
     since_s

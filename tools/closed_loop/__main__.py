@@ -4,7 +4,7 @@
 
 In memory the head and the cameras are simulated inside the daemon. Through devices the daemon runs in the
 virtual machine (tools/vm) on the kernel's own capture nodes and a servo bus that the real SDK drives over a
-pseudo terminal. Prints the table of docs/validation.md; --out keeps both records.
+pseudo terminal. Prints the table of docs/evidence/validation.md; --out keeps both records.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The pictures of docs/validation.md. Part of flight_validation.py.
+"""The pictures of docs/evidence/validation.md. Part of flight_validation.py.
 
 Opportunity's frames are NASA/JPL-Caltech images, in the public domain; the credit is printed on each picture.
 """

@@ -1,9 +1,9 @@
-"""Make all numbers and pictures of docs/validation.md from the flight data beside the checkout.
+"""Make all numbers and pictures of docs/evidence/validation.md from the flight data beside the checkout.
 
     python -m tools.flight.validation [--data FOLDER] [--write] [--mast-file OUT.yaml]
 
 The tables go to stdout. With --write they also replace the text between the marks
-``<!-- numbers: NAME -->`` and ``<!-- end -->`` of docs/validation.md, and the pictures are renewed.
+``<!-- numbers: NAME -->`` and ``<!-- end -->`` of docs/evidence/validation.md, and the pictures are renewed.
 --mast-file writes the mast file of the replayed rover, for a configuration with the driver ``replay``.
 """
 
@@ -27,7 +27,7 @@ from tools.arguments import end
 from tools.flight import mer, msl
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-DOCUMENT = REPOSITORY / "docs" / "validation.md"
+DOCUMENT = REPOSITORY / "docs" / "evidence" / "validation.md"
 PICTURES = REPOSITORY / "docs" / "img"
 PRINTED_SEEDS = range(10)
 PAIRS = {"3rd to 4th": (2, 3), "4th to 5th": (3, 4), "1st to 2nd": (0, 1)}
@@ -37,7 +37,9 @@ def main() -> int:
     """Run the whole comparison."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=REPOSITORY.parent / "shared" / "data")
-    parser.add_argument("--write", action="store_true", help="renew docs/validation.md and its pictures")
+    parser.add_argument(
+        "--write", action="store_true", help="renew docs/evidence/validation.md and its pictures"
+    )
     parser.add_argument("--mast-file", type=Path, help="write the mast file of the replayed rover here")
     arguments = parser.parse_args()
     for name in ("msl_navcam", "mer_navcam"):

@@ -1,4 +1,4 @@
-"""The scene of docs/simulation.md, from outside: seen exactly, pointed at, refused when it fails."""
+"""The scene of docs/how-to/simulation.md, from outside: seen exactly, pointed at, refused when it fails."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def opened(seed, fault): return Blind() if fault == "blind" else Slow() if fault
 def outside(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A folder with the page's example and a scene that fails, on the path."""
     folder = tmp_path_factory.mktemp("outside")
-    page = (repository / "docs" / "simulation.md").read_text()
+    page = (repository / "docs" / "how-to" / "simulation.md").read_text()
     (source,) = re.findall(r"`quarry\.py`.*?```python\n(.*?)```", page, re.DOTALL)
     assert len(source.splitlines()) < 60
     (folder / "quarry.py").write_text(source)

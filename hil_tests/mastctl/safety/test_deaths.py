@@ -35,7 +35,7 @@ SPEED_RAD_PER_S = 0.05  # the way takes 19 s: a stop on a busy machine still com
 STANDS_S = 0.3
 SAME_RAD = 1e-4
 COUNTS_RAD = 5e-3  # three of the coarser servo's
-JOG_GOES_ON_S = 0.35  # docs/limits.md: a goal 0.25 s ahead, ten of them a second
+JOG_GOES_ON_S = 0.35  # docs/how-to/limits.md: a goal 0.25 s ahead, ten of them a second
 
 DRIVERS = ["dynamixel", "flir_ptu"]
 

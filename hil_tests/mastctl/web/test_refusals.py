@@ -1,4 +1,4 @@
-"""Every error has a word of its own and a status by its family, and docs/http.md lists both."""
+"""Every error has a word of its own and a status by its family, and docs/reference/http.md lists both."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _every_module() -> None:
 @pytest.fixture(scope="module")
 def documented(repository: Path) -> dict[str, set[str]]:
     """The table's codes by its first column."""
-    page = (repository / "docs" / "http.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "reference" / "http.md").read_text(encoding="utf-8")
     section = page.split("## Refusals", 1)[1].split("\n## ", 1)[0]
     rows = re.findall(r"^\| (\w[^|]*?) \| ([^|]*`[^|]*) \|", section, re.MULTILINE)
     return {status: set(re.findall(r"`(\w+)`", codes)) for status, codes in rows}

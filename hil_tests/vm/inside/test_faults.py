@@ -179,7 +179,7 @@ def test_a_name_that_two_cameras_bear_is_refused() -> None:
     ("mode", "group", "words"),
     [
         (0o660, 44, "the group video may: add the user to it"),
-        (0o600, 0, "its mode lets root alone do so, a udev rule"),
+        (0o600, 0, "only root may; a udev rule"),
     ],
 )
 def test_a_user_without_permission_is_told_which_group_has_it(mode: int, group: int, words: str) -> None:

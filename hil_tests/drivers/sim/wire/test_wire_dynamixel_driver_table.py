@@ -77,7 +77,7 @@ def test_what_a_head_is_made_ready_by_can_be_told_apart_by_its_length(map_name: 
 
 
 def test_the_page_of_the_simulator_names_every_model(repository: Path) -> None:
-    text = (repository / "docs" / "dynamixel_simulator.md").read_text(encoding="utf-8")
+    text = (repository / "docs" / "reference" / "dynamixel-simulator.md").read_text(encoding="utf-8")
     cell = next(line for line in text.splitlines() if line.startswith("| models | ")).split("|")[2]
     told = set()
     for group in cell.replace("(2.0)", "").split(","):
