@@ -5,10 +5,10 @@
 
 Prints the tables of docs/explanation/safety.md. A daemon in a process of its own on a simulated rover. For
 each word of the head and of a camera a pointing at a place is sent off, or a track is followed while the
-rover drives a step; the fault is set under way and taken back after some seconds. Told are
-when and as what the status or the operation names it, the states reached, how the operation and the track ended, and how long after the
-fault's end the daemon was well: no fault told, at rest, and a pointing (a look) done again. Times are of the
-machine as it is busy now.
+rover drives a step; the fault is set under way and taken back after some seconds. Told are when and as what
+the status or the operation names it, the states reached, how the operation and the track ended, and how long
+after the fault's end the daemon was well: no fault told, at rest, and a pointing (a look) done again. Times
+are of the machine as it is busy now.
 """
 
 from __future__ import annotations
