@@ -10,7 +10,7 @@ from typing import Any
 
 from drivers.hardware import DeviceSettings
 from mastctl.config import load_config
-from mastctl.conform.drivers_run import head_under_test
+from mastctl.conform.devices import head_under_test
 from mastctl.conform.head_trial import HeadTrial
 from mastctl.service.mast_in_use import bounds_of
 

@@ -15,8 +15,8 @@ import pytest
 from hil_tests.bench.hardware_rig import CHOSEN, error_registers, hardware_trial
 from mastctl.config import load_config
 from mastctl.conform.checks import Check, NotTried
+from mastctl.conform.head_checks import HEADS
 from mastctl.conform.head_trial import HeadTrial
-from mastctl.conform.heads import HEADS
 
 if CHOSEN is None:
     pytest.skip("moves a real head; name its configuration with --hardware FILE", allow_module_level=True)

@@ -13,7 +13,7 @@ import pytest
 
 from drivers.known import HEADS
 from mastctl.cli.main import main
-from mastctl.conform.drivers_run import COUNTS
+from mastctl.conform.devices import COUNTS
 from tools.campaigns.servo_rigs import LIMITS_RAD, RIGS
 
 MAST = """schema: mastctl/mast/1

@@ -23,8 +23,8 @@ from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.conform.checks import Check
+from mastctl.conform.head_checks import HEADS, fastest_seen
 from mastctl.conform.head_trial import HeadTrial
-from mastctl.conform.heads import HEADS, fastest_seen
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.demo import SimulationTruth, demo_config
 from mastctl.experiment.pointing import run_pointing_experiment

@@ -1,4 +1,4 @@
-"""``mastctl conform``: a running daemon, a head or a camera against what it promises."""
+"""``mastctl conform``: a rig through its running daemon, a head or a camera, against what it promises."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from mastctl.cli.output import WrongUse, at_least, finite_number, positive_numbe
 
 if TYPE_CHECKING:
     from drivers.hardware import HardwareSettings
-    from mastctl.conform.checks import Check, Outcome
+    from mastctl.conform.checks import Check, ConformReport, Outcome
     from mastctl.conform.head_trial import Angles
-    from mastctl.conform.report import Report
     from mastctl.devices.opening import Bounds
 
 MARKS = {"passed": "ok", "failed": "FAILED", "skipped": "-"}
@@ -25,7 +24,7 @@ MARKS = {"passed": "ok", "failed": "FAILED", "skipped": "-"}
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add conform."""
     parser = subparsers.add_parser(
-        "conform", help="check a running daemon against the contract, or a head or camera driver"
+        "conform", help="accept a rig through its running daemon, or check a head or camera driver"
     )
     parser.add_argument("url", nargs="?", metavar="URL", help="a running daemon's address")
     what = parser.add_argument_group("a driver instead of a daemon")
@@ -91,53 +90,50 @@ def _conform(args: argparse.Namespace) -> int:
 
 
 def _daemon(args: argparse.Namespace) -> int:
-    """Check a running daemon."""
-    from mastctl.conform.daemon_run import CHECKS, check_daemon, daemon_under_test
+    """Check a rig through its running daemon."""
+    from mastctl.conform.rig import check_rig, rig_under_test
+    from mastctl.conform.rig_checks import RIG
 
-    checks = chosen(CHECKS, args.only)
+    checks = chosen(RIG.checks, args.only)
     if args.list:
         return _list(checks, args.json)
-    with daemon_under_test(args.url, args.reach) as daemon:
-        motion = _motion(args, checks, f"the head at {args.url}", bool(daemon.began.get("simulated")))
-        return told(args, check_daemon(daemon, checks, motion, tell_of(args)))
+    with rig_under_test(args.url, args.reach) as rig:
+        motion = _motion(args, checks, f"the head at {args.url}", bool(rig.began.get("simulated")))
+        return told(args, check_rig(rig, checks, motion, tell_of(args)))
 
 
 def _driver(args: argparse.Namespace) -> int:
     """Check a head or a camera."""
-    from mastctl.conform import drivers_run
+    from mastctl.conform import devices
 
     kind = (
-        "head"
-        if args.head
-        else "camera"
-        if args.camera is not None
-        else drivers_run.kind_of(args.driver or "")
+        "head" if args.head else "camera" if args.camera is not None else devices.kind_of(args.driver or "")
     )
     if not kind:
         raise WrongUse("--head or --camera is expected: the driver's name does not say which it is")
-    checks = chosen(drivers_run.ALL[kind], args.only)
+    checks = chosen(devices.ALL[kind], args.only)
     if args.list:
         return _list(checks, args.json)
     settings, name, bounds, size_px = _device(args, kind)
     if kind == "camera":
         driver = settings.cameras[name].driver
         with_head = bounds if args.with_head else None
-        with drivers_run.camera_under_test(settings, name, size_px, args.seconds, with_head) as camera:
-            return told(args, drivers_run.check_camera(camera, driver, checks, tell_of(args)))
+        with devices.camera_under_test(settings, name, size_px, args.seconds, with_head) as camera:
+            return told(args, devices.check_camera(camera, driver, checks, tell_of(args)))
     driver = settings.pan_tilt.driver
     if driver == "replay":
         raise WrongUse("a replayed head stands at recorded pointings only; there is no motion to check")
     motion = _motion(args, checks, f"the head of driver {driver}", driver == "sim")
     own = None if args.limits is None else _limits(args.limits, bounds)
-    with drivers_run.head_under_test(settings, bounds, args.reach, args.speed, own, moves=motion) as head:
-        return told(args, drivers_run.check_head(head, driver, checks, motion, tell_of(args)))
+    with devices.head_under_test(settings, bounds, args.reach, args.speed, own, moves=motion) as head:
+        return told(args, devices.check_head(head, driver, checks, motion, tell_of(args)))
 
 
 def _device(
     args: argparse.Namespace, kind: str
 ) -> tuple[HardwareSettings, str, Bounds | None, tuple[int, int] | None]:
     """What opens the device, its name, what bounds its moves, the size of its pictures; as far as known."""
-    from mastctl.conform.drivers_run import device_settings
+    from mastctl.conform.devices import device_settings
 
     size_px = None if args.size is None else (int(args.size[0]), int(args.size[1]))
     if args.config is None:
@@ -257,7 +253,7 @@ def tell_of(args: argparse.Namespace) -> Callable[[Outcome], None]:
     return tell
 
 
-def told(args: argparse.Namespace, report: Report) -> int:
+def told(args: argparse.Namespace, report: ConformReport) -> int:
     """Tell the whole and write the reports; return the exit code."""
     if args.junit is not None:
         report.write_junit(args.junit)

@@ -181,3 +181,11 @@ def away(reading: Reading, goal: Angles) -> float:
 def at(reading: Reading) -> Angles:
     """The angles of a reading."""
     return reading.pan_rad, reading.tilt_rad
+
+
+def box(at_rad: float, ends_rad: Angles, reach_rad: float) -> Angles:
+    """Return where an axis may be moved: as far as the reach about where it stands, inside its ends."""
+    low, high = ends_rad
+    width = min(2 * reach_rad, high - low)
+    start = min(max(at_rad - width / 2, low), high - width)
+    return start, start + width

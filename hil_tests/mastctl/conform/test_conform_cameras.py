@@ -16,7 +16,7 @@ from drivers.interfaces import Frame
 from hil_tests.mastctl.conform.conform_world import HERE, NoiseCamera
 from hil_tests.mastctl.service_fakes import SIZE_PX
 from mastctl.cli.main import main
-from mastctl.conform.cameras import CAMERAS, CameraTrial
+from mastctl.conform.camera_checks import CAMERAS, CameraTrial
 from mastctl.conform.checks import run_checks
 
 NAMES = [check.name for check in CAMERAS.checks]

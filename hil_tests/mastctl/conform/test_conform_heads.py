@@ -19,9 +19,9 @@ from drivers.interfaces import Reading
 from hil_tests.mastctl.conform.conform_world import HERE, configuration, open_head
 from mastctl.cli.main import main
 from mastctl.conform.checks import run_checks
-from mastctl.conform.drivers_run import check_head
+from mastctl.conform.devices import check_head
+from mastctl.conform.head_checks import HEADS
 from mastctl.conform.head_trial import HeadTrial
-from mastctl.conform.heads import HEADS
 
 LIMITS = ((-2.0, 2.0), (-2.0, 2.0))
 BOX = ((-0.4, 0.4), (-0.3, 0.3))

@@ -1,4 +1,4 @@
-"""The packaged simulated rover conforms: its daemon, its head and its cameras."""
+"""The packaged simulated rover conforms: through its daemon, its head and its cameras."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import pytest
 
 from mastctl.cli.main import main
 from mastctl.config import load_config
-from mastctl.conform.daemon_run import CHECKS, check_daemon, daemon_under_test
+from mastctl.conform.rig import check_rig, rig_under_test
+from mastctl.conform.rig_checks import RIG
 from mastctl.daemon import RunningDaemon
 
-TOO_QUICK = {"times.rate", "motion.speed", "motion.busy"}
+TOO_QUICK = {"motion.speed"}
 """Where nothing waits for motion, the head may have arrived before anybody looks."""
 
 
@@ -25,9 +26,9 @@ def test_the_simulated_rover_conforms_and_a_click_lands() -> None:
     listen = replace(config.listen, port=0)
     with (
         RunningDaemon(replace(config, hardware=hardware, listen=listen)) as daemon,
-        daemon_under_test(daemon.url, 0.3) as under_test,
+        rig_under_test(daemon.url, 0.3) as under_test,
     ):
-        outcomes = check_daemon(under_test, CHECKS, True).outcomes
+        outcomes = check_rig(under_test, RIG.checks, True).outcomes
     assert [outcome for outcome in outcomes if outcome.state == "failed"] == []
     assert {outcome.name for outcome in outcomes if outcome.state == "skipped"} <= TOO_QUICK
 

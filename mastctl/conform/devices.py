@@ -17,11 +17,17 @@ from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.interfaces import Camera
 from drivers.known import CAMERAS as CAMERA_DRIVERS
 from drivers.known import HEADS as HEAD_DRIVERS
-from mastctl.conform.cameras import CAMERAS, CameraTrial
-from mastctl.conform.checks import Check, Outcome, PromiseBroken, SubjectLost, run_checks
-from mastctl.conform.head_trial import Angles, HeadTrial, at
-from mastctl.conform.heads import HEADS
-from mastctl.conform.report import Report
+from mastctl.conform.camera_checks import CAMERAS, CameraTrial
+from mastctl.conform.checks import (
+    Check,
+    ConformReport,
+    Outcome,
+    PromiseBroken,
+    SubjectLost,
+    run_checks,
+)
+from mastctl.conform.head_checks import HEADS
+from mastctl.conform.head_trial import Angles, HeadTrial, at, box
 from mastctl.conform.worker import beside
 from mastctl.devices.limits import Limits
 from mastctl.devices.opening import Bounds, head_beside, open_one_camera
@@ -121,14 +127,6 @@ def head_under_test(
             trial.worker.close()
 
 
-def box(at_rad: float, ends_rad: Angles, reach_rad: float) -> Angles:
-    """Return where an axis may be moved: as far as the reach about where it stands, inside its ends."""
-    low, high = ends_rad
-    width = min(2 * reach_rad, high - low)
-    start = min(max(at_rad - width / 2, low), high - width)
-    return start, start + width
-
-
 @contextmanager
 def camera_under_test(
     settings: HardwareSettings,
@@ -155,7 +153,7 @@ def camera_under_test(
 def check_head(
     trial: HeadTrial, driver: str, checks: Sequence[Check[HeadTrial]], motion: bool,
     tell: Callable[[Outcome], object] = lambda outcome: None,
-) -> Report:  # fmt: skip
+) -> ConformReport:  # fmt: skip
     """Run checks on a head, and stop it however they end, by Ctrl-C too."""
     began_s = time.time()
     may_move = ""
@@ -164,7 +162,7 @@ def check_head(
     finally:
         if motion and not trial.closed and any(check.moves for check in checks):
             may_move = _stopped(trial)
-    return Report("head", driver, began_s, outcomes, may_move)
+    return ConformReport("head", driver, began_s, outcomes, may_move)
 
 
 def _stopped(trial: HeadTrial) -> str:
@@ -186,10 +184,10 @@ def _stopped(trial: HeadTrial) -> str:
 def check_camera(
     trial: CameraTrial, driver: str, checks: Sequence[Check[CameraTrial]],
     tell: Callable[[Outcome], object] = lambda outcome: None,
-) -> Report:  # fmt: skip
+) -> ConformReport:  # fmt: skip
     """Run checks on a camera."""
     began_s = time.time()
-    return Report("camera", driver, began_s, run_checks(checks, trial, motion=False, tell=tell))
+    return ConformReport("camera", driver, began_s, run_checks(checks, trial, motion=False, tell=tell))
 
 
 def count_of(device: DeviceSettings) -> float | None:

@@ -1,0 +1,265 @@
+"""A rig under test, through its running daemon: what checks ask of it, and where its head may be moved."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from typing import Any
+
+import yaml
+
+from mastctl.client import Client, ClientError, Snapshot
+from mastctl.conform.checks import (
+    Check,
+    ConformReport,
+    NotTried,
+    Outcome,
+    PromiseBroken,
+    expect,
+    run_checks,
+)
+from mastctl.conform.head_trial import Angles, box
+from mastctl.errors import NotNow
+
+log = logging.getLogger(__name__)
+
+ENDED = ("done", "failed", "stopped")
+ARRIVED_RAD = 0.006  # what the service takes for arrived
+POLL_S = 0.02
+OPERATION_S = 60.0
+TIMEOUT_S = 20.0
+STOP_TRIES, STOP_TIMEOUT_S = 3, 5.0
+
+
+class RigTrial:
+    """A rig under test.
+
+    Parameters
+    ----------
+    client
+        A connection to its daemon.
+    reach_rad
+        How far from where it stands the head may be moved, radians.
+    """
+
+    def __init__(self, client: Client, reach_rad: float) -> None:
+        self.client = client
+        self.reach_rad = reach_rad
+        self.began = self.status()
+
+    def status(self) -> dict[str, Any]:
+        """Return the status."""
+        return dict(self.client.status())
+
+    def joints(self, status: Mapping[str, Any] | None = None) -> Angles:
+        """Return the measured angles, radians, of a status or of now."""
+        joints = field(self.status() if status is None else status, "joints")
+        expect(isinstance(joints, dict), "GET /status: joints is not told, so no reading came from the head")
+        return number(joints, "pan_rad"), number(joints, "tilt_rad")
+
+    @cached_property
+    def limits(self) -> tuple[Angles, Angles, float]:
+        """Pan's and tilt's limits, radians, and the fastest speed, rad/s, as the daemon tells them."""
+        limits = field(self.began, "limits")
+        ends = []
+        for key in ("pan_rad", "tilt_rad"):
+            pair = field(limits, key)
+            expect(isinstance(pair, list) and len(pair) == 2, f"limits.{key} is {pair!r}, no [low, high]")
+            low, high = (number({key: end}, key) for end in pair)
+            expect(low < high, f"limits.{key} is {pair}: the lower end is not below the upper one")
+            ends.append((low, high))
+        speed = number(limits, "speed_rad_per_s")
+        expect(speed > 0, f"limits.speed_rad_per_s is {speed}")
+        return ends[0], ends[1], speed
+
+    @cached_property
+    def box_rad(self) -> tuple[Angles, Angles]:
+        """Where the head may be moved: about where it stands at the beginning, inside its limits."""
+        boxes = []
+        for at_rad, (low, high) in zip(self.joints(self.began), self.limits[:2], strict=True):
+            margin = min(0.02, 0.1 * (high - low))
+            boxes.append(box(at_rad, (low + margin, high - margin), self.reach_rad))
+        return boxes[0], boxes[1]
+
+    def goal(self, pan_part: float, tilt_part: float) -> Angles:
+        """Return angles inside the box; parts from -1 (its lower end) to 1."""
+        (a, b), (c, d) = self.box_rad
+        return a + (pan_part + 1) / 2 * (b - a), c + (tilt_part + 1) / 2 * (d - c)
+
+    @cached_property
+    def mast(self) -> bytes:
+        """The mast file in use, byte for byte."""
+        return self.client.mast_file()
+
+    @cached_property
+    def mast_cameras(self) -> Mapping[str, Any]:
+        """The cameras of the mast file, by name."""
+        try:
+            told = yaml.safe_load(self.mast)["cameras"]
+            return told if isinstance(told, dict) else {}
+        except (yaml.YAMLError, LookupError, TypeError) as error:
+            raise PromiseBroken(f"GET /mast is no mast file: {' '.join(str(error).split())[:200]}") from None
+
+    @cached_property
+    def cameras(self) -> tuple[str, ...]:
+        """The configured cameras. Raises NotTried without any."""
+        names = field(self.began, "cameras")
+        expect(isinstance(names, dict), "GET /status: cameras is no object")
+        if not names:
+            raise NotTried("there is no camera")
+        return tuple(names)
+
+    def picture(self, camera: str) -> Snapshot:
+        """Take a picture that is exposed from now on."""
+        return self.client.snapshot(camera)
+
+    def ended(self, name: str, each: Callable[[dict[str, Any]], object] = lambda status: None) -> Any:
+        """Wait until an operation has ended and return its record; ``each`` is given the status meanwhile."""
+        until_s = time.monotonic() + OPERATION_S
+        while (record := self.client.operation(name)).get("state") not in ENDED:
+            expect(
+                time.monotonic() < until_s,
+                f"operation {name} is {record.get('state')!r} after {OPERATION_S:g} s; it has to end",
+            )
+            each(self.status())
+            time.sleep(POLL_S)
+        return record
+
+    def start(self, goal: Angles) -> str:
+        """Start a pointing to joint angles; return its id."""
+        return self.client.point(pan_rad=goal[0], tilt_rad=goal[1])
+
+    def point(self, goal: Angles, each: Callable[[dict[str, Any]], object] = lambda status: None) -> Any:
+        """Point to joint angles; return the record of the operation, which has to be done."""
+        record = self.ended(self.start(goal), each)
+        expect(
+            record["state"] == "done",
+            f"a pointing to {goal[0]:.4f}, {goal[1]:.4f} rad ended {record['state']}: {record.get('error')}",
+        )
+        return record
+
+    @cached_property
+    def _time_waits(self) -> bool:
+        """Whether a simulated rover's time passes only when it is told to."""
+        simulated = self.began.get("hardware") == "simulated"
+        return simulated and self.client.simulation_time()["speed"] == "max"
+
+    def let_pass(self, duration_s: float) -> None:
+        """Let some of the daemon's time pass."""
+        if self._time_waits:
+            self.client.advance(duration_s)
+        else:
+            time.sleep(duration_s)
+
+    def rest(self, within_s: float = 10.0) -> dict[str, Any]:
+        """Wait until nothing moves and nothing runs; return the status."""
+        until_s = time.monotonic() + within_s
+        while (status := self.status()).get("moving") or status.get("operation") is not None:
+            expect(time.monotonic() < until_s, f"the head does not come to rest within {within_s:g} s")
+            self.let_pass(POLL_S)
+        return status
+
+
+@contextmanager
+def rig_under_test(url: str, reach_rad: float) -> Iterator[RigTrial]:
+    """Connect to a daemon that is at rest.
+
+    Raises
+    ------
+    NotNow
+        ``busy``, if it is at work: a check would get into somebody's way.
+    ClientError
+        If nobody answers there, or no mastctl daemon.
+    """
+    with Client(url, TIMEOUT_S, "mastctl conform") as client:
+        trial = RigTrial(client, reach_rad)
+        at_work = _at_work(trial.began)
+        if at_work:
+            raise NotNow("busy", f"the daemon at {url} is at work ({at_work}); check it when it rests")
+        yield trial
+
+
+def check_rig(
+    trial: RigTrial,
+    checks: Sequence[Check[RigTrial]],
+    motion: bool,
+    tell: Callable[[Outcome], object] = lambda outcome: None,
+) -> ConformReport:
+    """Run checks on a rig. However they end, by Ctrl-C too, a head that was moved is stopped.
+
+    Parameters
+    ----------
+    trial, checks
+        Of what to ask what.
+    motion
+        Whether the head may be moved.
+    tell
+        Called with each outcome as it comes.
+    """
+    began_s = time.time()
+    left = ""
+    try:
+        outcomes = run_checks(checks, trial, motion=motion, tell=tell)
+    finally:
+        if motion and any(check.moves for check in checks):
+            left = _stopped_at_the_end(trial.client.url)
+    return ConformReport("daemon", trial.client.url, began_s, outcomes, left)
+
+
+def _stopped_at_the_end(url: str) -> str:
+    """Stop the head, say why if that was not confirmed. A second Ctrl-C leaves the stop under way."""
+    reasons: list[str] = []
+
+    def stop() -> None:
+        for _ in range(STOP_TRIES):  # over connections of their own, whatever became of the others
+            try:
+                with Client(url, STOP_TIMEOUT_S) as client:
+                    client.stop()
+                reasons.clear()
+                return
+            except ClientError as error:
+                words = f"the stop at the end was not confirmed, the head may still move: {error}"
+                reasons[:] = [words]
+            time.sleep(0.2)
+        log.error("%s", reasons[0])
+
+    thread = threading.Thread(target=stop, name="stop at the end")
+    thread.start()
+    thread.join()
+    return reasons[0] if reasons else ""
+
+
+def _at_work(status: Mapping[str, Any]) -> str:
+    """What the daemon is doing, in words; empty at rest."""
+    if status.get("operation") is not None:
+        return f"operation {status['operation']}"
+    if status.get("moving"):
+        return "the head moves"
+    control = status.get("control")
+    if isinstance(control, dict):
+        return f"{control.get('holder')} steers"
+    track = status.get("track")
+    following = isinstance(track, dict) and track.get("state") in ("starting", "tracking")
+    return "it follows a target" if following else ""
+
+
+def field(document: Any, *path: str) -> Any:
+    """Return what stands at a path of keys. Raises PromiseBroken."""
+    here = document
+    for index, key in enumerate(path):
+        if not isinstance(here, Mapping) or key not in here:
+            raise PromiseBroken(f"the key {'.'.join(path[: index + 1])} is missing")
+        here = here[key]
+    return here
+
+
+def number(document: Any, *path: str) -> float:
+    """Return the number at a path of keys. Raises PromiseBroken."""
+    value = field(document, *path)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise PromiseBroken(f"{'.'.join(path)} is {value!r} where a number is expected")
+    return float(value)

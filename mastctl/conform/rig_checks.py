@@ -1,0 +1,333 @@
+"""What a rig promises through its daemon: fresh readings and frames, motion within limits, the stop."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import math
+import time
+from contextlib import suppress
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mastctl.client import ClientError, Snapshot
+from mastctl.conform.checks import NotTried, PromiseBroken, Suite, expect
+from mastctl.conform.head_trial import Angles
+from mastctl.conform.rig import ARRIVED_RAD, POLL_S, RigTrial, field, number
+
+RIG: Suite[RigTrial] = Suite()
+
+READ_EVERY_S = 1.0  # the head at rest is read 20 times a second; a reading this old is none
+BEYOND_RAD = 0.015  # an approach may pass a limit by its own length, and a reading has its noise
+FASTER_PART, FASTER_RAD_PER_S = 0.1, 0.05
+PACE_S = 0.1  # readings nearer to each other tell more of their noise than of a speed
+STOP_TRIES = 4
+BRAKED_WITHIN_S = 3.0
+BEGINS_WITHIN_S = 5.0
+CLICKS = 6
+OF_THE_SCENE = {
+    "target_flat", "target_ambiguous", "target_border", "target_not_found", "target_moving", "not_in_view",
+    "outside_image", "outside_limits", "eyes_disagree", "too_near", "blind_cone", "not_one_point",
+}  # fmt: skip
+"""Why a click may come to nothing with a rig that does all it should."""
+
+
+@RIG.check("status.joints", "measured joint angles are finite, within a turn, and fresh")
+def _joints(trial: RigTrial) -> str:
+    status = trial.status()
+    pan, tilt = trial.joints(status)
+    for name, angle in (("pan_rad", pan), ("tilt_rad", tilt)):
+        expect(
+            math.isfinite(angle) and abs(angle) <= math.tau, f"joints.{name} is {angle}, beyond a full turn"
+        )
+    age_s = number(status, "joints", "age_s")
+    expect(0 <= age_s < READ_EVERY_S, f"joints.age_s is {age_s:.3f} s: no reading came for so long")
+    return f"pan {pan:.4f} rad, tilt {tilt:.4f} rad, {age_s:.3f} s old"
+
+
+@RIG.check("pictures.facts", "every camera gives a PNG of the mast file's size with its facts in headers")
+def _facts(trial: RigTrial) -> str:
+    digest = hashlib.sha256(trial.mast).hexdigest()
+    for camera in trial.cameras:
+        shot = trial.picture(camera)
+        expect(shot.data.startswith(b"\x89PNG\r\n"), f"{camera}: the picture is told to be PNG and is not")
+        height, width = shot.image.shape[:2]
+        size = field(trial.mast_cameras, camera, "size_px")
+        expect(
+            list(size) == [width, height],
+            f"{camera}: {width}x{height} px where the mast file has {'x'.join(map(str, size))} px",
+        )
+        expect(shot.camera == camera, f"{camera}: its picture says that it is of {shot.camera}")
+        expect(shot.mast_digest == digest, f"{camera}: the digest is not that of the mast file in use")
+        expect(shot.exposure_s >= 0, f"{camera}: exposure {shot.exposure_s} s")
+        for angle in (shot.pan_rad, shot.tilt_rad):
+            expect(math.isfinite(angle) and abs(angle) <= math.tau, f"{camera}: a joint angle is {angle} rad")
+    return f"{len(trial.cameras)} cameras"
+
+
+@RIG.check("pictures.fresh", "with fresh=true the exposure begins and ends within the request")
+def _fresh(trial: RigTrial) -> str:
+    longest_s = 0.0
+    for camera in trial.cameras:
+        for _ in range(2):
+            before_s = number(trial.status(), "now_s")
+            shot = trial.picture(camera)
+            after_s = number(trial.status(), "now_s")
+            early_s = before_s - (shot.mid_exposure_s - shot.exposure_s / 2)
+            late_s = shot.mid_exposure_s + shot.exposure_s / 2 - after_s
+            expect(early_s <= 0, f"{camera}: the exposure began {early_s:.4f} s before the request")
+            expect(late_s <= 0, f"{camera}: the exposure ends {late_s:.4f} s after the answer")
+            longest_s = max(longest_s, after_s - before_s)
+    return f"at most {longest_s:.2f} s a picture"
+
+
+@RIG.check("pictures.ids", "ids are unique; counts and mid-exposures grow together")
+def _ids(trial: RigTrial) -> str:
+    seen: set[str] = set()
+    for camera in trial.cameras:
+        shots = [trial.picture(camera) for _ in range(3)]
+        for before, shot in itertools.pairwise(shots):
+            expect(
+                shot.sequence > before.sequence and shot.mid_exposure_s > before.mid_exposure_s,
+                f"{camera}: frame {shot.sequence} of {shot.mid_exposure_s:.4f} s came after frame "
+                f"{before.sequence} of {before.mid_exposure_s:.4f} s",
+            )
+        names = [shot.frame_id for shot in shots]
+        expect(
+            len(seen | set(names)) == len(seen) + len(names),
+            f"{camera}: two pictures bear one id of {', '.join(names)}",
+        )
+        seen |= set(names)
+    return f"{len(seen)} pictures"
+
+
+@RIG.check("pictures.joints", "at rest a picture bears the measured angles, and says that nothing moved")
+def _angles(trial: RigTrial) -> None:
+    at = trial.joints(trial.rest())
+    camera = trial.cameras[0]
+    shot = trial.picture(camera)
+    expect(not shot.moving, f"{camera}: a picture of the head at rest says that it moved")
+    off_rad = _away((shot.pan_rad, shot.tilt_rad), at)
+    expect(off_rad <= ARRIVED_RAD, f"{camera}: its angles are {off_rad:.4f} rad from the measured ones")
+
+
+@RIG.check(
+    "motion.pointing", "a pointing to joint angles ends there, inside the limits all the way", moves=True
+)
+def _pointing(trial: RigTrial) -> str:
+    worst_rad, seen = 0.0, 0
+
+    def inside(status: dict[str, Any]) -> None:
+        nonlocal seen
+        seen += 1
+        for name, angle, (low, high) in zip(
+            ("pan", "tilt"), trial.joints(status), trial.limits[:2], strict=True
+        ):
+            beyond = max(low - angle, angle - high)
+            expect(
+                beyond <= BEYOND_RAD,
+                f"{name} is measured at {angle:.4f} rad, {beyond:.4f} rad beyond its limit",
+            )
+
+    for parts in ((0.6, -0.4), (-0.6, 0.4), (0.0, 0.0)):
+        goal = trial.goal(*parts)
+        record = trial.point(goal, inside)
+        status = trial.rest()
+        inside(status)
+        at = trial.joints(status)
+        off_rad = _away(at, goal)
+        expect(
+            off_rad <= ARRIVED_RAD,
+            f"sent to ({goal[0]:.4f}, {goal[1]:.4f}) rad the head rests at ({at[0]:.4f}, {at[1]:.4f}) rad",
+        )
+        expect(record.get("residual_px") is None, "residual_px is told where no picture was to be compared")
+        worst_rad = max(worst_rad, off_rad)
+    return f"within {worst_rad:.1e} rad, seen {seen} times on the way"
+
+
+@RIG.check("motion.speed", "the head is never measured to go faster than its limit", moves=True)
+def _speed(trial: RigTrial) -> str:
+    limit = trial.limits[2]
+    bound = limit * (1 + FASTER_PART) + FASTER_RAD_PER_S
+    readings: list[tuple[float, Angles]] = []
+
+    def note(status: dict[str, Any]) -> None:
+        readings.append((number(status, "joints", "measured_s"), trial.joints(status)))
+
+    trial.point(trial.goal(-0.9, -0.9))
+    trial.point(trial.goal(0.9, 0.9), note)
+    fastest = 0.0
+    for index, (time_s, angles) in enumerate(readings):
+        for later_s, later in readings[index + 1 :]:
+            if later_s - time_s >= PACE_S:
+                fastest = max(fastest, _away(angles, later) / (later_s - time_s))
+                break
+    expect(fastest <= bound, f"{fastest:.3f} rad/s was measured where the limit is {limit:g} rad/s")
+    if fastest == 0.0:
+        raise NotTried("the move was too short to be seen; a larger --reach shows it")
+    return f"{fastest:.3f} rad/s, limit {limit:g} rad/s"
+
+
+@RIG.check("motion.stop", "a stop ends motion and operation short of the goal, from anybody", moves=True)
+def _stop(trial: RigTrial) -> str:
+    for attempt in range(STOP_TRIES):
+        way = 1 if attempt % 2 == 0 else -1
+        trial.point(trial.goal(-way, -way))
+        told = _stopped_on_the_way(trial, trial.goal(way, way))
+        if told:
+            return told
+    raise NotTried("the head had come too near to its goal before the stop; a larger --reach shows it")
+
+
+def _stopped_on_the_way(trial: RigTrial, goal: Angles) -> str:
+    """Send the head off and stop it; empty if it was too near to its goal to tell."""
+    name = trial.start(goal)
+    until_s = time.monotonic() + BEGINS_WITHIN_S
+    while True:
+        asked_s = time.monotonic()
+        status = trial.status()
+        if status.get("moving"):
+            break
+        if time.monotonic() > until_s or trial.client.operation(name)["state"] in ("done", "failed"):
+            return ""
+    left_rad = _away(trial.joints(status), goal)
+    sent_s = time.monotonic()
+    expect(trial.client.stop().get("stopped") is True, "POST /stop does not answer that it stopped")
+    answered_s = time.monotonic()
+    took_s = answered_s - asked_s + number(status, "joints", "age_s")
+    status = trial.rest(BRAKED_WITHIN_S)
+    record = trial.ended(name)
+    rests_rad = _away(trial.joints(status), goal)
+    if rests_rad <= ARRIVED_RAD and left_rad < 2 * trial.limits[2] * took_s:
+        return ""
+    expect(
+        rests_rad > ARRIVED_RAD,
+        f"stopped {left_rad:.3f} rad before its goal the head went on ({took_s:.2f} s from that reading)",
+    )
+    expect(record["state"] == "stopped", f"the operation that was stopped ended {record['state']!r}")
+    word = trial.status().get("state")
+    expect(word == "holding", f"after the stop the state is {word!r}, not holding")
+    trial.let_pass(10 * POLL_S)
+    crept_rad = abs(_away(trial.joints(), goal) - rests_rad)
+    expect(crept_rad <= ARRIVED_RAD, f"after the stop the head crept by {crept_rad:.4f} rad")
+    return f"{rests_rad:.3f} rad short of the goal, answered in {1e3 * (answered_s - sent_s):.0f} ms"
+
+
+@RIG.check("motion.stop_at_rest", "a stop at rest is taken too, again and again, and moves nothing")
+def _stop_at_rest(trial: RigTrial) -> None:
+    before = trial.joints()
+    for _ in range(3):
+        trial.client.stop()
+    moved_rad = _away(before, trial.joints())
+    expect(moved_rad <= ARRIVED_RAD, f"a stop at rest moved the head by {moved_rad:.4f} rad")
+
+
+@RIG.check("motion.after_stop", "after a stop the next pointing goes out", moves=True)
+def _after_stop(trial: RigTrial) -> None:
+    trial.client.stop()
+    trial.point(trial.goal(0.0, 0.0))
+
+
+@RIG.check(
+    "motion.estop", "an emergency stop refuses moves until a reset, and that moves nothing", moves=True
+)
+def _estop(trial: RigTrial) -> str:
+    reason, name = "a check of this rig's promises", "mastctl conform"
+    before = trial.joints()
+    told = trial.client.estop(reason=reason, name=name)
+    expect(told.get("latched") is True, "POST /estop does not answer that it is latched")
+    try:
+        try:
+            trial.start(trial.goal(0.5, 0.5))
+        except ClientError as error:
+            expect(error.code == "estopped", f"a pointing after it: {error.code} where estopped is expected")
+        else:
+            raise PromiseBroken("a pointing after it was taken")
+        expect(trial.status().get("state") == "stopped", "after an emergency stop the state is not stopped")
+    finally:
+        trial.client.reset(reason=reason, name=name)
+    trial.let_pass(10 * POLL_S)
+    moved_rad = _away(before, trial.joints())
+    expect(moved_rad <= ARRIVED_RAD, f"emergency stop and reset moved the head by {moved_rad:.4f} rad")
+    return "kept across a restart" if told.get("kept") else "not kept across a restart"
+
+
+@RIG.check(
+    "clicks.pointed", "a click on a frame ends with a residual measured in a newer picture", moves=True
+)
+def _clicked(trial: RigTrial) -> str:
+    camera = _clicked_camera(trial)
+    reasons = []
+    for attempt in range(CLICKS):
+        trial.rest()
+        shot = trial.picture(camera)
+        places = _places(trial, shot)
+        if attempt >= len(places):
+            break
+        record = trial.ended(trial.client.point(pixel=(camera, shot.frame_id, *places[attempt])))
+        if record["state"] == "done":
+            return _residual(trial, shot, record)
+        code, message = (str(field(record, "error", key)) for key in ("code", "message"))
+        expect(code in OF_THE_SCENE, f"the operation ended {record['state']}: {code}: {message}")
+        reasons.append(f"{code}: {message}")
+    words = reasons[-1] if reasons else "the picture shows nothing that stands out"
+    raise NotTried(f"nothing that was clicked could be pointed at; the last time {words}")
+
+
+def _clicked_camera(trial: RigTrial) -> str:
+    """The left camera of a stereo pair on the head."""
+    for camera in trial.cameras:
+        other = camera.removesuffix("_left") + "_right"
+        on = trial.mast_cameras.get(camera, {}).get("on")
+        if on == "head" and camera.endswith("_left") and other in trial.cameras:
+            return camera
+    raise NotTried("no stereo pair on the head gives pictures")
+
+
+def _places(trial: RigTrial, shot: Snapshot) -> list[tuple[float, float]]:
+    """Pixels that stand out, the clearest first, near enough to the image centre for the reach."""
+    grey = shot.image if shot.image.ndim == 2 else cv2.cvtColor(shot.image, cv2.COLOR_BGR2GRAY)
+    height, width = grey.shape
+    told = trial.mast_cameras[shot.camera]
+    focal_px = float(np.linalg.norm(np.cross(told["A"], told["H"])))
+    half = round(min(0.25 * min(width, height), 0.5 * trial.reach_rad * focal_px))
+    mask = np.zeros_like(grey)
+    mask[height // 2 - half : height // 2 + half, width // 2 - half : width // 2 + half] = 255
+    found = cv2.goodFeaturesToTrack(grey, CLICKS, 0.01, max(2.0, half / 4), mask=mask, blockSize=7)
+    return [] if found is None else [(float(x), float(y)) for x, y in found.reshape(-1, 2)]
+
+
+def _residual(trial: RigTrial, shot: Snapshot, record: dict[str, Any]) -> str:
+    """Say the residual of a pointing that is done. Raises PromiseBroken if it cannot be one."""
+    for key in ("residual_px", "residual_sigma_px"):
+        pair = field(record, key)
+        expect(isinstance(pair, list) and len(pair) == 2, f"{key} is {pair!r} where two numbers are expected")
+    residual, sigma = (
+        [number({key: v}, key) for v in record[key]] for key in ("residual_px", "residual_sigma_px")
+    )
+    expect(min(sigma) > 0, f"residual_sigma_px is {sigma}")
+    last = str(field(field(record, "pointings")[-1], "frame_id"))
+    with suppress(ClientError):  # it need not be kept any more
+        mid_s = trial.client.snapshot(shot.camera, frame_id=last).mid_exposure_s
+        expect(mid_s > shot.mid_exposure_s, "the residual was measured in a picture from before the click")
+    return f"residual {residual[0]:.2f}, {residual[1]:.2f} px, sigma {sigma[0]:.2f}, {sigma[1]:.2f} px"
+
+
+@RIG.check("motion.home", "the head goes back to where it stood before the checks", moves=True)
+def _home(trial: RigTrial) -> None:
+    pan, tilt = (
+        min(max(angle, low), high)
+        for angle, (low, high) in zip(trial.joints(trial.began), trial.limits[:2], strict=True)
+    )
+    try:
+        trial.point((pan, tilt))
+    except PromiseBroken:
+        trial.client.stop()
+        raise
+
+
+def _away(angles: Angles, others: Angles) -> float:
+    """How far angles are apart, the farther axis, radians."""
+    return max(abs(a - b) for a, b in zip(angles, others, strict=True))
