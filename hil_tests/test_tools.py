@@ -13,7 +13,7 @@ CASES = {
     "against_others.trackers --work /dev/null/x": "/dev/null/x: Not a directory",
     "campaigns.handoff --cases 0": "--cases: '0' where a whole number of at least 1 is expected",
     "campaigns.handoff --out /dev/null/x.csv": "--out: /dev/null/x.csv: Not a directory",
-    "campaigns.life --minutes 0": "--minutes: '0' where a number above zero is expected",
+    "campaigns.life head --minutes 0": "--minutes: '0' where a number above zero is expected",
     "campaigns.motion --moves 0": "--moves: '0' where a whole number of at least 1 is expected",
     "campaigns.provoked_surveys --cases 0": "--cases: '0' where a whole number of at least 1 is expected",
     "campaigns.provoked_surveys --pairs eye": "has no stereo pair 'eye'",

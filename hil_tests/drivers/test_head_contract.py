@@ -26,8 +26,8 @@ from mastctl.conform.checks import Check
 from mastctl.conform.head_checks import HEADS, fastest_seen
 from mastctl.conform.head_trial import HeadTrial
 from mastctl.daemon import RunningDaemon
-from mastctl.experiment.demo import SimulationTruth, demo_config
 from mastctl.experiment.pointing import run_pointing_experiment
+from mastctl.experiment.simulated import SimulationTruth, demo_config
 from tools.campaigns.servo_rigs import LIMITS_RAD, RIGS, TURNED, Rig
 
 REAL = [name for name in RIGS if name != "in_memory"]

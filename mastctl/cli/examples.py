@@ -57,9 +57,6 @@ board find board.yaml picture.png
 calibrate survey --out mast.yaml --report report
 calibrate bench --config rig.yaml --board board.yaml --out mast.yaml --report report
 experiment pointing --targets 20 --out pointing
-experiment handoff --simulated --targets 20 --out handoff
-experiment approach --runs 5 --out approach
-experiment calibration --surveys 20 --out calibration
 demo --out demo
 completion bash
 conform http://127.0.0.1:8420

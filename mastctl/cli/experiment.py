@@ -1,4 +1,4 @@
-"""``mastctl experiment`` (pointing on any daemon, calibration), ``mastctl demo`` on the simulated rover."""
+"""``mastctl experiment pointing`` on any daemon, ``mastctl demo`` on the simulated rover."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ from mastctl.cli.tasks import add_task_options, refuse_task_options, results_of
 
 if TYPE_CHECKING:
     from mastctl.client import Client
-    from mastctl.experiment.pointing import ClickTruth
-    from mastctl.experiment.pointing_record import PointingExperiment, TargetRecord
+    from mastctl.experiment.pointing import ClickTruth, PointingExperiment, TargetRecord
 
 DEFAULT_TARGETS = 10
 DEFAULT_DISTANCES_M = (10.0, 6.0, 2.0)
@@ -30,7 +29,7 @@ HEADS = ("ptu_d46_70", "dynamixel_x", "ph42")
 
 def add_commands(subparsers: Any) -> None:
     """Add ``experiment`` and ``demo``."""
-    experiment = subparsers.add_parser("experiment", help="the paper's experiments")
+    experiment = subparsers.add_parser("experiment", help="the paper's pointing experiment")
     kinds = experiment.add_subparsers(dest="experiment", metavar="EXPERIMENT", required=True)
     pointing = kinds.add_parser("pointing", help="point at random textured targets and measure the residuals")
     from mastctl.cli.service import add_daemon_options
@@ -52,11 +51,6 @@ def add_commands(subparsers: Any) -> None:
     )
     add_task_options(pointing)
     pointing.set_defaults(run=run_pointing)
-    from mastctl.cli import experiment_approach, experiment_calibration, experiment_handoff
-
-    experiment_handoff.add_parser(kinds)
-    experiment_approach.add_parser(kinds)
-    experiment_calibration.add_parser(kinds)
 
     demo = subparsers.add_parser("demo", help="the pointing experiment on the packaged simulated rover")
     _add_common(demo, out_help="folder for the report (default mastctl_demo)")
@@ -115,9 +109,9 @@ def run_pointing(args: argparse.Namespace) -> int:
 
 def _run_simulated(args: argparse.Namespace) -> int:
     """Run each target on a simulated rover of its own."""
-    from mastctl.cli.experiment_simulated import PointingTask, Rover, joined_pointings, one_pointing
     from mastctl.cli.service import refuse_daemon_options
     from mastctl.experiment.pointing_report import PICTURES_PER_DISTANCE
+    from mastctl.experiment.simulated import PointingTask, Rover, joined_pointings, one_pointing
 
     refuse_daemon_options(args)
     rover = Rover(args.head or HEADS[0], args.seed)
@@ -143,8 +137,8 @@ def run_demo(args: argparse.Namespace) -> int:
     """Start a simulated rover behind a daemon on a free port, and run the experiment on it."""
     from drivers.sim.compile_beside import drawing_compiled_beside
     from mastctl.config import load_config
-    from mastctl.experiment.demo import SimulationTruth, demo_config, head_note, own_config
     from mastctl.experiment.pointing import head_pair
+    from mastctl.experiment.simulated import SimulationTruth, demo_config, head_note, own_config
 
     check_folder(args.out, "--out")
     if args.config is None:

@@ -135,7 +135,7 @@ def _beside(out: Any) -> Path | None:
 
 
 def _opened(args: argparse.Namespace) -> Callable[[], AbstractContextManager[Any]]:
-    from mastctl.experiment.executors import open_executor
+    from mastctl.experiment.tasks import open_executor
 
     if args.task:
         return partial(open_executor, "local", min(len(args.task), args.workers or 1))

@@ -8,7 +8,9 @@ fails is a row of its own with the reason; it never leaves the record.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,15 +19,179 @@ from calib.files.mast_file import parse_rig
 from calib.mast.rig import Rig
 from drivers.interfaces import Image
 from mastctl.client import Client, ClientError
-from mastctl.experiment.pointing_record import (
-    Landing,
-    PointingExperiment,
-    TargetRecord,
-    summarise_distance,
-)
-from mastctl.experiment.run_time import RunTime
-from mastctl.experiment.targets import Target
-from mastctl.experiment.views import VIEWS_PER_TARGET, Views, pointed
+from mastctl.experiment.targets import VIEWS_PER_TARGET, Target, Views, pointed
+
+# Rms pixel errors (x, y) of the paper's Table VI: first and second pointing at each distance in metres.
+PAPER_TABLE_VI: Mapping[float, tuple[tuple[float, float], tuple[float, float]]] = {
+    10.0: ((0.591, 1.219), (0.527, 0.778)),
+    6.0: ((0.743, 1.243), (0.596, 0.844)),
+    2.0: ((1.260, 0.925), (0.672, 0.921)),
+}
+
+
+@dataclass(frozen=True)
+class Landing:
+    """One pointing of a target: the measured residual, its sigma, the true one where it is known."""
+
+    residual_px: tuple[float, float]
+    sigma_px: tuple[float, float]
+    frame_id: str
+    true_px: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TargetRecord:
+    """One target: what was clicked, where it landed, or why it failed; pictures where they were kept."""
+
+    distance_m: float
+    index: int
+    camera: str
+    frame_id: str
+    clicked_px: tuple[float, float]
+    range_m: float
+    pan_before_rad: float
+    tilt_before_rad: float
+    landings: tuple[Landing, ...]
+    error: str = ""
+    seconds: float = 0.0
+    operation: Mapping[str, Any] = field(default_factory=dict)
+    clicked_image: Image | None = None
+    landed_images: tuple[Image, ...] = ()
+
+
+@dataclass(frozen=True)
+class DistanceSummary:
+    """One row of the table. ``*_rms_px`` is None where no target landed."""
+
+    distance_m: float
+    targets: int
+    failed: int
+    first_rms_px: tuple[float, float] | None
+    second_rms_px: tuple[float, float] | None
+    true_first_rms_px: tuple[float, float] | None
+    true_second_rms_px: tuple[float, float] | None
+    worst_first_px: float | None
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class PointingExperiment:
+    """What was run and what came out."""
+
+    url: str
+    status: Mapping[str, Any]
+    seed: int
+    camera: str
+    aim_px: tuple[float, float]
+    records: tuple[TargetRecord, ...]
+    summaries: tuple[DistanceSummary, ...]
+    started: str
+    seconds: float
+    notes: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the document of contract section 3, with what else is known of each distance."""
+        return {
+            "url": self.url,
+            "hardware": self.status.get("hardware"),
+            "camera": self.camera,
+            "seed": self.seed,
+            "seconds": round(self.seconds, 2),
+            "distances": [_row_as_json(row) for row in self.summaries],
+            "notes": list(self.notes),
+            "failures": [
+                {"distance_m": r.distance_m, "target": r.index, "error": r.error}
+                for r in self.records
+                if r.error
+            ],
+        }
+
+
+def _row_as_json(row: DistanceSummary) -> dict[str, Any]:
+    """One distance for programs; the keys of the contract first."""
+    document: dict[str, Any] = {
+        "distance_m": row.distance_m,
+        "targets": row.targets,
+        "first_rms_px": row.first_rms_px,
+        "second_rms_px": row.second_rms_px,
+        "seconds": round(row.seconds, 2),
+        "failed": row.failed,
+        "worst_first_px": row.worst_first_px,
+    }
+    if row.true_first_rms_px is not None:
+        document["true_first_rms_px"] = row.true_first_rms_px
+        document["true_second_rms_px"] = row.true_second_rms_px
+    paper = PAPER_TABLE_VI.get(row.distance_m)
+    if paper is not None:
+        document["paper_first_rms_px"], document["paper_second_rms_px"] = paper
+    return document
+
+
+def summarise_distance(distance_m: float, rows: Sequence[TargetRecord], seconds: float) -> DistanceSummary:
+    """Return the table's row for the records of one distance; failed targets are counted, not averaged."""
+    firsts = [row.landings[0] for row in rows if len(row.landings) > 0]
+    seconds_ = [row.landings[1] for row in rows if len(row.landings) > 1]
+    return DistanceSummary(
+        distance_m=distance_m,
+        targets=len(rows),
+        failed=sum(bool(row.error) for row in rows),
+        first_rms_px=rms([landing.residual_px for landing in firsts]),
+        second_rms_px=rms([landing.residual_px for landing in seconds_]),
+        true_first_rms_px=rms([landing.true_px for landing in firsts if landing.true_px is not None]),
+        true_second_rms_px=rms([landing.true_px for landing in seconds_ if landing.true_px is not None]),
+        worst_first_px=max((math.hypot(*landing.residual_px) for landing in firsts), default=None),
+        seconds=seconds,
+    )
+
+
+def rms(pairs: Sequence[tuple[float, float]]) -> tuple[float, float] | None:
+    """Return the root mean square of each column about zero, or None of nothing."""
+    if not pairs:
+        return None
+    x, y = np.sqrt(np.mean(np.square(np.array(pairs, dtype=float)), axis=0))
+    return float(x), float(y)
+
+
+class RunTime:
+    """The time of one run, which begins here.
+
+    Durations are the daemon's, so that those of a simulated rover are what a rover would have taken. One
+    whose time passes only on demand (``simulation.speed: max``) knows no calendar and no address: the record
+    of such a run is to be the same every time.
+
+    Attributes
+    ----------
+    started
+        The date, or words that say that there is none.
+    where
+        The daemon's address, or words.
+    """
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._began_s = self.now_s()
+        self.started = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+        self.where = client.url
+        if on_demand(client):
+            self.started = f"{self._began_s:.3f} s of the simulated rover's own time"
+            self.where = "a simulated rover"
+
+    def now_s(self) -> float:
+        """Return the daemon's time, seconds."""
+        return float(self._client.status()["now_s"])
+
+    def since_s(self, moment_s: float | None = None) -> float:
+        """Return how long the run, or what began at ``moment_s``, takes by now, seconds."""
+        return self.now_s() - (self._began_s if moment_s is None else moment_s)
+
+
+def on_demand(client: Client) -> bool:
+    """Whether the daemon is a simulated rover whose time passes only on demand."""
+    try:
+        return bool(client.simulation_time()["speed"] == "max")
+    except ClientError:  # anything else than this program's own simulated rover
+        return False
+
 
 # Targets lie this far to either side of straight ahead: the pan range of the paper's calibration (III.C).
 PAN_RANGE_RAD = 1.0

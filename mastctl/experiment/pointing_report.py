@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mastctl.experiment.pointing_record import (
+from mastctl.experiment.pointing import (
     PAPER_TABLE_VI,
     DistanceSummary,
     PointingExperiment,

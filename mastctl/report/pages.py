@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined
 
 
 @dataclass(frozen=True)
@@ -22,18 +23,19 @@ class Badge:
     kind: str = ""
 
 
-def page(template: str, **told: Any) -> str:
+def page(template: str | Path, **told: Any) -> str:
     """Return a whole page.
 
     Parameters
     ----------
     template
-        A file of the folder ``templates``.
+        A file of the folder ``templates``; by its path, one from elsewhere that builds on these.
     told
         For the head ``title`` (words), ``badge`` (`Badge`) and ``facts`` (pairs of words); then all that the
         template names itself.
     """
-    return _templates().get_template(template).render(**told)
+    beside = None if isinstance(template, str) else template.parent
+    return _templates(beside).get_template(Path(template).name).render(**told)
 
 
 def of_daemon(status: Mapping[str, Any]) -> tuple[Badge, list[tuple[str, str]]]:
@@ -45,10 +47,11 @@ def of_daemon(status: Mapping[str, Any]) -> tuple[Badge, list[tuple[str, str]]]:
 
 
 @cache
-def _templates() -> Environment:
-    """The templates, strict about names that nobody gave."""
+def _templates(beside: Path | None) -> Environment:
+    """The templates, and those of another folder, strict about names that nobody gave."""
+    own = PackageLoader("mastctl.report")
     return Environment(
-        loader=PackageLoader("mastctl.report"),
+        loader=own if beside is None else ChoiceLoader([FileSystemLoader(beside), own]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

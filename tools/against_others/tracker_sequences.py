@@ -37,8 +37,8 @@ from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
 from calib.tracking.start import start_track
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
-from mastctl.experiment.approach_world import WorldErrors
 from mastctl.experiment.targets import texture_mask
+from tools.studies.approach_world import WorldErrors
 
 PAIR = ("pancam_left", "pancam_right")
 STEPS, START_M = 20, 10.0

@@ -1,6 +1,6 @@
 """How often check pictures of a bench that is right are called bad.
 
-    .venv/bin/python -m tools.campaigns.bench_checks --benches 300 --seed 1
+    .venv/bin/python -m tools.campaigns.bench_checks --cases 300 --seed 1
 
 Benches as `tools.campaigns.bench_coverage` has them are linearised at the truth: each of twelve is simulated
 without noise and fitted; errors of all that is measured are then drawn anew for every bench (corners normal,
@@ -13,7 +13,6 @@ tenth of all.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -31,8 +30,8 @@ from calib.fit.significance import chance_of_sum
 from calib.fit.terms import ImageTerm
 from drivers.sim_survey.bench import simulate_bench
 from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
+from tools.campaign import options, run_cases
 from tools.campaigns.bench_coverage import CHANCES, HEADS, plan_of
 
 GEOMETRIES = 12
@@ -109,32 +108,23 @@ def drawn_squares(
 
 def main(words: Sequence[str] | None = None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--benches", type=at_least(1), default=300)
-    parser.add_argument(
-        "--seed", type=at_least(0), default=1, help="of the first geometry; the others follow"
-    )
+    parser = options(__doc__, 300, "benches")
     parser.add_argument("--head", choices=sorted(HEADS), default="driven")
     parser.add_argument("--attitudes", type=at_least(4), default=8, help="head positions per placement")
     parser.add_argument("--checks", type=at_least(1), default=3, help="the same that are not fitted")
-    add_task_options(parser)
-    options = parser.parse_args(words)
-    each = -(-options.benches // GEOMETRIES)
+    args = parser.parse_args(words)
+    each = -(-args.cases // GEOMETRIES)
     tasks = [
-        Task(options.head, options.attitudes, options.checks, each, seed)
-        for seed in range(options.seed, options.seed + GEOMETRIES)
+        Task(args.head, args.attitudes, args.checks, each, seed)
+        for seed in range(args.seed, args.seed + GEOMETRIES)
     ]
-    results = results_of(options, "checks", found, tasks, lambda task: f"seed {task.seed}")
-    if results is None:
-        return 0
+    results = run_cases(args, "checks", found, tasks, lambda task: f"seed {task.seed}")
     chances = np.concatenate([one.chances for one in results]).ravel()
     part = np.concatenate([one.part for one in results])
     below = ", ".join(f"{100 * np.mean(chances < p):.2f} % below {p:g}" for p in CHANCES)
     bad = int(np.sum(chances < UNPREDICTED))
     print(
-        f"check pictures of {len(chances)} cameras of {each * GEOMETRIES} benches ({options.head}): {bad} "
+        f"check pictures of {len(chances)} cameras of {each * GEOMETRIES} benches ({args.head}): {bad} "
         f"called bad, {len(chances) * UNPREDICTED:.2g} meant\n"
         f"chances: {below}\n"
         f"calibration's part of the squares: {part.min():.2f} to {part.max():.2f}"

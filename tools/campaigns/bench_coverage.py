@@ -1,9 +1,9 @@
 """Fit many simulated benches and count how often stated intervals hold the truth, and how well the rig
 points.
 
-    .venv/bin/python -m tools.campaigns.bench_coverage --benches 200 --seed 1
-    .venv/bin/python -m tools.campaigns.bench_coverage --benches 200 --seed 1 --head servo
-    .venv/bin/python -m tools.campaigns.bench_coverage --benches 100 --head driven --attitudes 8 --checks 3
+    .venv/bin/python -m tools.campaigns.bench_coverage --cases 200 --seed 1
+    .venv/bin/python -m tools.campaigns.bench_coverage --cases 200 --seed 1 --head servo
+    .venv/bin/python -m tools.campaigns.bench_coverage --cases 100 --head driven --attitudes 8 --checks 3
 
 Benches are simulated (`drivers.sim_survey.bench`): a Navcam pair, an A2 board at three placements, corners
 with 0.1 px noise and some of them wrong. ``--head ptu`` reads true but for counts of 0.05 mrad; ``--head
@@ -25,7 +25,6 @@ behind ± stands its standard error, from the scatter of whole benches.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -50,8 +49,8 @@ from calib.mast.rig_rates import pixel_rates
 from calib.rigid import tangents
 from drivers.sim_survey.bench import BenchPlan, Placement, simulate_bench
 from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
+from tools.campaign import held_percent, options, rms, run_cases
 
 LEVEL, Z = 0.95, 1.959964
 LOWEST = 88.0
@@ -295,11 +294,8 @@ def within(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--benches", type=at_least(1), default=100)
-    parser.add_argument("--seed", type=at_least(0), default=1, help="of the first bench; the others follow")
+    """Print the tables."""
+    parser = options(__doc__, 100, "benches")
     parser.add_argument("--head", choices=sorted(HEADS), default="ptu")
     parser.add_argument("--attitudes", type=at_least(4), default=20, help="head positions per placement")
     parser.add_argument(
@@ -308,26 +304,19 @@ def main() -> int:
     parser.add_argument(
         "--doubts", type=at_least(0), default=0, help="head positions that the start is made to doubt"
     )
-    add_task_options(parser)
-    options = parser.parse_args()
-    seeds = range(options.seed, options.seed + options.benches)
+    args = parser.parse_args()
     began = time.monotonic()
     tasks = [
-        BenchTask(plan_of(options.head, options.attitudes, seed, options.checks), seed, options.doubts)
-        for seed in seeds
+        BenchTask(plan_of(args.head, args.attitudes, seed, args.checks), seed, args.doubts)
+        for seed in range(args.seed, args.seed + args.cases)
     ]
-    found = results_of(options, "benches", score, tasks, lambda task: f"seed {task.seed}")
-    if found is None:
-        return 0
-    scores = [one for one in found if isinstance(one, Score)]
-    refused = [one for one in found if isinstance(one, str)]
-    if scores:
+    found = run_cases(args, "benches", score, tasks, lambda task: f"seed {task.seed}")
+    if scores := [one for one in found if isinstance(one, Score)]:
         report(scores)
+    refused = [one for one in found if isinstance(one, str)]
     print("\n".join([f"benches refused: {len(refused)}", *refused]))
-    print(
-        f"{options.benches} benches from seed {options.seed}, {options.head}, {options.attitudes} attitudes: "
-        f"{time.monotonic() - began:.0f} s"
-    )
+    what = f"{args.cases} benches from seed {args.seed}, {args.head}, {args.attitudes} attitudes"
+    print(f"{what}: {time.monotonic() - began:.0f} s")
     return 0
 
 
@@ -339,19 +328,21 @@ def report(scores: Sequence[Score]) -> None:
         errors = np.array([s.parameters[name] for s in scores if name in s.parameters])
         held = 100 * np.mean(np.abs(errors) < Z)
         mark = "  <--" if held < LOWEST else ""
-        print(f"  {name:36s} {held:5.1f}      {np.sqrt(np.mean(errors**2)):.2f}  {len(errors)}{mark}")
-    each = [100 * np.mean(np.abs(list(s.parameters.values())) < Z) for s in scores]
-    pixels = [100 * np.mean(np.abs(s.pixels) < Z) for s in scores]
-    for what, rates in (("pooled over parameters", each), ("pooled over pixels", pixels)):
-        error = np.std(rates, ddof=1) / np.sqrt(len(rates)) if len(rates) > 1 else np.nan
-        print(f"  {what:36s} {np.mean(rates):5.1f} ± {error:.1f}")
+        print(f"  {name:36s} {held:5.1f}      {rms(errors):.2f}  {len(errors)}{mark}")
+    each = [np.abs(list(s.parameters.values())) < Z for s in scores]
+    pixels = [np.abs(s.pixels) < Z for s in scores]
+    for what, by_bench in (("pooled over parameters", each), ("pooled over pixels", pixels)):
+        rate, error = held_percent(by_bench)
+        print(f"  {what:36s} {rate:5.1f} ± {error:.1f}")
     print(
         "first pointing, rms px an axis, exact clicks:   "
         + "".join(f"{r:8g} m" for r in sorted(RANGES_M)[::-1])
     )
     landed = np.array([s.landed_px for s in scores])
-    rms = np.sqrt(np.nanmean(landed**2, axis=(0, 3, 4)))
-    for label, row in zip(("the fitted file", "without joints' errors", "counts alone"), rms, strict=True):
+    by_range = np.sqrt(np.nanmean(landed**2, axis=(0, 3, 4)))
+    for label, row in zip(
+        ("the fitted file", "without joints' errors", "counts alone"), by_range, strict=True
+    ):
         print(f"  {label:44s}" + "".join(f"{value:10.3f}" for value in row))
     whole = np.sqrt(np.nanmean(landed**2, axis=(0, 2, 3, 4)))
     over = whole / whole[2]

@@ -1,6 +1,6 @@
 """What a driven bench is worth on a head whose encoders and gears err: calibrated by the command, pointed.
 
-    .venv/bin/python -m tools.campaigns.bench_driven [--targets 8] [--distances 10,6,2] [--keep DIR]
+    .venv/bin/python -m tools.campaigns.bench_driven [--cases 8] [--distances 10,6,2] [--keep DIR]
 
 The packaged bench with a Dynamixel X head: harmonics of 6 and 2 mrad in both encoders, 4 mrad of play. Of it
 only the drawing is known. `mastctl calibrate bench` drives it before a simulated A2 board; the mast file that
@@ -11,7 +11,6 @@ of the true residual of the first pointing, px an axis, how many times what coun
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from collections.abc import Mapping
@@ -25,15 +24,15 @@ from calib.files.yaml_text import dump_mapping
 from calib.mast.joints import Joints
 from calib.mast.rig import Rig
 from mastctl.cli.main import main as mastctl
-from mastctl.cli.output import at_least
 from mastctl.client import Client
 from mastctl.config import Config, Listen, load_config
 from mastctl.daemon import RunningDaemon
-from mastctl.experiment.demo import SimulationTruth
 from mastctl.experiment.pointing import run_pointing_experiment
+from mastctl.experiment.simulated import SimulationTruth
 from mastctl.packaged import config_folder
 from tools.arguments import end
-from tools.campaigns.joints import ERRS, rms_px
+from tools.campaign import heading, line, numbers, options, rms
+from tools.campaigns.joints import ERRS
 
 A2_BOARD = Charuco(10, 6, 0.055, 0.04125)
 HEAD = {"preset": "dynamixel_x", **ERRS}
@@ -42,15 +41,10 @@ COUNTS_ALONE = {"preset": "dynamixel_x", "backlash_rad": 0.0}
 
 def main() -> int:
     """Calibrate, point, and print a table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--targets", type=at_least(1), default=8, metavar="N", help="a distance (default 8)")
-    parser.add_argument("--distances", default="10,6,2", metavar="M,M", help="metres (default 10,6,2)")
-    parser.add_argument("--seed", type=at_least(0), default=1, metavar="S", help="(default 1)")
+    parser = options(__doc__, 8, "targets a distance", tasks=False)
+    parser.add_argument("--distances", type=numbers, default="10,6,2", metavar="M,M", help="(default 10,6,2)")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the bench and its report there")
     args = parser.parse_args()
-    distances_m = tuple(float(one) for one in args.distances.split(","))
     packaged = load_config(config_folder() / "bench.yaml")
     with tempfile.TemporaryDirectory() as scratch:
         folder = args.keep or Path(scratch)
@@ -65,16 +59,15 @@ def main() -> int:
             ("the same without joints", HEAD, replace(calibrated, joints=Joints(), fit={})),
         ]
         counts_px = 0.0
+        print(heading(("case", "targets", "first, rms px", "times counts alone", "second")))
         for name, head, rig in cases:
             path = Path(scratch) / "points.yaml"
             save_rig(rig, path)
-            first, second, errors = pointed(packaged, head, path, args.targets, distances_m, args.seed)
-            counts_px = counts_px or rms_px(first)
-            print(
-                f"| {name} | {len(first)} | {rms_px(first):.2f} | {rms_px(first) / counts_px:.2f} | "
-                f"{rms_px(second):.2f} |",
-                flush=True,
-            )
+            first, second, errors = pointed(packaged, head, path, args.cases, args.distances, args.seed)
+            counts_px = counts_px or rms(first)
+            times = rms(first) / counts_px
+            cells = (f"{rms(first):.2f}", f"{times:.2f}", f"{rms(second):.2f}")
+            print(line(name, len(first), *cells), flush=True)
             for words in errors:
                 print(f"  {words}")
     return 0

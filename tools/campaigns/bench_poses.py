@@ -6,12 +6,11 @@ places of the picture; random ones put it anywhere in it. The error is what the 
 leaves of a first pointing over the workspace, rms px an axis: its rms over the benches, and the least and the
 largest of them. Corners alone, nothing is rendered.
 
-    .venv/bin/python -m tools.campaigns.bench_poses --rig configs/sim/rocky8.yaml --benches 10 --seed 1
+    .venv/bin/python -m tools.campaigns.bench_poses --rig configs/sim/rocky8.yaml --cases 10 --seed 1
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 import time
@@ -32,8 +31,8 @@ from calib.mast.pointing import solve
 from calib.mast.rig import Rig
 from calib.mast.solutions import choose
 from mastctl.bench.wanted import FEWEST_LOOKS
-from mastctl.cli.output import at_least
 from tools.arguments import end
+from tools.campaign import options
 
 A2 = Charuco(10, 7, 0.055, 0.042)
 PAIR = ("navcam_left", "navcam_right")
@@ -55,35 +54,31 @@ Way = Callable[[Knowledge, Sought, str, int, Pointing, np.random.Generator, Sequ
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, 10, "benches", tasks=False)
     parser.add_argument("--rig", type=Path, required=True, metavar="MAST.yaml", help="the true rig")
-    parser.add_argument("--benches", type=at_least(1), default=10, metavar="N")
-    parser.add_argument("--seed", type=at_least(0), default=1, metavar="S")
     parser.add_argument("--two-sided", action="store_true", help="a head that comes from either side")
     args = parser.parse_args()
     rig = load_rig(args.rig).rig
     rig = replace(rig, cameras={name: rig.cameras[name] for name in PAIR}, stereo={"navcam": PAIR}, fit={})
     found: dict[str, list[list[float]]] = {name: [] for name in WAYS}
-    for bench in range(args.benches):
+    for bench in range(args.cases):
         rng = np.random.default_rng([args.seed, bench])
         for name, curve in one_bench(rig, rng, one_sided=not args.two_sided).items():
             found[name].append(curve)
-        print(f"bench {bench + 1} of {args.benches}", file=sys.stderr)
+        print(f"bench {bench + 1} of {args.cases}", file=sys.stderr)
     curves = {name: np.array(mine) for name, mine in found.items()}
-    rms = {name: np.sqrt(np.mean(mine**2, axis=0)) for name, mine in curves.items()}
+    root = {name: np.sqrt(np.mean(mine**2, axis=0)) for name, mine in curves.items()}
     print("pictures a camera        " + "".join(f"{3 * k:8d}" for k in EACH))
     for name, mine in curves.items():
-        for what, values in (("rms", rms[name]), ("least", mine.min(axis=0)), ("most", mine.max(axis=0))):
+        for what, values in (("rms", root[name]), ("least", mine.min(axis=0)), ("most", mine.max(axis=0))):
             print(f"{name:8s} {what:15s} " + "".join(f"{value:8.3f}" for value in values))
     for name in ("grid", "random"):
         print(f"{name}: pictures that it needs for the rms of the chosen, in times of theirs: "
-              + needed(rms["chosen"], rms[name]))  # fmt: skip
+              + needed(root["chosen"], root[name]))  # fmt: skip
         twice = [EACH.index(2 * k) for k in EACH if 2 * k in EACH]
         once = [k for k, each in enumerate(EACH) if 2 * each in EACH]
         wins = (curves["chosen"][:, once] <= curves[name][:, twice]).sum(axis=0)
-        print(f"{name}: benches of {args.benches} in which it leaves no less with twice the pictures: "
+        print(f"{name}: benches of {args.cases} in which it leaves no less with twice the pictures: "
               + ", ".join(f"{n} at {3 * EACH[k]}" for n, k in zip(wins, once, strict=True)))  # fmt: skip
     print(f"the choice of a pose took {1e3 * np.mean(CHOICES_S):.0f} ms of processor time on average, "
           f"{1e3 * max(CHOICES_S):.0f} at most")  # fmt: skip

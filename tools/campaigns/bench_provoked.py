@@ -10,7 +10,6 @@ code, the pictures that are in the folder afterwards, whether it can be read, an
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import json
@@ -38,6 +37,7 @@ from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.packaged import config_folder
 from tools.arguments import end
+from tools.campaign import heading, line, options
 
 PRINTED = Charuco(10, 6, 0.055, 0.04125)
 LEFT, RIGHT = "navcam_left", "navcam_right"
@@ -52,7 +52,7 @@ Change = Callable[[str, Image], Image]
 
 
 @dataclass(frozen=True)
-class Case:
+class BenchCase:
     """Something wrong: from which look on, what is done to the rover, once or before each picture, what to
     pictures, which board it is that stands there, and how far to the right of where it was asked for."""
 
@@ -127,29 +127,29 @@ def mirrored(camera: str, image: Image) -> Image:
 
 
 CASES = (
-    Case("nothing"),
-    Case("other columns and rows", stands=Charuco(8, 5, 0.065, 0.049)),
-    Case("other ids", stands=Charuco(10, 6, 0.055, 0.04125, first_id=40)),
-    Case("another kind of board", stands=AprilGrid(6, 4, 0.061, 0.0183)),
-    Case("half a per cent larger than stated", stands=Charuco(10, 6, 0.055275, 0.04145625)),
-    Case("mirrored print", change=mirrored),
-    Case("34 degrees aside, and night but there", act=night, always=True, aside_deg=34.0),
-    Case("100 degrees aside, and night but there", act=night, always=True, aside_deg=100.0),
-    Case("two boards of the same ids", 1, twin_board),
-    Case("board moved 2 cm in a placement", HALF_WAY, board_aside),
-    Case("pan slipped by 10 mrad", HALF_WAY, slipped),
-    Case("left camera refocused by 0.5 %", HALF_WAY, change=refocused),
-    Case("too dark from the first", 0, dark),
-    Case("too dark half-way", HALF_WAY, dark),
-    Case("motion blur of 25 px from the first", change=blurred),
-    Case("motion blur of 25 px half-way", HALF_WAY, change=blurred),
-    Case("one camera's cable pulled half-way", HALF_WAY, lambda client: client.set_fault(RIGHT, "off")),
-    Case("both cables pulled half-way", HALF_WAY, all_off),
+    BenchCase("nothing"),
+    BenchCase("other columns and rows", stands=Charuco(8, 5, 0.065, 0.049)),
+    BenchCase("other ids", stands=Charuco(10, 6, 0.055, 0.04125, first_id=40)),
+    BenchCase("another kind of board", stands=AprilGrid(6, 4, 0.061, 0.0183)),
+    BenchCase("half a per cent larger than stated", stands=Charuco(10, 6, 0.055275, 0.04145625)),
+    BenchCase("mirrored print", change=mirrored),
+    BenchCase("34 degrees aside, and night but there", act=night, always=True, aside_deg=34.0),
+    BenchCase("100 degrees aside, and night but there", act=night, always=True, aside_deg=100.0),
+    BenchCase("two boards of the same ids", 1, twin_board),
+    BenchCase("board moved 2 cm in a placement", HALF_WAY, board_aside),
+    BenchCase("pan slipped by 10 mrad", HALF_WAY, slipped),
+    BenchCase("left camera refocused by 0.5 %", HALF_WAY, change=refocused),
+    BenchCase("too dark from the first", 0, dark),
+    BenchCase("too dark half-way", HALF_WAY, dark),
+    BenchCase("motion blur of 25 px from the first", change=blurred),
+    BenchCase("motion blur of 25 px half-way", HALF_WAY, change=blurred),
+    BenchCase("one camera's cable pulled half-way", HALF_WAY, lambda client: client.set_fault(RIGHT, "off")),
+    BenchCase("both cables pulled half-way", HALF_WAY, all_off),
 )
 
 
 @contextmanager
-def provoked(case: Case) -> Iterator[None]:
+def provoked(case: BenchCase) -> Iterator[None]:
     """Have it happen to whoever looks through a client."""
     snapshot, put_board = Client.snapshot, Client.put_board
     looks, acted = 0, False
@@ -185,7 +185,7 @@ def provoked(case: Case) -> Iterator[None]:
         Client.snapshot, Client.put_board = snapshot, put_board  # type: ignore[method-assign]
 
 
-def told(case: Case, url: str, folder: Path) -> tuple[int, int, str]:
+def told(case: BenchCase, url: str, folder: Path) -> tuple[int, int, str]:
     """Exit code, pictures kept, and the sentence: a refusal, else the verdict and what is not well."""
     board, out = folder / "board.yaml", folder / "mast.yaml"
     save_board(board, PRINTED)
@@ -215,22 +215,20 @@ def clean(url: str) -> None:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Provoke all, and print a table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("--only", nargs="+", metavar="NAME", help="cases whose names contain one of these")
     args = parser.parse_args(words)
     config = load_config(config_folder() / "bench.yaml")
     simulation = {**config.hardware.simulation, "speed": "max", "samples": 1}
     config = replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))
-    print("| provoked | exit | pictures kept | said |\n| --- | --- | --- | --- |", flush=True)
+    print(heading(("provoked", "exit", "pictures kept", "said")), flush=True)
     with RunningDaemon(config) as daemon:
         for case in CASES:
             if args.only and not any(part in case.name for part in args.only):
                 continue
             with tempfile.TemporaryDirectory() as folder:
-                code, kept, words_told = told(case, daemon.url, Path(folder))
-            print(f"| {case.name} | {code} | {kept} | {words_told} |", flush=True)
+                code, kept, sentence = told(case, daemon.url, Path(folder))
+            print(line(case.name, code, kept, sentence), flush=True)
             clean(daemon.url)
     return 0
 

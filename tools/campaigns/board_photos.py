@@ -8,8 +8,10 @@ them where they are.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -222,3 +224,20 @@ def _opencvs(board: Charuco, texels: int, smooth: float) -> tuple[NDArray[np.uin
         board.square_m / texels,
         np.array([n * texels / 2 + rim - 0.5 for n in size]),
     )
+
+
+class Pictured(Protocol):
+    """A result that has pictures (PNG) by their names."""
+
+    @property
+    def pictures(self) -> Mapping[str, bytes]: ...
+
+
+def keep_pictures(folder: Path | None, found: Iterable[Pictured]) -> None:
+    """Write the pictures of results into a folder (made if need be); nothing without one."""
+    if folder is None:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    for one in found:
+        for name, png in one.pictures.items():
+            (folder / name).write_bytes(png)

@@ -30,6 +30,7 @@ from calib.files.mast_file import load_rig
 from calib.files.yaml_text import parse_mapping
 from calib.rigid import FloatArray
 from tools.arguments import end
+from tools.campaign import options
 
 FORMATS = {"opencv": "yaml", "ros": "yaml", "kalibr": "yaml", "mrcal": "cameramodel"}
 GRID = (61, 47)
@@ -39,9 +40,7 @@ NO_LIMIT_PX = 1e4
 
 def main() -> int:
     """Print a row for each camera and format."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("masts", nargs="*", type=Path, metavar="MAST.yaml", help="whose cameras")
     parser.add_argument("--vectors", type=Path, metavar="DIR", help="reference models as JSON files")
     args = parser.parse_args()

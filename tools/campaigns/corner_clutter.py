@@ -6,12 +6,11 @@ mirror image as a faint reflection or as a mirrored print, chessboard textures, 
 laid in by OpenCV's warpPerspective, blurred and made noisy. A corner is wrong if it is farther than 1 px
 from where the board has it, or if there is no board.
 
-    .venv/bin/python -m tools.campaigns.corner_clutter --pictures 2000
+    .venv/bin/python -m tools.campaigns.corner_clutter --cases 2000
 """
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cache
@@ -24,9 +23,8 @@ from scipy.spatial.transform import Rotation
 from calib.boards import AnyBoard, AprilGrid, Charuco, Corners
 from calib.boards.pattern import pattern_of
 from calib.corners import find_corners
-from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
+from tools.campaign import options, run_cases
 
 FloatArray = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -67,7 +65,7 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class Told:
+class ClutteredPicture:
     """Of one picture: what lay in it, corners found, wrong and spoilt, and whether the board was there."""
 
     clutter: tuple[str, ...]
@@ -155,7 +153,7 @@ def picture(rng: np.random.Generator, kind: str) -> tuple[Image, FloatArray | No
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8), place, clutter
 
 
-def run_batch(batch: Batch) -> list[Told]:
+def run_batch(batch: Batch) -> list[ClutteredPicture]:
     """Draw pictures and find the board in them."""
     board = BOARDS[batch.kind]
     places = np.column_stack([board.in_board_m(board.ids)[:, :2], np.ones(len(board.ids))])
@@ -171,21 +169,15 @@ def run_batch(batch: Batch) -> list[Told]:
             off = np.linalg.norm(found.pixels_px[:, None] - carried[:, :2] / carried[:, 2:], axis=2)
             wrong = int((board.ids[off.argmin(axis=1)] != found.ids).sum())
             spoilt = int((off[np.arange(count), found.ids] > SPOILT_PX).sum())
-        told.append(Told(clutter, count, wrong, spoilt, pixels_from_m is not None))
+        told.append(ClutteredPicture(clutter, count, wrong, spoilt, pixels_from_m is not None))
     return told
 
 
 def main() -> int:
     """Run the campaign and print its table."""
-    parser = argparse.ArgumentParser(description="A board among things that are easily taken for it.")
-    parser.add_argument("--pictures", type=at_least(BATCH), default=2000, help="of each board, in fifties")
-    parser.add_argument("--seed", type=at_least(0), default=1)
-    add_task_options(parser)
-    arguments = parser.parse_args()
-    batches = [Batch(kind, n, arguments.seed) for kind in BOARDS for n in range(arguments.pictures // BATCH)]
-    results = results_of(arguments, "batches", run_batch, batches, lambda b: f"{b.kind} {b.number}")
-    if results is None:
-        return 0
+    args = options(__doc__, 2000, "pictures of each board, in fifties").parse_args()
+    batches = [Batch(kind, n, args.seed) for kind in BOARDS for n in range(-(-args.cases // BATCH))]
+    results = run_cases(args, "batches", run_batch, batches, lambda b: f"{b.kind} {b.number}")
     wrong = 0
     for kind in BOARDS:
         of_kind = [t for b, told in zip(batches, results, strict=True) if b.kind == kind for t in told]

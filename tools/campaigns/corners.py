@@ -5,13 +5,12 @@ Boards are drawn, and their corners projected, by OpenCV (tools/campaigns/board_
 bends, at random slants, rolls and places; a scene's pictures are of the same boards, each spoilt in every
 way of its scene. Beside the corners found here stand those of OpenCV's CharucoDetector on the same pictures.
 
-    .venv/bin/python -m tools.campaigns.corners --poses 20 --seed 1
-    .venv/bin/python -m tools.campaigns.corners --poses 3 --kind aprilgrid --pictures FOLDER
+    .venv/bin/python -m tools.campaigns.corners --cases 20 --seed 1
+    .venv/bin/python -m tools.campaigns.corners --cases 3 --kind aprilgrid --pictures FOLDER
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,10 +21,9 @@ from numpy.typing import NDArray
 
 from calib.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, Corners, DotBoard
 from calib.corners import CornersNotFound, find_corners
-from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
-from tools.campaigns.board_photos import SIZE_PX, Levels, light, photographed, placed
+from tools.campaign import options, run_cases
+from tools.campaigns.board_photos import SIZE_PX, Levels, keep_pictures, light, photographed, placed
 
 FloatArray = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -118,7 +116,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Found:
+class PoseFound:
     """What became of a pose: an outcome a case, and pictures (PNG) by their names."""
 
     outcomes: dict[str, Outcome]
@@ -151,7 +149,7 @@ def opencvs(board: AnyBoard, image: Image, truth: FloatArray) -> FloatArray:
     return np.asarray(np.reshape(corners, (-1, 2)) - truth[np.ravel(ids)], dtype=np.float64)
 
 
-def run_pose(task: Task) -> Found:
+def run_pose(task: Task) -> PoseFound:
     """Draw a board, photograph it in every case, and find its corners."""
     board, scene = BOARDS[task.kind], task.scene
     rng = np.random.default_rng([task.seed, task.pose, *task.kind.encode(), *scene.name.encode()])
@@ -161,7 +159,7 @@ def run_pose(task: Task) -> Found:
     # without markers the upper side in the picture is taken for the board's
     one = placed(rng, board, scene.slant_deg, range_m, 0.35 if marked else 0.1, 180.0 if marked else 20.0)
     fine, truth = light([one]), one.truth_px
-    told = Found({})
+    told = PoseFound({})
     for case in scene.cases:
         if case.hidden and not marked:
             continue
@@ -246,26 +244,19 @@ def tell(kind: str, name: str, outcomes: list[Outcome]) -> int:
 
 def main() -> int:
     """Run the campaign and print its table."""
-    parser = argparse.ArgumentParser(
-        description="Corners found on drawn boards: error, sigma, wrong ids, time."
-    )
-    parser.add_argument("--poses", type=at_least(1), default=20, help="of each board in each scene")
-    parser.add_argument("--seed", type=at_least(0), default=1)
+    parser = options(__doc__, 20, "poses of each board in each scene")
     parser.add_argument("--kind", choices=sorted(BOARDS), help="one kind of board only")
     parser.add_argument("--pictures", type=Path, help="folder for pictures with what was found")
-    add_task_options(parser)
-    arguments = parser.parse_args()
+    args = parser.parse_args()
     tasks = [
-        Task(kind, scene, pose, arguments.seed, arguments.pictures is not None)
+        Task(kind, scene, pose, args.seed, args.pictures is not None)
         for kind in BOARDS
         for scene in SCENES
-        if arguments.kind in (None, kind)
-        for pose in range(arguments.poses)
+        if args.kind in (None, kind)
+        for pose in range(args.cases)
     ]
-    founds = results_of(arguments, "poses", run_pose, tasks, lambda t: f"{t.kind}, {t.scene.name}, {t.pose}")
-    if founds is None:
-        return 0
-    print(f"seed {arguments.seed}, {arguments.poses} pictures a line; px per axis; % of corners in view")
+    founds = run_cases(args, "poses", run_pose, tasks, lambda t: f"{t.kind}, {t.scene.name}, {t.pose}")
+    print(f"seed {args.seed}, {args.cases} pictures a line; px per axis; % of corners in view")
     print(f"{'':31s}|    %     rms   worst rms/sigma     95 %  wrong |  lost of  ms    | OpenCV wrong")
     wrong = 0
     for kind in BOARDS:
@@ -277,11 +268,7 @@ def main() -> int:
                 outcomes = [f.outcomes[case.name] for f in of_scene if case.name in f.outcomes]
                 if outcomes:
                     wrong += tell(kind, case.name, outcomes)
-    if arguments.pictures:
-        arguments.pictures.mkdir(parents=True, exist_ok=True)
-        for found in founds:
-            for name, png in found.pictures.items():
-                (arguments.pictures / name).write_bytes(png)
+    keep_pictures(args.pictures, founds)
     return 1 if wrong else 0
 
 

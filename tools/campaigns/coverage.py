@@ -1,9 +1,9 @@
 """Fit many simulated surveys and count how often stated intervals hold the truth.
 
-    .venv/bin/python -m tools.campaigns.coverage --surveys 400 --seed 1
-    .venv/bin/python -m tools.campaigns.coverage --surveys 100 --seed 1 --method paper
-    .venv/bin/python -m tools.campaigns.coverage --surveys 100 --seed 1 --mast 8
-    .venv/bin/python -m tools.campaigns.coverage --surveys 200 --seed 1 --gross 0.05
+    .venv/bin/python -m tools.campaigns.coverage --cases 400 --seed 1
+    .venv/bin/python -m tools.campaigns.coverage --cases 100 --seed 1 --method paper
+    .venv/bin/python -m tools.campaigns.coverage --cases 100 --seed 1 --mast 8
+    .venv/bin/python -m tools.campaigns.coverage --cases 200 --seed 1 --gross 0.05
 
 Surveys are simulated (`drivers.sim_survey.survey`). Prints, over the surveys, how often the 95 % interval of
 each mast parameter and of predicted pixels (points at 2 to 10 m, three directions, every camera) holds the
@@ -20,7 +20,6 @@ named, and the errors of predicted pixels over those of the same surveys without
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -40,9 +39,10 @@ from calib.survey import Sigma, Survey
 from drivers.sim_survey.blunders import with_fewer_dots, with_moved_tape, with_scattered_dots
 from drivers.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
 from mastctl.calibration.run import FITS, Method
-from mastctl.cli.output import at_least, not_negative
-from mastctl.cli.tasks import add_task_options, results_of
+from mastctl.cli.output import not_negative
+from mastctl.packaged import config_folder
 from tools.arguments import end
+from tools.campaign import held_percent, options, rms, run_cases
 
 DIRECTIONS_RAD = ((-0.8, -0.2), (0.0, -0.4), (0.7, -0.7))
 RANGES_M = (2.0, 6.0, 10.0)
@@ -180,11 +180,8 @@ def _pixel_errors(true: Rig, name: str, fit: Calibration) -> tuple[np.ndarray, n
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--surveys", type=at_least(1), default=100)
-    parser.add_argument("--seed", type=at_least(0), default=1, help="of the first survey; the others follow")
+    """Print the table."""
+    parser = options(__doc__, 100, "surveys")
     parser.add_argument("--method", choices=sorted(FITS), default="joint")
     parser.add_argument("--mast", type=int, choices=(6, 8), default=6)
     parser.add_argument("--joint-sigma-rad", type=not_negative, default=0.0, help="noise of joint readings")
@@ -192,26 +189,23 @@ def main() -> int:
         "--prism-cad-sigma-m", type=not_negative, default=0.0, help="noise of the prisms' drawing"
     )
     parser.add_argument("--gross", type=not_negative, default=0.0, help="part of the dots thrown anywhere")
-    add_task_options(parser)
-    root = Path(__file__).resolve().parents[2]
-    parser.add_argument("--rig", type=Path, default=root / "configs" / "sim" / "rocky8.yaml")
-    options = parser.parse_args()
-    true = load_rig(options.rig).rig
-    if options.mast == 8:
+    parser.add_argument("--rig", type=Path, default=config_folder() / "sim" / "rocky8.yaml")
+    args = parser.parse_args()
+    true = load_rig(args.rig).rig
+    if args.mast == 8:
         true = replace(true, mast=replace(true.mast, **SKEW))
-    plan = SurveyPlan(sigma=Sigma(0.001, 0.1, options.joint_sigma_rad, options.prism_cad_sigma_m))
-    seeds = range(options.seed, options.seed + options.surveys)
+    plan = SurveyPlan(sigma=Sigma(0.001, 0.1, args.joint_sigma_rad, args.prism_cad_sigma_m))
     began = time.monotonic()
-    tasks = [SurveyTask(true, seed, plan, options.method, options.mast, options.gross) for seed in seeds]
-    found = results_of(options, "surveys", score, tasks, lambda task: f"seed {task.seed}")
-    if found is None:
-        return 0
-    scores = [one for one in found if isinstance(one, Score)]
-    refused = [one for one in found if isinstance(one, str)]
-    if scores:
+    tasks = [
+        SurveyTask(true, seed, plan, args.method, args.mast, args.gross)
+        for seed in range(args.seed, args.seed + args.cases)
+    ]
+    found = run_cases(args, "surveys", score, tasks, lambda task: f"seed {task.seed}")
+    if scores := [one for one in found if isinstance(one, Score)]:
         report(scores)
+    refused = [one for one in found if isinstance(one, str)]
     print("\n".join([f"surveys refused: {len(refused)}", *refused]))
-    what = f"{options.surveys} surveys from seed {options.seed}, {options.method}, {options.mast} parameters"
+    what = f"{args.cases} surveys from seed {args.seed}, {args.method}, {args.mast} parameters"
     print(f"{what}: {time.monotonic() - began:.0f} s")
     return 0
 
@@ -228,7 +222,8 @@ def report(scores: list[Score]) -> None:
     rows |= {f"pixels of {name}": errors for name, errors in pixels.items()}
     rows["pooled over pixels"] = together
     for name, errors in rows.items():
-        print(f"  {name:30s} {_held(errors)}      {np.sqrt(np.mean(errors**2)):.2f}")
+        rate, error = held_percent([np.abs(one) < Z for one in errors])
+        print(f"  {name:30s} {rate:5.1f} ± {error:3.1f}      {rms(errors):.2f}")
     coordinates = [f"{n} {k}" for n, errors in pixels.items() for k in range(errors.shape[1])]
     rates = 100 * np.mean(np.abs(together) < Z, axis=0)
     lowest = int(np.argmin(rates))
@@ -269,13 +264,6 @@ def report_gross(gross: list[Gross]) -> None:
         f"{with_px / without_px:.3f} times, in the worst survey {worst:.2f} times"
     )
     print("\n".join(f"not named: {name}" for name in unnamed[:20]))
-
-
-def _held(errors: np.ndarray) -> str:
-    """Part of the errors (surveys, k) within their intervals, per cent, and its standard error."""
-    by_survey = 100 * np.mean(np.abs(errors) < Z, axis=1)
-    spread = by_survey.std(ddof=1) / np.sqrt(len(by_survey)) if len(by_survey) > 1 else np.nan
-    return f"{by_survey.mean():5.1f} ± {spread:3.1f}"
 
 
 if __name__ == "__main__":

@@ -3,13 +3,12 @@
 The truth is the projected centre of each dot. Every prediction is wrong by up to 20 cm, 10 degrees and 5 % of
 the focal length, as rough cameras of a survey may be. Stresses: more noise, little contrast, uneven light.
 
-    .venv/bin/python -m tools.campaigns.dots --poses 12 --seed 1
-    .venv/bin/python -m tools.campaigns.dots --poses 4 --stress contrast --pictures FOLDER
+    .venv/bin/python -m tools.campaigns.dots --cases 12 --seed 1
+    .venv/bin/python -m tools.campaigns.dots --cases 4 --stress contrast --pictures FOLDER
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -26,9 +25,9 @@ from calib.survey import Board
 from drivers.sim.render import Renderer
 from drivers.sim.scene import SceneSettings, build_scene
 from drivers.sim_survey.board import BoardLook, draw_board, half_size_m, photograph
-from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
+from tools.campaign import options, run_cases
+from tools.campaigns.board_photos import keep_pictures
 
 BOARD = Board(10, 10, 0.08, 0.04, {})
 SIZE_PX = (1024, 768)
@@ -62,7 +61,7 @@ STRESSES = {
 
 
 @dataclass(frozen=True)
-class Trial:
+class BoardTrial:
     """A picture of a board, and what it shows."""
 
     image: np.ndarray
@@ -132,7 +131,7 @@ def random_pose(rng: np.random.Generator, camera: CameraModel, range_m: float, t
 
 def make_trial(
     rng: np.random.Generator, behind: np.ndarray, focal_px: float, pose: Rigid, stress: Stress
-) -> Trial:
+) -> BoardTrial:
     """Return a picture of the board in front of the ground, and a rough prediction of the board's pose."""
     camera = camera_of(focal_px)
     picture = draw_board(behind, camera, pose, BOARD, stress.look, samples=6)
@@ -148,10 +147,10 @@ def make_trial(
     shift = rng.uniform(0, WRONG_BY_M) * aside / np.linalg.norm(aside)
     predicted = Rigid(wrong.as_matrix() @ pose.rotation, wrong.apply(pose.translation_m + shift))
     rough = camera_of(focal_px, rng.choice([-1, 1]) * rng.uniform(0.001, WRONG_FOCAL))
-    return Trial(image, camera, pose, PredictedBoard(rough, predicted))
+    return BoardTrial(image, camera, pose, PredictedBoard(rough, predicted))
 
 
-def judge(trial: Trial) -> tuple[Outcome, DotsFound | DetectionFailure]:
+def judge(trial: BoardTrial) -> tuple[Outcome, DotsFound | DetectionFailure]:
     """Find the dots and compare them with the truth."""
     start_s = time.perf_counter()
     found = find_dots(trial.image, BOARD, trial.predicted)
@@ -180,18 +179,18 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Found:
+class CellFound:
     """What became of a cell: an outcome a pose, and pictures (PNG) by their names."""
 
     outcomes: list[Outcome]
     pictures: dict[str, bytes] = field(default_factory=dict)
 
 
-def run_cell(cell: Cell) -> Found:
+def run_cell(cell: Cell) -> CellFound:
     """Draw a cell's boards and find their dots."""
     views = [ground(cell.seed, cell.focal_px, cell.range_m, a) for a in (-0.8, 0.0, 0.8)]
     rng = np.random.default_rng([cell.seed, int(cell.focal_px), int(10 * cell.range_m), int(cell.tilt_deg)])
-    told = Found([])
+    told = CellFound([])
     for k in range(cell.poses):
         pose = random_pose(rng, camera_of(cell.focal_px), cell.range_m, np.radians(cell.tilt_deg))
         trial = make_trial(rng, views[k % len(views)], cell.focal_px, pose, cell.stress)
@@ -238,37 +237,22 @@ def tell(cell: Cell, outcomes: list[Outcome]) -> int:
 
 def main() -> int:
     """Run the campaign and print its table."""
-    parser = argparse.ArgumentParser(description="Dots found on rendered boards: error, failures, time.")
-    parser.add_argument("--poses", type=at_least(1), default=6, help="poses for each range and tilt")
-    parser.add_argument("--seed", type=at_least(0), default=1)
+    parser = options(__doc__, 6, "poses for each range and tilt")
     parser.add_argument("--stress", choices=sorted(STRESSES), default="none")
     parser.add_argument("--pictures", type=Path, help="folder for pictures with what was found")
-    add_task_options(parser)
-    arguments = parser.parse_args()
-    stress, pictures = STRESSES[arguments.stress], arguments.pictures
+    args = parser.parse_args()
+    stress, pictures = STRESSES[args.stress], args.pictures is not None
     cells = [
-        Cell(focal_px, range_m, tilt_deg, arguments.poses, arguments.seed, stress, pictures is not None)
+        Cell(focal_px, range_m, tilt_deg, args.cases, args.seed, stress, pictures)
         for focal_px, range_m in CELLS
         for tilt_deg in TILTS_DEG
     ]
-    if pictures:
-        pictures.mkdir(parents=True, exist_ok=True)
-    founds = results_of(
-        arguments,
-        "cells",
-        run_cell,
-        cells,
-        lambda c: f"{c.focal_px:g} px, {c.range_m:g} m, {c.tilt_deg:g} deg",
-    )
-    if founds is None:
-        return 0
-    print(f"stress {arguments.stress}, seed {arguments.seed}, {arguments.poses} poses a line; px per axis")
+    label = "{0.focal_px:g} px, {0.range_m:g} m, {0.tilt_deg:g} deg".format
+    founds = run_cases(args, "cells", run_cell, cells, label)
+    print(f"stress {args.stress}, seed {args.seed}, {args.cases} poses a line; px per axis")
     print("  f px  range  tilt |   rms   worst  rms/sigma | failed  order | median ms  worst ms")
-    bad = 0
-    for cell, found in zip(cells, founds, strict=True):
-        bad += tell(cell, found.outcomes)
-        for name, png in found.pictures.items():
-            (pictures / name).write_bytes(png)
+    bad = sum(tell(cell, found.outcomes) for cell, found in zip(cells, founds, strict=True))
+    keep_pictures(args.pictures, founds)
     return 1 if bad else 0
 
 

@@ -13,7 +13,6 @@ are of the machine as it is busy now.
 
 from __future__ import annotations
 
-import argparse
 import os
 import tempfile
 import time
@@ -24,6 +23,7 @@ from typing import Any
 
 from drivers.faults import CAMERA_WORDS, HEAD_WORDS, PAN_TILT
 from tools.arguments import end
+from tools.campaign import heading, line, options
 from tools.living_daemon import HEADS, Asker, simulated, started
 
 CAMERAS = ("navcam_left", "navcam_right")
@@ -40,7 +40,7 @@ DURING = ("pointing", "tracking")
 
 
 @dataclass(frozen=True)
-class Trial:
+class FaultTrial:
     """What came of one fault.
 
     Attributes
@@ -77,7 +77,7 @@ class Trial:
 
 def main() -> int:
     """Try all, print the tables; 1 if something was lost."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("--head", choices=HEADS, default="dynamixel", help="default dynamixel")
     parser.add_argument(
         "--during", choices=DURING, action="append", help="default: both, one after the other"
@@ -89,12 +89,9 @@ def main() -> int:
     bad = 0
     for during in args.during or DURING:
         print(f"\nHead {args.head}, while {during}, load {os.getloadavg()[0]:.1f}.\n")
-        print(
-            "| fault | told after | as | states | operation |"
-            + " track |" * (during == "tracking")
-            + " well after |"
-        )
-        print("| --- " * (7 if during == "tracking" else 6) + "|", flush=True)
+        track = ("track",) if during == "tracking" else ()
+        columns = ("fault", "told after", "as", "states", "operation", *track, "well after")
+        print(heading(columns), flush=True)
         with tempfile.TemporaryDirectory() as folder:
             for trial in trials(Path(folder), args.head, during, args.word):
                 print(_row(trial), flush=True)
@@ -125,13 +122,13 @@ class _Bench:
         self.x_m = 0.0
         self.why = ""
 
-    def tried(self, device: str, word: str, begin: Any, well: Any) -> Trial:
+    def tried(self, device: str, word: str, begin: Any, well: Any) -> FaultTrial:
         """Set a fault under way and take it back."""
         mast = self.asker.json("GET", "/status")["mast"]["digest"]
         operation = begin(self)
         set_s = time.monotonic()
         self.asker.json("POST", "/simulation/faults", {"device": device, "word": word, "parameters": {}})
-        trial = self._watched(Trial(device, word, None, "", (), "", "", None), operation, set_s)
+        trial = self._watched(FaultTrial(device, word, None, "", (), "", "", None), operation, set_s)
         self.asker.json("DELETE", "/simulation/faults")
         over_s = time.monotonic()
         record = self.ended(operation)
@@ -149,7 +146,7 @@ class _Bench:
             trial = replace(trial, why=self.why)
         return replace(trial, well_s=time.monotonic() - over_s if good else None, lost=lost)
 
-    def _watched(self, trial: Trial, operation: str, set_s: float) -> Trial:
+    def _watched(self, trial: FaultTrial, operation: str, set_s: float) -> FaultTrial:
         """Look at the status while the fault holds."""
         states: list[str] = []
         while time.monotonic() < set_s + HOLDS_S:
@@ -275,7 +272,7 @@ def _looked(bench: _Bench, until_s: float) -> bool:
     return False
 
 
-def _row(trial: Trial) -> str:
+def _row(trial: FaultTrial) -> str:
     """One line of the table."""
     device = "head" if trial.device == PAN_TILT else "camera"
     told = "" if trial.told_s is None else f"{trial.told_s:.2f} s"
@@ -289,7 +286,7 @@ def _row(trial: Trial) -> str:
     if trial.track:
         cells.append(trial.track)
     cells.append(f"not by itself: {trial.why}" if trial.well_s is None else f"{trial.well_s:.1f} s")
-    return "| " + " | ".join(cells) + " |"
+    return line(*cells)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ Everything else is printed with the bytes that caused it, and the exit code is 1
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import json
@@ -44,8 +43,8 @@ from calib.files.tables import parse_table
 from calib.survey.check import check_survey
 from calib.survey.reader import read_survey
 from mastctl.cli.main import main as mastctl
-from mastctl.cli.output import at_least
 from tools.arguments import end
+from tools.campaign import options
 
 HANG_S = 20
 
@@ -428,9 +427,7 @@ def _alarm() -> Iterator[None]:
 
 def main() -> int:
     """Run the campaign, print counts and the slowest case, and return 1 if anything was let out."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", type=at_least(1), default=20_000)
-    parser.add_argument("--seed", type=at_least(0), default=1)
+    parser = options(__doc__, 20_000, tasks=False)
     parser.add_argument(
         "--command-share", type=float, default=0.2, help="part of the cases that run a command"
     )

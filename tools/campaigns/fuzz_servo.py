@@ -13,7 +13,6 @@ caused it, and the exit code is 1.
 
 from __future__ import annotations
 
-import argparse
 import math
 import random
 import re
@@ -32,8 +31,8 @@ from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_packets import InstructionParser
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
 from drivers.sim.wire.ptu import SimulatedPtu
-from mastctl.cli.output import at_least
 from tools.arguments import end
+from tools.campaign import options
 
 SDK = PacketHandler(2.0)
 MARK = b"\xff\xff\xfd"
@@ -445,10 +444,7 @@ def campaign(cases: int, seed: int) -> tuple[dict[str, Counter[str]], dict[str, 
 
 def main() -> int:
     """Run the campaign, print the table, and return 1 if anything failed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", type=at_least(1), default=60_000)
-    parser.add_argument("--seed", type=at_least(0), default=1)
-    args = parser.parse_args()
+    args = options(__doc__, 60_000, tasks=False).parse_args()
     counts, spent_s, failures = campaign(args.cases, args.seed)
     for failure in failures[:20]:
         print(failure)

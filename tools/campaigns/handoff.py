@@ -9,13 +9,9 @@ in either eye, and caught if no such eye is accepted; an accepted pixel is judge
 
 from __future__ import annotations
 
-import argparse
-import csv
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -31,9 +27,10 @@ from calib.pictures.patch_verdict import MatchSettings
 from calib.pictures.warp import Plane, warp_patch
 from drivers.sim.render import compile_renderer
 from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.packaged import config_folder
+from mastctl.report.records import write_csv
 from tools.arguments import end, new_file
+from tools.campaign import options, run_cases, show
 from tools.campaigns.handoff_provocations import KINDS, Case, Stage
 
 WRONG_PX = 4.0
@@ -170,6 +167,13 @@ def summarise(kind: str, cases: Sequence[Sequence[Outcome]]) -> Row:
     )
 
 
+COLUMNS = {
+    "kind": "{kind}", "cases": "{cases}", "wrong": "{wrong}", "flagged": "{flagged} of {wrong}",
+    "accepted": "{accepted}", "rms px": "{accepted_rms_px:.2f}", "worst px": "{accepted_worst_px:.2f}",
+    "accepted wrong": "{accepted_wrong}", "refused right": "{refused_right}",
+}  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """Cases of one kind from ``first`` on, up to ``BLOCK``, with a draw of their own."""
@@ -196,73 +200,35 @@ def run_block(block: Block) -> list[list[Outcome]]:
 
 def main() -> int:
     """Run the campaign; exit 1 if less than nine tenths of the wrong answers are flagged."""
-    parser = argparse.ArgumentParser(description="Provoke bad hand-offs and count what the verdicts catch.")
-    parser.add_argument(
-        "--cases", type=at_least(1), default=100, help="bad cases, a fifth of each kind (default 100)"
-    )
+    parser = options(__doc__, 100, "bad cases, a fifth of each kind", as_json=True)
     parser.add_argument("--good", type=at_least(0), help="good cases beside them (default: half as many)")
-    parser.add_argument("--seed", type=at_least(0), default=1, help="of scene, views, targets and noise")
     parser.add_argument("--kind", choices=(*KINDS, "good"), help="only this kind, --cases of it")
-    parser.add_argument("--json", action="store_true")
     parser.add_argument("--out", type=new_file, metavar="FILE.csv", help="a line for each case and camera")
-    add_task_options(parser)
-    options = parser.parse_args()
+    args = parser.parse_args()
     true = load_rig(config_folder() / "sim" / "rocky8.yaml").rig
     believed = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig
-    wanted = {kind: math.ceil(options.cases / len(KINDS)) for kind in KINDS}
-    wanted["good"] = options.cases // 2 if options.good is None else options.good
-    if options.kind:
-        wanted = {options.kind: options.cases}
+    wanted = {kind: math.ceil(args.cases / len(KINDS)) for kind in KINDS}
+    wanted["good"] = args.cases // 2 if args.good is None else args.good
+    if args.kind:
+        wanted = {args.kind: args.cases}
     blocks = [
-        Block(true, believed, options.seed, kind, first, min(BLOCK, count - first))
+        Block(true, believed, args.seed, kind, first, min(BLOCK, count - first))
         for kind, count in wanted.items()
         for first in range(0, count, BLOCK)
     ]
-    found = results_of(
-        options, "blocks", run_block, blocks,
-        lambda block: f"{block.kind}, {block.count} from {block.first}",
-    )  # fmt: skip
-    if found is None:
-        return 0
+    label = "{0.kind}, {0.count} from {0.first}".format
     done: dict[str, list[list[Outcome]]] = {kind: [] for kind in wanted}
-    for block, cases in zip(blocks, found, strict=True):
+    for block, cases in zip(blocks, run_cases(args, "blocks", run_block, blocks, label), strict=True):
         done[block.kind] += cases
-    rows = [summarise(kind, cases) for kind, cases in done.items()]
     bad = [cases for kind in KINDS for cases in done.get(kind, [])]
     total = summarise("all bad", bad)
-    if options.out:
-        _write(options.out, [one for cases in done.values() for eyes in cases for one in eyes])
-    if options.json:
-        document = {"seed": options.seed, "rows": [vars(row) for row in (*rows, total)]}
-        print(json.dumps(document, indent=1))
-    else:
-        _print([*rows, total])
+    if args.out:
+        outcomes = [vars(one) for cases in done.values() for eyes in cases for one in eyes]
+        write_csv(args.out, list(outcomes[0]), [list(one.values()) for one in outcomes])
+    show(args, [vars(summarise(kind, cases)) for kind, cases in done.items()] + [vars(total)], COLUMNS)
+    if not args.json:
+        print(f"(wrong: plain correlation is more than {WRONG_PX:g} px off; right: at most {RIGHT_PX:g} px)")
     return 0 if total.flagged >= WANTED * total.wrong else 1
-
-
-def _print(rows: Sequence[Row]) -> None:
-    print(
-        f"{'kind':10s} {'cases':>6s} {'wrong':>6s} {'flagged':>8s} {'accepted':>9s} {'rms px':>7s} "
-        f"{'worst px':>9s} {'accepted wrong':>15s} {'refused right':>14s}"
-    )
-    for row in rows:
-        flagged = f"{row.flagged} of {row.wrong}"
-        rms, worst = (
-            "-" if value is None else f"{value:.2f}" for value in (row.accepted_rms_px, row.accepted_worst_px)
-        )
-        print(
-            f"{row.kind:10s} {row.cases:6d} {row.wrong:6d} {flagged:>8s} {row.accepted:9d} "
-            f"{rms:>7s} {worst:>9s} {row.accepted_wrong:15d} "
-            f"{row.refused_right:14d}"
-        )
-    print(f"  (wrong: plain correlation is more than {WRONG_PX:g} px off; right: at most {RIGHT_PX:g} px)")
-
-
-def _write(path: Path, outcomes: Sequence[Outcome]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(vars(outcomes[0]))
-        writer.writerows(list(vars(one).values()) for one in outcomes)
 
 
 if __name__ == "__main__":

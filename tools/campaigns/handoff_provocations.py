@@ -25,8 +25,8 @@ from drivers.sim.bricks import Brick, make_brick, meshes
 from drivers.sim.compiled import kernels
 from drivers.sim.rocks import together
 from drivers.sim.scene import Scene, SceneSettings, build_scene, sun_direction
-from mastctl.experiment.approach_world import ApproachWorld, WorldErrors
 from mastctl.experiment.targets import BORDER_PX, texture_mask
+from tools.studies.approach_world import ApproachWorld, WorldErrors
 
 Float64 = NDArray[np.float64]
 

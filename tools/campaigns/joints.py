@@ -1,6 +1,6 @@
 """What joint terms in the mast file are worth: pointing a simulated 12-bit head whose encoders and gears err.
 
-    .venv/bin/python -m tools.campaigns.joints [--targets 8] [--distances 10,6,2] [--seed 1] [--json]
+    .venv/bin/python -m tools.campaigns.joints [--cases 8] [--distances 10,6,2] [--seed 1] [--json]
 
 The packaged rover with a Dynamixel X head, its belief the packaged mast file, through a daemon. Cases: counts
 alone (no play, encoders that read true); encoder harmonics of 6 and 2 mrad and play of 4 mrad with ``joints``
@@ -11,27 +11,21 @@ the first is what counts alone allow, and the rover's seconds a target.
 
 from __future__ import annotations
 
-import argparse
-import json
-import math
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from calib.files.mast_file import load_rig, save_rig
 from calib.mast.joints import AxisJoint, Joints
-from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
-from mastctl.experiment.demo import SimulationTruth, demo_config
 from mastctl.experiment.pointing import run_pointing_experiment
+from mastctl.experiment.simulated import SimulationTruth, demo_config
 from tools.arguments import end
+from tools.campaign import numbers, options, rms, run_cases, show
 
 BACKLASH_RAD = 0.004
 APPROACH_RAD = 0.02
@@ -75,7 +69,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Found:
+class JointsFound:
     """True residuals (n, 2) of the first and the second pointings, the rover's seconds, what failed."""
 
     first_px: list[tuple[float, float]]
@@ -84,7 +78,7 @@ class Found:
     errors: list[str]
 
 
-def point(task: Task) -> Found:
+def point(task: Task) -> JointsFound:
     """Point at the targets of a task, on a rover of its own."""
     config = demo_config(load_config(None), head=None, seed=task.seed)
     head = {"preset": "dynamixel_x", **dict(task.case.head)}
@@ -104,7 +98,7 @@ def point(task: Task) -> Found:
                 truth=SimulationTruth(daemon.hardware.simulation),
             )
     landed = [[one.true_px for one in record.landings if one.true_px] for record in done.records]
-    return Found(
+    return JointsFound(
         [row[0] for row in landed if row],
         [row[1] for row in landed if len(row) > 1],
         done.seconds,
@@ -112,34 +106,21 @@ def point(task: Task) -> Found:
     )
 
 
-def named(task: Task) -> str:
-    """A task's name."""
-    return f"{task.case.name} at {task.distance_m:g} m"
-
-
-def rms_px(found: list[tuple[float, float]]) -> float:
-    """Root mean square of both axes together; nan of none."""
-    return float(np.sqrt(np.mean(np.square(found)))) if found else math.nan
+COLUMNS = {
+    "case": "{case}", "targets": "{targets}", "first, rms px": "{first_rms_px:.2f}",
+    "second": "{second_rms_px:.2f}", "times counts alone": "{times_counts_alone:.2f}", "s": "{seconds:.1f}",
+}  # fmt: skip
 
 
 def main() -> int:
     """Point, and print a table or a document."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--targets", type=at_least(1), default=8, metavar="N", help="a distance (default 8)")
-    parser.add_argument("--distances", default="10,6,2", metavar="M,M", help="metres (default 10,6,2)")
-    parser.add_argument("--seed", type=at_least(0), default=1, metavar="S", help="(default 1)")
-    parser.add_argument("--json", action="store_true", help="one JSON document")
-    add_task_options(parser)
+    parser = options(__doc__, 8, "targets a distance", as_json=True)
+    parser.add_argument("--distances", type=numbers, default="10,6,2", metavar="M,M", help="(default 10,6,2)")
     args = parser.parse_args()
-    distances_m = [float(one) for one in args.distances.split(",")]
-    tasks = [Task(case, at_m, args.targets, args.seed) for case in CASES for at_m in distances_m]
-    found = results_of(
+    tasks = [Task(case, at_m, args.cases, args.seed) for case in CASES for at_m in args.distances]
+    found = run_cases(
         args, "targets", point, tasks, lambda task: f"{task.case.name} at {task.distance_m:g} m"
     )
-    if found is None:
-        return 0
     rows: list[dict[str, Any]] = []
     for case in CASES:
         mine = [one for task, one in zip(tasks, found, strict=True) if task.case == case]
@@ -149,23 +130,14 @@ def main() -> int:
             {
                 "case": case.name,
                 "targets": len(first),
-                "first_rms_px": rms_px(first),
-                "second_rms_px": rms_px(second),
-                "times_counts_alone": rms_px(first) / (rows[0]["first_rms_px"] if rows else rms_px(first)),
+                "first_rms_px": rms(first),
+                "second_rms_px": rms(second),
+                "times_counts_alone": rms(first) / (rows[0]["first_rms_px"] if rows else rms(first)),
                 "seconds": sum(one.seconds for one in mine) / max(len(first), 1),
                 "errors": [words for one in mine for words in one.errors],
             }
         )
-    if args.json:
-        print(json.dumps(rows))
-        return 0
-    for row in rows:
-        print(
-            f"| {row['case']} | {row['targets']} | {row['first_rms_px']:.2f} | {row['second_rms_px']:.2f} | "
-            f"{row['times_counts_alone']:.2f} | {row['seconds']:.1f} |"
-        )
-        for words in row["errors"]:
-            print(f"  {words}")
+    show(args, rows, COLUMNS, "errors")
     return 0
 
 

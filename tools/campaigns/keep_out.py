@@ -11,7 +11,6 @@ past the door, to show that it is the door that keeps the head out.
 
 from __future__ import annotations
 
-import argparse
 import math
 import random
 from collections import Counter
@@ -21,13 +20,12 @@ from drivers.clock import ManualClock
 from drivers.interfaces import Reading
 from drivers.sim.axis import AxisSettings
 from drivers.sim.pan_tilt import PRESETS, HeadSettings, SimulatedPanTilt
-from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.devices.door import REST_S, Door
 from mastctl.devices.keep_out import Box, KeptOut, NoWay, Pair, Span
 from mastctl.devices.limits import Limits
 from mastctl.pointing.jog import AHEAD_S, TICK_S
 from tools.arguments import end
+from tools.campaign import options, run_cases
 
 LOOK_S = 0.01
 LATEST_S = 0.08
@@ -36,7 +34,7 @@ PAN, TILT = (-2.4, 2.4), (-1.1, 0.5)
 
 
 @dataclass
-class Found:
+class Driven:
     """What one case came to: counts, the deepest place in a box and the least margin that was left."""
 
     counts: Counter[str]
@@ -44,7 +42,7 @@ class Found:
     least_rad: float = math.inf
 
 
-def case(seed: str, checked: bool = True, actions: int = ACTIONS) -> Found:
+def case(seed: str, checked: bool = True, actions: int = ACTIONS) -> Driven:
     """Drive one head among its boxes."""
     return _Drive(random.Random(seed), checked).run(actions)
 
@@ -57,7 +55,7 @@ class Case:
     checked: bool
 
 
-def run_case(one: Case) -> Found:
+def run_case(one: Case) -> Driven:
     """Drive one head of the campaign."""
     return case(one.seed, one.checked)
 
@@ -76,9 +74,9 @@ class _Drive:
         self._limits = Limits(PAN, TILT, speed, _margin_rad(head), keep_out=boxes)
         self._door = Door(self._limits, self._head, self._clock, "pan_tilt", None, None)
         self._boxes = [copy for box in boxes for copy in box.within(PAN)]
-        self._found = Found(Counter())
+        self._found = Driven(Counter())
 
-    def run(self, actions: int) -> Found:
+    def run(self, actions: int) -> Driven:
         """Begin somewhere free, then do so many things."""
         start = self._free_place()
         if start is None:
@@ -266,16 +264,11 @@ def _into(value: float, limits: Pair) -> float:
 
 def main() -> int:
     """Run the campaign and print what came of it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--cases", type=at_least(1), default=200, metavar="N", help="heads (default 200)")
-    parser.add_argument("--seed", type=at_least(0), default=1)
+    parser = options(__doc__, 200, "heads")
     parser.add_argument("--unchecked", action="store_true", help="send every goal, past the door")
-    add_task_options(parser)
     args = parser.parse_args()
     cases = [Case(f"{args.seed}/{number}", not args.unchecked) for number in range(args.cases)]
-    founds = results_of(args, "heads", run_case, cases, lambda one: f"case {one.seed}")
-    if founds is None:
-        return 0
+    founds = run_cases(args, "heads", run_case, cases, lambda one: f"case {one.seed}")
     counts = sum((found.counts for found in founds), Counter[str]())
     least_rad = min(found.least_rad for found in founds)
     entered = [(c.seed, f.deepest_rad) for c, f in zip(cases, founds, strict=True) if f.deepest_rad > 0.0]

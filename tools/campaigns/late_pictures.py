@@ -1,6 +1,6 @@
 """Pictures older than their stamps: a pointing is refused, or what it tells is true of the head at rest.
 
-    .venv/bin/python -m tools.campaigns.late_pictures [--targets 12] [--repeat-after 1.0] [--json]
+    .venv/bin/python -m tools.campaigns.late_pictures [--cases 12] [--repeat-after 1.0] [--json]
 
 The packaged rover, its targets at 2 to 8 m, each pointed at twice, by a head as fast as it may and a slow
 one. Its cameras are honest; or every picture is so many seconds older than its stamp, in both eyes; or each
@@ -11,9 +11,6 @@ three of its sigmas. Seconds are of the rover's clock, from the request to the e
 
 from __future__ import annotations
 
-import argparse
-import json
-import math
 import statistics
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -29,16 +26,14 @@ from calib.rigid import FloatArray
 from drivers.interfaces import Frame
 from drivers.sim.cameras import SimulatedCamera
 from drivers.sim.rover import SimulatedRover
-from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.client import Client
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.frames import camera_and_sequence
-from mastctl.experiment.demo import demo_config
-from mastctl.experiment.targets import Target
-from mastctl.experiment.views import Views, pointed
+from mastctl.experiment.simulated import demo_config
+from mastctl.experiment.targets import Target, Views, pointed
 from tools.arguments import end
+from tools.campaign import numbers, options, run_cases, show
 
 PAIR = ("navcam_left", "navcam_right")
 PAN_RANGE_RAD = 1.2
@@ -64,7 +59,7 @@ class Task:
 
 
 @dataclass
-class Found:
+class LateFound:
     """Of one speed and lag: how operations ended, each told residual's error over its sigma (the larger axis)
     and in pixels, and how long those that were done took."""
 
@@ -73,7 +68,7 @@ class Found:
     off_px: list[float] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
 
-    def __iadd__(self, other: Found) -> Found:
+    def __iadd__(self, other: LateFound) -> LateFound:
         self.ended.update(other.ended)
         for name in ("off_sigma", "off_px", "seconds"):
             getattr(self, name).extend(getattr(other, name))
@@ -110,7 +105,7 @@ def buffered() -> Iterator[None]:
         SimulatedCamera.next_frame = plain  # type: ignore[method-assign]
 
 
-def point(task: Task) -> dict[Key, Found]:
+def point(task: Task) -> dict[Key, LateFound]:
     """Find a target with honest cameras, and point at it at every speed with every lag."""
     config = demo_config(load_config(None), head=task.head, seed=task.seed)
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
@@ -118,7 +113,7 @@ def point(task: Task) -> dict[Key, Found]:
         rig = parse_rig(client.mast_file(), "the mast file").rig
         views = Views(client, rig, PAIR, client.status()["limits"], rng, PAN_RANGE_RAD)
         target = next(filter(None, (views.find_target(task.distance_m) for _ in range(TRIES))), None)
-    found: dict[Key, Found] = {}
+    found: dict[Key, LateFound] = {}
     for speed, lag_s in product(task.speeds_rad_per_s, task.lags_s) if target is not None else ():
         assert target is not None
         with (
@@ -129,11 +124,11 @@ def point(task: Task) -> dict[Key, Found]:
     return found
 
 
-def judged(daemon: RunningDaemon, target: Target, lag_s: float) -> Found:
+def judged(daemon: RunningDaemon, target: Target, lag_s: float) -> LateFound:
     """Point twice at what a view showed, and hold what is told against the joints of the head at rest."""
     rover, at, pixel_px = daemon.hardware.simulation, target.shot, (target.x_px, target.y_px)
     assert rover is not None
-    found = Found()
+    found = LateFound()
     with Client(daemon.url) as client:
         if lag_s > 0.0:
             for camera in PAIR:  # a stamp is never of the future: what is stamped late comes late
@@ -167,12 +162,7 @@ def true_residual_px(rover: SimulatedRover, place_m: FloatArray, time_s: float) 
     return np.asarray(camera.project(place_m)[0] - rover.rig.cameras[PAIR[0]].model.image_center_px)
 
 
-def named(task: Task) -> str:
-    """A task's name."""
-    return f"target {task.index} at {task.distance_m:.1f} m"
-
-
-def row_of(key: Key, found: Found) -> dict[str, Any]:
+def row_of(key: Key, found: LateFound) -> dict[str, Any]:
     """What the table says of a speed and a lag."""
     speed, lag_s = key
     return {
@@ -180,7 +170,7 @@ def row_of(key: Key, found: Found) -> dict[str, Any]:
         "lag": "buffered" if lag_s == BUFFERED else f"{lag_s:g} s" if lag_s else "honest",
         "operations": found.ended.total(),
         "done": found.ended["done"],
-        "refused": {code: count for code, count in found.ended.most_common() if code != "done"},
+        "refused": ", ".join(f"{n} `{code}`" for code, n in found.ended.most_common() if code != "done"),
         "told": len(found.off_px),
         "false": sum(one > FALSE_SIGMAS for one in found.off_sigma),
         "worst_px": max(found.off_px, default=None),
@@ -189,23 +179,20 @@ def row_of(key: Key, found: Found) -> dict[str, Any]:
     }
 
 
-def numbers(words: str) -> tuple[float, ...]:
-    """Numbers with commas between them."""
-    values = tuple(float(word) for word in words.split(","))
-    if not all(0.0 <= value < math.inf for value in values):
-        raise argparse.ArgumentTypeError(f"{words!r} where numbers of 0 or more are expected")
-    return values
+COLUMNS = {
+    "rad/s": "{speed_rad_per_s:g}", "pictures": "{lag}", "operations": "{operations}", "done": "{done}",
+    "refused": "{refused}", "residuals told": "{told}", "false": "{false}",
+    "worst px, sigma": "{worst_px:.2f}, {worst_sigma:.1f}", "s": "{median_s:.1f}",
+}  # fmt: skip
 
 
 def main() -> int:
     """Point, and print a table or a document."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--targets", type=at_least(1), default=12, metavar="N", help="(default 12)")
+    lags = "0.05,0.1,0.15,0.2,0.25,0.3,0.5,0.8,1"
+    parser = options(__doc__, 12, "targets", as_json=True)
     parser.add_argument(
-        "--lags", type=numbers, default="0.05,0.1,0.15,0.2,0.25,0.3,0.5,0.8,1", metavar="S,S",
-        help="seconds, beside honest and buffered cameras (default 0.05,0.1,0.15,0.2,0.25,0.3,0.5,0.8,1)",
+        "--lags", type=numbers, default=lags, metavar="S,S",
+        help=f"seconds, beside honest and buffered cameras (default {lags})",
     )  # fmt: skip
     parser.add_argument(
         "--speeds", type=numbers, default="1,0.2", metavar="R,R", help="rad/s (default 1,0.2)"
@@ -215,39 +202,21 @@ def main() -> int:
         help="pointing.repeat_after_s, 0: no second picture (default 1)",
     )  # fmt: skip
     parser.add_argument("--head", default="ptu_d46_70", metavar="NAME", help="preset (default ptu_d46_70)")
-    parser.add_argument("--seed", type=at_least(0), default=1, metavar="S", help="(default 1)")
-    parser.add_argument("--json", action="store_true", help="one JSON document")
-    add_task_options(parser)
     args = parser.parse_args()
-    distances_m = np.geomspace(2.0, 8.0, args.targets)
     lags_s = (0.0, BUFFERED, *args.lags)
     tasks = [
         Task(index, float(at_m), args.speeds, lags_s, args.repeat_after, args.head, args.seed)
-        for index, at_m in enumerate(distances_m)
+        for index, at_m in enumerate(np.geomspace(2.0, 8.0, args.cases))
     ]
-    results = results_of(args, "targets", point, tasks, named)
-    if results is None:
-        return 0
+    label = "target {0.index} at {0.distance_m:.1f} m".format
+    results = run_cases(args, "targets", point, tasks, label)
     rows = []
-    for key in ((speed, lag_s) for speed in args.speeds for lag_s in lags_s):
-        found = Found()
+    for key in product(args.speeds, lags_s):
+        found = LateFound()
         for one in results:
-            found += one.get(key, Found())
+            found += one.get(key, LateFound())
         rows.append(row_of(key, found))
-    if args.json:
-        print(json.dumps(rows))
-        return 0
-    print("| rad/s | pictures | operations | done | refused | residuals told | false | worst px, sigma | s |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
-    for row in rows:
-        worst = "" if not row["told"] else f"{row['worst_px']:.2f}, {row['worst_sigma']:.1f}"
-        seconds = "" if row["median_s"] is None else f"{row['median_s']:.1f}"
-        refused = ", ".join(f"{count} `{code}`" for code, count in row["refused"].items())
-        cells = (
-            f"{row['speed_rad_per_s']:g}", row["lag"], row["operations"], row["done"], refused, row["told"],
-            row["false"], worst, seconds,
-        )  # fmt: skip
-        print(f"| {' | '.join(map(str, cells))} |")
+    show(args, rows, COLUMNS)
     return 0
 
 

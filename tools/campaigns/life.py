@@ -1,42 +1,52 @@
 """What each unkindness of the simulated head and cameras costs in pixels, and what is left after what helps.
 
-    .venv/bin/python -m tools.campaigns.life [--config FILE] [--moves 100] [--minutes 10] [--seed 1] [--json]
+    .venv/bin/python -m tools.campaigns.life head [--config FILE] [--cases 100] [--minutes 10] [--seed 1]
+    .venv/bin/python -m tools.campaigns.life cameras [--config FILE] [--cases 4] [--seed 1]
 
-Each option of the configuration's head, clocks and temperature is tried alone, on a head that is else the
-preset. Head: moves to random views of the ground; how far the view is from the one that was asked for in the
-middle of the first exposure after the head says that it rests, at the first pointing (less the mean, which a
-calibration takes) and, corrected by what that exposure showed, at the second. Clocks: what stamps taken at
-their word are off by after so many minutes while a head turns at 0.1 rad/s. Temperature: the whole picture,
-at the day's extreme. rms and worst, pixels of Navcam and Pancam. Nothing is rendered: the truth is the
-simulator's own.
+``head``: each option of the configuration's head, clocks and temperature is tried alone, on a head that is
+else the preset. Head: moves to random views of the ground; how far the view is from the one that was asked
+for in the middle of the first exposure after the head says that it rests, at the first pointing (less the
+mean, which a calibration takes) and, corrected by what that exposure showed, at the second. Clocks: what
+stamps taken at their word are off by after so many minutes while a head turns at 0.1 rad/s. Temperature: the
+whole picture, at the day's extreme. rms and worst, pixels of Navcam and Pancam. Nothing is rendered: the
+truth is the simulator's own.
+
+``cameras``: each option of the configuration's cameras is put on the packaged rover, and the pointing
+experiment is run on it, a number of targets a distance, at the simulation's own speed ``max``: residuals of
+the left Navcam, rms px (x, y) over all distances, as measured and (true) as the simulator knows. Two rows are
+between these: none of the options, and all of them.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from calib.camera.cahvor import CameraModel
 from calib.files.mast_file import load_rig
 from calib.mast.rig import Rig
 from drivers.clock import ManualClock
+from drivers.errors import DriverError
 from drivers.sim.camera_clock import CameraClock, ClockSettings
 from drivers.sim.pan_tilt import PRESETS, HeadSettings, SimulatedPanTilt
 from drivers.sim.settings import SimulationSettings, simulation_settings
 from drivers.sim.warmth import TemperatureSettings
-from mastctl.cli.output import at_least, positive_number
-from mastctl.cli.tasks import add_task_options, results_of
+from mastctl.cli.output import at_least
 from mastctl.config import load_config
 from mastctl.packaged import config_folder
 from mastctl.pointing.settings import PointingSettings
 from tools.arguments import end
+from tools.campaign import options, run_cases, show
 
 PAIRS = ("navcam", "pancam")
 PERIOD_S, EXPOSURE_S = 0.1, 0.008
@@ -49,12 +59,24 @@ OPTIONS: Mapping[str, tuple[str, ...]] = {
     "play under gravity": ("gravity_turnover_rad", "gravity_friction"),
 }
 
+OF_CAMERAS: Mapping[str, tuple[str, ...]] = {
+    "none of them": (),
+    "smear and rolling shutter": ("smear", "row_time_s"),
+    "automatic exposure": ("exposure",),
+    "falloff": ("lens.falloff",),
+    "defocus": ("lens.f_number", "lens.focus_m", "lens.pitch_um"),
+    "dust": ("lens.dust", "lens.dust_um", "lens.dust_gap_um"),
+    "colour": ("colour",),
+    "JPEG": ("jpeg_quality",),
+    "all of them": ("smear", "row_time_s", "exposure", "lens", "colour", "jpeg_quality"),
+}
+
 Offs = NDArray[np.float64]
 """(n, 2): in pan and tilt, radians, or in x and y, pixels."""
 
 
 @dataclass(frozen=True)
-class Head:
+class LivedHead:
     """A head with one option; all heads are sent to the same views and looked at after the same waits."""
 
     option: str
@@ -63,7 +85,7 @@ class Head:
     seed: int
 
 
-class Row(NamedTuple):
+class LifeRow(NamedTuple):
     """By pair, rms and worst, px; None where nothing is told."""
 
     option: str
@@ -72,52 +94,84 @@ class Row(NamedTuple):
     pancam: tuple[float, float] | None
 
 
+@dataclass(frozen=True)
+class CameraTrial:
+    """An option, the section ``cameras`` that is it, and the targets."""
+
+    option: str
+    cameras: Mapping[str, Any]
+    targets: int
+    seed: int
+
+
+class LightRow(NamedTuple):
+    """Rms px (x, y) over all targets; ``failed``: targets without a residual."""
+
+    option: str
+    first_px: tuple[float, float]
+    second_px: tuple[float, float]
+    true_second_px: tuple[float, float]
+    failed: int
+
+
+_TWO = "{{{0}[0]:{1}}}, {{{0}[1]:{1}}}".format
+HEAD_COLUMNS = {
+    "option": "{option}", "how": "{how}", "navcam px: rms, worst": _TWO("navcam", ".2f"),
+    "pancam px: rms, worst": _TWO("pancam", ".2f"),
+}  # fmt: skip
+CAMERA_COLUMNS = {
+    "option": "{option}", "first, rms px": _TWO("first_px", ".3f"), "second": _TWO("second_px", ".3f"),
+    "second, true": _TWO("true_second_px", ".3f"), "failed": "{failed}",
+}  # fmt: skip
+
+
 def main() -> int:
     """Measure, and print a table or a document."""
     worst = config_folder() / "worst_day.yaml"
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    parser = options(__doc__, minutes=10.0, as_json=True)
+    parser.add_argument("of", choices=("head", "cameras"))
+    parser.add_argument(
+        "--cases",
+        type=at_least(2),
+        metavar="N",
+        help="moves (default 100), or targets a distance (default 4)",
     )
     parser.add_argument("--config", type=Path, default=worst, metavar="FILE", help="(default worst_day.yaml)")
-    parser.add_argument("--moves", type=at_least(2), default=100, metavar="N", help="moves (default 100)")
-    parser.add_argument("--minutes", type=positive_number, default=10.0, metavar="T", help="(default 10)")
-    parser.add_argument("--seed", type=at_least(0), default=1, metavar="S", help="of the views (default 1)")
-    parser.add_argument("--json", action="store_true", help="one JSON document")
-    add_task_options(parser)
     args = parser.parse_args()
     config = load_config(args.config)
+    if args.of == "cameras":
+        cameras = config.hardware.simulation.get("cameras", {})
+        trials = [
+            CameraTrial(option, only_of(cameras, keys), args.cases or 4, args.seed)
+            for option, keys in OF_CAMERAS.items()
+        ]
+        lights = run_cases(args, "options", pointed, trials, lambda trial: trial.option)
+        show(args, [row._asdict() for row in lights], CAMERA_COLUMNS)
+        return 0
     settings = simulation_settings(config.hardware.simulation, config.hardware.folder)
     rig = load_rig(settings.rover).rig
     heads = [
-        Head(option, only(settings.head, names), args.moves, args.seed) for option, names in OPTIONS.items()
+        LivedHead(option, only(settings.head, names), args.cases or 100, args.seed)
+        for option, names in OPTIONS.items()
     ]
-    found = results_of(args, "heads", offs, heads, lambda head: head.option)
-    if found is None:
-        return 0
+    found = run_cases(args, "heads", offs, heads, lambda head: head.option)
     rows = [
         *of_the_head(heads, found, rig),
         *of_the_clocks(settings, rig, 60 * args.minutes, config.hardware.cameras),
         *of_the_day(settings.temperature, rig),
     ]
-    if args.json:
-        print(json.dumps([row._asdict() for row in rows]))
-        return 0
-    for row in rows:
-        print(f"| {row.option} | {row.how} | {told(row.navcam)} | {told(row.pancam)} |")
+    show(args, [row._asdict() for row in rows], HEAD_COLUMNS)
     return 0
 
 
-def told(px: tuple[float, float] | None) -> str:
-    """A cell."""
-    return "" if px is None else "{:.2f}, {:.2f}".format(*px)
-
-
-def of_the_head(heads: Sequence[Head], found: Sequence[tuple[Offs, Offs]], rig: Rig) -> Iterator[Row]:
+def of_the_head(
+    heads: Sequence[LivedHead], found: Sequence[tuple[Offs, Offs]], rig: Rig
+) -> Iterator[LifeRow]:
     """Each option of the head alone."""
     for head, pointings in zip(heads, found, strict=True):
         for number, off in enumerate(pointings, 1):
             pixels = (spread(off * px_per_rad(rig, pair)) for pair in PAIRS)
-            yield Row(head.option, f"pointing {number}", *pixels)
+            yield LifeRow(head.option, f"pointing {number}", *pixels)
 
 
 def only(head: HeadSettings, names: tuple[str, ...]) -> HeadSettings:
@@ -127,7 +181,7 @@ def only(head: HeadSettings, names: tuple[str, ...]) -> HeadSettings:
     return replace(plain, pan=replace(plain.pan, **pan), tilt=replace(plain.tilt, **tilt))
 
 
-def offs(head: Head) -> tuple[Offs, Offs]:
+def offs(head: LivedHead) -> tuple[Offs, Offs]:
     """How far a picture is from the view that was asked for, at the first and at the second pointing."""
     random = np.random.default_rng(head.seed)
     ranges_m = np.exp(random.uniform(np.log(2.0), np.log(12.0), head.moves))
@@ -164,7 +218,7 @@ def spread(px: Offs) -> tuple[float, float]:
 
 def of_the_clocks(
     settings: SimulationSettings, rig: Rig, passed_s: float, cameras: Mapping[str, Any]
-) -> Iterator[Row]:
+) -> Iterator[LifeRow]:
     """What stamps are off by if the cameras' clocks make them, without and with offset_s; and as it is."""
     turning = {pair: TURNING_RAD_PER_S * px_per_rad(rig, pair) for pair in PAIRS}
     cases = (("own stamps", True, False), ("own stamps, offset_s", True, True), ("offset_s", False, True))
@@ -178,10 +232,10 @@ def of_the_clocks(
                 offset_s = cameras[name].offset_s if corrected else 0.0
                 late_s.append(clock.stamp_s(passed_s) + offset_s - passed_s)
             cells[pair] = spread(np.array(late_s) * turning[pair])
-        yield Row("clocks", how, cells["navcam"], cells["pancam"])
+        yield LifeRow("clocks", how, cells["navcam"], cells["pancam"])
 
 
-def of_the_day(day: TemperatureSettings, rig: Rig) -> Iterator[Row]:
+def of_the_day(day: TemperatureSettings, rig: Rig) -> Iterator[LifeRow]:
     """Lenses and mount at the extreme."""
     warmer_k = day.amplitude_k
     still = {"focal_ppm_per_k": 0.0, "centre_x_px_per_k": 0.0, "centre_y_px_per_k": 0.0}
@@ -194,9 +248,9 @@ def of_the_day(day: TemperatureSettings, rig: Rig) -> Iterator[Row]:
         for pair in PAIRS:
             model = rig.cameras[rig.stereo[pair][0]].model
             cells.append(spread(moved_px(model, one.camera(model, False, warmer_k))))
-        yield Row("temperature", part, *cells)
+        yield LifeRow("temperature", part, *cells)
     mount = np.array([[day.mount_pan_rad_per_k, day.mount_tilt_rad_per_k]]) * warmer_k
-    yield Row("temperature", "mount", *(spread(mount * px_per_rad(rig, pair)) for pair in PAIRS))
+    yield LifeRow("temperature", "mount", *(spread(mount * px_per_rad(rig, pair)) for pair in PAIRS))
 
 
 def moved_px(model: CameraModel, warm: CameraModel) -> Offs:
@@ -206,6 +260,47 @@ def moved_px(model: CameraModel, warm: CameraModel) -> Offs:
     rays = model.ray(grid.reshape(-1, 2))
     far, _ = warm.project(rays.origins_m + 1000.0 * rays.directions)
     return np.asarray(far - grid.reshape(-1, 2))
+
+
+def only_of(cameras: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
+    """The section with some keys alone, ``a.b`` for one of a part."""
+    kept: dict[str, Any] = {}
+    for key in keys:
+        part, _, name = key.partition(".")
+        if part in cameras and not name:
+            kept[part] = cameras[part]
+        elif name in cameras.get(part, {}):
+            kept.setdefault(part, {})[name] = cameras[part][name]
+    return kept
+
+
+def pointed(trial: CameraTrial) -> LightRow:
+    """The pointing experiment on the packaged rover with such cameras."""
+    folder = config_folder()
+    config = yaml.safe_load((folder / "default.yaml").read_text())
+    config["mast_file"] = str(folder / config["mast_file"])
+    config["simulation"]["rover"] = str(folder / config["simulation"]["rover"])
+    config["simulation"]["cameras"] = dict(trial.cameras)
+    with tempfile.TemporaryDirectory() as where:
+        file = Path(where, "config.yaml")
+        file.write_text(yaml.safe_dump(config))
+        command = [sys.executable, "-m", "mastctl", "demo", "--config", str(file), "--speed", "max", "--json"]
+        out = str(Path(where, "out"))
+        command += ["--targets", str(trial.targets), "--seed", str(trial.seed), "--out", out]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    try:
+        distances = json.loads(done.stdout)["distances"]
+    except (ValueError, KeyError):
+        raise DriverError(f"the experiment with {trial.option} did not run: {done.stderr[-300:]}") from None
+
+    def of_all(key: str) -> tuple[float, float]:
+        x_px, y_px = np.sqrt(np.mean(np.square([distance[key] for distance in distances]), axis=0))
+        return float(x_px), float(y_px)
+
+    failed = sum(distance["failed"] for distance in distances)
+    return LightRow(
+        trial.option, of_all("first_rms_px"), of_all("second_rms_px"), of_all("true_second_rms_px"), failed
+    )
 
 
 if __name__ == "__main__":

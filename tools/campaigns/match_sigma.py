@@ -6,13 +6,11 @@ meets the scene (`Scene.cast`), and the point is projected into the other pictur
 picture does not show are left out. Rows: the loop's settings, the tracker's. Errors are
 found minus true, px along x (where ranges show in the other eye) and y; a true sigma has error/sigma 1.
 
-    .venv/bin/python -m tools.campaigns.match_sigma [--views 4] [--relief 0.15 0.5] [--seeds 3] [--json]
+    .venv/bin/python -m tools.campaigns.match_sigma [--cases 4] [--relief 0.15 0.5] [--seeds 3] [--json]
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -31,7 +29,6 @@ from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 from drivers.sim_survey.board import photograph
 from mastctl.cli.output import at_least, not_negative
-from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.devices.frames import StampedFrame
 from mastctl.experiment.targets import texture_mask
 from mastctl.packaged import config_folder
@@ -39,6 +36,7 @@ from mastctl.pointing.looking import Clicked, Eyes, View
 from mastctl.pointing.results import PointingError
 from mastctl.pointing.settings import PointingSettings
 from tools.arguments import end
+from tools.campaign import options, run_cases, show
 
 LEFT, RIGHT = "navcam_left", "navcam_right"
 NEAR_M, FAR_M = 1.8, 11.0
@@ -221,59 +219,35 @@ def told(relief_m: float, rows: Rows) -> list[dict[str, Any]]:
     return table
 
 
-def line(row: dict[str, Any]) -> str:
-    """A row as a person reads it."""
-    counts = f"{row['good']:4d} of {row['asked']:<4d}"
-    what = f"{row['relief_m']:4.2f} m  {row['match']:12s}  {row['settings']:17s}  {counts}"
-    return " | ".join(
-        [what, _pairs(row, "rms_px", "p95_px", "worst_px"), _pairs(row, "of_sigma", "p95_of_sigma")]
-    )
-
-
-def _pairs(row: dict[str, Any], *keys: str) -> str:
-    return "  ".join("{:.3f}, {:.3f}".format(*row[key]) for key in keys if key in row)
+_X_Y = "{{{0}[0]:.3f}}, {{{0}[1]:.3f}}".format
+COLUMNS = {
+    "relief, m": "{relief_m:.2f}", "match": "{match}", "settings": "{settings}", "good": "{good} of {asked}",
+    "px x, y: rms": _X_Y("rms_px"), "p95": _X_Y("p95_px"), "worst": _X_Y("worst_px"),
+    "of sigma: rms": _X_Y("of_sigma"), "p95 of sigma": _X_Y("p95_of_sigma"),
+}  # fmt: skip
 
 
 def main() -> int:
     """Match, and print a table or a document."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--views", type=at_least(1), default=4, help="of each scene (default 4)")
+    parser = options(__doc__, 4, "views of each scene", seed=None, as_json=True)
     parser.add_argument("--targets", type=at_least(1), default=20, help="of each view (default 20)")
     parser.add_argument("--relief", type=not_negative, nargs="+", default=[0.15, 0.5], metavar="M")
     parser.add_argument("--seeds", type=at_least(1), default=3, help="scenes of each relief, from seed 1 on")
-    parser.add_argument("--json", action="store_true", help="print one JSON document on stdout")
-    add_task_options(parser)
     args = parser.parse_args()
     rig = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig
     looks = [
         Look(rig, relief_m, seed, number, args.targets)
         for relief_m in args.relief
         for seed in range(1, args.seeds + 1)
-        for number in range(args.views)
+        for number in range(args.cases)
     ]
-    found = results_of(
-        args,
-        "views",
-        run_look,
-        looks,
-        lambda one: f"relief {one.relief_m:g} m, seed {one.seed}, view {one.number}",
-    )
-    if found is None:
-        return 0
+    label = "relief {0.relief_m:g} m, seed {0.seed}, view {0.number}".format
+    found = run_cases(args, "views", run_look, looks, label)
     table: list[dict[str, Any]] = []
     for relief_m in dict.fromkeys(args.relief):
         parts = [rows for look, rows in zip(looks, found, strict=True) if look.relief_m == relief_m]
         table += told(relief_m, together(parts))
-    if args.json:
-        print(json.dumps({"rows": table}))
-        return 0
-    print(
-        "relief  match         settings           good        | px x, y: rms, p95, worst | of sigma: rms, p95"
-    )
-    for row in table:
-        print(line(row))
+    show(args, table, COLUMNS)
     return 0
 
 

@@ -1,6 +1,6 @@
 """Provoke the check of which view a picture shows: false alarms, missed lies, error and time.
 
-    .venv/bin/python -m tools.campaigns.motion [--moves 30] [--walks 1] [--seed 1] [--json]
+    .venv/bin/python -m tools.campaigns.motion [--moves 30] [--cases 1] [--seed 1] [--json]
 
 The simulated rover's head goes from view to view; its pictures come from the true rig, the check believes the
 packaged mast file. Each move is judged by both eyes of Navcam and Pancam: with the honest pictures; with
@@ -18,11 +18,10 @@ import os
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"
 
-import argparse
-import json
 import statistics
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -35,9 +34,9 @@ from drivers.clock import ManualClock
 from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.open_hardware import open_hardware
 from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.packaged import config_folder
 from tools.arguments import end
+from tools.campaign import options, run_cases, show
 
 PAIRS = {"navcam": ("navcam_left", "navcam_right"), "pancam": ("pancam_left", "pancam_right")}
 
@@ -177,7 +176,7 @@ def told(tallies: dict[str, dict[str, Tally]]) -> list[dict[str, object]]:
         {
             "pair": pair,
             "pictures": kind,
-            "verdicts": dict(tally.verdicts.most_common()),
+            "verdicts": ", ".join(f"{count} {word}" for word, count in tally.verdicts.most_common()),
             "rms_mrad": None
             if not tally.off_rad
             else 1e3 * float(np.sqrt(np.mean(np.square(tally.off_rad)))),
@@ -191,39 +190,23 @@ def told(tallies: dict[str, dict[str, Tally]]) -> list[dict[str, object]]:
     ]
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+COLUMNS = {
+    "pair": "{pair}", "pictures": "{pictures}", "rms, mrad": "{rms_mrad:.2f}", "worst": "{worst_mrad:.2f}",
+    "of allowed": "{worst_of_allowed:.2f}", "missed": "{missed}", "ms a look": "{median_ms:.1f}",
+    "verdicts": "{verdicts}",
+}  # fmt: skip
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Walk, and print a table or a document."""
+    parser = options(__doc__, 1, "walks, each with the next seed", as_json=True)
     parser.add_argument("--moves", type=at_least(1), default=30, help="moves of a walk (default 30)")
-    parser.add_argument(
-        "--walks", type=at_least(1), default=1, help="walks, each with the next seed (default 1)"
-    )
-    parser.add_argument("--seed", type=at_least(0), default=1, help="of the first walk (default 1)")
     parser.add_argument("--head", choices=("ptu_d46_70", "dynamixel_x", "ph42"), default="ptu_d46_70")
-    parser.add_argument("--json", action="store_true", help="print one JSON document on stdout")
-    add_task_options(parser)
-    args = parser.parse_args(argv)
+    args = parser.parse_args(words)
     rig = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig
-    walks = [Walk(rig, args.moves, args.seed + number, args.head) for number in range(args.walks)]
-    found = results_of(args, "walks", walked, walks, lambda walk: f"seed {walk.seed}, {walk.moves} moves")
-    if found is None:
-        return 0
-    rows = told(together(found))
-    if args.json:
-        print(
-            json.dumps({"moves": args.moves * args.walks, "seed": args.seed, "head": args.head, "rows": rows})
-        )
-        return 0
-    for row in rows:
-        numbers = [row["rms_mrad"], row["worst_mrad"], row["worst_of_allowed"]]
-        rms, worst, share = ("-" if one is None else f"{one:.2f}" for one in numbers)
-        verdicts = ", ".join(f"{count} {word}" for word, count in dict(row["verdicts"]).items())  # type: ignore[call-overload]
-        print(
-            f"{row['pair']} {row['pictures']:7s} rms {rms} worst {worst} mrad ({share} of allowed), "
-            f"missed {row['missed']}, "
-            f"{row['median_ms']:.1f} ms a look: {verdicts}"
-        )
+    walks = [Walk(rig, args.moves, args.seed + number, args.head) for number in range(args.cases)]
+    found = run_cases(args, "walks", walked, walks, "seed {0.seed}, {0.moves} moves".format)
+    show(args, told(together(found)), COLUMNS)
     return 0
 
 

@@ -1,6 +1,6 @@
 """Pointing with one camera beside the pair: range told, a plane told, nothing told.
 
-    .venv/bin/python -m tools.campaigns.one_eye [--targets 8] [--distances 10,6,2] [--head NAME] [--json]
+    .venv/bin/python -m tools.campaigns.one_eye [--cases 8] [--distances 10,6,2] [--head NAME] [--json]
 
 The packaged rover twice, of one scene: with both Navcams, and with the left one alone. Targets are found by
 the pair; each is clicked in both from the same view. Told are rms of the true residual, px an axis, of the
@@ -11,8 +11,6 @@ last picture.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -22,16 +20,14 @@ import numpy as np
 
 from calib.files.mast_file import parse_rig
 from drivers.sim.rover import SimulatedRover
-from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.client import Client
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.frames import camera_and_sequence
-from mastctl.experiment.demo import SimulationTruth, demo_config
-from mastctl.experiment.targets import Target
-from mastctl.experiment.views import Views, pointed
+from mastctl.experiment.simulated import SimulationTruth, demo_config
+from mastctl.experiment.targets import Target, Views, pointed
 from tools.arguments import end
+from tools.campaign import numbers, options, percent, rms, run_cases, show
 
 PAIR = ("navcam_left", "navcam_right")
 CASES = ("pair", "range told", "plane told", "unknown")
@@ -51,7 +47,7 @@ class Task:
 
 
 @dataclass
-class Found:
+class OneEyeFound:
     """Of one case: true residuals (n, 2) by pointing, which intervals held, what failed."""
 
     first_px: list[tuple[float, float]] = field(default_factory=list)
@@ -61,7 +57,7 @@ class Found:
     range_held: list[bool] = field(default_factory=list)
     errors: list[str] = field(default_factory=list)
 
-    def __iadd__(self, other: Found) -> Found:
+    def __iadd__(self, other: OneEyeFound) -> OneEyeFound:
         for name, values in vars(other).items():
             getattr(self, name).extend(values)
         return self
@@ -73,7 +69,7 @@ def alone(config: Config) -> Config:
     return replace(config, hardware=replace(config.hardware, cameras=cameras))
 
 
-def point(task: Task) -> dict[str, Found]:
+def point(task: Task) -> dict[str, OneEyeFound]:
     """Find one target with the pair and point at it in every case."""
     config = demo_config(load_config(None), head=task.head, seed=task.seed)
     with RunningDaemon(config) as two, Client(two.url) as pair:
@@ -86,7 +82,7 @@ def point(task: Task) -> dict[str, Found]:
             if target is not None:
                 break
         if target is None:
-            return {case: Found(errors=[f"no target at {task.distance_m:g} m"]) for case in CASES}
+            return {case: OneEyeFound(errors=[f"no target at {task.distance_m:g} m"]) for case in CASES}
         rover = two.hardware.simulation
         assert rover is not None
         found = {CASES[0]: judged(pair, rover, target, {})}
@@ -98,14 +94,14 @@ def point(task: Task) -> dict[str, Found]:
     return found
 
 
-def judged(client: Client, rover: SimulatedRover, target: Target, how: Mapping[str, str]) -> Found:
+def judged(client: Client, rover: SimulatedRover, target: Target, how: Mapping[str, str]) -> OneEyeFound:
     """Point twice at a target from the view that it was found in, and hold the record against the truth."""
     at = target.shot
     pointed(client, pan_rad=at.pan_rad, tilt_rad=at.tilt_rad)
     shot = client.snapshot(PAIR[0])
     place = rover.true_point(*camera_and_sequence(shot.frame_id), (target.x_px, target.y_px))
     if place is None:
-        return Found(errors=["the click hit the sky"])
+        return OneEyeFound(errors=["the click hit the sky"])
     told: dict[str, Any] = {}
     if how.get("case") == "range told":
         eye = rover.frame_truth(*camera_and_sequence(shot.frame_id)).camera_in_rover
@@ -113,7 +109,7 @@ def judged(client: Client, rover: SimulatedRover, target: Target, how: Mapping[s
     elif how.get("case") == "plane told":
         told["plane"] = {"point_m": place.tolist()}
     record = pointed(client, pixel=(PAIR[0], shot.frame_id, target.x_px, target.y_px), pointings=2, **told)
-    found = Found()
+    found = OneEyeFound()
     if record["state"] != "done":
         error = record.get("error") or {}
         found.errors.append(f"{how.get('case', 'pair')}: {error.get('code')}: {error.get('message')}")
@@ -143,67 +139,39 @@ def judged(client: Client, rover: SimulatedRover, target: Target, how: Mapping[s
 FOUND_OUT = ("parallax", "unknown")
 
 
-def named(task: Task) -> str:
-    """A task's name."""
-    return f"target {task.index} at {task.distance_m:g} m"
-
-
-def rms_px(found: list[tuple[float, float]]) -> float:
-    """Root mean square of both axes together; nan of none."""
-    return float(np.sqrt(np.mean(np.square(found)))) if found else math.nan
-
-
-def percent(held: list[bool]) -> float | None:
-    """How many of a hundred; None of nothing."""
-    return 100.0 * sum(held) / len(held) if held else None
+COLUMNS = {
+    "case": "{case}", "targets": "{targets}", "first, rms px": "{first_rms_px:.2f}",
+    "second": "{second_rms_px:.2f}", "residual held, %": "{residual_held_percent:.0f}",
+    "predicted held, %": "{predicted_held_percent:.0f}", "range held, %": "{range_held_percent:.0f}",
+}  # fmt: skip
 
 
 def main() -> int:
     """Point, and print a table or a document."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--targets", type=at_least(1), default=8, metavar="N", help="a distance (default 8)")
-    parser.add_argument("--distances", default="10,6,2", metavar="M,M", help="metres (default 10,6,2)")
+    parser = options(__doc__, 8, "targets a distance", as_json=True)
+    parser.add_argument("--distances", type=numbers, default="10,6,2", metavar="M,M", help="(default 10,6,2)")
     parser.add_argument("--head", default="ptu_d46_70", metavar="NAME", help="preset (default ptu_d46_70)")
-    parser.add_argument("--seed", type=at_least(0), default=1, metavar="S", help="(default 1)")
-    parser.add_argument("--json", action="store_true", help="one JSON document")
-    add_task_options(parser)
     args = parser.parse_args()
-    distances_m = [float(one) for one in args.distances.split(",")]
-    tasks = [Task(at, index, args.head, args.seed) for at in distances_m for index in range(args.targets)]
-    results = results_of(args, "targets", point, tasks, named)
-    if results is None:
-        return 0
+    tasks = [Task(at, index, args.head, args.seed) for at in args.distances for index in range(args.cases)]
+    results = run_cases(args, "targets", point, tasks, "target {0.index} at {0.distance_m:g} m".format)
     rows = []
     for case in CASES:
-        found = Found()
+        found = OneEyeFound()
         for one in results:
             found += one[case]
         rows.append(
             {
                 "case": case,
                 "targets": len(found.first_px),
-                "first_rms_px": rms_px(found.first_px),
-                "second_rms_px": rms_px(found.second_px),
+                "first_rms_px": rms(found.first_px),
+                "second_rms_px": rms(found.second_px),
                 "residual_held_percent": percent(found.residual_held),
                 "predicted_held_percent": percent(found.predicted_held),
                 "range_held_percent": percent(found.range_held),
                 "errors": found.errors,
             }
         )
-    if args.json:
-        print(json.dumps(rows))
-        return 0
-    for row in rows:
-        held = ("residual_held_percent", "predicted_held_percent", "range_held_percent")
-        cells = ["" if row[name] is None else f"{row[name]:.0f}" for name in held]
-        print(
-            f"| {row['case']} | {row['targets']} | {row['first_rms_px']:.2f} | {row['second_rms_px']:.2f} | "
-            f"{' | '.join(cells)} |"
-        )
-        for words in row["errors"]:
-            print(f"  {words}")
+    show(args, rows, COLUMNS, "errors")
     return 0
 
 

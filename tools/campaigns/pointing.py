@@ -8,7 +8,6 @@ exist; losing it is a failure. The kinematics here are SciPy's rotations, not th
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -22,9 +21,8 @@ from calib.errors import Unreachable
 from calib.mast.pointing import solve
 from calib.mast.rig import Mast
 from calib.mast.solutions import Solution
-from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
+from tools.campaign import options, run_cases
 
 WORST_PX = 1e-7
 BLOCK = 1000
@@ -164,20 +162,11 @@ def run_block(block: Block) -> list[Outcome]:
 
 def main() -> int:
     """Run the campaign; exit 1 if a solution was lost or one missed its pixel by more than 1e-7."""
-    parser = argparse.ArgumentParser(description="Point random masts and print the worst re-projection.")
-    parser.add_argument(
-        "--cases", type=at_least(1), default=10_000, help="number of random masts (default 10000)"
-    )
-    parser.add_argument("--seed", type=at_least(0), default=1)
-    add_task_options(parser)
-    options = parser.parse_args()
+    args = options(__doc__, 10_000, "random masts").parse_args()
     blocks = [
-        Block(options.seed, first, min(BLOCK, options.cases - first))
-        for first in range(0, options.cases, BLOCK)
+        Block(args.seed, first, min(BLOCK, args.cases - first)) for first in range(0, args.cases, BLOCK)
     ]
-    found = results_of(options, "thousands", run_block, blocks, lambda block: f"cases from {block.first}")
-    if found is None:
-        return 0
+    found = run_cases(args, "thousands", run_block, blocks, lambda block: f"cases from {block.first}")
     worst: dict[tuple[str, str], float] = {}
     seconds: dict[str, list[float]] = {"a = k = 0": [], "skew": []}
     counts: Counter[int] = Counter()
@@ -192,7 +181,7 @@ def main() -> int:
             bad += 1
             what = outcome.refused or f"found {outcome.found}, worst {outcome.worst_px:.3g} px"
             print(f"case {number}: {what}")
-    print(f"{options.cases} cases, seed {options.seed}: {bad} failed")
+    print(f"{args.cases} cases, seed {args.seed}: {bad} failed")
     print(f"  (failed: the generating solution lost, or a re-projection off by more than {WORST_PX:g} px)")
     for (kind, mast), pixels in sorted(worst.items()):
         print(f"  {kind:8s} {mast:10s} worst re-projection {pixels:.2g} px")

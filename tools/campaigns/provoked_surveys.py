@@ -19,7 +19,6 @@ at the level that it claims and at 5 %: whether chances are what they say.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import Counter
 from dataclasses import replace
@@ -48,9 +47,9 @@ from mastctl.calibration import expected
 from mastctl.calibration.expected import check_sizes
 from mastctl.calibration.run import SurveyRefused, checked_survey
 from mastctl.calibration.verdict import judge_calibration
-from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
+from mastctl.packaged import config_folder
 from tools.arguments import end
+from tools.campaign import options, rms, run_cases
 from tools.campaigns.survey_provocations import PROVOCATIONS, Provoked
 
 DIRECTIONS_RAD = ((-0.8, -0.2), (0.0, -0.4), (0.7, -0.7))
@@ -138,10 +137,11 @@ def chances_of(survey: Survey, fit: Calibration) -> dict[str, float]:
 
 def errors_in_sigmas(made: Provoked, fit: Calibration) -> dict[str, float]:
     """Return how far a fit is from the truth, by what it is good for, in its own sigmas."""
-    found = {f"pixels of {name}": _rms(_pixels(made, fit, name)) for name in made.rig.cameras}
+    found = {f"pixels of {name}": rms(_pixels(made, fit, name)) for name in made.rig.cameras}
     for pair, names in made.rig.stereo.items():
         if made.rig.cameras[names[0]].on == "head":
-            found[f"pointing by {pair}"] = _rms(_pointing(made, fit, names))
+            landed = _pointing(made, fit, names)
+            found[f"pointing by {pair}"] = rms(landed) if len(landed) else 0.0
     fitted = fit.part("mast.")
     if not made.waves and not (made.rig.mast.axis_offset_m or made.rig.mast.axis_twist_rad):
         names = [fit.parameter_names[i].removeprefix("mast.") for i in fitted]
@@ -152,10 +152,6 @@ def errors_in_sigmas(made: Provoked, fit: Calibration) -> dict[str, float]:
         # The distance at which chance is that of three sigma of one number counts as three.
         found["mast"] = SIGMAS * float(np.sqrt(distance / chi2.isf(THREE_SIGMAS, len(off))))
     return found
-
-
-def _rms(errors: FloatArray) -> float:
-    return float(np.sqrt(np.mean(errors**2))) if errors.size else 0.0
 
 
 def _seen(made: Provoked, name: str, true_rad: FloatArray, points_m: FloatArray) -> FloatArray:
@@ -224,39 +220,31 @@ def tasks_of(rig: Rig, cases: int, seed: int) -> list[Task]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    root = Path(__file__).resolve().parents[2]
+    """Print the table."""
+    parser = options(__doc__, 200, "surveys")
     parser.add_argument(
-        "--rig", type=Path, default=root / "configs" / "sim" / "rocky8.yaml", help="the true rig"
+        "--rig", type=Path, default=config_folder() / "sim" / "rocky8.yaml", help="the true rig"
     )
     parser.add_argument(
         "--pairs", nargs="+", default=["navcam", "hazcam"], help="the stereo pairs that are surveyed"
     )
-    parser.add_argument("--cases", type=at_least(1), default=200)
-    parser.add_argument("--seed", type=at_least(0), default=1, help="of the first survey; the others follow")
     parser.add_argument("--only", choices=sorted(PROVOCATIONS), help="this kind alone")
-    add_task_options(parser)
-    options = parser.parse_args()
-    rig = load_rig(options.rig).rig
-    if lacking := [pair for pair in options.pairs if pair not in rig.stereo]:
-        parser.error(f"--rig {options.rig} has no stereo pair '{lacking[0]}'")
-    names = {name for pair in options.pairs for name in rig.stereo[pair]}
+    args = parser.parse_args()
+    rig = load_rig(args.rig).rig
+    if lacking := [pair for pair in args.pairs if pair not in rig.stereo]:
+        parser.error(f"--rig {args.rig} has no stereo pair '{lacking[0]}'")
+    names = {name for pair in args.pairs for name in rig.stereo[pair]}
     rig = replace(
         rig,
         cameras={name: camera for name, camera in rig.cameras.items() if name in names},
-        stereo={pair: rig.stereo[pair] for pair in options.pairs},
+        stereo={pair: rig.stereo[pair] for pair in args.pairs},
     )
-    tasks = tasks_of(rig, options.cases, options.seed)
-    if options.only:
-        tasks = [task._replace(kind=options.only) for task in tasks]
+    tasks = tasks_of(rig, args.cases, args.seed)
+    if args.only:
+        tasks = [task._replace(kind=args.only) for task in tasks]
     began = time.monotonic()
-    found = results_of(options, "surveys", judged, tasks, lambda task: f"seed {task.seed}, {task.kind}")
-    if found is None:
-        return 0
-    report(found)
-    print(f"{options.cases} surveys from seed {options.seed}: {time.monotonic() - began:.0f} s")
+    report(run_cases(args, "surveys", judged, tasks, "seed {0.seed}, {0.kind}".format))
+    print(f"{args.cases} surveys from seed {args.seed}: {time.monotonic() - began:.0f} s")
     return 0
 
 

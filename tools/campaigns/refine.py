@@ -28,8 +28,8 @@ from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid, moved_rigid
 from mastctl.calibration.landing import handoff_errors_px
 from mastctl.cli.output import at_least, not_negative, positive_number
-from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
+from tools.campaign import options, rms, run_cases
 
 HEAD_HEIGHT_M, ASIDE_RAD = 1.45, 0.35
 HELD_OUT, HELD_OUT_M = 60, (1.5, 4.0)
@@ -172,24 +172,18 @@ def blocks_of(true: Rig, options: argparse.Namespace) -> list[Block]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    """Print the table."""
+    parser = options(__doc__, 100)
     parser.add_argument("--rig", required=True, type=Path, help="the true rig")
-    parser.add_argument("--cases", type=at_least(1), default=100)
     parser.add_argument("--handoffs", type=at_least(1), default=20, help="of each case")
     parser.add_argument("--click-px", type=positive_number, default=0.2)
     parser.add_argument("--match-px", type=not_negative, default=0.4, help="what a match is wrong by")
-    parser.add_argument("--seed", type=at_least(0), default=1)
-    add_task_options(parser)
-    options = parser.parse_args()
-    true = load_rig(options.rig).rig
+    args = parser.parse_args()
+    true = load_rig(args.rig).rig
     if lacking := [pair for pair in ("navcam", "hazcam") if pair not in true.stereo]:
-        parser.error(f"--rig {options.rig} has no stereo pair '{lacking[0]}'")
-    blocks = blocks_of(true, options)
-    found = results_of(options, "tens of cases", run_block, blocks, label)
-    if found is None:
-        return 0
+        parser.error(f"--rig {args.rig} has no stereo pair '{lacking[0]}'")
+    blocks = blocks_of(true, args)
+    found = run_cases(args, "tens of cases", run_block, blocks, label)
     print("targets     moved  significant  told  chi2 of 6   before rms, worst px   after rms, worst px")
     for words, ranges_m, size in ROWS:
         row = [
@@ -199,12 +193,12 @@ def main() -> int:
             for case in cases
         ]
         told = [
-            f"{np.sqrt(np.mean(e**2)):6.2f} {np.linalg.norm(e, axis=-1).max():6.2f}"
+            f"{rms(e):6.2f} {np.linalg.norm(e, axis=-1).max():6.2f}"
             for e in (np.concatenate([c.before_px for c in row]), np.concatenate([c.after_px for c in row]))
         ]
         significant, seen = sum(case.significant for case in row), np.mean([case.seen for case in row])
         print(
-            f"{words:11s} {'yes' if size else 'no':5s}  {significant:4d} of {options.cases:<4d}  "
+            f"{words:11s} {'yes' if size else 'no':5s}  {significant:4d} of {args.cases:<4d}  "
             f"{seen:4.1f}  {np.mean([c.chi2 for c in row]):9.2f}   {told[0]:>20s}  {told[1]:>20s}"
         )
     return 0

@@ -5,12 +5,11 @@ a shift of all pixels hides from a turn, but not from a roll. Patches of the fir
 their range (``Scene.cast``) into the second (``CameraModel.project``) and found there by OpenCV's ECC with an
 affine warp, which knows nothing of the renderer. Mean error tells of bias, rms of aliasing and poor texture.
 
-    .venv/bin/python -m tools.campaigns.render_bias --pairs 12
+    .venv/bin/python -m tools.campaigns.render_bias --cases 12
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -25,8 +24,8 @@ from calib.rigid import FloatArray, Rigid, rot_y, rot_z
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 from mastctl.cli.output import at_least, positive_number
-from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
+from tools.campaign import options, run_cases
 
 MAST = Mast(np.array([0.3443, -0.0043, -1.4572]), np.array([-0.0088, -0.0181, 0.0027]))
 Poses = Callable[[CameraModel, float, np.random.Generator], tuple[Rigid, Rigid]]
@@ -247,7 +246,7 @@ CAMERAS: dict[str, tuple[CameraModel, Poses]] = {
 
 
 @dataclass(frozen=True)
-class Row:
+class BiasRow:
     """A scene, a camera and how it moves, a range, rays a pixel and side; so many pairs of pictures."""
 
     scene: str
@@ -269,7 +268,7 @@ def scene_renderer(scene: str, seed: int) -> Renderer:
     return Renderer(build_scene(flat if scene == "flat" else SceneSettings(seed=seed)), workers=1)
 
 
-def run_row(row: Row) -> Errors:
+def run_row(row: BiasRow) -> Errors:
     """Draw a row's pictures and measure them."""
     camera, poses = CAMERAS[row.camera]
     rng = np.random.default_rng([row.seed, int(row.range_m * 10), row.samples])
@@ -284,27 +283,19 @@ def run_row(row: Row) -> Errors:
 
 def main() -> int:
     """Print one row for each scene, camera, range and number of samples."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--pairs", type=at_least(1), default=6, help="pairs of pictures a row")
+    parser = options(__doc__, 6, "pairs of pictures a row")
     parser.add_argument("--patches", type=at_least(1), default=40, help="patches a pair")
     parser.add_argument("--samples", type=at_least(1), nargs="+", default=[1, 2, 3])
     parser.add_argument("--ranges", type=positive_number, nargs="+", default=[10.0, 6.0, 2.0])
-    parser.add_argument("--seed", type=at_least(0), default=1)
-    add_task_options(parser)
-    options = parser.parse_args()
-    places = [
-        (camera, range_m) for range_m in options.ranges for camera in CAMERAS if camera != "hazcam turned"
-    ]
+    args = parser.parse_args()
+    places = [(camera, range_m) for range_m in args.ranges for camera in CAMERAS if camera != "hazcam turned"]
     rows = [
-        Row(scene, camera, range_m, samples, options.pairs, options.patches, options.seed)
+        BiasRow(scene, camera, range_m, samples, args.cases, args.patches, args.seed)
         for scene in ("flat", "relief")
         for camera, range_m in [*places, ("hazcam turned", 2.0)]
-        for samples in options.samples
+        for samples in args.samples
     ]
-    found = results_of(options, "rows", run_row, rows, str)
-    for row, errors in zip(rows, found or [], strict=found is not None):
+    for row, errors in zip(rows, run_cases(args, "rows", run_row, rows), strict=True):
         print(f"{row}  {errors.line()}")
     return 0
 

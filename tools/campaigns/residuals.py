@@ -13,12 +13,12 @@ px; medians of sigma.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -28,16 +28,15 @@ from calib.camera.cahvor import CameraModel
 from calib.rigid import FloatArray
 from drivers.sim.rover import SimulatedRover
 from drivers.simulation_clock import MAX
-from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.frames import camera_and_sequence
-from mastctl.experiment.demo import own_config
+from mastctl.experiment.simulated import own_config
 from mastctl.experiment.targets import BORDER_PX
 from mastctl.packaged import config_folder
 from tools.arguments import end
+from tools.campaign import options, rms, run_cases, show
 
 DAYS = {"kind": "default.yaml", "worst": "worst_day.yaml", "still": "worst_day.yaml"}
 RINGING = ("ring_hz", "ring_damping", "settle_s")
@@ -55,10 +54,6 @@ HIDDEN = 0.01
 """A point is hidden from an eye whose ray ends earlier by more than this part of the way."""
 MOMENTS = 8
 """Of an exposure, at which the truth is asked where the head stood."""
-HEADING = (
-    "| day | on | cases | refused, % | of these hidden | z rms | of x, y | worst | beyond 3, % "
-    "| error rms, px | worst | sigma, px |"
-)
 WAITED_S = 900.0
 """A busy machine is no reason to count a click as refused."""
 A_TASK = 10
@@ -228,7 +223,7 @@ def told(day: str, group: str, clicks: Sequence[Click]) -> dict[str, Any]:
         "cases": len(clicks),
         "refused_percent": 100.0 * len(refused) / max(len(clicks), 1),
         "refused_hidden": sum(one.hidden for one in refused),
-        "reasons": dict(Counter(one.refused.split(":")[0] for one in refused).most_common()),
+        "reasons": [f"{n} {code}" for code, n in Counter(map(_code, refused)).most_common()],
     }
     if not good:
         return row
@@ -236,52 +231,37 @@ def told(day: str, group: str, clicks: Sequence[Click]) -> dict[str, Any]:
     sigma = np.array([one.sigma_px for one in good])
     z = error / sigma
     return row | {
-        "z_rms": _rms(z),
-        "z_rms_x_y": [_rms(z[:, 0]), _rms(z[:, 1])],
+        "z_rms": rms(z),
+        "z_rms_x_y": [rms(z[:, 0]), rms(z[:, 1])],
         "worst_z": float(np.abs(z).max()),
         "beyond_3_percent": 100.0 * float((np.abs(z).max(axis=1) > 3.0).mean()),
-        "error_rms_px": [_rms(error[:, 0]), _rms(error[:, 1])],
+        "error_rms_px": [rms(error[:, 0]), rms(error[:, 1])],
         "worst_error_px": float(np.abs(error).max()),
         "median_sigma_px": np.median(sigma, axis=0).tolist(),
     }
 
 
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+def _code(one: Click) -> str:
+    return one.refused.split(":")[0]
 
 
-def line(row: dict[str, Any]) -> str:
-    """A row as a person reads it, as a line of the docs' table."""
-    cells = [row["day"], row["group"], str(row["cases"]), f"{row['refused_percent']:.0f}"]
-    cells.append(str(row["refused_hidden"]))
-    if "z_rms" in row:
-        cells += [f"{row['z_rms']:.2f}", "{:.2f}, {:.2f}".format(*row["z_rms_x_y"]), f"{row['worst_z']:.1f}"]
-        cells += [f"{row['beyond_3_percent']:.1f}", "{:.3f}, {:.3f}".format(*row["error_rms_px"])]
-        cells += [f"{row['worst_error_px']:.2f}", "{:.3f}, {:.3f}".format(*row["median_sigma_px"])]
-    return f"| {' | '.join(cells)} |"
+_X_Y = "{{{0}[0]:{1}}}, {{{0}[1]:{1}}}".format
+COLUMNS = {
+    "day": "{day}", "on": "{group}", "cases": "{cases}", "refused, %": "{refused_percent:.0f}",
+    "of these hidden": "{refused_hidden}", "z rms": "{z_rms:.2f}", "of x, y": _X_Y("z_rms_x_y", ".2f"),
+    "worst": "{worst_z:.1f}", "beyond 3, %": "{beyond_3_percent:.1f}",
+    "error rms, px": _X_Y("error_rms_px", ".3f"), "worst px": "{worst_error_px:.2f}",
+    "sigma, px": _X_Y("median_sigma_px", ".3f"),
+}  # fmt: skip
 
 
 def main() -> int:
     """Click, and print a table or a document."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, 200, "clicks a group and day", as_json=True)
     parser.add_argument(
-        "--cases", type=at_least(1), default=200, metavar="N", help="a group and day (default 200)"
-    )
-    parser.add_argument(
-        "--seed", type=at_least(0), default=1, metavar="S", help="of scenes and clicks (default 1)"
-    )
-    parser.add_argument(
-        "--day",
-        choices=DAYS,
-        nargs="+",
-        default=["kind", "worst"],
-        metavar="DAY",
+        "--day", choices=DAYS, nargs="+", default=["kind", "worst"], metavar="DAY",
         help="kind, worst, or still: the worst with a mast that does not ring (default kind worst)",
-    )
-    parser.add_argument("--json", action="store_true", help="one JSON document, with every click")
-    add_task_options(parser)
+    )  # fmt: skip
     args = parser.parse_args()
     tasks = [
         Task(day, group, args.seed, number, min(A_TASK, args.cases - number * A_TASK))
@@ -289,30 +269,22 @@ def main() -> int:
         for day in args.day
         for group in GROUPS
     ]
-    found = results_of(
-        args, "scenes", click_all, tasks, lambda one: f"{one.day} day, {one.group}, scene {one.number}"
-    )
-    if found is None:
-        return 0
+    label = "{0.day} day, {0.group}, scene {0.number}".format
+    found = run_cases(args, "scenes", click_all, tasks, label)
     rows, clicks = [], []
-    for day in args.day:
-        for group in GROUPS:
-            mine = [
-                one
-                for task, row in zip(tasks, found, strict=True)
-                if (task.day, task.group) == (day, group)
-                for one in row
-            ]
-            rows.append(told(day, group, mine))
-            clicks += [{"day": day, "group": group, **vars(one)} for one in mine]
+    for day, group in product(args.day, GROUPS):
+        mine = [
+            one
+            for task, row in zip(tasks, found, strict=True)
+            if (task.day, task.group) == (day, group)
+            for one in row
+        ]
+        rows.append(told(day, group, mine))
+        clicks += [{"day": day, "group": group, **vars(one)} for one in mine]
     if args.json:
         print(json.dumps({"rows": rows, "clicks": clicks}))
-        return 0
-    print(HEADING)
-    for row in rows:
-        print(line(row))
-        for reason, count in row["reasons"].items():
-            print(f"    {count} {reason}")
+    else:
+        show(args, rows, COLUMNS, "reasons")
     return 0
 
 

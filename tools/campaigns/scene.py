@@ -1,8 +1,8 @@
 """Correct masts by still scenes and hold what is stated against the truth; leave right ones alone.
 
-    .venv/bin/python -m tools.campaigns.scene --scenes 40 --seed 1
-    .venv/bin/python -m tools.campaigns.scene --scenes 40 --seed 1 --right [--repeat-rad 0.001]
-    .venv/bin/python -m tools.campaigns.scene --scenes 5 --seed 1 --pictures
+    .venv/bin/python -m tools.campaigns.scene --cases 40 --seed 1
+    .venv/bin/python -m tools.campaigns.scene --cases 40 --seed 1 --right [--repeat-rad 0.001]
+    .venv/bin/python -m tools.campaigns.scene --cases 5 --seed 1 --pictures
 
 A scene, at the level of features: two eyes look all round at two tilts, 22 rests, features of 0.1 px on rough
 ground; the head's rests err by ``--repeat-rad``, while ``--told-rad`` is what the fit is told. One thing is
@@ -18,7 +18,6 @@ stands a pooled rate's standard error, from the scatter of whole scenes.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import Counter
 from typing import NamedTuple
@@ -33,9 +32,9 @@ from calib.scene.features import Feature, find_features
 from calib.scene.fit import SceneFit, fit_scene
 from calib.scene.terms import corrected
 from calib.scene.views import View
-from mastctl.cli.output import at_least, positive_number
-from mastctl.cli.tasks import add_task_options, results_of
+from mastctl.cli.output import positive_number
 from tools.arguments import end
+from tools.campaign import options, rms, run_cases
 from tools.still_scene import navcams, pictures, rests
 
 Z = 1.959964
@@ -164,9 +163,10 @@ def score(task: SceneTask) -> Score | str:
     off = {n: (v - names.get(n, 0.0)) / s for n, v, s in zip(fit.names, fit.values, sigma, strict=True)}
     before, after, spread = foretold(believed, true, fit)
     moved = spread > LEAST_PX  # what goes by an eye that was not corrected is as it was
-    rms = [float(np.sqrt(np.mean(one**2))) for one in (before, after)]
     pixels = after[moved] / spread[moved]
-    return Score(task.kind, fit.taken, off, pixels, *rms, fit.joint_sigma_rad, fit.scale, seconds)
+    return Score(
+        task.kind, fit.taken, off, pixels, rms(before), rms(after), fit.joint_sigma_rad, fit.scale, seconds
+    )
 
 
 def foretold(believed: Rig, true: Rig, fit: SceneFit) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -197,30 +197,21 @@ def carried(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--scenes", type=at_least(1), default=24)
-    parser.add_argument("--seed", type=at_least(0), default=1, help="of the first scene; the others follow")
+    """Print the tables."""
+    parser = options(__doc__, 24, "scenes")
     parser.add_argument("--right", action="store_true", help="nothing is wrong with the rigs")
     parser.add_argument("--pictures", action="store_true", help="rendered pictures instead of features")
     parser.add_argument("--repeat-rad", type=positive_number, default=1e-4)
     parser.add_argument("--told-rad", type=positive_number, default=2e-4)
-    add_task_options(parser)
     args = parser.parse_args()
     tasks = [
         SceneTask(
-            seed,
-            "" if args.right else KINDS[seed % len(KINDS)],
-            args.repeat_rad,
-            args.told_rad,
+            seed, "" if args.right else KINDS[seed % len(KINDS)], args.repeat_rad, args.told_rad,
             args.pictures,
         )
-        for seed in range(args.seed, args.seed + args.scenes)
-    ]
-    found = results_of(args, "scenes", score, tasks, lambda task: f"seed {task.seed}")
-    if found is None:
-        return 0
+        for seed in range(args.seed, args.seed + args.cases)
+    ]  # fmt: skip
+    found = run_cases(args, "scenes", score, tasks, lambda task: f"seed {task.seed}")
     scores = [one for one in found if isinstance(one, Score)]
     if scores:
         report(scores)
@@ -247,11 +238,10 @@ def report(scores: list[Score]) -> None:
     for name, count in sorted(names.items()):
         off = np.array([one.numbers[name] for one in scores if name in one.numbers])
         held = 100 * np.mean(np.abs(off) < Z)
-        print(f"  {name}: {held:.0f} % of {count}, rms {np.sqrt(np.mean(off**2)):.2f} sigma")
+        print(f"  {name}: {held:.0f} % of {count}, rms {rms(off):.2f} sigma")
     print(f"95 % intervals of the pixels: {_rate([np.abs(one.pixels) < Z for one in scores])}")
-    worst = max(scores, key=lambda one: float(np.sqrt(np.mean(one.pixels**2))))
-    rms = float(np.sqrt(np.mean(worst.pixels**2)))
-    print(f"  worst scene: {rms:.1f} sigma rms, {worst.kind}: {', '.join(worst.taken)}")
+    worst = max(scores, key=lambda one: rms(one.pixels))
+    print(f"  worst scene: {rms(worst.pixels):.1f} sigma rms, {worst.kind}: {', '.join(worst.taken)}")
     spread = 1e3 * float(np.median([one.joint_sigma_rad for one in scores]))
     print(f"joints repeat to {spread:.2f} mrad, fit {np.mean([one.seconds for one in scores]):.1f} s")
 

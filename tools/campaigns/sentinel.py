@@ -16,10 +16,7 @@ An alarm takes two looks one after the other that name the same. Then masts that
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -33,14 +30,14 @@ from mastctl.cli.output import at_least
 from mastctl.sentinel.folder import Reference, look_line
 from mastctl.sentinel.standing import slow_course, standing
 from tools.arguments import end
+from tools.campaign import options
+from tools.campaigns.sentinel_days import RESTS, Truth, about, alarm
+from tools.campaigns.sentinel_rendered import calm_days, power
 
 SIZE = (1024, 768)
 FOCAL_PX = 1280.0
 EYES_M = {"navcam_left": np.array([0.06, -0.1, -0.08]), "navcam_right": np.array([0.06, 0.1, -0.08])}
 MAST_M = np.array([0.2, 0.0, -1.1])
-RESTS = tuple(
-    (pan, tilt) for tilt, pans in ((-0.2, (-1.8, 0.0, 1.8)), (-0.5, (-0.9, 0.9, 2.7))) for pan in pans
-)
 FEATURES = 60
 JOINT_SIGMA_RAD, BEND_RAD = 2e-4, 1e-4
 LIGHT_PX, EYE_PX, LIGHT_TURN, LIGHT_SCALE = np.array([0.16, 0.08]), 0.03, 1e-4, 1.4e-4
@@ -65,27 +62,6 @@ def rig() -> Rig:
         for name, C in EYES_M.items()
     }
     return Rig("campaign", Mast(MAST_M, np.zeros(3)), cameras)
-
-
-@dataclass(frozen=True)
-class Truth:
-    """What is changed: turns of eyes, part of the focal length, slips, a turn of the rover; radians."""
-
-    turned: Mapping[str, FloatArray] = field(default_factory=dict)
-    focal: Mapping[str, float] = field(default_factory=dict)
-    slip: tuple[float, float] = (0.0, 0.0)
-    rover: FloatArray = field(default_factory=lambda: np.zeros(3))
-    name: str = ""
-
-
-def about(axis: int, angle_rad: float) -> FloatArray:
-    """A turn about x, y or z (3, 3), right-handed."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    i, j = [(1, 2), (2, 0), (0, 1)][axis]
-    matrix = np.eye(3)
-    matrix[i, i] = matrix[j, j] = c
-    matrix[i, j], matrix[j, i] = -s, s
-    return matrix
 
 
 def shown(points: FloatArray, eye: str, pan: float, tilt: float, truth: Truth) -> FloatArray:
@@ -152,13 +128,6 @@ class Site:
         return find_drift(self.rig, shifts)
 
 
-def alarm(before: Drift | None, now: Drift) -> str:
-    """What two looks one after the other name alike, '' if nothing."""
-    if before is None or before.named is None or now.named is None:
-        return ""
-    return now.named.what if before.named.what == now.named.what else ""
-
-
 def random_change(rng: np.random.Generator) -> Truth:
     """A bump, a slip, another focus or a rover that sank, from some sigmas up."""
     eye = str(rng.choice(list(EYES_M)))
@@ -185,28 +154,20 @@ def random_change(rng: np.random.Generator) -> Truth:
             return Truth(rover=level * rng.uniform(2e-3, 5e-3), name="rover turned")
 
 
-def _rendered(args: argparse.Namespace) -> int:
-    """Rendered days, and changes of many sizes at ``--changes`` sites."""
-    from tools.campaigns.sentinel_rendered import calm_days, power
-
-    false = calm_days(args.days, args.seed, args.smaller, args.hour) if args.days else 0
-    if args.changes:
-        power(args.changes, args.seed, args.smaller, args.hour)
-    return 1 if false else 0
-
-
 def main() -> int:
     """Run both parts; 1 if there was a false alarm."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, tasks=False)
     parser.add_argument("--days", type=at_least(0), default=1000)
     parser.add_argument("--changes", type=at_least(0), default=100)
-    parser.add_argument("--seed", type=at_least(0), default=1)
     parser.add_argument("--rendered", action="store_true", help="full pictures of rendered days instead")
     parser.add_argument("--smaller", type=at_least(1), default=1, help="in so many times fewer pixels a side")
     parser.add_argument("--hour", choices=("any", "same"), default="any", help="of the looks, by the sun")
     args = parser.parse_args()
     if args.rendered:
-        return _rendered(args)
+        false_days = calm_days(args.days, args.seed, args.smaller, args.hour) if args.days else 0
+        if args.changes:
+            power(args.changes, args.seed, args.smaller, args.hour)
+        return 1 if false_days else 0
     rng = np.random.default_rng(args.seed)
     site, before, false, largest = Site(rng), None, [], 0.0
     for day in range(args.days):

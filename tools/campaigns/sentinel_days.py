@@ -1,4 +1,4 @@
-"""A rover's surroundings, day after day, in rendered pictures: what the drift sentinel's campaign looks at.
+"""What the drift sentinel looks at in its campaign: changes, and surroundings in rendered pictures of days.
 
 Ground, stones and shadows are the simulator's, drawn anew under each day's sun; what makes a day of it here
 is this file's own: the hour and so the sun, haze, exposure, noise, blur, a dirty window, stones that were
@@ -20,13 +20,12 @@ from calib.camera.cahvor import CameraModel
 from calib.mast.rig import Rig
 from calib.pictures.warp import Grey
 from calib.rigid import FloatArray, Rigid
-from calib.scene.drift import ViewShift
+from calib.scene.drift import Drift, ViewShift
 from drivers.sim import boards, bricks, rocks, scene, texture
 from drivers.sim.compiled import kernels
 from drivers.sim.render import Renderer
 from drivers.sim.scene import INNER_CELL_M, Scene, SceneSettings
 from mastctl.sentinel.folder import Picture
-from tools.campaigns.sentinel import Truth, about
 
 LATITUDE_RAD, TURN_OF_AXIS_RAD = math.radians(35.0), math.radians(23.4)
 LOWEST_SUN_RAD = 0.22
@@ -35,6 +34,37 @@ GRAVEL_TEXELS = 2048
 JOINT_SIGMA_RAD, BEND_SIGMA_RAD = 2e-4, 1e-4
 PERSON_M, WHEEL_M = (0.45, 0.3, 1.75), (0.5, 0.25, 0.45)
 DIGEST = "campaign"
+RESTS = tuple(
+    (pan, tilt) for tilt, pans in ((-0.2, (-1.8, 0.0, 1.8)), (-0.5, (-0.9, 0.9, 2.7))) for pan in pans
+)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is changed: turns of eyes, part of the focal length, slips, a turn of the rover; radians."""
+
+    turned: Mapping[str, FloatArray] = field(default_factory=dict)
+    focal: Mapping[str, float] = field(default_factory=dict)
+    slip: tuple[float, float] = (0.0, 0.0)
+    rover: FloatArray = field(default_factory=lambda: np.zeros(3))
+    name: str = ""
+
+
+def about(axis: int, angle_rad: float) -> FloatArray:
+    """A turn about x, y or z (3, 3), right-handed."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    i, j = [(1, 2), (2, 0), (0, 1)][axis]
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = c
+    matrix[i, j], matrix[j, i] = -s, s
+    return matrix
+
+
+def alarm(before: Drift | None, now: Drift) -> str:
+    """What two looks one after the other name alike, '' if nothing."""
+    if before is None or before.named is None or now.named is None:
+        return ""
+    return now.named.what if before.named.what == now.named.what else ""
 
 
 @dataclass(frozen=True)
@@ -190,7 +220,7 @@ def smaller(model: CameraModel, by: int) -> CameraModel:
 
 
 @dataclass(frozen=True)
-class Look:
+class DaysLook:
     """One look: where the head really stood at each rest (r, 2), the scene then, and its pictures."""
 
     stood_rad: FloatArray
@@ -207,7 +237,7 @@ class Days:
 
     def look(
         self, rng: np.random.Generator, day: Weather, truths: Sequence[Truth] = (Truth(),)
-    ) -> list[Look]:
+    ) -> list[DaysLook]:
         """Return a look for each truth, all on one day and from the same rests."""
         shown = self.place.scene(day)
         if self._renderer is None:
@@ -216,7 +246,7 @@ class Days:
         off = rng.normal(0.0, JOINT_SIGMA_RAD, (len(self.rests), 2)) + rng.normal(0.0, BEND_SIGMA_RAD, 2)
         stood = np.array(self.rests) + off
         drawn: dict[object, Grey] = {}
-        return [Look(stood, shown, self._pictures(rng, day, stood, truth, drawn)) for truth in truths]
+        return [DaysLook(stood, shown, self._pictures(rng, day, stood, truth, drawn)) for truth in truths]
 
     def _pictures(
         self,
@@ -243,7 +273,7 @@ class Days:
                 found.append(Picture(eye, pose, *rest, DIGEST, picture))
         return found
 
-    def truly_moved(self, then: Look, now: Look, shift: ViewShift) -> FloatArray:
+    def truly_moved(self, then: DaysLook, now: DaysLook, shift: ViewShift) -> FloatArray:
         """How far (n, 2) what stands still has moved in a view by where the head stood, pixels."""
         model = self.rig.cameras[shift.camera].model
         before = model.moved(self.rig.mast.rover_from_head(*then.stood_rad[shift.pose]))

@@ -19,8 +19,18 @@ from calib.scene.drift import Drift, ViewShift, find_drift, view_change
 from mastctl.packaged import config_folder
 from mastctl.sentinel.folder import Reference, save_reference
 from mastctl.sentinel.look import view_shifts
-from tools.campaigns.sentinel import RESTS, Truth, alarm
-from tools.campaigns.sentinel_days import Days, Look, Surroundings, Weather, moved_stones, smaller, weather_of
+from tools.campaigns.sentinel_days import (
+    RESTS,
+    Days,
+    DaysLook,
+    Surroundings,
+    Truth,
+    Weather,
+    alarm,
+    moved_stones,
+    smaller,
+    weather_of,
+)
 
 RENEWED = 25
 """Days that a reference is looked at, in surroundings of their own."""
@@ -105,7 +115,7 @@ class Noise:
         )
 
 
-class Site:
+class RenderedSite:
     """Surroundings with their reference look, through the sentinel's own folder and matching."""
 
     def __init__(self, seed: int, at: int, by: int, hour: str, folder: Path) -> None:
@@ -127,7 +137,7 @@ class Site:
         self._stones = moved_stones(self.rng, self._stones)
         return weather_of(self.rng, self.eyes, self._stones, self.hour_rad)
 
-    def seen(self, look: Look) -> tuple[list[ViewShift], Drift]:
+    def seen(self, look: DaysLook) -> tuple[list[ViewShift], Drift]:
         """What the sentinel finds in a look's pictures."""
         shifts = view_shifts(self.believed, self.reference, look.pictures)
         return shifts, find_drift(self.believed, shifts)
@@ -138,13 +148,13 @@ def calm_days(days: int, seed: int, by: int, hour: str) -> int:
     noise, false, largest, blind, named = Noise(), [], 0.0, 0, 0
     begun_s = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
-        site: Site | None = None
+        site: RenderedSite | None = None
         before: Drift | None = None
         for day in range(days):
             if site is None or day % RENEWED == 0:
                 if site is not None:
                     site.days.close()
-                site, before = Site(seed, day // RENEWED, by, hour, Path(folder)), None
+                site, before = RenderedSite(seed, day // RENEWED, by, hour, Path(folder)), None
                 _progress(f"day {day}, {len(false)} false alarms")
             look = site.days.look(site.rng, site.next_day())[0]
             shifts, now = site.seen(look)
@@ -178,7 +188,7 @@ def power(sites: int, seed: int, by: int, hour: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for at in range(sites):
             _progress(f"site {at} of {sites}")
-            site = Site(seed, 500 + at, by, hour, Path(folder))
+            site = RenderedSite(seed, 500 + at, by, hour, Path(folder))
             cases = provoked(site.rng, site.eyes)
             before: dict[str, Drift] = {}
             found: dict[str, tuple[int, bool]] = {}

@@ -10,8 +10,8 @@ words, and from its end to a good reading.
 An encoder that lies (``wrong``, ``drifting``, ``garbage``) cannot be told from a moving axis by its bytes;
 for those words the worst error of a reading that calls itself settled and healthy is told instead.
 
-    .venv/bin/python -m tools.campaigns.servo --transactions 10000 --seed 1
-    .venv/bin/python -m tools.campaigns.servo --hours 8 --driver ptu_pty
+    .venv/bin/python -m tools.campaigns.servo --cases 10000 --seed 1
+    .venv/bin/python -m tools.campaigns.servo --minutes 480 --driver ptu_pty
     .venv/bin/python -m tools.campaigns.servo --openings 100
 
 With ``--openings`` a healthy Dynamixel head fresh from the factory is opened so many times under each fault
@@ -21,7 +21,6 @@ opened, how often a servo was rebooted, and how often one was not set as an open
 
 from __future__ import annotations
 
-import argparse
 import json
 import logging
 import math
@@ -42,6 +41,7 @@ from drivers.faults import HEAD_WORDS
 from drivers.interfaces import Reading
 from mastctl.cli.output import at_least, positive_number
 from tools.arguments import end, new_file
+from tools.campaign import heading, line, options
 from tools.campaigns.servo_rigs import (
     LIMITS_RAD,
     Rig,
@@ -88,7 +88,7 @@ OPENINGS: tuple[tuple[str, dict[str, float]], ...] = (
 
 
 @dataclass
-class Row:
+class ServoRow:
     """What came out for one driver and one word."""
 
     driver: str
@@ -118,7 +118,7 @@ class Row:
 class Judge:
     """Compares readings with the true angles, and true angles with the limits."""
 
-    def __init__(self, rig: Rig, row: Row, lying: bool) -> None:
+    def __init__(self, rig: Rig, row: ServoRow, lying: bool) -> None:
         self._rig, self._row, self.lying = rig, row, lying
         self._seen_s = self._rig.clock.now_s()
 
@@ -179,7 +179,7 @@ class Judge:
 class Run:
     """Episodes of one word on one rig."""
 
-    def __init__(self, rig: Rig, row: Row, rng: np.random.Generator) -> None:
+    def __init__(self, rig: Rig, row: ServoRow, rng: np.random.Generator) -> None:
         self._rig, self._row, self._rng = rig, row, rng
         self._judge = Judge(rig, row, row.word in LYING)
 
@@ -310,9 +310,9 @@ def _parameters(word: str, rng: np.random.Generator) -> dict[str, float]:
     return drawn
 
 
-def run_word(driver: str, word: str, transactions: int, seed: int, until_s: float = math.inf) -> Row:
+def run_word(driver: str, word: str, transactions: int, seed: int, until_s: float = math.inf) -> ServoRow:
     """Run episodes of one word on one driver until so many calls were made, and return what came out."""
-    row = Row(driver, word, seed)
+    row = ServoRow(driver, word, seed)
     rng = np.random.default_rng([seed, list(DRIVERS).index(driver), WORDS.index(word)])
     threads, descriptors = set(threading.enumerate()), _descriptors()
     while row.calls < transactions and time.monotonic() < until_s:
@@ -341,22 +341,23 @@ def _descriptors() -> int:
     return len(list(Path("/proc/self/fd").iterdir()))
 
 
-def told(row: Row) -> str:
+def told(row: ServoRow) -> str:
     """One line of the table."""
     lie = f"{row.worst_lie_rad * 1e3:.1f}" if row.word in (*LYING, MIXTURE) else "-"
-    return (
-        f"| {row.driver} | {row.word} | {row.calls} | {row.episodes} | {row.errors} | {row.wrong} "
-        f"| {1e3 * row.oldest_s:.0f} | {lie} | {row.outside} | {row.left_over} | {row.lost} "
-        f"| {row.power_cycles} | {row.unseen} "
-        f"| {_times(row.detect_s)} | {_times(row.recover_s)} |"
+    return line(
+        row.driver, row.word, row.calls, row.episodes, row.errors, row.wrong, f"{1e3 * row.oldest_s:.0f}",
+        lie, row.outside, row.left_over, row.lost, row.power_cycles, row.unseen,
+        _times(row.detect_s), _times(row.recover_s),
+    )  # fmt: skip
+
+
+HEADING = heading(
+    (
+        "driver", "word", "calls", "episodes", "errors", "wrong", "worst age, ms", "worst lie, mrad",
+        "outside", "left over", "not back", "power cycles", "unseen", "detect, ms: median, worst",
+        "recover, ms: median, worst",
     )
-
-
-HEADING = (
-    "| driver | word | calls | episodes | errors | wrong | worst age, ms | worst lie, mrad "
-    "| outside | left over | not back | power cycles | unseen | detect, ms: median, worst "
-    "| recover, ms: median, worst |\n" + "| --- " * 15 + "|"
-)
+)  # fmt: skip
 
 
 def _times(values: Sequence[float]) -> str:
@@ -367,7 +368,7 @@ def _times(values: Sequence[float]) -> str:
 
 def run_all(
     drivers: Iterable[str], words: Iterable[str], transactions: int, seed: int, until_s: float
-) -> list[Row]:
+) -> list[ServoRow]:
     """Run every word on every driver and print a line each."""
     rows = []
     for driver in drivers:
@@ -383,52 +384,52 @@ def run_all(
 
 def run_openings(openings: int, seed: int) -> bool:
     """Open a healthy head again and again under each of `OPENINGS`; returns whether nothing was wrong."""
-    print("| fault | opened | not opened | reboots | not as told |\n" + "| --- " * 5 + "|", flush=True)
+    print(heading(("fault", "opened", "not opened", "reboots", "not as told")), flush=True)
     good = True
     for word, parameters in OPENINGS:
         opened = reboots = untrue = 0
         for number in range(openings):
-            with fresh_servos() as (line, panel, servos):
+            with fresh_servos() as (wire, panel, servos):
                 panel.set("pan_tilt", word, replies=math.inf, seed=seed + number, **parameters)
-                with suppress(DriverError), opened_on(line) as head:
+                with suppress(DriverError), opened_on(wire) as head:
                     opened += 1
                     untrue += not all(as_opened(servo, head) for servo in servos)
                 panel.clear()
                 reboots += sum(servo.restarts for servo in servos)
         told = ", ".join(f"{name} {value:g}" for name, value in parameters.items())
-        rest = f"{openings - opened} | {reboots} | {untrue}"
-        print(f"| {word}, {told} | {opened} | {rest} |", flush=True)
+        print(line(f"{word}, {told}", opened, openings - opened, reboots, untrue), flush=True)
         good = good and not reboots and not untrue
     return good
 
 
 def main() -> int:
     """Run the campaign; exit 1 if a position was wrong, a limit passed, or something did not come back."""
-    parser = argparse.ArgumentParser(description="Drive servo drivers on faulty simulated hardware.")
-    parser.add_argument("--transactions", type=at_least(1), default=10_000, help="calls a driver and word")
-    parser.add_argument("--hours", type=positive_number, help="go on with new seeds for so long")
-    parser.add_argument("--seed", type=at_least(0), help="chosen and printed when left out")
+    parser = options(__doc__, 10_000, "calls a driver and word", seed=None, tasks=False)
+    parser.add_argument(
+        "--minutes", type=positive_number, metavar="T", help="go on with new seeds for so long"
+    )
+    parser.add_argument("--seed", type=at_least(0), metavar="S", help="chosen and printed when left out")
     parser.add_argument("--driver", choices=list(DRIVERS), action="append", help="one or more (default all)")
     parser.add_argument("--word", choices=WORDS, action="append", help="one or more (default all)")
     parser.add_argument(
         "--openings", type=at_least(1), help="only open a head so many times under each fault"
     )
     parser.add_argument("--out", type=new_file, help="file for the rows as JSON lines")
-    options = parser.parse_args()
+    args = parser.parse_args()
     logging.getLogger("drivers").setLevel(logging.CRITICAL)
-    seed = secrets.randbelow(2**31) if options.seed is None else options.seed
-    if options.openings is not None:
-        return 0 if run_openings(options.openings, seed) else 1
-    until_s = math.inf if options.hours is None else time.monotonic() + 3600 * options.hours
-    drivers, words = options.driver or DRIVERS, options.word or WORDS
-    rows: list[Row] = []
+    seed = secrets.randbelow(2**31) if args.seed is None else args.seed
+    if args.openings is not None:
+        return 0 if run_openings(args.openings, seed) else 1
+    until_s = math.inf if args.minutes is None else time.monotonic() + 60 * args.minutes
+    drivers, words = args.driver or DRIVERS, args.word or WORDS
+    rows: list[ServoRow] = []
     while True:
-        print(f"seed {seed}, {options.transactions} calls a driver and word\n{HEADING}", flush=True)
-        rows += run_all(drivers, words, options.transactions, seed, until_s)
-        if options.out is not None:
-            with suppress(OSError), options.out.open("a", encoding="utf-8") as file:
+        print(f"seed {seed}, {args.cases} calls a driver and word\n{HEADING}", flush=True)
+        rows += run_all(drivers, words, args.cases, seed, until_s)
+        if args.out is not None:
+            with suppress(OSError), args.out.open("a", encoding="utf-8") as file:
                 file.writelines(json.dumps(asdict(row)) + "\n" for row in rows)
-        if options.hours is None or time.monotonic() >= until_s:
+        if args.minutes is None or time.monotonic() >= until_s:
             break
         seed += 1
     bad = [row for row in rows if not row.good]

@@ -18,15 +18,14 @@ gives freed memory back at once, so that what is weighed is what it holds. Wante
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
 import tempfile
 import time
 from pathlib import Path
 
-from mastctl.cli.output import at_least, positive_number
 from tools.arguments import end
+from tools.campaign import options
 from tools.campaigns.soak_clients import Crowd
 from tools.campaigns.soak_ledger import SEES, Ledger
 from tools.living_daemon import HEADS, Vitals, simulated, started, vitals
@@ -46,16 +45,8 @@ WEIGH_S = 4.0
 
 def main() -> int:
     """Run it, print the tables; 1 if something was not as wanted."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument(
-        "--minutes",
-        type=positive_number,
-        default=20.0,
-        metavar="N",
-        help="how long after the warm-up (default 20)",
-    )
+    parser = options(__doc__, minutes=20.0, tasks=False)
     parser.add_argument("--head", choices=HEADS, default="memory", help="default memory")
-    parser.add_argument("--seed", type=at_least(0), default=1, metavar="S", help="of all draws (default 1)")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         wrong = soak(Path(folder), args.head, 60.0 * args.minutes, args.seed)

@@ -1,6 +1,6 @@
 """How soon a stop brakes one axis of a Dynamixel head while the other's servo fails, on the byte simulator.
 
-    python -m tools.campaigns.stop [--trials N] [--seed S]
+    python -m tools.campaigns.stop [--cases N] [--seed S]
 
 Each trial moves both axes, lets one servo fail, waits a random while (the failure is then unnoticed, being
 missed, or has already ended the session) and calls stop. For the axis that can be reached it tells when its
@@ -10,7 +10,6 @@ the call took. The watchdog is 0.3 s and a reply is waited for 0.05 s, as they c
 
 from __future__ import annotations
 
-import argparse
 import logging
 import random
 import time
@@ -21,9 +20,8 @@ from dataclasses import dataclass
 from drivers.errors import DriverError
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import VOLTAGE
-from mastctl.cli.output import at_least
-from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
+from tools.campaign import options, run_cases
 from tools.campaigns.servo_rigs import ACCELERATION_RAD_PER_S2, Rig, dynamixel
 
 AXES = ("pan", "tilt")
@@ -61,7 +59,7 @@ class Stopped:
 
 
 @dataclass(frozen=True)
-class Trial:
+class StopTrial:
     """One servo, by its axis, that has failed ``after_s`` seconds ago when the stop comes."""
 
     fault: str
@@ -70,7 +68,7 @@ class Trial:
     after_s: float
 
 
-def trial(one: Trial) -> Stopped:
+def trial(one: StopTrial) -> Stopped:
     """Stop a moving head of which one servo has failed; tell of the other axis."""
     logging.disable(logging.CRITICAL)  # each trial gives a line up, and says so
     fault, axis, after_s = one.fault, one.axis, one.after_s
@@ -122,25 +120,18 @@ def _until(true: Callable[[], bool]) -> None:
 
 def main() -> int:
     """Run the campaign and print its table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument(
-        "--trials", type=at_least(1), default=5, metavar="N", help="a fault and axis (default 5)"
-    )
-    parser.add_argument("--seed", type=at_least(0), default=1)
-    add_task_options(parser)
+    parser = options(__doc__, 5, "trials of a fault and axis")
     parser.set_defaults(workers=1)  # times are measured: two at once would make each other late
     args = parser.parse_args()
     trials = [
-        Trial(fault, axis, number, _after_s(args.seed, fault, axis, number))
+        StopTrial(fault, axis, number, _after_s(args.seed, fault, axis, number))
         for fault in FAULTS
         for axis in range(len(AXES))
-        for number in range(args.trials)
+        for number in range(args.cases)
     ]
-    found = results_of(
+    found = run_cases(
         args, "trials", trial, trials, lambda one: f"{one.fault}, {AXES[one.axis]}, trial {one.number}"
     )
-    if found is None:
-        return 0
     print(
         "fault          failed  brake ms: median  worst   call ms: worst   beyond a perfect brake mrad: worst"
     )

@@ -19,9 +19,8 @@ from mastctl.cli.output import at_least, positive_number
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
-from mastctl.experiment.demo import SimulationTruth
-from mastctl.experiment.pointing import run_pointing_experiment
-from mastctl.experiment.pointing_record import PointingExperiment, TargetRecord
+from mastctl.experiment.pointing import PointingExperiment, TargetRecord, run_pointing_experiment
+from mastctl.experiment.simulated import SimulationTruth
 from tools.arguments import end
 from tools.closed_loop import files
 

@@ -24,7 +24,7 @@ from drivers.sim.settings import scene_settings
 from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
-from mastctl.experiment.demo import own_config
+from mastctl.experiment.simulated import own_config
 
 EYE_M = np.array([0.0, 0.1, -1.5])
 BROKEN = """

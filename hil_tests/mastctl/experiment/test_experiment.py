@@ -16,8 +16,7 @@ from drivers.sim.settings import simulation_settings
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.config import load_config
-from mastctl.experiment.demo import demo_config
-from mastctl.experiment.pointing_record import (
+from mastctl.experiment.pointing import (
     Landing,
     PointingExperiment,
     TargetRecord,
@@ -25,8 +24,8 @@ from mastctl.experiment.pointing_record import (
     summarise_distance,
 )
 from mastctl.experiment.pointing_report import CSV_COLUMNS, pointing_table, write_pointing_report
-from mastctl.experiment.targets import on_level_ground, texture_mask
-from mastctl.experiment.views import pointed
+from mastctl.experiment.simulated import demo_config
+from mastctl.experiment.targets import on_level_ground, pointed, texture_mask
 
 NAN = math.nan
 

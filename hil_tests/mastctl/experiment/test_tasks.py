@@ -25,9 +25,8 @@ from hil_tests.mastctl.calibration.survey_world import RIG_FILE
 from hil_tests.mastctl.experiment.toy_tasks import Draw, broken_when_odd, calls, drawn, drawn_or_stuck
 from mastctl.cli.main import main
 from mastctl.experiment import tasks
-from mastctl.experiment.calibration import survey_tasks
-from mastctl.experiment.calibration_survey import one_survey
 from mastctl.experiment.tasks import Kept, OtherProgram, TaskFailed, Work
+from tools.studies.calibration_survey import one_survey, survey_tasks
 
 
 @contextmanager
@@ -176,7 +175,7 @@ def test_a_task_that_fails_takes_no_other_with_it(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_written_is_refused_in_words(tmp_path: Path, capsys: Any) -> None:
     (tmp_path / "file").write_text("")
-    words = ["experiment", "approach", "--results", str(tmp_path / "file"), "--json"]
+    words = ["experiment", "pointing", "--simulated", "--results", str(tmp_path / "file"), "--json"]
     assert main(words) == 2
     assert "is a file; a folder is expected" in json.loads(capsys.readouterr().out)["error"]["message"]
 
@@ -184,7 +183,7 @@ def test_a_folder_that_cannot_be_written_is_refused_in_words(tmp_path: Path, cap
 LONG = """
 import sys, time
 from pathlib import Path
-from mastctl.experiment.executors import open_executor
+from mastctl.experiment.tasks import open_executor
 from mastctl.experiment.tasks import Kept, Work
 from hil_tests.mastctl.experiment.toy_tasks import Draw, drawn_or_stuck
 
@@ -214,7 +213,7 @@ def test_a_killed_run_keeps_what_was_done_and_leaves_no_process(tmp_path: Path) 
 
 # Commands
 
-COVERAGE = ["experiment", "calibration", "--study", "prisms", "--surveys", "1", "--targets", "2", "--json"]
+POINTING = ["experiment", "pointing", "--simulated", "--targets", "1", "--distances", "6", "2", "--json"]
 
 
 def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(
@@ -225,7 +224,7 @@ def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Work, "run", interrupted)
-    assert main([*COVERAGE[:-1], "--results", str(tmp_path)]) == 130
+    assert main([*POINTING[:-1], "--results", str(tmp_path)]) == 130
     said = capsys.readouterr().err
     assert f"1 of 2 tasks are kept in {tmp_path}; the same command goes on" in said
 
@@ -237,6 +236,6 @@ def test_an_unknown_task_and_one_without_a_place_are_refused(
         (["--task", "0" * 16, "--results", str(tmp_path)], "is none of these 2 tasks"),
         (["--task", "0" * 16], "--task needs --results DIR"),
     ):
-        assert main([*COVERAGE, *words]) == 2
+        assert main([*POINTING, *words]) == 2
         assert reason in json.loads(capsys.readouterr().out)["error"]["message"]
     assert not list(tmp_path.iterdir())

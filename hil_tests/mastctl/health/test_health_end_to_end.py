@@ -14,8 +14,8 @@ from drivers.sim.pan_tilt import PRESETS
 from mastctl.client import Client
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon
-from mastctl.experiment.demo import demo_config
-from mastctl.experiment.views import Views
+from mastctl.experiment.simulated import demo_config
+from mastctl.experiment.targets import Views
 from mastctl.packaged import config_folder
 
 BUMP_RAD = 2e-3

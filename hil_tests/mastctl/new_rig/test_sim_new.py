@@ -18,7 +18,7 @@ from drivers.sim.settings import simulation_settings
 from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
-from mastctl.experiment.demo import own_config
+from mastctl.experiment.simulated import own_config
 from mastctl.new_rig.twin import true_twin
 
 FILES = ("config.yaml", "mast.yaml", "true_rig.yaml")

@@ -34,7 +34,7 @@ from mastctl.recorder.recorder import MastTold
 from mastctl.recorder.shelf import Shelf
 from mastctl.recorder.writer import Attached, RecordFile
 from mastctl.state.faults import StandingFault
-from tools.campaigns.record_kills import MOST_LOST_S, kills
+from tools.campaigns.kills import MOST_LOST_S, kills
 
 FAULT = StandingFault("pan_tilt", "no_reply", "it does not answer", 1.0, "it answers")
 

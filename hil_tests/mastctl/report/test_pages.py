@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from html.parser import HTMLParser
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,7 +16,9 @@ from mastctl.report import pages, plots
 from mastctl.report.figures import Figure, data_url
 from mastctl.report.pictures import encoded, enlarged, photo
 from mastctl.report.tables import Table, number, x_y
+from tools.studies import calibration
 
+STUDY = Path(calibration.__file__).with_suffix(".html")
 EVIL = "<script>alert('x')</script> & \"quoted\""
 
 
@@ -55,7 +58,7 @@ def study(**changed: object) -> str:
         "failures": table,
         **dict.fromkeys(("table_iv", "table_v", "pointing", "handoff"), table),
     }
-    return pages.page("calibration_study.html", **(told | changed))
+    return pages.page(STUDY, **(told | changed))
 
 
 def test_words_from_outside_are_never_markup() -> None:
@@ -73,9 +76,7 @@ def test_a_page_fetches_nothing() -> None:
 
 def test_a_name_that_nobody_gave_is_refused_rather_than_left_empty() -> None:
     with pytest.raises(UndefinedError, match="station"):
-        pages.page(
-            "calibration_study.html", title="t", badge=pages.Badge("b"), facts=[], table_iv=Table((), ())
-        )
+        pages.page(STUDY, title="t", badge=pages.Badge("b"), facts=[], table_iv=Table((), ()))
 
 
 def test_without_matplotlib_the_page_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

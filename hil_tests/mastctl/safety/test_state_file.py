@@ -190,12 +190,12 @@ def test_what_is_no_json_is_not_written(tmp_path: Path) -> None:
 
 
 def kills(*options: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tools.campaigns.state_kills", *options]
+    command = [sys.executable, "-m", "tools.campaigns.kills", "state", *options]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def test_processes_killed_while_they_write_leave_whole_files() -> None:
-    done = kills("--kills", "60")
+    done = kills("--cases", "60")
     assert done.returncode == 0, done.stdout + done.stderr
     found = {what: int(number) for number, _, what in (one.partition(" ") for one in done.stdout.split(", "))}
     assert found["kills"] == 60
@@ -203,6 +203,6 @@ def test_processes_killed_while_they_write_leave_whole_files() -> None:
 
 
 def test_the_campaign_of_kills_sees_a_careless_writer() -> None:
-    done = kills("--kills", "500", "--careless")
+    done = kills("--cases", "500", "--careless")
     assert done.returncode == 1
     assert "seed 1" in done.stdout

@@ -12,7 +12,7 @@ from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.web import PREFIX
 from mastctl.web.described import ANSWERS, EVENTS, FILES
-from tools.campaigns.fuzz_http import UNASKED, ask, taken_back
+from tools.campaigns.fuzz_daemon import UNASKED, ask, taken_back
 
 FUZZ_S = 30.0
 EXAMPLES = 4  # of each route, twice

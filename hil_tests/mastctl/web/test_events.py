@@ -31,7 +31,7 @@ from mastctl.state.publisher import TOPICS
 from mastctl.web import connections as connections_module
 from mastctl.web import sockets as sockets_module
 from mastctl.web.streams import Streams
-from tools.campaigns import fuzz_websocket
+from tools.campaigns import fuzz_daemon
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 
@@ -354,11 +354,11 @@ def test_nothing_that_is_sent_into_a_websocket_harms_the_daemon(
     pair: BOTH, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     daemon, _ = pair
-    monkeypatch.setattr(fuzz_websocket, "ATTACK_S", 0.5)
+    monkeypatch.setattr(fuzz_daemon, "ATTACK_S", 0.5)
     publisher = daemon.service.machine.publisher
     before = publisher.listeners
     with ThreadPoolExecutor(4) as pool:
-        done = fuzz_websocket.campaign(daemon.url, 0, 4 * len(fuzz_websocket.ATTACKS), pool)
+        done = fuzz_daemon.campaign(daemon.url, 0, 4 * len(fuzz_daemon.ATTACKS), pool)
     assert set(done.values()) == {4}
     until(lambda: publisher.listeners == before, "every attacker is forgotten")
     assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
@@ -367,19 +367,19 @@ def test_nothing_that_is_sent_into_a_websocket_harms_the_daemon(
 @pytest.mark.parametrize(
     ("sent", "code"),
     [
-        (fuzz_websocket.frame(1, b"hello"), 1003),
-        (fuzz_websocket.frame(2, b"", last=False), 1003),
-        (fuzz_websocket.frame(9, b"") * 100, 1008),
-        (fuzz_websocket.frame(1, b"", told_bytes=1 << 40), 1009),
-        (fuzz_websocket.frame(1, b"hello", masked=False), 1002),
+        (fuzz_daemon.frame(1, b"hello"), 1003),
+        (fuzz_daemon.frame(2, b"", last=False), 1003),
+        (fuzz_daemon.frame(9, b"") * 100, 1008),
+        (fuzz_daemon.frame(1, b"", told_bytes=1 << 40), 1009),
+        (fuzz_daemon.frame(1, b"hello", masked=False), 1002),
         (b"\xff" * 20, 1002),
-        (fuzz_websocket.frame(8, b"\x03\xe8") + fuzz_websocket.frame(2, b"more") * 3, 1000),
+        (fuzz_daemon.frame(8, b"\x03\xe8") + fuzz_daemon.frame(2, b"more") * 3, 1000),
     ],
 )
 def test_what_a_client_sends_ends_its_websocket_and_says_why(pair: BOTH, sent: bytes, code: int) -> None:
     daemon, _ = pair
     with socket.create_connection(("127.0.0.1", int(daemon.url.rpartition(":")[2])), timeout=NET_S) as line:
-        fuzz_websocket.opened(line, "/api/v1/events?topics=lease")
+        fuzz_daemon.opened(line, "/api/v1/events?topics=lease")
         line.sendall(sent)
         got = b"".join(iter(lambda: line.recv(65536), b""))
     assert got.rpartition(b"\x88")[2][1:3] == code.to_bytes(2, "big"), got
@@ -392,7 +392,7 @@ def test_a_websocket_whose_client_does_not_read_is_left(pair: BOTH, monkeypatch:
     before = publisher.listeners
     with socket.create_connection(("127.0.0.1", int(daemon.url.rpartition(":")[2])), timeout=NET_S) as line:
         line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        fuzz_websocket.opened(line)
+        fuzz_daemon.opened(line)
         until(lambda: publisher.listeners == before + 1, "it listens")
         began_s = time.monotonic()
 

@@ -1,8 +1,17 @@
-"""The demo: the pointing experiment on the packaged simulated rover, the truth beside each measurement."""
+"""The pointing experiment on the packaged simulated rover, the truth beside each measurement.
+
+A task's rover, its daemon and its draw begin anew, and time passes only on demand, so that a target comes to
+the same to the last bit whatever was done before it, here or elsewhere.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
@@ -10,8 +19,18 @@ from drivers.errors import BadOptions
 from drivers.faults import PAN_TILT
 from drivers.sim.rover import SimulatedRover
 from drivers.simulation_clock import MAX
-from mastctl.config import Config, Listen
+from mastctl.config import Config, Listen, load_config
 from mastctl.devices.frames import camera_and_sequence
+from mastctl.experiment.pointing import (
+    PointingExperiment,
+    head_pair,
+    run_pointing_experiment,
+    summarise_distance,
+)
+
+if TYPE_CHECKING:
+    from mastctl.client import Client
+    from mastctl.daemon import RunningDaemon
 
 
 def demo_config(
@@ -100,3 +119,71 @@ class SimulationTruth:
             return None
         x, y = self._rover.true_pixel(*camera_and_sequence(landed_frame_id), point)
         return float(x) - aim_px[0], float(y) - aim_px[1]
+
+
+@dataclass(frozen=True)
+class Rover:
+    """The packaged simulated rover; ``mast_file`` is what another mast file than the packaged one holds."""
+
+    head: str
+    seed: int
+    bricks: int = 0
+    mast_file: bytes | None = None
+
+
+@dataclass(frozen=True)
+class PointingTask:
+    """One target of the pointing experiment."""
+
+    rover: Rover
+    distance_m: float
+    index: int
+    pictures: bool = False
+
+
+@contextmanager
+def running_rover(rover: Rover) -> Iterator[tuple[RunningDaemon, Client, SimulatedRover]]:
+    """Start the rover behind a daemon of its own, with a client of it, and end both."""
+    from mastctl.client import Client
+    from mastctl.daemon import RunningDaemon  # late: `mastctl demo` compiles its renderer meanwhile
+
+    config = demo_config(load_config(None), head=rover.head, seed=rover.seed, bricks=rover.bricks)
+    with tempfile.TemporaryDirectory() as folder:
+        if rover.mast_file is not None:
+            config = replace(config, mast_file=Path(folder) / "mast.yaml")
+            config.mast_file.write_bytes(rover.mast_file)
+        with RunningDaemon(config) as daemon, Client(daemon.url) as client:
+            assert daemon.hardware.simulation is not None  # the packaged configuration is a simulated rover
+            yield daemon, client, daemon.hardware.simulation
+
+
+def one_pointing(task: PointingTask) -> PointingExperiment:
+    """Point at one target, on a rover of its own."""
+    with running_rover(task.rover) as (daemon, client, rover):
+        rig = daemon.service.stored.rig
+        camera = head_pair(rig, set(client.status()["cameras"]))[0]
+        return run_pointing_experiment(
+            client,
+            targets=1,
+            distances_m=(task.distance_m,),
+            seed=task.rover.seed,
+            truth=SimulationTruth(rover),
+            notes=(head_note(rover, rig, camera),),
+            pictures=int(task.pictures),
+            first=task.index,
+        )
+
+
+def joined_pointings(parts: Sequence[PointingExperiment]) -> PointingExperiment:
+    """Return one experiment of many with a target each; its time is that of all targets one after another."""
+    records = [record for part in parts for record in part.records]
+    seconds = dict.fromkeys(dict.fromkeys(record.distance_m for record in records), 0.0)
+    for part in parts:
+        seconds[part.records[0].distance_m] += part.seconds
+    summaries = [
+        summarise_distance(distance, [r for r in records if r.distance_m == distance], spent)
+        for distance, spent in seconds.items()
+    ]
+    return replace(
+        parts[0], records=tuple(records), summaries=tuple(summaries), seconds=sum(seconds.values())
+    )

@@ -9,18 +9,18 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mastctl.experiment.handoff_record import (
+from mastctl.handoff.log import HandoffLog
+from mastctl.report import pages, pictures, plots
+from mastctl.report.figures import Figure
+from mastctl.report.records import write_csv, write_json
+from mastctl.report.tables import Table, number, x_y
+from tools.studies.handoff_record import (
     PAPER_WORST_PX,
     Handed,
     HandoffExperiment,
     HandoffRecord,
     HandoffSummary,
 )
-from mastctl.handoff.log import HandoffLog
-from mastctl.report import pages, pictures, plots
-from mastctl.report.figures import Figure
-from mastctl.report.records import write_csv, write_json
-from mastctl.report.tables import Table, number, x_y
 
 CSV_COLUMNS = (
     "handoff", "target", "kind", "range_m", "frame_id", "clicked_x_px", "clicked_y_px", "camera",
@@ -142,7 +142,7 @@ def _page(experiment: HandoffExperiment) -> str:
     pictured = [r for r in records if r.source_image is not None and r.handed]
     handed = any(record.handed for record in records)
     return pages.page(
-        "handoff.html",
+        Path(__file__).with_name("handoff.html"),
         title="Hand-off experiment",
         badge=badge,
         facts=facts,

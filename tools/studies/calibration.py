@@ -1,28 +1,48 @@
-"""The study of calibration as tables, as JSON, as CSV and as one self-contained HTML page."""
+"""How good a survey must be: the paper's Tables IV and V, and what pointing by other surveys is worth.
+
+    .venv/bin/python -m tools.studies.calibration --cases 10 --seed 1 --out study
+
+Simulated surveys, larger and smaller, better and worse, each fitted and judged by pointings and hand-offs
+with what comes out. One thing is varied at a time from the paper's survey.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from calib.files.mast_file import load_rig
 from calib.mast.rig import Rig
-from mastctl.experiment.calibration import PAPER_TABLE_V, CalibrationExperiment, VariantSummary
-from mastctl.experiment.calibration_survey import (
-    DISTANCES_M,
-    HANDOFFS,
-    NAVCAM_TO_HAZCAM,
-    PANCAM_TO_NAVCAM,
-    Handoff,
-    SurveyOutcome,
-)
-from mastctl.experiment.calibration_variants import PAPER_STATION_M
+from mastctl.cli.experiment_common import tell_report
+from mastctl.cli.output import WrongUse, at_least, print_table
+from mastctl.cli.places import check_folder
+from mastctl.packaged import config_folder
 from mastctl.report import pages, plots
 from mastctl.report.figures import Figure
 from mastctl.report.records import write_csv, write_json
 from mastctl.report.tables import Table, number, x_y
+from tools.arguments import end
+from tools.campaign import options, run_cases
+from tools.studies.calibration_survey import (
+    DISTANCES_M,
+    HANDOFFS,
+    NAVCAM_TO_HAZCAM,
+    PANCAM_TO_NAVCAM,
+    PAPER_STATION_M,
+    PAPER_TABLE_V,
+    CalibrationExperiment,
+    Handoff,
+    SurveyOutcome,
+    VariantSummary,
+    one_survey,
+    survey_tasks,
+    variants,
+)
 
 SIX = ("txm, m", "tym, m", "tzm, m", "θxm, rad", "θym, rad", "θzm, rad")
 STUDIES = {
@@ -142,7 +162,7 @@ def write_study_report(experiment: CalibrationExperiment, folder: Path) -> Path:
 def _page(experiment: CalibrationExperiment) -> str:
     failures = [[o.variant.study, o.variant.label, o.failure] for o in experiment.outcomes if o.failure]
     return pages.page(
-        "calibration_study.html",
+        Path(__file__).with_suffix(".html"),
         title="Calibration experiment",
         badge=pages.Badge("SIMULATED", "simulated"),
         facts=[
@@ -257,3 +277,54 @@ def _six(rig: Rig) -> np.ndarray:
 
 def _numbers(values: np.ndarray, sign: bool = True) -> list[str]:
     return [f"{value:+.4f}" if sign else f"{value:.4f}" for value in values]
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the study; 1 if no survey at all could be fitted."""
+    parser = options(__doc__, 10, "surveys of each kind, some 6 minutes on two processors", as_json=True)
+    parser.add_argument(
+        "--rig", type=Path, metavar="MAST.yaml", help="the true rig (default: the packaged simulated rover's)"
+    )
+    parser.add_argument(
+        "--targets", type=at_least(1), default=20, metavar="N",
+        help="targets of each survey at each distance (default 20)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--study", action="append", metavar="NAME",
+        choices=("placements", "boards", "station", "prisms", "hazcam", "mast"),
+        help="placements, boards, station, prisms, hazcam or mast; may be given several times (default: all)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for report.html, surveys.csv and record.json"
+    )
+    args = parser.parse_args(words)
+    rig = load_rig(args.rig or config_folder() / "sim" / "rocky8.yaml").rig
+    if "navcam" not in rig.stereo:
+        raise WrongUse("the rig has no stereo pair navcam, which the study clicks in")
+    check_folder(args.out, "--out")
+    chosen = [v for v in variants() if args.study is None or v.study.startswith(tuple(args.study))]
+    begun_s = time.monotonic()
+    outcomes = run_cases(
+        args,
+        "surveys",
+        one_survey,
+        survey_tasks(rig, surveys=args.cases, targets=args.targets, seed=args.seed, chosen=chosen),
+        lambda task: f"{task.variant.study} {task.variant.label}, survey {task.seed[1]}",
+        failure=lambda outcome: outcome.failure,
+    )
+    seconds = time.monotonic() - begun_s
+    study = CalibrationExperiment(rig, args.seed, args.cases, tuple(outcomes), seconds)
+
+    def tables(notes: list[str]) -> None:
+        mast = table_iv(study)
+        if len(mast.rows) > 1:
+            print_table("Table IV, mast parameters", *mast.turned())
+            print_table("Table V, rms residuals of the mast's images, px", *table_v(study))
+        print_table("Errors, px: rms an axis, and worst", *short_rows(study.summaries), notes)
+
+    tell_report(args, partial(write_study_report, study), lambda: study_as_json(study), tables)
+    return 0 if any(not outcome.failure for outcome in study.outcomes) else 1
+
+
+if __name__ == "__main__":
+    end(main)

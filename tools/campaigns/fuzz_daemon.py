@@ -1,16 +1,25 @@
-"""Send a daemon's WebSocket what no client sends, many at a time, and see that it costs nobody anything.
+"""Ask a daemon all that its /openapi.json allows and much that it does not; attack its WebSocket.
 
-    .venv/bin/python -m tools.campaigns.fuzz_websocket --minutes 10
+    .venv/bin/python -m tools.campaigns.fuzz_daemon http --minutes 10
+    .venv/bin/python -m tools.campaigns.fuzz_daemon websocket --minutes 10
 
-Each attack is a connection of its own: a wrong or half handshake, noise, frames with flipped bits, frames
-that promise gigabytes, texts without an end, pings whose answers nobody reads, closings of any kind, silence.
-A daemon with the simulated rover must go on to answer its status and stops, log no error, and have forgotten
-every attacker afterwards. Frames are made here by RFC 6455 and not by a library.
+``http``: a daemon of its own with the simulated rover is asked by schemathesis: all its checks (no 5xx;
+status, kind, form and headers as described; what is wrong is refused) but one. That every body which fits the
+form is accepted cannot hold: which keys go together (exactly one target), what is in reach and which ids
+there are stands in no form. Left out are the two endless event streams (/events, /track/stream) and
+/health/ready, whose 503 is an answer. What is asked at random latches emergency stops, takes leases and sets
+faults, for which nearly all that follows would be refused: they are taken back twice a second. For a third of
+the time it asks as who holds the lease, with bodies that fit the form, so that commands are carried out too.
+Exit code 1 if anything was found.
+
+``websocket``: each attack is a connection of its own: a wrong or half handshake, noise, frames with flipped
+bits, frames that promise gigabytes, texts without an end, pings whose answers nobody reads, closings of any
+kind, silence. A daemon with the simulated rover must go on to answer its status and stops, log no error, and
+have forgotten every attacker afterwards. Frames are made here by RFC 6455 and not by a library.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import logging
@@ -18,18 +27,98 @@ import random
 import resource
 import socket
 import struct
+import subprocess
 import sys
+import tempfile
+import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from mastctl.cli.output import positive_number
-from mastctl.client import Client
+from mastctl.client import Client, ClientError
+from mastctl.commands.lease import LONGEST_S
+from mastctl.config import Listen, load_config
+from mastctl.daemon import RunningDaemon
+from mastctl.web import PREFIX
 from tools.arguments import end
-from tools.campaigns.fuzz_http import simulated_daemon
+from tools.campaign import options
+
+LEFT_OUT = ("positive_data_acceptance",)
+UNASKED = f"^{PREFIX}/(events|track/stream|health/ready)$"
+UNASKED_AS_HOLDER = f"^{PREFIX}/(events|track/stream|health/ready|stop|estop|lease.*)$"
+DEADLINE_S = 20.0
+TAKEN_BACK_EACH_S = 0.5
+
+
+@contextlib.contextmanager
+def simulated_daemon() -> Iterator[str]:
+    """A daemon with the simulated rover on a free port; its address."""
+    config = replace(load_config(), listen=Listen(port=0))
+    with RunningDaemon(config) as daemon:
+        yield daemon.url
+
+
+def ask(url: str, seconds: float | None, examples: int, seed: int | None = None) -> int:
+    """Have schemathesis ask, as anybody and as who steers; return its exit code, its words go to stdout.
+
+    With ``seconds`` None each route is asked ``examples`` times as anybody and as who steers, and no more.
+    """
+    common = ["--max-examples", str(examples), *(() if seed is None else ("--seed", str(seed)))]
+    phases = "examples,fuzzing" if seconds is None else "examples,coverage,fuzzing"
+    with taken_back(url):
+        anybody = ["--exclude-path-regex", UNASKED, "--phases", phases]
+        code = _asked(url, None if seconds is None else 2.0 / 3.0 * seconds, [*anybody, *common])
+    if code != 0:
+        return code
+    with Client(url, name="holder") as client:
+        lease = client.acquire_lease(for_s=LONGEST_S, take_over="the campaign goes on")["lease_id"]
+    holder = ["--exclude-path-regex", UNASKED_AS_HOLDER, "--phases", "fuzzing", "--mode", "positive"]
+    headers = ["--header", f"Mastctl-Lease: {lease}", "--header", f"Deadline-S: {DEADLINE_S:g}"]
+    return _asked(url, None if seconds is None else seconds / 3.0, [*holder, *headers, *common])
+
+
+def _asked(url: str, seconds: float | None, options: Sequence[str]) -> int:
+    command = [
+        *(str(Path(sys.executable).with_name("schemathesis")), "run", f"{url}/openapi.json", "--no-color"),
+        *("--checks", "all", "--exclude-checks", ",".join(LEFT_OUT)),
+        *(() if seconds is None else ("--max-time", f"{seconds:.0f}")),
+        *("--request-timeout", "60", "--warnings", "off", *options),
+    ]
+    with tempfile.TemporaryDirectory() as folder:  # it leaves a folder where it runs
+        return subprocess.run(command, cwd=folder, text=True, check=False).returncode
+
+
+@contextlib.contextmanager
+def taken_back(url: str) -> Iterator[None]:
+    """Take back again and again, inside the block, what has commands refused."""
+    over = threading.Event()
+
+    def work() -> None:
+        with Client(url, name="taken-back") as client:
+            while not over.wait(TAKEN_BACK_EACH_S):
+                for take_back in (
+                    lambda: client.reset(reason="the campaign goes on", name="taken-back"),
+                    lambda: client.use_lease(client.acquire_lease(take_over="it goes on")["lease_id"]),
+                    client.release_lease,
+                    client.clear_faults,
+                ):
+                    with contextlib.suppress(ClientError):  # nothing was latched; no simulated rover
+                        take_back()
+
+    thread = threading.Thread(target=work, name="taken back", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+# The WebSocket
 
 AT_ONCE = 8
 FLOOD = 4000
@@ -179,7 +268,7 @@ def attack(url: str, seed: int) -> str:
     return one.__name__
 
 
-class Errors(logging.Handler):
+class LoggedErrors(logging.Handler):
     """What the daemon logs that is no mere warning."""
 
     def __init__(self) -> None:
@@ -206,19 +295,28 @@ def held() -> tuple[float, int]:
 
 
 def main() -> int:
-    """Run the campaign."""
-    parser = argparse.ArgumentParser(description="Send a daemon's WebSocket what no client sends.")
-    parser.add_argument("--minutes", type=positive_number, default=10.0, help="how long (default 10)")
-    parser.add_argument("--seed", type=int, default=1, help="of the first attack (default 1)")
+    """Ask or attack; 1 if anything was found."""
+    parser = options(__doc__, seed=None, minutes=10.0, tasks=False)
+    parser.add_argument("of", choices=("http", "websocket"))
+    parser.add_argument("--examples", type=int, default=100000, help="http: at most for each route")
+    parser.add_argument("--seed", type=int, help="http: of an earlier run; websocket: of the first attack")
     args = parser.parse_args()
-    errors = Errors()
+    with simulated_daemon() as url:
+        if args.of == "http":
+            return ask(url, 60.0 * args.minutes, args.examples, args.seed)
+        return attacked(url, 60.0 * args.minutes, 1 if args.seed is None else args.seed)
+
+
+def attacked(url: str, seconds: float, first: int) -> int:
+    """Attack for so long and print what it cost; 1 if an error was logged, or something is still held."""
+    errors = LoggedErrors()
     logging.getLogger().addHandler(errors)
     counts: Counter[str] = Counter()
-    with simulated_daemon() as url, ThreadPoolExecutor(AT_ONCE) as pool:
-        counts += campaign(url, args.seed, 200, pool)
-        before, until_s = held(), time.monotonic() + 60.0 * args.minutes
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        counts += campaign(url, first, 200, pool)
+        before, until_s = held(), time.monotonic() + seconds
         while time.monotonic() < until_s:
-            counts += campaign(url, args.seed + counts.total(), 200, pool)
+            counts += campaign(url, first + counts.total(), 200, pool)
         time.sleep(2.0 * ATTACK_S)
         after = held()
     told = {"attacks": dict(counts), "rss_mb": [before[0], after[0]], "descriptors": [before[1], after[1]]}

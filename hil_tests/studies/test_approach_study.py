@@ -18,20 +18,20 @@ from calib.mast.pointing import solve
 from calib.mast.rig import Rig
 from drivers.sim import bricks, rocks
 from drivers.sim.scene import Scene, SceneSettings, make_grid, tiny_scene
-from mastctl.cli.main import main
-from mastctl.experiment import approach
-from mastctl.experiment.approach import ROCK_M, ROCKS, START_M, ApproachRun, Stop
-from mastctl.experiment.approach_report import (
+from mastctl.experiment.tasks import Kept
+from tools.studies import approach_run as approach
+from tools.studies.approach import (
     approach_table,
     handoffs,
     losses,
+    main,
     strip,
     summary,
     write_record,
     write_strip,
 )
-from mastctl.experiment.approach_world import WINDOW_PX, ApproachWorld, WorldErrors, windowed
-from mastctl.experiment.tasks import Kept
+from tools.studies.approach_run import ROCK_M, ROCKS, START_M, ApproachRun, Stop
+from tools.studies.approach_world import WINDOW_PX, ApproachWorld, WorldErrors, windowed
 
 
 def stop(range_m: float, error_m: tuple[float, float, float], state: str = "tracked") -> Stop:
@@ -233,9 +233,10 @@ def test_the_command_says_what_targets_lie_on(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("mastctl.experiment.approach_report.write_strip", lambda run, folder: None)
-    command = ["experiment", "approach", "--runs", "2", "--results", str(tmp_path), *words]
-    assert main([*command, "--list-tasks", "--json"]) == 0
+    monkeypatch.setattr("tools.studies.approach.write_strip", lambda run, folder: None)
+    command = ["--cases", "2", "--results", str(tmp_path), *words]
+    with pytest.raises(SystemExit, match=r"^0$"):
+        main([*command, "--list-tasks", "--json"])
     for row in json.loads(capsys.readouterr().out)["tasks"]:
         assert row["task"].startswith(f"on {on}, seed ")
         run = ApproachRun(int(row["task"].split()[-1]), (stop(1.05, (0.001, 0.0, 0.0)),))
@@ -244,7 +245,8 @@ def test_the_command_says_what_targets_lie_on(
     assert f"targets on {on}" in capsys.readouterr().out
     record = json.loads((tmp_path / "out" / "record.json").read_text())
     assert [run["seed"] for run in record["runs"]] == [1, 2]
-    assert main(["experiment", "approach", "--on", "sand"]) == 2
+    with pytest.raises(SystemExit, match=r"^2$"):
+        main(["--on", "sand"])
 
 
 def test_a_task_is_the_approach_of_its_seed(monkeypatch: pytest.MonkeyPatch, repository: Path) -> None:

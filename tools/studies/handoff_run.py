@@ -23,13 +23,17 @@ from calib.mast.covariance import RigCovariance, stored_covariance
 from calib.mast.rig import Rig
 from calib.pictures.warp import grey
 from mastctl.client import Client, ClientError, Snapshot
-from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise_handoffs
-from mastctl.experiment.known_points import KnownPoint, KnownPoints
-from mastctl.experiment.pointing import ClickTruth
-from mastctl.experiment.run_time import RunTime
-from mastctl.experiment.targets import Target
-from mastctl.experiment.views import VIEWS_PER_TARGET, Views
+from mastctl.experiment.pointing import ClickTruth, RunTime
+from mastctl.experiment.targets import VIEWS_PER_TARGET, Target, Views
 from mastctl.tracking.matched import JOINT_SIGMA_RAD
+from tools.studies.handoff_record import (
+    Handed,
+    HandoffExperiment,
+    HandoffRecord,
+    KnownPoint,
+    KnownPoints,
+    summarise_handoffs,
+)
 
 STEPS: tuple[tuple[str, str, float], ...] = (("pancam", "navcam", 6.0), ("navcam", "hazcam", 2.0))
 """The paper's hand-offs: from, to, distance in metres."""

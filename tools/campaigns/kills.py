@@ -1,11 +1,16 @@
-"""A recorder killed at random moments, many times: what of its recording is lost, and is the rest whole?
+"""Processes killed at random moments, many times: what of their files is lost, and is the rest whole?
 
-    python -m tools.campaigns.record_kills [--kills N] [--at-once N] [--seed S] [--folder DIR]
+    .venv/bin/python -m tools.campaigns.kills record [--cases 1000] [--at-once 4] [--seed 1] [--folder DIR]
+    .venv/bin/python -m tools.campaigns.kills state [--cases 1000] [--seed 1]
 
-Each child tells a recorder a numbered message every 5 ms and a picture every 50 ms, and notes in shared
-memory which it told last and when; it gets SIGKILL after 0.1 to 3 s. Then its files must begin with the mast
-file, hold every number from the first to the last without a gap, and after a repair be read whole by the
-mcap library's own reader. Told is how long before its end a child's last message that is on the disk was.
+``record``: each child tells a recorder a numbered message every 5 ms and a picture every 50 ms, and notes in
+shared memory which it told last and when; it gets SIGKILL after 0.1 to 3 s. Then its files must begin with
+the mast file, hold every number from the first to the last without a gap, and after a repair be read whole by
+the mcap library's own reader. Told is how long before its end a child's last message that is on the disk was.
+
+``state``: each process saves numbered documents of many sizes one after the other, and tells each number when
+it is saved. What is read after its death must be whole, and the last document that was told as saved, or the
+one that was being saved.
 """
 
 from __future__ import annotations
@@ -21,6 +26,7 @@ import signal
 import struct
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,10 +35,12 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.records import Attachment
 
+from calib.errors import BadFile
 from calib.files.mast_file import parse_rig
 from drivers.clock import SystemClock
 from drivers.mcap_file import Entry, Found, read_items
 from mastctl.cli.output import at_least
+from mastctl.config import load_config
 from mastctl.devices.frames import StampedFrame
 from mastctl.packaged import default_config
 from mastctl.recorder import recorder as recorder_module
@@ -40,7 +48,9 @@ from mastctl.recorder.recorder import MastTold, Recorder
 from mastctl.recorder.repair import repair
 from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.writer import Attached
+from mastctl.safety.state_file import StateFile
 from tools.arguments import end
+from tools.campaign import options
 
 MOST_LOST_S = 1.0
 STEP_S = 0.005
@@ -63,8 +73,6 @@ class Killed:
 
 def mast_of(config: Path) -> MastTold:
     """Return the mast file that a configuration names."""
-    from mastctl.config import load_config
-
     path = load_config(config).mast_file
     data = path.read_bytes()
     return MastTold(parse_rig(data, path).rig, Attached(path.name, data))
@@ -193,17 +201,108 @@ def kills(count: int, at_once: int, seed: int, folder: Path) -> list[Killed]:
     return results
 
 
+# State files
+
+STATE_SCHEMA = "mastctl/kills/1"
+STATE_LATEST_S = 0.05
+
+
+class BadState(Exception):
+    """What was read is neither what was saved last nor what was being saved."""
+
+
+def document(number: int) -> dict[str, object]:
+    """Return the document of a number; its size goes up and down."""
+    return {"number": number, "filling": str(number % 10) * (1 + number * 977 % 60_000)}
+
+
+def write_for_ever(path: Path, first: int, careless: bool, told: int) -> None:
+    """Save one document after the other and tell each on a descriptor; in the process that is killed."""
+    file = StateFile(path, STATE_SCHEMA)
+    number = first
+    while True:
+        os.write(told, f"begun {number}\n".encode())
+        if careless:
+            path.write_text(json.dumps({"schema": STATE_SCHEMA, **document(number)}))
+        else:
+            file.write(document(number))
+        os.write(told, f"saved {number}\n".encode())
+        number += 1
+
+
+def kill_writers(folder: Path, kills: int, seed: int, careless: bool = False) -> Counter[str]:
+    """Start and kill writers of one file; return how often what was found.
+
+    Raises
+    ------
+    BadState
+        If what a killed writer has left is not whole, or is an old one.
+    """
+    draw = random.Random(seed)
+    path, counts, saved = folder / "state.json", Counter[str](), 0
+    for kill in range(kills):
+        words = _killed_writer(path, saved + 1, draw.uniform(0.0, STATE_LATEST_S), careless)
+        if not words:
+            raise BadState(f"kill {kill}: the writer ended by itself; seed {seed}")
+        begun = max(int(line.split()[1]) for line in words if line.startswith("begun"))
+        known = max((int(line.split()[1]) for line in words if line.startswith("saved")), default=saved)
+        try:
+            found = StateFile(path, STATE_SCHEMA).read()
+        except BadFile as error:
+            raise BadState(f"kill {kill}: {error}; seed {seed}") from None
+        number = 0 if found is None else found["number"]
+        if number not in (known, begun) or (number and found != document(number)):
+            raise BadState(f"kill {kill}: {number} is there, {known} was saved, {begun} begun; seed {seed}")
+        counts["kills"] += 1
+        counts["in the middle of a save"] += begun > known
+        counts["of these the new one was there"] += begun > known and number == begun
+        saved = number
+    return counts
+
+
+def _killed_writer(path: Path, first: int, after_s: float, careless: bool) -> list[str]:
+    """Start a writer, kill it a while after its first word, and return what it told; nothing if it failed."""
+    reading, writing = os.pipe()
+    writer = os.fork()
+    if not writer:
+        try:
+            os.close(reading)
+            write_for_ever(path, first, careless, writing)
+        finally:
+            os._exit(1)
+    os.close(writing)
+    with os.fdopen(reading) as stream:
+        words = [stream.readline()]
+        time.sleep(after_s)
+        os.kill(writer, signal.SIGKILL)
+        os.waitpid(writer, 0)
+        return [*words, *stream.read().splitlines()] if words[0] else []
+
+
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kills", type=at_least(1), default=1000, help="how many (default 1000)")
+    """Kill, and print what was left; 1 if anything is wrong."""
+    parser = options(__doc__, 1000, "kills", tasks=False)
+    parser.add_argument("of", choices=("record", "state"))
     parser.add_argument(
         "--at-once", type=at_least(1), default=4, help="children beside each other (default 4)"
     )
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--folder", type=Path, help="where recordings lie (default: a temporary folder)")
+    parser.add_argument("--folder", type=Path, help="where files lie (default: a temporary folder)")
+    parser.add_argument("--careless", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args(words)
     with tempfile.TemporaryDirectory(dir=args.folder) as folder:
-        results = kills(args.kills, args.at_once, args.seed, Path(folder))
+        if args.of == "record":
+            return _told(kills(args.cases, args.at_once, args.seed, Path(folder)))
+        try:
+            counts = kill_writers(Path(folder), args.cases, args.seed, args.careless)
+        except BadState as error:
+            print(error)
+            return 1
+    print(", ".join(f"{number} {what}" for what, number in counts.items()))
+    return 0
+
+
+def _told(results: Sequence[Killed]) -> int:
+    """Print what recorders left."""
     wrong = [one.wrong for one in results if one.wrong]
     lost = sorted(one.lost_s for one in results)
     print(f"kills {len(results)}, messages told {sum(one.told for one in results)}, ", end="")

@@ -22,9 +22,9 @@ from calib.tracking.start import start_track
 from calib.tracking.track import Track, moved_track
 from drivers.interfaces import Image
 from drivers.sim.scene import SceneSettings, build_scene
-from mastctl.experiment.approach_world import ApproachWorld, WorldErrors
 from mastctl.experiment.targets import texture_mask
 from mastctl.tracking.choice import choose_pairs
+from tools.studies.approach_world import ApproachWorld, WorldErrors
 
 START_M, END_M = 10.0, 1.0
 STEP = 0.1

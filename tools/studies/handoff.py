@@ -1,18 +1,34 @@
-"""``mastctl experiment handoff``: the paper's hand-offs on a daemon, or on the packaged simulated rover."""
+"""The paper's hand-offs (section V) on a daemon, or on the packaged simulated rover, and their errors.
+
+    .venv/bin/python -m tools.studies.handoff --simulated --targets 20 --out handed
+
+Targets are handed from Pancam to Navcam at 6 m and on to Hazcam at 2 m. ``--out`` gets a page, the tables,
+and handoffs.jsonl, by which ``mastctl calibrate --refine`` corrects body cameras.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+from calib.files.mast_file import load_rig
 from mastctl.cli import output
-
-if TYPE_CHECKING:
-    from mastctl.client import Client
-    from mastctl.experiment.handoff_record import HandoffExperiment, HandoffRecord
+from mastctl.cli.experiment_common import run_bar, tell_report
+from mastctl.cli.places import check_folder
+from mastctl.cli.service import add_daemon_options, client_of, refuse_daemon_options
+from mastctl.cli.tasks import refuse_task_options
+from mastctl.client import Client
+from mastctl.config import load_config
+from mastctl.experiment.simulated import Rover, SimulationTruth, running_rover
+from tools.arguments import end
+from tools.campaign import options, run_cases
+from tools.studies.handoff_record import BrickPoints, HandoffExperiment, HandoffRecord, summarise_handoffs
+from tools.studies.handoff_report import bias_sentences, handoff_table, write_handoff_report
+from tools.studies.handoff_run import STEPS, run_handoff_experiment
 
 PICTURES_PER_STEP = 4
 TARGETS = {"ground": "textured ground", "corner": "bricks' corners", "face": "middles of bricks' faces"}
@@ -20,16 +36,57 @@ MOST_BRICKS = 24  # what a scene takes
 MOST_POINTS = 9  # of one brick: its upper corners and its faces but the bottom
 
 
-def add_parser(kinds: Any) -> None:
-    """Add ``handoff`` to the experiments."""
-    from mastctl.cli.experiment_common import add_run_options, at_least_one
-    from mastctl.cli.service import add_daemon_options
-    from mastctl.cli.tasks import add_task_options
+@dataclass(frozen=True)
+class HandoffTask:
+    """One target of a hand-off from a pair; with bricks, all of them, ``targets`` at most."""
 
-    parser = kinds.add_parser(
-        "handoff",
-        help="hand targets from Pancam to Navcam at 6 m and on to Hazcam at 2 m, and measure the errors",
+    rover: Rover
+    source: str
+    index: int
+    click_px: float
+    targets: int = 1
+    pictures: int = 0
+
+
+def one_handoff(task: HandoffTask) -> HandoffExperiment:
+    """Hand over one target, or all bricks of a step, on a rover of its own."""
+    with running_rover(task.rover) as (_, client, rover):
+        return run_handoff_experiment(
+            client,
+            targets=task.targets,
+            seed=task.rover.seed,
+            click_px=task.click_px,
+            truth=SimulationTruth(rover),
+            points=BrickPoints(rover) if task.rover.bricks else None,
+            pictures=task.pictures,
+            first=task.index,
+            chosen=(task.source,),
+        )
+
+
+def joined_handoffs(parts: Sequence[HandoffExperiment]) -> HandoffExperiment:
+    """Return one experiment of many; its time is that of all targets one after another."""
+    records = [record for part in parts for record in part.records]
+    cameras = dict.fromkeys((row.step, row.camera) for part in parts for row in part.summaries)
+    kinds = dict.fromkeys(record.kind for record in records)
+    summaries = [
+        summarise_handoffs(step, kind, camera, records)
+        for step in dict.fromkeys(step for step, _ in cameras)
+        for kind in kinds
+        for of_step, camera in cameras
+        if of_step == step
+    ]
+    return replace(
+        parts[0],
+        records=tuple(records),
+        summaries=tuple(summaries),
+        seconds=sum(part.seconds for part in parts),
     )
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the experiment; 1 if no target at all was handed over."""
+    parser = options(__doc__, as_json=True)
     add_daemon_options(parser)
     parser.add_argument(
         "--simulated", action="store_true",
@@ -40,11 +97,11 @@ def add_parser(kinds: Any) -> None:
         help="with --simulated: the mast file that its daemon uses (default: the packaged one)",
     )  # fmt: skip
     parser.add_argument(
-        "--targets", type=at_least_one, metavar="N",
+        "--targets", type=output.at_least(1), metavar="N",
         help="targets of each hand-off (default 10, with --bricks all that show)",
     )  # fmt: skip
     parser.add_argument(
-        "--bricks", type=at_least_one, metavar="N",
+        "--bricks", type=output.at_least(1), metavar="N",
         help="put N bricks (at most 24) into the simulation, by turns at 2 m and at 6 m; their corners and "
         "the middles of their faces are the targets",
     )  # fmt: skip
@@ -52,39 +109,25 @@ def add_parser(kinds: Any) -> None:
         "--click-px", type=output.not_negative, default=0.2, metavar="PX",
         help="sigma of the noise added to the clicks (default 0.2)",
     )  # fmt: skip
-    out_help = "folder for report.html, targets.csv, handoffs.jsonl and record.json"
-    add_run_options(parser, "chooses views and pixels", out_help)
-    add_task_options(parser)
-    parser.set_defaults(run=run)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Run the experiment; 1 if no target at all was handed over."""
-    from mastctl.cli.places import check_folder
-    from mastctl.cli.service import client_of
-    from mastctl.cli.tasks import refuse_task_options
-
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR",
+        help="folder for report.html, targets.csv, handoffs.jsonl and record.json",
+    )  # fmt: skip
+    args = parser.parse_args(words)
     if args.mast_file is not None and not args.simulated:
         raise output.WrongUse("--mast-file belongs to --simulated; a running daemon has its own mast file")
     if args.bricks is not None and not (args.simulated and args.bricks <= MOST_BRICKS):
         raise output.WrongUse(f"--bricks {args.bricks}: 1 to {MOST_BRICKS} are possible, with --simulated")
     check_folder(args.out, "--out")
     if args.simulated:
-        return _run_simulated(args)
+        return _tell(args, _simulated(args))
     refuse_task_options(args)
     with client_of(args) as client:
-        return _tell(args, _run(args, client))
+        return _tell(args, _on_daemon(args, client))
 
 
-def _run_simulated(args: argparse.Namespace) -> int:
+def _simulated(args: argparse.Namespace) -> HandoffExperiment:
     """Run each target on a simulated rover of its own; bricks, all of a step on one."""
-    from calib.files.mast_file import load_rig
-    from mastctl.cli.experiment_simulated import HandoffTask, Rover, joined_handoffs, one_handoff
-    from mastctl.cli.service import refuse_daemon_options
-    from mastctl.cli.tasks import results_of
-    from mastctl.config import load_config
-    from mastctl.experiment.handoff import STEPS
-
     refuse_daemon_options(args)
     stereo = load_rig(args.mast_file or load_config(None).mast_file).rig.stereo
     sources = [source for source, to, _ in STEPS if {source, to} <= set(stereo)]
@@ -104,23 +147,19 @@ def _run_simulated(args: argparse.Namespace) -> int:
             for source in sources
             for index in range(args.targets or 10)
         ]
-    parts = results_of(
+    parts = run_cases(
         args,
         "hand-off",
         one_handoff,
         tasks,
         lambda task: f"from {task.source}, " + ("all bricks" if args.bricks else f"target {task.index}"),
-        lambda part: next((record.error for record in part.records if record.error), ""),
+        failure=lambda part: next((record.error for record in part.records if record.error), ""),
     )
-    return 0 if parts is None else _tell(args, joined_handoffs(parts))
+    return joined_handoffs(parts)
 
 
-def _run(args: argparse.Namespace, client: Client) -> HandoffExperiment:
+def _on_daemon(args: argparse.Namespace, client: Client) -> HandoffExperiment:
     """Run on a running daemon, with a progress bar on stderr, one step a target."""
-
-    from mastctl.cli.experiment_common import run_bar
-    from mastctl.experiment.handoff import STEPS, run_handoff_experiment
-
     targets = args.targets or 10
     with run_bar(args, "hand-off", targets * len(STEPS)) as step:
 
@@ -139,9 +178,6 @@ def _run(args: argparse.Namespace, client: Client) -> HandoffExperiment:
 
 
 def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
-    from mastctl.cli.experiment_common import tell_report
-    from mastctl.experiment.handoff_report import bias_sentences, handoff_table, write_handoff_report
-
     def show(notes: list[str]) -> None:
         noise = f"clicks with {experiment.click_px:g} px of noise; lengths in px of the destination camera"
         kinds = list(dict.fromkeys(row.kind for row in experiment.summaries))
@@ -155,3 +191,7 @@ def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
 
     tell_report(args, partial(write_handoff_report, experiment), experiment.as_json, show)
     return 0 if any(record.handed for record in experiment.records) else 1
+
+
+if __name__ == "__main__":
+    end(main)

@@ -21,19 +21,25 @@ from calib.rigid import Rigid
 from drivers.sim import bricks
 from drivers.sim.rover import SimulatedRover
 from drivers.sim.scene import Scene, tiny_scene
-from mastctl.cli import experiment_handoff
-from mastctl.cli.main import main
+from mastctl.cli.output import WrongUse
 from mastctl.client import Client, ClientError
-from mastctl.experiment.handoff import run_handoff_experiment
-from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise_handoffs
-from mastctl.experiment.handoff_report import (
+from mastctl.handoff.log import read_log
+from tools.studies import handoff as study
+from tools.studies.handoff_record import (
+    BrickPoints,
+    Handed,
+    HandoffExperiment,
+    HandoffRecord,
+    KnownPoint,
+    summarise_handoffs,
+)
+from tools.studies.handoff_report import (
     handoff_table,
     handoff_targets,
     view_picture,
     write_handoff_report,
 )
-from mastctl.experiment.known_points import BrickPoints, KnownPoint
-from mastctl.handoff.log import read_log
+from tools.studies.handoff_run import run_handoff_experiment
 
 STEP = "navcam to hazcam"
 FRAME = "hazcam_left-000001-00000000-0000"
@@ -155,9 +161,9 @@ def test_bricks_points_are_seen_only_where_nothing_hides_them(repository: Path) 
 
 
 @pytest.mark.parametrize("words", [["--bricks", "3"], ["--simulated", "--bricks", "25"]])
-def test_bricks_are_the_simulations_and_few(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["experiment", "handoff", *words]) == 2
-    assert "1 to 24 are possible, with --simulated" in " ".join(capsys.readouterr().err.split())
+def test_bricks_are_the_simulations_and_few(words: list[str]) -> None:
+    with pytest.raises(WrongUse, match="1 to 24 are possible, with --simulated"):
+        study.main(words)
 
 
 class StuckDaemon:
@@ -254,13 +260,50 @@ def test_an_experiment_without_any_target_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     nothing = HandoffExperiment({"hardware": "simulated"}, 1, 0.2, (), (), "now", 3.0)
-    monkeypatch.setattr(experiment_handoff, "_run", lambda args, client: nothing)
+    monkeypatch.setattr(study, "_on_daemon", lambda args, client: nothing)
     out = tmp_path / "report"
-    assert main(["experiment", "handoff", "--out", str(out)]) == 1
+    assert study.main(["--url", "http://127.0.0.1:9", "--out", str(out)]) == 1
     told = capsys.readouterr().out.splitlines()
     assert told == ["no target was found to hand over", f"report: {out / 'report.html'}"]
 
 
-def test_another_mast_file_is_for_the_simulated_rover_only(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["experiment", "handoff", "--mast-file", "m.yaml", "--json"]) == 2
-    assert "--simulated" in json.loads(capsys.readouterr().out)["error"]["message"]
+def test_another_mast_file_is_for_the_simulated_rover_only() -> None:
+    with pytest.raises(WrongUse, match="--simulated"):
+        study.main(["--mast-file", "m.yaml"])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--executor", "dask:tcp://127.0.0.1:1"], ["--workers", "2"], ["--list-tasks"], ["--results", "kept"]],
+)
+def test_a_running_daemon_takes_no_executor(words: list[str]) -> None:
+    with pytest.raises(WrongUse, match=f"{words[0]} belongs to --simulated"):
+        study.main(["--url", "http://127.0.0.1:9", *words])
+
+
+def test_simulated_rovers_are_no_running_daemon() -> None:
+    with pytest.raises(WrongUse, match="names a running daemon"):
+        study.main(["--simulated", "--url", "http://127.0.0.1:9"])
+
+
+def test_another_mast_file_is_another_task_by_its_content(
+    tmp_path: Path, repository: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    packaged = (repository / "configs/masts/rocky8_simulated.yaml").read_text()
+    names = []
+    for name, text in (("a.yaml", packaged), ("b.yaml", packaged), ("c.yaml", f"# another\n{packaged}")):
+        (tmp_path / name).write_text(text)
+        words = [
+            "--simulated",
+            "--targets",
+            "1",
+            "--mast-file",
+            str(tmp_path / name),
+            "--list-tasks",
+            "--json",
+        ]
+        with pytest.raises(SystemExit, match=r"^0$"):
+            study.main(words)
+        names.append([row["id"] for row in json.loads(capsys.readouterr().out)["tasks"]])
+    assert names[0] == names[1] != names[2]
+    assert len(names[0]) == 2, "from Pancam and from Navcam"

@@ -1,4 +1,10 @@
-"""What an approach experiment tells and leaves: the table beside the paper's Table I, records, pictures."""
+"""The paper's approach (Fig. 1, Table I) on the simulated rover: a target picked at 10 m, followed to 1 m.
+
+    .venv/bin/python -m tools.studies.approach --cases 5 --out approaches
+
+Each run follows a rock from Pancam to Navcam to Hazcam, a minute a run. It prints the errors of the tracked
+stops beside the paper's Table I; ``--out`` gets the record of all stops and their pictures.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +17,19 @@ from typing import Any
 import cv2
 import numpy as np
 
+from calib.files.mast_file import load_rig
 from calib.mast.budget import target_approach_budget
 from calib.rigid import FloatArray
 from drivers.interfaces import Image
-from mastctl.experiment.approach import ApproachRun, Stop
+from mastctl.cli import output
+from mastctl.cli.places import check_folder
+from mastctl.packaged import config_folder
 from mastctl.report import pictures, plots
 from mastctl.report.records import write_csv, write_json
 from mastctl.report.tables import Table
+from tools.arguments import end
+from tools.campaign import options, run_cases
+from tools.studies.approach_run import ApproachRun, ApproachTask, Stop, one_approach
 
 PAPER_CM = {"stereo": 9.7, "untracked": 22.2, "tracked": 1.5}
 """Table I as printed, Pancam: stereo at 10 m, the approach without and with ideal tracking; 3 sigma."""
@@ -215,3 +227,57 @@ def _errors_by_range(runs: Sequence[ApproachRun], stops: Sequence[Stop]) -> Any:
     axis.set_xlabel("range, m")
     figure.axes[0].legend(loc="upper right")
     return figure
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the approaches; 1 if no target at all was kept."""
+    parser = options(__doc__, 5, "approaches", as_json=True)
+    parser.add_argument(
+        "--mast", type=Path, metavar="MAST.yaml",
+        help="the mast file that is believed (default: the packaged one, from a simulated survey)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--on", choices=("rocks", "ground"), default="rocks",
+        help="what targets lie on (default rocks; ground: wherever there is texture)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR",
+        help="folder for stops.csv, record.json, a strip of pictures a run, and error.png",
+    )  # fmt: skip
+    args = parser.parse_args(words)
+    check_folder(args.out, "--out")
+    true = load_rig(config_folder() / "sim" / "rocky8.yaml").rig
+    believed = load_rig(args.mast or config_folder() / "masts" / "rocky8_simulated.yaml").rig
+    if lacking := [pair for pair in true.stereo if pair not in believed.stereo]:
+        raise output.WrongUse(f"--mast {args.mast} has no stereo pair '{lacking[0]}'")
+    runs: dict[int, ApproachRun] = {}
+
+    def done(one: ApproachRun) -> None:
+        runs[one.seed] = one
+        if args.out is not None and not args.task:  # after every run: what is interrupted leaves its record
+            write_record([runs[seed] for seed in sorted(runs)], args.out)
+            write_strip(one, args.out)
+
+    tasks = [ApproachTask(true, believed, args.seed + index, args.on) for index in range(args.cases)]
+    found = run_cases(
+        args, "approaches", one_approach, tasks, lambda task: f"on {task.on}, seed {task.seed}",
+        found=_how, done=done,
+    )  # fmt: skip
+    if args.json:
+        output.print_json(summary(found))
+    else:
+        notes = [counted(found)]
+        notes += ["3 times the rms, along the line of sight, to its right and below it, in the rover frame"]
+        notes += [f"record: {args.out}"] if args.out is not None else []
+        title = f"Approach from 10 m to 1 m, targets on {args.on}, simulated rover"
+        output.print_table(title, *approach_table(found), notes)
+    return 0 if any(one.kept for one in found) else 1
+
+
+def _how(one: ApproachRun) -> str:
+    """How a run went, in words."""
+    return one.error or ("kept" if one.kept else f"lost: {one.stops[-1].reason}" if one.stops else "lost")
+
+
+if __name__ == "__main__":
+    end(main)

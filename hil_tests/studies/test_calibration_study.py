@@ -1,4 +1,4 @@
-"""``mastctl experiment calibration``: the same numbers wherever it runs, and what it shows."""
+"""The study of calibration: the same numbers wherever it runs, and what it shows."""
 
 from __future__ import annotations
 
@@ -23,13 +23,17 @@ from calib.survey import Sigma, Survey
 from drivers.sim_survey.survey import SurveyPlan
 from hil_tests.mastctl.calibration.survey_world import RIG_FILE
 from mastctl.calibration.run import FITS
-from mastctl.cli.main import main
-from mastctl.experiment.calibration import CalibrationExperiment, survey_tasks
-from mastctl.experiment.calibration_report import study_as_json, table_iv, table_v, write_study_report
-from mastctl.experiment.calibration_survey import SurveyOutcome, SurveyTask, one_survey
-from mastctl.experiment.calibration_variants import Variant, variants
-from mastctl.experiment.executors import NoExecutor, open_executor
-from mastctl.experiment.tasks import Work
+from mastctl.experiment.tasks import NoExecutor, Work, open_executor
+from tools.studies.calibration import main, study_as_json, table_iv, table_v, write_study_report
+from tools.studies.calibration_survey import (
+    CalibrationExperiment,
+    SurveyOutcome,
+    SurveyTask,
+    Variant,
+    one_survey,
+    survey_tasks,
+    variants,
+)
 
 PLAN = SurveyPlan(sigma=Sigma(0.002, 0.1))
 CHOSEN = (
@@ -137,8 +141,8 @@ def test_the_report_and_the_document(experiment: CalibrationExperiment, tmp_path
 
 def test_the_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     few = tuple(replace(v, study="prisms") for v in CHOSEN[1:])
-    monkeypatch.setattr("mastctl.experiment.calibration_variants.variants", lambda: few)
-    words = ["experiment", "calibration", "--study", "prisms", "--surveys", "1", "--targets", "2"]
+    monkeypatch.setattr("tools.studies.calibration.variants", lambda: few)
+    words = ["--study", "prisms", "--cases", "1", "--targets", "2"]
     assert main([*words, "--workers", "1", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert [v["study"] for v in told["variants"]] == ["prisms"]
@@ -163,14 +167,11 @@ def test_an_unknown_executor_is_refused(name: str) -> None:
         pass
 
 
-def test_dask_without_its_package_is_refused_plainly(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_dask_without_its_package_is_refused_plainly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    assert main(["experiment", "calibration", "--executor", "dask:tcp://127.0.0.1:1", "--json"]) == 2
-    error = json.loads(capsys.readouterr().out)["error"]
-    assert error["code"] == "no_executor"
-    assert "pip install distributed" in error["message"]
+    with pytest.raises(NoExecutor, match="pip install distributed") as refused:
+        main(["--executor", "dask:tcp://127.0.0.1:1", "--json"])
+    assert (refused.value.code, refused.value.exit_code) == ("no_executor", 2)
 
 
 def test_a_silent_scheduler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

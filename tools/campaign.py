@@ -1,0 +1,151 @@
+"""A campaign: cases that are drawn, each a task of its own; what came of them as a table or as JSON.
+
+What a case is stands in the campaign: a value that carries its seed, and a function of it. The rest is here:
+the options that all have, the processes (or the cluster) that carry cases out, and how results are printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mastctl.cli.output import at_least, positive_number
+from mastctl.cli.tasks import add_task_options, results_of
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+Row = Mapping[str, Any]
+
+
+def options(
+    doc: str | None,
+    cases: int | None = None,
+    of: str = "",
+    *,
+    seed: int | None = 1,
+    minutes: float | None = None,
+    as_json: bool = False,
+    tasks: bool = True,
+) -> argparse.ArgumentParser:
+    """Return a campaign's parser.
+
+    Parameters
+    ----------
+    doc
+        The module's docstring, which its help shows.
+    cases, of
+        Default of ``--cases``, and what a case is of; None: it has no such option.
+    seed
+        Default of ``--seed``; None: nothing is drawn.
+    minutes
+        Default of ``--minutes``; None: it does not go by time.
+    as_json
+        Whether there is ``--json``.
+    tasks
+        Whether its cases are tasks (docs/how-to/campaigns.md).
+    """
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    if cases is not None:
+        words = f"{of or 'how many'} (default {cases})"
+        parser.add_argument("--cases", type=at_least(1), default=cases, metavar="N", help=words)
+    if minutes is not None:
+        words = f"how long (default {minutes:g})"
+        parser.add_argument("--minutes", type=positive_number, default=minutes, metavar="T", help=words)
+    if seed is not None:
+        words = f"of all that is drawn; cases with seeds of their own begin there (default {seed})"
+        parser.add_argument("--seed", type=at_least(0), default=seed, metavar="S", help=words)
+    if as_json:
+        parser.add_argument("--json", action="store_true", help="one JSON document")
+    if tasks:
+        add_task_options(parser)
+    return parser
+
+
+def run_cases(
+    args: argparse.Namespace,
+    what: str,
+    function: Callable[[Task], Result],
+    tasks: Sequence[Task],
+    label: Callable[[Task], str] = str,
+    **told: Callable[[Result], Any],
+) -> list[Result]:
+    """Return the results of tasks in their order, as `mastctl.cli.tasks.results_of` runs and tells them.
+
+    Where tasks are only listed, or some of them run, the command ends here.
+    """
+    found = results_of(args, what, function, tasks, label, **told)
+    if found is None:
+        raise SystemExit(0)
+    return found
+
+
+def show(args: argparse.Namespace, rows: Iterable[Row], columns: Mapping[str, str], below: str = "") -> None:
+    """Print rows: one JSON document with ``--json``, else a table as docs have it.
+
+    Parameters
+    ----------
+    columns
+        Heading to a format of the row's keys, such as ``{rms_px:.2f}``; of a key that is not there, or is
+        None, the cell stays empty.
+    below
+        A key of sentences that stand under their row.
+    """
+    if args.json:
+        print(json.dumps(list(rows)))
+        return
+    print(heading(columns))
+    for row in rows:
+        print(line(*(_cell(form, row) for form in columns.values())), flush=True)
+        for words in row.get(below) or ():
+            print(f"    {words}")
+
+
+def heading(columns: Iterable[str]) -> str:
+    """Return the first two lines of a table."""
+    names = tuple(columns)
+    return f"{line(*names)}\n{'| --- ' * len(names)}|"
+
+
+def line(*cells: object) -> str:
+    """Return one line of a table."""
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def _cell(form: str, row: Row) -> str:
+    try:
+        return form.format_map(row)
+    except (KeyError, TypeError, IndexError):
+        return ""
+
+
+def rms(values: ArrayLike) -> float:
+    """Return the root mean square of all numbers; not-a-number of none."""
+    numbers = np.asarray(values, dtype=float)
+    return float(np.sqrt(np.mean(numbers**2))) if numbers.size else float("nan")
+
+
+def percent(held: Sequence[bool]) -> float | None:
+    """Return how many of a hundred hold; None of nothing."""
+    return 100.0 * sum(held) / len(held) if held else None
+
+
+def held_percent(by_case: Sequence[ArrayLike]) -> tuple[float, float]:
+    """Return the mean over cases of how many of a hundred hold in each, and its standard error.
+
+    Errors of one case go together, so that the scatter of whole cases is what tells how sure a rate is.
+    """
+    rates = 100 * np.array([np.mean(held) for held in by_case])
+    return float(rates.mean()), float(rates.std(ddof=1) / np.sqrt(len(rates))) if len(rates) > 1 else np.nan
+
+
+def numbers(words: str) -> tuple[float, ...]:
+    """Read numbers of 0 or more with commas between them (argparse ``type``)."""
+    values = tuple(float(word) for word in words.split(","))
+    if not all(0.0 <= value < np.inf for value in values):
+        raise argparse.ArgumentTypeError(f"{words!r} where numbers of 0 or more are expected")
+    return values
