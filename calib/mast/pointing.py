@@ -25,7 +25,7 @@ _SAME_RAD = 1e-7
 """Solutions closer than this are one: at the edge of reach two meet, good to the root of rounding."""
 
 _PARALLEL = 1e-3
-"""|cos k| below this: the axes are parallel to a milliradian, and the mast is not a pan/tilt head."""
+"""``|cos k|`` below this: the axes are parallel to a milliradian, and the mast is not a pan/tilt head."""
 
 _FARTHEST_M = 1e9
 """Coordinates from here on are taken for a mistake; their squares would overflow in the end."""
@@ -62,9 +62,9 @@ def solve(
     -------
     list of Solution
         For arrays of more than one axis what ``solve_many`` returns, which says so to a type checker too.
-        For one target never empty. Upright solutions (tilt within ±π/2) first, then by the larger of |Δpan|
-        and |Δtilt|. The differences are plain ones, not taken round the circle: a head with a cable cannot
-        pass ±π.
+        For one target never empty. Upright solutions (tilt within ±π/2) first, then by the larger of
+        ``|Δpan|`` and ``|Δtilt|``. The differences are plain ones, not taken round the circle: a head with a
+        cable cannot pass ±π.
         Each has the target in front of the camera (range_m > 0). Limits are left to ``choose``. For a target
         on the pan axis every pan does; from_pan_rad is returned.
 
@@ -74,7 +74,7 @@ def solve(
         ``blind_cone``: too near the pan axis, with the distance from the axis that could be reached.
         ``too_near``: nearer than the ray can be brought, with both distances. ``bad_pixel``, ``bad_target``:
         the pixel has no ray, or the target is not three finite numbers below 1e9 m. ``parallel_axes``:
-        |cos k| < 0.001. ``bad_joints``: where the head is now is not finite.
+        ``|cos k|`` < 0.001. ``bad_joints``: where the head is now is not finite.
 
     Notes
     -----

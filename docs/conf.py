@@ -1,0 +1,33 @@
+"""The site: Sphinx, MyST pages, furo's theme, and a reference from the code (`tools/site_pages.py`)."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))  # Sphinx imports this file from wherever it was started
+
+from tools.site_pages import write_pages  # noqa: E402
+
+project = "mastctl"
+author = "the mastctl developers"
+copyright = "the mastctl developers, Apache-2.0"
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_heading_anchors = 4
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = "mastctl"
+autodoc_typehints = "description"
+autodoc_member_order = "bysource"
+napoleon_google_docstring = False
+
+write_pages(HERE / "reference" / "generated")

@@ -1,0 +1,37 @@
+"""The site of docs/: it builds, and nothing in it points to what is not there."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+@pytest.mark.long(
+    1, "half a minute: the whole site is built, with broken links, images and references as errors"
+)
+def test_the_site_builds_without_a_warning(repository: Path, tmp_path: Path) -> None:
+    build = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-q",
+        "-W",
+        "--keep-going",
+        "-b",
+        "html",
+        "-d",
+        tmp_path / "trees",
+    ]
+    done = subprocess.run([*build, repository / "docs", tmp_path / "html"], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "calib.solve" in (tmp_path / "html/reference/generated/python-calib.html").read_text()
+
+
+def test_every_page_stands_in_the_contents(repository: Path) -> None:
+    docs = repository / "docs"
+    pages = {str(page.relative_to(docs).with_suffix("")) for page in docs.rglob("*.md")}
+    pages = {page for page in pages if not page.startswith(("decisions/", "reference/generated/", "_build/"))}
+    assert pages - {"index"} <= set((docs / "index.md").read_text().split())

@@ -1,0 +1,183 @@
+"""Pages of the reference that are written from the code at each build: commands, HTTP, Python names.
+
+`write_pages` fills ``docs/reference/generated``, which git ignores. Nothing here states a fact of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import calib
+from mastctl.cli.main import build_parser
+from mastctl.web.app import api
+from mastctl.web.described import description
+
+PYTHON = {
+    "Pointing, calibration and cameras: `calib`": ["calib"],
+    "Client: `mastctl.client`": ["mastctl.client"],
+    "pytest fixtures: `mastctl.testing`": ["mastctl.testing"],
+    "Driver protocols: `drivers`": ["drivers.interfaces", "drivers.errors", "drivers.clock"],
+}
+"""Titles of the pages of Python names, and the modules whose public names stand on each."""
+
+BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
+
+
+def write_pages(folder: Path) -> None:
+    """Write all pages; one whose text has not changed keeps its time stamp, so that builds stay quick."""
+    pages = {"commands.md": commands_page(), "http-api.md": http_page(json.loads(description(api())))}
+    for title, modules in PYTHON.items():
+        pages[f"python-{modules[0].replace('.', '-')}.md"] = python_page(title, modules)
+    folder.mkdir(exist_ok=True)
+    for name, text in pages.items():
+        file = folder / name
+        if not file.is_file() or file.read_text() != text:
+            file.write_text(text)
+
+
+def commands_page() -> str:
+    """Return every command with its options, as `--help` has them."""
+    lines = ["# Commands", ""]
+    lines += ["Written from the parsers, so that it agrees with `mastctl COMMAND --help`.", ""]
+    for depth, parser in _parsers(build_parser([]), 1):
+        lines += [f"{'#' * min(depth, 4)} `{parser.prog}`", ""] if depth > 1 else []
+        lines += [_plain(parser.description or ""), ""]
+        lines += ["```text", _usage(parser), "```", ""]
+        rows = [row for action in parser._actions if (row := _option(action))]
+        if rows:
+            lines += ["| option | meaning |", "| --- | --- |", *rows, ""]
+        if parser.epilog:
+            lines += [_plain(parser.epilog), ""]
+    return "\n".join(lines)
+
+
+def _parsers(parser: argparse.ArgumentParser, depth: int) -> Iterator[tuple[int, argparse.ArgumentParser]]:
+    yield depth, parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for one in dict.fromkeys(action.choices.values()):
+                yield from _parsers(one, depth + 1)
+
+
+def _usage(parser: argparse.ArgumentParser) -> str:
+    return parser.format_usage().removeprefix("usage: ").rstrip()
+
+
+def _option(action: argparse.Action) -> str | None:
+    if isinstance(action, (argparse._SubParsersAction, argparse._HelpAction)) or action.dest == "json":
+        return None
+    if action.help == argparse.SUPPRESS:
+        return None
+    value = action.metavar if isinstance(action.metavar, str) else action.dest.upper()
+    if isinstance(action.metavar, tuple):
+        value = " ".join(action.metavar)
+    if action.choices:
+        value = "|".join(map(str, action.choices))
+    names = " or ".join(f"`{one}`" for one in action.option_strings) or f"`{value}`"
+    if action.option_strings and action.nargs != 0:
+        names += f" `{value}`"
+    meaning = (action.help or "") % {**vars(action), "prog": ""} if action.help else ""
+    return f"| {names.replace('|', chr(92) + '|')} | {_cell(meaning)} |"
+
+
+def http_page(openapi: dict[str, Any]) -> str:
+    """Return every path with its body, parameters and answers, as ``/openapi.json`` has them."""
+    lines = ["# HTTP paths", ""]
+    lines += ["Written from `/openapi.json`; [The daemon's interface](../http.md) explains them.", ""]
+    for path, methods in openapi["paths"].items():
+        for method, told in methods.items():
+            words = told.get("description") or told.get("summary", "")
+            lines += [f"## {method.upper()} {path}", "", _plain(words), ""]
+            rows = [
+                (f"`{one['name']}` ({one['in']})", _kind(one["schema"]), one.get("description", ""))
+                for one in told.get("parameters", ())
+            ]
+            body = _schema(told.get("requestBody", {}), openapi)
+            rows += _fields(body, "body", openapi)
+            if rows:
+                lines += _table("field", rows)
+            codes = (f"{code} {_plain(one['description'])}" for code, one in told["responses"].items())
+            lines += [f"Answers: {', '.join(codes)}.", ""]
+            answer = _fields(_schema(told["responses"].get("200", {}), openapi), "", openapi)
+            if answer:
+                lines += _table("answer", answer)
+    return "\n".join(lines)
+
+
+def _table(first: str, rows: list[tuple[str, str, str]]) -> list[str]:
+    lines = [f"| {first} | type | meaning |", "| --- | --- | --- |"]
+    return [*lines, *(f"| {name} | {_cell(kind)} | {_cell(words)} |" for name, kind, words in rows), ""]
+
+
+def _schema(place: dict[str, Any], openapi: dict[str, Any]) -> dict[str, Any]:
+    schema: dict[str, Any] = place.get("content", {}).get("application/json", {}).get("schema", {})
+    return _resolved(schema, openapi)
+
+
+def _resolved(schema: dict[str, Any], openapi: dict[str, Any]) -> dict[str, Any]:
+    while "$ref" in schema:
+        schema = openapi["components"]["schemas"][schema["$ref"].rpartition("/")[2]]
+    return schema
+
+
+def _fields(schema: dict[str, Any], where: str, openapi: dict[str, Any]) -> list[tuple[str, str, str]]:
+    needed = set(schema.get("required", ()))
+    beside = f" ({where})" if where else ""
+    return [
+        (
+            f"`{name}`{beside}{'' if name in needed or not where else ', optional'}",
+            _kind(one),
+            one.get("description", ""),
+        )
+        for name, one in schema.get("properties", {}).items()
+    ]
+
+
+def _kind(schema: dict[str, Any]) -> str:
+    if "$ref" in schema:
+        return str(schema["$ref"].rpartition("/")[2])
+    if "enum" in schema:
+        return ", ".join(f"`{json.dumps(one)}`" for one in schema["enum"])
+    if "const" in schema:
+        return f"`{json.dumps(schema['const'])}`"
+    for many in ("anyOf", "oneOf", "allOf"):
+        if many in schema:
+            return " or ".join(dict.fromkeys(_kind(one) for one in schema[many]))
+    kind = str(schema.get("type", "any"))
+    if kind == "array":
+        items = schema.get("items") or (schema.get("prefixItems") or [{}])[0]
+        return f"list of {_kind(items)}"
+    bounds = [f"{sign} {schema[key]:g}" for key, sign in BOUNDS.items() if key in schema]
+    return " ".join([kind, *bounds])
+
+
+def python_page(title: str, modules: list[str]) -> str:
+    """Return the directives by which autodoc writes the public names of these modules."""
+    lines = [f"# {title}", ""]
+    for module in modules:
+        lines += ["```{eval-rst}", f".. automodule:: {module}", "   :no-members:", ""]
+        names = calib.__all__ if module == "calib" else None
+        if names is None:
+            lines += [f".. automodule:: {module}", "   :members:", "   :noindex:", ""]
+        else:
+            for name in names:
+                is_class = isinstance(getattr(calib, name), type)
+                members = ["   :members:"] if is_class else []
+                kind = "autoclass" if is_class else "autofunction"
+                lines += [f".. {kind}:: {module}.{name}", *members, ""]
+        lines += ["```", ""]
+    return "\n".join(lines)
+
+
+def _plain(text: str) -> str:
+    """Return a help text as Markdown that shows every sign of it."""
+    return re.sub(r"([<>*_\[\]])", r"\\\1", text.replace("%%", "%")).replace("``", "`")
+
+
+def _cell(text: str) -> str:
+    return _plain(" ".join(text.split())).replace("|", "\\|")
