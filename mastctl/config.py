@@ -24,10 +24,9 @@ from mastctl.devices.keep_out import Box
 from mastctl.devices.limits import Limits
 from mastctl.devices.sun import LEAST_CONE_RAD, SUN, WIDEST_CONE_RAD, Frame, Sun, direction_of
 from mastctl.live.settings import LiveSettings
+from mastctl.motion.settings import HandoffRules, PairBounds, TrackingSettings
 from mastctl.packaged import default_config
 from mastctl.recorder.settings import RecordSettings
-from mastctl.tracking.choice import HandoffRules, PairBounds
-from mastctl.tracking.settings import TrackingSettings
 
 CONFIG_SCHEMA = "mastctl/config/1"
 DEFAULT_HOST = "127.0.0.1"
@@ -96,7 +95,7 @@ class Listen:
 class Config:
     """A daemon's configuration; paths are absolute or relative to the working folder. ``data``: its bytes.
 
-    ``repeat_after_s``: as `mastctl.pointing.settings.PointingSettings` has it, None for its default.
+    ``repeat_after_s``: as `mastctl.motion.settings.PointingSettings` has it, None for its default.
     """
 
     path: Path

@@ -19,7 +19,7 @@ from hil_tests.drivers.turned import Gate, Turned
 from hil_tests.waiting import NET_S
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
-from mastctl.pointing.loop import AnglesTarget, PointingError, PointingLoop, PointRequest
+from mastctl.motion.loop import AnglesTarget, PointingError, PointingLoop, PointRequest
 from tools.campaigns.servo_rigs import dynamixel, ptu
 
 BARE = Rig("bare", Mast(np.zeros(3), np.zeros(3)), {}, {})

@@ -23,7 +23,7 @@ from drivers.interfaces import Camera, Frame, PanTilt
 from drivers.open_hardware import open_hardware
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
-from mastctl.pointing.loop import (
+from mastctl.motion.loop import (
     AnglesTarget,
     PixelTarget,
     PointingError,

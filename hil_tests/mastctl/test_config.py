@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from calib.errors import BadFile
 from hil_tests.mastctl.service_fakes import rig
 from mastctl.config import Config, Listen, check_cameras, load_config, parse_address, parse_config
+from mastctl.motion.settings import PairBounds
 from mastctl.packaged import config_folder, default_config
-from mastctl.tracking.choice import PairBounds
 
 GOOD: dict[str, Any] = {
     "schema": "mastctl/config/1",

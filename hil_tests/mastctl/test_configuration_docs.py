@@ -28,7 +28,7 @@ from drivers.sim.scene import SceneSettings
 from drivers.sim.warmth import TemperatureSettings
 from drivers.v4l2 import options as v4l2
 from mastctl import config
-from mastctl.pointing.settings import PointingSettings
+from mastctl.motion.settings import PointingSettings
 
 PAGE = Path("docs") / "reference" / "configuration.md"
 

@@ -24,7 +24,7 @@ from mastctl.devices import frames, joint_history, rest, stops
 from mastctl.devices.cameras import CAMERA_GRACE_S
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
-from mastctl.pointing.settings import PointingSettings
+from mastctl.motion.settings import PointingSettings
 from mastctl.service import service as service_module
 
 

@@ -1,6 +1,6 @@
 """How long a command is given that asks for no time of its own.
 
-Each move has its own deadline, from distance over speed (`mastctl.pointing.motion`); this one is behind
+Each move has its own deadline, from distance over speed (`mastctl.motion.head`); this one is behind
 those, for an operation as a whole.
 """
 

@@ -37,10 +37,12 @@ from mastctl.live.settings import LiveSettings
 from mastctl.live.view import LiveView, check_installed
 from mastctl.metrics.history import History
 from mastctl.metrics.metrics import Metrics
+from mastctl.motion.jog import Jogs
+from mastctl.motion.requests import wrong_camera
+from mastctl.motion.track import ACTIVE, TrackStatus
+from mastctl.motion.tracker import Tracker
 from mastctl.operations.operations import Operations
 from mastctl.operations.records import Operation, last_frame
-from mastctl.pointing.jog import Jogs
-from mastctl.pointing.wanted import wrong_camera
 from mastctl.safety import heads, stop_socket
 from mastctl.safety.latch import Latch
 from mastctl.safety.state_folder import StateFolder
@@ -60,8 +62,6 @@ from mastctl.service.stopping import Stopping, state_faults
 from mastctl.service_manager import ServiceManager
 from mastctl.state.faults import StandingFault
 from mastctl.state.machine import Machine
-from mastctl.tracking.status import ACTIVE, TrackStatus
-from mastctl.tracking.tracker import Tracker
 
 log = logging.getLogger(__name__)
 

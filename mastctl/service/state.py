@@ -14,9 +14,9 @@ from mastctl.as_json import as_json, picked
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.limits import Limits
+from mastctl.motion.track import TrackStatus
 from mastctl.state.faults import StandingFault
 from mastctl.state.standing import Standing
-from mastctl.tracking.status import TrackStatus
 
 AS_THEY_ARE = (
     "hardware", "moving", "limits", "mast", "former_mast", "version", "now_s", "stop_socket",

@@ -16,17 +16,23 @@ from mastctl.devices.devices import Devices
 from mastctl.devices.frames import check_known
 from mastctl.errors import NotNow
 from mastctl.health.health import CalibrationHealth
+from mastctl.motion.loop import PointingLoop
+from mastctl.motion.requests import (
+    AnglesTarget,
+    PixelTarget,
+    PointRequest,
+    PositionTarget,
+    aim_of,
+    check_pair,
+    clicked_frame,
+)
+from mastctl.motion.results import Preview
+from mastctl.motion.settings import PointingSettings
+from mastctl.motion.track import ACTIVE, RoverPose
+from mastctl.motion.tracker import Tracker
 from mastctl.operations.operations import Operations
 from mastctl.operations.records import Operation
-from mastctl.pointing.loop import PointingLoop
-from mastctl.pointing.requests import AnglesTarget, PixelTarget, PointRequest, PositionTarget
-from mastctl.pointing.results import Preview
-from mastctl.pointing.settings import PointingSettings
-from mastctl.pointing.wanted import aim_of, check_pair, clicked_frame
 from mastctl.service.masts import Masts
-from mastctl.tracking.pose import RoverPose
-from mastctl.tracking.status import ACTIVE
-from mastctl.tracking.tracker import Tracker
 
 CLICK_AGE_S = 300.0  # a person may look at a picture for minutes before clicking; the sun moves meanwhile
 
@@ -47,7 +53,7 @@ class Steering:
     health
         Is told of each pointing's end.
     repeat_after_s
-        Of pointings, as `mastctl.pointing.settings.PointingSettings` has it; None for its default.
+        Of pointings, as `mastctl.motion.settings.PointingSettings` has it; None for its default.
     """
 
     def __init__(
@@ -116,7 +122,7 @@ class Steering:
         NotKnown, NoLonger, BadRequest, NotNow
             As `point`.
         MastctlError, DriverError, CalibError
-            As `mastctl.pointing.loop.PointingLoop.preview`.
+            As `mastctl.motion.loop.PointingLoop.preview`.
         """
         with self._masts.unchanged():
             self._check(request)
@@ -146,7 +152,7 @@ class Steering:
         Raises
         ------
         NotNow, Unable
-            As `mastctl.tracking.tracker.Tracker.look`.
+            As `mastctl.motion.tracker.Tracker.look`.
         """
         with self._masts.unchanged():
             return self._tracker.look()
@@ -157,7 +163,7 @@ class Steering:
         Raises
         ------
         BadRequest, NotNow
-            As `mastctl.tracking.tracker.Tracker.take_pose`.
+            As `mastctl.motion.tracker.Tracker.take_pose`.
         """
         if look:
             self._operations.let_stopped_end()

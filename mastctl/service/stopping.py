@@ -13,13 +13,13 @@ from typing import Any
 from drivers.errors import DriverError
 from mastctl.devices.devices import Devices
 from mastctl.errors import MastctlError, NotNow, Unable
+from mastctl.motion.tracker import Tracker
 from mastctl.operations.operations import STOP_ASKED, Operations
 from mastctl.safety.latch import Estopped, Latch
 from mastctl.safety.state_folder import StateFolder
 from mastctl.state.faults import StandingFault
 from mastctl.state.machine import Machine
 from mastctl.state.standing import Latched
-from mastctl.tracking.tracker import Tracker
 
 KEPT_S = 1.0  # what the disk is given before an emergency stop is answered without it
 STATE = "state"

@@ -8,7 +8,7 @@ listener that counts may ask for every value, up to a bound beyond which it lose
     state       "machine"           `mastctl.state.standing.Standing`
     joints      the head's name     `drivers.interfaces.Reading`
     operation   its id              `mastctl.operations.records.Operation`, with the steps so far
-    track       "track"             `mastctl.tracking.status.TrackStatus`
+    track       "track"             `mastctl.motion.track.TrackStatus`
     fault       of a device, file   tuple of `mastctl.state.faults.StandingFault`, empty when it is healthy
     frame       the camera's name   facts of its newest frame, without the picture
     mast        "in_use"            the mast file in use, as `GET /mast` tells it

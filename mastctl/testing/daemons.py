@@ -18,8 +18,8 @@ from mastctl.config import Config, Listen, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.frames import camera_and_sequence
 from mastctl.errors import NotKnown, NotNow
+from mastctl.motion.track import RoverPose
 from mastctl.testing.pictures import with_width
-from mastctl.tracking.pose import RoverPose
 
 USUAL = {"samples": 1, "speed": "max"}
 

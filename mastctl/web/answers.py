@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from mastctl.commands.caller import Role
+from mastctl.motion.track import TrackState
 from mastctl.state.standing import Word
-from mastctl.tracking.status import TrackState
 from mastctl.web.answer import ErrorTold, Told
 
 Pixel = Annotated[list[float], Field(min_length=2, max_length=2)]

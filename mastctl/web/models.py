@@ -14,8 +14,8 @@ from mastctl.commands.entry import LONGEST_DEADLINE_S
 from mastctl.commands.lease import LONGEST_S, SHORTEST_S, USUAL_S
 from mastctl.devices.sun import LEAST_CONE_RAD, WIDEST_CONE_RAD, Sun, direction_of
 from mastctl.guided.guide import Wanted
-from mastctl.pointing.jog import Beat
-from mastctl.pointing.requests import (
+from mastctl.motion.jog import Beat
+from mastctl.motion.requests import (
     LARGEST_M,
     Aim,
     Angle,
@@ -30,9 +30,9 @@ from mastctl.pointing.requests import (
     Range,
     Target,
 )
+from mastctl.motion.track import RoverPose
 from mastctl.safety.latch import LONGEST
 from mastctl.state.publisher import TOPICS, Topic
-from mastctl.tracking.pose import RoverPose
 
 Rate = Annotated[float, Field(ge=-100.0, le=100.0)]
 Slope = Annotated[float, Field(ge=-1.0, le=1.0)]

@@ -11,8 +11,8 @@ from mastctl.as_json import as_json
 from mastctl.commands.deadlines import usual_s
 from mastctl.commands.entry import POINT, POSE, STOP, TRACK, TRACK_LOOK, TRACK_STOP
 from mastctl.errors import BadRequest, NotNow
-from mastctl.pointing.requests import AnglesTarget
-from mastctl.pointing.results import PointingError
+from mastctl.motion.requests import AnglesTarget
+from mastctl.motion.results import PointingError
 from mastctl.web import PREFIX
 from mastctl.web.commands import Headers
 from mastctl.web.limits import stop_before_keep_outs

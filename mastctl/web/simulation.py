@@ -24,8 +24,8 @@ from mastctl.commands.entry import (
     SIMULATION_TIME,
 )
 from mastctl.errors import BadRequest, NoLonger, NotKnown, NotNow
+from mastctl.motion.track import RoverPose
 from mastctl.service.service import Service
-from mastctl.tracking.pose import RoverPose
 from mastctl.web import PREFIX
 from mastctl.web.commands import Headers
 from mastctl.web.models import BoardBody, FaultBody, FaultsQuery, StandBody, TimeBody, TruthQuery

@@ -23,7 +23,7 @@ from drivers.sim.pan_tilt import PRESETS, HeadSettings, SimulatedPanTilt
 from mastctl.devices.door import REST_S, Door
 from mastctl.devices.keep_out import Box, KeptOut, NoWay, Pair, Span
 from mastctl.devices.limits import Limits
-from mastctl.pointing.jog import AHEAD_S, TICK_S
+from mastctl.motion.jog import AHEAD_S, TICK_S
 from tools.arguments import end
 from tools.campaign import options, run_cases
 
@@ -127,7 +127,7 @@ class _Drive:
             self._wait(self._rng.uniform(0.0, 0.8))
 
     def _jog(self) -> None:
-        """Rates that change, carried out as `mastctl.pointing.jog` does."""
+        """Rates that change, carried out as `mastctl.motion.jog` does."""
         sent: Pair | None = None
         for _ in range(self._rng.randint(1, 4)):
             fastest = self._limits.speed_rad_per_s

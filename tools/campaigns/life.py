@@ -43,8 +43,8 @@ from drivers.sim.settings import SimulationSettings, simulation_settings
 from drivers.sim.warmth import TemperatureSettings
 from mastctl.cli.output import at_least
 from mastctl.config import load_config
+from mastctl.motion.settings import PointingSettings
 from mastctl.packaged import config_folder
-from mastctl.pointing.settings import PointingSettings
 from tools.arguments import end
 from tools.campaign import options, run_cases, show
 

@@ -31,10 +31,10 @@ from drivers.sim_survey.board import photograph
 from mastctl.cli.output import at_least, not_negative
 from mastctl.devices.frames import StampedFrame
 from mastctl.experiment.targets import texture_mask
+from mastctl.motion.looking import CameraView, Clicked, RigCameras
+from mastctl.motion.results import PointingError
+from mastctl.motion.settings import PointingSettings
 from mastctl.packaged import config_folder
-from mastctl.pointing.looking import Clicked, Eyes, View
-from mastctl.pointing.results import PointingError
-from mastctl.pointing.settings import PointingSettings
 from tools.arguments import end
 from tools.campaign import options, run_cases, show
 
@@ -87,14 +87,14 @@ class Taken:
     def __init__(self, look: Look, pan_rad: float, tilt_rad: float, rng: np.random.Generator) -> None:
         drawing = renderer(look.relief_m, look.seed)
         site_from_head = look.rig.mast.rover_from_head(pan_rad, tilt_rad)
-        self.views: dict[str, View] = {}
+        self.views: dict[str, CameraView] = {}
         for number, name in enumerate((LEFT, RIGHT)):
             picture = drawing.image(look.rig.cameras[name].model, site_from_head)
             image = photograph(picture, BLUR_PX, NOISE_DN, rng)
             facts = (f"{name}-{number}", name, number, 0.0, 0.0, pan_rad, tilt_rad, False, "")
             camera = look.rig.camera_in_rover(name, pan_rad, tilt_rad)
             frame = StampedFrame(*facts, image=image, true_pan_rad=pan_rad, true_tilt_rad=tilt_rad)
-            self.views[name] = View(frame, grey(image), camera)
+            self.views[name] = CameraView(frame, grey(image), camera)
 
 
 def run_look(look: Look) -> Rows:
@@ -111,7 +111,7 @@ def run_look(look: Look) -> Rows:
     }
     for pixel, truths in chosen(look, scene, first, second, rng):
         for name, match in SETTINGS.items():
-            eyes = Eyes(_NoCameras(), look.rig, replace(PointingSettings(), match=match))
+            eyes = RigCameras(_NoCameras(), look.rig, replace(PointingSettings(), match=match))
             stereo, turned = matched(eyes, pixel, first, second)
             for kind, one, truth in zip(MATCHES, (stereo, turned), truths, strict=True):
                 found[name, kind].append(
@@ -155,7 +155,7 @@ def shown(scene: Scene, camera: CameraModel, point_m: FloatArray) -> FloatArray 
 
 
 def matched(
-    eyes: Eyes, pixel: FloatArray, first: Taken, second: Taken
+    eyes: RigCameras, pixel: FloatArray, first: Taken, second: Taken
 ) -> tuple[PatchMatch | None, PatchMatch | None]:
     """The matches in the other eye and after the turn, None where the loop refuses."""
     view = first.views[LEFT]

@@ -23,7 +23,7 @@ from calib.tracking.track import Track, moved_track
 from drivers.interfaces import Image
 from drivers.sim.scene import SceneSettings, build_scene
 from mastctl.experiment.targets import texture_mask
-from mastctl.tracking.choice import choose_pairs
+from mastctl.motion.pairs import choose_pairs
 from tools.studies.approach_world import ApproachWorld, WorldErrors
 
 START_M, END_M = 10.0, 1.0

@@ -25,7 +25,7 @@ from calib.pictures.warp import grey
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.experiment.pointing import ClickTruth, RunTime
 from mastctl.experiment.targets import VIEWS_PER_TARGET, Target, Views
-from mastctl.tracking.matched import JOINT_SIGMA_RAD
+from mastctl.motion.pairs import JOINT_SIGMA_RAD
 from tools.studies.handoff_record import (
     Handed,
     HandoffExperiment,

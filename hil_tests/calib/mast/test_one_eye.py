@@ -12,7 +12,7 @@ from calib.errors import CalibError
 from calib.mast.covariance import RigCovariance
 from calib.mast.joints import AxisJoint, Joints
 from calib.mast.one_eye import FARTHEST_M, Sight, range_to_plane, seen_from, shown, unknown_range
-from hil_tests.mastctl.pointing.pointing_world import rig, true_camera
+from hil_tests.mastctl.motion.pointing_world import rig, true_camera
 
 EYE = "navcam_left"
 EXACT = RigCovariance((), np.zeros((0, 0)))

@@ -19,7 +19,7 @@ from drivers.sim.motion import Motion
 from drivers.sim.pan_tilt import PRESETS, HeadSettings, SimulatedPanTilt, head_settings
 from drivers.sim.wire.axis import WireAxis
 from mastctl.devices.rest import RestWatch
-from mastctl.pointing.settings import PointingSettings
+from mastctl.motion.settings import PointingSettings
 
 AXIS = AxisSettings(1e-5, 0.0, -1.5, 1.5, 1.0, 2.0)
 RINGING = replace(AXIS, ring_hz=6.0, ring_damping=0.03)

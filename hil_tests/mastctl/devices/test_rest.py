@@ -11,13 +11,13 @@ import pytest
 
 from drivers.interfaces import Reading
 from hil_tests.mastctl.devices.turned import Turned
-from hil_tests.mastctl.pointing.pointing_world import World, click, run
+from hil_tests.mastctl.motion.pointing_world import World, click, run
 from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from mastctl.devices.devices import Devices
 from mastctl.devices.joint_history import JointHistory
 from mastctl.devices.limits import Limits
 from mastctl.devices.rest import DITHER_RAD, RestWatch, dithers
-from mastctl.pointing.loop import AnglesTarget, PointingError, PointRequest
+from mastctl.motion.loop import AnglesTarget, PointingError, PointRequest
 
 XM430_RAD = 2 * math.pi / 4096
 """A count of a 12-bit servo."""

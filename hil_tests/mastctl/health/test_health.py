@@ -21,8 +21,8 @@ from mastctl.health.health import CalibrationHealth
 from mastctl.health.journal import FILE, Journal
 from mastctl.health.measured import Measured, measured_by, measured_of
 from mastctl.health.windows import Windows
+from mastctl.motion.results import Step
 from mastctl.operations.records import Operation
-from mastctl.pointing.results import Step
 
 STORED = stored_rig()
 

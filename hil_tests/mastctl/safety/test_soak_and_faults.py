@@ -84,7 +84,7 @@ def test_a_daemon_that_has_grown_is_not_as_wanted(more: dict[str, Any], said: st
 
 
 @pytest.mark.long(
-    4, "a whole daemon in real time for each; pointing/test_pointing_faults.py has each fault quickly"
+    4, "a whole daemon in real time for each; motion/test_pointing_faults.py has each fault quickly"
 )
 @pytest.mark.parametrize("during", ["pointing", "tracking"])
 def test_a_fault_under_way_is_told_ends_what_it_must_and_is_over_when_it_is_over(

@@ -13,7 +13,7 @@ from mastctl.client import Client
 from mastctl.commands.deadlines import usual_s
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.limits import Limits
-from mastctl.pointing.requests import AnglesTarget, PointRequest
+from mastctl.motion.requests import AnglesTarget, PointRequest
 
 FAR = {"pan_rad": 1.2, "tilt_rad": 0.2}
 

@@ -11,7 +11,7 @@ import pytest
 from hil_tests.waiting import until
 from mastctl.config import load_config
 from mastctl.devices.keep_out import Box, KeptOut
-from mastctl.pointing.requests import AnglesTarget, PointRequest
+from mastctl.motion.requests import AnglesTarget, PointRequest
 from mastctl.service.service import Service
 
 DECK = Box("deck", (-0.5, 0.5), (-1.2, -0.4))

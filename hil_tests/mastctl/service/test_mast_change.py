@@ -22,7 +22,7 @@ from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, ScriptedLoop, r
 from hil_tests.waiting import NET_S, until
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped
-from mastctl.pointing.jog import Beat
+from mastctl.motion.jog import Beat
 from mastctl.service import steering as steering_module
 from mastctl.service.mast_in_use import configured
 

@@ -18,7 +18,7 @@ from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.limits import Limits, OutsideLimits
 from mastctl.errors import Stopped
-from mastctl.pointing.settings import PointingSettings
+from mastctl.motion.settings import PointingSettings
 from mastctl.service import reload as reload_module
 from mastctl.service import steering as steering_module
 from mastctl.service.reload import FIXED

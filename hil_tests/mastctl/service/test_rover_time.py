@@ -19,7 +19,7 @@ from hil_tests.waiting import NET_S, joined, until
 from mastctl.client import Client, ClientError
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon
-from mastctl.pointing.requests import AnglesTarget, PixelTarget, PointRequest
+from mastctl.motion.requests import AnglesTarget, PixelTarget, PointRequest
 from mastctl.service.service import Service
 
 

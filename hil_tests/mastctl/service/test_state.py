@@ -11,10 +11,10 @@ from drivers.interfaces import AxisMotion
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.limits import Limits
+from mastctl.motion.track import TrackStatus
 from mastctl.service.state import State
 from mastctl.state.faults import StandingFault
 from mastctl.state.standing import Latched, Residual, Standing
-from mastctl.tracking.status import TrackStatus
 
 REST = State(
     now_s=100.0,

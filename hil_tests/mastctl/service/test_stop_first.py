@@ -22,12 +22,12 @@ from hil_tests.waiting import NET_S, joined, until
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped, Unable
+from mastctl.motion import tracker as tracker_module
+from mastctl.motion.loop import PointingLoop
 from mastctl.operations import operations as operations_module
 from mastctl.operations.operations import Operations
 from mastctl.operations.records import Operation
-from mastctl.pointing.loop import PointingLoop
 from mastctl.safety import stop_threads as stop_threads_module
-from mastctl.tracking import tracker as tracker_module
 from mastctl.web import commands as commands_module
 
 

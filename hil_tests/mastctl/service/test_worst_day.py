@@ -13,8 +13,8 @@ import pytest
 
 from hil_tests.waiting import until
 from mastctl.config import load_config
+from mastctl.motion.requests import PixelTarget, PointRequest
 from mastctl.packaged import config_folder
-from mastctl.pointing.requests import PixelTarget, PointRequest
 from mastctl.service.service import Service
 
 AIM_PX = (511.5, 383.5)

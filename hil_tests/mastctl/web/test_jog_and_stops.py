@@ -14,7 +14,7 @@ from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, ScriptedLoop
 from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
-from mastctl.pointing import jog as jog_module
+from mastctl.motion import jog as jog_module
 from mastctl.safety.stop_line import ask
 
 RATES = {"pan_rad_per_s": 0.2, "tilt_rad_per_s": 0.0}

@@ -27,7 +27,7 @@ from mastctl.errors import (
     TooMany,
     Unable,
 )
-from mastctl.pointing.results import PointingError
+from mastctl.motion.results import PointingError
 from mastctl.web.answer import GuardError, error_response
 from mastctl.web.refusals import status_of
 

@@ -32,8 +32,8 @@ from hil_tests.waiting import NET_S, until
 from mastctl.client import Client
 from mastctl.commands.caller import Caller
 from mastctl.daemon import RunningDaemon
-from mastctl.pointing.requests import Aim
-from mastctl.pointing.results import Preview
+from mastctl.motion.requests import Aim
+from mastctl.motion.results import Preview
 from mastctl.web.page import page_files
 
 BOTH = tuple[RunningDaemon, FakeHardware]

@@ -27,7 +27,7 @@ from hil_tests.mastctl.web.page.conftest import Visit
 from hil_tests.waiting import until
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
-from mastctl.pointing.results import PointingError
+from mastctl.motion.results import PointingError
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 Visits = Callable[..., Visit]

@@ -1,0 +1,382 @@
+"""Jog: the head turns while heartbeats come, and stops by itself in every case in which they do not."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from drivers.faults import FaultPanel
+from drivers.interfaces import Reading
+from drivers.sim.pan_tilt import PRESETS, SimulatedPanTilt
+from drivers.simulation_clock import SimulationClock
+from mastctl.devices.devices import Devices
+from mastctl.devices.keep_out import Box
+from mastctl.devices.limits import Limits
+from mastctl.errors import NotNow
+from mastctl.motion.jog import AHEAD_S, PATIENCE_S, TICK_S, Beat, Jogs
+from mastctl.operations.operations import Operations
+from mastctl.operations.records import Operation
+
+DECK = Box("deck", (-0.5, 0.5), (-1.2, -0.8))
+LIMITS = Limits((-1.0, 1.0), (-1.2, 0.6), 1.0, margin_rad=0.02, keep_out=(DECK,))
+RATE = 0.3
+HEAD = PRESETS["dynamixel_x"]
+BRAKING_RAD = RATE**2 / 2 / HEAD.pan.acceleration_rad_per_s2
+AHEAD_RAD = RATE * AHEAD_S + BRAKING_RAD
+COUNT_RAD = HEAD.pan.count_rad
+
+
+@dataclass
+class Watched:
+    """A head whose goals are written down beside where it was when they came."""
+
+    head: SimulatedPanTilt
+    moves: list[tuple[Reading, tuple[float, float]]] = field(default_factory=list)
+    stops: int = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.head, name)
+
+    def read(self) -> Reading:
+        return self.head.read()
+
+    def axis_motion(self) -> Any:
+        return self.head.axis_motion()
+
+    def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
+        self.moves.append((self.head.read(), (pan_rad, tilt_rad)))
+        self.head.move(pan_rad, tilt_rad, speed_rad_per_s)
+
+    def stop(self) -> None:
+        self.stops += 1
+        self.head.stop()
+
+    def close(self) -> None:
+        self.head.close()
+
+
+@dataclass
+class Rig:
+    clock: SimulationClock
+    panel: FaultPanel
+    head: Watched
+    devices: Devices
+    operations: Operations
+    jogs: Jogs
+
+    def pass_by(self, duration_s: float) -> None:
+        self.clock.sleep(duration_s)
+
+    def beats(self, pan: float, tilt: float, for_s: float, **how: Any) -> dict[str, Any]:
+        """Heartbeats, one a tick; the last answer."""
+        answer: dict[str, Any] = {}
+        for _ in range(round(for_s / TICK_S)):
+            answer = self.jogs.beat(Beat((pan, tilt), **how))
+            self.pass_by(TICK_S)
+        return answer
+
+    def place(self, pan: float, tilt: float) -> None:
+        self.head.head.move(pan, tilt)
+        self.pass_by(5.0)
+        self.head.moves.clear()
+
+    def joints(self) -> tuple[float, float]:
+        reading = self.devices.read()
+        return reading.pan_rad, reading.tilt_rad
+
+    def ended(self, name: str) -> Operation:
+        for _ in range(300):
+            if self.operations.get(name).state not in ("queued", "running"):
+                return self.operations.get(name)
+            self.pass_by(0.01)
+        raise AssertionError(f"{name} still runs")
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    clock = SimulationClock(math.inf)
+    panel = FaultPanel(clock.now_s, ())
+    with clock.at_work():
+        head = Watched(SimulatedPanTilt(HEAD, clock, panel))
+        devices = Devices(SimpleNamespace(pan_tilt=head, cameras={}), LIMITS, "0" * 64, clock)
+        operations = Operations(devices, clock)
+    made = Rig(clock, panel, head, devices, operations, Jogs(operations, devices, clock))
+    made.pass_by(0.1)
+    yield made
+    made.pass_by(1.0)  # a jog that nobody ended ends by itself; the close would wait for it while time stands
+    operations.close()
+    devices.close()
+
+
+def test_the_head_turns_at_the_rate_while_heartbeats_come(rig: Rig) -> None:
+    rig.beats(RATE, 0.0, 2.0)
+    pan, tilt = rig.joints()
+    assert pan == pytest.approx(2.0 * RATE, abs=RATE * 0.25)
+    assert abs(tilt) <= COUNT_RAD
+
+
+def test_no_goal_lies_further_ahead_than_a_look_and_the_braking(rig: Rig) -> None:
+    rig.beats(RATE, -RATE / 2, 1.5)
+    rig.beats(-RATE, RATE, 1.0)
+    assert len(rig.head.moves) > 15
+    for reading, (pan, tilt) in rig.head.moves:
+        assert max(abs(pan - reading.pan_rad), abs(tilt - reading.tilt_rad)) <= AHEAD_RAD + RATE * TICK_S
+
+
+def test_without_a_heartbeat_for_half_a_second_the_head_stops_and_says_why(rig: Rig) -> None:
+    name = rig.beats(RATE, 0.0, 0.5)["id"]
+    before = rig.joints()[0]
+    rig.pass_by(PATIENCE_S + 2 * TICK_S)
+    record = rig.ended(name)
+    assert record.state == "done" and rig.head.stops == 1
+    assert record.result.ended_because.startswith("no heartbeat came for 0.")
+    rig.pass_by(1.0)
+    assert rig.joints()[0] - before <= RATE * (PATIENCE_S + TICK_S) + AHEAD_RAD
+    assert not rig.devices.read().moving
+
+
+def test_rates_of_zero_end_it_at_once(rig: Rig) -> None:
+    name = rig.beats(RATE, 0.0, 0.5)["id"]
+    answer = rig.jogs.beat(Beat((0.0, 0.0), jog=name))
+    assert answer["taken"]
+    rig.pass_by(0.02)
+    assert rig.ended(name).result.ended_because == "its client let go"
+    assert rig.jogs.beat(Beat((0.0, 0.0))) == {"id": None, "taken": False, "held": {}}
+
+
+def test_a_heartbeat_of_a_jog_that_has_ended_moves_nothing(rig: Rig) -> None:
+    name = rig.beats(RATE, 0.0, 0.3)["id"]
+    rig.pass_by(1.0)
+    moves = len(rig.head.moves)
+    with pytest.raises(NotNow, match="does not run any more") as refused:
+        rig.jogs.beat(Beat((RATE, 0.0), jog=name))
+    assert refused.value.code == "jog_ended"
+    rig.pass_by(0.5)
+    assert len(rig.head.moves) == moves
+
+
+def test_heartbeats_out_of_order_are_not_taken_and_keep_nothing_going(rig: Rig) -> None:
+    name = rig.jogs.beat(Beat((RATE, 0.0), sequence=5))["id"]
+    rig.pass_by(0.2)
+    assert rig.jogs.beat(Beat((-RATE, 0.0), 7, name))["taken"]
+    for number in (6, 7, 5):
+        rig.pass_by(0.1)
+        assert not rig.jogs.beat(Beat((RATE, 0.0), number, name))["taken"]
+    assert not rig.jogs.beat(Beat((RATE, 0.0), None, name))["taken"]
+    rig.pass_by(0.35)
+    assert rig.operations.get(name).state == "done"
+    assert rig.head.moves[-1][1][0] < 0.0, "the newest one counted"
+
+
+def test_a_second_client_is_refused_while_the_first_counts_its_heartbeats(rig: Rig) -> None:
+    name = rig.jogs.beat(Beat((RATE, 0.0), sequence=1))["id"]
+    with pytest.raises(NotNow, match="is running") as refused:
+        rig.jogs.beat(Beat((-RATE, 0.0), sequence=1))
+    assert refused.value.code == "busy"
+    with pytest.raises(NotNow) as refused:
+        rig.jogs.beat(Beat((-RATE, 0.0), 9, "000009-beef"))
+    assert refused.value.code == "jog_ended"
+    rig.pass_by(0.2)
+    assert rig.jogs.beat(Beat((RATE, 0.0), 2, name))["taken"]
+
+
+def test_a_jog_during_a_pointing_and_a_pointing_during_a_jog_are_refused(rig: Rig) -> None:
+    go = threading.Event()
+    pointing = rig.operations.start({}, lambda record, cancelled: go.wait(20.0)).id
+    with pytest.raises(NotNow, match="is running") as refused:
+        rig.jogs.beat(Beat((RATE, 0.0)))
+    assert refused.value.code == "busy"
+    go.set()
+    rig.ended(pointing)
+    rig.jogs.beat(Beat((RATE, 0.0)))
+    with pytest.raises(NotNow, match="is running"):
+        rig.operations.start({}, lambda record, cancelled: None)
+
+
+def test_a_stop_is_the_last_word(rig: Rig) -> None:
+    name = rig.beats(RATE, 0.0, 0.5)["id"]
+    with rig.clock.at_work():
+        assert rig.operations.stop() == name
+    assert rig.ended(name).state == "stopped"
+    moves = len(rig.head.moves)
+    with pytest.raises(NotNow, match="does not run any more"):
+        rig.jogs.beat(Beat((RATE, 0.0), jog=name))
+    rig.pass_by(0.5)
+    assert len(rig.head.moves) == moves and not rig.devices.read().moving
+
+
+def test_nameless_heartbeats_begin_a_jog_after_a_stop_when_none_came_for_half_a_second(rig: Rig) -> None:
+    stops: list[object] = [object()]
+    jogs = Jogs(rig.operations, rig.devices, rig.clock, last_stop=lambda: stops[-1])
+    stick, still, counted = Beat((RATE, 0.0)), Beat((0.0, 0.0)), Beat((RATE, 0.0), sequence=8)
+
+    def refused(beat: Beat) -> str:
+        with pytest.raises(NotNow) as error, jogs.heard(beat) as may_begin:
+            jogs.beat(beat, may_begin)
+        return error.value.code
+
+    def taken(beat: Beat) -> str | None:
+        with jogs.heard(beat) as may_begin:
+            told: str | None = jogs.beat(beat, may_begin)["id"]
+        return told
+
+    first = taken(stick)
+    assert first is not None
+    rig.pass_by(0.3)
+    assert taken(stick) == first
+    with rig.clock.at_work():
+        rig.operations.stop()
+        stops.append(object())
+    rig.ended(first)
+    moves = len(rig.head.moves)
+    for _ in range(10):
+        assert refused(stick) == "jog_ended"
+        assert taken(still) is None
+        rig.pass_by(PATIENCE_S - 0.01)
+    assert len(rig.head.moves) == moves
+    rig.pass_by(0.02)
+    second = taken(Beat((RATE, 0.0), sequence=1))
+    assert second is not None
+    assert refused(counted) == "busy"
+    with rig.clock.at_work():
+        rig.operations.stop()
+        stops.append(object())
+    rig.ended(second)
+    assert refused(counted) == "jog_ended", "its number makes it none that begins"
+    rig.pass_by(PATIENCE_S + 0.01)
+    assert taken(counted) is not None
+
+
+def test_a_head_that_reports_a_fault_is_stopped(rig: Rig) -> None:
+    name = rig.beats(RATE, 0.0, 0.3)["id"]
+    rig.panel.set("pan_tilt", "voltage_dip", factor=0.5)
+    rig.pass_by(0.3)
+    record = rig.ended(name)
+    assert record.state == "failed" and record.error is not None and record.error["code"] == "head_fault"
+    assert rig.head.stops >= 1
+
+
+def test_a_daemon_that_was_held_up_goes_on_with_no_heartbeat_that_waited(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, held = rig.devices.read, [PATIENCE_S + 0.3]
+
+    def read() -> Reading:
+        if held and rig.head.moves:
+            rig.clock.sleep(held.pop())
+            rig.jogs.beat(Beat((RATE, 0.0)))  # it lay in the socket meanwhile
+        return plain()
+
+    monkeypatch.setattr(rig.devices, "read", read)
+    name = rig.jogs.beat(Beat((RATE, 0.0)))["id"]
+    rig.pass_by(1.5)
+    assert rig.ended(name).result.ended_because.startswith("the daemon was held up for 0.")
+
+
+def test_an_axis_at_its_limit_stands_while_the_other_goes_on(rig: Rig) -> None:
+    rig.place(0.9, 0.0)
+    answer = rig.beats(RATE, RATE, 1.0)
+    pan, tilt = rig.joints()
+    assert pan == pytest.approx(1.0, abs=COUNT_RAD) and tilt > 0.2
+    assert answer["held"] == {"pan": "pan is held at 1 rad by a limit or a keep-out"}
+
+
+def test_the_head_slides_along_a_keep_out_and_never_nearer_than_its_margin(rig: Rig) -> None:
+    rig.place(-0.3, -0.7)
+    lowest = 0.0
+    for _ in range(20):
+        answer = rig.beats(RATE, -RATE, 0.1)
+        lowest = min(lowest, rig.joints()[1])
+    assert rig.joints()[0] > 0.2 and "tilt" in answer["held"], "pan goes on over the deck"
+    assert rig.joints()[1] < -0.75
+    assert lowest >= -0.8 + 0.02 - COUNT_RAD
+
+
+def test_faster_than_the_limit_is_as_fast_as_the_limit_in_the_same_direction(rig: Rig) -> None:
+    rig.place(-0.9, 0.0)
+    rig.jogs.beat(Beat((4.0, 2.0)))
+    rig.pass_by(0.05)
+    reading, (pan, tilt) = rig.head.moves[0]
+    reach = [AHEAD_S * rate + rate**2 / 2 / 4.0 for rate in (1.0, 0.5)]
+    assert pan - reading.pan_rad == pytest.approx(reach[0], abs=0.01)
+    assert tilt - reading.tilt_rad == pytest.approx(reach[1], abs=0.01)
+
+
+def test_limits_hold_whatever_rates_come(rig: Rig) -> None:
+    rig.place(0.8, 0.5)
+    for rates in ((3.0, 3.0), (-3.0, 3.0), (1.0, -3.0), (-1.0, -3.0)):
+        rig.beats(*rates, 1.5)
+        for _, (pan, tilt) in rig.head.moves:
+            assert -1.0 <= pan <= 1.0 and -1.2 <= tilt <= 0.6
+            assert not (abs(pan) < 0.52 and tilt < -0.78)
+
+
+def test_where_time_stands_a_client_that_is_gone_does_not_keep_the_head_for_ever(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mastctl.motion.jog.GONE_S", 0.2)
+    name = rig.jogs.beat(Beat((RATE, 0.0)))["id"]
+    ended = threading.Event()
+    for _ in range(600):  # of the machine's time: the rig's stands
+        if rig.operations.running is None:
+            break
+        ended.wait(0.05)
+    operation = rig.operations.get(name)
+    assert operation.state == "done"
+    assert "nothing was heard of its client" in operation.result.ended_because
+    assert rig.head.stops >= 1
+
+
+def test_two_clients_that_begin_while_what_was_stopped_still_ends_do_not_make_time_stand_still(
+    rig: Rig,
+) -> None:
+    """A simulation's time passes while all wait on its clock: nobody may keep a lock meanwhile."""
+
+    def slow_to_end(record: Any, cancelled: threading.Event) -> None:
+        while not cancelled.is_set():
+            rig.clock.sleep(0.05)
+        rig.clock.sleep(2.0)
+
+    refused: list[str] = []
+
+    def begin() -> None:
+        with rig.clock.at_work():
+            try:
+                rig.jogs.beat(Beat((RATE, 0.0), sequence=1))
+            except NotNow as error:
+                refused.append(error.code)
+
+    with rig.clock.at_work():
+        rig.operations.start({}, slow_to_end)
+        rig.clock.sleep(0.2)
+        rig.operations.stop()
+        clients = [threading.Thread(target=begin, daemon=True) for _ in range(2)]
+        for client in clients:
+            client.start()
+    for client in clients:
+        client.join(10.0)
+    assert refused == ["stopping", "stopping"]
+
+
+def test_a_jog_begins_before_or_after_what_needs_a_head_that_rests(rig: Rig) -> None:
+    changing = threading.Lock()
+    jogs = Jogs(rig.operations, rig.devices, rig.clock, undisturbed=lambda: changing)
+    begun = threading.Event()
+
+    def begin() -> None:
+        jogs.beat(Beat((RATE, 0.0)))
+        begun.set()
+
+    with changing:
+        client = threading.Thread(target=begin, daemon=True)
+        client.start()
+        assert not begun.wait(0.2)
+        assert rig.operations.running is None
+    assert begun.wait(10.0)
+    assert rig.operations.running is not None

@@ -1,0 +1,188 @@
+"""Which pair looks, and what poses mean: by hand, by SciPy, and by the rig's own cameras."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib.errors import CalibError
+from calib.files.mast_file import load_rig
+from calib.handoff.by_image import Eye
+from calib.mast.rig import Rig
+from calib.rigid import Rigid, carried_covariance
+from calib.tracking.track import Key, Track
+from mastctl.devices.limits import Limits
+from mastctl.errors import MastctlError
+from mastctl.motion.pairs import choose_pairs
+from mastctl.motion.settings import HandoffRules, PairBounds
+from mastctl.motion.track import (
+    HELD_UP_S,
+    Carried,
+    RoverPose,
+    check_follows,
+    motion_between,
+    stands,
+)
+
+
+@pytest.fixture(scope="module")
+def rig(repository: Path) -> Rig:
+    return load_rig(repository / "configs/sim/rocky8.yaml").rig
+
+
+def ahead(range_m: float) -> np.ndarray:
+    """A place on level ground, so far in front of the rover's origin."""
+    return np.array([0.5 + range_m, 0.3, 0.0])
+
+
+@pytest.mark.parametrize(("range_m", "pair"), [(9.0, "pancam"), (4.0, "navcam"), (1.0, "hazcam")])
+def test_the_papers_pair_looks_at_each_range(rig: Rig, range_m: float, pair: str) -> None:
+    assert choose_pairs(rig, ahead(range_m))[0].pair == pair
+
+
+@pytest.mark.parametrize("range_m", [9.0, 4.0, 2.0])
+def test_the_target_comes_midway_between_the_middles_of_both_pictures(rig: Rig, range_m: float) -> None:
+    turned = [choice for choice in choose_pairs(rig, ahead(range_m)) if choice.pan_rad is not None]
+    assert {choice.pair for choice in turned} == {"pancam", "navcam"}
+    for choice in turned:
+        assert choice.pan_rad is not None and choice.tilt_rad is not None
+        left, right = (
+            rig.camera_in_rover(eye, choice.pan_rad, choice.tilt_rad) for eye in rig.stereo[choice.pair]
+        )
+        off = [model.project(ahead(range_m))[0] - np.array(model.image_center_px) for model in (left, right)]
+        assert np.abs(off[0] + off[1]).max() < 1.0
+
+
+def test_the_budget_decides_between_pairs_that_keep_their_bounds(rig: Rig) -> None:
+    found = choose_pairs(rig, ahead(4.0), HandoffRules(pairs={}))
+    assert [choice.pair for choice in found] == ["pancam", "navcam", "hazcam"]
+    errors = [choice.range_error_m for choice in found]
+    # Eqs. (1) and (2) with 1 px: 4.1 m away and 1.48 m up, 3409 px by 0.3 m and 1288 px by 0.203 m.
+    away_m = math.hypot(4.1, 1.48, 0.3)
+    assert errors[:2] == pytest.approx([away_m**2 / (3409 * 0.2998), away_m**2 / (1288 * 0.2031)], rel=0.02)
+    near = choose_pairs(rig, ahead(4.0), HandoffRules(pairs={}, range_error=0.01))
+    assert [choice.pair for choice in near if not choice.outside] == ["pancam"]
+    assert "more than 0.01 of the range" in near[-1].outside
+
+
+def test_a_pair_that_looks_down_too_steeply_hands_over(rig: Rig) -> None:
+    rules = HandoffRules(pairs={"pancam": PairBounds(6.0), "navcam": PairBounds(0.0, 0.6)})
+    assert choose_pairs(rig, ahead(2.2), rules)[0].pair == "navcam"
+    found = choose_pairs(rig, ahead(1.5), rules)
+    assert found[0].pair == "hazcam"
+    assert "steeper than 0.6 rad" in next(one.outside for one in found if one.pair == "navcam")
+
+
+def test_where_no_pair_keeps_its_bounds_the_shortest_focal_length_serves(rig: Rig) -> None:
+    behind = np.array([-0.9, 0.2, 0.0])
+    found = choose_pairs(rig, behind)
+    assert found[0].pair == "navcam"
+    assert "nearer than 2 m" in found[0].outside
+
+
+def test_nobody_who_sees_it_is_told_camera_by_camera(rig: Rig) -> None:
+    blind = replace(rig, stereo={"hazcam": rig.stereo["hazcam"]})
+    with pytest.raises(CalibError, match=r"no stereo pair sees the target.*hazcam_left has it at pixel"):
+        choose_pairs(blind, np.array([-1.5, 0.2, 0.0]))
+    with pytest.raises(CalibError, match="beyond the limit"):
+        choose_pairs(rig, np.array([-5.0, 0.2, 0.0]), limits=Limits((-1.0, 1.0), (-1.2, 0.5), 1.0))
+
+
+def pose(
+    time_s: float | None, x_m: float = 0.0, heading_rad: float = 0.0, received_s: float = 0.0
+) -> RoverPose:
+    turned = Rotation.from_euler("z", heading_rad).as_matrix()
+    return RoverPose(Rigid(turned, np.array([x_m, 0.0, 0.0])), None, time_s, received_s)
+
+
+@pytest.mark.parametrize(
+    ("before_s", "now_s", "code"),
+    [(5.0, 4.9, "pose_runs_backwards"), (5.0, 5.0, "pose_runs_backwards"), (5.0, None, "pose_without_time")],
+)
+def test_poses_come_in_order(before_s: float, now_s: float | None, code: str) -> None:
+    with pytest.raises(MastctlError) as refused:
+        check_follows(pose(now_s), pose(before_s))
+    assert refused.value.code == code
+    check_follows(pose(5.1), pose(5.0))
+    check_follows(pose(None), pose(None))
+    check_follows(pose(1.0), None)
+
+
+@pytest.mark.parametrize(
+    ("before_s", "now_s", "later_s"),
+    [
+        (1e12, 17.5, 0.01),
+        (1e12, -1e12, 0.0),
+        (5.0 + HELD_UP_S, 4.99, 0.0),
+        (5.0, 4.9, HELD_UP_S),
+        (5.0, 5.0, HELD_UP_S + 0.01),
+        (5.0, None, HELD_UP_S + 0.01),
+    ],
+)
+def test_a_pose_that_cannot_have_been_on_its_way_so_long_has_another_clock(
+    before_s: float, now_s: float | None, later_s: float
+) -> None:
+    check_follows(pose(now_s, received_s=100.0 + later_s), pose(before_s, received_s=100.0))
+
+
+@pytest.mark.parametrize(
+    ("before_s", "now_s", "later_s", "code"),
+    [
+        (5.0 + HELD_UP_S, 5.0, 0.0, "pose_runs_backwards"),
+        (6.0, 5.0, HELD_UP_S - 1.0, "pose_runs_backwards"),
+        (5.0, None, HELD_UP_S, "pose_without_time"),
+    ],
+)
+def test_a_pose_that_was_held_up_on_its_way_comes_too_late(
+    before_s: float, now_s: float | None, later_s: float, code: str
+) -> None:
+    with pytest.raises(MastctlError) as refused:
+        check_follows(pose(now_s, received_s=100.0 + later_s), pose(before_s, received_s=100.0))
+    assert refused.value.code == code
+
+
+def test_a_motion_is_where_the_frame_before_lies_in_the_one_of_now() -> None:
+    motion = motion_between(pose(None), pose(None, 2.0, math.pi / 2))
+    # After 2 m ahead and a quarter turn to the right, what was 3 m ahead is 1 m to the left.
+    assert motion.points([3.0, 0.0, 0.0]) == pytest.approx([0.0, -1.0, 0.0])
+    assert not stands(motion)
+    assert stands(motion_between(pose(None), pose(None, 0.004, 0.0009)))
+    assert not stands(motion_between(pose(None), pose(None, 0.0, 0.0012)))
+
+
+def test_a_covariance_carried_on_moves_points_as_the_motions_themselves_do() -> None:
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(6, 6)) * 1e-5
+    onward = Rigid(Rotation.from_rotvec([0.1, -0.2, 0.7]).as_matrix(), np.array([0.5, -1.0, 0.2]))
+    points = rng.normal(size=(5, 3)) * 3.0
+    carried = carried_covariance(root @ root.T, onward)
+    for point in points:
+        moves = np.array(
+            [
+                onward.points(Rotation.from_rotvec(step[:3]).apply(point) + step[3:]) - onward.points(point)
+                for step in root.T
+            ]
+        )
+        x, y, z = onward.points(point)
+        rate = np.hstack([np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]]), np.eye(3)])
+        assert rate @ carried @ rate.T == pytest.approx(moves.T @ moves, abs=2e-3 * np.abs(moves).max() ** 2)
+
+
+def test_what_jumped_poses_are_uncertain_by_has_no_variance_below_zero(rig: Rig) -> None:
+    """A slip along one direction, turned onto an axis: rounding alone makes -1e-20 of the others' nothing."""
+    key = Key(Eye(np.zeros((48, 64), np.float32), rig.cameras["navcam_left"].model), np.zeros(2), np.ones(3))
+    begun = Carried(Track("tracked", np.array([5.0, 0.5, 0.0]), 1e-4 * np.eye(3), key), pose(0.0))
+    for heading in np.arange(0.1, 3.1, 0.1):
+        along = np.array([0.0, 0.0, 0.0, math.cos(heading), math.sin(heading), 0.0])
+        far = replace(pose(1.0, 4.0), covariance=0.01**2 * np.outer(along, along))
+        back = replace(pose(2.0, 0.1, heading), covariance=np.zeros((6, 6)))
+        jumped, _ = begun.to(far, np.zeros(3), 0.3)
+        assert jumped.jumped
+        carried, reason = jumped.to(back, np.zeros(3), 0.3)
+        assert (reason, carried.jumped) == ("", False)
+        assert carried.track.motion_covariance[3, 3] == pytest.approx(0.01**2)

@@ -1,0 +1,304 @@
+"""Moving the head and knowing that it has arrived: deadlines, readings judged, solutions chosen."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from typing import Protocol, TypeVar
+
+from calib.mast.solutions import Solution, order, ordered
+from drivers.clock import Clock
+from mastctl.devices.joint_history import HeadReading
+from mastctl.devices.keep_out import KeptOut, NoWay, Pair
+from mastctl.devices.limits import Limits
+from mastctl.devices.rest import RestWatch
+from mastctl.devices.ways import Way
+from mastctl.motion.results import PointingError
+from mastctl.motion.settings import PointingSettings
+
+WATCHED_S = 0.05
+"""How often a head at rest is read while a moment is waited for; a stop is noticed as soon."""
+
+
+class SteeredHeadLike(Protocol):
+    """What of `mastctl.devices.devices.Devices` moves the head."""
+
+    def read(self) -> HeadReading: ...
+    @property
+    def reading_sigma_rad(self) -> Pair: ...
+    @property
+    def counts_rad(self) -> Mapping[str, float]: ...
+    def goal(self, true_rad: Pair, here: HeadReading, corners: Sequence[Pair] = ()) -> Pair: ...
+    def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None: ...
+    def stop(self) -> None: ...
+    def way(self, here: Pair, goal: Pair) -> Way: ...
+
+
+class SteeredHead:
+    """The head during one request.
+
+    A reading must be finite, of now, not before the last one, and free of faults; it must be reachable from
+    the last one at twice the speed cap, or lie on the way to the commanded angles (a replayed head is there
+    at once). The head has settled when it rests (`mastctl.devices.rest`); it has arrived when it rests where
+    it was sent.
+    """
+
+    def __init__(
+        self,
+        head: SteeredHeadLike,
+        limits: Limits,
+        clock: Clock,
+        settings: PointingSettings,
+        cancelled: threading.Event,
+    ) -> None:
+        self._head = head
+        self._limits = limits
+        self._clock = clock
+        self._settings = settings
+        self._cancelled = cancelled
+        self._last: HeadReading | None = None
+        self._goal: tuple[float, float] | None = None
+
+    def check_not_stopped(self) -> None:
+        """Pass unless the request was cancelled. Raises PointingError ``stopped``."""
+        if self._cancelled.is_set():
+            raise PointingError("stopped", "the operation was stopped")
+
+    def resting(self) -> HeadReading:
+        """Return the reading of a head that rests now.
+
+        Raises
+        ------
+        PointingError
+            ``head_moving`` if it still moves after ``rest_wait_s``; else as for a reading.
+        DriverError
+            If the head does not answer.
+        """
+        watch = RestWatch(0.0, self._settings.rest_tolerance_rad)
+        settled, last = self._rests(watch, self._clock.now_s() + self._settings.rest_wait_s)
+        if not settled:
+            words = f"the head still moves after {self._settings.rest_wait_s:g} s of waiting"
+            raise PointingError("head_moving", f"{words}: {watch.seen()}")
+        return last
+
+    def time_allowed_s(self, pan_rad: float, tilt_rad: float) -> float:
+        """Return the deadline of a move to these angles: distance over speed, ramps, dwell, margin."""
+        here = self.read()
+        distance = max(abs(pan_rad - here.pan_rad), abs(tilt_rad - here.tilt_rad))
+        settings = self._settings
+        return (
+            distance / self._limits.speed_rad_per_s
+            + settings.acceleration_s
+            + settings.dwell_s
+            + settings.margin_s
+        )
+
+    def way(self, pan_rad: float, tilt_rad: float) -> tuple[Pair, ...]:
+        """Return where to send the head, one after the other, so that it comes to these angles.
+
+        Raises
+        ------
+        OutsideLimits, KeptOut, NoWay
+            If they may not be commanded, or keep-outs lie around.
+        PointingError, DriverError
+            As for a reading.
+        """
+        here = self.read()
+        return self._head.way((here.pan_rad, here.tilt_rad), (pan_rad, tilt_rad)).goals
+
+    def chosen(self, solutions: Sequence[Solution], here: HeadReading) -> Solution:
+        """Return the one of several true joint angles that is taken from ``here``; raises as `reached`."""
+
+        def read(one: Solution) -> Pair:
+            return self.goal((one.pan_rad, one.tilt_rad), here)
+
+        return reached(solutions, self._limits, self._head.way, (here.pan_rad, here.tilt_rad), read)
+
+    def goal(self, true_rad: Pair, here: HeadReading, corners: Sequence[Pair] = ()) -> Pair:
+        """Return the readings to send the head to, so that it comes to true angles."""
+        return self._head.goal(true_rad, here, corners)
+
+    def send(self, pan_rad: float, tilt_rad: float) -> None:
+        """Start the move at the speed cap. Raises OutsideLimits, Stopped, DriverError."""
+        self.check_not_stopped()
+        self._goal = (pan_rad, tilt_rad)
+        self._head.move(pan_rad, tilt_rad)
+
+    def arrived(self, pan_rad: float, tilt_rad: float, deadline_s: float) -> HeadReading:
+        """Wait until the head rests at these angles and return the reading.
+
+        Raises
+        ------
+        PointingError
+            ``did_not_arrive`` with how far it is off, ``did_not_settle`` if it never rests before the
+            deadline (clock time, seconds), ``stopped``; else as for a reading.
+        DriverError
+            If the head does not answer.
+        """
+        tolerance = self._settings.arrival_tolerance_rad
+        watch = RestWatch(self._settings.dwell_s, self._settings.rest_tolerance_rad)
+        while True:
+            settled, last = self._rests(watch, deadline_s)
+            off = last.pan_rad - pan_rad, last.tilt_rad - tilt_rad
+            if settled and max(map(abs, off)) <= tolerance:
+                return last
+            if self._clock.now_s() < deadline_s:
+                self._clock.sleep(self._settings.poll_s)
+                continue  # a head that rests elsewhere may not have started yet
+            where = f"pan {off[0]:+.4f} rad and tilt {off[1]:+.4f} rad from the commanded angles"
+            if max(map(abs, off)) > tolerance:
+                words = f"at its deadline the head is {where}, at most {tolerance:g} rad is expected"
+                raise PointingError("did_not_arrive", words)
+            words = f"at its deadline the head still moves, {where}: {watch.seen()}"
+            raise PointingError("did_not_settle", words)
+
+    def watch_until(self, until_s: float) -> None:
+        """Read the head until a moment, clock time in seconds.
+
+        Raises
+        ------
+        PointingError, DriverError
+            ``stopped``; else as for a reading.
+        """
+        while (left_s := until_s - self._clock.now_s()) > 0.0:
+            self.check_not_stopped()
+            self.read()
+            self._clock.sleep(min(left_s, WATCHED_S))
+
+    def read(self) -> HeadReading:
+        """Return a reading that can be true.
+
+        Raises
+        ------
+        PointingError
+            ``bad_reading`` or ``head_fault``.
+        DriverError
+            If the head does not answer.
+        """
+        reading, before = self._head.read(), self._last
+        now_s = self._clock.now_s()
+        if not all(map(math.isfinite, (reading.pan_rad, reading.tilt_rad, reading.time_s))):
+            words = f"the head reads pan {reading.pan_rad}, tilt {reading.tilt_rad}"
+            words += "" if math.isfinite(reading.time_s) else f" at {reading.time_s} s"
+            raise PointingError("bad_reading", f"{words}: not finite numbers")
+        if reading.faults:
+            raise PointingError("head_fault", f"the head reports: {'; '.join(reading.faults)}")
+        if now_s - reading.time_s > self._settings.reading_age_s:
+            words = f"the head's reading is {now_s - reading.time_s:.2f} s old"
+            raise PointingError(
+                "bad_reading", f"{words}, at most {self._settings.reading_age_s:g} s is taken"
+            )
+        if before is not None:
+            passed_s = reading.time_s - before.time_s
+            if passed_s < 0:
+                raise PointingError("bad_reading", f"the head's time went back by {-passed_s:.3f} s")
+            reach = 2.0 * self._limits.speed_rad_per_s * passed_s + self._settings.jump_rad
+            goal = self._goal or (before.pan_rad, before.tilt_rad)
+            jump = max(
+                _outside(reading.pan_rad, before.pan_rad, goal[0]),
+                _outside(reading.tilt_rad, before.tilt_rad, goal[1]),
+            )
+            if jump > reach:
+                words = f"the head's reading jumped {jump:.3f} rad off its way in {passed_s:.3f} s"
+                raise PointingError("bad_reading", f"{words}, at most {reach:.3f} rad is possible")
+        self._last = reading
+        return reading
+
+    def _rests(self, watch: RestWatch, deadline_s: float) -> tuple[bool, HeadReading]:
+        """Read until the head rests (True) or the deadline passes; return the last reading."""
+        while True:
+            self.check_not_stopped()
+            reading = self.read()
+            if watch.rests(reading):
+                return True, reading
+            if self._clock.now_s() >= deadline_s:
+                return False, reading
+            self._clock.sleep(self._settings.poll_s)
+
+
+def _outside(value: float, one: float, other: float) -> float:
+    """Return how far a value lies outside the range between two others."""
+    return max(min(one, other) - value, value - max(one, other), 0.0)
+
+
+def reached(
+    solutions: Sequence[Solution],
+    limits: Limits,
+    way: Callable[[Pair, Pair], Way],
+    here: Pair,
+    read: Callable[[Solution], Pair],
+) -> Solution:
+    """Return the solution to take: upright ones first, then the one that is reached soonest.
+
+    Parameters
+    ----------
+    solutions
+        Of the closed form; at least one.
+    limits
+        Of the joints: an angle is taken whole turns away too, where a cable lets the pan turn so far.
+    way
+        Plans the moves from one pose to another, in readings.
+    here
+        Where the head rests, as read.
+    read
+        The readings to send the head to, so that it comes to a solution's true angles.
+
+    Raises
+    ------
+    Unreachable
+        If none lies within the limits.
+    KeptOut, NoWay
+        If keep-outs stand against all that do; of the one that would have been taken.
+    """
+    found: list[tuple[bool, float, Solution]] = []
+    refused: KeptOut | NoWay | None = None
+    for one in ordered(solutions, limits.pan_rad, limits.tilt_rad, *here, read):
+        try:
+            time_s = way(here, read(one)).time_s
+        except (KeptOut, NoWay) as error:
+            refused = refused or error
+        else:
+            found.append((order(one, *here)[0], time_s, one))
+    if not found:
+        assert refused is not None
+        raise refused
+    return min(found, key=lambda candidate: candidate[:2])[2]
+
+
+T = TypeVar("T")
+
+LOOKED_S = 0.02  # how late a stop may be noticed
+
+
+def result_unless(stopped: Callable[[], None], work: Callable[[], T], clock: Clock) -> T:
+    """Return what ``work()`` returns; it runs in a thread of its own.
+
+    Only for work that moves nothing: when ``stopped()`` raises, that is raised, and the work goes on to its
+    end with nobody to take its result. ``clock`` is one that goes on while somebody waits.
+
+    Raises
+    ------
+    BaseException
+        Whatever ``work`` or ``stopped`` raises.
+    """
+    future: Future[T] = Future()
+    ended = clock.signal()
+
+    def run() -> None:
+        try:
+            future.set_result(work())
+        except BaseException as error:  # it belongs to who waits
+            future.set_exception(error)
+        with ended:
+            ended.notify_all()
+
+    clock.thread(run, "operation's work").start()
+    while True:
+        with ended:
+            if not future.done():
+                ended.wait(LOOKED_S)
+        if future.done():
+            return future.result()
+        stopped()

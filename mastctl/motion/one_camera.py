@@ -1,0 +1,150 @@
+"""Pointing with one camera: how far the clicked thing is was told, follows from a plane, or is not known.
+
+What is not known is counted with (`calib.mast.one_eye`): between `PointingSettings.unknown_nearest_m` and
+infinity at first, and less after each view from elsewhere that shows the thing. There is no second eye that
+could confirm a match; instead the thing must be found near the line on which its range can put it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from calib.mast.covariance import stored_covariance
+from calib.mast.one_eye import NORMAL_95, SeenFrom, Sight, range_to_plane, seen_from, shown, unknown_range
+from calib.mast.rig import Rig
+from calib.pictures.patch_verdict import PatchMatch
+from calib.pictures.warp import Plane, facing_plane
+from calib.rigid import FloatArray
+from mastctl.devices.keep_out import Pair
+from mastctl.motion.looking import CameraView, Clicked
+from mastctl.motion.requests import PointRequest
+from mastctl.motion.results import PointingError, rounded
+from mastctl.motion.settings import PointingSettings
+from mastctl.motion.steps import FoundAgain
+
+RangeFrom = Literal["given", "plane", "parallax", "unknown"]
+TRIED_SIGMAS = (1.0, -1.0, 2.0)
+"""Beside the likeliest range, where a thing of unknown range is looked for: nearer, farther, nearer still."""
+TOLD_SHARE = 0.5
+"""Parallax has told a range when it left less than this part of the sigma that nothing else leaves."""
+
+
+class OneCamera:
+    """What one camera knows of a target during one request.
+
+    Attributes
+    ----------
+    sight
+        The newest line of sight, with its range.
+    range_from
+        What says how far the target is.
+
+    Raises
+    ------
+    CalibError
+        If the clicked pixel does not meet the plane that it is told to lie in, or has no ray.
+    """
+
+    def __init__(
+        self, rig: Rig, settings: PointingSettings, sigma_rad: Pair, found: FoundAgain, request: PointRequest
+    ) -> None:
+        self._rig = rig
+        self._settings = settings
+        self._sigma_rad = sigma_rad
+        self._calibration = stored_covariance(rig)
+        camera, joints = found.view.frame.camera, found.view.frame.true_rad
+        pixel, now = found.clicked_px, found.now
+        self.range_from: RangeFrom = "unknown"
+        inverse, sigma = self._unknown = unknown_range(settings.unknown_nearest_m)
+        if request.range_m is not None:
+            self.range_from, inverse, sigma = "given", 1.0 / request.range_m, 0.0
+        elif request.plane is not None:
+            point, normal = np.array(request.plane.point_m), np.array(request.plane.normal)
+            away_m = range_to_plane(rig, camera, joints, pixel, point, normal)
+            self.range_from, inverse, sigma = "plane", 1.0 / away_m, 0.0
+        self.sight = Sight(camera, joints, pixel, inverse, sigma)
+        self._plane = request.plane
+        self.learn(now, found.pixel_px, found.sigma_px, self.expected(now))
+
+    @property
+    def position_m(self) -> FloatArray:
+        """The likeliest place of the target, (3,), rover frame."""
+        return self.sight.position_m(self._rig)
+
+    @property
+    def range_interval_m(self) -> tuple[float, float | None]:
+        """Where the range lies in 95 of 100 cases, from the camera that saw the target last."""
+        return self.sight.range_interval_m
+
+    def told(self) -> Mapping[str, Any]:
+        """What is known of the range, for a step's detail."""
+        near, far = self.range_interval_m
+        return {
+            "range_from": self.range_from,
+            "range_m": round(self.sight.range_m, 5),
+            "range_interval_m": [round(near, 5), None if far is None else round(far, 5)],
+            "position_m": rounded(self.position_m, 5),
+        }
+
+    def clicked(self, found: FoundAgain) -> Clicked:
+        """Return the clicked thing with the surfaces that it may lie on."""
+        view, pixel = found.view, found.clicked_px
+        if self._plane is not None:
+            plane = Plane(np.array(self._plane.point_m), np.array(self._plane.normal))
+            facing = facing_plane(view.camera, pixel, self.sight.range_m)
+            return Clicked(view, pixel, plane, (facing,))
+        near, sigma = self.sight.inverse_m, self.sight.inverse_sigma_m
+        ranges_m = [self.sight.range_m]
+        if sigma > 0.0:
+            ranges_m += [1.0 / max(near + by * sigma, 1e-3) for by in TRIED_SIGMAS]
+        plane, *others = (facing_plane(view.camera, pixel, range_m) for range_m in ranges_m)
+        return Clicked(view, pixel, plane, tuple(others))
+
+    def expected(self, now: CameraView) -> SeenFrom:
+        """Return where a new view should show the target. Raises CalibError if it cannot."""
+        return seen_from(
+            self._rig,
+            self.sight,
+            now.frame.camera,
+            now.frame.true_rad,
+            sigma_px=self._settings.triangulation_sigma_px,
+            sigma_rad=self._sigma_rad,
+            calibration=self._calibration,
+        )
+
+    def check(self, now: CameraView, seen: PatchMatch, expected: SeenFrom) -> dict[str, float]:
+        """Pass a match that lies where the range can put it; return how far off, for the record.
+
+        Raises
+        ------
+        PointingError
+            ``off_the_line``.
+        """
+        reach = NORMAL_95 * 1.5 * self.sight.inverse_sigma_m
+        low, high = max(-reach, -self.sight.inverse_m), reach
+        along, off = expected.along_px_m, seen.pixel_px - expected.pixel_px
+        length2 = float(along @ along)
+        at = min(max(float(off @ along) / length2, low), high) if length2 > 0.0 else 0.0
+        beside_px = float(np.linalg.norm(off - at * along))
+        model = now.camera
+        focal_px = float(np.linalg.norm(np.cross(model.A, model.H)))
+        most_px = self._settings.eyes_px + self._settings.view.floor_rad * focal_px
+        if beside_px > most_px:
+            raise PointingError(
+                "off_the_line",
+                f"what looks like the target in {now.frame.frame_id} is {beside_px:.1f} px from where its "
+                f"range can put it, at most {most_px:.1f} px is expected",
+            )
+        return {"beside_px": round(beside_px, 3)}
+
+    def learn(self, now: CameraView, pixel_px: FloatArray, sigma_px: float, expected: SeenFrom) -> None:
+        """Take what a view has shown. Raises CalibError."""
+        before = self.sight
+        self.sight = shown(
+            self._rig, before, now.frame.camera, now.frame.true_rad, pixel_px, expected, sigma_px
+        )
+        if self.range_from == "unknown" and self.sight.inverse_sigma_m < TOLD_SHARE * self._unknown[1]:
+            self.range_from = "parallax"

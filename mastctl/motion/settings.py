@@ -1,0 +1,170 @@
+"""How pointing and tracking are set: times and tolerances, with the reasons for their values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from calib.pictures.patch_verdict import MatchSettings
+from calib.pictures.shown_view import ViewLimits
+from mastctl.devices.rest import DITHER_RAD
+
+
+@dataclass(frozen=True)
+class PointingSettings:
+    """Times and tolerances of the loop, with the reasons for their values.
+
+    Attributes
+    ----------
+    poll_s
+        Between readings while the head moves.
+    dwell_s
+        How long the reading must stay the same: three exposures, and longer than a mast's ringing after the
+        axis reports its position reached. A reading that dithers is watched for a second
+        (`mastctl.devices.rest`).
+    rest_tolerance_rad
+        How far the readings of a head at rest may lie from each other: three counts of a 12-bit servo.
+    arrival_tolerance_rad
+        How far from the commanded angle a head may rest: three counts and half the backlash of a 12-bit
+        servo, 6 mrad. What remains is measured in the picture.
+    acceleration_s, margin_s
+        Beyond distance over speed: ramps and an approach from one side; then everything else.
+    reading_age_s
+        Oldest reading that is one of now.
+    jump_rad
+        Beyond what the speed allows between two readings (twice over): two encoder slips of a degree.
+    rest_wait_s
+        How long a request waits for a head that still moves.
+    frame_timeout_s
+        For a new picture: some frames of a slow camera, on a busy machine.
+    repeat_after_s
+        How much later a second picture is taken, which has to repeat a residual before it is told; 0: none.
+        Pictures older than their stamps by up to that are found out: what is told was measured in one that
+        was exposed by a head at rest.
+    same_pose_rad
+        Joint angles nearer than this are one pose: a tenth of a Pancam pixel.
+    same_moment_s
+        Exposures less apart than this are one: half a pixel would take 5000 px/s, which blurs any picture.
+    between_eyes_px
+        How far the target may move between the exposures of a pair that serves a measurement.
+    nearest_m
+        Nothing nearer is looked for.
+    unknown_nearest_m
+        A thing whose range nobody tells is taken to be here or farther, in 95 of 100: nearer than a mast's
+        camera has the ground only looking straight down.
+    search_px, wide_search_px
+        Half windows around the predicted place: what arrival tolerance and mast file explain in a Navcam
+        (6 mrad are 8 px) with room; then what a slipped encoder may do (2 degrees are 45 px in a Navcam, 120
+        in a Pancam).
+    eyes_px, range_px
+        Largest offset across the epipolar line, and along it after the move (same pair only), that is still
+        put down to calibration: the paper's mast fit leaves 1.1 px rms.
+    triangulation_sigma_px
+        Of a pixel for the position's covariance: noise and calibration. What the match in the other eye
+        tells is added, so that a position on rough ground is told as less sure.
+    view
+        What may lie between the view that joints tell and the one that a picture shows.
+    match, small_half_px
+        Of the matching itself; and the half patch that is tried after a move where the usual one fits
+        nowhere. ``roughness`` and ``relief`` decide sigmas only, and only where no second eye saw the
+        surface. A second place may fit a little better than elsewhere, as along a rock's smooth edge: the
+        prediction and the other eye must confirm the best.
+    """
+
+    poll_s: float = 0.02
+    dwell_s: float = 0.15
+    rest_tolerance_rad: float = DITHER_RAD
+    arrival_tolerance_rad: float = 6e-3
+    acceleration_s: float = 1.5
+    margin_s: float = 2.5
+    reading_age_s: float = 1.0
+    jump_rad: float = 0.035
+    rest_wait_s: float = 2.0
+    frame_timeout_s: float = 8.0
+    repeat_after_s: float = 1.0
+    same_pose_rad: float = 3e-5
+    same_moment_s: float = 1e-4
+    between_eyes_px: float = 0.5
+    nearest_m: float = 0.4
+    unknown_nearest_m: float = 1.0
+    search_px: float = 48.0
+    wide_search_px: float = 200.0
+    eyes_px: float = 2.0
+    range_px: float = 4.0
+    triangulation_sigma_px: float = 0.2
+    small_half_px: int = 12
+    view: ViewLimits = field(default_factory=ViewLimits)
+    match: MatchSettings = field(
+        default_factory=partial(MatchSettings, roughness=0.02, relief=0.01, least_lead=0.03)
+    )
+
+
+@dataclass(frozen=True)
+class PairBounds:
+    """Where a pair looks.
+
+    Attributes
+    ----------
+    nearest_m
+        Least range of the target from the middle between the pair's cameras.
+    steepest_rad
+        How far below the rover's horizontal it looks at most.
+    """
+
+    nearest_m: float = 0.0
+    steepest_rad: float = math.pi / 2
+
+
+@dataclass(frozen=True)
+class HandoffRules:
+    """What decides between the pairs.
+
+    Attributes
+    ----------
+    pairs
+        Bounds of each pair by its name; a pair that is not here has none. The ranges are the paper's.
+    margin_px
+        The target lies at least so far inside both pictures.
+    disparity_error_px
+        3-sigma disparity error of eq. (1).
+    range_error
+        Largest range error by eqs. (1) and (2), 3 sigma, as a part of the range. At 0.2 a 640x480 Hazcam
+        serves up to some 6 m.
+    """
+
+    pairs: Mapping[str, PairBounds] = field(
+        default_factory=lambda: {"pancam": PairBounds(6.0), "navcam": PairBounds(2.0)}
+    )
+    margin_px: float = 30.0
+    disparity_error_px: float = 1.0
+    range_error: float = 0.2
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """What may be set about tracking.
+
+    Attributes
+    ----------
+    handoff
+        Which pair looks.
+    most_step
+        Longest way between two poses that a track is carried over, as a part of the target's range. A tenth
+        is a usual step; with three tenths the target is seen so differently that a longer way is taken for a
+        pose that jumped.
+    start_error
+        How far from an asked position the target of a track may turn out to be, as a part of its range.
+    named_pairs
+        Pairs whose bounds were set; the mast file must have them.
+    handoff_log
+        Where hand-offs are written down; None: they are forgotten at the daemon's end.
+    """
+
+    handoff: HandoffRules = field(default_factory=HandoffRules)
+    most_step: float = 0.3
+    start_error: float = 0.1
+    named_pairs: tuple[str, ...] = ()
+    handoff_log: Path | None = None

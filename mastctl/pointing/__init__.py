@@ -1,1 +1,0 @@
-"""The pointing loop: from a request to a residual measured in a new picture."""
