@@ -12,10 +12,8 @@ from drivers.serial_line import stable_name
 from drivers.simulation_clock import SimulationClock, simulation_speed
 
 HEADS = {"dynamixel": "drivers.dynamixel.head", "flir_ptu": "drivers.flir_ptu.head"}
-"""Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them."""
-
-HALTS = {"dynamixel": "drivers.dynamixel.halt", "flir_ptu": "drivers.flir_ptu.halt"}
-"""The module of each whose ``halt(options)`` stops a head that no daemon drives any more."""
+"""Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them, and whose
+``halt(options)`` stops a head that no daemon drives any more."""
 
 CAMERAS = {"v4l2": "drivers.v4l2.camera"}
 """Camera drivers of this repository: the module whose ``open_camera(options, clock, name)`` opens one."""

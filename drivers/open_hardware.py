@@ -21,7 +21,7 @@ from drivers.errors import BadOptions, DriverError, NoReply
 from drivers.faults import PAN_TILT, nearest
 from drivers.hardware import DeviceSettings, Hardware, HardwareKind, HardwareSettings, close_devices
 from drivers.interfaces import Camera, PanTilt
-from drivers.known import BUILT_IN, CAMERAS, HALTS, HEADS, OURS
+from drivers.known import BUILT_IN, CAMERAS, HEADS, OURS
 from drivers.outside import device_from_outside
 
 if TYPE_CHECKING:
@@ -89,8 +89,8 @@ def halt_head(settings: HardwareSettings) -> list[str]:
         If the head did not confirm; it may still move.
     """
     device = settings.pan_tilt
-    if device.driver in HALTS:
-        return list(importlib.import_module(HALTS[device.driver]).halt(device.options))
+    if device.driver in HEADS:
+        return list(importlib.import_module(HEADS[device.driver]).halt(device.options))
     if device.driver in OURS:
         return [f"driver {device.driver!r} has no head that moves without its daemon; nothing to halt"]
     head = _Opener(settings, SystemClock()).head(device)

@@ -7,10 +7,17 @@ which good answers narrow, so that a chain of answers, each a little late, canno
 
 from __future__ import annotations
 
+from drivers.dynamixel.packets import GroupQuestion, Status
+from drivers.dynamixel.port import QUIET_S, Exchange
+from drivers.errors import BadReply, DriverError, LineLost
+
 MODULUS_S = 32.768
 STEP_S = 0.001
 SLACK_S = 0.003  # the servo takes its counter and its other registers at different moments of its own loop
 DRIFT = 0.03  # its oscillator against ours
+
+MEETING_SHAPES = ((12, 0), (8, 2), (4, 4), (0, 2), (8, 4), (4, 2), (12, 2), (0, 4))
+"""Bytes read before and after the counter to get to know it; no two of the same length in all."""
 
 
 class Counter:
@@ -55,3 +62,70 @@ class Counter:
         self._earliest_s = min(max(earliest_s, sent_s - STEP_S), latest_s)
         self._latest_s = max(min(latest_s, received_s), earliest_s)
         return ""
+
+
+class TickCounters:
+    """Which servo's counter showed what when; for the thread that has the line."""
+
+    def __init__(self, exchange: Exchange) -> None:
+        self._exchange = exchange
+        self._clock = exchange.port.clock
+        self._known: dict[int, Counter] = {}
+
+    def forget(self, servo_id: int) -> None:
+        """Get to know a servo's counter anew: it restarts."""
+        self._known.pop(servo_id, None)
+
+    def unmet(self, question: GroupQuestion) -> DriverError | None:
+        """Get to know the counters of a group's servos; returns why that failed. Raises LineLost."""
+        for servo_id, at in question.ticks.items():
+            if servo_id not in self._known:
+                try:
+                    self._meet(servo_id, question.parts[servo_id].address + at)
+                except LineLost:
+                    raise
+                except DriverError as error:
+                    return error
+        return None
+
+    def doubts(self, question: GroupQuestion, status: Status, sent_s: float) -> BadReply | None:
+        """Return why a reply that just came is not to this question; None if it is, or holds no counter."""
+        servo_id = status.servo_id
+        if servo_id not in question.ticks:
+            return None
+        at = question.ticks[servo_id]
+        tick = int.from_bytes(status.data[at : at + 2], "little")
+        doubts = self._known[servo_id].doubts(tick, sent_s, self._clock.now_s())
+        if not doubts:
+            return None
+        self._exchange.stray(status)
+        return self._bad(servo_id, "group read", doubts)
+
+    def _meet(self, servo_id: int, tick_address: int) -> None:
+        """Get to know a counter: by two answers, each after a silence, that agree about it.
+
+        No question is asked twice, so that no reply that is some questions late can be taken for another.
+        """
+        shapes = iter(MEETING_SHAPES)
+        for shape in shapes:
+            counter = Counter(*self._tick(servo_id, tick_address, shape))
+            doubts = counter.doubts(*self._tick(servo_id, tick_address, next(shapes)))
+            if not doubts:
+                self._known[servo_id] = counter
+                return
+        words = f"no two replies are of the moments that they were asked for: {doubts}"
+        raise self._bad(servo_id, "read", words)
+
+    def _tick(self, servo_id: int, address: int, shape: tuple[int, int]) -> tuple[int, float, float]:
+        """The counter in a reply of so many bytes around it, and when that was asked and came."""
+        before, after = shape
+        self._exchange.quiet(QUIET_S)
+        sent_s = self._clock.now_s()
+        data = self._exchange.read(servo_id, address - before, before + 2 + after, "realtime_tick")
+        return int.from_bytes(data[before : before + 2], "little"), sent_s, self._clock.now_s()
+
+    def _bad(self, servo_id: int, word: str, words: str) -> BadReply:
+        return BadReply(
+            f"servo {servo_id} on {self._exchange.port.name}: {words}",
+            detail=self._exchange.where(servo_id, word, "realtime_tick"),
+        )

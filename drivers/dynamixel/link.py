@@ -5,7 +5,7 @@ is of its question:
 
 - Where it holds the servo's millisecond counter, that shows the moment of the question (`counter`).
 - Where it does not, `Link.proven` asks twice around a silence and wants one answer; what is read for one
-  register differs in length from what is read for another (`models.Register.window`).
+  register differs in length from what is read for another (`registers.Register.window`).
 - Of a group read the replies come in the order asked, one of each servo, or none counts.
 - A reply without data (to a write, a restart) proves nothing: who must be certain reads afterwards.
 """
@@ -17,20 +17,24 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 from drivers.clock import Clock
-from drivers.dynamixel.exchange import Exchange
-from drivers.dynamixel.group import (
+from drivers.dynamixel.counter import TickCounters
+from drivers.dynamixel.packets import (
+    BROADCAST_ID,
+    PING,
+    REBOOT,
+    WRITE,
     GroupAnswer,
     GroupQuestion,
     Part,
+    Status,
     fast_blocks,
     group_question,
     group_write_packet,
+    instruction_packet,
     tick_at,
 )
-from drivers.dynamixel.models import Register
-from drivers.dynamixel.packets import BROADCAST_ID, PING, REBOOT, WRITE, Status, instruction_packet
-from drivers.dynamixel.port import QUIET_S, Port
-from drivers.dynamixel.tick_counters import TickCounters
+from drivers.dynamixel.port import QUIET_S, Exchange, Port
+from drivers.dynamixel.registers import Register
 from drivers.errors import BadReply, DriverError, LineLost, Refused
 from drivers.serial_line import OpenLine, SerialLine
 

@@ -1,147 +1,27 @@
-"""The servos that the driver knows: registers, counts, units and limits, in two tables.
+"""The servos that the driver knows: counts, units and limits, and what the numbers in their registers mean.
 
-Sources: the control tables of the ROBOTIS e-manual (emanual.robotis.com, one page per model), which the
-``.model`` files of dynamixel-sdk 4.1.0 (``dynamixel_easy_sdk/control_table``) repeat without ranges and
-units. X and MX servos with protocol 2.0 share one register map, P servos another one that holds the same
-registers in the same order, from torque_enable on 448 addresses higher.
+Sources: the tables of dynamixel-sdk (`drivers.dynamixel.registers`); for what these do not say, which are
+currents, backlash, the units of velocity and acceleration, the meaning of bits and codes, and since which
+firmware there is a watchdog, the ROBOTIS e-manual (emanual.robotis.com, one page per model). The tables' own
+velocity unit is 0.05 % below the manual's.
 """
 
 from __future__ import annotations
 
 import math
-import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal
 
+from drivers.dynamixel.registers import Register, vendor_table
 from drivers.errors import BadOptions
 from drivers.faults import nearest
 
-Map = Literal["X", "P"]
 RPM_RAD_PER_S = math.tau / 60
 REV_PER_MIN2_RAD_PER_S2 = math.tau / 3600
-
-
-@dataclass(frozen=True)
-class Register:
-    """One entry of a control table: its address, its size in bytes, whether it is signed or permanent.
-
-    ``permanent`` registers (EEPROM) can be written only while torque is off and wear with each write.
-    ``window`` is the address and the length of what is read to know the register: see `_WINDOWS`.
-    """
-
-    name: str
-    address: int
-    size: int
-    signed: bool = False
-    permanent: bool = False
-    window: tuple[int, int] = (0, 0)
-
-    def decode(self, data: bytes) -> int:
-        """Return the value of the register's little-endian bytes."""
-        return int.from_bytes(data, "little", signed=self.signed)
-
-    def decode_window(self, data: bytes) -> int:
-        """Return the register's value out of the bytes of its window."""
-        at = self.address - self.window[0]
-        return self.decode(data[at : at + self.size])
-
-    def encode(self, value: int) -> bytes:
-        """Return a value as the register's little-endian bytes; OverflowError if it does not fit."""
-        return value.to_bytes(self.size, "little", signed=self.signed)
-
-
-#   name                    X/MX   P  bytes signed
-_REGISTERS = """
-    model_number               0    0   2
-    firmware                   6    6   1
-    id                         7    7   1
-    baud                       8    8   1
-    return_delay               9    9   1
-    drive_mode                10   10   1
-    operating_mode            11   11   1
-    secondary_id              12   12   1
-    homing_offset             20   20   4   signed
-    moving_threshold          24   24   4
-    temperature_limit         31   31   1
-    max_voltage_limit         32   32   2
-    min_voltage_limit         34   34   2
-    pwm_limit                 36   36   2
-    current_limit             38   38   2
-    velocity_limit            44   44   4
-    max_position_limit        48   48   4   signed
-    min_position_limit        52   52   4   signed
-    shutdown                  63   63   1
-    torque_enable             64  512   1
-    status_return_level       68  516   1
-    hardware_error            70  518   1
-    bus_watchdog              98  546   1
-    goal_pwm                 100  548   2   signed
-    goal_current             102  550   2   signed
-    goal_velocity            104  552   4   signed
-    profile_acceleration     108  556   4
-    profile_velocity         112  560   4
-    goal_position            116  564   4   signed
-    realtime_tick            120  568   2
-    moving                   122  570   1
-    moving_status            123  571   1
-    present_pwm              124  572   2   signed
-    present_current          126  574   2   signed
-    present_velocity         128  576   4   signed
-    present_position         132  580   4   signed
-    velocity_trajectory      136  584   4   signed
-    position_trajectory      140  588   4   signed
-    present_voltage          144  592   2
-    present_temperature      146  594   1
-"""
-FIRST_RAM_ADDRESS = 64
-
-# A reply does not say which register it is of, but its length does if no two have the same one: here only
-# torque and goal PWM, and shutdown and bus watchdog, which are never asked for one after the other. Each
-# window holds registers only that every servo of the table has, without gaps, which servos may refuse. The
-# registers around the counter (realtime_tick) are read together with it.
-#   X/MX address, bytes   what stands there
-_WINDOWS = (
-    (0, 13),  # model number to secondary id
-    (20, 8),  # homing offset, moving threshold
-    (31, 7),  # temperature and voltage limits, PWM limit
-    (36, 4),  # PWM limit, current limit
-    (44, 12),  # velocity limit, position limits
-    (63, 1),  # shutdown
-    (64, 2),  # torque, LED
-    (68, 3),  # status return level, registered instruction, hardware error
-    (98, 1),  # bus watchdog
-    (100, 2),  # goal PWM
-)
-
-
-def _window(x: int, size: int, tick: int) -> tuple[int, int]:
-    """Address and length, on the X map, of what is read to know a register."""
-    for address, length in _WINDOWS:
-        if address <= x and x + size <= address + length:
-            return address, length
-    first, end = min(x, tick), max(x + size, tick + 2)
-    return first, end - first
-
-
-def _maps() -> dict[Map, Mapping[str, Register]]:
-    maps: dict[Map, dict[str, Register]] = {"X": {}, "P": {}}
-    rows = [line.split() for line in _REGISTERS.strip().splitlines()]
-    tick = next(int(row[1]) for row in rows if row[0] == "realtime_tick")
-    for name, x, p, size, *signed in rows:
-        first, length = _window(int(x), int(size), tick)
-        for key, address in (("X", int(x)), ("P", int(p))):
-            permanent = int(x) < FIRST_RAM_ADDRESS
-            window = (first + address - int(x), length)
-            maps["X" if key == "X" else "P"][name] = Register(
-                name, address, int(size), bool(signed), permanent, window
-            )
-    return {key: MappingProxyType(registers) for key, registers in maps.items()}
-
-
-REGISTERS = _maps()
-TICK_ADDRESSES = tuple(registers["realtime_tick"].address for registers in REGISTERS.values())
+POSITION_MODE = 3
+NO_SECONDARY_ID = 253  # and above
+WATCHDOG_TRIPPED = 255
 
 BAUD_RATES = MappingProxyType(
     {
@@ -180,6 +60,8 @@ OPERATING_MODES = MappingProxyType(
     }
 )
 
+Words = Callable[["Model", int], str]
+
 
 @dataclass(frozen=True)
 class Model:
@@ -190,13 +72,13 @@ class Model:
     name, number
         As ROBOTIS names it, and what a ping answers.
     registers
-        Its register map, by name.
-    counts_per_turn
-        Of the output shaft.
+        Those that it has, by name.
     low_count, high_count
         What its position limits may be in position mode.
     centre_count
         Where its own angle is zero.
+    counts_per_turn
+        Of the output shaft.
     velocity_unit_rad_per_s, acceleration_unit_rad_per_s2
         Of one count of velocity and profile acceleration.
     current_unit_A, most_current_counts
@@ -211,10 +93,10 @@ class Model:
     name: str
     number: int
     registers: Mapping[str, Register]
-    counts_per_turn: int
     low_count: int
     high_count: int
     centre_count: int
+    counts_per_turn: int
     velocity_unit_rad_per_s: float
     acceleration_unit_rad_per_s2: float
     current_unit_A: float | None
@@ -228,36 +110,21 @@ class Model:
         return math.tau / self.counts_per_turn
 
 
-_X = (REGISTERS["X"], 4096, 0, 4095, 2048, 0.229 * RPM_RAD_PER_S, 214.577 * REV_PER_MIN2_RAD_PER_S2)
-
-
 def _x(
     name: str, number: int, current_unit_A: float | None, most_current_counts: int, backlash_deg: float | None
 ) -> Model:
     """A servo of the X or MX series: 12-bit encoder on the output shaft."""
+    table = vendor_table(number, first_ram_address=64)
     backlash = None if backlash_deg is None else math.radians(backlash_deg)
-    return Model(name, number, *_X, current_unit_A, most_current_counts, backlash, watchdog_firmware=38)
+    units = 0.229 * RPM_RAD_PER_S, 214.577 * REV_PER_MIN2_RAD_PER_S2
+    return Model(name, number, *table, 4096, *units, current_unit_A, most_current_counts, backlash, 38)
 
 
-def _p(
-    name: str, number: int, counts_per_turn: int, half_turn_counts: int, most_current_counts: int
-) -> Model:
+def _p(name: str, number: int, most_current_counts: int) -> Model:
     """A servo of the P series: counts on the motor's side of the gear."""
-    units = 0.01 * RPM_RAD_PER_S, 1.0 * REV_PER_MIN2_RAD_PER_S2
-    return Model(
-        name,
-        number,
-        REGISTERS["P"],
-        counts_per_turn,
-        -half_turn_counts,
-        half_turn_counts,
-        0,
-        *units,
-        0.001,
-        most_current_counts,
-        math.radians(0.1),
-        watchdog_firmware=0,
-    )
+    table = vendor_table(number, first_ram_address=512)
+    turn, units = table.high_count - table.low_count, (0.01 * RPM_RAD_PER_S, 1.0 * REV_PER_MIN2_RAD_PER_S2)
+    return Model(name, number, *table, turn, *units, 0.001, most_current_counts, math.radians(0.1), 0)
 
 
 # Current units and limits, backlash: e-manual, and the makers' data sheets where they state backlash
@@ -279,13 +146,15 @@ _MODELS = (
     _x("MX-28", 30, None, 0, 0.33),
     _x("MX-64", 311, 0.00336, 1941, 0.33),
     _x("MX-106", 321, 0.00336, 2047, 0.33),
-    #  name             number  counts a turn  half a turn  most counts of current
-    _p("PH42-020-S300", 2000, 607_500, 303_750, 4500),
-    _p("PH54-100-S500", 2010, 1_003_846, 501_923, 15900),
-    _p("PH54-200-S500", 2020, 1_003_846, 501_923, 22740),
+    #  name             number  most counts of current
+    _p("PH42-020-S300", 2000, 4500),
+    _p("PH54-100-S500", 2010, 15900),
+    _p("PH54-200-S500", 2020, 22740),
 )
+
 MODELS: Mapping[str, Model] = MappingProxyType({model.name: model for model in _MODELS})
 MODELS_BY_NUMBER: Mapping[int, Model] = MappingProxyType({model.number: model for model in _MODELS})
+TICK_ADDRESSES = tuple(sorted({model.registers["realtime_tick"].address for model in _MODELS}))
 
 
 def model_named(name: str) -> Model:
@@ -310,31 +179,77 @@ def hardware_error_words(value: int) -> list[str]:
     return words + ([f"unknown hardware error bits 0x{unknown:02x}"] if unknown else [])
 
 
-class Block:
-    """Neighbouring registers that are read in one go, and their decoding.
+def register_words(model: Model, name: str, value: int) -> str:
+    """Return what a register's number means; empty where the number says it."""
+    words = _WORDS.get(name)
+    return "" if words is None else words(model, value)
 
-    Parameters
-    ----------
-    registers
-        A register map.
-    first, last
-        The names of its ends.
-    """
 
-    def __init__(self, registers: Mapping[str, Register], first: str, last: str) -> None:
-        start, end = registers[first].address, registers[last].address
-        inside = sorted((r for r in registers.values() if start <= r.address <= end), key=lambda r: r.address)
-        codes, at = "<", start
-        for register in inside:
-            codes += "x" * (register.address - at)
-            code = {1: "B", 2: "H", 4: "I"}[register.size]
-            codes += code.lower() if register.signed else code
-            at = register.address + register.size
-        self.address = start
-        self.length = at - start
-        self._names = tuple(register.name for register in inside)
-        self._struct = struct.Struct(codes)
+def _angle(model: Model, value: int) -> str:
+    return f"{math.degrees((value - model.centre_count) * model.count_rad):.3f} deg from its middle"
 
-    def decode(self, data: bytes) -> dict[str, int]:
-        """Return the registers' values by name; ``data`` has ``length`` bytes."""
-        return dict(zip(self._names, self._struct.unpack(data), strict=True))
+
+def _velocity(model: Model, value: int) -> str:
+    return f"{value * model.velocity_unit_rad_per_s:.4f} rad/s"
+
+
+def _acceleration(model: Model, value: int) -> str:
+    return f"{value * model.acceleration_unit_rad_per_s2:.4f} rad/s2" if value else "as hard as it can"
+
+
+def _current(model: Model, value: int) -> str:
+    return "" if model.current_unit_A is None else f"{value * model.current_unit_A:.3f} A"
+
+
+def _load(model: Model, value: int) -> str:
+    return f"{value / 10:.1f} % load" if model.current_unit_A is None else _current(model, value)
+
+
+def _volts(model: Model, value: int) -> str:
+    return f"{value / 10:.1f} V"
+
+
+def _errors(model: Model, value: int) -> str:
+    return ", ".join(hardware_error_words(value)) or "none"
+
+
+_WORDS: Mapping[str, Words] = {
+    "model_number": lambda model, value: model.name,
+    "baud": lambda model, value: f"{BAUD_RATES[value]} baud" if value in BAUD_RATES else "unknown baud rate",
+    "return_delay": lambda model, value: f"{2 * value} us",
+    "operating_mode": lambda model, value: OPERATING_MODES.get(value, "unknown mode"),
+    "secondary_id": lambda model, value: "none" if value >= NO_SECONDARY_ID else "also obeys this id",
+    "min_position_limit": _angle,
+    "max_position_limit": _angle,
+    "present_position": _angle,
+    "goal_position": _angle,
+    "position_trajectory": _angle,
+    "homing_offset": lambda model, value: f"{math.degrees(value * model.count_rad):.3f} deg",
+    "velocity_limit": _velocity,
+    "goal_velocity": _velocity,
+    "profile_velocity": lambda model, value: _velocity(model, value) if value else "as fast as it can",
+    "present_velocity": _velocity,
+    "velocity_trajectory": _velocity,
+    "moving_threshold": _velocity,
+    "profile_acceleration": _acceleration,
+    "current_limit": _current,
+    "goal_current": _current,
+    "present_current": _load,
+    "max_voltage_limit": _volts,
+    "min_voltage_limit": _volts,
+    "present_voltage": _volts,
+    "temperature_limit": lambda model, value: f"{value} C",
+    "present_temperature": lambda model, value: f"{value} C",
+    "hardware_error": _errors,
+    "shutdown": lambda model, value: f"shuts down on: {_errors(model, value)}",
+    "bus_watchdog": lambda model, value: {0: "off", WATCHDOG_TRIPPED: "tripped"}.get(
+        value, f"{20 * value} ms"
+    ),
+    "torque_enable": lambda model, value: "on" if value else "off",
+    "status_return_level": lambda model, value: {
+        0: "answers pings",
+        1: "answers reads",
+        2: "answers everything",
+    }.get(value, "unknown"),
+    "moving_status": lambda model, value: "in position" if value & 1 else "not in position",
+}

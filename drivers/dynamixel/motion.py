@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drivers.approach import legs_to
-from drivers.dynamixel.models import Block
+from drivers.dynamixel.registers import Block
 from drivers.dynamixel.settings import ServoAxisSettings
 from drivers.errors import BadReply
 from drivers.interfaces import AxisReport, Side

@@ -10,12 +10,11 @@ import logging
 from collections.abc import Callable, Sequence
 
 from drivers.clock import Clock
-from drivers.dynamixel.group import GroupAnswer, Part
-from drivers.dynamixel.hardware_errors import Reboots
 from drivers.dynamixel.link import Link
-from drivers.dynamixel.models import Block
 from drivers.dynamixel.motion import AxisMotion, Sample, motion_blocks
-from drivers.dynamixel.servo import Servo
+from drivers.dynamixel.packets import GroupAnswer, Part
+from drivers.dynamixel.registers import Block
+from drivers.dynamixel.servo import Reboots, Servo
 from drivers.dynamixel.settings import DynamixelSettings, ServoAxisSettings
 from drivers.errors import DriverError, LineLost
 from drivers.serial_line import OpenLine, SerialLine

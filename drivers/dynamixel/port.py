@@ -1,22 +1,39 @@
 """The line to servos: packets sent, replies gathered until a deadline, what nobody asked for dropped.
 
-Every wait gives way to a stop; a stop itself goes out whatever is under way.
+Every wait gives way to a stop; a stop itself goes out whatever is under way. `Exchange` asks one servo one
+thing. Every failure names port, servo id, register and instruction, in its sentence and in ``detail``. No
+value is ever made up: what a servo did not say is an error.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+import logging
+from collections.abc import Callable, Iterator, Sequence
 
 from drivers.clock import Clock, SystemClock
-from drivers.dynamixel.packets import Status, take_status
-from drivers.errors import BadReply
+from drivers.dynamixel.packets import (
+    ERROR_WORDS,
+    PING,
+    READ,
+    REBOOT,
+    WRITE,
+    Status,
+    instruction_packet,
+    take_status,
+)
+from drivers.errors import BadReply, LineLost, NoReply, Refused
 from drivers.serial_line import OpenLine, SerialLine
+
+log = logging.getLogger(__name__)
 
 QUIET_S = 0.02  # a USB adapter may hold bytes back for 16 ms
 LONGEST_DRAIN_S = 0.3
 SLICE_S = 0.005  # how soon a wait sees that it has to give way
 REPLY_UNDER_WAY_S = 0.01  # how long it then lets a reply come in that would collide with what is sent next
+
+STATUS_BYTES = 11  # of a reply without data
+INSTRUCTION_WORDS = {PING: "ping", READ: "read", WRITE: "write", REBOOT: "reboot"}
 
 
 class Overtaken(Exception):
@@ -198,3 +215,92 @@ class Port:
             if give_way_s is not None and now_s >= give_way_s:
                 self.suspect = True
                 raise Overtaken
+
+
+class Exchange:
+    """Asking one servo at a time; for the thread that has the port.
+
+    Parameters
+    ----------
+    port
+        Open. `Overtaken` may come from whatever asks.
+    """
+
+    def __init__(self, port: Port) -> None:
+        self.port = port
+
+    def ask(
+        self, servo_id: int, instruction: int, parameters: bytes, length: int, register: str = ""
+    ) -> Status:
+        """Send an instruction to one servo and return its reply of ``length`` bytes.
+
+        ``register`` is for messages. Raises NoReply, BadReply, Refused, LineLost.
+        """
+        word = INSTRUCTION_WORDS[instruction]
+        packet = instruction_packet(servo_id, instruction, parameters)
+        try:
+            self.port.send(packet, STATUS_BYTES + length)
+            while (status := self.port.receive()) is not None:
+                if status.servo_id != servo_id or not (status.refused or len(status.data) == length):
+                    self.stray(status)
+                elif status.refused:
+                    raise self.refusal(status, word, register)
+                else:
+                    return status
+        except LineLost as error:
+            raise self.placed(error, [servo_id], word, register) from error
+        raise self.silence(servo_id, word, register)
+
+    def read(self, servo_id: int, address: int, length: int, register: str) -> bytes:
+        """Return bytes of one servo's table, as they seem to be; raises as `ask`."""
+        asked = address.to_bytes(2, "little") + length.to_bytes(2, "little")
+        return self.ask(servo_id, READ, asked, length, register).data
+
+    def quiet(self, quiet_s: float) -> None:
+        """Drop what comes until nothing has come for ``quiet_s``: late replies. Raises LineLost, BadReply."""
+        self.port.drain(quiet_s, 1.0)
+
+    def stray(self, status: Status) -> None:
+        """Note a reply to another question; the line is listened to until quiet before the next one."""
+        self.port.suspect = True
+        log.debug("%s: dropped a reply of id %d that nobody waits for", self.port.name, status.servo_id)
+
+    def silence(self, servo_id: int, word: str, register: str) -> NoReply:
+        """Return the error of a servo that did not answer."""
+        self.port.suspect = True
+        return NoReply(
+            f"servo {servo_id} on {self.port.name} at {self.port.baud} baud gave no usable answer to "
+            f"{_what(word, register)} within {1000 * self.port.reply_timeout_s:g} ms",
+            detail=self.where(servo_id, word, register),
+        )
+
+    def refusal(self, status: Status, word: str, register: str) -> Refused:
+        """Return the error of a servo that refused."""
+        reason = ERROR_WORDS.get(status.refused, f"unknown error {status.refused}")
+        alert = ", and it reports a hardware error" if status.alert else ""
+        return Refused(
+            f"servo {status.servo_id} on {self.port.name} refused the {_what(word, register)}: "
+            f"{reason}{alert}",
+            detail={**self.where(status.servo_id, word, register), "error": status.error},
+        )
+
+    def placed(self, error: LineLost, servo_ids: Sequence[int], word: str, register: str = "") -> LineLost:
+        """Return the same loss, saying what was being asked."""
+        servos = " and ".join(str(servo_id) for servo_id in servo_ids)
+        where = self.where(servo_ids[0], word, register)
+        words = f"{error} during {_what(word, register)} of servo {servos}"
+        return LineLost(words, detail={**where, **error.detail})
+
+    def where(self, servo_id: int, word: str, register: str) -> dict[str, object]:
+        """Return the place of an error, for programs."""
+        return {
+            "port": self.port.name,
+            "baud": self.port.baud,
+            "servo_id": servo_id,
+            "register": register,
+            "instruction": word,
+        }
+
+
+def _what(word: str, register: str) -> str:
+    return f"{word} of {register}" if register else word

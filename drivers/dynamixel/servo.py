@@ -10,25 +10,57 @@ from __future__ import annotations
 import itertools
 import logging
 
-from drivers.dynamixel.group import Part
-from drivers.dynamixel.hardware_errors import Reboots, hardware_fault_words
 from drivers.dynamixel.link import Link
-from drivers.dynamixel.models import MODELS_BY_NUMBER, hardware_error_words
+from drivers.dynamixel.models import (
+    HARDWARE_ERRORS,
+    MODELS_BY_NUMBER,
+    NO_SECONDARY_ID,
+    POSITION_MODE,
+    hardware_error_words,
+)
 from drivers.dynamixel.motion import Sample, Truth, motion_blocks
-from drivers.dynamixel.register_words import NO_SECONDARY_ID
+from drivers.dynamixel.packets import Part
 from drivers.dynamixel.servo_table import ServoTable, again, identified
 from drivers.dynamixel.settings import DynamixelSettings, ServoAxisSettings
 from drivers.errors import BadReply, DriverError, HardwareFault, NoReply, Refused, WrongDevice
 
 log = logging.getLogger(__name__)
 
-POSITION_MODE = 3
+MOST_REBOOTS, REBOOT_SPAN_S = 3, 600.0
+
 FULL_STATUS_RETURN = 2
 REVERSE_BIT, SLAVE_BIT = 0x01, 0x02
-WATCHDOG_TRIPPED = 255
 HOMING_LIMIT = 1024  # what position mode honours of an X servo's homing offset, counts
 REBOOT_S = 2.0  # how long a servo may be deaf after a reboot
 COME_TO_REST_S = 0.5
+
+
+class Reboots:
+    """When the servos of a head were rebooted: `MOST_REBOOTS` times in `REBOOT_SPAN_S` at most.
+
+    Counted over all lines of the head, where a servo is rebooted and nowhere else.
+    """
+
+    def __init__(self) -> None:
+        self._times_s: list[float] = []
+
+    def left(self, now_s: float) -> int:
+        """Return how many may be done now."""
+        self._times_s = [then_s for then_s in self._times_s if now_s - then_s < REBOOT_SPAN_S]
+        return MOST_REBOOTS - len(self._times_s)
+
+    def note(self, now_s: float) -> None:
+        """Count one."""
+        self._times_s.append(now_s)
+
+
+def hardware_fault_words(name: str, error: int) -> str:
+    """Return one sentence for a hardware error."""
+    words = " and ".join(hardware_error_words(error & sum(HARDWARE_ERRORS)) or [f"bits 0x{error:02x}"])
+    return (
+        f"{name} reports {words} (hardware error 0x{error:02x}); it keeps saying so until it is rebooted or "
+        "switched off and on, which drops its torque"
+    )
 
 
 class Servo(ServoTable):

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TypeVar
 
-from drivers.dynamixel.group import GroupAnswer, Part
 from drivers.dynamixel.link import Link, Pinged
-from drivers.dynamixel.models import Block, Register
+from drivers.dynamixel.packets import GroupAnswer, Part
 from drivers.dynamixel.port import QUIET_S
+from drivers.dynamixel.registers import Block, Register
 from drivers.errors import BadReply, NoReply, Refused, WrongDevice
 
 T = TypeVar("T")

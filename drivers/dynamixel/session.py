@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
 from drivers.clock import Clock
-from drivers.dynamixel.hardware_errors import Reboots
+from drivers.dynamixel.models import WATCHDOG_TRIPPED
 from drivers.dynamixel.pair import Pair, ServoAxis
-from drivers.dynamixel.servo import WATCHDOG_TRIPPED
+from drivers.dynamixel.servo import Reboots
 from drivers.dynamixel.settings import DynamixelSettings
 from drivers.dynamixel.watch import GivenUp, Watch
 from drivers.errors import DriverError, LineLost, NoReply, WatchdogTripped

@@ -9,9 +9,9 @@ import logging
 import math
 from collections.abc import Sequence
 
-from drivers.dynamixel.hardware_errors import Reboots, hardware_fault_words
+from drivers.dynamixel.models import WATCHDOG_TRIPPED
 from drivers.dynamixel.pair import Pair, ServoAxis
-from drivers.dynamixel.servo import WATCHDOG_TRIPPED
+from drivers.dynamixel.servo import Reboots, hardware_fault_words
 from drivers.dynamixel.settings import DynamixelSettings
 from drivers.errors import BadReply, DriverError, HardwareFault, Refused, WatchdogTripped
 

@@ -24,7 +24,16 @@ from typing import TypeVar
 
 from drivers.clock import Clock
 from drivers.errors import BadReply, DriverError, NoReply, Refused
-from drivers.flir_ptu.replies import Answer, LineSplitter, answer_of, hits_of, number_of, without_hits
+from drivers.flir_ptu.protocol import (
+    RESOLUTION,
+    Answer,
+    LineSplitter,
+    Query,
+    answer_of,
+    hits_of,
+    number_of,
+    without_hits,
+)
 from drivers.serial_line import ByteLine
 
 T = TypeVar("T")
@@ -44,32 +53,6 @@ class Interrupted(DriverError):
     """Something was shouted meanwhile; the command was not sent, and its caller gives way."""
 
     code = "interrupted"
-
-
-@dataclass(frozen=True)
-class Query:
-    """A question with a number for an answer: its letters, and words of its verbose answer."""
-
-    letters: str
-    words: tuple[str, ...]
-
-
-def _axis_query(letter: str, *words: str) -> dict[str, Query]:
-    """The same question for both axes."""
-    return {
-        axis: Query(axis[0].upper() + letter, tuple(axis if word == "AXIS" else word for word in words))
-        for axis in ("pan", "tilt")
-    }
-
-
-POSITION = _axis_query("P", "current", "AXIS", "position")
-RESOLUTION = _axis_query("R", "arc", "position")  # the E series does not say of which axis
-LOWEST = _axis_query("N", "minimum", "AXIS", "position")
-HIGHEST = _axis_query("X", "maximum", "AXIS", "position")
-SPEED = _axis_query("S", "AXIS", "speed")
-FASTEST = _axis_query("U", "maximum", "AXIS", "speed")
-SLOWEST = _axis_query("L", "minimum", "AXIS", "speed")
-ACCELERATION = _axis_query("A", "AXIS", "acceleration")
 
 
 @dataclass(frozen=True)
@@ -328,7 +311,7 @@ class Conversation:
     def _written(self, command: str) -> str:
         """A command as it is written this time, which is not as the last time.
 
-        Two small letters in front would hide a limit hit before the echo: see `replies`.
+        Two small letters in front would hide a limit hit before the echo: see `protocol`.
         """
         self._turn += 1
         ways = 3 if command[1:2].isalpha() else 2

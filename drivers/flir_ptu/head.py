@@ -6,7 +6,7 @@ for the service's soft limits and not for the decision what to do about a fault:
 - Both axes start together: the goals are sent in slaved mode (``S``) and begin with ``I``. Each step is
   confirmed by the unit's echo, so a goal that was garbled on the way never starts. ``A`` is not used, since
   it holds back every answer until the motion is over.
-- Once a limit hit or a changed position has shown that the unit has lost count (`drivers.flir_ptu.count`),
+- Once a limit hit or a changed position has shown that the unit has lost count (`drivers.flir_ptu.axis`),
   it is read but not moved until it was homed (``mastctl ptu home``), which sweeps the full range and which
   this driver never does, and opened anew.
 """
@@ -22,14 +22,11 @@ from drivers.absence import Absence
 from drivers.approach import rising_below_rad
 from drivers.clock import Clock, SystemClock, Turn, deadlines_on
 from drivers.errors import BadReply, DriverError, HardwareFault, LineLost, NoReply, OutOfRange
-from drivers.flir_ptu import conversation as ask
-from drivers.flir_ptu.axis import StepAxis
+from drivers.flir_ptu import protocol as ask
+from drivers.flir_ptu.axis import StepAxis, StepCount
 from drivers.flir_ptu.conversation import Conversation, Interrupted
-from drivers.flir_ptu.count import StepCount
 from drivers.flir_ptu.options import DEVICE, Options, options_from
-from drivers.flir_ptu.position import measure
-from drivers.flir_ptu.ready import checked_version, ready_axes
-from drivers.flir_ptu.supply import SupplyWatch
+from drivers.flir_ptu.unit import SupplyWatch, checked_version, measure, ready_axes
 from drivers.interfaces import AxisMotion, Reading
 from drivers.serial_line import OpenLine, SerialLine
 
@@ -360,3 +357,31 @@ class FlirPtu:
         """What is wrong, in plain words."""
         stalls = (axis.stall_words() for axis in self._axes.values())
         return (*self._count.lost.values(), *self._supply.words, *(words for words in stalls if words))
+
+
+def halt(
+    options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
+) -> list[str]:
+    """Halt both axes, and see that the unit took it; it holds where that ends. Sets nothing.
+
+    ``clock`` and ``open_line`` are as of `drivers.flir_ptu.head.open_head`.
+
+    Raises
+    ------
+    BadOptions
+        For options that cannot be.
+    LineLost, NoReply, BadReply, Refused
+        If it was not confirmed; the command has been sent twice all the same, unless the line is lost.
+    """
+    read = options_from(options)
+    line = open_line(read.port, read.baud, DEVICE)
+    talk = Conversation(line, DEVICE, lambda axis: None, clock or SystemClock())
+    try:
+        talk.shout("H")  # before any question
+        talk.shout("H")
+        talk.in_step()
+        with talk.patient():
+            talk.tell("H")
+    finally:
+        talk.close()
+    return ["pan and tilt halted (H), confirmed"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, Refused
-from drivers.flir_ptu import conversation as ask
+from drivers.flir_ptu import protocol as ask
 from drivers.flir_ptu.conversation import Conversation
 from drivers.flir_ptu.options import DEVICE
 from drivers.serial_line import ByteLine, OpenLine, SerialLine

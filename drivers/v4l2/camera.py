@@ -12,12 +12,12 @@ from drivers.clock import Clock, SystemClock
 from drivers.errors import NoFreshFrame
 from drivers.interfaces import Frame, FrameTime
 from drivers.v4l2 import find, pixels
-from drivers.v4l2.capture import Bytes, Capture
+from drivers.v4l2.capture import Bytes, Capture, Counters
 from drivers.v4l2.controls import get_value, list_controls
-from drivers.v4l2.errors import NoCamera, StreamFailed
 from drivers.v4l2.exposure import GROUPS, ExposureControl
-from drivers.v4l2.frames import Arrived, Counters
+from drivers.v4l2.node import NoCamera, StreamFailed
 from drivers.v4l2.options import CameraOptions, parse_options
+from drivers.v4l2.stamps import Arrived
 from drivers.v4l2.stream import Stream, sizes_text
 
 JUDGE_EVERY_S = 0.25  # how often the automatic exposure looks at a frame

@@ -1,8 +1,8 @@
 """The thread of one camera: always dequeues, checks, keeps the newest good frame, reopens what went away.
 
-The newest frame stays in the kernel's buffer until the next one is there. Who asks for it has it converted
-straight from there, once for all that ask; nobody's slowness holds more than that one buffer up. What runs
-for every frame is kept short: one that nobody asks for costs little more than its system calls.
+The newest frame stays in the kernel's buffer until the next one is there. Whoever asks for it has it
+converted straight from there, once for all that ask; a slow caller holds up no more than that one buffer.
+What runs for every frame is kept short: one that nobody asks for costs little more than its system calls.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +24,10 @@ from drivers.clock import Clock
 from drivers.errors import BadFrame, DriverError
 from drivers.interfaces import Image
 from drivers.v4l2 import abi, pixels
-from drivers.v4l2.bells import Bells
-from drivers.v4l2.errors import StreamFailed
-from drivers.v4l2.frames import Arrived, Counters
-from drivers.v4l2.node import Dequeued, Node, PictureFormat
+from drivers.v4l2.node import Dequeued, NoCamera, Node, PictureFormat, StreamFailed
 from drivers.v4l2.options import CameraOptions
-from drivers.v4l2.stamps import Spacing, StampCheck, Timing, exposure_window
+from drivers.v4l2.stamps import Arrived, Spacing, StampCheck, Timing, exposure_window
 from drivers.v4l2.stream import Stream
-from drivers.v4l2.uevents import UeventSocket
 
 log = logging.getLogger(__name__)
 
@@ -40,28 +36,50 @@ Bytes = NDArray[np.uint8]
 SILENT_PERIODS = 3
 STALLED_S = 5.0  # a camera that is there but gives nothing for so long is opened again
 LATE_S = 0.005  # a frame is late if it comes more than a period and this after its stamp
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0  # between tries to open a camera that is there and fails
+GONE_PAUSE_S = 0.1  # between looks for one that is not: they disturb nobody
 CLOSE_PATIENCE_S = 2.0  # for the thread to end: a device that died may hold it in the kernel
 RECENT_FRAMES = 30  # a second's: from their times the offset between two cameras is learned
 
 
-@dataclass(eq=False)
-class _Shared:
-    """What the thread and its callers share, under one lock."""
+@dataclass
+class Counters:
+    """What happened to a camera's frames since it was opened.
 
-    lock: threading.Lock = field(default_factory=threading.Lock)
-    bells: Bells = field(default_factory=Bells)  # of the callers that wait for a change
-    newest: Arrived | None = None
-    node: Node | None = None  # in whose memory the newest lies
-    picture: Image | None = None  # the newest converted, once somebody asked
-    jpeg: bytes = b""  # what it was made of, if that is a JPEG
-    recent: deque[Arrived] = field(default_factory=lambda: deque(maxlen=RECENT_FRAMES))  # of this stream
+    Attributes
+    ----------
+    good, damaged
+        Frames that were published, and frames that were refused (error flag, length, stamp). The first one or
+        two of a stream are neither, where nothing tells yet when their exposure began.
+    dropped
+        Frames that never came, by gaps in the driver's count.
+    late
+        Good frames that came more than a period and 5 ms after their stamp.
+    reopened
+        How often the camera was lost and opened again.
+    last_damage
+        What was wrong with the last refused frame.
+    """
+
     good: int = 0
     damaged: int = 0
     dropped: int = 0
     late: int = 0
     reopened: int = 0
     last_damage: str = ""
+
+
+@dataclass(eq=False)
+class _Shared:
+    """What the thread and its callers share, under one lock; callers wait for ``changed``."""
+
+    changed: threading.Condition = field(default_factory=lambda: threading.Condition(threading.Lock()))
+    newest: Arrived | None = None
+    node: Node | None = None  # in whose memory the newest lies
+    picture: Image | None = None  # the newest converted, once somebody asked
+    jpeg: bytes = b""  # what it was made of, if that is a JPEG
+    recent: deque[Arrived] = field(default_factory=lambda: deque(maxlen=RECENT_FRAMES))  # of this stream
+    counters: Counters = field(default_factory=Counters)
     lost: str = ""
     closed: bool = False
     ended: bool = False  # the thread is through and touches nothing any more
@@ -122,8 +140,6 @@ class Capture:
             self.identity = stream.node.identity
             self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
             opened.callback(os.close, self._wake)
-            self._uevents = UeventSocket()
-            opened.callback(self._uevents.close)
             self._thread = threading.Thread(
                 target=self._run, args=(stream,), name=f"capture {name}", daemon=True
             )
@@ -133,31 +149,29 @@ class Capture:
     @property
     def counters(self) -> Counters:
         """What happened to the frames so far."""
-        with (shared := self._shared).lock:
-            return Counters(
-                shared.good, shared.damaged, shared.dropped, shared.late, shared.reopened, shared.last_damage
-            )
+        with self._shared.changed:
+            return replace(self._shared.counters)
 
     @property
     def damaged(self) -> int:
         """How many frames were refused so far."""
-        return self._shared.damaged
+        return self._shared.counters.damaged
 
     @property
     def lost(self) -> str:
         """Why there are no frames now: the camera is gone or its stream failed; empty while it streams."""
-        with self._shared.lock:
+        with self._shared.changed:
             return self._shared.lost
 
     @property
     def newest(self) -> Arrived | None:
         """The newest good frame, however old; None if there is none."""
-        with self._shared.lock:
+        with self._shared.changed:
             return self._shared.newest
 
     def recent(self) -> list[Arrived]:
         """Return the last good frames of this stream, oldest first, without their pictures."""
-        with self._shared.lock:
+        with self._shared.changed:
             return list(self._shared.recent)
 
     def take(self, exposed_after_s: float, timeout_s: float) -> tuple[Arrived, Image, bytes] | None:
@@ -168,31 +182,22 @@ class Capture:
         computer stood still for longer, a newer one is on its way. None after ``timeout_s``, and at once when
         the camera is lost or closed.
         """
-        shared, bell, until_s, first = self._shared, None, None, None
-        try:
+        shared, until_s = self._shared, time.monotonic() + timeout_s
+        with shared.changed:
+            first = shared.newest
             while True:
-                with shared.lock:
-                    newest = shared.newest
-                    first = newest if bell is None else first
-                    if (
-                        newest is not None
-                        and newest.window.begin_s > exposed_after_s
-                        and (newest is not first or self._is_young(newest))
-                        and (picture := self._picture(newest)) is not None
-                    ):
-                        return newest, picture, shared.jpeg
-                    if shared.closed or shared.lost:
-                        return None
-                    bell = bell or shared.bells.take()
-                now_s = time.monotonic()
-                until_s = now_s + timeout_s if until_s is None else until_s
-                if now_s >= until_s:
+                newest = shared.newest
+                if (
+                    newest is not None
+                    and newest.window.begin_s > exposed_after_s
+                    and (newest is not first or self._is_young(newest))
+                    and (picture := self._picture(newest)) is not None
+                ):
+                    return newest, picture, shared.jpeg
+                left_s = until_s - time.monotonic()
+                if shared.closed or shared.lost or left_s <= 0:
                     return None
-                bell.wait(until_s - now_s)
-        finally:
-            if bell is not None:
-                with shared.lock:
-                    shared.bells.give_back(bell)
+                shared.changed.wait(left_s)
 
     def _is_young(self, frame: Arrived) -> bool:
         return self._clock.now_s() - frame.buffer.stamp_s <= self.period_s + LATE_S
@@ -211,9 +216,9 @@ class Capture:
                 shared.picture.setflags(write=False)
             except BadFrame as error:
                 shared.newest = None
-                shared.good -= 1
-                shared.damaged += 1
-                shared.last_damage = str(error)
+                shared.counters.good -= 1
+                shared.counters.damaged += 1
+                shared.counters.last_damage = str(error)
         return shared.picture
 
     def close(self) -> None:
@@ -221,27 +226,20 @@ class Capture:
 
         A driver that hangs in the kernel is left behind after 2 s; its thread lets go when it comes back.
         """
-        with self._shared.lock:
+        with self._shared.changed:
             if self._shared.closed:
                 return
             self._shared.closed = True
-        self._shared.bells.ring_all()
+            self._shared.changed.notify_all()
         os.eventfd_write(self._wake, 1)
         self._thread.join(CLOSE_PATIENCE_S)
-        with self._shared.lock:
+        with self._shared.changed:
             self._shared.left_behind = self._thread.is_alive() and not self._shared.ended
             left_behind = self._shared.left_behind
         if left_behind:
             log.warning("%s: its driver hangs; it is closed when the driver comes back", self._name)
         else:
-            self._close_own()
-
-    def _close_own(self) -> None:
-        """Give back what the thread used, once it is through."""
-        with self._shared.lock:
-            self._shared.bells.close()
-        self._uevents.close()
-        os.close(self._wake)
+            os.close(self._wake)
 
     # In the capture thread
 
@@ -250,11 +248,11 @@ class Capture:
         try:
             self._serve(stream)
         finally:
-            with self._shared.lock:
+            with self._shared.changed:
                 self._shared.ended = True
                 left_behind = self._shared.left_behind
             if left_behind:
-                self._close_own()
+                os.close(self._wake)
 
     def _serve(self, stream: Stream | None) -> None:
         """Stream, and open again after every failure, until closed."""
@@ -282,7 +280,7 @@ class Capture:
         poll = select.poll()
         poll.register(node.fileno(), select.POLLIN)
         poll.register(self._wake, select.POLLIN)
-        with self._shared.lock:
+        with self._shared.changed:
             self._shared.node = node
         silent_since_s: float | None = None
         while True:
@@ -320,10 +318,10 @@ class Capture:
             sequence = self._last_sequence + 1
         self._last_sequence = sequence
         if wrong:
-            with (shared := self._shared).lock:
-                shared.dropped += dropped
-                shared.damaged += 1
-                shared.last_damage = wrong
+            with (shared := self._shared).changed:
+                shared.counters.dropped += dropped
+                shared.counters.damaged += 1
+                shared.counters.last_damage = wrong
             stream.node.queue(buffer.number)
             return
         timing = Timing(
@@ -331,37 +329,37 @@ class Capture:
         )
         window = exposure_window(stream.rule, timing, buffer.flags, buffer.stamp_s, received_s)
         if window is None:
-            with self._shared.lock:
-                self._shared.dropped += dropped
+            with self._shared.changed:
+                self._shared.counters.dropped += dropped
             stream.node.queue(buffer.number)
             return
         arrived = Arrived(buffer, stream.format, timing, window, sequence, self._streams, received_s)
-        with (shared := self._shared).lock:
-            shared.dropped += dropped
-            shared.good += 1
-            shared.late += received_s - buffer.stamp_s > stream.period_s + LATE_S
+        with (shared := self._shared).changed:
+            shared.counters.dropped += dropped
+            shared.counters.good += 1
+            shared.counters.late += received_s - buffer.stamp_s > stream.period_s + LATE_S
             shared.newest, shared.picture = arrived, None
             shared.recent.append(arrived)
+            shared.changed.notify_all()
         held, self._held = self._held, buffer.number
         if held is not None:
             stream.node.queue(held)
-        shared.bells.ring_all()
         self._pause_s = FIRST_PAUSE_S
         if self._between is not None:
             self._between(stream, arrived, np.frombuffer(stream.node.bytes_of(buffer), np.uint8))
 
     def _lose(self, why: str) -> None:
         """Say that there are no frames for now."""
-        with self._shared.lock:
+        with self._shared.changed:
             if not self._shared.lost:
                 log.warning("%s; it is opened again when it is back", why)
             self._shared.lost = why
             self._forget()
-        self._shared.bells.ring_all()
+            self._shared.changed.notify_all()
 
     def _let_go(self) -> None:
         """Forget the frame that lies in the memory of a stream that ends."""
-        with self._shared.lock:
+        with self._shared.changed:
             self._forget()
         self._held = None
 
@@ -371,35 +369,27 @@ class Capture:
         shared.recent.clear()
 
     def _closing_after(self, pause_s: float) -> bool:
-        """Wait before the next try, shorter if the kernel says that a node came; True when closed."""
+        """Wait before the next try; True when closed."""
         poll = select.poll()
         poll.register(self._wake, select.POLLIN)
-        if self._uevents.available:
-            poll.register(self._uevents, select.POLLIN)
-        until_s = time.monotonic() + pause_s
-        while (left_s := until_s - time.monotonic()) > 0:
-            events = dict(poll.poll(1e3 * left_s))
-            if self._wake in events:
-                return True
-            if any(event.action == "add" for event in self._uevents.read()):
-                self._pause_s = FIRST_PAUSE_S
-                until_s = min(until_s, time.monotonic() + FIRST_PAUSE_S / 5)  # for udev to make its links
-        return False
+        return bool(poll.poll(1e3 * pause_s))
 
     def _reopened(self) -> Stream | None:
         """Try to open the camera again; None if it is not back."""
         try:
             stream = self._open()
         except Exception as error:
-            if not isinstance(error, DriverError):  # a defect: the thread goes on trying, and says so
+            if isinstance(error, NoCamera):
+                self._pause_s = GONE_PAUSE_S
+            elif not isinstance(error, DriverError):  # a defect: the thread goes on trying, and says so
                 log.exception("%s: opening again failed", self._name)
-            with self._shared.lock:
+            with self._shared.changed:
                 self._shared.lost = str(error) or type(error).__name__
             return None
-        with self._shared.lock:
+        with self._shared.changed:
             self._shared.lost = ""
-            self._shared.reopened += 1
-        self._shared.bells.ring_all()
+            self._shared.counters.reopened += 1
+            self._shared.changed.notify_all()
         log.warning("%s is back at %s", self._name, stream.node.path)
         return stream
 

@@ -1,4 +1,4 @@
-"""One open video node: the kernel's requests as methods, and its refusals as plain sentences."""
+"""One open video node: the kernel's requests as methods, and its refusals as typed errors in plain words."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from drivers.errors import DriverError
+from drivers.errors import BadOptions, DriverError
 from drivers.v4l2 import abi
-from drivers.v4l2.errors import CameraBusy, NoCamera, NoPermission, NotACamera, StreamFailed
 
 _quick_ioctl = ctypes.PyDLL(None, use_errno=True).ioctl
 """Keeps Python's lock, for the two requests of every frame: they never wait, and a thread that lets go of the
@@ -25,6 +24,42 @@ lock may get it back only after 5 ms."""
 _quick_ioctl.argtypes = (ctypes.c_int, ctypes.c_ulong, ctypes.c_void_p)
 
 _MOST_ENTRIES = 1024  # of any enumeration: a driver that never ends one must not hang us
+
+
+class NoCamera(DriverError):
+    """The camera is not connected, or went away while it was in use."""
+
+    code = "no_camera"
+
+
+class CameraBusy(DriverError):
+    """Another program has the camera."""
+
+    code = "camera_busy"
+
+
+class NoPermission(DriverError):
+    """This user may not open the device; the message says which group may."""
+
+    code = "no_permission"
+
+
+class StreamFailed(DriverError):
+    """The camera is there but its driver cannot deliver frames."""
+
+    code = "stream_failed"
+
+
+class NotACamera(BadOptions):
+    """The path leads to something that gives no pictures."""
+
+    code = "not_a_camera"
+
+
+class UnsupportedFormat(BadOptions):
+    """The camera does not offer the format, size or rate; the message says what it offers."""
+
+    code = "unsupported_format"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""When a frame was exposed, from its stamp; and whether the stamp can be true.
+"""When a frame was exposed, by its stamp and the exposure times that were set; whether a stamp can be true.
 
 The kernel stamps a buffer at the start or at the end of a frame (docs/how-to/cameras.md). What is sure is a
 *window*: the whole exposure, of all rows, lay inside it. A frame counts as fresh only if its window began
@@ -11,12 +11,17 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from drivers.v4l2 import abi
+from drivers.v4l2.node import Dequeued, PictureFormat
 
 AHEAD_S = 0.005
 """How far ahead of the clock a stamp may be: rounding, and drivers that estimate."""
 
 READOUT_STAMPERS = ("uvcvideo",)
 """Drivers that say "start of exposure" but stamp the first packet, when the first row's exposure is over."""
+
+SETTLE_FRAMES = 4
+"""So many frames stamped after a change may still show what was set before it: the one that was being read
+out when it was made, and three more."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,30 @@ class Window(NamedTuple):
     def mid_uncertainty_s(self, exposure_s: float | None) -> float:
         """The most that mid-exposure may be from the window's middle; less if the exposure is known."""
         return max(0.0, self.length_s - (exposure_s or 0.0)) / 2
+
+
+class Arrived(NamedTuple):
+    """A good frame, without its picture.
+
+    Attributes
+    ----------
+    buffer, format
+        The kernel's buffer with the driver's own count and stamp, and what its bytes mean.
+    timing, window
+        What is known of its exposure time, and in which the whole exposure lay.
+    sequence, stream
+        Our own count, which grows over every reopening, and the number of the stream.
+    received_s
+        When it was dequeued, seconds of CLOCK_MONOTONIC.
+    """
+
+    buffer: Dequeued
+    format: PictureFormat
+    timing: Timing
+    window: Window
+    sequence: int
+    stream: int
+    received_s: float
 
 
 def exposure_window(
@@ -187,3 +216,50 @@ class StampCheck:
         if last_s is not None and stamp_s <= last_s:
             return f"its stamp is {1e3 * (last_s - stamp_s):.1f} ms before the last frame's"
         return ""
+
+
+@dataclass
+class _Setting:
+    """An exposure time and when it was in force; ``over_at`` is the first count that cannot show it."""
+
+    exposure_s: float | None
+    since_s: float
+    until_s: float | None = None
+    over_at: int | None = None
+
+
+class ExposuresSet:
+    """The exposure times that were set on one stream, as long as a frame may show them.
+
+    Parameters
+    ----------
+    exposure_s
+        What is in force from the first frame on, seconds; None if that is not known.
+    """
+
+    def __init__(self, exposure_s: float | None) -> None:
+        self._settings = [_Setting(exposure_s, float("-inf"))]
+
+    def change(self, exposure_s: float | None, began_s: float, ended_s: float) -> None:
+        """Take in that another one was set, between two moments of CLOCK_MONOTONIC."""
+        self._settings[-1].until_s = ended_s
+        self._settings.append(_Setting(exposure_s, began_s))
+
+    def of(self, sequence: int, stamp_s: float) -> tuple[float | None, float | None]:
+        """Return a frame's exposure time and the longest that it may have; None for what is not known.
+
+        Frames are asked for in their order; one that was stamped before a change knows nothing of it.
+        """
+        found: list[float | None] = []
+        for setting in self._settings:
+            if setting.until_s is not None and setting.over_at is None and stamp_s > setting.until_s:
+                setting.over_at = sequence + SETTLE_FRAMES
+            if setting.since_s <= stamp_s and (setting.over_at is None or sequence < setting.over_at):
+                found.append(setting.exposure_s)
+        while self._settings[0].over_at is not None and sequence >= self._settings[0].over_at:
+            del self._settings[0]
+        known = [exposure_s for exposure_s in found if exposure_s is not None]
+        if len(known) < len(found):
+            return None, None
+        longest_s = max(known)
+        return (longest_s if min(known) == longest_s else None), longest_s

@@ -8,12 +8,10 @@ from collections.abc import Sequence
 from drivers.clock import Clock
 from drivers.v4l2 import abi, find
 from drivers.v4l2.controls import Control, Problem, first_of, get_value, list_controls, set_by_name, set_value
-from drivers.v4l2.errors import UnsupportedFormat
-from drivers.v4l2.exposures_set import ExposuresSet
-from drivers.v4l2.node import Node, PictureFormat
+from drivers.v4l2.node import Node, PictureFormat, UnsupportedFormat
 from drivers.v4l2.options import CameraOptions
 from drivers.v4l2.pixels import FORMATS
-from drivers.v4l2.stamps import StampRule
+from drivers.v4l2.stamps import ExposuresSet, StampRule
 
 log = logging.getLogger(__name__)
 

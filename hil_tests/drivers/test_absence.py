@@ -7,7 +7,7 @@ import math
 import pytest
 
 from drivers.absence import Absence
-from drivers.dynamixel.hardware_errors import Reboots
+from drivers.dynamixel.servo import Reboots
 from drivers.errors import BadOptions, LineLost
 from drivers.options import OptionReader
 

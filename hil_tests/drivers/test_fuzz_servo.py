@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.dynamixel.packets import take_status
-from drivers.flir_ptu.replies import LineSplitter, answer_of
+from drivers.flir_ptu.protocol import LineSplitter, answer_of
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.ptu import SimulatedPtu

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from drivers.dynamixel import trial, workshop
+from drivers.dynamixel import workshop
 from drivers.dynamixel.link import Link
 from drivers.faults import FaultPanel
 from drivers.flir_ptu import workshop as ptu_workshop
@@ -94,7 +94,7 @@ def test_the_commands_for_a_servo_on_the_bench_write_what_is_listed(
         try:
             workshop.facts(link, 1)
             assert written == set()
-            trial.try_out(link, 1, 0.05, 50.0)
+            workshop.try_out(link, 1, 0.05, 50.0)
             assert written == set(), "a trial leaves nothing behind"
             workshop.set_id(link, 1, 7, 57_600)
         finally:

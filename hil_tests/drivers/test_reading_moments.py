@@ -12,7 +12,7 @@ from drivers.dynamixel import session
 from drivers.dynamixel.motion import Sample
 from drivers.flir_ptu.axis import Seen, StepAxis
 from drivers.flir_ptu.conversation import Conversation
-from drivers.flir_ptu.position import measure
+from drivers.flir_ptu.unit import measure
 
 
 class TurnedClock:

@@ -36,7 +36,7 @@ def add_camera_options(parser: argparse.ArgumentParser) -> None:
 def opened_camera(args: argparse.Namespace) -> Iterator[V4l2Camera]:
     """Open the camera of the arguments, by itself or by its name in a configuration, and close it."""
     from drivers.v4l2.camera import open_camera
-    from drivers.v4l2.choice import options_for
+    from drivers.v4l2.find import options_for
 
     if args.config is not None:
         options = _configured_options(args)

@@ -180,7 +180,7 @@ def _set_id(args: argparse.Namespace) -> int:
 
 def _test(args: argparse.Namespace) -> int:
     """Turn a servo a little."""
-    from drivers.dynamixel.trial import try_out
+    from drivers.dynamixel.workshop import try_out
     from mastctl.devices.opening import line_held
 
     if args.degrees > FARTHEST_DEG:

@@ -7,7 +7,7 @@ from typing import Any
 
 from drivers.errors import BadOptions, DriverError
 from drivers.v4l2 import find
-from drivers.v4l2.errors import CameraBusy, NoCamera, NoPermission
+from drivers.v4l2.node import CameraBusy, NoCamera, NoPermission
 from drivers.v4l2.options import parse_options
 from mastctl.doctor.findings import Finding
 

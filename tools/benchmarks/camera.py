@@ -34,9 +34,8 @@ import cv2
 from drivers.errors import DriverError
 from drivers.v4l2 import find
 from drivers.v4l2.camera import V4l2Camera, open_camera
-from drivers.v4l2.choice import options_for
 from drivers.v4l2.controls import set_by_name
-from drivers.v4l2.find import open_node
+from drivers.v4l2.find import open_node, options_for
 from drivers.v4l2.options import CameraOptions, parse_options
 from drivers.v4l2.stream import set_format
 from mastctl.cli.output import at_least, positive_number

@@ -123,7 +123,7 @@ def plain_sdk(path: str) -> Iterator[tuple[CALL, CALL]]:
 
 def parts() -> tuple[list[Any], list[Any]]:
     """What the driver's link is asked to read and write."""
-    from drivers.dynamixel.group import Part
+    from drivers.dynamixel.packets import Part
 
     reads = [Part(servo_id, POSITION, SIZE) for servo_id in IDS]
     writes = [Part(servo_id, GOAL, SIZE, (2048).to_bytes(4, "little")) for servo_id in IDS]

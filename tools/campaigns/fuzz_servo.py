@@ -23,8 +23,8 @@ from collections.abc import Callable, Iterator
 from dynamixel_sdk import PacketHandler
 
 from drivers.dynamixel.packets import take_status
-from drivers.flir_ptu import conversation
-from drivers.flir_ptu.replies import LineSplitter, answer_of, number_of
+from drivers.flir_ptu import protocol
+from drivers.flir_ptu.protocol import LineSplitter, answer_of, number_of
 from drivers.sim.pan_tilt import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
@@ -374,7 +374,7 @@ def ptu_driver(rng: random.Random) -> str:
         return (hits + echo + "* " + words).encode() + rng.choice((b"\r\n", b"\n\r\n"))
 
     kind, axis, number, words = answer()
-    query = getattr(conversation, kind)[axis]
+    query = getattr(protocol, kind)[axis]
     stream, others = b"", []
     for _ in range(rng.randrange(4)):
         what = rng.random()

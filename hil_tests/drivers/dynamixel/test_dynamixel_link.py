@@ -21,9 +21,10 @@ import serial.rfc2217
 
 from drivers.clock import SystemClock
 from drivers.dynamixel.bus import Bus
-from drivers.dynamixel.group import Part
 from drivers.dynamixel.link import Link
-from drivers.dynamixel.models import REGISTERS, Register
+from drivers.dynamixel.models import MODELS
+from drivers.dynamixel.packets import Part
+from drivers.dynamixel.registers import Register
 from drivers.errors import BadOptions, BadReply, LineLost, NoReply, Refused
 from drivers.serial_line import SerialLine
 from drivers.sim.wire.dynamixel_packets import Instruction, fast_status_packets
@@ -32,7 +33,7 @@ from hil_tests.drivers.dynamixel.scripted_servos import BAUD_RATE, ScriptedServo
 from hil_tests.drivers.turned import turned
 from hil_tests.waiting import NET_S
 
-X = REGISTERS["X"]
+X = MODELS["XM430-W350"].registers
 POSITION, TORQUE = X["present_position"], X["torque_enable"]
 PING, READ, WRITE, REBOOT, SYNC_READ, SYNC_WRITE, BULK_READ, BULK_WRITE = 1, 2, 3, 8, 0x82, 0x83, 0x92, 0x93
 FAST_SYNC_READ = 0x8A

@@ -11,8 +11,7 @@ from typing import cast
 import pytest
 
 from drivers.errors import DriverError, NoReply
-from drivers.flir_ptu.axis import StepAxis
-from drivers.flir_ptu.count import StepCount
+from drivers.flir_ptu.axis import StepAxis, StepCount
 from drivers.flir_ptu.head import FlirPtu
 from drivers.interfaces import Reading
 from hil_tests.drivers.flir_ptu.ptu_bench import Bench

@@ -23,12 +23,9 @@ from drivers.interfaces import Camera
 from drivers.v4l2 import abi, capture, find, pixels
 from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.capture import Capture
-from drivers.v4l2.errors import NoCamera, StreamFailed
-from drivers.v4l2.exposures_set import ExposuresSet
-from drivers.v4l2.node import Dequeued, Identity, PictureFormat
+from drivers.v4l2.node import Dequeued, Identity, NoCamera, PictureFormat, StreamFailed
 from drivers.v4l2.options import parse_options
-from drivers.v4l2.stamps import StampRule
-from drivers.v4l2.uevents import Uevent, UeventSocket, parse
+from drivers.v4l2.stamps import ExposuresSet, StampRule
 from hil_tests.waiting import NET_S, until
 
 SIZE_PX = (16, 8)
@@ -302,6 +299,17 @@ def test_a_lost_camera_is_told_at_once_and_opened_again(bench: Bench, camera: V4
     assert camera.counters.reopened == 1
 
 
+def test_a_camera_that_stays_away_is_looked_for_as_often_all_the_time(
+    bench: Bench, camera: V4l2Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pauses_s: list[float] = []
+    monkeypatch.setattr(capture.Capture, "_closing_after", lambda self, pause_s: pauses_s.append(pause_s))
+    bench.refusals += [NoCamera("/dev/v4l/by-id/x is not there")] * 8
+    bench.streams[0].node.put(NoCamera("/dev/video7 is gone", device="navcam_left"))
+    until(lambda: len(bench.streams) == 2, "it is opened again")
+    assert len(pauses_s) == 9 and max(pauses_s) <= capture.GONE_PAUSE_S
+
+
 def test_a_failed_stream_is_opened_again(bench: Bench, camera: V4l2Camera) -> None:
     bench.streams[0].node.put(StreamFailed("/dev/video7 does not give a frame: Input/output error"))
     until(lambda: len(bench.streams) == 2, "it is opened again")
@@ -380,7 +388,7 @@ def no_more_descriptors(*ignored: object) -> int:
 
 @pytest.mark.parametrize(
     ("where", "name"),
-    [(capture.os, "eventfd"), (capture, "UeventSocket"), (capture.threading.Thread, "start")],
+    [(capture.os, "eventfd"), (capture.threading.Thread, "start")],
 )
 def test_what_fails_after_the_camera_was_opened_leaves_no_stream_behind(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, where: object, name: str
@@ -513,33 +521,3 @@ def test_a_bare_number_is_refused_with_the_stable_link_that_leads_there_now(
 def test_a_rate_of_none_is_left_as_it_is() -> None:
     assert parse_options({"card": "a", "rate_hz": None}, "c").rate_hz is None
     assert parse_options({"card": "a"}, "c").rate_hz == 30.0
-
-
-def test_uevents_of_video_nodes_are_read_and_others_ignored() -> None:
-    told = (
-        b"remove@/devices/platform/vivid.0/video4linux/video1\0ACTION=remove\0"
-        b"DEVPATH=/devices/platform/vivid.0/video4linux/video1\0SUBSYSTEM=video4linux\0MAJOR=81\0MINOR=1\0"
-        b"DEVNAME=video1\0SEQNUM=512\0"
-    )
-    assert parse(told) == Uevent("remove", "video1")
-    assert parse(told.replace(b"=video4linux", b"=usb")) is None
-    assert parse(b"") is None and parse(b"\xff\0\0garbage") is None
-
-
-def test_only_the_kernel_is_believed_that_a_camera_came(monkeypatch: pytest.MonkeyPatch) -> None:
-    told = b"add@/devices/video4linux/%s\0ACTION=add\0SUBSYSTEM=video4linux\0DEVNAME=%s\0"
-    arriving = deque([(told % (b"video1", b"video1"), (4242, 1)), (told % (b"video2", b"video2"), (0, 1))])
-
-    class Netlink:
-        """Datagrams with their sender, a process or 0 for the kernel itself (man 7 netlink)."""
-
-        def __init__(self, *ignored: int) -> None: ...
-        def bind(self, address: object) -> None: ...
-        def close(self) -> None: ...
-        def recvfrom(self, size: int) -> tuple[bytes, tuple[int, int]]:
-            if not arriving:
-                raise BlockingIOError
-            return arriving.popleft()
-
-    monkeypatch.setattr("drivers.v4l2.uevents.socket.socket", Netlink)
-    assert UeventSocket().read() == [Uevent("add", "video2")]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from drivers.v4l2 import abi
-from drivers.v4l2.exposures_set import ExposuresSet
-from drivers.v4l2.stamps import Spacing, StampCheck, StampRule, Timing, Window, exposure_window
+from drivers.v4l2.stamps import ExposuresSet, Spacing, StampCheck, StampRule, Timing, Window, exposure_window
 
 START = abi.BUF_FLAG_TIMESTAMP_MONOTONIC | 0x10000
 END = abi.BUF_FLAG_TIMESTAMP_MONOTONIC

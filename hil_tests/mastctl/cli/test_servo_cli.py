@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from drivers.dynamixel import models, trial, workshop
+from drivers.dynamixel import models, workshop
 from drivers.dynamixel.link import Link
 from drivers.errors import HardwareFault, OutOfRange, WrongDevice
 from drivers.sim.pan_tilt import AxisSettings
@@ -215,15 +215,15 @@ def test_test_restores_the_torque_first_and_all_the_rest_whatever_fails(
     servo = bench.servos[0]
     before = dict(servo.table.values)
     link = quiet_link(bench)
-    true_step = trial._step
+    true_step = workshop._step
 
     def step(*how: Any) -> Any:
         deaf_to(bench, monkeypatch, "bus_watchdog", "profile_acceleration")
         return true_step(*how)
 
-    monkeypatch.setattr(trial, "_step", step)
+    monkeypatch.setattr(workshop, "_step", step)
     with pytest.raises(WrongDevice, match="left as it was found in bus_watchdog and profile_acc"):
-        trial.try_out(link, 1, math.radians(1), 30.0)
+        workshop.try_out(link, 1, math.radians(1), 30.0)
     link.close()
     for name in ("torque_enable", "profile_velocity", "goal_pwm"):
         assert servo.table[name] == before[name], name
@@ -238,10 +238,10 @@ def test_test_says_that_the_torque_may_be_on_and_what_went_wrong_before(
         deaf_to(bench, monkeypatch, "torque_enable")
         raise HardwareFault("it is blocked")
 
-    monkeypatch.setattr(trial, "_step", step)
+    monkeypatch.setattr(workshop, "_step", step)
     words = "^it is blocked; and servo 1 is not left as it was found in torque_enable: its torque may be on"
     with pytest.raises(WrongDevice, match=words):
-        trial.try_out(link, 1, math.radians(1), 30.0)
+        workshop.try_out(link, 1, math.radians(1), 30.0)
     link.close()
     assert bench.servos[0].table["goal_pwm"] == 885
 
@@ -251,13 +251,13 @@ def test_a_test_that_is_ended_leaves_the_servo_as_it_was(
     bench: Bench, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     before = dict(bench.servos[0].table.values)
-    true_step = trial._step
+    true_step = workshop._step
 
     def step(*how: Any) -> Any:
         signal.raise_signal(number)
         return true_step(*how)
 
-    monkeypatch.setattr(trial, "_step", step)
+    monkeypatch.setattr(workshop, "_step", step)
     handlers = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGHUP)]
     code, _, err = run(capsys, "test", bench.line.path, "1", "--baud", BAUD, "--degrees", "3")
     assert code == 128 + number, err
@@ -296,9 +296,9 @@ def test_a_second_ctrl_c_leaves_nothing_unrestored(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(link, "write", write)
-    monkeypatch.setattr(trial, "_step", step)
+    monkeypatch.setattr(workshop, "_step", step)
     with pytest.raises(KeyboardInterrupt):
-        trial.try_out(link, 1, math.radians(1), 30.0)
+        workshop.try_out(link, 1, math.radians(1), 30.0)
     link.close()
     for name in ("torque_enable", "profile_velocity", "profile_acceleration", "goal_pwm", "bus_watchdog"):
         assert servo.table[name] == before[name], name
@@ -313,10 +313,10 @@ def test_a_servo_that_ctrl_c_could_not_leave_as_it_was_is_told(
         deaf_to(bench, monkeypatch, "torque_enable")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(trial, "_step", step)
+    monkeypatch.setattr(workshop, "_step", step)
     words = "^interrupted; and servo 1 is not left as it was found in torque_enable: its torque may be on"
     with pytest.raises(WrongDevice, match=words):
-        trial.try_out(link, 1, math.radians(1), 30.0)
+        workshop.try_out(link, 1, math.radians(1), 30.0)
     link.close()
 
 
@@ -336,7 +336,7 @@ def test_test_begins_only_when_it_is_certain_to_be_slow_and_weak(
         true_write(servo_id, register, value)
 
     monkeypatch.setattr(link, "write", write)
-    trial.try_out(link, 1, math.radians(1), 30.0)
+    workshop.try_out(link, 1, math.radians(1), 30.0)
     link.close()
     slow_and_weak = {"goal_pwm": 266, "profile_velocity": 8, "profile_acceleration": 3}  # 0.2 rad/s, 1 rad/s2
     assert {name: at_torque[name] for name in slow_and_weak} == slow_and_weak
@@ -353,7 +353,7 @@ def test_test_stops_at_its_fence(bench: Bench, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(models.Block, "decode", misread)
     with pytest.raises(OutOfRange, match="left the fence"):
-        trial.try_out(link, 1, math.radians(3), 30.0)
+        workshop.try_out(link, 1, math.radians(3), 30.0)
     link.close()
     assert bench.servos[0].table["torque_enable"] == 0
 

@@ -12,8 +12,8 @@ import pytest
 from drivers.v4l2 import find, pixels
 from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.controls import get_value, list_controls, set_by_name
-from drivers.v4l2.errors import UnsupportedFormat
 from drivers.v4l2.find import Address, open_node
+from drivers.v4l2.node import UnsupportedFormat
 
 from .conftest import BUS, STEADY, options
 

@@ -1,4 +1,4 @@
-"""What a unit says, line by line: answers, error replies, and limit hits that may stand before any of them.
+"""What a unit is asked and what it says, line by line: answers, errors, limit hits before any of them.
 
 From the manuals (PTU-D46 v2.14, section 4.2; E series v6.00): a command that succeeds is answered ``*``, a
 query ``* <text>``, a failure ``! <words>``, each ended by CR or LF or both. An axis that runs into a limit
@@ -18,6 +18,32 @@ from dataclasses import dataclass
 _HIT = re.compile(rb"\s*!([PTpt])(?![a-z]{2})")
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?\Z")
 _LONGEST_LINE = 400
+
+
+@dataclass(frozen=True)
+class Query:
+    """A question with a number for an answer: its letters, and words of its verbose answer."""
+
+    letters: str
+    words: tuple[str, ...]
+
+
+def _axis_query(letter: str, *words: str) -> dict[str, Query]:
+    """The same question for both axes."""
+    return {
+        axis: Query(axis[0].upper() + letter, tuple(axis if word == "AXIS" else word for word in words))
+        for axis in ("pan", "tilt")
+    }
+
+
+POSITION = _axis_query("P", "current", "AXIS", "position")
+RESOLUTION = _axis_query("R", "arc", "position")  # the E series does not say of which axis
+LOWEST = _axis_query("N", "minimum", "AXIS", "position")
+HIGHEST = _axis_query("X", "maximum", "AXIS", "position")
+SPEED = _axis_query("S", "AXIS", "speed")
+FASTEST = _axis_query("U", "maximum", "AXIS", "speed")
+SLOWEST = _axis_query("L", "minimum", "AXIS", "speed")
+ACCELERATION = _axis_query("A", "AXIS", "acceleration")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,311 @@
+"""What is asked of a unit as a whole: to be ready, where both axes are, how its supply is. Moves nothing.
+
+Its protocol cannot detect a damaged digit. So a position is taken at once only where the axis rests by all
+that is known. Otherwise the unit is asked again, and a middle answer is taken if it lies between its
+neighbours, and these no further apart than the axis can go meanwhile: with one of them damaged, what is taken
+still is where the axis was during the call. A unit tells one axis at a time. Where both move they are asked
+by turns, and what is taken is a middle answer of pan, and for its moment tilt on the straight line between
+the two middle answers around it, if tilt turns evenly there.
+
+The manuals' answer to ``O`` is ``Input 30 VDC @ 86 degF``; units with more sensors list more temperatures.
+They give no bounds for all models, so these are the configuration's, or what was there at the start.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from drivers.clock import Clock
+from drivers.errors import BadReply, Refused, WrongDevice
+from drivers.flir_ptu import protocol as ask
+from drivers.flir_ptu.axis import Seen, StepAxis
+from drivers.flir_ptu.conversation import Conversation
+from drivers.flir_ptu.options import DEVICE, Options
+
+log = logging.getLogger(__name__)
+
+ASKED_AT_MOST = 12  # questions for one axis; three or four do on a good line
+MOST_BEND_RAD = 0.01
+"""How far tilt may be from the straight line, by what its speed changes there."""
+
+RECOMPUTE_S = 10.0  # PA and TA take seconds, the manual says
+
+EVERY_S = 5.0
+"""How often a resting unit is asked."""
+DIP = 0.8
+"""Below this part of what it was at the start a supply counts as fallen, where no bounds are configured."""
+
+_VOLTS = re.compile(r"(\d+(?:\.\d+)?) ?V")
+_DEGREES_F = re.compile(r"(-?\d+(?:\.\d+)?) ?(?:deg)?F\b")
+
+
+def measure(talk: Conversation, pan: StepAxis, tilt: StepAxis, clock: Clock) -> float:
+    """Ask for both positions until they can be taken, have the axes take them, and return their moment.
+
+    Raises
+    ------
+    BadReply
+        If the positions contradict each other, or as `Conversation.ask`.
+    NoReply, Refused, LineLost
+        As `Conversation.ask`.
+    """
+    asked: dict[StepAxis, list[Seen]] = {tilt: [], pan: []}
+    at_rest: dict[StepAxis, Seen] = {}
+    found: tuple[Seen, Seen] | None = None
+    while found is None:
+        for axis, answers in asked.items():
+            if axis not in at_rest and found is None:
+                if len(answers) == ASKED_AT_MOST:
+                    words = ", ".join(str(seen.position) for seen in answers)
+                    raise BadReply(
+                        f"gives {axis.name} positions that contradict each other: {words}", device=DEVICE
+                    )
+                answers.append(_asked(talk, axis, clock))
+                if axis.rests_at(answers[-1]):
+                    at_rest[axis] = answers[-1]
+                if len(asked[pan]) and len(asked[tilt]):
+                    found = _found(pan, tilt, asked[pan], asked[tilt], at_rest)
+    for axis, seen in zip((pan, tilt), found, strict=True):
+        axis.take(seen)
+    return found[0].time_s
+
+
+def _asked(talk: Conversation, axis: StepAxis, clock: Clock) -> Seen:
+    """One answer, and when it was measured."""
+    before_s = clock.now_s()
+    number = talk.ask(ask.POSITION[axis.name])
+    # The unit looks when the question is there; its answer takes ten times as long on the wire.
+    took_s = min((clock.now_s() - before_s) / 2, 4 * talk.byte_s)
+    return Seen(round(number), before_s + took_s)
+
+
+def _found(
+    pan: StepAxis, tilt: StepAxis, pans: Sequence[Seen], tilts: Sequence[Seen], at_rest: dict[StepAxis, Seen]
+) -> tuple[Seen, Seen] | None:
+    """Pan and tilt at one moment, as far as the answers tell; None if they do not yet."""
+    if pan in at_rest and tilt in at_rest:
+        time_s = (at_rest[pan].time_s + at_rest[tilt].time_s) / 2
+        return Seen(at_rest[pan].position, time_s), Seen(at_rest[tilt].position, time_s)
+    if tilt in at_rest:
+        seen = _middle(pan, pans)
+        return None if seen is None else (seen, Seen(at_rest[tilt].position, seen.time_s))
+    if pan in at_rest:
+        seen = _middle(tilt, tilts)
+        return None if seen is None else (Seen(at_rest[pan].position, seen.time_s), seen)
+    if len(tilts) < 4 or len(tilts) == len(pans) or _middle(tilt, tilts[:-1]) is None:
+        return None
+    seen, other = _middle(pan, pans), _middle(tilt, tilts)
+    if seen is None or other is None or _bend_rad(tilt, tilts[-4:]) > MOST_BEND_RAD:
+        return None
+    before = tilts[-3]
+    part = (seen.time_s - before.time_s) / max(other.time_s - before.time_s, 1e-6)
+    return seen, Seen(round(before.position + part * (other.position - before.position)), seen.time_s)
+
+
+def _middle(axis: StepAxis, answers: Sequence[Seen]) -> Seen | None:
+    """The last answer but one, if those around it confirm it."""
+    if len(answers) < 3 or not axis.confirms(*answers[-3:]):
+        return None
+    return answers[-2]
+
+
+def _bend_rad(axis: StepAxis, four: Sequence[Seen]) -> float:
+    """How far from the straight line between the middle two of four answers the axis may have been.
+
+    No further than these two are apart, and than its change of speed around them carries it.
+    """
+    speeds = [
+        (then.position - now.position) / max(then.time_s - now.time_s, 1e-6) for now, then in pairwise(four)
+    ]
+    change = max(abs(speeds[1] - speeds[0]), abs(speeds[2] - speeds[1]))
+    bend = change * (four[2].time_s - four[1].time_s) / 2
+    return min(bend, abs(four[2].position - four[1].position)) * axis.position_rad
+
+
+def checked_version(talk: Conversation, options: Options, known: str) -> str:
+    """Return what the unit says about itself.
+
+    Parameters
+    ----------
+    known
+        What it said before; empty if it was not asked yet.
+
+    Raises
+    ------
+    WrongDevice
+        If it is another unit, or an E46 and the options do not say its resolutions.
+    NoReply, BadReply, Refused, LineLost
+        As `Conversation.tell`.
+    """
+    version = talk.sure_text("V")
+    if known and version != known:
+        words = f"another unit answers: '{version[:80]}' where '{known[:80]}' was"
+        raise WrongDevice(words, device=DEVICE)
+    if "E46" in version and None in (options.pan.resolution_arcsec, options.tilt.resolution_arcsec):
+        raise WrongDevice(
+            "is an E46, which does not know its gears before it was homed: "
+            "options.pan.resolution_arcsec and options.tilt.resolution_arcsec have to say what is right",
+            device=DEVICE,
+        )
+    return version
+
+
+def ready_axes(
+    talk: Conversation,
+    options: Options,
+    resolutions: Mapping[str, float],
+    known: Mapping[str, StepAxis],
+    clock: Clock,
+) -> dict[str, StepAxis]:
+    """Halt the unit, set its limits and speeds, and return its axes, by name, as they are seen now.
+
+    Parameters
+    ----------
+    resolutions
+        What it says that a position is, seconds of arc.
+    known
+        The axes before the unit or its line was away, whose usual speeds are kept; empty the first time.
+
+    Raises
+    ------
+    WrongDevice
+        If it does not fit the options.
+    NoReply, BadReply, Refused, LineLost
+        As `Conversation.ask` and `Conversation.tell`.
+    """
+    talk.tell("H")
+    _try(talk, "CI")  # goals are positions, not speeds
+    for command in ("PO0", "TO0", "I"):  # whatever was given in slaved mode and never started is void
+        talk.tell(command)
+    settings = {"pan": options.pan, "tilt": options.tilt}
+    axes = {
+        name: StepAxis(name, settings[name], talk.sure(ask.RESOLUTION[name], resolutions[name]))
+        for name in settings
+    }
+    _try(talk, "LE")
+    for axis in axes.values():
+        axis.lowest, axis.highest = (int(talk.sure(q[axis.name])) for q in (ask.LOWEST, ask.HIGHEST))
+        axis.check_limits()
+    _limit(talk, axes)
+    for name, axis in axes.items():
+        axis.fastest, axis.slowest = talk.sure(ask.FASTEST[name]), talk.sure(ask.SLOWEST[name])
+        if options.speed_rad_per_s is not None:
+            axis.usual_speed = axis.speed_from_rad(options.speed_rad_per_s)
+        elif name in known:
+            axis.usual_speed = known[name].usual_speed
+        else:
+            axis.usual_speed = int(talk.sure(ask.SPEED[name]))
+        axis.acceleration = int(talk.sure(ask.ACCELERATION[name]))
+        if options.acceleration_rad_per_s2 is not None:
+            _accelerate(talk, axis, options.acceleration_rad_per_s2)
+    measure(talk, axes["pan"], axes["tilt"], clock)
+    return axes
+
+
+def _limit(talk: Conversation, axes: Mapping[str, StepAxis]) -> None:
+    """Put the configuration's limits into the unit, if it has user limits."""
+    try:
+        for name, axis in axes.items():
+            for letter, end in zip("NX", axis.soft_limits(), strict=True):
+                talk.tell(f"{name[0].upper()}{letter}U{end}")
+        talk.tell("LU")
+    except Refused as error:
+        log.info("%s: only its factory limits hold inside the unit (%s)", DEVICE, error)
+        _try(talk, "LE")
+
+
+def _accelerate(talk: Conversation, axis: StepAxis, acceleration_rad_per_s2: float) -> None:
+    """Set the acceleration, if the unit has another."""
+    positions = max(1, round(acceleration_rad_per_s2 / axis.position_rad))
+    if axis.acceleration != positions:
+        talk.tell(f"{axis.name[0].upper()}A{positions}", RECOMPUTE_S)
+        axis.acceleration = positions
+
+
+def _try(talk: Conversation, command: str) -> None:
+    """Send a command that not every firmware has."""
+    try:
+        talk.tell(command)
+    except Refused as error:
+        log.info("%s", error)
+
+
+@dataclass(frozen=True)
+class Supply:
+    """Supply, volts, and the hottest temperature that the unit tells, °C."""
+
+    volts: float
+    hottest_c: float
+
+
+def supply_of(text: str) -> Supply | None:
+    """Return what an answer to ``O`` says; None if it says something else."""
+    volts, degrees = _VOLTS.findall(text), _DEGREES_F.findall(text)
+    if len(volts) != 1 or not degrees:
+        return None
+    return Supply(float(volts[0]), (max(float(one) for one in degrees) - 32) / 1.8)
+
+
+def supply_words(now: Supply, at_start: Supply, options: Options) -> tuple[str, ...]:
+    """Say what is wrong with the supply or the temperature; empty if nothing is."""
+    words = []
+    low, high = options.supply_V or (DIP * at_start.volts, float("inf"))
+    if not low <= now.volts <= high:
+        expected = f"{low:.1f} to {high:.1f} V" if options.supply_V else f"{low:.1f} V or more"
+        words.append(f"the supply is {now.volts:.1f} V, expected {expected}")
+    if now.hottest_c > options.hottest_C:
+        words.append(f"the unit is at {now.hottest_c:.0f} °C, expected {options.hottest_C:.0f} °C at most")
+    return tuple(words)
+
+
+class SupplyWatch:
+    """The watch over a unit's supply and temperature.
+
+    Attributes
+    ----------
+    words
+        What is wrong, in plain words; empty if nothing is, or the unit does not tell.
+    """
+
+    def __init__(self, options: Options, clock: Clock) -> None:
+        self.words: tuple[str, ...] = ()
+        self._options = options
+        self._clock = clock
+        self._at_start: Supply | None = None  # None: this unit does not tell
+        self._due_s = 0.0
+
+    def begin(self, talk: Conversation) -> None:
+        """Ask what there is, unless that is known; raises as `Conversation.tell`."""
+        if self._at_start is not None:
+            return
+        first, again = _supply(talk), _supply(talk)
+        if first is not None and again is not None:  # the middle, should a digit be damaged
+            third = _supply(talk) or again
+            self._at_start = sorted((first, again, third), key=lambda supply: supply.volts)[1]
+
+    def look(self, talk: Conversation) -> None:
+        """Ask and judge now and then; a fault is told only if it is measured twice. Raises as `begin`."""
+        if self._at_start is None or self._clock.now_s() < self._due_s:
+            return
+        words: tuple[str, ...] = ()
+        for _ in range(2):
+            supply = _supply(talk)
+            if supply is None:
+                return  # damaged: asked again by the next reading
+            words = supply_words(supply, self._at_start, self._options)
+            if not words:
+                break
+        self.words, self._due_s = words, self._clock.now_s() + EVERY_S
+
+
+def _supply(talk: Conversation) -> Supply | None:
+    """Supply and temperature; None where the unit does not tell, or in words nobody knows."""
+    try:
+        return supply_of(talk.tell("O"))
+    except Refused as error:
+        log.info("%s: it does not tell its supply (%s)", DEVICE, error)
+        return None
