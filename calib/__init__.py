@@ -8,14 +8,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from calib.boards.board_file import load_board as load_board
-    from calib.camera.cahvor import CameraModel as CameraModel
-    from calib.camera.stereo import triangulate as triangulate
-    from calib.camera.stereo import triangulate_many as triangulate_many
-    from calib.corners.find import CornersNotFound as CornersNotFound
-    from calib.corners.find import find_corners as find_corners
-    from calib.dots.find import find_dots as find_dots
-    from calib.dots.find_in_survey import detect_survey as detect_survey
+    from calib.adjust.robust import SurveyNotFitted as SurveyNotFitted
+    from calib.calibrate.paper import fit_paper as fit_paper
+    from calib.calibrate.survey import fit_joint as fit_joint
     from calib.errors import BadFile as BadFile
     from calib.errors import CalibError as CalibError
     from calib.errors import NoHandoff as NoHandoff
@@ -26,42 +21,75 @@ if TYPE_CHECKING:
     from calib.files.any_camera import save_any as save_any
     from calib.files.mast_file import load_rig as load_rig
     from calib.files.mast_file import save_rig as save_rig
-    from calib.fit.joint import fit_joint as fit_joint
-    from calib.fit.paper import fit_paper as fit_paper
-    from calib.fit.start_values import SurveyNotFitted as SurveyNotFitted
-    from calib.handoff.geometric import Joints as Joints
-    from calib.handoff.geometric import hand_off as hand_off
-    from calib.mast.pointing import solve as solve
-    from calib.mast.pointing import solve_many as solve_many
-    from calib.mast.rig import Mast as Mast
-    from calib.mast.rig import Rig as Rig
-    from calib.mast.rig import RigCamera as RigCamera
-    from calib.mast.solutions import choose as choose
+    from calib.geometry.cahvor import CameraModel as CameraModel
+    from calib.geometry.handoff import Joints as Joints
+    from calib.geometry.handoff import hand_off as hand_off
+    from calib.geometry.pointing import solve as solve
+    from calib.geometry.pointing import solve_many as solve_many
+    from calib.geometry.rig import Mast as Mast
+    from calib.geometry.rig import Rig as Rig
+    from calib.geometry.rig import RigCamera as RigCamera
+    from calib.geometry.solutions import choose as choose
+    from calib.geometry.stereo import triangulate as triangulate
+    from calib.geometry.stereo import triangulate_many as triangulate_many
     from calib.survey.check import check_survey as check_survey
+    from calib.survey.find_dots import detect_survey as detect_survey
     from calib.survey.reader import read_survey as read_survey
     from calib.survey.writer import write_survey as write_survey
+    from calib.targets.board_file import load_board as load_board
+    from calib.targets.corners import CornersNotFound as CornersNotFound
+    from calib.targets.corners import find_corners as find_corners
+    from calib.targets.dots import find_dots as find_dots
 
 _MODULES = {
-    "calib.boards.board_file": ("load_board",),
-    "calib.camera.cahvor": ("CameraModel",),
-    "calib.camera.stereo": ("triangulate", "triangulate_many"),
-    "calib.corners.find": ("CornersNotFound", "find_corners"),
-    "calib.dots.find": ("find_dots",),
-    "calib.dots.find_in_survey": ("detect_survey",),
-    "calib.errors": ("BadFile", "CalibError", "NoHandoff", "NoStereoPoint", "Unreachable"),
+    "calib.adjust.robust": ("SurveyNotFitted",),
+    "calib.calibrate.paper": ("fit_paper",),
+    "calib.calibrate.survey": ("fit_joint",),
+    "calib.errors": (
+        "BadFile",
+        "CalibError",
+        "NoHandoff",
+        "NoStereoPoint",
+        "Unreachable",
+    ),
     "calib.files": ("CameraFile",),
-    "calib.files.any_camera": ("load_any", "save_any"),
-    "calib.files.mast_file": ("load_rig", "save_rig"),
-    "calib.fit.joint": ("fit_joint",),
-    "calib.fit.paper": ("fit_paper",),
-    "calib.fit.start_values": ("SurveyNotFitted",),
-    "calib.handoff.geometric": ("Joints", "hand_off"),
-    "calib.mast.pointing": ("solve", "solve_many"),
-    "calib.mast.rig": ("Mast", "Rig", "RigCamera"),
-    "calib.mast.solutions": ("choose",),
+    "calib.files.any_camera": (
+        "load_any",
+        "save_any",
+    ),
+    "calib.files.mast_file": (
+        "load_rig",
+        "save_rig",
+    ),
+    "calib.geometry.cahvor": ("CameraModel",),
+    "calib.geometry.handoff": (
+        "Joints",
+        "hand_off",
+    ),
+    "calib.geometry.pointing": (
+        "solve",
+        "solve_many",
+    ),
+    "calib.geometry.rig": (
+        "Mast",
+        "Rig",
+        "RigCamera",
+    ),
+    "calib.geometry.solutions": ("choose",),
+    "calib.geometry.stereo": (
+        "triangulate",
+        "triangulate_many",
+    ),
     "calib.survey.check": ("check_survey",),
+    "calib.survey.find_dots": ("detect_survey",),
     "calib.survey.reader": ("read_survey",),
     "calib.survey.writer": ("write_survey",),
+    "calib.targets.board_file": ("load_board",),
+    "calib.targets.corners": (
+        "CornersNotFound",
+        "find_corners",
+    ),
+    "calib.targets.dots": ("find_dots",),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -157,7 +157,7 @@ def test_a_tool_that_a_signal_ends_leaves_nothing_behind(
 @pytest.mark.long(2, "copies and compiles the checkout for the sampler of mutants")
 def test_mutants_that_a_signal_ends_leave_nothing_behind(repository: Path, tmp_path: Path) -> None:
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    command = [sys.executable, "-m", "tools.mutants", "calib/mast", "--mutants", "2", "--jobs", "1"]
+    command = [sys.executable, "-m", "tools.mutants", "calib/geometry", "--mutants", "2", "--jobs", "1"]
     with subprocess.Popen(
         command, cwd=repository, env=environment, stdout=subprocess.DEVNULL, start_new_session=True
     ) as tool:

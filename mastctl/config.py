@@ -15,9 +15,8 @@ from urllib.parse import quote
 
 from calib.errors import BadFile
 from calib.files import read_bytes
-from calib.files.strict import Section, nearest
-from calib.files.yaml_text import parse_mapping
-from calib.mast.rig import Rig
+from calib.files.yaml_text import Section, nearest, parse_mapping
+from calib.geometry.rig import Rig
 from drivers.camera_offset import MOST_OFFSET_S
 from drivers.hardware import DeviceSettings, HardwareSettings
 from mastctl.devices.keep_out import Box

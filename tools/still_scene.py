@@ -1,7 +1,7 @@
 """Pictures of a still scene from a simulated head that looks round, with a true rig unlike the believed one.
 
-Nothing of `calib.scene` has a part in it: the head's joints err by what is told here, and the simulator's
-renderer draws what its cameras then see.
+Nothing of `calib.calibrate.scene` has a part in it: the head's joints err by what is told here, and the
+simulator's renderer draws what its cameras then see.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.calibrate.scene.terms import SceneView
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray, Rigid
-from calib.scene.views import View
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, Rigid
 from drivers.sim.render import Renderer
 from drivers.sim.scene import SceneSettings, build_scene
 from drivers.sim.sensor import Noise
@@ -53,7 +53,7 @@ def pictures(
     seed: int,
     noise_dn: float = 1.5,
     moved: Callable[[int], Rigid] = lambda _: Rigid.identity(),
-) -> Iterator[View]:
+) -> Iterator[SceneView]:
     """Yield what the head cameras of a true rig see, with the angles that the joints read.
 
     ``moved`` says where the rover stands at a rest, in its first place's frame.
@@ -65,7 +65,7 @@ def pictures(
             light = renderer.image(camera.model, site_from_head, 2)
             noise = Noise(noise_dn, noise_dn, seed, name)
             image: FloatArray = noise.levels(light, noise.sigma_dn(light), pose).astype(np.float32)
-            yield View(f"{name} {pose}", name, image, *rest, pose)
+            yield SceneView(f"{name} {pose}", name, image, *rest, pose)
 
 
 @cache

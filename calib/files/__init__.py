@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.camera.cahvor import CameraModel, Kind
-from calib.camera.opencv_camera import OpencvCamera
 from calib.errors import BadFile
+from calib.files.opencv_camera import OpencvCamera
+from calib.geometry.cahvor import CameraModel, Kind
 
 #: A shift of a pixel by the normalisation of A and O is told from this size on.
 TOLD_SHIFT_PX = 0.01
@@ -99,7 +99,7 @@ def build_model(
     path, place
         For messages: the file, and the key or group of the camera in it.
     kind, size_px, cahvore_type, linearity
-        As in `calib.camera.cahvor.CameraModel`; ``linearity`` None where the type fixes it.
+        As in `calib.geometry.cahvor.CameraModel`; ``linearity`` None where the type fixes it.
     vectors
         C, A, H, V and, as the kind needs, O, R, E, each (3,).
 

@@ -8,43 +8,46 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.opencv_camera import LensKind, OpencvCamera
-from calib.camera.twin import (
+from calib.errors import BadFile
+from calib.files import CameraFile, read_bytes
+from calib.files.atomic import save_bytes
+from calib.files.cahvor_text import internal_parameters, looks_like_cahvor, parse_cahvor, save_cahvor
+from calib.files.mast_file import CAMERA_SCHEMA, MAST_SCHEMA, StoredRig, parse_camera, parse_rig, save_camera
+from calib.files.mrcal_kalibr_colmap import (
+    format_colmap,
+    format_kalibr,
+    format_mrcal,
+    looks_like_colmap,
+    looks_like_kalibr,
+    looks_like_mrcal,
+    parse_colmap,
+    parse_kalibr,
+    parse_mrcal,
+    refuse_mirrored,
+)
+from calib.files.opencv_camera import LensKind, OpencvCamera
+from calib.files.opencv_ros import (
+    error_words,
+    format_camera_info,
+    format_opencv,
+    looks_like_camera_info,
+    looks_like_opencv,
+    parse_camera_info,
+    parse_opencv,
+    without_last_mark,
+)
+from calib.files.pds3 import MAX_FILE_BYTES, load_pds3_camera, looks_like_pds3
+from calib.files.twin import (
     GOOD_PX,
-    Camera,
+    CameraLike,
     TwinError,
     nearest_opencv,
     nearest_square,
     nearest_tilted,
     twin_error,
 )
-from calib.errors import BadFile
-from calib.files import CameraFile, read_bytes
-from calib.files.atomic import save_bytes
-from calib.files.cahvor_text import internal_parameters, looks_like_cahvor, parse_cahvor, save_cahvor
-from calib.files.camera_info import (
-    format_camera_info,
-    looks_like_camera_info,
-    parse_camera_info,
-    without_last_mark,
-)
-from calib.files.colmap import format_colmap, looks_like_colmap, parse_colmap
-from calib.files.kalibr import format_kalibr, looks_like_kalibr, parse_kalibr
-from calib.files.mast_file import (
-    CAMERA_SCHEMA,
-    MAST_SCHEMA,
-    StoredRig,
-    parse_camera,
-    parse_rig,
-    save_camera,
-)
-from calib.files.mrcal_model import format_mrcal, looks_like_mrcal, parse_mrcal, refuse_mirrored
-from calib.files.opencv_yaml import format_opencv, looks_like_opencv, parse_opencv
-from calib.files.other_lens import error_words
-from calib.files.pds3 import load_pds3_camera, looks_like_pds3
-from calib.files.pds3_image import MAX_FILE_BYTES
 from calib.files.yaml_text import parse_mapping
+from calib.geometry.cahvor import CameraModel
 
 KNOWN_FORMATS = (
     "a mast file, a camera file, a .cahvor file, a PDS3 label, OpenCV's or ROS's YAML, Kalibr's camchain, "
@@ -261,7 +264,7 @@ def _save_twins(
     offered = _OFFERED[to]
     if lens and lens not in offered:
         raise BadFile(path, "", f"lens '{lens[:20]}' where one of {', '.join(offered)} is expected for {to}")
-    found: dict[str, tuple[str, Camera, TwinError]] = {}
+    found: dict[str, tuple[str, CameraLike, TwinError]] = {}
     for name, camera in cameras.items():
         refuse_mirrored(camera.model, path)
         found[name] = _nearest(camera, (lens,) if lens else offered, path)
@@ -296,11 +299,13 @@ def _save_twins(
     )
 
 
-def _nearest(camera: CameraFile, lenses: tuple[str, ...], path: str | Path) -> tuple[str, Camera, TwinError]:
+def _nearest(
+    camera: CameraFile, lenses: tuple[str, ...], path: str | Path
+) -> tuple[str, CameraLike, TwinError]:
     """Lens, twin and error: the plainest lens that is good enough, else the nearest of them."""
-    original: Camera = camera.as_read or camera.model
+    original: CameraLike = camera.as_read or camera.model
     near = camera.model.lens.moving
-    best: tuple[str, Camera, TwinError] | None = None
+    best: tuple[str, CameraLike, TwinError] | None = None
     problem = ""
     for name in lenses:
         try:
@@ -319,7 +324,7 @@ def _nearest(camera: CameraFile, lenses: tuple[str, ...], path: str | Path) -> t
     return best
 
 
-def _twin(camera: CameraFile, lens: str) -> Camera:
+def _twin(camera: CameraFile, lens: str) -> CameraLike:
     """The camera itself where the lens holds it, else the nearest one."""
     if lens == "cahvor":
         return camera.model if _is_square(camera.model) else nearest_square(camera.model)
@@ -356,7 +361,7 @@ def _why(model: CameraModel) -> str:
 
 
 def _lost(
-    cameras: Mapping[str, CameraFile], twins: Mapping[str, Camera], to: str, frame: str
+    cameras: Mapping[str, CameraFile], twins: Mapping[str, CameraLike], to: str, frame: str
 ) -> tuple[str, ...]:
     """What a format of other lenses cannot hold, a sentence each."""
     lost = []

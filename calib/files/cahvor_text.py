@@ -21,12 +21,12 @@ from typing import Any, cast
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel, Kind
 from calib.errors import BadFile
 from calib.files import CameraFile, build_model, digest_of, read_bytes
 from calib.files.atomic import save_bytes
 from calib.files.yaml_text import plain
-from calib.rigid import FloatArray
+from calib.geometry.cahvor import CameraModel, Kind
+from calib.geometry.rigid import FloatArray
 
 MAX_BYTES = 1_000_000
 UNKNOWN_FRAME = "unknown"

@@ -13,14 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from calib.camera.cahvor import CameraModel, Kind
 from calib.errors import BadFile
 from calib.files import LARGEST_IMAGE_PX, CameraFile, build_model, digest_of, read_bytes
 from calib.files.atomic import save_bytes
-from calib.files.strict import Section
-from calib.files.yaml_text import MAX_BYTES, dump_mapping, kind_of, parse_mapping
-from calib.mast.joints import MOST_HARMONICS, AxisJoint, Joints
-from calib.mast.rig import Mast, Rig, RigCamera
+from calib.files.yaml_text import MAX_BYTES, Section, dump_mapping, kind_of, parse_mapping
+from calib.geometry.cahvor import CameraModel, Kind
+from calib.geometry.rig import MOST_HARMONICS, AxisJoint, JointErrors, Mast, Rig, RigCamera
 
 MAST_SCHEMA = "mastctl/mast/1"
 CAMERA_SCHEMA = "mastctl/camera/1"
@@ -85,7 +83,7 @@ def parse_rig(data: bytes, path: str | Path) -> StoredRig:
         stereo=read_stereo(top, cameras),
         fit=top.free("fit"),
         provenance=top.free("provenance"),
-        joints=_joints(top.section("joints", (), ("pan", "tilt"))) if "joints" in top else Joints(),
+        joints=_joints(top.section("joints", (), ("pan", "tilt"))) if "joints" in top else JointErrors(),
     )
     return StoredRig(rig, digest_of(data), Path(path), notes)
 
@@ -112,7 +110,7 @@ def save_rig(rig: Rig, path: str | Path) -> StoredRig:
             name: {"on": camera.on, **_model_keys(camera.model)} for name, camera in rig.cameras.items()
         },
         "stereo": rig.stereo,
-        **({} if rig.joints == Joints() else {"joints": joint_keys(rig.joints)}),
+        **({} if rig.joints == JointErrors() else {"joints": joint_keys(rig.joints)}),
         "fit": rig.fit,
         "provenance": rig.provenance,
     }
@@ -205,7 +203,7 @@ def _model_keys(model: CameraModel) -> dict[str, Any]:
     return keys
 
 
-def _joints(section: Section) -> Joints:
+def _joints(section: Section) -> JointErrors:
     """Read what the joints' readings are wrong by; an axis that is not there reads true."""
     axes: dict[str, AxisJoint] = {}
     for axis in section.values:
@@ -218,10 +216,10 @@ def _joints(section: Section) -> Joints:
             axes[axis] = AxisJoint(pairs, backlash)
         except ValueError as error:
             raise section.bad(axis, str(error)) from None
-    return Joints(**axes)
+    return JointErrors(**axes)
 
 
-def joint_keys(joints: Joints) -> dict[str, Any]:
+def joint_keys(joints: JointErrors) -> dict[str, Any]:
     """Return both joints' keys in the contract's order."""
     return {
         name: {

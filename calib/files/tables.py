@@ -19,7 +19,7 @@ import numpy as np
 
 from calib.errors import BadFile
 from calib.files import read_bytes
-from calib.rigid import FloatArray
+from calib.geometry.rigid import FloatArray
 
 MAX_BYTES = 1 << 29
 

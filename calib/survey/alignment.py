@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from calib.errors import CalibError
-from calib.rigid import FloatArray, Rigid, rigid_rates
-from calib.survey import Survey
+from calib.geometry.rigid import FloatArray, Rigid, rigid_rates
+from calib.survey.records import Survey
 
 FALSE_ALARM = 1e-4
 """How often points without a blunder are called in doubt."""

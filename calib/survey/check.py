@@ -10,13 +10,83 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from calib.files.strict import nearest
-from calib.rigid import FloatArray, Rigid
-from calib.survey import Finding, Survey, SurveyCamera, SurveyImage
-from calib.survey.bench_check import bench_findings
+from calib.files.yaml_text import nearest
+from calib.geometry.rigid import FloatArray, Rigid
 from calib.survey.doubts import dot_doubts, grid_doubts, station_doubts, unit_doubts
-from calib.survey.joint_doubts import joint_doubts
-from calib.survey.mixups import Placement, eyes_in_rover_m, mixups, rover_from_boards
+from calib.survey.mixups import Placement, eyes_in_rover_m, joint_doubts, mixups, rover_from_boards
+from calib.survey.records import Survey, SurveyCamera, SurveyFinding, SurveyImage
+
+FEWEST_CORNERS = 8
+"""Of an image, for a pose that says something about the lens."""
+
+FEWEST_PLACEMENTS = 2
+
+
+def bench_findings(survey: Survey) -> Iterator[SurveyFinding]:
+    """Yield what is missing of a bench: corners of images, images of cameras, placements."""
+    for name in survey.cameras:
+        yield from _of_camera(survey, name)
+    head = [image for image in survey.images if image.pan_rad is not None and image.purpose != "check"]
+    placements = {(image.setup, image.placement, image.board) for image in head if _seen(survey, image)}
+    if head and len(placements) < FEWEST_PLACEMENTS:
+        yield SurveyFinding(
+            "warning",
+            "images.csv",
+            "the board stood in one place only; its distance and the lenses can trade for each other",
+            "Put the board elsewhere, nearer or further and at another slant, two to four placements in all",
+        )
+
+
+def _of_camera(survey: Survey, name: str) -> Iterator[SurveyFinding]:
+    mine = [image for image in survey.images if image.camera == name]
+    if not mine:
+        yield SurveyFinding(
+            "error",
+            f"camera {name}",
+            "it has no image in images.csv",
+            "Photograph a board with it, or take it out of survey.yaml",
+        )
+        return
+    without = [image for image in mine if not _seen(survey, image)]
+    lost = [image for image in without if not (survey.folder / image.file).is_file()]
+    if lost:
+        yield SurveyFinding(
+            "error",
+            f"images.csv line {lost[0].row}, camera {name}",
+            f"{len(lost)} of {len(mine)} images have neither corners in corners.csv nor a picture "
+            f"({_some_images(lost)})",
+            "Put the picture there, add its corners, or take out the row",
+        )
+    if len(without) == len(mine):
+        yield SurveyFinding(
+            "error",
+            f"camera {name}",
+            f"none of its {len(mine)} images shows corners of a board",
+            "Find the corners of its pictures, or photograph a board with it",
+        )
+    few = [image for image in mine if 0 < _count(survey, image) < FEWEST_CORNERS]
+    if few:
+        yield SurveyFinding(
+            "warning",
+            f"camera {name}",
+            f"{len(few)} images show fewer than {FEWEST_CORNERS} corners ({_some_images(few)})",
+            "Have more of the board in the picture",
+        )
+
+
+def _count(survey: Survey, image: SurveyImage) -> int:
+    return len(survey.corners[image.name]) if image.name in survey.corners else 0
+
+
+def _seen(survey: Survey, image: SurveyImage) -> bool:
+    return _count(survey, image) > 0
+
+
+def _some_images(images: list[SurveyImage]) -> str:
+    """The first few names."""
+    names = ", ".join(image.name for image in images[:4])
+    return names + (f" and {len(images) - 4} more" if len(images) > 4 else "")
+
 
 FEWEST_BOARDS, ENOUGH_BOARDS = 3, 5
 """For a camera, and for the mast; the paper finds 5 to 8 positions adequate."""
@@ -40,7 +110,7 @@ def check_survey(
     tilt_limits_rad: tuple[float, float] = TILT_LIMITS_RAD,
     *,
     only_camera_images: bool = False,
-) -> tuple[Finding, ...]:
+) -> tuple[SurveyFinding, ...]:
     """Return what is missing, too little, or at odds with itself in a survey; errors first.
 
     Parameters
@@ -78,7 +148,7 @@ def check_survey(
         findings += _mast_spread(survey)
     if survey.images and not any(image.purpose == "check" for image in survey.images):
         findings.append(
-            Finding(
+            SurveyFinding(
                 "warning",
                 "images.csv",
                 "there is no image of purpose check, so nothing independent tells how good the result is",
@@ -88,13 +158,13 @@ def check_survey(
     return tuple(sorted(findings, key=lambda finding: finding.severity))
 
 
-def _missing(survey: Survey) -> Iterator[Finding]:
+def _missing(survey: Survey) -> Iterator[SurveyFinding]:
     """Images without dots and picture; cameras without images; images with next to no dots."""
     clicked = {click.image for click in survey.clicks}
     for name in survey.cameras:
         mine = [image for image in survey.images if image.camera == name]
         if not mine:
-            yield Finding(
+            yield SurveyFinding(
                 "error",
                 f"camera {name}",
                 "it has no image in images.csv",
@@ -112,7 +182,7 @@ def _missing(survey: Survey) -> Iterator[Finding]:
             missing = (
                 f"the file {first.file.as_posix()} is missing" if first.file.name else "no file is named"
             )
-            yield Finding(
+            yield SurveyFinding(
                 "error",
                 f"images.csv line {first.row}, camera {name}",
                 f"{len(empty)} of {len(mine)} images have neither dots in dots.csv nor a picture "
@@ -122,7 +192,7 @@ def _missing(survey: Survey) -> Iterator[Finding]:
         found = {i.name: len(survey.dots[i.name].rows) for i in mine if i.name in survey.dots}
         few = [image for image, count in found.items() if count < FEWEST_DOTS]
         if few:
-            yield Finding(
+            yield SurveyFinding(
                 "warning",
                 f"camera {name}",
                 f"{len(few)} images have fewer than {FEWEST_DOTS} dots ({_some(few)})",
@@ -130,20 +200,20 @@ def _missing(survey: Survey) -> Iterator[Finding]:
             )
 
 
-def _set_ups(survey: Survey) -> Iterator[Finding]:
+def _set_ups(survey: Survey) -> Iterator[SurveyFinding]:
     """Set-ups with too few prisms."""
     measured = survey.measured("prism")
     for setup in dict.fromkeys(image.setup for image in survey.images):
         prisms = list(measured.get((setup, ""), ()))
         if len(prisms) < 3:
-            yield Finding(
+            yield SurveyFinding(
                 "error",
                 f"set-up {setup}",
                 f"{len(prisms)} prisms are measured ({', '.join(prisms) or 'none'}) where three are needed",
                 "Measure at least three prisms, better four, from this standing of the station",
             )
         elif len(prisms) == 3:
-            yield Finding(
+            yield SurveyFinding(
                 "warning",
                 f"set-up {setup}",
                 f"only three prisms are measured ({', '.join(prisms)}), so none can be left out if it is off",
@@ -151,7 +221,7 @@ def _set_ups(survey: Survey) -> Iterator[Finding]:
             )
 
 
-def _placements(survey: Survey) -> Iterator[Finding]:
+def _placements(survey: Survey) -> Iterator[SurveyFinding]:
     """Images of placements not measured; placements with too few tapes, or not photographed."""
     tapes = survey.measured("tape")
     seen = {(image.setup, image.placement) for image in survey.images}
@@ -160,7 +230,7 @@ def _placements(survey: Survey) -> Iterator[Finding]:
         if image.placement and at not in tapes:
             there = [placement for setup, placement in tapes if setup == image.setup]
             hint = f"; {nearest(image.placement, there)}" if there else ""
-            yield Finding(
+            yield SurveyFinding(
                 "error",
                 f"images.csv line {image.row}, image {image.name}",
                 f"placement {image.placement} has no tapes in set-up {image.setup} of station.csv{hint}",
@@ -169,14 +239,14 @@ def _placements(survey: Survey) -> Iterator[Finding]:
     for (setup, placement), names in tapes.items():
         place = f"set-up {setup}, placement {placement}"
         if len(names) < 3:
-            yield Finding(
+            yield SurveyFinding(
                 "error",
                 place,
                 f"{len(names)} of three tapes are measured ({', '.join(names)})",
                 "Measure the missing tapes, or take out the placement and its images",
             )
         if (setup, placement) not in seen:
-            yield Finding(
+            yield SurveyFinding(
                 "warning",
                 place,
                 "it was measured but no image shows it",
@@ -186,7 +256,7 @@ def _placements(survey: Survey) -> Iterator[Finding]:
 
 def _angles(
     survey: Survey, pan_limits_rad: tuple[float, float], tilt_limits_rad: tuple[float, float]
-) -> Iterator[Finding]:
+) -> Iterator[SurveyFinding]:
     """Joint angles outside their limits; many of them are degrees."""
     for joint, (low, high) in (("pan", pan_limits_rad), ("tilt", tilt_limits_rad)):
         angles = [(getattr(i, f"{joint}_rad"), i) for i in survey.images if i.pan_rad is not None]
@@ -200,7 +270,7 @@ def _angles(
                 f"If the angles are in degrees, write radians: {worst:g} degrees are "
                 f"{np.radians(worst):.4f} rad, one radian is 57.3 degrees"
             )
-        yield Finding(
+        yield SurveyFinding(
             "error",
             f"images.csv line {image.row}, {joint}_rad",
             f"{joint} of {len(off)} of {len(angles)} images is outside {low:.2f} to {high:.2f} rad, "
@@ -215,12 +285,12 @@ def _camera_spread(
     purposes: Sequence[str],
     fitted: Sequence[SurveyImage],
     in_rover: Mapping[Placement, Rigid],
-) -> Iterator[Finding]:
+) -> Iterator[SurveyFinding]:
     """Too few boards, at one distance, or in one part of the picture."""
     boards = list(dict.fromkeys((image.setup, image.placement) for image in fitted))
     of_purpose = "" if len(purposes) > 1 else f" of purpose {purposes[0]}"
     if len(boards) < ENOUGH_BOARDS:
-        yield Finding(
+        yield SurveyFinding(
             "error" if len(boards) < FEWEST_BOARDS else "warning",
             f"camera {camera.name}",
             f"{len(boards)} placements{of_purpose} are there to fit it; {FEWEST_BOARDS} are the least and "
@@ -230,7 +300,7 @@ def _camera_spread(
     eye_m = eyes_in_rover_m(survey)[camera.name]
     ranges_m = [float(np.linalg.norm(in_rover[at].translation_m - eye_m)) for at in boards if at in in_rover]
     if len(ranges_m) > 1 and max(ranges_m) < DEPTH_RATIO * min(ranges_m):
-        yield Finding(
+        yield SurveyFinding(
             "warning",
             f"camera {camera.name}",
             f"all its boards stand between {min(ranges_m):.1f} and {max(ranges_m):.1f} m, so focal length "
@@ -242,7 +312,7 @@ def _camera_spread(
         yield from _area(camera, np.concatenate(pixels))
 
 
-def _area(camera: SurveyCamera, pixels_px: FloatArray) -> Iterator[Finding]:
+def _area(camera: SurveyCamera, pixels_px: FloatArray) -> Iterator[SurveyFinding]:
     """Say where in the picture there are no dots, if that is much of it."""
     cells = np.clip(((pixels_px + 0.5) / np.array(camera.size_px) * (4, 3)).astype(int), 0, (3, 2))
     reached = np.zeros((3, 4), dtype=bool)
@@ -257,7 +327,7 @@ def _area(camera: SurveyCamera, pixels_px: FloatArray) -> Iterator[Finding]:
     }
     emptiest = min(sides, key=sides.__getitem__)
     (left, top), (right, bottom) = pixels_px.min(axis=0), pixels_px.max(axis=0)
-    yield Finding(
+    yield SurveyFinding(
         "warning",
         f"camera {camera.name}",
         f"its dots reach {100 * reached.mean():.0f} % of the picture (x {left:.0f} to {right:.0f}, "
@@ -267,7 +337,7 @@ def _area(camera: SurveyCamera, pixels_px: FloatArray) -> Iterator[Finding]:
     )
 
 
-def _mast_spread(survey: Survey) -> Iterator[Finding]:
+def _mast_spread(survey: Survey) -> Iterator[SurveyFinding]:
     """Too little turning of the head."""
     head = [i for i in survey.images if i.pan_rad is not None and i.purpose != "check"]
     if not head:
@@ -275,7 +345,7 @@ def _mast_spread(survey: Survey) -> Iterator[Finding]:
     joints = np.array([(i.pan_rad, i.tilt_rad) for i in head])
     pan_rad, tilt_rad = np.ptp(joints, axis=0)
     if max(pan_rad, tilt_rad) < STILL_RAD:
-        yield Finding(
+        yield SurveyFinding(
             "error",
             "the mast",
             f"the head did not move: pan changes by {pan_rad:.3f} rad and tilt by {tilt_rad:.3f} rad",
@@ -285,7 +355,7 @@ def _mast_spread(survey: Survey) -> Iterator[Finding]:
     for joint, found, wanted in (("pan", pan_rad, PAN_RANGE_RAD), ("tilt", tilt_rad, TILT_RANGE_RAD)):
         if found < wanted:
             column = joints[:, 0 if joint == "pan" else 1]
-            yield Finding(
+            yield SurveyFinding(
                 "warning",
                 "the mast",
                 f"{joint} goes from {column.min():.2f} to {column.max():.2f} rad only, {found:.2f} rad where "
@@ -294,7 +364,7 @@ def _mast_spread(survey: Survey) -> Iterator[Finding]:
             )
     boards = {(i.setup, i.placement) for i in head if i.purpose == "mast"}
     if len(boards) < ENOUGH_BOARDS:
-        yield Finding(
+        yield SurveyFinding(
             "warning",
             "the mast",
             f"{len(boards)} placements of purpose mast; {ENOUGH_BOARDS} to 8 are adequate",

@@ -7,9 +7,10 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from calib.rigid import FloatArray
-from calib.survey import Dots, Finding, Survey
+from calib.geometry.rigid import FloatArray
 from calib.survey.alignment import Alignment, NotAligned, align, mirrored
+from calib.survey.records import Survey, SurveyFinding
+from calib.targets.boards import Dots
 
 UNITS = {"feet": 3.28084, "inches": 39.3701, "centimetres": 100.0, "millimetres": 1000.0}
 """How many of them a metre has."""
@@ -28,7 +29,7 @@ NEAR_DOT = 0.25
 """Two dots nearer than this part of the usual distance are one dot found twice."""
 
 
-def unit_doubts(survey: Survey) -> Iterator[Finding]:
+def unit_doubts(survey: Survey) -> Iterator[SurveyFinding]:
     """Yield what is wrong with the scale of all prisms, or of all tapes."""
     ratios = {
         "prisms": _ratio(survey.prisms_in_rover_m, survey.measured("prism").values()),
@@ -37,7 +38,7 @@ def unit_doubts(survey: Survey) -> Iterator[Finding]:
     off = {what: ratio for what, ratio in ratios.items() if ratio is not None and abs(ratio - 1) > SCALE}
     if len(off) == 2 and abs(off["prisms"] / off["tapes"] - 1) < SCALE:
         ratio = off["tapes"]
-        yield Finding(
+        yield SurveyFinding(
             "error",
             "station.csv",
             f"distances between prisms and between tapes are {ratio:.4g} times those of survey.yaml"
@@ -47,7 +48,7 @@ def unit_doubts(survey: Survey) -> Iterator[Finding]:
         return
     keys = {"prisms": "prisms_in_rover_m", "tapes": "board.tapes_in_board_m"}
     for what, ratio in off.items():
-        yield Finding(
+        yield SurveyFinding(
             "error",
             f"survey.yaml {keys[what]}",
             f"distances between {what} are {ratio:.4g} times as long in station.csv"
@@ -56,7 +57,7 @@ def unit_doubts(survey: Survey) -> Iterator[Finding]:
         )
 
 
-def station_doubts(survey: Survey) -> Iterator[Finding]:
+def station_doubts(survey: Survey) -> Iterator[SurveyFinding]:
     """Yield columns that mirror the world, points that disagree with the design, rows that are copies."""
     sigma_m = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
     prisms, tapes = survey.measured("prism"), survey.measured("tape")
@@ -65,7 +66,7 @@ def station_doubts(survey: Survey) -> Iterator[Finding]:
         s for s, seen in prisms.items() if mirrored(list(seen.values()), [design[n] for n in seen], sigma_m)
     ]
     if inverted:
-        yield Finding(
+        yield SurveyFinding(
             "error",
             f"station.csv, set-up {', '.join(setup for setup, _ in inverted)}",
             "the prisms fit the drawing only in a mirror: two columns of coordinates are swapped, or one has "
@@ -84,7 +85,7 @@ def station_doubts(survey: Survey) -> Iterator[Finding]:
     yield from _copies(survey)
 
 
-def dot_doubts(survey: Survey) -> Iterator[Finding]:
+def dot_doubts(survey: Survey) -> Iterator[SurveyFinding]:
     """Yield grids seen in a mirror, dots found twice, and images that share their dots."""
     flipped, first_with = [], dict[bytes, str]()
     fitted = {image.name for image in survey.images if image.purpose != "check"}
@@ -94,10 +95,10 @@ def dot_doubts(survey: Survey) -> Iterator[Finding]:
             flipped.append(name)
         near = _found_twice(dots)
         if near is not None:
-            yield Finding("warning", f"dots.csv, image {name}", *near, tested_again=name in fitted)
+            yield SurveyFinding("warning", f"dots.csv, image {name}", *near, tested_again=name in fitted)
         key = dots.pixels_px.tobytes()
         if key in first_with:
-            yield Finding(
+            yield SurveyFinding(
                 "error",
                 f"dots.csv, image {name}",
                 f"its dots are the very same as those of image {first_with[key]}",
@@ -105,7 +106,7 @@ def dot_doubts(survey: Survey) -> Iterator[Finding]:
             )
         first_with.setdefault(key, name)
     if flipped:
-        yield Finding(
+        yield SurveyFinding(
             "error",
             f"dots.csv, image {flipped[0]}",
             f"{len(flipped)} of {len(survey.dots)} images show the grid in a mirror: x_px and y_px are "
@@ -114,14 +115,14 @@ def dot_doubts(survey: Survey) -> Iterator[Finding]:
         )
 
 
-def grid_doubts(survey: Survey) -> Iterator[Finding]:
+def grid_doubts(survey: Survey) -> Iterator[SurveyFinding]:
     """Yield a board that is said to be larger than any image shows it; its middle would be elsewhere."""
     if len(survey.dots) < FEWEST_IMAGES:
         return
     for what, count in (("row", survey.board.rows), ("column", survey.board.columns)):
         seen = np.concatenate([getattr(dots, f"{what}s") for dots in survey.dots.values()])
         if seen.min() > 0 or seen.max() < count - 1:
-            yield Finding(
+            yield SurveyFinding(
                 "error",
                 f"survey.yaml board.{what}s",
                 f"the board has {count} {what}s, 0 to {count - 1}, but the dots of all {len(survey.dots)} "
@@ -164,7 +165,7 @@ def _disagreement(
     sigma_m: float,
     needed: bool,
     tested_again: bool,
-) -> Iterator[Finding]:
+) -> Iterator[SurveyFinding]:
     """Yield which points of a group do not fit the design, and whether two names are exchanged."""
     names = list(seen)
     try:
@@ -175,7 +176,7 @@ def _disagreement(
         return
     swapped = _exchanged(design, seen, sigma_m)
     if swapped:
-        yield Finding(
+        yield SurveyFinding(
             "error",
             place,
             f"the {what}s {swapped[0]} and {swapped[1]} are exchanged: the other way round they fit",
@@ -183,7 +184,7 @@ def _disagreement(
         )
     elif found.rejected:
         off = [f"{n} ({_off_mm(found, n):.0f} mm)" for n in found.rejected]
-        yield Finding(
+        yield SurveyFinding(
             "warning",
             place,
             f"{what} {', '.join(off)} does not fit the others and will be left out",
@@ -191,7 +192,7 @@ def _disagreement(
             tested_again,
         )
     else:
-        yield Finding(
+        yield SurveyFinding(
             "error" if needed else "warning",
             place,
             f"the {what}s do not have the drawing's shape: {found.doubt}",
@@ -217,7 +218,7 @@ def _exchanged(
     return pairs[0] if len(pairs) == 1 else None
 
 
-def _copies(survey: Survey) -> Iterator[Finding]:
+def _copies(survey: Survey) -> Iterator[SurveyFinding]:
     """Yield points of one set-up with the same coordinates to the micrometre."""
     for setup in dict.fromkeys(point.setup for point in survey.station):
         mine = [point for point in survey.station if point.setup == setup]
@@ -226,7 +227,7 @@ def _copies(survey: Survey) -> Iterator[Finding]:
         for i, j in pairwise(order):
             if np.abs(places[i] - places[j]).max() < SAME_PLACE_M:
                 first, second = sorted((mine[i], mine[j]), key=lambda point: point.row)
-                yield Finding(
+                yield SurveyFinding(
                     "error",
                     f"station.csv line {second.row}",
                     f"{second.kind} {second.point} {second.placement} has the coordinates of {first.kind} "

@@ -7,48 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from calib.geometry.cahvor import Kind
+from calib.geometry.rigid import FloatArray
+from calib.targets.boards import AnyBoard, Board, Corners, Dots
 
-from calib.boards import AnyBoard, Corners
-from calib.camera.cahvor import Kind
-from calib.rigid import FloatArray
-
-IntArray = NDArray[np.int64]
 StationKind = Literal["prism", "tape", "check"]
 Purpose = Literal["camera", "mast", "check"]
 Approach = Literal[-1, 0, 1]
-
-
-@dataclass(frozen=True, eq=False)
-class Board:
-    """The dot board; its frame has the origin at the grid's centre, x along a row, y down a column.
-
-    Attributes
-    ----------
-    rows, columns
-        Number of dots down and across.
-    spacing_m, dot_diameter_m
-        Metres.
-    tapes_in_board_m
-        Name of a tape to its place (3,) in the board frame, metres.
-    """
-
-    rows: int
-    columns: int
-    spacing_m: float
-    dot_diameter_m: float
-    tapes_in_board_m: Mapping[str, FloatArray]
-
-    def dots_in_board_m(self, rows: ArrayLike, columns: ArrayLike) -> FloatArray:
-        """Return the centres (n, 3), metres, of dots (rows (n,), columns (n,)), counted from 0."""
-        x = (np.asarray(columns, dtype=np.float64) - (self.columns - 1) / 2) * self.spacing_m
-        y = (np.asarray(rows, dtype=np.float64) - (self.rows - 1) / 2) * self.spacing_m
-        return np.stack([x, y, np.zeros_like(x)], axis=-1)
-
-
-NO_BOARD = Board(0, 0, 0.0, 0.0, {})
-"""The surveyed board of a bench: none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,16 +73,6 @@ class SurveyImage:
 
 
 @dataclass(frozen=True, eq=False)
-class Dots:
-    """Dots found in one image: rows (n,), columns (n,), pixels_px (n, 2), sigma_px (n,) or None."""
-
-    rows: IntArray
-    columns: IntArray
-    pixels_px: FloatArray
-    sigma_px: FloatArray | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class Click:
     """A check point (kind ``check`` of the station) at ``pixel_px`` (2,) of an image."""
 
@@ -174,7 +129,7 @@ class Survey:
 
 
 @dataclass(frozen=True)
-class Finding:
+class SurveyFinding:
     """Something about a survey that a person should know before it is fitted.
 
     Attributes

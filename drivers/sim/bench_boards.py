@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from calib.boards import AnyBoard
-from calib.boards.kinds import FLAT, Bow
-from calib.boards.pattern import pattern_of
-from calib.camera.cahvor import CameraModel
-from calib.rigid import Rigid, rot_x, rot_y, rot_z
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid, rot_x, rot_y, rot_z
+from calib.targets.boards import FLAT, AnyBoard, Bow
+from calib.targets.pattern import pattern_of
 from drivers.errors import BadOptions
 from drivers.sim.placed import REACH_M
 from drivers.sim.rays import ray_table
@@ -59,7 +58,7 @@ class BenchBoard:
     site_from_board
         The board's frame (origin in its middle, x right, y down, z into the board) in the site frame.
     bow_m
-        How far its middle stands out, across and down (`calib.boards.kinds`).
+        How far its middle stands out, across and down (`calib.targets.boards`).
     margin_m
         White paper around the print.
     """

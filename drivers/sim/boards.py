@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.rigid import Rigid
+from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions
 from drivers.sim import bricks, texture
 from drivers.sim.bricks import Brick

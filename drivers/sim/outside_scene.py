@@ -11,8 +11,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.camera.cahvor import CameraModel
-from calib.rigid import Rigid
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions, DriverError
 from drivers.factory import named_factory, one_line
 from drivers.sim.render import MAX_SAMPLES, Float32, Renderer

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
-from calib.mast.joints import Joints
+from calib.geometry.rig import JointErrors
 from drivers.clock import Clock
 from drivers.errors import BadOptions, BadReply, DriverError, NoReply
 from drivers.faults import PAN_TILT, Fault, FaultPanel, nearest
@@ -116,7 +116,7 @@ def head_settings(value: Any) -> HeadSettings:
     return head
 
 
-def with_joints(head: HeadSettings, joints: Joints) -> HeadSettings:
+def with_joints(head: HeadSettings, joints: JointErrors) -> HeadSettings:
     """Return a head whose encoders and gears err as a true rig's ``joints`` say; the same if they read true.
 
     Raises

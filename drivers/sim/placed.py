@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 from drivers.errors import BadOptions
 from drivers.faults import nearest
 from drivers.sim.section import check_bounds, filled

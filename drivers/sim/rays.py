@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-from calib.camera.cahvor import CameraModel
+from calib.geometry.cahvor import CameraModel
 from drivers.sim.compiled import kernels
 
 Float32 = NDArray[np.float32]

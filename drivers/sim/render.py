@@ -17,8 +17,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera.cahvor import CameraModel
-from calib.rigid import Rigid
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions
 from drivers.sim.compiled import is_compiled, kernels
 from drivers.sim.rays import BLOCK_PX, TILE_PX, RayTable, ray_table

@@ -19,13 +19,12 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.boards import AnyBoard
-from calib.boards.kinds import FLAT
-from calib.camera.cahvor import CameraModel
 from calib.errors import BadFile
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray, Rigid
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.targets.boards import FLAT, AnyBoard
 from drivers.clock import Clock
 from drivers.errors import BadOptions, NoFreshFrame
 from drivers.faults import FaultPanel, nearest

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.rigid import Rigid, rot_x, rot_y, rot_z
+from calib.geometry.rigid import Rigid, rot_x, rot_y, rot_z
 from drivers.errors import BadOptions
 from drivers.sim import boards, bricks, rocks, terrain, texture
 from drivers.sim.boards import Board

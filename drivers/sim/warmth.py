@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.rigid import Rigid, rot_y, rot_z
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid, rot_y, rot_z
 from drivers.sim.section import check_bounds, filled
 
 STEP_K = 1 / 16

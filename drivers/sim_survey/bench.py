@@ -16,13 +16,11 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.boards import AnyBoard, Charuco, Corners
-from calib.camera.cahvor import CameraModel, Kind
-from calib.mast.joints import AxisJoint, Joints
-from calib.mast.rig import Mast, Rig, RigCamera
-from calib.rigid import FloatArray, Rigid
-from calib.survey import Sigma, Survey, SurveyCamera, SurveyImage
-from calib.survey.records import NO_BOARD, Approach, Purpose
+from calib.geometry.cahvor import CameraModel, Kind
+from calib.geometry.rig import AxisJoint, JointErrors, Mast, Rig, RigCamera
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.survey.records import Approach, Purpose, Sigma, Survey, SurveyCamera, SurveyImage
+from calib.targets.boards import NO_BOARD, AnyBoard, Charuco, Corners
 
 CAMERA_FROM_HEAD = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 """Axes of a camera that looks straight ahead."""
@@ -188,7 +186,7 @@ class BenchPlan:
     def rig(self) -> Rig:
         """The truth as a rig."""
         cameras = {n: RigCamera(c.on, c.model()) for n, c in self.cameras.items()}
-        joints = Joints(
+        joints = JointErrors(
             AxisJoint(tuple(self.pan_harmonics), self.backlash_rad),
             AxisJoint(tuple(self.tilt_harmonics), self.backlash_rad),
         )

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from calib.rigid import FloatArray, Rigid
-from calib.survey import Dots, StationPoint, Survey, SurveyImage
-from calib.survey.records import StationKind
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.survey.records import StationKind, StationPoint, Survey, SurveyImage
+from calib.targets.boards import Dots
 from drivers.sim_survey.plan import SurveyTruth
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from calib.camera.cahvor import CameraModel
-from calib.rigid import Rigid
-from calib.survey import Board
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid
+from calib.targets.boards import Board
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

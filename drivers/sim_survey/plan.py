@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.camera.cahvor import CameraModel
-from calib.mast.rig import Mast, Rig
-from calib.rigid import FloatArray, Rigid
-from calib.survey import Board, Sigma, Survey
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Mast, Rig
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.survey.records import Sigma, Survey
+from calib.targets.boards import Board
 
 PRISMS_IN_ROVER_M = {
     "p1": (0.10, -0.25, -0.75),

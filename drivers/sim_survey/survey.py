@@ -13,19 +13,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.camera.cahvor import CameraModel
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray, Rigid
-from calib.survey import Dots, StationPoint, Survey, SurveyCamera, SurveyImage
-from calib.survey.records import Purpose, StationKind
-from drivers.sim_survey.plan import (
-    BOARD,
-    PRISMS_IN_ROVER_M,
-    Ring,
-    SurveyPlan,
-    SurveyTruth,
-    rover_from_head,
-)
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.survey.records import Purpose, StationKind, StationPoint, Survey, SurveyCamera, SurveyImage
+from calib.targets.boards import Dots
+from drivers.sim_survey.plan import BOARD, PRISMS_IN_ROVER_M, Ring, SurveyPlan, SurveyTruth, rover_from_head
 
 __all__ = ["Ring", "SurveyPlan", "SurveyTruth", "simulate_survey"]
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 
 if TYPE_CHECKING:
-    from calib.fit.calibration import Calibration
+    from calib.adjust.result import Calibration
 
 
 @pytest.fixture(scope="session")
@@ -31,8 +31,8 @@ def navcams(true_rig: Rig) -> Rig:
 @pytest.fixture(scope="session")
 def joint(true_rig: Rig) -> Calibration:
     """The joint fit of survey 1."""
-    from calib.fit.joint import fit_joint  # slow to load, and most tests need no fit
-    from hil_tests.calib.fit.small_surveys import survey_of
+    from calib.calibrate.survey import fit_joint  # slow to load, and most tests need no fit
+    from hil_tests.calib.adjust.small_surveys import survey_of
 
     return fit_joint(survey_of(true_rig, 1))
 
@@ -40,7 +40,7 @@ def joint(true_rig: Rig) -> Calibration:
 @pytest.fixture(scope="session")
 def paper(true_rig: Rig) -> Calibration:
     """The paper's fit of survey 1."""
-    from calib.fit.paper import fit_paper
-    from hil_tests.calib.fit.small_surveys import survey_of
+    from calib.calibrate.paper import fit_paper
+    from hil_tests.calib.adjust.small_surveys import survey_of
 
     return fit_paper(survey_of(true_rig, 1))

@@ -8,14 +8,14 @@ import pickle
 import numpy as np
 import pytest
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.stereo import Triangulations, triangulate, triangulate_many
 from calib.errors import NoStereoPoint, Unreachable
 from calib.files.mast_file import load_rig
-from calib.handoff.geometric import Joints, hand_off
-from calib.mast.pointing import solve, solve_many
-from calib.mast.rig import Mast, Rig
-from calib.mast.solutions import Solutions, choose
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.handoff import Joints, hand_off
+from calib.geometry.pointing import solve, solve_many
+from calib.geometry.rig import Mast, Rig
+from calib.geometry.solutions import Solutions, choose
+from calib.geometry.stereo import Triangulations, triangulate, triangulate_many
 
 LAST_BITS = 1e-12
 """Relative: sums of three terms in another order, over the two milliradians under which the rays meet."""

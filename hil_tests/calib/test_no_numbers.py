@@ -15,27 +15,28 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.difference import model_difference
-from calib.camera.stereo import triangulate
-from calib.dots.find import DotsFound, PredictedBoard
-from calib.dots.find_in_survey import find_in_file
+from calib.calibrate.starts.camera import SAMPLES, fit_camera
+from calib.calibrate.survey import fit_joint
 from calib.errors import CalibError, Unreachable
-from calib.fit.camera import SAMPLES, fit_camera
-from calib.fit.joint import fit_joint
-from calib.handoff.geometric import Joints
-from calib.mast.covariance import RigCovariance
-from calib.mast.pointing import solve
-from calib.mast.rig import Mast, Rig
-from calib.mast.solutions import Solution, choose
-from calib.pictures.epipolar import find_partner
-from calib.pictures.patch_match import match_patch
-from calib.pictures.warp import Plane, facing_plane
-from calib.rigid import Rigid
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.covariance import RigCovariance
+from calib.geometry.handoff import Joints
+from calib.geometry.maps import model_difference
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Mast, Rig
+from calib.geometry.rigid import Rigid
+from calib.geometry.solutions import Solution, choose
+from calib.geometry.stereo import triangulate
+from calib.matching.partner import find_partner
+from calib.matching.patch import match_patch
+from calib.matching.warp import Plane, facing_plane
 from calib.survey.alignment import NotAligned, align, mirrored
+from calib.survey.find_dots import find_in_file
+from calib.targets.dot_order import PredictedBoard
+from calib.targets.dots import DotsFound
 from drivers.sim_survey.board import draw_board, photograph
-from hil_tests.calib.dots.boards import BOARD, COLUMNS, ROWS, SIZE_PX, camera, gravel, pose
-from hil_tests.calib.fit.small_surveys import survey_of, with_shifted_dots
+from hil_tests.calib.adjust.small_surveys import survey_of, with_shifted_dots
+from hil_tests.calib.targets.boards import BOARD, COLUMNS, ROWS, SIZE_PX, camera, gravel, pose
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf)
 HEAD = CameraModel("CAHV", (101, 101), np.zeros(3), [1, 0, 0], [50, 100, 0], [50, 0, 100])

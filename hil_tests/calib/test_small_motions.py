@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.rigid import Rigid, carried_covariance, moved_rigid, rigid_rates
+from calib.geometry.rigid import Rigid, carried_covariance, moved_rigid, rigid_rates
 
 STEP = np.array([0.3, -0.2, 0.5, 1.0, 2.0, -3.0])
 POSE = Rigid(Rotation.from_rotvec([0.4, 1.1, -0.7]).as_matrix(), np.array([0.2, -1.4, 0.9]))

@@ -9,20 +9,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.camera import one_point
+from calib.adjust import robust
+from calib.adjust import solver as least_squares
+from calib.calibrate import body as fit_body_pose
+from calib.calibrate import paper as fit_paper
+from calib.calibrate import survey as fit_joint
+from calib.calibrate.starts import camera as fit_camera
+from calib.calibrate.starts import mast as fit_mast
 from calib.errors import CalibError
-from calib.fit import camera as fit_camera
-from calib.fit import joint as fit_joint
-from calib.fit import least_squares
-from calib.fit import mast as fit_mast
-from calib.fit import paper as fit_paper
-from calib.fit import poses as fit_poses
-from calib.handoff import fit_body_pose
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray
-from hil_tests.calib.fit.small_surveys import survey_of
-from hil_tests.calib.fit.test_fit_camera import boards
-from hil_tests.calib.handoff.handed_over import HAZCAMS, hand_offs, moved_hazcams, plain_rig, targets
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.matching import look as one_point
+from hil_tests.calib.adjust.small_surveys import survey_of
+from hil_tests.calib.calibrate.test_fit_camera import boards
+from hil_tests.calib.matching.handed_over import HAZCAMS, hand_offs, moved_hazcams, plain_rig, targets
+from tools.flight import poses as fit_poses
 
 
 def test_a_fit_whose_equations_have_a_factor_at_a_large_damping_only_stays_where_it_is() -> None:
@@ -129,14 +130,14 @@ def mast_views(rig: Rig) -> list[fit_mast.MastView]:
 
 
 def test_a_survey_in_one_piece(navcams: Rig, stopped: Callable[..., None]) -> None:
-    stopped(fit_joint)
-    with pytest.raises(fit_joint.SurveyNotFitted, match="did not settle"):
+    stopped(robust)
+    with pytest.raises(robust.SurveyNotFitted, match="did not settle"):
         fit_joint.fit_joint(survey_of(navcams, 2))
 
 
 def test_a_survey_as_the_paper_does_it(navcams: Rig, stopped: Callable[..., None]) -> None:
     stopped(fit_mast)
-    with pytest.raises(fit_joint.SurveyNotFitted, match="settled"):
+    with pytest.raises(robust.SurveyNotFitted, match="settled"):
         fit_paper.fit_paper(survey_of(navcams, 2))
 
 
@@ -155,7 +156,7 @@ def test_a_mast_from_camera_models(navcams: Rig, stopped: Callable[..., None]) -
 
 def shaken(model: object, rng: np.random.Generator) -> object:
     """The model turned by some 5 mrad and moved by some 5 mm."""
-    from calib.rigid import Rigid
+    from calib.geometry.rigid import Rigid
 
     turn = Rotation.from_rotvec(rng.normal(0.0, 5e-3, 3)).as_matrix()
     return model.moved(Rigid(turn, rng.normal(0.0, 5e-3, 3)))  # type: ignore[attr-defined]
@@ -174,7 +175,7 @@ def test_a_body_pose(true_rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_one_point_of_many_pixels(navcams: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     target = np.array([3.0, 0.2, -0.3])
     cameras = [navcams.camera_in_rover(name, 0.0, -0.3) for name in navcams.cameras]
-    seen = [one_point.Sighting(c, c.project(target)[0], 0.01 * np.eye(2)) for c in cameras]
+    seen = [one_point.PixelSighting(c, c.project(target)[0], 0.01 * np.eye(2)) for c in cameras]
     find: Callable[[], one_point.OnePoint | None] = partial(
         one_point.one_point, far(target), 25.0 * np.eye(3), seen, 0.1
     )

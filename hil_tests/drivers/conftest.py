@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.mast.rig import Rig, RigCamera
+from calib.geometry.rig import Rig, RigCamera
 from drivers.sim import rover
 from drivers.sim.kept_scenes import kept_scene
 from drivers.sim.scene import Scene, SceneSettings

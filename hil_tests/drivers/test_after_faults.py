@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.mast.rig import Mast, Rig
+from calib.geometry.rig import Mast, Rig
 from drivers.clock import Clock
 from drivers.interfaces import PanTilt
 from hil_tests.drivers.dynamixel.dynamixel_rig import failed, opened, read_or_none

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig
-from calib.mast.pointing import solve
+from calib.geometry.pointing import solve
 from drivers.clock import SystemClock
 from drivers.errors import BadOptions, NoFreshFrame, NoReply
 from drivers.hardware import DeviceSettings, Hardware, HardwareSettings
@@ -23,14 +23,7 @@ from drivers.interfaces import Camera, Frame, PanTilt
 from drivers.open_hardware import open_hardware
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
-from mastctl.motion.loop import (
-    AnglesTarget,
-    PixelTarget,
-    PointingError,
-    PointingLoop,
-    PointRequest,
-    Step,
-)
+from mastctl.motion.loop import AnglesTarget, PixelTarget, PointingError, PointingLoop, PointRequest, Step
 
 TOO_NEW_S = 1.5
 """0.3 s were seen on a rig; more, so that a busy machine does not make late pictures of them."""

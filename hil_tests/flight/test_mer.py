@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.camera.difference import model_difference
 from calib.files.mast_file import load_rig, save_rig
+from calib.geometry.maps import model_difference
 from drivers.clock import ManualClock
 
 MODELS_MM, MODELS_MRAD = 0.003, 0.003

@@ -8,10 +8,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from calib.camera.stereo import triangulate
-from calib.mast.pointing import solve
-from calib.pictures.patch_match import match_patch
-from calib.pictures.warp import Plane, grey
+from calib.geometry.pointing import solve
+from calib.geometry.stereo import triangulate
+from calib.matching.patch import match_patch
+from calib.matching.warp import Plane, grey
 from drivers.clock import ManualClock
 from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.open_hardware import open_hardware

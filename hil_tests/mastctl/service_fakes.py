@@ -15,9 +15,9 @@ import httpx
 import numpy as np
 import pytest
 
-from calib.camera.cahvor import CameraModel
 from calib.files.mast_file import save_rig
-from calib.mast.rig import Mast, Rig, RigCamera
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Mast, Rig, RigCamera
 from drivers.clock import Clock, SystemClock
 from drivers.interfaces import Camera, Frame, PanTilt, Reading
 from hil_tests.waiting import NET_S

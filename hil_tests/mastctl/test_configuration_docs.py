@@ -14,7 +14,7 @@ import yaml
 
 from calib.errors import BadFile
 from calib.files import mast_file as store
-from calib.files.strict import Section
+from calib.files.yaml_text import Section
 from drivers import options as driver_options
 from drivers.dynamixel import settings as dynamixel
 from drivers.errors import BadOptions

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig
-from calib.mast.pointing import solve
-from calib.mast.rig import Rig
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig
 from drivers.sim import bricks, rocks
 from drivers.sim.scene import Scene, SceneSettings, make_grid, tiny_scene
 from mastctl.experiment.tasks import Kept

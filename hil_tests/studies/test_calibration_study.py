@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from calib.adjust.result import Calibration
+from calib.adjust.robust import SurveyNotFitted
 from calib.files.mast_file import load_rig
-from calib.fit.calibration import Calibration
-from calib.fit.start_values import SurveyNotFitted
-from calib.survey import Sigma, Survey
+from calib.survey.records import Sigma, Survey
 from drivers.sim_survey.survey import SurveyPlan
 from hil_tests.mastctl.calibration.survey_world import RIG_FILE
 from mastctl.calibration.run import FITS

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig
-from calib.handoff.by_image import RefinedPixel, RefinedVerdict
-from calib.handoff.geometric import Joints, PredictedPixel
-from calib.handoff.matched import Landed, MatchedHandoff
-from calib.rigid import Rigid
+from calib.geometry.handoff import Joints, PredictedPixel
+from calib.geometry.rigid import Rigid
+from calib.matching.handed_over import Landed, MatchedHandoff
+from calib.matching.handoff import RefinedPixel, RefinedVerdict
 from drivers.sim import bricks
 from drivers.sim.rover import SimulatedRover
 from drivers.sim.scene import Scene, tiny_scene
@@ -33,12 +33,7 @@ from tools.studies.handoff_record import (
     KnownPoint,
     summarise_handoffs,
 )
-from tools.studies.handoff_report import (
-    handoff_table,
-    handoff_targets,
-    view_picture,
-    write_handoff_report,
-)
+from tools.studies.handoff_report import handoff_table, handoff_targets, view_picture, write_handoff_report
 from tools.studies.handoff_run import run_handoff_experiment
 
 STEP = "navcam to hazcam"

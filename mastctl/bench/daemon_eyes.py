@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from calib.boards import AnyBoard
-from calib.corners import CornersNotFound, find_corners
+from calib.calibrate.bench.problem import FEWEST_CORNERS
 from calib.files.mast_file import parse_rig
-from calib.fit.bench_terms import FEWEST_CORNERS
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
+from calib.targets.boards import AnyBoard
+from calib.targets.corners import CornersNotFound, find_corners
 from mastctl.bench.eyes import Head, Interrupted, Look, NoLight, NotThere, Seen
 from mastctl.client import Client, ClientError, Snapshot
 

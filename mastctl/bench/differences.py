@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.difference import camera_axes
-from calib.camera.parameters import predict
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.maps import camera_axes
+from calib.geometry.parameters import predict
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
 
 GRID = (13, 10)
 RANGES_M = (2.0, 20.0)

@@ -7,15 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from calib.bench.workspace import Pointing
-from calib.camera.parameters import predict
-from calib.fit.bench_calibration import BenchCalibration
-from calib.fit.calibration import ImageResiduals
-from calib.mast.covariance import RigCovariance
-from calib.mast.joints import JOINTS_NAMES, AxisJoint
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray, rigid_rates
-from calib.survey import Survey
+from calib.adjust.result import BenchCalibration, ImageResiduals
+from calib.geometry.covariance import RigCovariance
+from calib.geometry.parameters import predict
+from calib.geometry.rig import JOINTS_NAMES, AxisJoint, Rig
+from calib.geometry.rigid import FloatArray, rigid_rates
+from calib.plan.knowledge import ExpectedPointing
+from calib.survey.records import Survey
 from mastctl.bench.differences import Difference
 from mastctl.report import plots
 
@@ -242,7 +240,7 @@ def projection_sigma(
     return sigmas[0], sigmas[1]
 
 
-def pointing_table(aim: Pointing, covariance: FloatArray) -> list[tuple[float, float, float, float]]:
+def pointing_table(aim: ExpectedPointing, covariance: FloatArray) -> list[tuple[float, float, float, float]]:
     """Return pan, tilt, range and the rms per axis, pixels, of each place of a workspace."""
     found: dict[tuple[float, float, float], list[float]] = {}
     rows = np.einsum("ip,pq,iq->i", aim.to_rig, covariance, aim.to_rig)

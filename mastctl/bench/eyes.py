@@ -6,8 +6,8 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Protocol
 
-from calib.boards import Corners
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
+from calib.targets.boards import Corners
 from mastctl.errors import MastctlError
 
 

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.bench.knowledge import Knowledge, Shot
-from calib.bench.poses import Sought, candidates
-from calib.boards import AnyBoard
-from calib.camera.stereo import triangulate
 from calib.errors import CalibError, Unreachable
-from calib.mast.pointing import solve
-from calib.mast.solutions import Solution, choose
-from calib.rigid import FloatArray
+from calib.geometry.pointing import solve
+from calib.geometry.rigid import FloatArray
+from calib.geometry.solutions import Solution, choose
+from calib.geometry.stereo import triangulate
+from calib.plan.knowledge import BenchShot, Knowledge
+from calib.plan.poses import Sought, candidates
+from calib.targets.boards import AnyBoard
 from mastctl.bench.eyes import Eyes, Look, NotThere, Seen
 
 POINTINGS = 4
@@ -68,8 +68,8 @@ class Checked:
 
 
 def unvisited(
-    known: Knowledge, sought: Sought, here: Sequence[Shot], placement: str, count: int
-) -> Iterator[Shot]:
+    known: Knowledge, sought: Sought, here: Sequence[BenchShot], placement: str, count: int
+) -> Iterator[BenchShot]:
     """Yield attitudes that show the board, each as far as can be from all that were taken or yielded."""
     every = list(candidates(known, sought, here, placement))
     taken = [(shot.pan_rad, shot.tilt_rad) for shot in here]

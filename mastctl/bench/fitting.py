@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.fit.bench_calibration import BenchCalibration
-from calib.mast.rig import Rig
-from calib.rigid import Rigid
-from calib.survey import Survey
+from calib.adjust.result import BenchCalibration
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid
+from calib.survey.records import Survey
 from mastctl.bench.frame import Frame, fit_in_frame
 
 LEAST_PX, LEAST_SCALE = 0.01, 0.1

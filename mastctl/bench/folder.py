@@ -10,15 +10,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
-from calib.bench.placements import Placement
-from calib.boards import AnyBoard
 from calib.errors import BadFile
 from calib.files.atomic import replace_bytes
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
-from calib.survey import Sigma, Survey, SurveyCamera, SurveyImage
-from calib.survey.bench_writer import BenchFolder, NotWritten
-from calib.survey.records import Approach
+from calib.geometry.rig import Rig
+from calib.plan.placements import Placement
+from calib.survey.records import Approach, Sigma, Survey, SurveyCamera, SurveyImage
+from calib.survey.writer import BenchFolder, NotWritten
+from calib.targets.boards import AnyBoard
 from mastctl.bench.eyes import Look, Seen
 from mastctl.bench.frame import Frame, frame_of
 

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.bench.body import FEWEST
-from calib.fit.bench import BenchNotFitted, BenchOptions, SomethingChanged, fit_bench
-from calib.fit.bench_calibration import BenchCalibration
-from calib.mast.rig import Mast, Rig
-from calib.rigid import Rigid
-from calib.survey import Survey
+from calib.adjust.result import BenchCalibration
+from calib.calibrate.bench.fit import fit_bench
+from calib.calibrate.bench.problem import BenchOptions
+from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged
+from calib.geometry.rig import Mast, Rig
+from calib.geometry.rigid import Rigid
+from calib.plan.placements import FEWEST
+from calib.survey.records import Survey
 from mastctl.bench.differences import implied_motion
 from mastctl.errors import MastctlError
 

@@ -13,16 +13,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.bench.board_pose import rover_from_board
-from calib.bench.body import FEWEST, body_cameras
-from calib.bench.knowledge import Knowledge, Shot, View
-from calib.bench.poses import Sought, expected_px, readings, shown, with_board
-from calib.bench.workspace import Pointing, Workspace, pointing
-from calib.boards import AnyBoard
+from calib.adjust.solver import covariance_of
 from calib.errors import CalibError, Unreachable
-from calib.fit.least_squares import covariance_of
-from calib.mast.rig import Rig
-from calib.rigid import Rigid, rigid_rates
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid, rigid_rates
+from calib.plan.knowledge import BenchShot, BoardView, ExpectedPointing, Knowledge, Workspace, pointing
+from calib.plan.placements import FEWEST, body_cameras
+from calib.plan.poses import Sought, expected_px, readings, rover_from_board, shown, with_board
+from calib.targets.boards import AnyBoard
 from mastctl.bench.eyes import Head, Look
 from mastctl.bench.fitting import FitSurvey, Fitted
 from mastctl.bench.folder import Kept, looks_of
@@ -103,9 +101,9 @@ class Known:
         )
         # A count is rounded both when the head is sent and when it is read.
         self.now = Knowledge(head.rig, {}, head.count_rad / math.sqrt(12.0))
-        self.aim: Pointing = pointing(self.now, self.workspace)
+        self.aim: ExpectedPointing = pointing(self.now, self.workspace)
         self.looks: list[tuple[str, bool, Look]] = list(looks_of(kept.survey()))
-        self.shots: list[Shot] = []
+        self.shots: list[BenchShot] = []
         self.fitted: Fitted | None = None
         self.fitted_looks = 0
         self._scale = 1.0
@@ -143,7 +141,7 @@ class Known:
                 counts[one.camera] = counts.get(one.camera, 0) + 1
         return max(counts.values(), default=0)
 
-    def cameras_for(self, shot: Shot, check: bool = False) -> tuple[str, ...]:
+    def cameras_for(self, shot: BenchShot, check: bool = False) -> tuple[str, ...]:
         """Return the cameras whose pictures of a shot may tell something: those that point, those that may
         see the board, and those on the body that have not seen it stand there yet."""
         beside = BESIDE if self.fitted is not None else BESIDE_AT_FIRST
@@ -159,7 +157,7 @@ class Known:
             )
         )
 
-    def round_others(self, name: str) -> Iterator[Shot]:
+    def round_others(self, name: str) -> Iterator[BenchShot]:
         """Yield attitudes at which a placement's board is at the corners of the picture of each camera on the
         head that does not point, apart from those that were taken: what tells most of pointing need not show
         the board to a camera of a narrow view, and its own place in the head follows from such alone."""
@@ -178,7 +176,7 @@ class Known:
                     continue
                 mine = [look for look in self.of(name) if any(one.camera == camera for one in look.found)]
                 if all((np.abs(np.subtract((one.pan_rad, one.tilt_rad), at)) > apart).any() for one in mine):
-                    yield Shot(name, *at, ())
+                    yield BenchShot(name, *at, ())
 
     def cells(self) -> dict[str, tuple[int, ...]]:
         """Return how many corners were seen in each of `CELLS` of each camera's picture, row by row."""
@@ -284,13 +282,13 @@ class Known:
         self.aim = pointing(self.now, self.workspace)
         self.believe_boards()
 
-    def _shot(self, name: str, look: Look) -> Shot:
+    def _shot(self, name: str, look: Look) -> BenchShot:
         views = tuple(
-            View(one.camera, self.board.in_board_m(one.corners.ids), self._scale * one.corners.sigma_px)
+            BoardView(one.camera, self.board.in_board_m(one.corners.ids), self._scale * one.corners.sigma_px)
             for one in look.found
             if one.corners is not None and one.camera in self.now.rig.cameras
         )
-        return Shot(name, look.pan_rad, look.tilt_rad, views, look.pan_approach, look.tilt_approach)
+        return BenchShot(name, look.pan_rad, look.tilt_rad, views, look.pan_approach, look.tilt_approach)
 
     def _board_from(self, look: Look) -> Rigid:
         """Where the board is, by the picture that shows most of it."""

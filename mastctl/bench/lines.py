@@ -24,7 +24,7 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any, TextIO
 
-from calib.bench.placements import Placement
+from calib.plan.placements import Placement
 from mastctl.bench.eyes import Head
 from mastctl.bench.teller import Progress, Step
 

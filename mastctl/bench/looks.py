@@ -7,9 +7,9 @@ from collections.abc import Collection
 
 import numpy as np
 
-from calib.bench.knowledge import Shot
-from calib.bench.placements import Placement
-from calib.bench.poses import Choice, next_shot
+from calib.plan.knowledge import BenchShot
+from calib.plan.placements import Placement
+from calib.plan.poses import AttitudeChoice, next_shot
 from mastctl.bench.eyes import Eyes, Look, NotThere
 from mastctl.bench.known import Known
 from mastctl.bench.search import Search
@@ -109,7 +109,7 @@ class Looks:
                     known.take(name, look)
         self._end(name)
 
-    def look_at(self, shot: Shot, check: bool = False) -> Look | None:
+    def look_at(self, shot: BenchShot, check: bool = False) -> Look | None:
         """Take a shot; None where the head must not go."""
         try:
             return self._look(shot, self._known.cameras_for(shot, check))
@@ -127,12 +127,12 @@ class Looks:
         """A look taken again, by the cameras that showed the board and those that point."""
         return self._look(then, {*self._known.workspace.cameras, *(one.camera for one in then.found)})
 
-    def _look(self, where: Shot | Look, cameras: Collection[str]) -> Look:
+    def _look(self, where: BenchShot | Look, cameras: Collection[str]) -> Look:
         at = where.pan_rad, where.tilt_rad, (where.pan_approach, where.tilt_approach)
         every = len(cameras) == len(self._known.head.rig.cameras)
         return self._eyes.look(*at) if every else self._eyes.look(*at, cameras)
 
-    def _suffices(self, here: int, choice: Choice) -> bool:
+    def _suffices(self, here: int, choice: AttitudeChoice) -> bool:
         if here < FEWEST_LOOKS:
             return False
         now_px = self._known.predicted_px()
@@ -164,7 +164,7 @@ class Looks:
         camera = head.rig.cameras[self._known.workspace.cameras[0]].model
         return MOVED_PX + 3.0 * head.count_rad * float(np.linalg.norm(camera.H))
 
-    def _tell(self, name: str, choice: Choice) -> None:
+    def _tell(self, name: str, choice: AttitudeChoice) -> None:
         known = self._known
         self._teller.progress(
             Progress(

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from calib.bench.workspace import Pointing
+from calib.adjust.result import BenchCalibration
 from calib.files.atomic import save_bytes
 from calib.files.mast_file import StoredRig
-from calib.fit.bench_calibration import BenchCalibration
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray
-from calib.survey import Survey
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.plan.knowledge import ExpectedPointing
+from calib.survey.records import Survey
 from mastctl.bench import drawn
 from mastctl.bench.differences import rig_differences
 from mastctl.bench.final import Checked
@@ -38,7 +38,7 @@ class Told:
     verdict: Verdict
     saved: StoredRig
     checked: Checked | None
-    aim: Pointing
+    aim: ExpectedPointing
     covariance: FloatArray
     worth: tuple[tuple[str, str], ...]
     former: Rig | None

@@ -12,16 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from calib.bench.knowledge import Knowledge
-from calib.bench.workspace import Workspace, pointing
+from calib.adjust.result import BenchCalibration, TermGain
+from calib.calibrate.bench.problem import BenchOptions
 from calib.errors import BadFile
 from calib.files.mast_file import StoredRig, joint_keys
 from calib.files.yaml_text import plain
-from calib.fit.bench import BenchOptions
-from calib.fit.bench_calibration import BenchCalibration, TermGain
-from calib.mast.covariance import RigCovariance
-from calib.mast.rig import Rig
-from calib.survey import Survey
+from calib.geometry.covariance import RigCovariance
+from calib.geometry.rig import Rig
+from calib.plan.knowledge import Knowledge, Workspace, pointing
+from calib.survey.records import Survey
 from mastctl.bench.final import Checked
 from mastctl.bench.frame import Frame, fit_in_frame
 from mastctl.bench.known import first_cameras

@@ -10,12 +10,11 @@ import math
 import time
 from dataclasses import asdict, replace
 
-from calib.bench.body import advise_for_body
-from calib.bench.placements import Advice, Placement, advise, first_placement
-from calib.bench.poses import next_shot
-from calib.boards import AnyBoard
+from calib.calibrate.starts.bench import SomethingChanged
 from calib.errors import CalibError
-from calib.fit.bench import SomethingChanged
+from calib.plan.placements import Advice, Placement, advise, advise_for_body, first_placement
+from calib.plan.poses import next_shot
+from calib.targets.boards import AnyBoard
 from mastctl.bench.eyes import Eyes
 from mastctl.bench.final import Checked, point_at_corners, unvisited
 from mastctl.bench.fitting import FitSurvey, Fitted

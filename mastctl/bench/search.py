@@ -8,10 +8,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from calib.bench.knowledge import Knowledge
-from calib.bench.placements import Placement
-from calib.bench.poses import Sought, readings
 from calib.errors import CalibError, Unreachable
+from calib.plan.knowledge import Knowledge
+from calib.plan.placements import Placement
+from calib.plan.poses import Sought, readings
 from mastctl.bench.eyes import Eyes, Look, NoLight, NotThere
 from mastctl.bench.teller import Teller
 from mastctl.errors import MastctlError
@@ -20,7 +20,7 @@ OVERLAP = 0.7
 """Of a picture's view: how far apart the looks of a search are."""
 
 TELLING = ("another board", "mirrored", "two boards")
-"""What `calib.corners` says of a board in view that is not the one that is looked for."""
+"""What `calib.targets.corners` says of a board in view that is not the one that is looked for."""
 
 LOOKS_BESIDE = 8
 """Looks after such a one: the right board may hang beside it."""

@@ -9,14 +9,13 @@ from typing import Any
 
 from scipy.spatial.transform import Rotation
 
-from calib.bench.placements import Placement
-from calib.boards import AnyBoard
-from calib.boards.board_file import document_of
 from calib.errors import BadFile
 from calib.files import read_bytes
-from calib.files.strict import Section
-from calib.files.yaml_text import MAX_BYTES, parse_mapping
-from calib.mast.rig import Rig
+from calib.files.yaml_text import MAX_BYTES, Section, parse_mapping
+from calib.geometry.rig import Rig
+from calib.plan.placements import Placement
+from calib.targets.board_file import document_of
+from calib.targets.boards import AnyBoard
 from mastctl.bench.eyes import Head
 from mastctl.bench.teller import NobodyThere, Progress, Step, Teller
 from mastctl.client import Client

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from calib.bench.placements import Placement
+from calib.plan.placements import Placement
 from mastctl.bench.eyes import Head
 from mastctl.errors import MastctlError
 

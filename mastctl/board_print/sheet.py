@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from calib.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, DotBoard
-from calib.boards.pattern import Spots, pattern_of
+from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, DotBoard
+from calib.targets.pattern import Spots, pattern_of
 from mastctl.errors import MastctlError
 
 PAPERS_MM = {

@@ -6,12 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calib.bench.knowledge import Knowledge
-from calib.bench.workspace import Workspace, pointing
+from calib.adjust.result import BenchCalibration
 from calib.errors import CalibError
-from calib.fit.bench_calibration import BenchCalibration
-from calib.mast.covariance import RigCovariance
-from calib.survey import Survey
+from calib.geometry.covariance import RigCovariance
+from calib.plan.knowledge import Knowledge, Workspace, pointing
+from calib.survey.records import Survey
 from mastctl.calibration.expected import RARELY
 from mastctl.calibration.verdict import (
     MANY_LEFT_OUT,

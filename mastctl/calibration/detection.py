@@ -13,8 +13,8 @@ from pathlib import Path
 
 import cv2
 
-from calib.dots.find_in_survey import Progress, detect_survey
-from calib.survey import Survey
+from calib.survey.find_dots import Progress, detect_survey
+from calib.survey.records import Survey
 from mastctl.errors import MastctlError
 
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.fit.calibration import Calibration, ImageResiduals
-from calib.mast.rig import Rig
-from calib.rigid import Rigid
-from calib.survey import Board
+from calib.adjust.result import Calibration, ImageResiduals
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid
+from calib.targets.boards import Board
 from mastctl.calibration.maps import PointingMap
 from mastctl.report import plots
 

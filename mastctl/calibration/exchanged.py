@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calib.fit.calibration import Calibration, ImageResiduals
-from calib.survey import Survey
+from calib.adjust.result import Calibration, ImageResiduals
+from calib.survey.records import Survey
 
 CLOSER = 0.1
 """Another board is the one that is shown if it fits the image so many times better than its own."""

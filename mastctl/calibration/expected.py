@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
-from calib.fit.calibration import Calibration, ImageResiduals
-from calib.fit.terms import DOTS_OF, JOINTS, PRISMS, TAPES
-from calib.fit.uncertainty import pixel_covariance
-from calib.rigid import FloatArray, rigid_rates
-from calib.survey import Survey
+from calib.adjust.result import Calibration, ImageResiduals
+from calib.adjust.terms import DOTS_OF, JOINTS, PRISMS, TAPES
+from calib.adjust.uncertainty import pixel_covariance
+from calib.geometry.rigid import FloatArray, rigid_rates
 from calib.survey.alignment import Alignment, NotAligned, rover_from_station, station_from_board
+from calib.survey.records import Survey
 
 RARELY = 0.001
 

@@ -11,11 +11,11 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.camera.stereo import triangulate
 from calib.errors import CalibError
-from calib.mast.pointing import solve
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.geometry.stereo import triangulate
 
 
 def click(

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.stereo import triangulate
+from calib.adjust.result import Calibration
+from calib.adjust.uncertainty import pixel_covariance, rig_moved_along
 from calib.errors import CalibError
-from calib.fit.calibration import Calibration
-from calib.fit.uncertainty import pixel_covariance, rig_moved_along
-from calib.mast.pointing import solve
-from calib.mast.rig import Mast, Rig
-from calib.rigid import FloatArray
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Mast, Rig
+from calib.geometry.rigid import FloatArray
+from calib.geometry.stereo import triangulate
 from mastctl.calibration.landing import click, pointing_error_px, position_error_px
 
 PAN_RAD = (-2.6, 2.6)
@@ -85,7 +85,7 @@ def change_map(new: Rig, old: Rig, pair: str, range_m: float) -> PointingMap | N
 class _Clicks:
     """A click near a corner, pointed at by rigs that are off by one sigma in one direction each.
 
-    `calib.fit.uncertainty.pointing_covariance` for many joint angles: a target that keeps its place in the
+    `calib.adjust.uncertainty.pointing_covariance` for many joint angles: a target that keeps its place in the
     head frame is triangulated once a rig, not once for each pan and tilt. The directions are the columns of a
     square root of the covariance, so that their squares add up to the variance.
     """

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from calib.adjust.result import Calibration
 from calib.files.yaml_text import plain
-from calib.fit.calibration import Calibration
-from calib.mast.rig import Rig
-from calib.survey import Survey
+from calib.geometry.rig import Rig
+from calib.survey.records import Survey
 from mastctl.calibration.stated import components_told
 
 DIGITS = 9
@@ -26,7 +26,7 @@ def with_fit(calibration: Calibration, survey: Survey, verdict: Mapping[str, Any
 
     ``fit.covariance`` is square, its rows and columns in the order of ``fit.parameters``: ``mast.KEY.x`` and
     ``cameras.NAME.C.x``; A and O have two each (``A.1``, ``A.2``), radians along
-    `calib.camera.parameters.tangents`.
+    `calib.geometry.parameters.tangents`.
     """
     fit = {
         "method": calibration.method,

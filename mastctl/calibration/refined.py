@@ -11,18 +11,15 @@ from typing import Any
 
 import numpy as np
 
+from calib.adjust.uncertainty import sigma_by_key
+from calib.calibrate.body import corrected_covariance, corrected_rig, fit_body_pose
+from calib.calibrate.body_sights import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose, body_groups
 from calib.errors import NoCorrection
 from calib.files.mast_file import StoredRig
 from calib.files.yaml_text import plain
-from calib.fit.uncertainty import sigma_by_key
-from calib.handoff.bias import HandoffBias, handoff_bias
-from calib.handoff.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose
-from calib.handoff.body_sights import body_groups
-from calib.handoff.corrected_rig import corrected_covariance, corrected_rig
-from calib.handoff.fit_body_pose import fit_body_pose
-from calib.handoff.matched import MatchedHandoff
-from calib.mast.covariance import stored_covariance
-from calib.mast.rig import Rig
+from calib.geometry.covariance import stored_covariance
+from calib.geometry.rig import Rig
+from calib.matching.handed_over import HandoffBias, MatchedHandoff, handoff_bias
 from mastctl.calibration.mast_file import rounded_matrix
 from mastctl.calibration.run import save_new
 from mastctl.handoff.log import ReadLog

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from calib.adjust.result import HELD_FIXED, Calibration
 from calib.files.atomic import save_bytes
 from calib.files.mast_file import StoredRig
-from calib.fit.calibration import HELD_FIXED, Calibration
-from calib.survey import Survey
+from calib.survey.records import Survey
 from mastctl.calibration import drawn
 from mastctl.calibration.maps import change_map, uncertainty_map
 from mastctl.calibration.stated import component_table

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from calib.adjust.result import Calibration
+from calib.calibrate.paper import fit_paper
+from calib.calibrate.survey import fit_joint
 from calib.errors import CalibError
 from calib.files.atomic import keep_previous, previous_path
 from calib.files.mast_file import StoredRig, save_rig
-from calib.fit.calibration import Calibration
-from calib.fit.joint import fit_joint
-from calib.fit.paper import fit_paper
-from calib.mast.rig import Rig
-from calib.survey import Finding, Survey
+from calib.geometry.rig import Rig
 from calib.survey.check import check_survey
+from calib.survey.records import Survey, SurveyFinding
 from mastctl.calibration.mast_file import with_fit
 from mastctl.calibration.verdict import Verdict, judge_calibration
 from mastctl.errors import MastctlError
@@ -31,7 +31,7 @@ class SurveyRefused(MastctlError):
     code = "survey_refused"
     exit_code = 2
 
-    def __init__(self, survey: Survey, findings: Sequence[Finding]) -> None:
+    def __init__(self, survey: Survey, findings: Sequence[SurveyFinding]) -> None:
         errors = [finding for finding in findings if finding.severity == "error"]
         self.findings = tuple(findings)
         self.detail = {"findings": [finding_told(finding) for finding in findings]}
@@ -52,7 +52,7 @@ class Calibrated:
     previous: Path | None
 
 
-def checked_survey(survey: Survey, method: Method = "joint") -> tuple[Finding, ...]:
+def checked_survey(survey: Survey, method: Method = "joint") -> tuple[SurveyFinding, ...]:
     """Return the warnings of the check; ``method`` decides which images have to show a camera.
 
     Raises
@@ -71,7 +71,7 @@ def calibrate(
     out: Path,
     method: Method = "joint",
     mast_parameters: int = 6,
-    warnings: tuple[Finding, ...] = (),
+    warnings: tuple[SurveyFinding, ...] = (),
     undetected: tuple[tuple[str, str], ...] = (),
 ) -> Calibrated:
     """Fit a checked survey, judge the result, and save it as a mast file.
@@ -129,12 +129,12 @@ def save_new(rig: Rig, out: Path) -> tuple[StoredRig, Path | None]:
         raise
 
 
-def sentence_of(finding: Finding) -> str:
+def sentence_of(finding: SurveyFinding) -> str:
     """Return a finding as one sentence: where, what, and what to measure next."""
     return str(finding).removeprefix(f"{finding.severity}: ")
 
 
-def finding_told(finding: Finding) -> dict[str, Any]:
+def finding_told(finding: SurveyFinding) -> dict[str, Any]:
     """Return a finding as JSON."""
     return {
         "severity": finding.severity,

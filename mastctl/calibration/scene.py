@@ -12,21 +12,19 @@ from typing import Any
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.parameters import parameter_names
+from calib.adjust.uncertainty import sigma_by_key
+from calib.calibrate.scene.features import find_features
+from calib.calibrate.scene.fit import SceneFit, fit_scene
+from calib.calibrate.scene.terms import SceneView, corrected, overlapping
 from calib.errors import NoCorrection
 from calib.files.mast_file import StoredRig
 from calib.files.yaml_text import plain
-from calib.fit.uncertainty import sigma_by_key
-from calib.mast.covariance import RigCovariance, stored_covariance
-from calib.mast.joints import UNKNOWN, Approach
-from calib.mast.rig import Rig
-from calib.pictures.warp import grey
-from calib.rigid import FloatArray, tangents
-from calib.scene.features import find_features
-from calib.scene.fit import SceneFit, fit_scene
-from calib.scene.terms import corrected
-from calib.scene.views import View, overlapping
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.covariance import RigCovariance, stored_covariance
+from calib.geometry.parameters import parameter_names
+from calib.geometry.rig import UNKNOWN, Approach, Rig
+from calib.geometry.rigid import FloatArray, tangents
+from calib.matching.warp import grey
 from drivers.errors import BadOptions
 from drivers.recorded_frames import SUFFIX, McapFrame, read_recording
 from drivers.recording import Pointing, read_folder, read_products
@@ -48,12 +46,12 @@ class SceneProposal:
     mast: StoredRig
     record: Path
     digest: str
-    views: tuple[View, ...]
+    views: tuple[SceneView, ...]
     fit: SceneFit
     other_mast: int
 
 
-def scene_views(rig: Rig, record: Path, camera: str | None = None) -> list[View]:
+def scene_views(rig: Rig, record: Path, camera: str | None = None) -> list[SceneView]:
     """Return the pictures of a record with the angles they were taken at; of cameras that the rig has.
 
     Parameters
@@ -86,7 +84,7 @@ def scene_views(rig: Rig, record: Path, camera: str | None = None) -> list[View]
                 raise BadOptions(f"{record}: {found} where {size} is expected", device=name)
             label = f"{name} at pan {pointing.pan_rad:.3f}, tilt {pointing.tilt_rad:.3f}"
             views.append(
-                View(label, name, image, pointing.pan_rad, pointing.tilt_rad, pose, _approach(frame))
+                SceneView(label, name, image, pointing.pan_rad, pointing.tilt_rad, pose, _approach(frame))
             )
     if len(views) < 2:
         wanted = camera or ", ".join(rig.cameras)
@@ -255,7 +253,7 @@ def _parameter_change(model: CameraModel, moved: CameraModel) -> FloatArray:
     return np.concatenate(change)
 
 
-def _digest(views: Sequence[View]) -> str:
+def _digest(views: Sequence[SceneView]) -> str:
     """SHA-256 of the pictures and their angles."""
     digest = hashlib.sha256()
     for view in views:

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.fit.bench_calibration import BenchCalibration
-from calib.fit.calibration import Calibration, ImageResiduals
-from calib.fit.components import Component
-from calib.fit.terms import DOTS_OF, DRAWING, JOINTS, PRISMS, TAPES
-from calib.survey import Survey
+from calib.adjust.goodness import Component
+from calib.adjust.result import BenchCalibration, Calibration, ImageResiduals
+from calib.adjust.terms import DOTS_OF, DRAWING, JOINTS, PRISMS, TAPES
+from calib.survey.records import Survey
 from mastctl.report.tables import Table
 
 Images = Sequence[ImageResiduals]

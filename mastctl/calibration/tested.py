@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.fit.calibration import Calibration
+from calib.adjust.result import Calibration
 from mastctl.report.tables import Table
 
 

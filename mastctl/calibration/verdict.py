@@ -10,13 +10,12 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calib.adjust.goodness import Component, as_one
+from calib.adjust.result import BenchCalibration, Calibration, ImageResiduals
+from calib.adjust.terms import PRISMS, TAPES
+from calib.adjust.uncertainty import pointing_covariance
 from calib.errors import CalibError
-from calib.fit.bench_calibration import BenchCalibration
-from calib.fit.calibration import Calibration, ImageResiduals
-from calib.fit.components import Component, as_one
-from calib.fit.terms import PRISMS, TAPES
-from calib.fit.uncertainty import pointing_covariance
-from calib.survey import Finding, Survey
+from calib.survey.records import Survey, SurveyFinding
 from mastctl.calibration.exchanged import exchanged_boards
 from mastctl.calibration.expected import RARELY, check_sizes
 from mastctl.calibration.stated import allowed, wrong_sentence
@@ -83,7 +82,7 @@ class Verdict:
 def judge_calibration(
     survey: Survey,
     calibration: Calibration,
-    warnings: Sequence[Finding] = (),
+    warnings: Sequence[SurveyFinding] = (),
     undetected: Sequence[str] = (),
     jointly: Calibration | CalibError | None = None,
 ) -> Verdict:
@@ -295,7 +294,7 @@ def _open(calibration: Calibration) -> list[Reason]:
 def _turned(calibration: Calibration) -> list[Reason]:
     """Whether the mast is turned about: a tilt that counts down fits as well, with the head half a turn off.
 
-    `calib.survey.joint_doubts` mostly refuses such a survey before.
+    `calib.survey.mixups` mostly refuses such a survey before.
     """
     angle = float(np.linalg.norm(Rotation.from_euler("XYZ", calibration.rig.mast.rotation_rad).as_rotvec()))
     if angle < TURNED_RAD:

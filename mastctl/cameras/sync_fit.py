@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.rigid import FloatArray
+from calib.geometry.rigid import FloatArray
 from mastctl.cameras.sync_motion import LEAST_FRAMES, CannotTell, JointMotion
 
 REACH_S = 0.6

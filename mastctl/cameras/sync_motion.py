@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
-from calib.rigid import FloatArray
+from calib.geometry.rigid import FloatArray
 from mastctl.errors import MastctlError
 
 LEAST_FRAMES = 30  # and readings

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
 from drivers.interfaces import Image
 from mastctl.cameras.sync_motion import CannotTell
 

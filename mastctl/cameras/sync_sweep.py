@@ -14,8 +14,8 @@ from functools import partial
 
 import numpy as np
 
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
 from drivers.clock import Clock
 from drivers.errors import DriverError, NoReply
 from drivers.interfaces import Camera, Frame, Reading

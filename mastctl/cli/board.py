@@ -11,7 +11,7 @@ from mastctl.cli import output
 from mastctl.cli.output import WrongUse, finite_number
 
 if TYPE_CHECKING:
-    from calib.boards import AnyBoard
+    from calib.targets.boards import AnyBoard
 
 USUAL_MM = 25.0
 """Of squares on A4; on other papers in proportion."""
@@ -69,8 +69,8 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 
 def _make(args: argparse.Namespace) -> int:
-    from calib.boards import save_board
     from calib.files.atomic import save_bytes
+    from calib.targets.board_file import save_board
     from mastctl.board_print.files import pdf_of, svg_of
     from mastctl.board_print.sheet import sheet_of
 
@@ -90,7 +90,7 @@ def _make(args: argparse.Namespace) -> int:
 
 
 def _measured(args: argparse.Namespace) -> int:
-    from calib.boards.board_file import measure
+    from calib.targets.board_file import measure
 
     across_m, down_m = _bars_m([one for one in (args.across_mm, args.down_mm) if one is not None]) or (
         0.0,
@@ -105,9 +105,9 @@ def _find(args: argparse.Namespace) -> int:
     import cv2
     import numpy as np
 
-    from calib.boards import load_board
-    from calib.corners import CornersNotFound, find_corners
     from calib.files.atomic import save_bytes
+    from calib.targets.board_file import load_board
+    from calib.targets.corners import CornersNotFound, find_corners
 
     board = load_board(args.board)
     rows, found = ["picture,id,x_px,y_px,sigma_px\n"], []
@@ -162,8 +162,8 @@ def _paper_mm(args: argparse.Namespace) -> tuple[float, float]:
 
 def _board(args: argparse.Namespace, paper_mm: tuple[float, float]) -> AnyBoard:
     """The board that the options and the paper ask for, read as its file will be."""
-    from calib.boards.board_file import board_of, dictionary_size
     from calib.errors import BadFile
+    from calib.targets.board_file import board_of, dictionary_size
     from mastctl.board_print.sheet import room_mm
 
     wide_mm, high_mm = room_mm(paper_mm)
@@ -252,8 +252,7 @@ def _check_free(yaml: Path, measured: bool) -> None:
 
 
 def _tell(args: argparse.Namespace, yaml: Path, files: list[Path], bar_m: tuple[float, float]) -> None:
-    from calib.boards import load_board
-    from calib.boards.board_file import document_of
+    from calib.targets.board_file import document_of, load_board
     from mastctl.board_print.sheet import drawn
 
     board = load_board(yaml)

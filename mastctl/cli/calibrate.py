@@ -12,7 +12,7 @@ from mastctl.cli.places import check_file, check_folder, unusable
 
 if TYPE_CHECKING:
     from calib.files.mast_file import StoredRig
-    from calib.survey import Survey
+    from calib.survey.records import Survey
     from mastctl.calibration.run import Calibrated
 
 OUTLIERS_SHOWN = 20
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _from_survey(args: argparse.Namespace) -> int:
-    from calib.survey import read_survey
+    from calib.survey.reader import read_survey
     from mastctl.calibration.run import SurveyRefused, calibrate, checked_survey, sentence_of
 
     survey = read_survey(args.survey)
@@ -190,8 +190,8 @@ def _report(args: argparse.Namespace, done: Calibrated, in_use: StoredRig | None
 
 def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> dict[str, Any]:
     """The contract's keys, and what else a program may want."""
+    from calib.adjust.result import HELD_FIXED
     from calib.files.yaml_text import plain
-    from calib.fit.calibration import HELD_FIXED
     from mastctl.calibration.mast_file import as_lists, mast_keys
     from mastctl.calibration.report import change_summary
     from mastctl.calibration.stated import components_told

@@ -131,8 +131,8 @@ def survey_folder(out: Path) -> Path:
 
 
 def _again(args: argparse.Namespace) -> int:
-    from calib.fit.bench import BenchOptions
-    from calib.survey import read_survey
+    from calib.calibrate.bench.problem import BenchOptions
+    from calib.survey.reader import read_survey
     from mastctl.bench.folder import former_rig, kept_frame, kept_moved
     from mastctl.bench.result import save_bench
 
@@ -189,9 +189,9 @@ def _drive_in_lines(args: argparse.Namespace) -> int:
 
 
 def _drive(args: argparse.Namespace) -> int:
-    from calib.boards import load_board
-    from calib.fit.bench import BenchNotFitted
-    from calib.survey.bench_writer import NotWritten
+    from calib.calibrate.starts.bench import BenchNotFitted
+    from calib.survey.writer import NotWritten
+    from calib.targets.board_file import load_board
     from mastctl.bench.eyes import Interrupted
     from mastctl.bench.looks import BoardLost
     from mastctl.bench.result import finish
@@ -239,7 +239,7 @@ def _go_on(args: argparse.Namespace, reason: Exception, folder: Path) -> bool:
 @contextmanager
 def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple[BenchRun, Teller]]:
     """A run on a daemon that runs, or on one that is started for it, under a lease."""
-    from calib.survey import Sigma
+    from calib.survey.records import Sigma
     from mastctl.bench.daemon_eyes import DaemonEyes
     from mastctl.bench.eyes import Interrupted
     from mastctl.bench.fitting import fit_in_rover

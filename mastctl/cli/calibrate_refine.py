@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from mastctl.cli import output
 
 if TYPE_CHECKING:
+    from calib.calibrate.body_sights import BodyPose
     from calib.files.mast_file import StoredRig
-    from calib.handoff.body_pose import BodyPose
     from mastctl.calibration.refined import Proposal
 
 OUTLIERS_SHOWN = 20
@@ -105,7 +105,7 @@ def _show(proposal: Proposal) -> None:
 
 
 def _show_pose(group: str, pose: BodyPose) -> None:
-    from calib.handoff.body_pose import WORDS
+    from calib.calibrate.body_sights import WORDS
     from mastctl.calibration.refined import SHIFT_FIRST
 
     sigma = pose.covariance.diagonal() ** 0.5

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from mastctl.cli import output
 
 if TYPE_CHECKING:
+    from calib.calibrate.scene.fit import SceneFit
     from calib.files.mast_file import StoredRig
-    from calib.scene.fit import SceneFit
     from mastctl.calibration.scene import SceneProposal
 
 OUTLIERS_SHOWN = 10
@@ -17,8 +17,8 @@ OUTLIERS_SHOWN = 10
 
 def run(args: argparse.Namespace) -> int:
     """Propose a correction as a new mast file; 1, and no file, if the pictures tell none that holds."""
+    from calib.calibrate.scene.fit import JOINT_SIGMA_RAD
     from calib.files.mast_file import load_rig
-    from calib.scene.fit import JOINT_SIGMA_RAD
     from mastctl.calibration.scene import propose_scene, save_scene
     from mastctl.cli.places import check_file
 

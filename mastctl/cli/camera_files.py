@@ -15,9 +15,9 @@ from mastctl.cli.output import finite_number, positive_number
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from calib.camera.cahvor import CameraModel
     from calib.files import CameraFile
     from calib.files.any_camera import Conversion
+    from calib.geometry.cahvor import CameraModel
 
 
 _SOURCES = "mast or camera file, .cahvor, PDS3 label, OpenCV's, ROS's, Kalibr's, mrcal's or COLMAP's"

@@ -15,7 +15,7 @@ from mastctl.cli.output import positive_number
 if TYPE_CHECKING:
     import numpy as np
 
-    from calib.camera.cahvor import CameraModel
+    from calib.geometry.cahvor import CameraModel
 
 
 def add_action(actions: Any) -> None:
@@ -37,7 +37,7 @@ def add_action(actions: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the maps, the new camera's matrix and vectors, and for a pair OpenCV's Q."""
-    from calib.camera.maps import ideal_camera, maps_between, rectified_pair
+    from calib.geometry.maps import ideal_camera, maps_between, rectified_pair
     from mastctl.cli.places import check_file
 
     if args.out.suffix != ".npz":

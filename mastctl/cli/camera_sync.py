@@ -15,7 +15,7 @@ from mastctl.cli.camera_choice import with_cameras
 from mastctl.cli.output import positive_number
 
 if TYPE_CHECKING:
-    from calib.mast.rig import Rig
+    from calib.geometry.rig import Rig
     from mastctl.cameras.sync_sweep import Sweep
     from mastctl.config import Config
 

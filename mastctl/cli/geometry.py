@@ -47,7 +47,7 @@ def add_commands(subparsers: Any) -> None:
 
 def solve_pointing(args: argparse.Namespace) -> int:
     """Solve for the joint angles that bring a target in the rover frame onto a pixel."""
-    from calib.mast.pointing import solve
+    from calib.geometry.pointing import solve
 
     stored = read_mast_file(args.mast)
     camera = stored.rig.cameras[camera_name(stored, args.camera)]
@@ -89,8 +89,7 @@ def solve_pointing(args: argparse.Namespace) -> int:
 
 def triangulate_pair(args: argparse.Namespace) -> int:
     """Triangulate the point seen at a pixel of each camera of a pair, in the rover frame."""
-    from calib.mast.covariance import stored_covariance
-    from calib.mast.ray_gap import clicked_point
+    from calib.geometry.covariance import clicked_point, stored_covariance
 
     stored = read_mast_file(args.mast)
     rig, pair = stored.rig, stereo_pair(stored, args.pair)
@@ -127,7 +126,7 @@ def triangulate_pair(args: argparse.Namespace) -> int:
 
 def error_budget(args: argparse.Namespace) -> int:
     """Compute the paper's Table I."""
-    from calib.mast.budget import target_approach_budget
+    from calib.geometry.stereo import target_approach_budget
 
     rows = target_approach_budget()
     keys = ("stereo_cm", "untracked_cm", "tracked_cm")

@@ -12,9 +12,9 @@ from mastctl.cli.mast_files import nearest_of, read_mast_file, stereo_pair
 from mastctl.cli.output import finite_number, positive_number
 
 if TYPE_CHECKING:
-    from calib.handoff.geometric import Handoff, Joints
-    from calib.mast.covariance import RigCovariance
-    from calib.mast.rig import Rig
+    from calib.geometry.covariance import RigCovariance
+    from calib.geometry.handoff import Handoff, Joints
+    from calib.geometry.rig import Rig
 
 
 def add_commands(subparsers: Any) -> None:
@@ -45,8 +45,8 @@ def add_commands(subparsers: Any) -> None:
 
 def hand_over(args: argparse.Namespace) -> int:
     """Hand a target over, geometrically."""
-    from calib.handoff.geometric import Joints, hand_off
-    from calib.mast.covariance import stored_covariance
+    from calib.geometry.covariance import stored_covariance
+    from calib.geometry.handoff import Joints, hand_off
 
     stored = read_mast_file(args.mast)
     rig, pair = stored.rig, stereo_pair(stored, args.source)
@@ -87,9 +87,9 @@ def _destination(
     calibration: RigCovariance | None,
 ) -> Joints | None:
     """The joint angles of the destination images; None where the head does not turn."""
-    from calib.handoff.geometric import Joints
-    from calib.mast.pointing import solve
-    from calib.mast.ray_gap import clicked_point
+    from calib.geometry.covariance import clicked_point
+    from calib.geometry.handoff import Joints
+    from calib.geometry.pointing import solve
 
     if args.point:
         if args.to_pan is not None or args.to_tilt is not None:

@@ -11,7 +11,7 @@ from mastctl.cli import output
 
 if TYPE_CHECKING:
     from calib.files.mast_file import StoredRig
-    from calib.mast.rig import Rig
+    from calib.geometry.rig import Rig
 
 
 def read_mast_file(path: Path) -> StoredRig:
@@ -61,6 +61,6 @@ def need_joints(rig: Rig, name: str, args: argparse.Namespace) -> None:
 
 def nearest_of(word: str, known: Collection[str]) -> str:
     """Return in words which of the known was meant, or what there is."""
-    from calib.files.strict import nearest
+    from calib.files.yaml_text import nearest
 
     return nearest(word, list(known)) if known else "it has none"

@@ -17,7 +17,7 @@ from functools import partial
 
 import numpy as np
 
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 from drivers.absent_camera import AbsentCamera
 from drivers.clock import Clock, SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame

@@ -15,18 +15,10 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Protocol
 
-from calib.mast.joints import AxisJoint, Joints
-from calib.mast.rig import Rig
+from calib.geometry.rig import AxisJoint, JointErrors, Rig
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import BadReply, DriverError, LineLost, NoReply
-from drivers.interfaces import (
-    COARSE_COUNT_RAD,
-    AxisReport,
-    Camera,
-    PanTilt,
-    Reporting,
-    StopsBeside,
-)
+from drivers.interfaces import COARSE_COUNT_RAD, AxisReport, Camera, PanTilt, Reporting, StopsBeside
 from mastctl.devices import joint_history
 from mastctl.devices.cameras import Cameras
 from mastctl.devices.door import REST_S, Door
@@ -127,7 +119,7 @@ class Devices:
         self.door = Door(limits, hardware.pan_tilt, clock, HEAD, rig, sun)
         self._clock = clock
         self._time = deadlines_on(clock)
-        self._joints = Joints() if rig is None else rig.joints
+        self._joints = JointErrors() if rig is None else rig.joints
         self._history = JointHistory(self._joints)
         self._store = FrameStore(mast_digest, new_run=new_run, on_new=self._new_frame)
         self._gate = threading.Lock()

@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.mast.joints import AxisJoint
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray
+from calib.geometry.rig import AxisJoint, Rig
+from calib.geometry.rigid import FloatArray
 from drivers.clock import Clock
 from drivers.errors import BadOptions
 from drivers.interfaces import AxisMotion, PanTilt, Reading, StatesMotion

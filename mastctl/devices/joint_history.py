@@ -1,6 +1,6 @@
 """What the head measured lately: checked readings, from which a frame's joint angles are told.
 
-Here read angles become true ones, once: by the mast file's ``joints`` (`calib.mast.joints`), and by the side
+Here read angles become true ones, once: by the mast file's ``joints`` (`calib.geometry.rig`), and by the side
 from which each axis came, which the readings tell. Behind gears with play b the load stands between the
 reading less b/2 and the reading plus b/2, and stays where it is until one of the two takes it along.
 """
@@ -17,7 +17,7 @@ from itertools import islice
 
 import numpy as np
 
-from calib.mast.joints import Approach, Joints, Pair
+from calib.geometry.rig import Approach, JointErrors, Pair
 from drivers.errors import BadReply
 from drivers.interfaces import Reading
 from mastctl.devices.rest import DITHER_S, dithers
@@ -131,8 +131,8 @@ class JointHistory:
     ``joints`` are the mast file's: what readings are wrong by.
     """
 
-    def __init__(self, joints: Joints | None = None) -> None:
-        self._joints = joints or Joints()
+    def __init__(self, joints: JointErrors | None = None) -> None:
+        self._joints = joints or JointErrors()
         self._readings: deque[Reading] = deque(maxlen=KEPT_READINGS)  # as the driver gave them
         self._loads: deque[tuple[Span, Span]] = deque(maxlen=KEPT_READINGS)  # and where the loads may be then
         self._newest: HeadReading | None = None  # with what is true of its motion
@@ -150,7 +150,7 @@ class JointHistory:
         with self._lock:
             return self._readings[0].time_s if self._readings else None
 
-    def use_joints(self, joints: Joints) -> None:
+    def use_joints(self, joints: JointErrors) -> None:
         """Take another mast file's joints, for the readings that are kept too."""
         with self._lock:
             self._joints = joints

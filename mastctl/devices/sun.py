@@ -15,8 +15,8 @@ from typing import Literal
 
 import numpy as np
 
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray, rot_x, rot_y
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, rot_x, rot_y
 from mastctl.devices.keep_out import Box, Pair
 
 SUN = "sun"

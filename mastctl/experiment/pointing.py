@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from calib.files.mast_file import parse_rig
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 from drivers.interfaces import Image
 from mastctl.client import Client, ClientError
 from mastctl.experiment.targets import VIEWS_PER_TARGET, Target, Views, pointed

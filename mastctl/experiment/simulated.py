@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
 from drivers.errors import BadOptions
 from drivers.faults import PAN_TILT
 from drivers.sim.rover import SimulatedRover

@@ -12,15 +12,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.stereo import triangulate
 from calib.errors import NoStereoPoint, Unreachable
-from calib.mast import pointing
-from calib.mast.rig import Rig
-from calib.mast.solutions import Solution, choose
-from calib.pictures.epipolar import find_partner
-from calib.pictures.warp import grey
-from calib.rigid import FloatArray
+from calib.geometry import pointing
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.geometry.solutions import Solution, choose
+from calib.geometry.stereo import triangulate
+from calib.matching.partner import find_partner
+from calib.matching.warp import grey
 from drivers.interfaces import Image
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.client.answers import OperationTold

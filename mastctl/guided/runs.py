@@ -17,11 +17,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from calib.boards import AnyBoard
-from calib.boards.board_file import parse_board
 from calib.errors import BadFile
 from calib.files import read_bytes
 from calib.files.atomic import replace_bytes
+from calib.targets.board_file import parse_board
+from calib.targets.boards import AnyBoard
 from mastctl.errors import BadRequest, NotKnown, Unable
 from mastctl.guided.told import Run
 from mastctl.packaged import config_folder

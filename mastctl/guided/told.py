@@ -34,7 +34,7 @@ class Asked:
     name
         Of the placement.
     range_m, bearing_deg, height_deg, turned_deg
-        As of `calib.bench.placements.Placement`.
+        As of `calib.plan.placements.Placement`.
     words
         The same for a person.
     waits

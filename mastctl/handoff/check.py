@@ -13,8 +13,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from calib.errors import BadFile
-from calib.handoff.bias import HandoffBias, handoff_bias
-from calib.handoff.matched import MatchedHandoff
+from calib.matching.handed_over import HandoffBias, MatchedHandoff, handoff_bias
 from drivers.clock import Clock, SystemClock
 from mastctl.handoff.log import HandoffLog, bias_told, read_log
 from mastctl.state.faults import StandingFault

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.camera.cahvor import CameraModel
+from calib.geometry.cahvor import CameraModel
 
 STEP_M = 1e-3  # of the differences; a camera's curvature over it is far below a pixel
 LEAST_SIGMA_PX = 0.05

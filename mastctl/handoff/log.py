@@ -23,12 +23,10 @@ import numpy as np
 from calib.errors import BadFile
 from calib.files import digest_of, read_bytes
 from calib.files.mast_file import CAMERA_NAME, CAMERA_NAME_WORDS
-from calib.files.strict import Section
-from calib.files.yaml_text import kind_of
-from calib.handoff.bias import HandoffBias
-from calib.handoff.by_image import RefinedVerdict
-from calib.handoff.geometric import Joints
-from calib.handoff.matched import Landed, MatchedHandoff
+from calib.files.yaml_text import Section, kind_of
+from calib.geometry.handoff import Joints
+from calib.matching.handed_over import HandoffBias, Landed, MatchedHandoff
+from calib.matching.handoff import RefinedVerdict
 from drivers.mcap_file import BadRecording, is_mcap, read_messages
 from mastctl.as_json import picked
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.rigid import FloatArray
+from calib.geometry.rigid import FloatArray
 from mastctl.health.expected import Expected
 
 TURN_RAD = 2e-3

@@ -1,7 +1,7 @@
 """What a pointing's residual is expected to be: how it depends on all that may be wrong, to first order.
 
 With e what the rig's parameters are wrong by, the pair's clicks put the target wrong by its own rates times
-e, and the aimed camera sees both that and its own error (the chain of `calib.handoff.geometric`, with the
+e, and the aimed camera sees both that and its own error (the chain of `calib.geometry.handoff`, with the
 joints turned in between). What pair and aimed camera share cancels here as it does in the rig.
 """
 
@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.parameters import parameter_names, parameter_part
 from calib.errors import CalibError
-from calib.mast.rig import Rig
-from calib.mast.rig_rates import JOINT_NAMES, click_rates, pixel_rates
-from calib.rigid import FloatArray, ReadOnlyArrays, tangents
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.covariance import JOINT_NAMES, click_rates, pixel_rates
+from calib.geometry.parameters import parameter_names, parameter_part
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, ReadOnlyArrays, tangents
 from mastctl.health.measured import Measured
 
 CLICK_SIGMA_PX = 0.1
@@ -55,7 +55,7 @@ def expected(rig: Rig, parameters: Sequence[str], cameras: Sequence[str], one: M
     rig
         The mast file in use.
     parameters
-        (p,) names, as `calib.mast.covariance` has them.
+        (p,) names, as `calib.geometry.covariance` has them.
     cameras
         (c,) whose turns are of interest.
     one

@@ -17,9 +17,9 @@ from operator import add, sub
 import numpy as np
 
 from calib.errors import CalibError
-from calib.mast.covariance import stored_covariance
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray
+from calib.geometry.covariance import stored_covariance
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
 from mastctl.health.evidence import Evidence, Judge, Sums, sums_of
 from mastctl.health.expected import Expected, expected
 from mastctl.health.measured import Measured

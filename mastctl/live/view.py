@@ -15,7 +15,7 @@ import time
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 from drivers.clock import Clock
 from drivers.errors import DriverError
 from mastctl.devices.frames import StampedFrame

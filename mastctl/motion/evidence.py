@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from calib.mast.rig import Rig
-from calib.pictures.patch_verdict import PatchMatch
-from calib.pictures.same_patches import Posed
-from calib.pictures.shown_view import ShownView, ViewLimits, overlap, shown_view
-from calib.rigid import FloatArray
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.matching.same_patches import Posed
+from calib.matching.shown_view import ShownView, ViewLimits, overlap, shown_view
+from calib.matching.verdict import PatchMatch
 from drivers.errors import BadFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.motion.looking import CameraView, Clicked, RigCameras

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import Protocol, TypeVar
 
-from calib.mast.solutions import Solution, order, ordered
+from calib.geometry.solutions import Solution, order, ordered
 from drivers.clock import Clock
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.keep_out import KeptOut, NoWay, Pair

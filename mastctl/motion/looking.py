@@ -10,15 +10,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError
-from calib.mast.rig import Rig
-from calib.pictures.epipolar import StereoMatch, find_partner
-from calib.pictures.epipolar_sweep import UP
-from calib.pictures.patch_match import match_patch
-from calib.pictures.patch_verdict import MatchSettings, PatchMatch
-from calib.pictures.warp import Grey, Plane, Relief, carry, facing_plane, grey
-from calib.rigid import FloatArray
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.matching.partner import StereoMatch, find_partner
+from calib.matching.patch import match_patch
+from calib.matching.sweep import UP
+from calib.matching.verdict import MatchSettings, PatchMatch
+from calib.matching.warp import Grey, Plane, Relief, carry, facing_plane, grey
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.motion.results import PointingError, rounded

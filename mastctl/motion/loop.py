@@ -29,14 +29,14 @@ from typing import Any
 
 import numpy as np
 
-from calib.camera.stereo import Triangulation, triangulate
 from calib.errors import CalibError
-from calib.mast.pointing import solve
-from calib.mast.rig import Rig
-from calib.mast.solutions import Solution
-from calib.pictures.epipolar import StereoMatch
-from calib.pictures.patch_verdict import PatchMatch
-from calib.rigid import FloatArray
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.geometry.solutions import Solution
+from calib.geometry.stereo import Triangulation, triangulate
+from calib.matching.partner import StereoMatch
+from calib.matching.verdict import PatchMatch
 from drivers.clock import Clock
 from drivers.errors import DriverError
 from mastctl.devices.joint_history import HeadReading

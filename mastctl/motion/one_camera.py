@@ -1,6 +1,6 @@
 """Pointing with one camera: how far the clicked thing is was told, follows from a plane, or is not known.
 
-What is not known is counted with (`calib.mast.one_eye`): between `PointingSettings.unknown_nearest_m` and
+What is not known is counted with (`calib.geometry.one_eye`): between `PointingSettings.unknown_nearest_m` and
 infinity at first, and less after each view from elsewhere that shows the thing. There is no second eye that
 could confirm a match; instead the thing must be found near the line on which its range can put it.
 """
@@ -12,12 +12,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from calib.mast.covariance import stored_covariance
-from calib.mast.one_eye import NORMAL_95, SeenFrom, Sight, range_to_plane, seen_from, shown, unknown_range
-from calib.mast.rig import Rig
-from calib.pictures.patch_verdict import PatchMatch
-from calib.pictures.warp import Plane, facing_plane
-from calib.rigid import FloatArray
+from calib.geometry.covariance import stored_covariance
+from calib.geometry.one_eye import NORMAL_95, SeenFrom, Sight, range_to_plane, seen_from, shown, unknown_range
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.matching.verdict import PatchMatch
+from calib.matching.warp import Plane, facing_plane
 from mastctl.devices.keep_out import Pair
 from mastctl.motion.looking import CameraView, Clicked
 from mastctl.motion.requests import PointRequest

@@ -8,18 +8,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError
-from calib.handoff.by_image import Eye, RefineSettings, refine_handoff
-from calib.handoff.geometric import Joints, hand_off
-from calib.handoff.matched import MatchedHandoff, matched_handoff
-from calib.mast.budget import stereo_range_error_m
-from calib.mast.covariance import stored_covariance
-from calib.mast.pointing import solve
-from calib.mast.rig import Rig
-from calib.mast.solutions import Solution, choose
-from calib.pictures.patch_verdict import PatchMatch
-from calib.rigid import FloatArray
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.covariance import stored_covariance
+from calib.geometry.handoff import Joints, hand_off
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.geometry.solutions import Solution, choose
+from calib.geometry.stereo import stereo_range_error_m
+from calib.matching.handed_over import MatchedHandoff, matched_handoff
+from calib.matching.handoff import Eye, RefineSettings, refine_handoff
+from calib.matching.verdict import PatchMatch
 from mastctl.devices.keep_out import KeptOut, NoWay
 from mastctl.devices.limits import Limits
 from mastctl.motion.looking import CameraView

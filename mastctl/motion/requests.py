@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 from mastctl.devices.frames import StampedFrame, check_known
 from mastctl.errors import BadRequest, NotNow
 

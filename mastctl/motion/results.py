@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.rigid import FloatArray
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import FloatArray
 from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.interfaces import AxisReport

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from calib.pictures.patch_verdict import MatchSettings
-from calib.pictures.shown_view import ViewLimits
+from calib.matching.shown_view import ViewLimits
+from calib.matching.verdict import MatchSettings
 from mastctl.devices.rest import DITHER_RAD
 
 

@@ -11,9 +11,9 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 
-from calib.mast.rig import Rig
-from calib.pictures.patch_verdict import PatchMatch
-from calib.rigid import FloatArray
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.matching.verdict import PatchMatch
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import DriverError
 from mastctl.devices.frames import StampedFrame

@@ -18,14 +18,13 @@ from typing import Literal
 import numpy as np
 
 from calib.errors import CalibError
-from calib.handoff.by_image import Eye
-from calib.handoff.matched import MatchedHandoff
-from calib.mast.rig import Rig
-from calib.pictures.patch_verdict import PatchMatch
-from calib.rigid import FloatArray
-from calib.tracking.look import Look, seen_by
-from calib.tracking.start import start_track
-from calib.tracking.track import Track
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.matching.handed_over import MatchedHandoff
+from calib.matching.handoff import Eye
+from calib.matching.look import TrackLook, seen_by
+from calib.matching.track import Track, start_track
+from calib.matching.verdict import PatchMatch
 from drivers.errors import DriverError
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.limits import Limits
@@ -51,7 +50,7 @@ class NotTrackable(MastctlError):
 
 @dataclass(frozen=True)
 class EyePixel:
-    """What one eye told: the verdict is `calib.pictures.patch_match`'s or ``no_frame``; pixel and sigma if it
+    """What one eye told: the verdict is `calib.matching.patch`'s or ``no_frame``; pixel and sigma if it
 
     is good.
     """
@@ -82,7 +81,7 @@ class TrackSighting:
     pixels
         By camera.
     chi2, renewed
-        As `calib.tracking.look.Look`.
+        As `calib.matching.look.Look`.
     pose_doubt
         What the pictures say against the pose, one sentence; empty if they do not.
     matched
@@ -264,7 +263,7 @@ class Looker:
         return _Sight(look.track, seen, taken, look.found)
 
     def _told(
-        self, choice: PairChoice, look: Look, pixels: Mapping[str, EyePixel], settled: HeadReading
+        self, choice: PairChoice, look: TrackLook, pixels: Mapping[str, EyePixel], settled: HeadReading
     ) -> TrackSighting:
         track, reason = look.track, look.reason
         gone = [one.reason for one in pixels.values() if one.verdict == "no_frame"]

@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from calib.rigid import FloatArray, Rigid, carried_covariance, quaternion_of
-from calib.tracking.track import Track, moved_track
+from calib.geometry.rigid import FloatArray, Rigid, carried_covariance, quaternion_of
+from calib.matching.track import Track, moved_track
 from mastctl.as_json import as_json, picked
 from mastctl.errors import BadRequest, NotNow
 from mastctl.motion.target_look import TrackSighting
@@ -33,7 +33,7 @@ class RoverPose:
         The pose.
     covariance
         (6, 6) of the motion since the pose before: small rotation, rad², then translation, m², both along
-        the rover's axes of this pose; None if it was not said. `calib.tracking.track.moved_track` takes it
+        the rover's axes of this pose; None if it was not said. `calib.matching.track.moved_track` takes it
         so.
     time_s
         By the sender's clock, which need not be the daemon's; None if it was not said.

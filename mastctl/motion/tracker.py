@@ -16,9 +16,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from calib.handoff.matched import MatchedHandoff
-from calib.mast.rig import Rig
-from calib.rigid import Rigid
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid
+from calib.matching.handed_over import MatchedHandoff
 from drivers.clock import Clock
 from mastctl.devices.limits import Limits
 from mastctl.errors import BadRequest, MastctlError, NotNow

@@ -13,7 +13,7 @@ import numpy as np
 from calib.files.atomic import save_bytes
 from calib.files.mast_file import load_rig, save_rig
 from calib.files.yaml_text import dump_mapping
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 from drivers.sim.axis import AxisSettings
 from drivers.sim.pan_tilt import PRESETS
 from drivers.sim.wired_head import DEFAULT_HEADS

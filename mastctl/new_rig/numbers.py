@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.mast.rig import Mast, Rig, RigCamera
-from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Mast, Rig, RigCamera
+from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
 from mastctl.errors import MastctlError
 
 FORWARD_M, DOWN_M = 0.06, 0.03

@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.parameters import parameter_names, parameter_part
-from calib.mast.covariance import RigCovariance, moved_rig, stored_covariance
-from calib.mast.joints import Joints
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z, tangents
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.covariance import RigCovariance, moved_rig, stored_covariance
+from calib.geometry.parameters import parameter_names, parameter_part
+from calib.geometry.rig import JointErrors, Rig
+from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z, tangents
 from mastctl.new_rig.numbers import BadRig
 
 # What a survey leaves open, one sigma. Mast: four prisms half a metre apart, 1 mm each. Cameras: so that
@@ -78,7 +77,7 @@ def true_twin(believed: Rig, rng: np.random.Generator) -> Twin:
         true_rig = moved_rig(believed, known.names, step)
         drawn = (true_rig.joints.pan, true_rig.joints.tilt)
         pan, tilt = (replace(axis, backlash_rad=max(axis.backlash_rad, 0.0)) for axis in drawn)
-        true_rig = replace(true_rig, joints=Joints(pan, tilt))
+        true_rig = replace(true_rig, joints=JointErrors(pan, tilt))
         apart = {name: _apart_px(believed, true_rig, name) for name in believed.cameras}
     except ValueError as error:
         raise BadRig(f"a rig drawn with {by} is none ({error}): they are far too wide") from None

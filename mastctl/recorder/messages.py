@@ -16,10 +16,10 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.plumb_bob import PlumbBob, camera_axes, nearest_plumb_bob
-from calib.mast.rig import Rig
-from calib.rigid import Rigid, quaternion_of
+from calib.files.opencv_camera import PlumbBob, camera_axes, nearest_plumb_bob
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid, quaternion_of
 from mastctl.as_json import as_json
 from mastctl.devices.frames import StampedFrame
 

@@ -19,14 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from calib.camera.stereo import triangulate
 from calib.errors import CalibError
-from calib.handoff.geometric import hand_off
-from calib.handoff.matched import MatchedHandoff
-from calib.mast.joints import UNKNOWN, Approach
-from calib.mast.pointing import solve
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray
+from calib.geometry.handoff import hand_off
+from calib.geometry.pointing import solve
+from calib.geometry.rig import UNKNOWN, Approach, Rig
+from calib.geometry.rigid import FloatArray
+from calib.geometry.stereo import triangulate
+from calib.matching.handed_over import MatchedHandoff
 
 STEP_PX = 0.01
 STEP_RAD = 1e-6

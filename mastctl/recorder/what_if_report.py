@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from calib.files.mast_file import StoredRig
-from calib.rigid import FloatArray
+from calib.geometry.rigid import FloatArray
 from drivers.errors import BadFrame
 from drivers.recorded_frames import McapFrame
 from mastctl.recorder.recorded import Recording

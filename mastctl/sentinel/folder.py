@@ -16,12 +16,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from calib.calibrate.scene.drift import SceneDrift
 from calib.errors import BadFile
 from calib.files import read_bytes
 from calib.files.atomic import replace_bytes
-from calib.files.strict import Section
-from calib.pictures.warp import Grey, grey
-from calib.scene.drift import Drift
+from calib.files.yaml_text import Section
+from calib.matching.warp import Grey, grey
 
 SCHEMA = "mastctl/sentinel/1"
 SENTINEL_FOLDER = "sentinel"
@@ -170,7 +170,7 @@ def read_reference(folder: Path) -> Reference:
     return Reference(time, top.text("mast_digest"), tuple(rests), tuple(pictures), folder)
 
 
-def add_look(folder: Path, reference: Reference, time: str, drift: Drift) -> dict[str, Any]:
+def add_look(folder: Path, reference: Reference, time: str, drift: SceneDrift) -> dict[str, Any]:
     """Append what a look at a reference found, and return it. Raises BadFile."""
     line = look_line(reference, time, drift)
     path = folder / LOOKS
@@ -188,7 +188,7 @@ def add_look(folder: Path, reference: Reference, time: str, drift: Drift) -> dic
     return line
 
 
-def look_line(reference: Reference, time: str, drift: Drift) -> dict[str, Any]:
+def look_line(reference: Reference, time: str, drift: SceneDrift) -> dict[str, Any]:
     """Return what is kept of a look at a reference."""
     named = drift.named
     return {

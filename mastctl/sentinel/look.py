@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from calib.calibrate.scene.drift import JOINT_SIGMA_RAD, SceneDrift, ViewShift, find_drift
+from calib.calibrate.scene.features import seen_again
 from calib.files.mast_file import parse_rig
-from calib.mast.rig import Rig
-from calib.pictures.warp import grey
-from calib.scene.again import seen_again
-from calib.scene.drift import JOINT_SIGMA_RAD, Drift, ViewShift, find_drift
+from calib.geometry.rig import Rig
+from calib.matching.warp import grey
 from mastctl.client import Client, ClientError
 from mastctl.errors import MastctlError
 from mastctl.sentinel.folder import Picture, Reference
@@ -132,7 +132,7 @@ def head_cameras(client: Client) -> tuple[Rig, list[str]]:
 
 def look_again(
     client: Client, reference: Reference, progress: Callable[[int, int], None] | None = None
-) -> Drift:
+) -> SceneDrift:
     """Take the pictures of a reference again and return what has changed.
 
     Nothing moves before it is known that the reference can be compared with.
@@ -164,7 +164,7 @@ def look_again(
 
 def compared(
     rig: Rig, reference: Reference, pictures: Sequence[Picture], joint_sigma_rad: float = JOINT_SIGMA_RAD
-) -> Drift:
+) -> SceneDrift:
     """Return what has changed between a reference and new pictures. Raises as `view_shifts`."""
     return find_drift(rig, view_shifts(rig, reference, pictures), joint_sigma_rad)
 

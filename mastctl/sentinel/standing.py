@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calib.errors import BadFile
-from calib.rigid import FloatArray
+from calib.geometry.rigid import FloatArray
 from mastctl.sentinel.folder import REFERENCE, Reference, read_looks, read_reference
 
 CONFIRMED = 2

@@ -10,8 +10,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from calib.calibrate.scene.drift import SceneDrift
 from calib.errors import BadFile
-from calib.scene.drift import Drift
 from mastctl.client import Client, ClientError
 from mastctl.errors import MastctlError
 from mastctl.sentinel.folder import Reference, add_look, read_looks, read_reference
@@ -43,7 +43,7 @@ def is_due(reference: Reference, last_look: str | None, every_s: float, now: dat
     return turn(now) != turn(datetime.fromisoformat(last).astimezone(UTC))
 
 
-def look_idle(client: Client, reference: Reference) -> Drift:
+def look_idle(client: Client, reference: Reference) -> SceneDrift:
     """Look under a lease that gives way to everybody.
 
     Raises

@@ -12,8 +12,8 @@ from calib.errors import BadFile, CalibError
 from calib.files import read_bytes
 from calib.files.mast_file import StoredRig, parse_rig
 from calib.files.yaml_text import MAX_BYTES
-from calib.mast.covariance import stored_covariance
-from calib.mast.rig import Rig
+from calib.geometry.covariance import stored_covariance
+from calib.geometry.rig import Rig
 from mastctl.config import Config, check_cameras
 from mastctl.devices.opening import Bounds
 from mastctl.errors import BadRequest

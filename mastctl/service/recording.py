@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from calib.handoff.matched import MatchedHandoff
+from calib.matching.handed_over import MatchedHandoff
 from drivers.clock import Clock
 from mastctl.config import Config
 from mastctl.devices.frames import StampedFrame

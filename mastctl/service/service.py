@@ -14,7 +14,7 @@ from importlib.metadata import version
 from typing import Any
 
 from calib.files.mast_file import StoredRig
-from calib.handoff.matched import MatchedHandoff
+from calib.matching.handed_over import MatchedHandoff
 from drivers.clock import Clock, SystemClock
 from drivers.hardware import Hardware
 from drivers.known import clock_for, head_name

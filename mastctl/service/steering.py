@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 from drivers.clock import Clock
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import check_known

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from calib.camera.cahvor import CameraModel
 from calib.errors import BadFile
 from calib.files.mast_file import load_rig, save_rig
-from calib.mast.rig import Rig
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Rig
 from drivers.errors import BadOptions
 from mastctl.config import Config
 

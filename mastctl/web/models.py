@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
-from calib.rigid import Rigid, rotation_of
+from calib.geometry.rigid import Rigid, rotation_of
 from mastctl.commands.entry import LONGEST_DEADLINE_S
 from mastctl.commands.lease import LONGEST_S, SHORTEST_S, USUAL_S
 from mastctl.devices.sun import LEAST_CONE_RAD, WIDEST_CONE_RAD, Sun, direction_of
@@ -220,7 +220,7 @@ class PoseBody(_Strict):
         rotation = rotation_of(self.quaternion)
         covariance = None
         if self.covariance is not None:
-            order = [3, 4, 5, 0, 1, 2]  # rotation first, as calib.tracking.track has it
+            order = [3, 4, 5, 0, 1, 2]  # rotation first, as calib.matching.track has it
             covariance = np.array(self.covariance)[np.ix_(order, order)]
         elif self.sigma is not None:
             covariance = np.diag([self.sigma.rotation_rad**2] * 3 + [self.sigma.position_m**2] * 3)

@@ -11,7 +11,7 @@ import numpy as np
 from fastapi import FastAPI, Request
 from fastapi.responses import Response
 
-from calib.mast.rig import RigCamera
+from calib.geometry.rig import RigCamera
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
 from mastctl.web.packed import ASK_AGAIN, FOR_GOOD, digest, text_answer

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
-from calib.files.strict import nearest
+from calib.files.yaml_text import nearest
 
 
 def sentence(problem: Mapping[str, Any], model: object) -> str:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from fastapi import FastAPI, Path, Query
 
-from calib.boards.board_file import board_of, document_of
 from calib.errors import BadFile
-from calib.rigid import FloatArray, Rigid, quaternion_of
+from calib.geometry.rigid import FloatArray, Rigid, quaternion_of
+from calib.targets.board_file import board_of, document_of
 from drivers.faults import BOUNDS, WHEN, FaultPanel
 from drivers.faults import Fault as SetFault
 from drivers.simulation_clock import MAX, SimulationClock

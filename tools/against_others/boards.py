@@ -21,14 +21,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.boards import AnyBoard, AprilGrid, Charuco, Corners, DotBoard, load_board
-from calib.corners import find_corners
-from calib.corners.markers import corners_on_board_m, detect
+from calib.adjust.adjustment import Adjustment, Estimate
+from calib.adjust.solver import minimise
+from calib.adjust.terms import ImageTerm
+from calib.calibrate.starts.views import view_poses
 from calib.errors import CalibError
-from calib.fit.adjustment import Adjustment, Estimate
-from calib.fit.least_squares import minimise
-from calib.fit.terms import ImageTerm
-from calib.fit.view_poses import view_poses
+from calib.targets.board_file import load_board
+from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Corners, DotBoard
+from calib.targets.corners import find_corners
+from calib.targets.markers import corners_on_board_m, detect
 from tools.against_others.calibration import boards_residuals, rms
 from tools.arguments import end
 

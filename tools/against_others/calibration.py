@@ -11,9 +11,9 @@ Three problems, each given to all who can solve it:
   that of predicted pixels over the whole picture at 3, 6 and 10 m.
 
 All fits of a problem that need a start have the same one, a pinhole with a rough focal length; OpenCV makes
-its own, fit_camera seeks its own, and so does a bench (``calib.fit.view_poses``), which knows no focal
-length. SciPy's least_squares gets residuals alone and differences them: once as it comes (trf), once by its
-quickest method (lm) with unknowns scaled by hand; where all poses are free, it is spared the six unknowns
+its own, fit_camera seeks its own, and so does a bench (``calib.calibrate.starts.views``), which knows no
+focal length. SciPy's least_squares gets residuals alone and differences them: once as it comes (trf), once by
+its quickest method (lm) with unknowns scaled by hand; where all poses are free, it is spared the six unknowns
 that only move everything together. Rms is over points (x and y together), as OpenCV tells it. Times are
 processor times of one fit, medians of --rounds. mrcal is used where this interpreter, or Debian's
 /usr/bin/python3, can import it (apt-get install --no-install-recommends python3-mrcal).
@@ -43,14 +43,14 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.parameters import parameter_names, parameter_part, stepped
-from calib.fit.adjustment import Adjustment, Estimate
-from calib.fit.camera import FixedPoints, fit_camera, pinhole
-from calib.fit.least_squares import minimise
-from calib.fit.terms import ImageTerm
-from calib.fit.view_poses import view_poses
-from calib.rigid import Rigid
+from calib.adjust.adjustment import Adjustment, Estimate
+from calib.adjust.solver import minimise
+from calib.adjust.terms import ImageTerm
+from calib.calibrate.starts.camera import FixedPoints, fit_camera, pinhole
+from calib.calibrate.starts.views import view_poses
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.parameters import parameter_names, parameter_part, stepped
+from calib.geometry.rigid import Rigid
 from mastctl.cli.output import at_least
 from tools.against_others.points import (
     COLUMNS,

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.published import project_as_published
 from calib.files.mast_file import load_rig
-from calib.rigid import Rigid
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.projection import project_as_published
+from calib.geometry.rigid import Rigid
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 COLUMNS, ROWS, SQUARE_M = 9, 6, 0.025

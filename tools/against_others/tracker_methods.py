@@ -19,12 +19,11 @@ import cv2
 import numpy as np
 
 from calib.errors import CalibError
-from calib.handoff.by_image import Eye
-from calib.pictures.warp import grey
-from calib.rigid import FloatArray
-from calib.tracking.look import seen_by
-from calib.tracking.start import start_track
-from calib.tracking.track import moved_track
+from calib.geometry.rigid import FloatArray
+from calib.matching.handoff import Eye
+from calib.matching.look import seen_by
+from calib.matching.track import moved_track, start_track
+from calib.matching.warp import grey
 from tools.against_others.tracker_sequences import STEPS, Sequence
 
 HALF_PX = 20
@@ -43,7 +42,7 @@ Tracked = tuple[FloatArray, FloatArray]
 
 
 def ours(sequence: Sequence) -> Tracked:
-    """`calib.tracking.track`, as the approach uses it: from uint8 pictures and odometry to both pixels."""
+    """`calib.matching.track`, as the approach uses it: from uint8 pictures and odometry to both pixels."""
     found, times = np.full((STEPS, 2, 2), np.nan), np.full(STEPS, np.nan)
     try:
         track = start_track(*_eyes(sequence, 0).values(), sequence.truth_px[0, 0])

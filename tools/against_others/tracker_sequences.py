@@ -26,15 +26,15 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError
 from calib.files.mast_file import load_rig
-from calib.handoff.by_image import Eye
-from calib.mast.pointing import solve
-from calib.mast.rig import Rig
-from calib.pictures.warp import grey
-from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
-from calib.tracking.start import start_track
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
+from calib.matching.handoff import Eye
+from calib.matching.track import start_track
+from calib.matching.warp import grey
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 from mastctl.experiment.targets import texture_mask

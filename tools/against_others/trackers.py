@@ -38,7 +38,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
+from calib.geometry.cahvor import CameraModel
 from mastctl.cli.output import at_least
 from tools.against_others.tracker_methods import HALF_PX, METHODS, Tracked
 from tools.against_others.tracker_sequences import SETTINGS, STEPS, WORLDS, Sequence, loaded, rigs, sequences

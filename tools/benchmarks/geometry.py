@@ -35,10 +35,10 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
-from calib.camera.cahvor import CameraModel
-from calib.mast.pointing import solve
-from calib.mast.rig import Mast
-from calib.rigid import Rigid, rot_x, rot_y, rot_z
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Mast
+from calib.geometry.rigid import Rigid, rot_x, rot_y, rot_z
 from mastctl.cli.output import at_least
 from tools.arguments import end
 

@@ -35,7 +35,7 @@ def measured(repeats: int) -> dict[str, float]:
     import cv2
     import numpy as np
 
-    from calib.rigid import Rigid
+    from calib.geometry.rigid import Rigid
     from drivers.clock import SystemClock
     from drivers.sim.render import Renderer
     from drivers.sim.rover import SimulatedRover

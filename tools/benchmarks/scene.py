@@ -15,9 +15,9 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from calib.scene.features import find_features
-from calib.scene.fit import fit_scene
-from calib.scene.terms import corrected
+from calib.calibrate.scene.features import find_features
+from calib.calibrate.scene.fit import fit_scene
+from calib.calibrate.scene.terms import corrected
 from mastctl.cli.output import at_least
 from tools.arguments import end
 from tools.still_scene import navcams, pictures, rests

@@ -20,14 +20,14 @@ from unittest import mock
 
 import numpy as np
 
-from calib.fit.adjustment import KNOWN_BEFOREHAND
-from calib.fit.bench import fit_bench
-from calib.fit.bench_changes import reading_rates
-from calib.fit.bench_problem import BenchProblem
-from calib.fit.bench_told import UNPREDICTED, check_weights
-from calib.fit.joint import Weighed
-from calib.fit.significance import chance_of_sum
-from calib.fit.terms import ImageTerm
+from calib.adjust.adjustment import KNOWN_BEFOREHAND
+from calib.adjust.changes import reading_rates
+from calib.adjust.robust import Weighed
+from calib.adjust.significance import chance_of_sum
+from calib.adjust.terms import ImageTerm
+from calib.calibrate.bench.fit import fit_bench
+from calib.calibrate.bench.problem import BenchProblem
+from calib.calibrate.bench.told import UNPREDICTED, check_weights
 from drivers.sim_survey.bench import simulate_bench
 from mastctl.cli.output import at_least
 from tools.arguments import end
@@ -59,7 +59,7 @@ def found(task: Task) -> Found:
     """Return the chances of the check pictures of some benches."""
     plan = replace(plan_of(task.head, task.attitudes, task.seed, task.checks), gross=0.0)
     survey = simulate_bench(task.seed, replace(plan, noise=0.0))
-    with mock.patch("calib.fit.bench.told") as told:
+    with mock.patch("calib.calibrate.bench.fit.told") as told:
         fit_bench(survey)
     bench: BenchProblem = told.call_args.args[0]
     weighed: Weighed = told.call_args.args[2]

@@ -34,19 +34,17 @@ from unittest import mock
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.stereo import triangulate
+from calib.adjust.result import BenchCalibration
+from calib.calibrate.bench.fit import fit_bench
+from calib.calibrate.bench.problem import BenchOptions, BenchProblem
 from calib.errors import CalibError
-from calib.fit.bench import BenchOptions, fit_bench
-from calib.fit.bench_calibration import BenchCalibration
-from calib.fit.bench_problem import BenchProblem
-from calib.mast.gimbal import numbers_of
-from calib.mast.joints import JOINTS_NAMES
-from calib.mast.joints import numbers_of as joint_numbers
-from calib.mast.pointing import solve
-from calib.mast.rig import Mast, Rig
-from calib.mast.rig_rates import pixel_rates
-from calib.rigid import tangents
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.covariance import pixel_rates
+from calib.geometry.pointing import solve
+from calib.geometry.rig import JOINTS_NAMES, Mast, Rig, numbers_of
+from calib.geometry.rig import joint_numbers_of as joint_numbers
+from calib.geometry.rigid import tangents
+from calib.geometry.stereo import triangulate
 from drivers.sim_survey.bench import BenchPlan, Placement, simulate_bench
 from mastctl.cli.output import at_least
 from tools.arguments import end

@@ -18,11 +18,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from calib.boards import Charuco, save_board
 from calib.files.mast_file import load_rig, save_rig
 from calib.files.yaml_text import dump_mapping
-from calib.mast.joints import Joints
-from calib.mast.rig import Rig
+from calib.geometry.rig import JointErrors, Rig
+from calib.targets.board_file import save_board
+from calib.targets.boards import Charuco
 from mastctl.cli.main import main as mastctl
 from mastctl.client import Client
 from mastctl.config import Config, Listen, load_config
@@ -56,7 +56,7 @@ def main() -> int:
         cases: list[tuple[str, Mapping[str, Any], Rig]] = [
             ("counts alone, the true rig", COUNTS_ALONE, true),
             ("calibrated by the command", HEAD, calibrated),
-            ("the same without joints", HEAD, replace(calibrated, joints=Joints(), fit={})),
+            ("the same without joints", HEAD, replace(calibrated, joints=JointErrors(), fit={})),
         ]
         counts_px = 0.0
         print(heading(("case", "targets", "first, rms px", "times counts alone", "second")))

@@ -20,16 +20,15 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.bench.knowledge import Knowledge, Shot
-from calib.bench.placements import Placement
-from calib.bench.poses import Sought, expected_px, next_shot, seen
-from calib.bench.workspace import Pointing, Workspace, pointing
-from calib.boards import Charuco
 from calib.errors import CalibError, Unreachable
 from calib.files.mast_file import load_rig
-from calib.mast.pointing import solve
-from calib.mast.rig import Rig
-from calib.mast.solutions import choose
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig
+from calib.geometry.solutions import choose
+from calib.plan.knowledge import BenchShot, ExpectedPointing, Knowledge, Workspace, pointing
+from calib.plan.placements import Placement
+from calib.plan.poses import Sought, expected_px, next_shot, seen
+from calib.targets.boards import Charuco
 from mastctl.bench.wanted import FEWEST_LOOKS
 from tools.arguments import end
 from tools.campaign import options
@@ -49,7 +48,9 @@ PAN_RAD, TILT_RAD = (-2.6, 2.6), (-1.2, 0.5)
 CHOICES_S: list[float] = []
 """Processor time of each choice."""
 
-Way = Callable[[Knowledge, Sought, str, int, Pointing, np.random.Generator, Sequence[Shot]], list[Shot]]
+Way = Callable[
+    [Knowledge, Sought, str, int, ExpectedPointing, np.random.Generator, Sequence[BenchShot]], list[BenchShot]
+]
 
 
 def main() -> int:
@@ -107,7 +108,7 @@ def one_bench(rig: Rig, rng: np.random.Generator, one_sided: bool) -> dict[str, 
     for name, way in WAYS.items():
         curves[name] = []
         for each in EACH:
-            shots: list[Shot] = []
+            shots: list[BenchShot] = []
             for placement in boards:
                 shots += way(known, sought, placement, each, aim, rng, shots)
             curves[name].append(expected_px(known, shots, aim))
@@ -119,12 +120,12 @@ def chosen(
     sought: Sought,
     placement: str,
     count: int,
-    aim: Pointing,
+    aim: ExpectedPointing,
     rng: np.random.Generator,
-    shots: Sequence[Shot],
-) -> list[Shot]:
+    shots: Sequence[BenchShot],
+) -> list[BenchShot]:
     """Return attitudes that tell most together, as the driving command chooses them."""
-    mine: list[Shot] = []
+    mine: list[BenchShot] = []
     for taken in range(count):
         ahead = max(min(count, FEWEST_LOOKS) - taken, 1)
         began = time.process_time()
@@ -140,10 +141,10 @@ def grid(
     sought: Sought,
     placement: str,
     count: int,
-    aim: Pointing,
+    aim: ExpectedPointing,
     rng: np.random.Generator,
-    shots: Sequence[Shot],
-) -> list[Shot]:
+    shots: Sequence[BenchShot],
+) -> list[BenchShot]:
     """Return attitudes that put the board's middle at even places of the first camera's picture."""
     columns = math.ceil(math.sqrt(count * 4 / 3))
     rows = math.ceil(count / columns)
@@ -161,12 +162,12 @@ def anywhere(
     sought: Sought,
     placement: str,
     count: int,
-    aim: Pointing,
+    aim: ExpectedPointing,
     rng: np.random.Generator,
-    shots: Sequence[Shot],
-) -> list[Shot]:
+    shots: Sequence[BenchShot],
+) -> list[BenchShot]:
     """Return attitudes that put the board's middle anywhere in the picture."""
-    mine: list[Shot] = []
+    mine: list[BenchShot] = []
     for _ in range(50 * count):
         if len(mine) < count:
             mine += _at(known, sought, placement, (rng.uniform(), rng.uniform()), rng)
@@ -178,7 +179,7 @@ WAYS: dict[str, Way] = {"chosen": chosen, "grid": grid, "random": anywhere}
 
 def _at(
     known: Knowledge, sought: Sought, placement: str, place: tuple[float, float], rng: np.random.Generator
-) -> list[Shot]:
+) -> list[BenchShot]:
     """The shot with the board's middle at a place of the picture, if it can be taken."""
     model = known.rig.cameras[PAIR[0]].model
     width, height = model.size_px
@@ -190,7 +191,7 @@ def _at(
         return []
     sides = (0, 0) if sought.one_sided else tuple(int(side) for side in rng.choice([-1, 1], 2))
     read = known.rig.joints.read_rad((angles.pan_rad, angles.tilt_rad))
-    shot = seen(known, sought, Shot(placement, *read, (), *sides))
+    shot = seen(known, sought, BenchShot(placement, *read, (), *sides))
     return [] if shot is None else [shot]
 
 

@@ -25,10 +25,10 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.boards import AnyBoard, AprilGrid, Charuco, save_board
-from calib.boards.board_file import document_of
 from calib.errors import CalibError
-from calib.survey import read_survey
+from calib.survey.reader import read_survey
+from calib.targets.board_file import document_of, save_board
+from calib.targets.boards import AnyBoard, AprilGrid, Charuco
 from drivers.interfaces import Image
 from mastctl.bench.simulated import BOARD
 from mastctl.cli.main import main as mastctl

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.boards import AnyBoard, AprilGrid, Charuco, DotBoard
-from calib.boards.pattern import pattern_of
+from calib.targets.boards import AnyBoard, AprilGrid, Charuco, DotBoard
+from calib.targets.pattern import pattern_of
 
 FloatArray = NDArray[np.float64]
 Float32 = NDArray[np.float32]

@@ -21,14 +21,14 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.twin import twin_error
 from calib.errors import BadFile
 from calib.files import CameraFile
 from calib.files.any_camera import load_any, save_any
 from calib.files.mast_file import load_rig
+from calib.files.twin import twin_error
 from calib.files.yaml_text import parse_mapping
-from calib.rigid import FloatArray
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import FloatArray
 from tools.arguments import end
 from tools.campaign import options
 

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.boards import AnyBoard, AprilGrid, Charuco, Corners
-from calib.boards.pattern import pattern_of
-from calib.corners import find_corners
+from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Corners
+from calib.targets.corners import find_corners
+from calib.targets.pattern import pattern_of
 from tools.arguments import end
 from tools.campaign import options, run_cases
 

@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, Corners, DotBoard
-from calib.corners import CornersNotFound, find_corners
+from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, Corners, DotBoard
+from calib.targets.corners import CornersNotFound, find_corners
 from tools.arguments import end
 from tools.campaign import options, run_cases
 from tools.campaigns.board_photos import SIZE_PX, Levels, keep_pictures, light, photographed, placed

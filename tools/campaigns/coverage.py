@@ -28,14 +28,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2, kstest
 
+from calib.adjust.result import Calibration
+from calib.adjust.uncertainty import pixel_covariance
 from calib.errors import CalibError
 from calib.files.mast_file import load_rig
-from calib.fit.adjustment import MAST_NAMES
-from calib.fit.calibration import Calibration
-from calib.fit.uncertainty import pixel_covariance
-from calib.mast.rig import Rig
-from calib.rigid import rigid_rates
-from calib.survey import Sigma, Survey
+from calib.geometry.rig import MAST_NAMES, Rig
+from calib.geometry.rigid import rigid_rates
+from calib.survey.records import Sigma, Survey
 from drivers.sim_survey.blunders import with_fewer_dots, with_moved_tape, with_scattered_dots
 from drivers.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
 from mastctl.calibration.run import FITS, Method

@@ -18,10 +18,12 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.camera.cahvor import CameraModel
-from calib.dots.find import DetectionFailure, DotsFound, PredictedBoard, find_dots
-from calib.rigid import Rigid
-from calib.survey import Board
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid
+from calib.targets.boards import Board
+from calib.targets.dot_grid import DetectionFailure
+from calib.targets.dot_order import PredictedBoard
+from calib.targets.dots import DotsFound, find_dots
 from drivers.sim.render import Renderer
 from drivers.sim.scene import SceneSettings, build_scene
 from drivers.sim_survey.board import BoardLook, draw_board, half_size_m, photograph

@@ -25,23 +25,20 @@ from typing import Any
 
 import numpy as np
 
-from calib.boards import AnyBoard
-from calib.boards.board_file import parse_board
-from calib.boards.pattern import pattern_of
 from calib.errors import BadFile
 from calib.files import CameraFile
 from calib.files.cahvor_text import format_cahvor, parse_cahvor
-from calib.files.camera_info import parse_camera_info
-from calib.files.colmap import parse_colmap
-from calib.files.kalibr import parse_kalibr
 from calib.files.mast_file import StoredRig, parse_camera, parse_rig
-from calib.files.mrcal_model import parse_mrcal
+from calib.files.mrcal_kalibr_colmap import parse_colmap, parse_kalibr, parse_mrcal
 from calib.files.odl import parse_label
-from calib.files.opencv_yaml import parse_opencv
+from calib.files.opencv_ros import parse_camera_info, parse_opencv
 from calib.files.pds3 import load_pds3_camera, read_product
 from calib.files.tables import parse_table
 from calib.survey.check import check_survey
 from calib.survey.reader import read_survey
+from calib.targets.board_file import parse_board
+from calib.targets.boards import AnyBoard
+from calib.targets.pattern import pattern_of
 from mastctl.cli.main import main as mastctl
 from tools.arguments import end
 from tools.campaign import options

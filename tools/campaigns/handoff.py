@@ -18,13 +18,13 @@ import numpy as np
 
 from calib.errors import NoHandoff, NoStereoPoint
 from calib.files.mast_file import load_rig
-from calib.handoff.by_image import Eye, RefineSettings, refine_handoff
-from calib.handoff.geometric import Handoff, Joints, PredictedPixel, hand_off
-from calib.mast.covariance import RigCovariance, stored_covariance
-from calib.mast.rig import Rig
-from calib.pictures.epipolar import find_partner
-from calib.pictures.patch_verdict import MatchSettings
-from calib.pictures.warp import Plane, warp_patch
+from calib.geometry.covariance import RigCovariance, stored_covariance
+from calib.geometry.handoff import Handoff, Joints, PredictedPixel, hand_off
+from calib.geometry.rig import Rig
+from calib.matching.handoff import Eye, RefineSettings, refine_handoff
+from calib.matching.partner import find_partner
+from calib.matching.verdict import MatchSettings
+from calib.matching.warp import Plane, warp_patch
 from drivers.sim.render import compile_renderer
 from mastctl.cli.output import at_least
 from mastctl.packaged import config_folder

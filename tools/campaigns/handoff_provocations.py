@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.handoff.by_image import Eye
-from calib.mast import pointing
-from calib.mast.covariance import RigCovariance, moved_rig
-from calib.mast.rig import Rig
-from calib.mast.solutions import choose
+from calib.geometry import pointing
+from calib.geometry.covariance import RigCovariance, moved_rig
+from calib.geometry.rig import Rig
+from calib.geometry.solutions import choose
+from calib.matching.handoff import Eye
 from drivers.sim import texture
 from drivers.sim.bricks import Brick, make_brick, meshes
 from drivers.sim.compiled import kernels

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.mast.joints import AxisJoint, Joints
+from calib.geometry.rig import AxisJoint, JointErrors
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
@@ -38,7 +38,7 @@ ERRS: Mapping[str, Any] = {
     "pan_harmonics_rad": HARMONICS["pan"],
     "tilt_harmonics_rad": HARMONICS["tilt"],
 }
-TRUTH = Joints(AxisJoint(HARMONICS["pan"], BACKLASH_RAD), AxisJoint(HARMONICS["tilt"], BACKLASH_RAD))
+TRUTH = JointErrors(AxisJoint(HARMONICS["pan"], BACKLASH_RAD), AxisJoint(HARMONICS["tilt"], BACKLASH_RAD))
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from calib.files.mast_file import parse_rig
-from calib.rigid import FloatArray
+from calib.geometry.rigid import FloatArray
 from drivers.interfaces import Frame
 from drivers.sim.cameras import SimulatedCamera
 from drivers.sim.rover import SimulatedRover

@@ -32,9 +32,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from calib.camera.cahvor import CameraModel
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Rig
 from drivers.clock import ManualClock
 from drivers.errors import DriverError
 from drivers.sim.camera_clock import CameraClock, ClockSettings

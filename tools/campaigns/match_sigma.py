@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
-from calib.pictures.patch_verdict import PatchMatch
-from calib.pictures.warp import grey
-from calib.rigid import FloatArray
-from calib.tracking.track import SIZES
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.matching.track import SIZES
+from calib.matching.verdict import PatchMatch
+from calib.matching.warp import grey
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 from drivers.sim_survey.board import photograph

@@ -27,9 +27,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
-from calib.pictures.same_patches import Posed
-from calib.pictures.shown_view import shown_view
+from calib.geometry.rig import Rig
+from calib.matching.same_patches import Posed
+from calib.matching.shown_view import shown_view
 from drivers.clock import ManualClock
 from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.open_hardware import open_hardware

@@ -16,11 +16,11 @@ from itertools import chain
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.camera.cahvor import CameraModel
 from calib.errors import Unreachable
-from calib.mast.pointing import solve
-from calib.mast.rig import Mast
-from calib.mast.solutions import Solution
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Mast
+from calib.geometry.solutions import Solution
 from tools.arguments import end
 from tools.campaign import options, run_cases
 

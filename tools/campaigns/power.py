@@ -24,12 +24,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from calib.calibrate.bench.fit import fit_bench
+from calib.calibrate.survey import fit_joint
 from calib.errors import CalibError
 from calib.files.mast_file import load_rig
-from calib.fit.bench import fit_bench
-from calib.fit.joint import fit_joint
-from calib.mast.rig import Rig
-from calib.survey import Survey
+from calib.geometry.rig import Rig
+from calib.survey.records import Survey
 from drivers.sim_survey.bench import BenchPlan, Mishap, simulate_bench
 from drivers.sim_survey.blunders import with_slipped_joint
 from drivers.sim_survey.plan import SurveyPlan

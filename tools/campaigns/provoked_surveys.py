@@ -28,20 +28,20 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from calib.camera.stereo import triangulate
+from calib.adjust import goodness as components
+from calib.adjust import wider
+from calib.adjust.result import Calibration
+from calib.adjust.significance import THREE_SIGMAS
+from calib.adjust.terms import DRAWING
+from calib.adjust.uncertainty import pixel_covariance, pointing_covariance
+from calib.calibrate.survey import fit_joint
 from calib.errors import CalibError
 from calib.files.mast_file import load_rig
-from calib.fit import components, wider
-from calib.fit.calibration import Calibration
-from calib.fit.joint import fit_joint
-from calib.fit.significance import THREE_SIGMAS
-from calib.fit.terms import DRAWING
-from calib.fit.uncertainty import pixel_covariance, pointing_covariance
-from calib.mast.gimbal import MAST_NAMES, numbers_of
-from calib.mast.pointing import solve
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray
-from calib.survey import Sigma, Survey
+from calib.geometry.pointing import solve
+from calib.geometry.rig import MAST_NAMES, Rig, numbers_of
+from calib.geometry.rigid import FloatArray
+from calib.geometry.stereo import triangulate
+from calib.survey.records import Sigma, Survey
 from drivers.sim_survey.plan import SurveyPlan, rover_from_head
 from mastctl.calibration import expected
 from mastctl.calibration.expected import check_sizes

@@ -17,15 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.calibrate.body import corrected_rig, fit_body_pose
+from calib.calibrate.body_sights import PRIOR_SHIFT_M, PRIOR_TURN_RAD
 from calib.files.mast_file import load_rig
-from calib.handoff.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD
-from calib.handoff.by_image import RefinedPixel
-from calib.handoff.corrected_rig import corrected_rig
-from calib.handoff.fit_body_pose import fit_body_pose
-from calib.handoff.geometric import Joints, hand_off
-from calib.handoff.matched import MatchedHandoff, matched_handoff
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray, Rigid, moved_rigid
+from calib.geometry.handoff import Joints, hand_off
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, Rigid, moved_rigid
+from calib.matching.handed_over import MatchedHandoff, matched_handoff
+from calib.matching.handoff import RefinedPixel
 from mastctl.calibration.landing import handoff_errors_px
 from mastctl.cli.output import at_least, not_negative, positive_number
 from tools.arguments import end

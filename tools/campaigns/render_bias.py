@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.camera.cahvor import CameraModel
-from calib.mast.rig import Mast
-from calib.rigid import FloatArray, Rigid, rot_y, rot_z
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Mast
+from calib.geometry.rigid import FloatArray, Rigid, rot_y, rot_z
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 from mastctl.cli.output import at_least, positive_number

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera.cahvor import CameraModel
-from calib.rigid import FloatArray
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import FloatArray
 from drivers.sim.rover import SimulatedRover
 from drivers.simulation_clock import MAX
 from mastctl.client import Client, ClientError, Snapshot

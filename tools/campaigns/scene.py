@@ -24,14 +24,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
+from calib.calibrate.scene.features import Feature, find_features
+from calib.calibrate.scene.fit import SceneFit, fit_scene
+from calib.calibrate.scene.terms import SceneView, corrected
 from calib.errors import NoCorrection
-from calib.mast.rig import Mast, Rig, RigCamera
-from calib.rigid import FloatArray
-from calib.scene.features import Feature, find_features
-from calib.scene.fit import SceneFit, fit_scene
-from calib.scene.terms import corrected
-from calib.scene.views import View
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Mast, Rig, RigCamera
+from calib.geometry.rigid import FloatArray
 from mastctl.cli.output import positive_number
 from tools.arguments import end
 from tools.campaign import options, rms, run_cases
@@ -106,11 +105,11 @@ def wrong(kind: str, camera: str, rng: np.random.Generator) -> dict[str, float]:
 
 def features_of(
     true: Rig, looked: list[tuple[float, float]], errs: FloatArray, rng: np.random.Generator
-) -> tuple[list[View], list[Feature]]:
+) -> tuple[list[SceneView], list[Feature]]:
     """Features on rough ground where a true rig shows them, six sights at most each."""
     nothing = np.zeros((2, 2), np.float32)
     views = [
-        View(f"{name} {pose}", name, nothing, *rest, pose)
+        SceneView(f"{name} {pose}", name, nothing, *rest, pose)
         for pose, rest in enumerate(looked)
         for name in true.cameras
     ]

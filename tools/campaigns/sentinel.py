@@ -22,10 +22,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.mast.rig import Mast, Rig, RigCamera
-from calib.rigid import FloatArray
-from calib.scene.drift import Drift, ViewShift, find_drift
+from calib.calibrate.scene.drift import SceneDrift, ViewShift, find_drift
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Mast, Rig, RigCamera
+from calib.geometry.rigid import FloatArray
 from mastctl.cli.output import at_least
 from mastctl.sentinel.folder import Reference, look_line
 from mastctl.sentinel.standing import slow_course, standing
@@ -96,7 +96,7 @@ class Site:
                 self.points[pose, eye] = points
                 self.then[pose, eye] = shown(points, eye, *(np.array([pan, tilt]) + off[pose]), Truth())
 
-    def look(self, truth: Truth) -> Drift:
+    def look(self, truth: Truth) -> SceneDrift:
         """One day's look: what the sentinel finds."""
         rng = self.rng
         dust, spoil = rng.uniform(0.2, 1.0), rng.uniform(1.0, 2.0)

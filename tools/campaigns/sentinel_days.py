@@ -16,11 +16,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.mast.rig import Rig
-from calib.pictures.warp import Grey
-from calib.rigid import FloatArray, Rigid
-from calib.scene.drift import Drift, ViewShift
+from calib.calibrate.scene.drift import SceneDrift, ViewShift
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.matching.warp import Grey
 from drivers.sim import boards, bricks, rocks, scene, texture
 from drivers.sim.compiled import kernels
 from drivers.sim.render import Renderer
@@ -60,7 +60,7 @@ def about(axis: int, angle_rad: float) -> FloatArray:
     return matrix
 
 
-def alarm(before: Drift | None, now: Drift) -> str:
+def alarm(before: SceneDrift | None, now: SceneDrift) -> str:
     """What two looks one after the other name alike, '' if nothing."""
     if before is None or before.named is None or now.named is None:
         return ""

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.calibrate.scene.drift import SceneDrift, ViewShift, find_drift, view_change
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray
-from calib.scene.drift import Drift, ViewShift, find_drift, view_change
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
 from mastctl.packaged import config_folder
 from mastctl.sentinel.folder import Reference, save_reference
 from mastctl.sentinel.look import view_shifts
@@ -137,7 +137,7 @@ class RenderedSite:
         self._stones = moved_stones(self.rng, self._stones)
         return weather_of(self.rng, self.eyes, self._stones, self.hour_rad)
 
-    def seen(self, look: DaysLook) -> tuple[list[ViewShift], Drift]:
+    def seen(self, look: DaysLook) -> tuple[list[ViewShift], SceneDrift]:
         """What the sentinel finds in a look's pictures."""
         shifts = view_shifts(self.believed, self.reference, look.pictures)
         return shifts, find_drift(self.believed, shifts)
@@ -149,7 +149,7 @@ def calm_days(days: int, seed: int, by: int, hour: str) -> int:
     begun_s = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         site: RenderedSite | None = None
-        before: Drift | None = None
+        before: SceneDrift | None = None
         for day in range(days):
             if site is None or day % RENEWED == 0:
                 if site is not None:
@@ -190,7 +190,7 @@ def power(sites: int, seed: int, by: int, hour: str) -> None:
             _progress(f"site {at} of {sites}")
             site = RenderedSite(seed, 500 + at, by, hour, Path(folder))
             cases = provoked(site.rng, site.eyes)
-            before: dict[str, Drift] = {}
+            before: dict[str, SceneDrift] = {}
             found: dict[str, tuple[int, bool]] = {}
             for look in range(LOOKS):
                 open_cases = [case for case in cases if case not in found]

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray, Rigid
-from calib.survey import Sigma, Survey
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.survey.records import Sigma, Survey
 from drivers.sim_survey.blunders import (
     with_bowed_board,
     with_changed_focus,

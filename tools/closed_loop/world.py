@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera.cahvor import CameraModel
 from calib.files.mast_file import load_rig
-from calib.rigid import FloatArray
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import FloatArray
 from drivers.clock import SystemClock
 from drivers.faults import FaultPanel
 from drivers.sim.cameras import CameraSettings, SimulatedCamera

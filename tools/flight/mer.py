@@ -6,7 +6,7 @@ and camera.
 The rule by which features count: at most 400 Shi-Tomasi corners of the first picture (quality 0.02 of
 the best, 25 px apart, 15 px blocks); the corner must lie in the second picture, 25 px from its border,
 for some range from 2 m on; of windows of +-12 px, every 8 px along the epipolar line, with the patch
-laid on level ground or across the ray, the best match counts if `calib.pictures.patch_match` calls it good
+laid on level ground or across the ray, the best match counts if `calib.matching.patch` calls it good
 (texture, correlation, one peak, certainty; its default thresholds) and no other good match more than 5 px
 away comes near it. The windows are free in both directions, so nothing pulls a match to the line and nothing
 sorts out large residuals.
@@ -23,20 +23,20 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.stereo import triangulate
 from calib.files.pds3 import PdsProduct, read_product
-from calib.fit.poses import PoseFit, fit_poses
-from calib.mast.pointing import solve
-from calib.mast.rig import Rig, RigCamera
-from calib.mast.solutions import Solution
-from calib.pictures.epipolar import find_partner
-from calib.pictures.patch_match import match_patch
-from calib.pictures.patch_verdict import MatchSettings, rivalled
-from calib.pictures.warp import Grey, Plane, grey
-from calib.rigid import FloatArray, Rigid
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig, RigCamera
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.geometry.solutions import Solution
+from calib.geometry.stereo import triangulate
+from calib.matching.partner import find_partner
+from calib.matching.patch import match_patch
+from calib.matching.verdict import MatchSettings, rivalled
+from calib.matching.warp import Grey, Plane, grey
 from drivers.clock import ManualClock
 from drivers.replay import Replay, open_replay
+from tools.flight.poses import PoseFit, fit_poses
 
 PRODUCTS = "1N4910*.IMG"
 CAMERA = "navcam_left"

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.difference import model_difference, with_one_lens
-from calib.fit.poses import PoseFit, fit_poses
-from calib.mast.rig import Mast
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.maps import model_difference, with_one_lens
+from calib.geometry.rig import Mast
+from tools.flight.poses import PoseFit, fit_poses
 
 CAMERAS = {"A": ("216", "4"), "B": ("215", "6")}
 """Serial number and calibration source of the two left Navcams' labels."""

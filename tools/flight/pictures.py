@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from calib.rigid import FloatArray
+from calib.geometry.rigid import FloatArray
 from tools.flight import mer
 
 matplotlib.use("Agg")

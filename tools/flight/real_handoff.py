@@ -12,7 +12,7 @@ range, so it is assumed, in two ways:
 - neighbours: the plane through the eight nearest other targets found in the first way, each at the range that
   its own two pixels tell, uncertain by 3 %. A target's own match never tells its range.
 
-The target then goes through `calib.tracking.look.seen_by` with one eye: window by the covariance of the
+The target then goes through `calib.matching.look.seen_by` with one eye: window by the covariance of the
 position, patch warped over the plane, correlation, sub-pixel place, verdict, misfit. Residual: found less
 predicted, in x and y, and across the epipolar line, where an unknown range does not reach.
 
@@ -37,14 +37,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.stereo import triangulate
 from calib.errors import CalibError
-from calib.handoff.by_image import Eye
-from calib.pictures.warp import Plane, carry
-from calib.rigid import FloatArray
-from calib.tracking.look import Look, seen_by
-from calib.tracking.track import Key, Track, TrackSettings
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import FloatArray
+from calib.geometry.stereo import triangulate
+from calib.matching.handoff import Eye
+from calib.matching.look import TrackLook, seen_by
+from calib.matching.track import KeyPicture, Track, TrackSettings
+from calib.matching.warp import Plane, carry
 from drivers.clock import ManualClock
 from tools.arguments import end, new_file
 from tools.campaigns.render_bias import BLUR_PX, GRID_PX, HALF_PX, MARGIN_PX, best_affine
@@ -147,7 +147,9 @@ def carried(
     point = ray.origins_m + range_m * ray.directions
     along = np.outer(ray.directions, ray.directions)
     covariance = (range_sigma * range_m) ** 2 * along + (1e-5 * range_m) ** 2 * np.eye(3)
-    track = Track("tracked", point, covariance, Key(Eye(first.image, first.camera), pixel_px, plane.normal))
+    track = Track(
+        "tracked", point, covariance, KeyPicture(Eye(first.image, first.camera), pixel_px, plane.normal)
+    )
     look = seen_by(track, {"second": Eye(second.image, second.camera)}, SETTINGS)
     predicted, rate, _ = second.camera.project_jacobian(point)
     spread = rate @ covariance @ rate.T + SETTINGS.model_px**2 * np.eye(2)
@@ -160,7 +162,7 @@ def carried(
     )  # fmt: skip
 
 
-def _verdict(look: Look) -> str:
+def _verdict(look: TrackLook) -> str:
     verdict = look.found["second"].verdict
     return "misfit" if verdict == "good" and look.track.state == "lost" else verdict
 

@@ -2,12 +2,12 @@
 
     .venv/bin/python -m tools.flight.scene ../shared/data/mer_navcam
 
-Five frames of one rover pose; three pairs overlap. Features by `calib.scene.features`; what is told is what
-no place of a feature explains, pixels. First all pairs together: as the labels have it, with each rest's
-own two angles free, with the mast's numbers free, with both. Then each pair predicted by a correction that
-the two others alone make (`calib.scene.fit`, its own rule for which terms enter), its own rests as read, for
-joints that are told to repeat to so much. Beside it what is to be expected of a left-out pair: from its
-rests' scatter alone, were the correction exact, and from the correction's own sigmas too.
+Five frames of one rover pose; three pairs overlap. Features by `calib.calibrate.scene.features`; what is told
+is what no place of a feature explains, pixels. First all pairs together: as the labels have it, with each
+rest's own two angles free, with the mast's numbers free, with both. Then each pair predicted by a correction
+that the two others alone make (`calib.calibrate.scene.fit`, its own rule for which terms enter), its own
+rests as read, for joints that are told to repeat to so much. Beside it what is to be expected of a left-out
+pair: from its rests' scatter alone, were the correction exact, and from the correction's own sigmas too.
 """
 
 from __future__ import annotations
@@ -17,15 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.calibrate.scene.features import Feature, find_features
+from calib.calibrate.scene.fit import SceneFit, fit_scene, white_px
+from calib.calibrate.scene.problem import SceneProblem
+from calib.calibrate.scene.terms import SceneView, terms_of
 from calib.errors import NoCorrection
-from calib.mast.rig import Rig
-from calib.pictures.warp import grey
-from calib.rigid import FloatArray
-from calib.scene.features import Feature, find_features
-from calib.scene.fit import SceneFit, fit_scene, white_px
-from calib.scene.problem import SceneProblem
-from calib.scene.terms import terms_of
-from calib.scene.views import View
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.matching.warp import grey
 from drivers.recording import read_products
 from tools.arguments import end
 from tools.flight import mer
@@ -48,7 +47,7 @@ def main() -> int:
     rig = mer.rig(mer.fit(products), products)
     pointings = read_products(sorted(args.folder.glob(mer.PRODUCTS)), mer.CAMERA)
     views = [
-        View(
+        SceneView(
             f"frame {at + 1}", mer.CAMERA, grey(one.frames[mer.CAMERA].image()), one.pan_rad, one.tilt_rad, at
         )
         for at, one in enumerate(pointings)
@@ -70,7 +69,9 @@ def main() -> int:
     return 0
 
 
-def left_with(rig: Rig, views: list[View], features: list[Feature], rests: bool, terms: bool) -> FloatArray:
+def left_with(
+    rig: Rig, views: list[SceneView], features: list[Feature], rests: bool, terms: bool
+) -> FloatArray:
     """What no place explains, px, where the rests' angles, the rig's numbers or both take what they like."""
     names = tuple(name for term in terms_of(rig, views) for name in term.names) if terms else ()
     problem = SceneProblem(rig, views, features, names, LOOSE_RAD if rests else 1e-9)
@@ -80,7 +81,7 @@ def left_with(rig: Rig, views: list[View], features: list[Feature], rests: bool,
 
 
 def predict(
-    rig: Rig, views: list[View], features: list[Feature], pair: tuple[int, ...], told_rad: float
+    rig: Rig, views: list[SceneView], features: list[Feature], pair: tuple[int, ...], told_rad: float
 ) -> None:
     """Print how a pair is predicted by the others."""
     mine = [feature for feature in features if feature.views == pair]

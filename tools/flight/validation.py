@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.camera.difference import ModelDifference, model_difference
 from calib.files.mast_file import save_rig
 from calib.files.pds3 import PdsProduct
-from calib.fit.poses import PoseFit
+from calib.geometry.maps import ModelDifference, model_difference
 from drivers.clock import ManualClock
 from drivers.errors import DriverError
 from tools.arguments import end
 from tools.flight import mer, msl
+from tools.flight.poses import PoseFit
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DOCUMENT = REPOSITORY / "docs" / "evidence" / "validation.md"

@@ -1,6 +1,6 @@
 """Change the code in small ways, drawn at random, and see whether the nearest tests object.
 
-    .venv/bin/python -m tools.mutants calib/mast drivers/flir_ptu/head.py --mutants 40 --seed 1
+    .venv/bin/python -m tools.mutants calib/geometry drivers/flir_ptu/head.py --mutants 40 --seed 1
 
 Each mutant is one change in one line of a copy of the checkout. Of the eight test files nearest to the
 module, those that enter the changed function run against it, the quickest first, until the first failure,

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib.bench.placements import Placement
-from calib.boards import AnyBoard, Corners
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray, Rigid
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.plan.placements import Placement
+from calib.targets.boards import AnyBoard, Corners
 from drivers.sim_survey.survey import rover_from_head
 from mastctl.bench.eyes import Head, Look, Seen
 

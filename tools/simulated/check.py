@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.stereo import triangulate
 from calib.errors import Unreachable
-from calib.mast.pointing import solve
-from calib.mast.rig import Rig
-from calib.mast.solutions import choose
-from calib.rigid import Rigid
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid
+from calib.geometry.solutions import choose
+from calib.geometry.stereo import triangulate
 from drivers.clock import ManualClock
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt
 

@@ -20,8 +20,10 @@ from pathlib import Path
 import numpy as np
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.mast.rig import Rig
-from calib.survey import Sigma, read_survey, write_survey
+from calib.geometry.rig import Rig
+from calib.survey.reader import read_survey
+from calib.survey.records import Sigma
+from calib.survey.writer import write_survey
 from drivers.sim.pan_tilt import PRESETS
 from drivers.sim_survey.survey import Ring, SurveyPlan, simulate_survey
 from mastctl.calibration.run import Calibrated, calibrate, checked_survey

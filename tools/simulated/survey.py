@@ -18,7 +18,8 @@ import numpy as np
 
 from calib.errors import BadFile
 from calib.files.mast_file import load_rig
-from calib.survey import Sigma, Survey, write_survey
+from calib.survey.records import Sigma, Survey
+from calib.survey.writer import write_survey
 from drivers.sim.render import Renderer
 from drivers.sim.scene import build_scene
 from drivers.sim_survey.board import draw_board, photograph

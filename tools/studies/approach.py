@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 
 from calib.files.mast_file import load_rig
-from calib.mast.budget import target_approach_budget
-from calib.rigid import FloatArray
+from calib.geometry.rigid import FloatArray
+from calib.geometry.stereo import target_approach_budget
 from drivers.interfaces import Image
 from mastctl.cli import output
 from mastctl.cli.places import check_folder

@@ -10,16 +10,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError
-from calib.handoff.by_image import Eye
-from calib.mast.pointing import solve
-from calib.mast.rig import Rig
-from calib.pictures.patch_verdict import PatchMatch
-from calib.rigid import FloatArray
-from calib.tracking.look import seen_by
-from calib.tracking.start import start_track
-from calib.tracking.track import Track, moved_track
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.matching.handoff import Eye
+from calib.matching.look import seen_by
+from calib.matching.track import Track, moved_track, start_track
+from calib.matching.verdict import PatchMatch
 from drivers.interfaces import Image
 from drivers.sim.scene import SceneSettings, build_scene
 from mastctl.experiment.targets import texture_mask

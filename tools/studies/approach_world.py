@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.handoff.by_image import Eye
-from calib.mast.rig import Rig
-from calib.pictures.warp import Grey
-from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
+from calib.matching.handoff import Eye
+from calib.matching.warp import Grey
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene
 

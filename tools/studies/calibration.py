@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 from mastctl.cli.experiment_common import tell_report
 from mastctl.cli.output import WrongUse, at_least, print_table
 from mastctl.cli.places import check_folder

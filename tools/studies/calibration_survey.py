@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from calib.adjust.result import Calibration
 from calib.errors import CalibError
-from calib.fit.calibration import Calibration
-from calib.mast.pointing import solve
-from calib.mast.rig import Rig
-from calib.rigid import FloatArray
-from calib.survey import Sigma
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from calib.survey.records import Sigma
 from drivers.sim_survey.survey import SurveyPlan, simulate_survey
 from mastctl.calibration.landing import click, handoff_errors_px, pointing_error_px, seen
 from mastctl.calibration.run import FITS, Method

@@ -8,11 +8,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from calib.handoff.bias import HandoffBias, handoff_bias
-from calib.handoff.by_image import RefinedPixel
-from calib.handoff.geometric import PredictedPixel
-from calib.handoff.matched import MatchedHandoff
-from calib.rigid import FloatArray
+from calib.geometry.handoff import PredictedPixel
+from calib.geometry.rigid import FloatArray
+from calib.matching.handed_over import HandoffBias, MatchedHandoff, handoff_bias
+from calib.matching.handoff import RefinedPixel
 from drivers.interfaces import Image
 from drivers.sim.rover import SimulatedRover
 from mastctl.devices.frames import camera_and_sequence

@@ -16,12 +16,12 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.files.mast_file import parse_rig
-from calib.handoff.by_image import Eye, refine_handoff
-from calib.handoff.geometric import Joints, hand_off
-from calib.handoff.matched import matched_handoff
-from calib.mast.covariance import RigCovariance, stored_covariance
-from calib.mast.rig import Rig
-from calib.pictures.warp import grey
+from calib.geometry.covariance import RigCovariance, stored_covariance
+from calib.geometry.handoff import Joints, hand_off
+from calib.geometry.rig import Rig
+from calib.matching.handed_over import matched_handoff
+from calib.matching.handoff import Eye, refine_handoff
+from calib.matching.warp import grey
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.experiment.pointing import ClickTruth, RunTime
 from mastctl.experiment.targets import VIEWS_PER_TARGET, Target, Views

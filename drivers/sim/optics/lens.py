@@ -16,8 +16,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from calib.camera.cahvor import CameraModel
-from calib.rigid import Rigid
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid
 from drivers.sim.optics.mesh import Float32, Float64, between, nodes, pixels_of
 
 MESH_PX = 8

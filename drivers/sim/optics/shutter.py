@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera.cahvor import CameraModel
-from calib.rigid import Rigid
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid
 from drivers.sim.optics.mesh import Float32, Float64, between, nodes, pixels_of
 
 VIEW_STEP_PX = 0.7

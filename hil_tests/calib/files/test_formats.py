@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.camera.cahvor import CameraModel
 from calib.errors import BadFile
 from calib.files import CameraFile
 from calib.files import mast_file as store
@@ -25,8 +24,9 @@ from calib.files.cahvor_text import (
     save_cahvor,
 )
 from calib.files.pds3 import load_pds3_camera
-from calib.files.strict import Section
 from calib.files.tables import parse_table, read_table, write_table
+from calib.files.yaml_text import Section
+from calib.geometry.cahvor import CameraModel
 from hil_tests.calib.files.test_pds3 import label_bytes
 from hil_tests.calib.files.test_store import CAMERA_TEXT, MAST_TEXT
 

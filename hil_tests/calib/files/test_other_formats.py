@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 import yaml
 
-from calib.camera.cahvor import CameraModel
-from calib.camera.opencv_camera import OpencvCamera
-from calib.camera.twin import twin_error
 from calib.errors import BadFile
 from calib.files import CameraFile
 from calib.files.any_camera import CameraFiles, load_any, save_any
 from calib.files.mast_file import load_rig
-from calib.files.mrcal_model import format_mrcal, parse_mrcal
-from hil_tests.calib.camera.camera_cases import plain
+from calib.files.mrcal_kalibr_colmap import format_mrcal, parse_mrcal
+from calib.files.opencv_camera import OpencvCamera
+from calib.files.twin import twin_error
+from calib.geometry.cahvor import CameraModel
+from hil_tests.calib.geometry.camera_cases import plain
 
 MAST = Path(__file__).parents[3] / "configs" / "masts" / "rocky8_simulated.yaml"
 VECTORS = json.loads((Path(__file__).parent / "mrcal_vectors.json").read_text())
@@ -156,7 +156,7 @@ def test_the_error_that_a_conversion_tells_is_the_error_of_its_file(
     if to not in HELD_POSE:  # both in their own axes then: the rotation was told, not written
         told = done.lost[0].split("columns of ")[1]
         place = done.lost[0].split("at [")[1].split("] m")[0]
-        from calib.rigid import Rigid
+        from calib.geometry.rigid import Rigid
 
         turn, _, other = np.linalg.svd(np.array(json.loads(told)))
         pose = Rigid(turn @ other, np.array(json.loads(f"[{place}]")))

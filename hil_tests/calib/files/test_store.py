@@ -22,7 +22,7 @@ from calib.files import CameraFile
 from calib.files import mast_file as store
 from calib.files.atomic import keep_previous, previous_path, save_bytes
 from calib.files.yaml_text import parse_mapping
-from calib.mast.covariance import moved_rig, stored_covariance
+from calib.geometry.covariance import moved_rig, stored_covariance
 
 # The contract's example, written as a person writes it.
 MAST_TEXT = """\

@@ -10,11 +10,11 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from calib.fit.prisms import adjust_prisms
-from calib.fit.station_poses import station_poses
-from calib.rigid import Rigid
-from calib.survey import Sigma, StationPoint, Survey, read_survey
+from calib.calibrate.starts.station import adjust_prisms, station_poses
+from calib.geometry.rigid import Rigid
 from calib.survey.alignment import NotAligned, align, mirrored, rover_from_station, station_from_board
+from calib.survey.reader import read_survey
+from calib.survey.records import Sigma, StationPoint, Survey
 from hil_tests.calib.survey.survey_case import write_files
 
 PRISMS = np.array([(0.10, -0.25, -0.75), (0.10, 0.25, -0.80), (-0.30, -0.25, -0.90), (-0.30, 0.25, -0.70)])

@@ -7,18 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.boards import Charuco, Corners, DotBoard
 from calib.errors import BadFile
-from calib.survey import (
-    BenchFolder,
-    Sigma,
-    SurveyCamera,
-    SurveyImage,
-    bench_writer,
-    read_survey,
-    write_survey,
-)
+from calib.survey import writer as bench_writer
 from calib.survey.check import check_survey
+from calib.survey.reader import read_survey
+from calib.survey.records import Sigma, SurveyCamera, SurveyImage
+from calib.survey.writer import BenchFolder, write_survey
+from calib.targets.boards import Charuco, Corners, DotBoard
 
 YAML = """\
 schema: mastctl/survey/1

@@ -15,8 +15,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from calib.errors import BadFile
-from calib.survey import Survey, read_survey, write_survey
-from calib.survey.picture_file import spoiled_png
+from calib.survey.folder import spoiled_png
+from calib.survey.reader import read_survey
+from calib.survey.records import Survey
+from calib.survey.writer import write_survey
 from hil_tests.calib.survey.survey_case import CLICKS, DOTS, FILES, IMAGES, write_files
 
 

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
-from calib.survey import Board, Finding, StationPoint, Survey, SurveyImage
+from calib.geometry.rig import Rig
 from calib.survey.check import check_survey
+from calib.survey.records import StationPoint, Survey, SurveyFinding, SurveyImage
+from calib.targets.boards import Board
 from drivers.sim_survey.blunders import with_moved_tape, with_swapped_boards, with_wrong_prism
 from drivers.sim_survey.survey import SurveyPlan, simulate_survey
 
@@ -30,7 +31,7 @@ def good(rig: Rig) -> Survey:
     return simulate_survey(rig, 1)[0]
 
 
-def only(findings: tuple[Finding, ...]) -> Finding:
+def only(findings: tuple[SurveyFinding, ...]) -> SurveyFinding:
     assert len(findings) == 1, [str(finding) for finding in findings]
     return findings[0]
 
@@ -54,7 +55,7 @@ def test_nothing_is_said_about_a_good_survey(rig: Rig, seed: int, rough: bool) -
 
 
 def test_a_finding_reads_as_a_sentence() -> None:
-    finding = Finding("error", "set-up level", "two prisms are measured", "Measure a third")
+    finding = SurveyFinding("error", "set-up level", "two prisms are measured", "Measure a third")
     assert str(finding) == "error: set-up level: two prisms are measured. Measure a third."
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.boards import AprilGrid, Charuco, Checkerboard
-from calib.camera.cahvor import CameraModel
-from calib.rigid import Rigid
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid
+from calib.targets.boards import AprilGrid, Charuco, Checkerboard
 from drivers.errors import BadOptions
 from drivers.sim.bench_boards import INK_DN, PAPER_DN, BenchBoard, BenchBoards, facing
 

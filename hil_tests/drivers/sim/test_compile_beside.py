@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.camera.cahvor import CameraModel
-from calib.rigid import Rigid, rot_z
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid, rot_z
 from drivers.sim import compile_beside
 from drivers.sim.compile_beside import drawing_compiled_beside
 from drivers.sim.compiled import kernels

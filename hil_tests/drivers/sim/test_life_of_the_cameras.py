@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.rigid import Rigid
+from calib.geometry.rigid import Rigid
 from drivers.camera_offset import corrected
 from drivers.clock import ManualClock
 from drivers.errors import BadFrame, BadOptions, NoFreshFrame

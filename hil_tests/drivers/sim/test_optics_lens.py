@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig
-from calib.rigid import Rigid
+from calib.geometry.rigid import Rigid
 from drivers.sim.optics.lens import Lens, LensSettings, disc_kernel, shadow
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import yaml
 
-from calib.camera.cahvor import CameraModel
-from calib.rigid import Rigid, rot_y
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid, rot_y
 from drivers.errors import BadOptions, DriverError
 from drivers.sim.outside_scene import OutsideRenderer, OutsideScene, outside_scene
 from drivers.sim.settings import scene_settings

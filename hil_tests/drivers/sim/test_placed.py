@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.camera.cahvor import CameraModel
 from calib.files.mast_file import load_rig
-from calib.rigid import Rigid
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions
 from drivers.sim.kept_scenes import read, write
 from drivers.sim.placed import check_clear_of

@@ -9,8 +9,8 @@ import numba
 import numpy as np
 import pytest
 
-from calib.camera.cahvor import CameraModel
-from calib.rigid import Rigid
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions
 from drivers.sim import rays as ray_tables
 from drivers.sim import render, texture

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.files.mast_file import load_rig
-from calib.rigid import Rigid, rot_z
+from calib.geometry.rigid import Rigid, rot_z
 from drivers.clock import ManualClock
 from drivers.errors import BadOptions, NoFreshFrame, NoReply
 from drivers.sim.render import Renderer

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.camera.cahvor import CameraModel
-from calib.rigid import Rigid
-from calib.survey import Board
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid
+from calib.targets.boards import Board
 from drivers.sim_survey.board import BoardLook, draw_board, photograph
 
 BOARD = Board(4, 5, 0.08, 0.04, {})

@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
-from calib.rigid import Rigid
-from calib.survey import Sigma, Survey, read_survey, write_survey
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid
+from calib.survey.reader import read_survey
+from calib.survey.records import Sigma, Survey
+from calib.survey.writer import write_survey
 from drivers.sim_survey.blunders import (
     with_moved_tape,
     with_outlier_dots,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig
-from calib.mast.covariance import stored_covariance
+from calib.geometry.covariance import stored_covariance
 from tools.simulated.check import projection_error_px, turned_rover_frame
 
 SAME_PX = 1e-3

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.boards import Charuco
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
-from calib.survey import Sigma
+from calib.geometry.rig import Rig
+from calib.survey.records import Sigma
+from calib.targets.boards import Charuco
 from mastctl.bench.eyes import Eyes, Head
 from mastctl.bench.fitting import fit_in_rover
 from mastctl.bench.folder import Kept, survey_cameras

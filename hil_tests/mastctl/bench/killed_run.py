@@ -7,7 +7,7 @@ from pathlib import Path
 
 from bench_world import corner_bench, run_of
 
-from calib.bench.placements import Placement
+from calib.plan.placements import Placement
 
 
 def main(folder: str, repository: str) -> None:

@@ -15,12 +15,14 @@ from typing import Any
 import pytest
 from bench_world import corner_bench, run_of
 
-from calib.bench.placements import Placement
-from calib.boards import Charuco, save_board
+from calib.calibrate.starts.bench import BenchNotFitted
 from calib.errors import BadFile
-from calib.fit.bench import BenchNotFitted
-from calib.survey import bench_writer, read_survey, write_survey
-from calib.survey.bench_writer import NotWritten
+from calib.plan.placements import Placement
+from calib.survey import writer as bench_writer
+from calib.survey.reader import read_survey
+from calib.survey.writer import NotWritten, write_survey
+from calib.targets.board_file import save_board
+from calib.targets.boards import Charuco
 from drivers.sim_survey.bench import BenchPlan, simulate_bench
 from mastctl.bench.eyes import Interrupted, Look, NoLight
 from mastctl.bench.folder import Kept, looks_of

@@ -11,11 +11,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calib.adjust.result import BenchCalibration
+from calib.calibrate.bench.fit import fit_bench
+from calib.calibrate.bench.problem import BenchOptions
+from calib.calibrate.starts.bench import BenchNotFitted
 from calib.files.mast_file import load_rig, save_rig
-from calib.fit.bench import BenchNotFitted, BenchOptions, fit_bench
-from calib.fit.bench_calibration import BenchCalibration
-from calib.mast.rig import Mast, Rig
-from calib.survey import Survey, read_survey, write_survey
+from calib.geometry.rig import Mast, Rig
+from calib.survey.reader import read_survey
+from calib.survey.records import Survey
+from calib.survey.writer import write_survey
 from drivers.sim_survey.bench import NAVCAMS, BenchCamera, BenchPlan, Placement, simulate_bench
 from mastctl.bench import frame
 from mastctl.bench.fitting import fit_in_rover

@@ -14,15 +14,14 @@ import numpy as np
 import pytest
 from bench_world import corner_bench, one_camera, run_of
 
-from calib.bench.knowledge import Knowledge, Shot
-from calib.bench.placements import Placement
-from calib.bench.workspace import Workspace, pointing
+from calib.calibrate.starts.bench import SomethingChanged
 from calib.errors import CalibError
 from calib.files.mast_file import load_rig
-from calib.fit.bench import SomethingChanged
-from calib.mast.rig import Rig
-from calib.rigid import Rigid
-from calib.survey import read_survey
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid
+from calib.plan.knowledge import BenchShot, Knowledge, Workspace, pointing
+from calib.plan.placements import Placement
+from calib.survey.reader import read_survey
 from mastctl.bench.eyes import Look
 from mastctl.bench.folder import looks_of
 from mastctl.bench.looks import BoardLost
@@ -81,7 +80,7 @@ def test_a_camera_that_cannot_show_the_board_or_has_seen_it_stand_takes_no_pictu
     known, looks, every = run.known, run._looks, tuple(bench.head.rig.cameras)
     bench.stand(Placement(1.3, 0.0, -35.0, (10.0, 0.0)))
     known.take("p1", bench.look(0.0, -0.6))
-    beside, at_it = Shot("p1", 0.7, -0.6, ()), Shot("p1", 0.0, -0.6, ())
+    beside, at_it = BenchShot("p1", 0.7, -0.6, ()), BenchShot("p1", 0.0, -0.6, ())
     navcams, pancams = ({name for name in every if kind in name} for kind in ("nav", "pan"))
     assert run.choice_s() > 0.0
     for shot in (at_it, beside, at_it):

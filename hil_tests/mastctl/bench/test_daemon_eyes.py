@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from calib.bench.placements import Placement
-from calib.boards import Charuco
 from calib.files.mast_file import load_rig, save_rig
-from calib.mast.joints import AxisJoint, Joints
+from calib.geometry.rig import AxisJoint, JointErrors
+from calib.plan.placements import Placement
+from calib.targets.boards import Charuco
 from mastctl.bench import daemon_eyes
 from mastctl.bench.daemon_eyes import DaemonEyes
 from mastctl.bench.eyes import Interrupted, NoLight, NotThere
@@ -65,7 +65,7 @@ def test_a_head_whose_mast_file_has_joints_is_turned_to_the_readings_that_are_wa
 ) -> None:
     config = bench(repository)
     wave = AxisJoint(harmonics_rad=((0.006, 0.0),))
-    rig = replace(load_rig(config.mast_file).rig, joints=Joints(wave, wave))
+    rig = replace(load_rig(config.mast_file).rig, joints=JointErrors(wave, wave))
     save_rig(rig, tmp_path / "waves.yaml")
     config = replace(config, mast_file=tmp_path / "waves.yaml")
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from calib.boards import Charuco
+from calib.targets.boards import Charuco
 from hil_tests import forks
 from hil_tests.waiting import until
 from mastctl.bench import daemon_eyes

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from calib.bench.placements import Placement
+from calib.plan.placements import Placement
 from hil_tests.waiting import until
 from mastctl.bench.lines import LEFT_ALONE, Lines
 from mastctl.bench.teller import Progress

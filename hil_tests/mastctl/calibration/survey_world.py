@@ -10,8 +10,9 @@ from typing import Any
 import yaml
 
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
-from calib.survey import Survey, write_survey
+from calib.geometry.rig import Rig
+from calib.survey.records import Survey
+from calib.survey.writer import write_survey
 from drivers.sim_survey.survey import Ring, SurveyPlan, SurveyTruth, simulate_survey
 
 RIG_FILE = Path(__file__).resolve().parents[3] / "configs" / "sim" / "rocky8.yaml"

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig
-from calib.mast.covariance import stored_covariance
-from calib.survey import write_survey
+from calib.geometry.covariance import stored_covariance
+from calib.survey.writer import write_survey
 from drivers.sim_survey.bench import BenchPlan, Mishap, simulate_bench
 from mastctl.cli.main import main
 

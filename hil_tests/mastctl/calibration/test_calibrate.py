@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.survey import Sigma, read_survey
+from calib.survey.reader import read_survey
+from calib.survey.records import Sigma
 from drivers.sim_survey.board import draw_board, photograph
 from hil_tests.mastctl.calibration.survey_world import edit_yaml, navcam_rig, navcam_survey, write_folder
 from mastctl.calibration.detection import missing, with_dots

@@ -16,10 +16,10 @@ from typing import Any
 
 import pytest
 
+from calib.adjust.result import Calibration
+from calib.calibrate.paper import fit_paper
 from calib.files.mast_file import load_rig, save_rig
-from calib.fit.calibration import Calibration
-from calib.fit.paper import fit_paper
-from calib.survey import read_survey
+from calib.survey.reader import read_survey
 from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey, write_folder
 from mastctl.calibration import detection
 from mastctl.calibration.run import FITS

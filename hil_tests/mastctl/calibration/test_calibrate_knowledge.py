@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.camera.cahvor import CameraModel
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
-from calib.survey import Sigma, SurveyImage
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Rig
+from calib.survey.records import Sigma, SurveyImage
 from drivers.sim_survey.survey import Ring, SurveyPlan, simulate_survey
-from hil_tests.calib.fit.small_surveys import held
+from hil_tests.calib.adjust.small_surveys import held
 from hil_tests.mastctl.calibration.survey_world import edit_yaml, navcam_survey, write_folder
 from mastctl.cli.main import main
 

@@ -11,14 +11,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.camera.parameters import parameter_names
+from calib.calibrate.body import fit_body_pose
 from calib.files import digest_of
 from calib.files.mast_file import load_rig, save_rig
-from calib.handoff.fit_body_pose import fit_body_pose
-from calib.handoff.matched import MatchedHandoff
-from calib.mast.covariance import stored_covariance
-from calib.mast.rig import Rig
-from hil_tests.calib.handoff.handed_over import HAZCAMS, hand_offs, moved_hazcams, plain_rig, targets, vectors
+from calib.geometry.covariance import stored_covariance
+from calib.geometry.parameters import parameter_names
+from calib.geometry.rig import Rig
+from calib.matching.handed_over import MatchedHandoff
+from hil_tests.calib.matching.handed_over import (
+    HAZCAMS,
+    hand_offs,
+    moved_hazcams,
+    plain_rig,
+    targets,
+    vectors,
+)
 from mastctl.calibration.refined import pose_told
 from mastctl.cli.main import main
 from mastctl.handoff.log import HandoffLog

@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.fit.calibration import Calibration, Degenerate, Outlier
-from calib.fit.components import Component
-from calib.fit.joint import fit_joint
-from calib.fit.paper import fit_paper
-from calib.fit.start_values import SurveyNotFitted
-from calib.fit.uncertainty import rig_moved_along
-from calib.survey import Finding, Survey
+from calib.adjust.goodness import Component
+from calib.adjust.outliers import Outlier
+from calib.adjust.result import Calibration, Degenerate
+from calib.adjust.robust import SurveyNotFitted
+from calib.adjust.uncertainty import rig_moved_along
+from calib.calibrate.paper import fit_paper
+from calib.calibrate.survey import fit_joint
+from calib.survey.records import Survey, SurveyFinding
 from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey
 from mastctl.calibration.drawn import boards
 from mastctl.calibration.expected import check_sizes
@@ -91,7 +92,9 @@ def test_the_worst_reason_decides(fitted: tuple[Survey, Calibration]) -> None:
     survey, calibration = fitted
     assert judge_calibration(survey, calibration).grade == "good"
     assert judge_calibration(survey, calibration, undetected=["a"]).grade == "care"
-    warning = Finding("warning", "set-up level, placement mast-1", "its tapes are off", "Measure them again")
+    warning = SurveyFinding(
+        "warning", "set-up level, placement mast-1", "its tapes are off", "Measure them again"
+    )
     assert judge_calibration(survey, calibration, warnings=[warning]).grade == "care"
     tape = replace(warning, tested_again=True)  # as the fit did, and found nothing
     assert judge_calibration(survey, calibration, warnings=[tape]).grade == "good"

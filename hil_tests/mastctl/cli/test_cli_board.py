@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.boards import Charuco, load_board
+from calib.targets.board_file import load_board
+from calib.targets.boards import Charuco
 from mastctl.board_print.sheet import PAPERS_MM, sheet_of
 from mastctl.cli.main import main
 

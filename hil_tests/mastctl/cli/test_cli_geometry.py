@@ -331,7 +331,7 @@ def test_a_defect_is_told_in_one_line(
     def defect(*_: object) -> None:
         raise ZeroDivisionError("made for this test")
 
-    monkeypatch.setattr("calib.mast.budget.target_approach_budget", defect)
+    monkeypatch.setattr("calib.geometry.stereo.target_approach_budget", defect)
     run = Run("budget --json", capsys)
     assert (run.code, json.loads(run.out)["error"]["code"]) == (1, "internal")
 

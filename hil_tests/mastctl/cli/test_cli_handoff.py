@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig
-from calib.mast.pointing import solve
+from calib.geometry.pointing import solve
 from mastctl.cli.main import main
 
 HEAD = ["--pan", "0.1", "--tilt", "-0.55"]

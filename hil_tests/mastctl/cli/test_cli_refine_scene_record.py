@@ -14,14 +14,14 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.camera.cahvor import CameraModel
+from calib.calibrate.scene.features import find_features
+from calib.calibrate.scene.fit import left_px
+from calib.calibrate.scene.terms import SceneView
 from calib.files.mast_file import load_rig, save_rig
-from calib.mast.rig import Rig, RigCamera
-from calib.pictures.warp import grey
-from calib.rigid import Rigid
-from calib.scene.features import find_features
-from calib.scene.fit import left_px
-from calib.scene.views import View
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Rig, RigCamera
+from calib.geometry.rigid import Rigid
+from calib.matching.warp import grey
 from drivers.recorded_frames import read_recording
 from mastctl.cli.main import main
 from mastctl.client import Client
@@ -121,7 +121,7 @@ def test_a_recorded_run_tells_how_the_camera_is_turned_and_predicts_pictures_of_
     rig = load_rig(tmp_path / "new.yaml").rig
     assert rig.provenance["refined"][0]["former_digest"] == renamed.digest
     views = [
-        View(f"{at}", CAMERA, grey(one.frames[CAMERA].image()), one.pan_rad, one.tilt_rad, at)
+        SceneView(f"{at}", CAMERA, grey(one.frames[CAMERA].image()), one.pan_rad, one.tilt_rad, at)
         for at, one in enumerate(read_recording(recorded.other))
     ]
     features = find_features(believed, views)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.camera.cahvor import CameraModel
-from calib.mast.rig import Mast, Rig, RigCamera
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Mast, Rig, RigCamera
 from mastctl.devices.keep_out import TOUCH_RAD
 from mastctl.devices.sun import ROWS, Sun, direction_of, sun_boxes
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.mast.joints import AxisJoint, Joints
+from calib.geometry.rig import AxisJoint, JointErrors
 from drivers.clock import ManualClock
 from drivers.errors import BadOptions
 from drivers.interfaces import AxisMotion, Reading
@@ -35,7 +35,7 @@ def simulated(**more: Any) -> SimulatedPanTilt:
     return SimulatedPanTilt(settings, ManualClock(100.0))
 
 
-TOLD = Joints(AxisJoint(HARMONICS, BACKLASH_RAD), AxisJoint(HARMONICS, BACKLASH_RAD))
+TOLD = JointErrors(AxisJoint(HARMONICS, BACKLASH_RAD), AxisJoint(HARMONICS, BACKLASH_RAD))
 
 
 @dataclass
@@ -43,7 +43,7 @@ class Bench:
     """A simulated head, read as the daemon does."""
 
     head: SimulatedPanTilt
-    joints: Joints = TOLD
+    joints: JointErrors = TOLD
     history: JointHistory = field(init=False)
 
     def __post_init__(self) -> None:
@@ -125,7 +125,7 @@ def test_a_true_rig_with_joints_makes_the_simulated_head_err_by_them() -> None:
     plain = head_settings({"preset": "dynamixel_x"})
     erring = with_joints(plain, TOLD)
     assert (erring.pan.harmonics_rad, erring.tilt.backlash_rad) == (HARMONICS, BACKLASH_RAD)
-    assert with_joints(plain, Joints()) is plain
+    assert with_joints(plain, JointErrors()) is plain
     for more, words in (
         ({"pan_harmonics_rad": HARMONICS}, "one of them"),
         ({"approach_rad": 0.0035}, "take up"),
@@ -135,21 +135,21 @@ def test_a_true_rig_with_joints_makes_the_simulated_head_err_by_them() -> None:
             with_joints(told, TOLD)
 
 
-def rows(*pans: float, joints: Joints | None = None) -> JointHistory:
+def rows(*pans: float, joints: JointErrors | None = None) -> JointHistory:
     made = JointHistory(joints)
     for number, pan in enumerate(pans):
         made.add(Reading(pan, 0.0, False, 1.0 + 0.05 * number))
     return made
 
 
-def approach(*pans: float, joints: Joints | None = None) -> float:
+def approach(*pans: float, joints: JointErrors | None = None) -> float:
     newest = rows(*pans, joints=joints).newest
     assert newest is not None
     return newest.approach[0]
 
 
 def test_the_side_is_not_known_before_the_head_has_gone_through_its_play() -> None:
-    wide = Joints(AxisJoint((), 0.01))
+    wide = JointErrors(AxisJoint((), 0.01))
     assert approach(0.5, joints=wide) == 0.0
     assert approach(0.5, 0.505, joints=wide) == pytest.approx(0.5), "somewhere in the upper half"
     assert approach(0.5, 0.51, joints=wide) == 1.0

@@ -18,7 +18,7 @@ import pytest
 from distributed import LocalCluster
 
 from calib.files.mast_file import load_rig
-from calib.survey import Sigma
+from calib.survey.records import Sigma
 from drivers.sim.pan_tilt import PRESETS
 from drivers.sim_survey.survey import SurveyPlan
 from hil_tests.mastctl.calibration.survey_world import RIG_FILE

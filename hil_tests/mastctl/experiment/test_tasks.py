@@ -20,7 +20,7 @@ import psutil
 import pytest
 
 from calib.files.mast_file import load_rig
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 from hil_tests.mastctl.calibration.survey_world import RIG_FILE
 from hil_tests.mastctl.experiment.toy_tasks import Draw, broken_when_odd, calls, drawn, drawn_or_stuck
 from mastctl.cli.main import main

@@ -12,10 +12,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.files.mast_file import load_rig
-from calib.handoff.matched import MatchedHandoff
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
+from calib.matching.handed_over import MatchedHandoff
 from drivers.clock import ManualClock
-from hil_tests.calib.handoff.handed_over import (
+from hil_tests.calib.matching.handed_over import (
     HAZCAMS,
     hand_offs,
     moved_hazcams,

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from calib.errors import BadFile
-from calib.handoff.geometric import Joints
-from calib.handoff.matched import Landed, MatchedHandoff
+from calib.geometry.handoff import Joints
+from calib.matching.handed_over import Landed, MatchedHandoff
 from mastctl.handoff.log import HandoffLog, line_of, read_log
 
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.camera.stereo import triangulate
 from calib.files.mast_file import StoredRig, load_rig
-from calib.mast.covariance import moved_rig, stored_covariance
-from calib.mast.pointing import solve
-from calib.mast.rig import Rig
-from calib.rigid import Rigid
+from calib.geometry.covariance import moved_rig, stored_covariance
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid
+from calib.geometry.stereo import triangulate
 from mastctl.health.measured import Measured
 from mastctl.packaged import default_config
 

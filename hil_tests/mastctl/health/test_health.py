@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calib.errors import BadFile
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 from drivers.interfaces import COARSE_COUNT_RAD
 from hil_tests.mastctl.health.histories import DAY_S, NOON_S, bumped, pointing, stored_rig
 from hil_tests.mastctl.service_fakes import Hang

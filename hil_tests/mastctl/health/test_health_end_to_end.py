@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.rigid import Rigid, rot_z
+from calib.geometry.rigid import Rigid, rot_z
 from drivers.sim.pan_tilt import PRESETS
 from mastctl.client import Client
 from mastctl.config import Config, load_config

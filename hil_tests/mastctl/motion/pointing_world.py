@@ -15,16 +15,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.mast.rig import Mast, Rig, RigCamera
+from calib.geometry.rig import Mast, Rig, RigCamera
 from drivers.clock import ManualClock
 from drivers.interfaces import Reading
-from hil_tests.calib.pictures.textured_planes import (
-    Edge,
-    Pinhole,
-    TexturedPlane,
-    picture,
-    random_texture,
-)
+from hil_tests.calib.matching.textured_planes import Edge, Pinhole, TexturedPlane, picture, random_texture
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.keep_out import Pair

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.pictures.same_patches import Posed
+from calib.matching.same_patches import Posed
 from tools.campaigns.motion import View, is_lie, taken
 
 NAME = "navcam_left"

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 from hil_tests.mastctl.motion.pointing_world import SIZE_PX, World, click, rig, run, true_camera
 from mastctl.motion.loop import AnglesTarget, PointingError, PointingResult, PointRequest, PositionTarget
 from mastctl.motion.requests import PlaneTarget

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.mast.rig import Rig, RigCamera
+from calib.geometry.rig import Rig, RigCamera
 from drivers.clock import ManualClock
 from drivers.faults import CAMERA_WORDS, HEAD_WORDS
 from drivers.hardware import DeviceSettings, Hardware, HardwareSettings

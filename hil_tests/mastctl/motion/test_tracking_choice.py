@@ -12,22 +12,15 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import CalibError
 from calib.files.mast_file import load_rig
-from calib.handoff.by_image import Eye
-from calib.mast.rig import Rig
-from calib.rigid import Rigid, carried_covariance
-from calib.tracking.track import Key, Track
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid, carried_covariance
+from calib.matching.handoff import Eye
+from calib.matching.track import KeyPicture, Track
 from mastctl.devices.limits import Limits
 from mastctl.errors import MastctlError
 from mastctl.motion.pairs import choose_pairs
 from mastctl.motion.settings import HandoffRules, PairBounds
-from mastctl.motion.track import (
-    HELD_UP_S,
-    Carried,
-    RoverPose,
-    check_follows,
-    motion_between,
-    stands,
-)
+from mastctl.motion.track import HELD_UP_S, Carried, RoverPose, check_follows, motion_between, stands
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +168,9 @@ def test_a_covariance_carried_on_moves_points_as_the_motions_themselves_do() -> 
 
 def test_what_jumped_poses_are_uncertain_by_has_no_variance_below_zero(rig: Rig) -> None:
     """A slip along one direction, turned onto an axis: rounding alone makes -1e-20 of the others' nothing."""
-    key = Key(Eye(np.zeros((48, 64), np.float32), rig.cameras["navcam_left"].model), np.zeros(2), np.ones(3))
+    key = KeyPicture(
+        Eye(np.zeros((48, 64), np.float32), rig.cameras["navcam_left"].model), np.zeros(2), np.ones(3)
+    )
     begun = Carried(Track("tracked", np.array([5.0, 0.5, 0.0]), 1e-4 * np.eye(3), key), pose(0.0))
     for heading in np.arange(0.1, 3.1, 0.1):
         along = np.array([0.0, 0.0, 0.0, math.cos(heading), math.sin(heading), 0.0])

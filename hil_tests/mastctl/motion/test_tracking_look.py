@@ -12,9 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.errors import CalibError
-from calib.mast.rig import Rig
-from calib.rigid import Rigid
-from calib.tracking.track import Track, moved_track
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid
+from calib.matching.track import Track, moved_track
 from drivers.errors import DriverError, NoReply
 from hil_tests.mastctl.motion.pointing_world import LIMITS, SIZE_PX, World, moving_world, rig
 from mastctl.devices.frames import StampedFrame

@@ -15,21 +15,14 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import save_rig
-from calib.handoff.by_image import Eye
-from calib.handoff.geometric import Joints
-from calib.handoff.matched import Landed, MatchedHandoff
-from calib.mast.rig import Mast
-from calib.rigid import Rigid
-from calib.tracking.track import Key, Track
+from calib.geometry.handoff import Joints
+from calib.geometry.rig import Mast
+from calib.geometry.rigid import Rigid
+from calib.matching.handed_over import Landed, MatchedHandoff
+from calib.matching.handoff import Eye
+from calib.matching.track import KeyPicture, Track
 from drivers.errors import NoReply
-from hil_tests.mastctl.service_fakes import (
-    CONFIG,
-    FakeHardware,
-    Hang,
-    ScriptedLoop,
-    fake_daemon,
-    rig,
-)
+from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, Hang, ScriptedLoop, fake_daemon, rig
 from hil_tests.waiting import NET_S, until
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
@@ -57,7 +50,9 @@ class ScriptedLooker:
         with self._steps.step("start"):
             type(self).begin()
         camera = rig().cameras["navcam_left"].model
-        key = Key(Eye(np.zeros((48, 64), np.float32), camera), np.array([32.0, 24.0]), np.array([0.0, 0, -1]))
+        key = KeyPicture(
+            Eye(np.zeros((48, 64), np.float32), camera), np.array([32.0, 24.0]), np.array([0.0, 0, -1])
+        )
         track = Track("tracked", np.array(TARGET_M), 1e-4 * np.eye(3), key)
         return track, seen(track)
 

@@ -13,8 +13,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.mast.rig import Rig, RigCamera
-from calib.rigid import FloatArray, Rigid
+from calib.geometry.rig import Rig, RigCamera
+from calib.geometry.rigid import FloatArray, Rigid
 from hil_tests.waiting import until
 from mastctl.client import Client, ClientError
 from mastctl.config import load_config

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 from hil_tests.mastctl.motion.test_tracking_simulated import ROVER, STEP_M, Drive, begun, cropped, off_m
 from mastctl.client import Client
 from mastctl.config import load_config

@@ -12,7 +12,7 @@ import yaml
 from scipy import stats
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.rigid import tangents
+from calib.geometry.rigid import tangents
 from drivers.sim.placed import check_clear_of
 from drivers.sim.settings import simulation_settings
 from mastctl.cli.main import main

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.mast.rig import Mast, Rig
+from calib.geometry.rig import Mast, Rig
 from hil_tests.mastctl.recorder.recorder_world import CONFIG
 from mastctl.cli.main import main
 from mastctl.client import Client

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 from hil_tests.mastctl.motion.test_tracking_simulated import ROVER, STEP_M, Drive, begun, cropped
 from hil_tests.mastctl.recorder.test_what_if import wrong_mast
 from hil_tests.waiting import until

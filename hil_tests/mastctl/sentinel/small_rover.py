@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.mast.rig import Rig
-from calib.rigid import rot_y
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import rot_y
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
 from tools.campaigns.sentinel import Truth

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from calib.mast.rig import Rig
+from calib.geometry.rig import Rig
 from hil_tests.mastctl.sentinel.small_rover import RESTS, bumped, refocused, slipped, small_rover, truly
 from hil_tests.waiting import until
 from mastctl.cli.main import main

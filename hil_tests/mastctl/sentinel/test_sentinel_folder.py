@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from calib.calibrate.scene.drift import SceneChange, SceneDrift
 from calib.errors import BadFile
-from calib.scene.drift import Change, Drift
 from mastctl.sentinel import folder as folder_module
 from mastctl.sentinel.folder import (
     LOOKS,
@@ -65,7 +65,7 @@ def test_a_reference_comes_back_as_it_was_saved(tmp_path: Path) -> None:
 
 def test_a_new_reference_takes_the_place_of_the_old_one_and_its_looks(tmp_path: Path) -> None:
     first = save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
-    add_look(tmp_path, first, NOW.isoformat(), Drift(2, (), (), None))
+    add_look(tmp_path, first, NOW.isoformat(), SceneDrift(2, (), (), None))
     looks = (tmp_path / LOOKS).read_bytes()
     second = save_reference(tmp_path, "2026-05-02T00:00:00+00:00", RESTS[:1], pictures()[:1])
     assert read_looks(tmp_path, second) == []
@@ -76,9 +76,9 @@ def test_a_new_reference_takes_the_place_of_the_old_one_and_its_looks(tmp_path: 
 
 
 def test_looks_are_added_line_by_line_and_a_torn_one_costs_only_itself(tmp_path: Path) -> None:
-    change = Change("pan slipped", np.array([3e-3]), np.eye(1), 9.0)
+    change = SceneChange("pan slipped", np.array([3e-3]), np.eye(1), 9.0)
     reference = save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
-    drift = Drift(4, ("eye at rest 2",), (change,), change)
+    drift = SceneDrift(4, ("eye at rest 2",), (change,), change)
     add_look(tmp_path, reference, NOW.isoformat(), drift)
     with (tmp_path / LOOKS).open("a") as file:
         file.write('{"time": "2026-0')
@@ -96,7 +96,7 @@ def test_looks_are_added_line_by_line_and_a_torn_one_costs_only_itself(tmp_path:
 def test_lines_that_are_no_looks_are_left_out(row: str, tmp_path: Path) -> None:
     reference = save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
     (tmp_path / LOOKS).write_text(row + "\n")
-    add_look(tmp_path, reference, NOW.isoformat(), Drift(2, (), (), None))
+    add_look(tmp_path, reference, NOW.isoformat(), SceneDrift(2, (), (), None))
     assert len(read_looks(tmp_path, reference)) == 1
     assert findings(tmp_path, "d" * 64)["level"] == "good"
 
@@ -105,7 +105,7 @@ def test_a_disk_that_is_full_costs_the_new_reference_and_not_the_old(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
-    add_look(tmp_path, first, NOW.isoformat(), Drift(2, (), (), None))
+    add_look(tmp_path, first, NOW.isoformat(), SceneDrift(2, (), (), None))
 
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -122,7 +122,7 @@ def test_a_disk_that_is_full_costs_the_new_reference_and_not_the_old(
         assert len(list(tmp_path.glob("pictures-*"))) == 1
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(BadFile, match="No space left on device; the look is not kept"):
-        add_look(tmp_path, first, NOW.isoformat(), Drift(2, (), (), None))
+        add_look(tmp_path, first, NOW.isoformat(), SceneDrift(2, (), (), None))
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.mast.covariance import stored_covariance
-from calib.mast.rig import Mast, RigCamera
+from calib.geometry.covariance import stored_covariance
+from calib.geometry.rig import Mast, RigCamera
 from drivers.errors import NoReply
 from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, ScriptedLoop, rig
 from hil_tests.waiting import NET_S, until

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import save_rig
-from calib.mast.rig import Mast
+from calib.geometry.rig import Mast
 from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, ScriptedLoop, rig
 from hil_tests.waiting import NET_S, joined, until
 from mastctl.client import Client, ClientError

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.camera.cahvor import CameraModel
 from calib.files.mast_file import load_rig
+from calib.geometry.cahvor import CameraModel
 from drivers.errors import BadOptions
 from drivers.hardware import DeviceSettings
 from hil_tests.waiting import until

@@ -1,0 +1,333 @@
+"""What changed while a bench's pictures were taken: a board, a joint, a camera, from some picture on.
+
+For every picture after which something may have changed, the fit is asked what it would gain if it had: the
+board of the placement stood elsewhere from there on (six numbers), pan or tilt read otherwise (one), a camera
+had another focal length (one) or looked elsewhere in the head (three). Near the fit the problem is linear, so
+that the gains follow from sums over pictures and no further fit is made (score tests). Of changes that
+explain the same, that with the fewest numbers is told. A pan that slips between two placements is seen by
+nothing and does no harm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.adjust.adjustment import Adjustment, Estimate, bounded_weights
+from calib.adjust.goodness import goodness
+from calib.adjust.significance import chance
+from calib.adjust.solver import covariance_of
+from calib.adjust.terms import ImageTerm
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import FloatArray, Rigid, moved_rigid
+
+UNLIKELY = 1e-7
+"""A change is told if so large a gain, were it none, had less than this chance over all that were tried."""
+
+AS_GOOD = 0.98
+"""A change with fewer numbers is preferred if it gains this part of the best one's."""
+
+LEAST_PART = 0.01
+"""A board or camera that moved explains at least this part of the weighted sum of squares: less is the
+model's."""
+
+STILL_FAR = 9.0
+"""Chi-square over its degrees of freedom that a cause leaves at most, or it explains half of it at least."""
+
+SIDE = 2
+"""Pictures at least on either side of a change, at different standstills: one is a blunder."""
+
+UNSEEN = 1e-3
+"""A direction of a change is not looked at if the other unknowns take up all but this part of it."""
+
+LARGEST = 0.5
+"""Radians, or part of the focal length: what is larger is no slip, knock or other focus."""
+
+STEP = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class BenchChange:
+    """Something that changed between two pictures.
+
+    Attributes
+    ----------
+    what
+        ``board``, ``pan``, ``tilt``, ``focus`` or ``knock``.
+    board, camera
+        Whose, where it is one's.
+    before, after
+        Names of the pictures between which it changed.
+    step
+        What it changed by, about: turn and shift of the board (6), radians (1) of a joint, a part of the
+        focal length (1), turn of the camera (3).
+    chi2
+        What it explains of the weighted sum of squares.
+    sure
+        Whether little would be left then; else only another fit tells, for far from it nothing is linear.
+    """
+
+    what: str
+    board: tuple[str, str] | None
+    camera: str
+    before: str
+    after: str
+    step: FloatArray
+    chi2: float
+    sure: bool = True
+
+    @property
+    def sentence(self) -> str:
+        """The change in words, and what to do."""
+        between = f"between pictures {self.before} and {self.after}"
+        if self.board is not None:
+            turn, shift = np.linalg.norm(self.step[:3]), np.linalg.norm(self.step[3:])
+            return (
+                f"board {self.board[0]} moved during placement {self.board[1]}, {between}, by about "
+                f"{_milli(shift)} mm and {_milli(turn)} mrad"
+            )
+        size = float(np.linalg.norm(self.step))
+        if self.what in ("pan", "tilt"):
+            return (
+                f"{self.what} slipped by about {_milli(size)} mrad {between}: the head no longer points "
+                "where it read before; tighten what holds it on its axis and take the pictures again"
+            )
+        if self.what == "focus":
+            return (
+                f"camera {self.camera} was refocused {between}: its focal length changed by about "
+                f"{100 * size:.2f} %; fix the lens and take the pictures again"
+            )
+        return (
+            f"camera {self.camera} was knocked {between}: it turned by about {_milli(size)} mrad in its "
+            "mount; fasten it and take the pictures again"
+        )
+
+
+def _milli(size: float | np.floating) -> str:
+    """A size in thousandths, with two digits at least."""
+    return f"{1e3 * size:.1f}" if 1e3 * size >= 1.0 else f"{1e3 * size:.2g}"
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """One image's weighted residuals (m,), Jacobian (m, k) on columns (k,), and rates (m, e) by what may
+    change."""
+
+    image: ImageTerm
+    residual: FloatArray
+    jacobian: FloatArray
+    columns: np.ndarray
+    rates: dict[str, FloatArray]
+
+
+def find_change(problem: Adjustment, state: Estimate) -> BenchChange | None:
+    """Return the change that explains most, or None if none is significant.
+
+    Parameters
+    ----------
+    problem, state
+        A fit with pulls bounded.
+    """
+    rows = [rows_of(problem, state, image) for image in problem.images if image.keep.any()]
+    # Of this very state: what is left of a change that others nearly take up is a small difference.
+    chi2, matrix, gradient = problem.normal(state)
+    covariance = covariance_of(matrix, problem.weak)
+    # Where the fit has not quite settled, what its last step would still do is none of the change's.
+    settling = covariance @ gradient
+    found: list[BenchChange] = []
+    count = 0
+    for what, board, camera, mine in _subjects(problem, state, rows):
+        changes = _tried(what, board, camera, mine, covariance, settling)
+        count += len(changes)
+        found += [change for change in changes if change.chi2 < chi2]
+    if not found:
+        return None
+    most = max(change.chi2 for change in found)
+    as_good = [c for c in found if c.chi2 >= AS_GOOD * most]
+    best = min(as_good, key=lambda c: (len(c.step), -c.chi2))
+    _, freedom = goodness(problem, state, covariance)
+    scale = max((chi2 - best.chi2) / max(freedom, 1.0), 0.1)
+    sure = scale <= STILL_FAR or best.chi2 >= 0.5 * chi2
+    if not sure and best.what in ("focus", "knock"):  # it is the model that is wrong
+        return None
+    if best.what in ("pan", "tilt"):
+        scale = max(scale, scatter(reading_rows(problem, state, rows), best.what, covariance, best.chi2))
+    if chance(best.chi2, len(best.step), scale, max(freedom, 1.0)) * count > UNLIKELY:
+        return None
+    if len(best.step) > 1 and best.chi2 < LEAST_PART * chi2:
+        return None
+    return replace(best, sure=sure)
+
+
+def _subjects(
+    problem: Adjustment, state: Estimate, rows: Sequence[Rows]
+) -> Iterator[tuple[str, tuple[str, str] | None, str, list[Rows]]]:
+    """What may have changed: its name, board, camera, and the images that would show it."""
+    for board in dict.fromkeys(r.image.board for r in rows):
+        if board not in problem.held:
+            yield "board", board, "", [r for r in rows if r.image.board == board]
+    readings = reading_rows(problem, state, rows)
+    for axis in ("pan", "tilt"):
+        yield axis, None, "", readings
+    for camera in dict.fromkeys(r.image.camera for r in rows):
+        mine = [r for r in rows if r.image.camera == camera]
+        for what in ("focus", "knock"):
+            yield what, None, camera, mine
+
+
+def _tried(
+    what: str,
+    board: tuple[str, str] | None,
+    camera: str,
+    rows: Sequence[Rows],
+    covariance: FloatArray,
+    settling: FloatArray,
+) -> list[BenchChange]:
+    """The gain of every picture from which something may have changed."""
+    size = rows[0].rates[what].shape[1]
+    found = []
+    own, pull = np.zeros((size, size)), np.zeros(size)
+    shared = np.zeros((size, len(covariance)))
+    for index in range(len(rows) - 1, 0, -1):
+        row, before = rows[index], rows[index - 1]
+        rates = row.rates[what]
+        own += rates.T @ rates
+        pull += rates.T @ row.residual
+        shared[:, row.columns] += rates.T @ row.jacobian
+        if _same_standstill(before.image, row.image):
+            continue
+        if min(_standstills(rows[:index]), _standstills(rows[index:])) < SIDE:
+            continue
+        left = own - shared @ covariance @ shared.T
+        gain, step = gain_of(left, own, pull - shared @ settling)
+        if what != "board" and np.linalg.norm(step) > LARGEST:
+            continue
+        found.append(BenchChange(what, board, camera, before.image.name, row.image.name, step, gain))
+    return found
+
+
+def gain_of(left: FloatArray, own: FloatArray, pull: FloatArray) -> tuple[float, FloatArray]:
+    """Return what numbers (k,) explain, and their values, without directions that the other unknowns take up.
+
+    ``own`` and ``left`` (k, k) are their normal equations without and with the other unknowns giving way,
+    ``pull`` (k,) is their gradient.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(own), 1e-300))
+    if not np.isfinite(left).all() or not np.isfinite(pull).all():
+        return 0.0, np.zeros(len(pull))
+    values, vectors = np.linalg.eigh(left * np.outer(scale, scale))
+    seen = values > UNSEEN
+    along = vectors.T @ (scale * pull)
+    gain = float(np.sum(along[seen] ** 2 / values[seen]))
+    step = -scale * (vectors[:, seen] @ (along[seen] / values[seen]))
+    return gain, np.asarray(step)
+
+
+def _same_standstill(one: ImageTerm, other: ImageTerm) -> bool:
+    if one.attitude is None or other.attitude is None:
+        return False
+    return one.attitude == other.attitude
+
+
+def _standstills(rows: Sequence[Rows]) -> int:
+    return len({r.image.name if r.image.attitude is None else r.image.attitude for r in rows})
+
+
+def rows_of(problem: Adjustment, state: Estimate, image: ImageTerm) -> Rows:
+    """Return one image as the fit weighs it."""
+    block = problem.image_block(state, image)
+    weight = np.sqrt(bounded_weights(block.residual, 2, problem.huber))
+    rates: dict[str, FloatArray] = {}
+    if image.board not in problem.held:
+        rates["board"] = block.jacobian[:, -6:]  # a board's pose comes last
+    if image.attitude is not None:
+        both = reading_rates(problem, state, image)
+        rates["pan"], rates["tilt"] = both[:, :1], both[:, 1:]
+    camera = state.cameras[image.camera]
+    rates["focus"] = _difference(
+        problem, state, _with(state, image, zoomed(camera, STEP)), image, block.residual
+    )[:, None]
+    turned = [
+        _difference(problem, state, _with(state, image, _turned(camera, STEP * axis)), image, block.residual)
+        for axis in np.eye(3)
+    ]
+    rates["knock"] = np.stack(turned, axis=1)
+    return Rows(
+        image,
+        weight * block.residual,
+        weight[:, None] * block.jacobian,
+        block.columns,
+        {what: weight[:, None] * rate for what, rate in rates.items()},
+    )
+
+
+def reading_rows(problem: Adjustment, state: Estimate, rows: Sequence[Rows]) -> list[Rows]:
+    """Return the rows of head images that show what the joints read.
+
+    Where readings have a sigma it is that measurement which changes, and images only tell where the head
+    was: sharp ones leave of a reading's rates in pixels next to nothing that no other unknown takes up. The
+    first image of a standstill has the reading then, and the others have no rows.
+    """
+    on_head = [row for row in rows if row.image.attitude is not None]
+    if problem.joint_rad == 0.0:
+        return on_head
+    blocks = {what: block for what, block in problem.known(state) if what.startswith("attitude ")}
+    found = []
+    for row in on_head:
+        block = blocks.pop(f"attitude {row.image.attitude}", None)
+        columns = problem.at(("attitude", row.image.attitude))
+        residual = np.zeros(0) if block is None else block.residual
+        jacobian = np.zeros((0, 2)) if block is None else block.jacobian
+        rates = {"pan": -jacobian[:, :1], "tilt": -jacobian[:, 1:]}
+        found.append(Rows(row.image, residual, jacobian, columns, rates))
+    return found
+
+
+def scatter(readings: Sequence[Rows], axis: str, covariance: FloatArray, gain: float) -> float:
+    """Return how much larger the squares of a joint's readings are than their sigma allows, less a gain.
+
+    A joint whose readings scatter more than stated, by a play that nobody knew of, has not slipped.
+    """
+    squares = redundancy = 0.0
+    for row in readings:
+        rates = row.rates[axis]
+        size = float(np.sum(rates**2))
+        if size:
+            taken = row.jacobian @ covariance[np.ix_(row.columns, row.columns)] @ row.jacobian.T
+            squares += float((rates.T @ row.residual)[0] ** 2) / size
+            redundancy += 1.0 - float((rates.T @ taken @ rates)[0, 0]) / size
+    return (squares - gain) / max(redundancy - 1.0, 1.0)
+
+
+def reading_rates(problem: Adjustment, state: Estimate, image: ImageTerm) -> FloatArray:
+    """Return how the residuals of a head image change with what pan and tilt read, (m, 2), sigmas a
+    radian."""
+    here = problem.image_residual(state, image)
+    moved = (replace(image, pan_rad=image.pan_rad + STEP), replace(image, tilt_rad=image.tilt_rad + STEP))
+    return np.stack([_difference(problem, state, state, one, here) for one in moved], axis=1)
+
+
+def _difference(
+    problem: Adjustment, state: Estimate, moved: Estimate, image: ImageTerm, residual: FloatArray
+) -> FloatArray:
+    """How residuals change with something that was moved by a small step."""
+    return np.asarray((problem.image_residual(moved, image) - residual) / STEP)
+
+
+def _with(state: Estimate, image: ImageTerm, camera: CameraModel) -> Estimate:
+    return replace(state, cameras={**state.cameras, image.camera: camera})
+
+
+def zoomed(camera: CameraModel, part: float) -> CameraModel:
+    """Return the camera with a focal length larger by a part of it."""
+    axis = camera.A
+    h, v = camera.H @ axis * axis, camera.V @ axis * axis
+    return replace(camera, H=h + (1 + part) * (camera.H - h), V=v + (1 + part) * (camera.V - v))
+
+
+def _turned(camera: CameraModel, turn: FloatArray) -> CameraModel:
+    """The camera turned about C."""
+    pose = moved_rigid(Rigid.identity(), np.concatenate([turn, np.zeros(3)]))
+    return camera.moved(Rigid(pose.rotation, camera.C - pose.rotation @ camera.C))

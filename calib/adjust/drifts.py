@@ -1,0 +1,158 @@
+"""What a bench's fit is tested for: joints and cameras that drift, and what each placement says of the rest.
+
+Near the fit the problem is linear: what a drift would gain is a score test, as a change from one picture on
+is (``calib.adjust.changes``); what the pictures of a placement say of cameras, axes and joints is held
+against what the others say of these (``calib.adjust.left_out``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.adjust.adjustment import Adjustment, Estimate, ResidualBlock
+from calib.adjust.changes import Rows, gain_of, reading_rows, rows_of, scatter
+from calib.adjust.goodness import goodness
+from calib.adjust.left_out import left_out
+from calib.adjust.significance import chance
+from calib.adjust.solver import covariance_of
+from calib.geometry.rigid import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class BenchDrift:
+    """Something that went on changing, from the first picture to the last.
+
+    Attributes
+    ----------
+    what
+        ``pan``, ``tilt``, or a camera's name.
+    step
+        By how much in all: radians (1) of a joint; of a camera a part of the focal length and its turn (4).
+    chi2
+        What it explains of the weighted sum of squares.
+    chance
+        Of so large a gain without any, all that were asked counted.
+    moves_px
+        Rms over the corners concerned of what it moves them by.
+    """
+
+    what: str
+    step: FloatArray
+    chi2: float
+    chance: float
+    moves_px: float
+
+    @property
+    def sentence(self) -> str:
+        """The drift in words, and what to do."""
+        if self.what in ("pan", "tilt"):
+            return (
+                f"{self.what} drifts off its reading, by {1e3 * self.step[0]:+.2f} mrad from the first "
+                "picture to the last: a mount or an encoder creeps; fasten it and take the pictures again"
+            )
+        return (
+            f"camera {self.what} drifts from the first picture to the last: its focal length changes by "
+            f"{100 * self.step[0]:+.3f} %, and it turns by {1e3 * np.linalg.norm(self.step[1:]):.2f} mrad; "
+            "let it warm up, fasten it, and take the pictures again"
+        )
+
+
+def find_drifts(problem: Adjustment, state: Estimate) -> tuple[BenchDrift, ...]:
+    """Return how far each joint and each camera drifts, the least likely first.
+
+    Parameters
+    ----------
+    problem, state
+        A fit at its minimum.
+    """
+    rows = [rows_of(problem, state, image) for image in problem.images if image.keep.any()]
+    passed = {row.image.name: k / max(len(rows) - 1, 1) for k, row in enumerate(rows)}
+    chi2, matrix, gradient = problem.normal(state)
+    covariance = covariance_of(matrix, problem.weak)
+    settling = covariance @ gradient
+    _, freedom = goodness(problem, state, covariance)
+    on_head = [row for row in rows if row.image.attitude is not None]
+    readings = reading_rows(problem, state, rows)
+    asked: list[tuple[str, tuple[str, ...], list[Rows], list[Rows]]] = []
+    if on_head:
+        asked += [("pan", ("pan",), on_head, readings), ("tilt", ("tilt",), on_head, readings)]
+    for camera in dict.fromkeys(row.image.camera for row in rows):  # one may have no picture left
+        mine = [row for row in rows if row.image.camera == camera]
+        asked.append((camera, ("focus", "knock"), mine, mine))
+    found = []
+    for what, names, moving, measured in asked:
+
+        def drifting(row: Rows, names: tuple[str, ...] = names) -> FloatArray:
+            return np.asarray(passed[row.image.name] * np.hstack([row.rates[name] for name in names]))
+
+        size = drifting(measured[0]).shape[1]
+        own, pull, shared = np.zeros((size, size)), np.zeros(size), np.zeros((size, len(covariance)))
+        for row in measured:
+            rates = drifting(row)
+            own += rates.T @ rates
+            pull += rates.T @ row.residual
+            shared[:, row.columns] += rates.T @ row.jacobian
+        gain, step = gain_of(own - shared @ covariance @ shared.T, own, pull - shared @ settling)
+        scale = max((chi2 - gain) / max(freedom, 1.0), 0.1)
+        if what in ("pan", "tilt"):
+            scale = max(scale, scatter(readings, what, covariance, gain))
+        likely = chance(gain, size, scale, max(freedom, 1.0))
+        off_px = [drifting(row) @ step * np.repeat(row.image.sigma_px[row.image.keep], 2) for row in moving]
+        moves_px = float(np.sqrt(np.mean(np.concatenate(off_px) ** 2)))
+        found.append(BenchDrift(what, step, gain, min(1.0, len(asked) * likely), moves_px))
+    return tuple(sorted(found, key=lambda drift: drift.chance))
+
+
+@dataclass(frozen=True)
+class OtherPlacements:
+    """A placement held against the others: chi-square of what its pictures and theirs say of ``freedom``
+    numbers that they share, and its chance if all is right, all placements counted."""
+
+    board: tuple[str, str]
+    chi2: float
+    freedom: int
+    chance: float
+
+    @property
+    def sentence(self) -> str:
+        """What contradicts the others, and what to do."""
+        return (
+            f"placement {self.board[1]} of board {self.board[0]} contradicts the others: its pictures say "
+            f"something else of cameras, axes and joints (chi-square {self.chi2:.0f} for {self.freedom} "
+            "numbers); see that it is the same board and that nothing changed in between, and put it up "
+            "there once more"
+        )
+
+
+def by_other_placements(problem: Adjustment, state: Estimate) -> tuple[OtherPlacements, ...]:
+    """Return each placement held against the others, the least likely first; none if there is but one.
+
+    Parameters
+    ----------
+    problem, state
+        A fit at its minimum.
+    """
+    chi2, matrix, _ = problem.normal(state)
+    covariance = covariance_of(matrix, problem.weak)
+    _, freedom = goodness(problem, state, covariance)
+    images = [image for image in problem.images if image.keep.any()]
+    boards = list(dict.fromkeys(image.board for image in images))
+    found = []
+    for board in boards if len(boards) > 1 else ():
+        blocks = [problem.image_block(state, image) for image in images if image.board == board]
+        columns = np.unique(np.concatenate([block.columns for block in blocks]))
+        residual = np.concatenate([block.residual for block in blocks])
+        jacobian = np.zeros((len(residual), len(columns)))
+        first = 0
+        for block in blocks:
+            last = first + len(block.residual)
+            jacobian[first:last, np.searchsorted(columns, block.columns)] = block.jacobian
+            first = last
+        every = ResidualBlock(residual, jacobian, columns, 2)
+        keep = np.ones(len(jacobian) // 2, dtype=bool)
+        pull, numbers = left_out(every, covariance[np.ix_(columns, columns)], keep, problem.huber).pull()
+        likely = chance(pull, numbers, chi2 / max(freedom, 1.0), max(freedom, 1.0))
+        found.append(OtherPlacements(board, pull, numbers, min(1.0, len(boards) * likely)))
+    return tuple(sorted(found, key=lambda one: one.chance))

@@ -1,0 +1,183 @@
+"""Variance components: how large the errors of each kind of measurement are, against its stated sigma.
+
+Kinds of measurements are compared with one another by the fit itself: each has its part of the redundancy,
+n - tr(JᵀJ C), which is what its squared residuals (in sigmas) should sum up to. Their quotient is the
+variance component (Foerstner 1979); iterated by fitting again with the sigmas that it gives, it is Helmert's
+estimate and that of restricted maximum likelihood. Its covariance is 2 H⁻¹ with Helmert's matrix
+
+    h_ii = n_i - 2 tr(C N_i) + tr(C N_i C N_i),    h_ij = tr(C N_i C N_j),    N_i = J_iᵀJ_i.
+
+So a few hundred points of a station are judged by themselves, and not drowned by ten thousand dots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtr, chdtrc, fdtrc
+
+from calib.adjust.adjustment import KNOWN_BEFOREHAND, Adjustment, Estimate, ResidualBlock
+from calib.adjust.terms import DRAWING, JOINTS, PRISMS, TAPES, ImageTerm, StationTerm
+from calib.geometry.rigid import FloatArray
+
+FEWEST = 3.0
+"""With less redundancy than this, nothing is said of a kind of measurement."""
+
+RARELY = 0.001
+"""A stated sigma is wrong if chance makes residuals so large, or so small, in fewer than so many surveys, all
+kinds together."""
+
+LEAST = 0.1
+"""A sigma is narrowed to this part of the stated one at most: what is smaller still is no noise."""
+
+STAYS = 20.0
+"""What was called wrong stays so up to a chance so many times larger."""
+
+APART = 0.001
+"""Tapes and prisms are one instrument's, unless chance makes them differ so seldom."""
+
+_KNOWN = {"attitude": JOINTS, "prism": DRAWING}
+
+
+@dataclass(frozen=True)
+class Component:
+    """How large the errors of one kind of measurement are.
+
+    Attributes
+    ----------
+    kind
+        ``dots of CAMERA``, ``tapes``, ``prisms``, ``joint readings`` or ``drawing`` (of the prisms).
+    count, redundancy
+        How many numbers were measured, and how many of them check the others.
+    factor, factor_sigma
+        Sigma found over sigma stated, and how sure that is.
+    weighed
+        What the stated sigma was multiplied by for the fit: 1 where the factor is no more than luck.
+    chance, small_chance
+        Of residuals as large, and as small, were the stated sigma right.
+    """
+
+    kind: str
+    count: int
+    redundancy: float
+    factor: float
+    factor_sigma: float
+    weighed: float
+    chance: float
+    small_chance: float = 1.0
+
+    @property
+    def wrong(self) -> bool:
+        """Whether the stated sigma is too small."""
+        return self.weighed > 1.0
+
+    @property
+    def generous(self) -> bool:
+        """Whether the stated sigma is too large."""
+        return self.weighed < 1.0
+
+
+def kind_of(what: ImageTerm | StationTerm | str) -> str | None:
+    """Return the kind of a group of residuals; None for what is no measurement."""
+    return _KNOWN.get(what.split()[0]) if isinstance(what, str) else what.kind
+
+
+def variance_components(
+    blocks: Iterable[tuple[ImageTerm | StationTerm | str, ResidualBlock]],
+    covariance: FloatArray,
+    weighed: Mapping[str, float] | None = None,
+) -> tuple[Component, ...]:
+    """Return the variance components of a fit at its minimum.
+
+    Parameters
+    ----------
+    blocks
+        Residuals in sigmas, and their Jacobians, of all that was measured.
+    covariance
+        (p, p) of the unknowns, the inverse of all the blocks' normal equations.
+    weighed
+        By what the stated sigma of a kind was multiplied before: residuals are in sigmas of that size.
+    """
+    before = weighed or {}
+    size = len(covariance)
+    squares: dict[str, float] = {}
+    counts: dict[str, int] = {}
+    normals: dict[str, FloatArray] = {}
+    for what, block in blocks:
+        kind = kind_of(what)
+        if kind is None:
+            continue
+        matrix = normals.setdefault(kind, np.zeros((size, size)))
+        matrix[np.ix_(block.columns, block.columns)] += block.jacobian.T @ block.jacobian
+        squares[kind] = squares.get(kind, 0.0) + float(block.residual @ block.residual)
+        counts[kind] = counts.get(kind, 0) + len(block.residual)
+    kinds = list(normals)
+    taken = [covariance @ normals[kind] for kind in kinds]
+    helmert = np.array([[float(np.sum(one * other.T)) for other in taken] for one in taken])
+    paid = np.array([np.trace(one) for one in taken])
+    count = np.array([counts[kind] for kind in kinds], dtype=np.float64)
+    helmert[np.diag_indices(len(kinds))] += count - 2 * paid
+    redundancy = count - paid
+    spread = 2 * np.diag(np.linalg.pinv(helmert)) if kinds else np.zeros(0)
+    found = []
+    for index, kind in enumerate(kinds):
+        told, r = before.get(kind, 1.0), float(redundancy[index])
+        if r < FEWEST:
+            found.append(Component(kind, counts[kind], r, float("nan"), float("nan"), told, 1.0))
+            continue
+        factor = float(np.sqrt(squares[kind] / r)) * told
+        sigma = factor * float(np.sqrt(spread[index])) / 2
+        square = squares[kind] * told**2
+        found.append(
+            Component(
+                kind, counts[kind], r, factor, sigma, told, float(chdtrc(r, square)), float(chdtr(r, square))
+            )
+        )
+    return tuple(found)
+
+
+def found_sigmas(components: Sequence[Component], *, narrows: bool = True) -> dict[str, float]:
+    """Return by kind what a stated sigma should be multiplied by.
+
+    Luck changes none: a kind is widened, or narrowed, where chance does not explain its residuals; one that
+    was before stays so a little longer, so that none comes and goes. Tapes and prisms are taken together
+    where they agree. Without ``narrows`` no sigma becomes smaller than stated.
+    """
+    told = [c for c in components if np.isfinite(c.factor)]
+    found = {c.kind: c.factor for c in told}
+    limit = {c.kind: (STAYS if c.weighed != 1.0 else 1.0) * RARELY / len(told) for c in told}
+    odd = {c.kind: 2 * min(c.chance, c.small_chance) if narrows else c.chance for c in told}
+    wrong = {kind for kind, chance in odd.items() if chance < limit[kind]}
+    station = {c.kind: c for c in told if c.kind in (TAPES, PRISMS)}
+    if len(station) == 2 and wrong & set(station) and as_one(station[TAPES], station[PRISMS]):
+        square = sum(c.redundancy * c.factor**2 for c in station.values())
+        together = float(np.sqrt(square / sum(c.redundancy for c in station.values())))
+        found |= dict.fromkeys(station, together)
+        wrong |= set(station)
+    return {kind: max(LEAST, factor) if kind in wrong else 1.0 for kind, factor in found.items()}
+
+
+def as_one(one: Component, other: Component) -> bool:
+    """Return whether two kinds may have one sigma."""
+    ratio = (one.factor / other.factor) ** 2
+    above = float(fdtrc(one.redundancy, other.redundancy, ratio))
+    return 2 * min(above, 1 - above) > APART
+
+
+def goodness(problem: Adjustment, state: Estimate, covariance: FloatArray) -> tuple[float, float]:
+    """Return the weighted sum of squares of all measurements and its degrees of freedom.
+
+    What is known of lenses beforehand counts as information but not as a measurement: the unknowns cost
+    only as many degrees of freedom as the measurements have paid for, tr(JᵀJ C).
+    """
+    total, count, paid = 0.0, 0, 0.0
+    for what, block in problem.blocks(state):
+        if isinstance(what, str) and what.startswith(KNOWN_BEFOREHAND):
+            continue
+        total += float(block.residual @ block.residual)
+        count += len(block.residual)
+        mine = covariance[np.ix_(block.columns, block.columns)]
+        paid += float(np.einsum("ik,kl,il->", block.jacobian, mine, block.jacobian))
+    return total, count - paid

@@ -1,0 +1,318 @@
+"""Which measurements cannot belong to the rest: explicit tests of standardised residuals.
+
+A measurement with residual r (in sigmas) and Jacobian J has, if all is right, cov(r) = I - J C Jᵀ (I + J C Jᵀ
+where it was not fitted), C being the covariance of the unknowns; rᵀ cov(r)⁻¹ r is chi-square. Limits are set
+so that one survey in a hundred without blunders loses any dot, or any tape or prism, and one in ten thousand
+any image.
+
+A whole image is judged by all its dots at once, against what the other measurements predict of it: the error
+of that prediction moves the dots together, and counts once. The statistic is what the sum of squares falls by
+if the image is left out, whether it was fitted or not, so that every image is asked again whenever the fit
+has changed. Stated sigmas may be too small: the typical dot and the typical station point then say by how
+much, and limits widen with them. Blunders hide one another, so the worst goes first and the fit is done
+again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.special import chdtri
+
+from calib.adjust.adjustment import Adjustment, Estimate
+from calib.adjust.left_out import REDUNDANT, LeftOut, dot_statistics, left_out
+from calib.adjust.terms import ImageTerm, StationTerm
+from calib.geometry.rigid import FloatArray, moved_rigid
+
+
+@dataclass(frozen=True, eq=False)
+class Outlier:
+    """A measurement that was not used, and the test it failed.
+
+    Attributes
+    ----------
+    kind
+        What it is.
+    name
+        Which one: ``image navcam_left-012``, ``image navcam_left-012 dot (row 3, column 4)``,
+        ``tape b of placement far-2 (set-up level)``, ``prism p3 of set-up level``.
+    statistic, limit
+        Sum of squares of its standardised residuals, and what it was allowed to be: at the stated rate of
+        false alarms, wider where the typical measurement is farther off than its sigma says. Not-a-number
+        for an image that was left out with its board's tapes.
+    size
+        How far off it is: pixels (rms over an image) or metres. Not-a-number for an image whose board,
+        as it is named, the camera cannot see.
+    """
+
+    kind: Literal["dot", "image", "tape", "prism"]
+    name: str
+    statistic: float
+    limit: float
+    size: float
+
+    @property
+    def sentence(self) -> str:
+        """The outlier in words."""
+        if not np.isfinite(self.size):
+            return f"{self.name} cannot show the board that it names and was not used"
+        off = f"{self.size:.2f} px" if self.kind in ("dot", "image") else f"{1000 * self.size:.1f} mm"
+        return f"{self.name} is off by {off} and was not used"
+
+
+FALSE_ALARMS = 0.01
+"""Chance that a survey without blunders loses any dot; and any tape or prism."""
+
+FALSE_IMAGES = 1e-4
+"""The same for whole images, whose dots have to be off together: their noise is not quite normal. Of 18
+corners in a rendered picture, all found well, chi-square was 74 for 36."""
+
+BAD_IMAGE = 0.25
+"""With more than this part of its dots beyond their limit an image is judged as a whole."""
+
+TELL_APART = 8
+"""With more images of a board than this, the rest says which of two is wrong."""
+
+BOARD_STEPS = 4
+"""Gauss-Newton steps of a board's pose: it starts within millimetres."""
+
+PRISMS_LEFT = 3
+"""A set-up keeps at least so many prisms: with fewer nothing says which of them is wrong."""
+
+
+@dataclass(frozen=True, eq=False)
+class OutlierVerdict:
+    """Terms with what failed left out and what passed readmitted."""
+
+    images: tuple[ImageTerm, ...]
+    station: tuple[StationTerm, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedImage:
+    """An image: chi-square of each dot by itself (n,), and the dots as the other measurements predict them,
+    together."""
+
+    dots: FloatArray
+    predicted: LeftOut
+
+    def whole(self, fitted: bool, limits: _Limits) -> tuple[np.ndarray, float, float, bool]:
+        """Which dots (n,) are good; chi-square of these together, or of all if too many are not, and its
+        limit; and whether the image fails."""
+        good = self.dots <= limits.dot
+        if not fitted:
+            good = self.predicted.agreeing(good, limits.dot)
+        many_bad = bool(good.mean() < 1 - BAD_IMAGE)
+        statistic, freedom = self.predicted.statistic(np.isfinite(self.dots) if many_bad else good)
+        limit = limits.image(freedom)
+        return good, statistic, limit, many_bad or statistic > limit
+
+
+@dataclass(frozen=True)
+class JudgedPoint:
+    """A station point: chi-square, and its degrees of freedom."""
+
+    statistic: float
+    freedom: int
+
+
+def judge(
+    problem: Adjustment, state: Estimate, covariance: FloatArray, all_images: Sequence[ImageTerm]
+) -> OutlierVerdict:
+    """Test every measurement at a fitted state and leave out the worst; readmit what passes.
+
+    Parameters
+    ----------
+    problem, state, covariance
+        The fit; its terms' ``keep`` say what was left out so far.
+    all_images
+        The images with every dot that was measured, in the order of the problem's.
+    """
+    seen, points, limits = _tested(problem, state, covariance, all_images)
+    images, worst, worst_excess = [], None, 0.0
+    bad_dots: list[tuple[int, np.ndarray]] = []
+    for index, (term, judged) in enumerate(zip(problem.images, seen, strict=True)):
+        good, statistic, limit, fails = judged.whole(bool(term.keep.any()), limits)
+        images.append(term)
+        if not term.keep.any():
+            if not fails:
+                images[index] = replace(term, keep=good)
+        elif fails:
+            # The sum of squares falls by that much without it: most without the one that pulls others along.
+            if worst is None or statistic - limit > worst_excess:
+                worst, worst_excess = ("image", index), statistic - limit
+        elif (good != term.keep).any():
+            bad_dots.append((index, good))
+    readmitted = []
+    image_failed, worst_ratio = worst is not None, 1.0
+    for index, (point, tested) in enumerate(zip(problem.station, points, strict=True)):
+        if not tested.freedom:
+            continue
+        ratio = tested.statistic / limits.point(tested.freedom)
+        # A tape or prism cannot pull hundreds of dots along: where an image fails, it goes first.
+        if point.keep and not image_failed and ratio > worst_ratio and _may_go(problem, point):
+            worst, worst_ratio = ("station", index), ratio
+        if not point.keep and ratio <= 1.0:
+            readmitted.append(index)
+    station = list(problem.station)
+    for index in readmitted:
+        station[index] = replace(station[index], keep=True)
+    if worst is not None and worst[0] == "image":
+        worst = ("image", _culprit(problem, state, worst[1]))
+        images[worst[1]] = replace(images[worst[1]], keep=np.zeros_like(images[worst[1]].keep))
+    elif worst is not None:
+        station[worst[1]] = replace(station[worst[1]], keep=False)
+    for index, good in bad_dots:
+        images[index] = replace(images[index], keep=good)
+    return OutlierVerdict(tuple(images), tuple(station))
+
+
+def name_outliers(
+    problem: Adjustment, state: Estimate, covariance: FloatArray, all_images: Sequence[ImageTerm]
+) -> tuple[Outlier, ...]:
+    """Return everything that the problem leaves out, with the statistic it was left out for and its limit."""
+    found: list[Outlier] = []
+    seen, points, limits = _tested(problem, state, covariance, all_images)
+    for whole, term, judged in zip(all_images, problem.images, seen, strict=True):
+        if term.keep.all():
+            continue
+        residual = problem.image_residual(state, whole).reshape(-1, 2) * whole.sigma_px[:, None]
+        if not term.keep.any():
+            _, statistic, limit, _ = judged.whole(False, limits)
+            size = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
+            found.append(Outlier("image", f"image {term.name}", statistic, limit, size))
+            continue
+        for row in np.flatnonzero(~term.keep):
+            name = f"image {term.name} {term.part(int(row))}"
+            size = float(np.linalg.norm(residual[row]))
+            found.append(Outlier("dot", name, float(judged.dots[row]), limits.dot, size))
+    for point, tested in zip(problem.station, points, strict=True):
+        if point.keep:
+            continue
+        limit = limits.point(tested.freedom or 3)
+        size = float(np.linalg.norm(problem.station_residual(state, point)) * point.sigma_m)
+        kind: Literal["prism", "tape"] = "prism" if point.board is None else "tape"
+        found.append(Outlier(kind, point.name, tested.statistic, limit, size))
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """Beyond what a statistic fails: a dot's, and an image's and a station point's by their freedom.
+
+    Where the typical measurement is farther off than its sigma says, they are wider by as much.
+    """
+
+    dots: int
+    images: int
+    points: int
+    dot_scale: float
+    point_scale: float
+
+    @property
+    def dot(self) -> float:
+        return float(chdtri(2, FALSE_ALARMS / max(self.dots, 1))) * self.dot_scale
+
+    def image(self, freedom: int) -> float:
+        return float(chdtri(max(freedom, 1), FALSE_IMAGES / max(self.images, 1))) * self.dot_scale
+
+    def point(self, freedom: int) -> float:
+        return float(chdtri(freedom, FALSE_ALARMS / max(self.points, 1))) * self.point_scale
+
+
+def _tested(
+    problem: Adjustment, state: Estimate, covariance: FloatArray, all_images: Sequence[ImageTerm]
+) -> tuple[list[JudgedImage], list[JudgedPoint], _Limits]:
+    """Every image and every station point, and the limits."""
+    seen = [
+        _image(problem, state, covariance, whole, term)
+        for whole, term in zip(all_images, problem.images, strict=True)
+    ]
+    points = [_point(problem, state, covariance, term) for term in problem.station]
+    kept = [one.dots[t.keep] for one, t in zip(seen, problem.images, strict=True) if t.keep.any()]
+    whole = [
+        np.array([p.statistic])
+        for p, t in zip(points, problem.station, strict=True)
+        if t.keep and p.freedom == 3
+    ]
+    count = sum(len(one.dots) for one in seen)
+    return seen, points, _Limits(count, len(seen), len(points), _scale(kept, 2), _scale(whole, 3))
+
+
+def _image(
+    problem: Adjustment, state: Estimate, covariance: FloatArray, whole: ImageTerm, term: ImageTerm
+) -> JudgedImage:
+    """An image with all its dots, of which some may be fitted."""
+    block = problem.image_block(state, whole)
+    mine = covariance[np.ix_(block.columns, block.columns)]
+    return JudgedImage(
+        dot_statistics(block.residual, block.jacobian, mine, term.keep),
+        left_out(block, mine, term.keep, problem.huber),
+    )
+
+
+def _point(problem: Adjustment, state: Estimate, covariance: FloatArray, term: StationTerm) -> JudgedPoint:
+    """The statistic of a prism or tape, in the directions in which the rest of the survey checks it."""
+    block = problem.station_block(state, term)
+    mine = covariance[np.ix_(block.columns, block.columns)]
+    spread = block.jacobian @ mine @ block.jacobian.T
+    values, vectors = np.linalg.eigh(np.eye(3) + (-spread if term.keep else spread))
+    tested = values > REDUNDANT
+    along = vectors.T @ block.residual
+    return JudgedPoint(float(np.sum(along[tested] ** 2 / values[tested])), int(tested.sum()))
+
+
+def _culprit(problem: Adjustment, state: Estimate, suspect: int) -> int:
+    """Which image of the suspect's board is to blame: the one without which the others and the tapes agree.
+
+    Two images that contradict each other look equally bad where the fit has ended between them.
+    """
+    board = problem.images[suspect].board
+    together = [i for i, t in enumerate(problem.images) if t.board == board and t.keep.any()]
+    if not 2 <= len(together) <= TELL_APART or board in problem.held:
+        return suspect
+    misfits = {i: _board_misfit(problem, state, board, [j for j in together if j != i]) for i in together}
+    best = min(misfits, key=lambda i: misfits[i])
+    return best if misfits[best] < misfits[suspect] else suspect
+
+
+def _board_misfit(
+    problem: Adjustment, state: Estimate, board: tuple[str, str], images: Sequence[int]
+) -> float:
+    """Sum of squares of a board's tapes and some of its images with its pose fitted to these alone."""
+    tapes = [p for p in problem.station if p.board == board and p.keep]
+    cost = float("inf")
+    for _ in range(BOARD_STEPS):
+        blocks = [problem.image_block(state, problem.images[i]) for i in images]
+        blocks += [problem.station_block(state, p) for p in tapes]
+        cost = float(sum(b.residual @ b.residual for b in blocks))
+        if not np.isfinite(cost):
+            return float("inf")
+        jacobian = np.concatenate([b.jacobian[:, -6:] for b in blocks])  # a board's pose comes last
+        residual = np.concatenate([b.residual for b in blocks])
+        step = np.linalg.lstsq(jacobian, -residual, rcond=None)[0]
+        moved = moved_rigid(state.rover_from_board[board], step)
+        state = replace(state, rover_from_board={**state.rover_from_board, board: moved})
+    return cost
+
+
+def _may_go(problem: Adjustment, point: StationTerm) -> bool:
+    """Whether a set-up has prisms enough without this one; tapes may always go.
+
+    Prisms are all that contradicts a mast taken as upright (four parameters): there they stay.
+    """
+    if point.board is not None:
+        return True
+    kept = sum(p.setup == point.setup and p.board is None and p.keep for p in problem.station)
+    return kept > PRISMS_LEFT and len(problem.mast_free) != 4
+
+
+def _scale(statistics: Sequence[FloatArray], freedom: int) -> float:
+    """By how much the typical statistic is larger than it should be; at least 1."""
+    if not statistics:
+        return 1.0
+    typical = float(np.median(np.concatenate([s.ravel() for s in statistics])))
+    return max(1.0, typical / float(chdtri(freedom, 0.5)))

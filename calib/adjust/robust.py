@@ -1,0 +1,135 @@
+"""A fit without its blunders, every kind of measurement weighed by what its residuals show.
+
+Pulls are bounded first (Huber), so that blunders can be told by the tests of `calib.adjust.outliers`; then
+plain least squares without them. Where residuals show that a kind of measurement is worse than stated, the
+fit is done again with the sigma that they show (`calib.adjust.goodness`), and so is its covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.adjust.adjustment import HUBER, Adjustment, Estimate
+from calib.adjust.goodness import Component, found_sigmas, variance_components
+from calib.adjust.outliers import judge
+from calib.adjust.significance import MEDIAN_OF_TWO
+from calib.adjust.solver import Minimum, Normal, covariance_of, minimise
+from calib.adjust.terms import ImageTerm, StationTerm, widened_images
+from calib.errors import CalibError
+from calib.geometry.rigid import FloatArray
+
+
+class SurveyNotFitted(CalibError):
+    """The survey does not determine what is asked of it, or no start leads to its noise."""
+
+
+ROUNDS = 40
+"""Times that measurements are judged and the fit done again, at most."""
+
+WEIGHINGS = 6
+"""Times that sigmas are changed and the fit done again, at most; three mostly do."""
+
+WEIGHED = 0.02
+"""Sigmas are good enough when the next ones differ by less than this part."""
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """A fit with sigmas as large as residuals show them.
+
+    ``images`` are all that were fitted, with every dot and these sigmas; ``excess`` is by how much the
+    squared residuals of the kinds that were widened were larger in the first fit than stated sigmas allow.
+    """
+
+    problem: Adjustment
+    fit: Minimum[Estimate]
+    covariance: FloatArray
+    images: tuple[ImageTerm, ...]
+    components: tuple[Component, ...]
+    excess: float
+
+
+def weigh(
+    problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTerm], *, narrows: bool = True
+) -> Weighed:
+    """Return the fit with the sigma of each kind of measurement that is worse, or better, than stated.
+
+    Parameters
+    ----------
+    problem, fit
+        Fitted with the stated sigmas, blunders left out.
+    images
+        All that were fitted, with every dot.
+    narrows
+        Whether a sigma may become smaller than stated.
+    """
+    weighed: dict[str, float] = {}
+    first: tuple[Component, ...] = ()
+    for count in range(WEIGHINGS + 1):
+        covariance = covariance_of(fit.normal.matrix, problem.weak)
+        components = variance_components(problem.blocks(fit.state), covariance, weighed)
+        first = first or components
+        wanted = found_sigmas(components, narrows=narrows)
+        change = {kind: factor / weighed.get(kind, 1.0) for kind, factor in wanted.items()}
+        if count == WEIGHINGS or all(abs(ratio - 1.0) < WEIGHED for ratio in change.values()):
+            break
+        weighed |= wanted
+        images = widened_images(images, change)
+        problem, fit = without_blunders(problem.with_sigmas(change), fit.state, images, bounded=False)
+    wrong = {c.kind for c in components if c.wrong}
+    excess = sum((c.factor**2 - 1) * c.redundancy for c in first if c.kind in wrong)
+    return Weighed(problem, fit, covariance, tuple(images), components, excess)
+
+
+def without_blunders(
+    problem: Adjustment, start: Estimate, all_images: Sequence[ImageTerm], *, bounded: bool = True
+) -> tuple[Adjustment, Minimum[Estimate]]:
+    """Fit, judge, and fit again until nothing fails; the last fit is plain least squares.
+
+    ``bounded`` begins with pulls bounded: for a start that blunders may have moved.
+    """
+    fit = Minimum(start, Normal(np.inf, np.zeros((0, 0)), np.zeros(0)), False, 0)
+    if bounded:
+        fit = minimise(problem, start, weak=problem.weak, gain=1e-7)
+        _refuse_lost(fit)
+    for huber in (HUBER, None) if bounded else (None,):
+        problem = problem.with_huber(huber)
+        fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-7 if huber else 1e-11)
+        kept = {_kept(problem.images, problem.station)}
+        for _ in range(ROUNDS):
+            verdict = judge(problem, fit.state, covariance_of(fit.normal.matrix, problem.weak), all_images)
+            pattern = _kept(verdict.images, verdict.station)
+            if pattern in kept:  # nothing new, or a measurement on its limit that comes and goes
+                break
+            kept.add(pattern)
+            problem = problem.with_terms(verdict.images, verdict.station)
+            fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-7 if huber else 1e-11)
+            _refuse_lost(fit)
+    return problem, fit
+
+
+def _kept(images: Sequence[ImageTerm], station: Sequence[StationTerm]) -> bytes:
+    """Which measurements count, as something to compare."""
+    return b"".join(t.keep.tobytes() for t in images) + bytes(p.keep for p in station)
+
+
+def _refuse_lost(fit: Minimum[Estimate]) -> None:
+    if not np.isfinite(fit.normal.cost):
+        raise SurveyNotFitted(
+            "the fit starts where a camera does not see a dot that it saw: no start was found"
+        )
+
+
+def typical_length(
+    problem: Adjustment, state: Estimate, images: Sequence[ImageTerm], least_px: float
+) -> tuple[float, float]:
+    """Return how far the typical dot of some images is off, in sigmas, and the median of these, pixels; no
+    sigma counts as less than ``least_px``."""
+    own_px = np.concatenate([t.sigma_px[t.keep] for t in images])
+    told_px = np.maximum(own_px, least_px)
+    residuals = np.concatenate([problem.image_residual(state, t).reshape(-1, 2) for t in images])
+    lengths = np.linalg.norm(residuals, axis=1) * own_px / told_px
+    return float(np.median(lengths) / np.sqrt(MEDIAN_OF_TWO)), float(np.median(told_px))

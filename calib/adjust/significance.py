@@ -1,0 +1,100 @@
+"""How large misfits are, and how unlikely by chance: as a probability and in sigmas."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from calib.geometry.rigid import FloatArray
+
+MOST_SIGMAS = 37.0
+"""Beyond this the probability is no number that a computer holds."""
+
+THREE_SIGMAS = 0.0027
+"""The chance that a normal error is beyond three sigma, either side."""
+
+MEDIAN_OF_TWO = 2 * np.log(2.0)
+"""Median of chi-square with two degrees of freedom."""
+
+
+def chance(chi2: float, freedom: int, scale: float = 1.0, scale_freedom: float = math.inf) -> float:
+    """Return the chance of a larger chi-square without any effect.
+
+    Parameters
+    ----------
+    chi2, freedom
+        Weighted sum of squares that an effect explains, and of how many numbers.
+    scale, scale_freedom
+        The residuals' own chi-square over its degrees of freedom, and these. Above one it says that the
+        stated sigmas are too small; chi2 is then taken by it, and the F distribution counts how well the
+        scale itself is known. Below one it is not used: luck makes no sigma smaller.
+    """
+    from scipy.special import chdtrc, fdtrc  # slow to load, and a daemon that starts does not need it
+
+    if freedom == 0:
+        return 1.0
+    if scale <= 1.0 or math.isinf(scale_freedom):
+        return float(chdtrc(freedom, chi2 / max(scale, 1.0)))
+    return float(fdtrc(freedom, scale_freedom, chi2 / (freedom * scale)))
+
+
+def sigmas(probability: float) -> float:
+    """Return how many sigmas a normal error is away whose chance (either side) this is; 37 at most."""
+    from scipy.special import ndtri  # slow to load, and a daemon that starts does not need it
+
+    if probability <= 0.0:
+        return MOST_SIGMAS
+    return min(float(-ndtri(min(probability, 1.0) / 2)), MOST_SIGMAS)
+
+
+def chance_of_sum(total: float, weights: FloatArray) -> float:
+    """Return the chance of a larger weighted sum of squares of independent unit normals.
+
+    Parameters
+    ----------
+    total, weights
+        The sum, and what each square counts in it (n,), positive.
+
+    Notes
+    -----
+    Lugannani and Rice's saddle point as in Kuonen, Biometrika 86 (1999). A chi-square of the same mean and
+    variance is wrong by orders of magnitude far out, where the largest weight decides.
+    """
+    from scipy.optimize import brentq  # slow to load, and a daemon that starts does not need it
+    from scipy.special import ndtr
+
+    if total <= 0.0:
+        return 1.0
+    w = weights / weights.max()
+    t = total / float(weights.max())
+    if 0.25 * t - 0.5 * len(w) > MOST_SIGMAS**2:  # Chernoff's bound, beyond what a computer holds
+        return 0.0
+
+    def slope(at: float) -> float:
+        return float(np.sum(w / (1.0 - 2.0 * at * w))) - t
+
+    # One square alone, and all of them with the largest weight, have their saddle points to either side.
+    at = float(brentq(slope, -0.5 * len(w) / t - 1e-9, 0.5 - 0.5 / t + 1e-9 / t, xtol=1e-15))
+    rise = w / (1.0 - 2.0 * at * w)
+    deviance = at * t + 0.5 * float(np.sum(np.log1p(-2.0 * at * w)))
+    r = math.copysign(math.sqrt(2.0 * max(deviance, 0.0)), at)
+    if abs(r) < 1e-4:  # at the mean the formula is a quotient of noughts, whose limit is this
+        return float(ndtr(-(r + math.sqrt(2.0) / 3.0 * float(np.sum(w**3) / np.sum(w**2) ** 1.5))))
+    return float(ndtr(-(r + math.log(at * math.sqrt(2.0 * float(np.sum(rise**2))) / r) / r)))
+
+
+def rare_sum(probability: float, weights: FloatArray) -> float:
+    """Return what such a weighted sum of squares (`chance_of_sum`) exceeds with a probability below 0.5."""
+    from scipy.optimize import brentq
+
+    low = high = float(weights.sum())
+    while chance_of_sum(high, weights) > probability:
+        low, high = high, 2.0 * high
+    return float(brentq(lambda total: chance_of_sum(total, weights) - probability, low, high, rtol=1e-9))
+
+
+def typical_px(residuals_px: FloatArray) -> float:
+    """Return the sigma of a coordinate that the median length of residuals (n, 2) tells, pixels."""
+    square = np.nan_to_num((residuals_px**2).sum(axis=1), nan=np.inf)
+    return float(np.sqrt(np.median(square) / MEDIAN_OF_TWO)) if len(square) else float("inf")

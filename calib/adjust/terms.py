@@ -1,0 +1,206 @@
+"""What a fit is made of: the dots of an image, a point of the station, and what lenses are usually like."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.parameters import parameter_names, parameter_part
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, Rigid, tangents
+from calib.survey.records import Survey
+
+JOINTS, TAPES, PRISMS, DRAWING, DOTS_OF = "joint readings", "tapes", "prisms", "drawing", "dots of "
+"""Kinds of measurements, each with a sigma of its own."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImageTerm:
+    """The dots or corners of one image: board points (n, 3), pixels (n, 2), their sigma (n,), and which count
+    (n,).
+
+    ``board`` is set-up and placement, of a bench board and placement; ``attitude`` the index of the head's
+    standstill, None for a body camera and -1 where it is not fitted. ``approach`` says from where pan and
+    tilt came to rest (+1: from smaller readings, -1: from larger, 0: not known). ``bend`` (n, 2) is what a
+    bow of one moves each point by, back from the board; ``ids`` (n,) are a bench's corners.
+    """
+
+    name: str
+    camera: str
+    board: tuple[str, str]
+    attitude: int | None
+    pan_rad: float
+    tilt_rad: float
+    rows: np.ndarray
+    columns: np.ndarray
+    in_board_m: FloatArray
+    pixels_px: FloatArray
+    sigma_px: FloatArray
+    keep: np.ndarray
+    approach: tuple[int, int] = (0, 0)
+    bend: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    ids: np.ndarray | None = None
+
+    def part(self, index: int) -> str:
+        """One of the dots or corners as a person says it."""
+        if self.ids is not None:
+            return f"corner {self.ids[index]}"
+        return f"dot (row {self.rows[index]}, column {self.columns[index]})"
+
+    @property
+    def kind(self) -> str:
+        """Which measurements have the same sigma."""
+        return DOTS_OF + self.camera
+
+
+@dataclass(frozen=True, eq=False)
+class StationTerm:
+    """One point measured by the station: a prism (``board`` None) or a tape."""
+
+    setup: str
+    board: tuple[str, str] | None
+    point: str
+    position_m: FloatArray
+    in_board_m: FloatArray
+    sigma_m: float
+    keep: bool = True
+
+    @property
+    def kind(self) -> str:
+        """Which measurements have the same sigma."""
+        return PRISMS if self.board is None else TAPES
+
+    @property
+    def name(self) -> str:
+        """The point as a person says it."""
+        if self.board is None:
+            return f"prism {self.point} of set-up {self.setup}"
+        return f"tape {self.point} of placement {self.board[1]} (set-up {self.setup})"
+
+
+def image_terms(
+    survey: Survey, boards: Mapping[tuple[str, str], Rigid], notes: list[str]
+) -> tuple[list[ImageTerm], list[ImageTerm], dict[tuple[object, ...], int]]:
+    """Return terms of the fitted and of the check images, and the head's attitudes among the former."""
+    fitted: list[ImageTerm] = []
+    checks: list[ImageTerm] = []
+    joints: dict[tuple[object, ...], int] = {}
+    for image in survey.images:
+        dots = survey.dots.get(image.name)
+        if dots is None or not len(dots.rows):
+            continue
+        if (image.setup, image.placement) not in boards:
+            notes.append(
+                f"image {image.name} is not used: placement {image.placement} of set-up {image.setup} "
+                "has no three tapes"
+            )
+            continue
+        attitude = None
+        on_head = survey.cameras[image.camera].on == "head"
+        if on_head:
+            key = (image.setup, image.placement, image.pan_rad, image.tilt_rad)
+            attitude = joints.setdefault(key, len(joints)) if image.purpose != "check" else -1
+        sigma = dots.sigma_px if dots.sigma_px is not None else np.full(len(dots.rows), survey.sigma.dot_px)
+        term = ImageTerm(
+            image.name,
+            image.camera,
+            (image.setup, image.placement),
+            attitude,
+            float(image.pan_rad or 0.0) if on_head else 0.0,
+            float(image.tilt_rad or 0.0) if on_head else 0.0,
+            dots.rows,
+            dots.columns,
+            survey.board.dots_in_board_m(dots.rows, dots.columns),
+            dots.pixels_px,
+            np.asarray(sigma, dtype=np.float64),
+            np.ones(len(dots.rows), dtype=bool),
+        )
+        (checks if image.purpose == "check" else fitted).append(term)
+    return fitted, checks, joints
+
+
+def station_terms(survey: Survey, boards: Mapping[tuple[str, str], Rigid]) -> tuple[StationTerm, ...]:
+    """Return terms of prisms and of the tapes of every board."""
+    terms = []
+    for p in survey.station:
+        if p.kind == "prism" and p.point in survey.prisms_in_rover_m:
+            terms.append(
+                StationTerm(p.setup, None, p.point, p.position_m, np.zeros(3), survey.sigma.station_m)
+            )
+        elif (
+            p.kind == "tape" and (p.setup, p.placement) in boards and p.point in survey.board.tapes_in_board_m
+        ):
+            place = survey.board.tapes_in_board_m[p.point]
+            board = (p.setup, p.placement)
+            terms.append(StationTerm(p.setup, board, p.point, p.position_m, place, survey.sigma.station_m))
+    return tuple(terms)
+
+
+def with_kept(images: Sequence[ImageTerm], left_out: frozenset[str] | set[str]) -> tuple[ImageTerm, ...]:
+    """Return the terms with whole images left out by name."""
+    return tuple(replace(t, keep=np.zeros_like(t.keep)) if t.name in left_out else t for t in images)
+
+
+def widened_images(images: Sequence[ImageTerm], factors: Mapping[str, float]) -> tuple[ImageTerm, ...]:
+    """Return the terms with sigmas times ``factors``, by kind."""
+    return tuple(replace(t, sigma_px=t.sigma_px * factors.get(t.kind, 1.0)) for t in images)
+
+
+O_SIGMA_RAD = 0.02
+R_SIGMA = (0.5, 1.0)
+E_SIGMA_M = 0.01
+"""What lenses are like, one sigma: O beside A, R1 and R2, E0 to E2. Flight cameras stay within some 2.5 of
+these; a survey that sees a lens well does not feel them, and one that does not cannot run away with it."""
+
+LIMITS = {"O": (O_SIGMA_RAD,) * 3, "R": R_SIGMA, "E": (E_SIGMA_M,) * 3}
+"""The same by a camera's letters."""
+
+HARDLY = 0.7
+"""A lens whose sigma stays above this part of what was known beforehand is hardly seen."""
+
+
+def lens_knowledge(model: CameraModel) -> tuple[FloatArray, FloatArray]:
+    """Return how far a lens is from usual, in sigmas, and the Jacobian to the camera's step."""
+    kind = model.kind
+    size = len(parameter_names(kind))
+    aside = np.zeros((3, size))
+    aside[:, parameter_part(kind, "O")] = tangents(model.O).T / O_SIGMA_RAD
+    aside[:, parameter_part(kind, "A")] = -tangents(model.A).T / O_SIGMA_RAD
+    residuals, rows = [(model.O - model.A) / O_SIGMA_RAD, model.R[1:] / np.array(R_SIGMA)], [aside]
+    bends = np.zeros((2, size))
+    bends[:, parameter_part(kind, "R")] = np.diag(1 / np.array(R_SIGMA))
+    rows.append(bends)
+    if "E" in kind:
+        enters = np.zeros((3, size))
+        enters[:, parameter_part(kind, "E")] = np.eye(3) / E_SIGMA_M
+        rows.append(enters)
+        residuals.append(model.E / E_SIGMA_M)
+    return np.concatenate(residuals), np.concatenate(rows)
+
+
+def lens_notes(rig: Rig, sigma: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return a sentence for what the survey hardly sees of lenses, so that usual lenses decide.
+
+    ``sigma`` is that of ``calib.adjust.result.Calibration``.
+    """
+    by_words: dict[str, list[str]] = {}
+    for name, camera in rig.cameras.items():
+        held = []
+        for letter, word in (("O", "lens axis"), ("R", "distortion"), ("E", "entrance point")):
+            if letter not in camera.model.kind or name not in sigma["cameras"]:
+                continue
+            found = np.array(sigma["cameras"][name][letter])
+            found = found[1:] if letter == "R" else found[:1] if letter == "E" else found
+            if (found > HARDLY * np.array(LIMITS[letter])[: len(found)]).any():
+                held.append(word)
+        if held:
+            by_words.setdefault(" and ".join(held), []).append(name)
+    return tuple(
+        f"the survey hardly shows {words} of {', '.join(names)}, so what lenses are usually like decides; "
+        "pixels beyond the dots suffer"
+        for words, names in by_words.items()
+    )

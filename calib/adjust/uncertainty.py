@@ -1,0 +1,323 @@
+"""What remains of every measurement after a fit, how sure the fit is, and what it leaves open."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.optimize import approx_fprime
+
+from calib.adjust.adjustment import Adjustment, Estimate
+from calib.adjust.result import Calibration, Degenerate, ImageResiduals, StationResidual
+from calib.adjust.terms import ImageTerm
+from calib.errors import CalibError
+from calib.geometry import covariance as rig_covariance
+from calib.geometry.covariance import pixel_rates
+from calib.geometry.parameters import parameter_part
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig, gimbal
+from calib.geometry.rigid import FloatArray, tangents
+from calib.geometry.stereo import triangulate
+from calib.survey.records import Survey
+
+Rms = dict[str, tuple[float, float]]
+
+
+def image_residuals(
+    survey: Survey,
+    problem: Adjustment,
+    state: Estimate,
+    all_images: Sequence[ImageTerm],
+    checks: Sequence[ImageTerm],
+) -> tuple[ImageResiduals, ...]:
+    """Return what remains of every image with dots; for a check image, the joint angles as read."""
+    used = {t.name: t.keep for t in problem.images}
+    by_name = {i.name: i for i in survey.images}
+    found = []
+    for term in (*all_images, *checks):
+        image = by_name[term.name]
+        keep = used.get(term.name)
+        residual = residual_px(problem, state, term)
+        centre, facing = _seen_from(problem, state, term)
+        found.append(
+            ImageResiduals(
+                term.name,
+                term.camera,
+                image.purpose,
+                image.setup,
+                image.placement,
+                image.pan_rad,
+                image.tilt_rad,
+                term.rows,
+                term.columns,
+                term.pixels_px,
+                residual,
+                term.sigma_px,
+                np.zeros(len(residual), dtype=bool) if keep is None else keep,
+                float(np.linalg.norm(centre)),
+                float(np.arccos(np.clip(abs(facing @ centre) / np.linalg.norm(centre), 0.0, 1.0))),
+            )
+        )
+    return tuple(found)
+
+
+def residual_px(problem: Adjustment, state: Estimate, term: ImageTerm) -> FloatArray:
+    """Return predicted less measured pixels (n, 2) of every dot of an image."""
+    pixels, _ = state.cameras[term.camera].project(problem.in_camera(state, term))
+    return np.asarray(pixels - term.pixels_px)
+
+
+def _seen_from(problem: Adjustment, state: Estimate, term: ImageTerm) -> tuple[FloatArray, FloatArray]:
+    """The board's centre from the camera's C, and its normal; rover-frame directions."""
+    board = state.rover_from_board[term.board]
+    centre = state.cameras[term.camera].C
+    if term.attitude is not None:
+        head = gimbal(state.mast, *problem.joints(state, term))
+        centre = head.rotation @ centre + head.translation_m
+    return board.translation_m - centre, board.rotation[:, 2]
+
+
+def rms_by_camera(images: Iterable[ImageResiduals]) -> Rms:
+    """Return the (x, y) rms of the fitted dots of each camera, pixels."""
+    return _rms((i.camera, i.residuals_px[i.used]) for i in images if i.used.any())
+
+
+def check_rms(survey: Survey, state: Estimate, images: Iterable[ImageResiduals]) -> Rms:
+    """Return the (x, y) rms over check images and clicks of each camera, pixels: none was fitted."""
+    parts = [(i.camera, i.residuals_px) for i in images if i.purpose == "check"]
+    points = {(p.setup, p.point): p.position_m for p in survey.station if p.kind == "check"}
+    by_name = {i.name: i for i in survey.images}
+    for click in survey.clicks:
+        image = by_name.get(click.image)
+        if image is None or (image.setup, click.point) not in points or image.camera not in state.cameras:
+            continue
+        in_rover = state.rover_from_station[image.setup].points(points[image.setup, click.point])[None]
+        if image.pan_rad is not None and image.tilt_rad is not None:
+            head = gimbal(state.mast, image.pan_rad, image.tilt_rad)
+            in_rover = (in_rover - head.translation_m) @ head.rotation
+        pixel, _ = state.cameras[image.camera].project(in_rover)
+        parts.append((image.camera, pixel - click.pixel_px))
+    return _rms((camera, residual) for camera, residual in parts if np.isfinite(residual).all())
+
+
+def _rms(parts: Iterable[tuple[str, FloatArray]]) -> Rms:
+    """Collect residuals by camera."""
+    collected: dict[str, list[FloatArray]] = {}
+    for camera, residual in parts:
+        collected.setdefault(camera, []).append(residual)
+    rms = {}
+    for camera, residuals in collected.items():
+        x, y = np.sqrt(np.mean(np.concatenate(residuals) ** 2, axis=0))
+        rms[camera] = (float(x), float(y))
+    return rms
+
+
+def station_residuals(problem: Adjustment, state: Estimate) -> tuple[StationResidual, ...]:
+    """Return what remains of every prism and tape, metres in the rover frame."""
+    return tuple(
+        StationResidual(
+            "prism" if p.board is None else "tape",
+            p.setup,
+            "" if p.board is None else p.board[1],
+            p.point,
+            problem.station_residual(state, p) * p.sigma_m,
+            p.keep,
+        )
+        for p in problem.station
+    )
+
+
+OPEN = 0.05
+"""A direction is open if the data leave more than this part of how far it could be off at all (1 m, 1 rad,
+one focal length)."""
+
+SEEN_RAD = 0.05
+"""A joint that moves less than this between the fitted images is called still."""
+
+PART = 0.25
+"""A parameter is named if it makes up at least this part of an open direction; the mast's a third of it."""
+
+
+def sigma_by_key(rig: Rig, names: Sequence[str], covariance: FloatArray) -> dict[str, Any]:
+    """Return standard deviations under the mast file's keys; vectors get one per component.
+
+    A number that was not fitted gets 0.
+    """
+    deviation = dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
+    mast: dict[str, Any] = {
+        key: [deviation.get(f"mast.{key}.{axis}", 0.0) for axis in "xyz"]
+        for key in ("translation_m", "rotation_rad")
+    }
+    mast |= {key: deviation.get(f"mast.{key}", 0.0) for key in ("axis_offset_m", "axis_twist_rad")}
+    cameras: dict[str, Any] = {}
+    for name, camera in rig.cameras.items():
+        first = [i for i, n in enumerate(names) if n.startswith(f"cameras.{name}.")]
+        if not first:
+            continue
+        mine = covariance[np.ix_(first, first)]
+        kind = camera.model.kind
+        cameras[name] = {}
+        for letter in dict.fromkeys(kind):
+            part = parameter_part(kind, letter)
+            block = mine[part, part]
+            if letter in "AO":
+                on = tangents(camera.model.A if letter == "A" else camera.model.O)
+                block = on.T @ block @ on
+            spread = np.sqrt(np.maximum(np.diag(block), 0.0)).tolist()
+            cameras[name][letter] = [0.0, *spread] if letter == "R" else spread
+    return {"mast": mast, "cameras": cameras}
+
+
+def pixel_covariance(
+    calibration: Calibration, camera: str, pan_rad: float, tilt_rad: float, points_m: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return predicted pixels (n, 2) of rover-frame points (n, 3), metres, and covariances (n, 2, 2), px².
+
+    What is uncertain is the calibration; points and joint angles count as exact. Points that have no
+    pixel come out as not-a-number.
+    """
+    rig, names = calibration.rig, calibration.parameter_names
+    pixels, rates = pixel_rates(rig, names, camera, pan_rad, tilt_rad, points_m)
+    return pixels, np.einsum("nip,pq,njq->nij", rates, calibration.covariance, rates)
+
+
+def pointing_covariance(
+    calibration: Calibration,
+    pair: tuple[str, str],
+    pan_rad: float,
+    tilt_rad: float,
+    left_px: FloatArray,
+    range_m: float,
+    *,
+    aim: str | None = None,
+    aim_px: FloatArray | None = None,
+    click_px: float = 0.0,
+) -> FloatArray:
+    """Return the covariance (2, 2), px², of where a target lands that was clicked in a stereo pair.
+
+    The target is ``range_m`` along the ray of ``left_px`` in the left image at the given joint angles.
+    It is found by stereo with the calibrated rig, the head is pointed so that it should land on ``aim_px``
+    (the image centre by default) of camera ``aim`` (the left one by default), and the true rig differs from
+    the calibrated one as the covariance says: errors that stereo and pointing share cancel.
+
+    Parameters
+    ----------
+    click_px
+        Sigma of a click coordinate, both images; 0 leaves the calibration alone.
+
+    Raises
+    ------
+    CalibError
+        If the target is not seen by both cameras, or cannot be pointed at.
+    """
+    rig = calibration.rig
+    aim = aim or pair[0]
+    model = rig.cameras[aim].model
+    wanted = np.array(model.image_center_px) if aim_px is None else np.asarray(aim_px, dtype=np.float64)
+    rays = rig.camera_in_rover(pair[0], pan_rad, tilt_rad).ray(left_px)
+    target = rays.origins_m + range_m * rays.directions
+    clicks = np.zeros((2, 2))
+    for row, name in enumerate(pair):
+        clicks[row], valid = rig.camera_in_rover(name, pan_rad, tilt_rad).project(target)
+        if not valid:
+            raise CalibError(f"camera {name} does not see the target at {target.round(3).tolist()} m")
+    moving = [calibration.part("mast.")]
+    moving += [calibration.part(f"cameras.{name}.") for name in dict.fromkeys((*pair, aim))]
+    columns = np.concatenate(moving)
+
+    def landed(step: FloatArray) -> FloatArray:
+        believed = rig_moved_along(calibration, columns, step[: len(columns)])
+        left, right = (believed.camera_in_rover(name, pan_rad, tilt_rad) for name in pair)
+        shift = step[len(columns) :].reshape(2, 2)
+        found = triangulate(left, right, clicks[0] + shift[0], clicks[1] + shift[1])
+        solution = solve(
+            believed.mast, believed.cameras[aim].model, found.position_m, wanted,
+            from_pan_rad=pan_rad, from_tilt_rad=tilt_rad,
+        )[0]  # fmt: skip
+        pixel, _ = rig.camera_in_rover(aim, solution.pan_rad, solution.tilt_rad).project(target)
+        return np.asarray(pixel)
+
+    spread = np.concatenate([np.sqrt(np.diag(calibration.covariance)[columns]), np.full(4, 0.1)])
+    rates = np.asarray(approx_fprime(np.zeros(len(spread)), landed, 1e-3 * np.maximum(spread, 1e-12)))
+    total = np.zeros((len(spread),) * 2)
+    total[: len(columns), : len(columns)] = calibration.covariance[np.ix_(columns, columns)]
+    total[len(columns) :, len(columns) :] = np.eye(4) * click_px**2
+    return np.asarray(rates @ total @ rates.T)
+
+
+def rig_moved_along(calibration: Calibration, columns: np.ndarray, step: FloatArray) -> Rig:
+    """Return the rig with the parameters at ``columns`` moved by ``step``."""
+    return rig_covariance.moved_rig(calibration.rig, [calibration.parameter_names[i] for i in columns], step)
+
+
+def open_parameters(
+    names: Sequence[str], covariance: FloatArray, weak: FloatArray
+) -> tuple[tuple[str, ...], ...]:
+    """Return the directions that the data leave open, the worst first, each as the parameters it moves most.
+
+    ``covariance`` (p, p) is of ``names`` with the weak knowledge (p,) of ``calib.adjust.solver.minimise``
+    added: an unknown that the data do not see keeps a sigma of 1 m, 1 rad or one focal length.
+    """
+    scale = np.sqrt(weak)
+    values, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
+    found = []
+    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
+        if np.sqrt(max(value, 0.0)) < OPEN:
+            break
+        size = np.abs(vector) * np.array([3.0 if n.startswith("mast.") else 1.0 for n in names])
+        order = [i for i in np.argsort(-size) if size[i] >= PART] or [int(np.argmax(size))]
+        found.append(tuple(names[i] for i in order))
+    return tuple(found)
+
+
+def open_directions(
+    problem: Adjustment, names: Sequence[str], covariance: FloatArray
+) -> tuple[Degenerate, ...]:
+    """Return the directions of mast and cameras that a survey leaves open, in words.
+
+    ``covariance`` is of ``names``, the first of the problem's unknowns, with the problem's weak knowledge
+    added.
+    """
+    shown = [i for i, n in enumerate(names) if n.startswith("mast.") or n.split(".")[2] not in "ORE"]
+    found = open_parameters([names[i] for i in shown], covariance[np.ix_(shown, shown)], problem.weak[shown])
+    return tuple(Degenerate(parts, _reason(problem, parts)) for parts in found)
+
+
+def _reason(problem: Adjustment, parameters: Sequence[str]) -> str:
+    """Why a direction is open, and what to measure."""
+    what = f"the survey does not fix {in_words(parameters)}"
+    head = [t for t in problem.images if t.attitude is not None and t.keep.any()]
+    on_mast = any(p.startswith("mast.") for p in parameters)
+    cameras = {p.split(".")[1] for p in parameters if p.startswith("cameras.")}
+    if head and (on_mast or cameras & {t.camera for t in head}):
+        pan = np.ptp([t.pan_rad for t in head])
+        tilt = np.ptp([t.tilt_rad for t in head])
+        still = [n for n, moved in (("pan", pan), ("tilt", tilt)) if moved < SEEN_RAD]
+        if still:
+            return (
+                f"{what}: {' and '.join(still)} hardly moved between the head images "
+                f"(pan {np.degrees(pan):.1f}°, tilt {np.degrees(tilt):.1f}°); take images of purpose mast "
+                f"over the range of {' and '.join(still)} that will be used"
+            )
+    if cameras:
+        name = sorted(cameras)[0]
+        boards = len({t.board for t in problem.images if t.camera == name and t.keep.any()})
+        return (
+            f"{what}: camera {name} sees {boards} boards; take more at two distances and over the whole image"
+        )
+    return f"{what}; take more images of purpose mast, spread over pan and tilt"
+
+
+def in_words(parameters: Sequence[str]) -> str:
+    """Return some parameters as a person says them."""
+    named = list(dict.fromkeys(_words(p) for p in parameters))
+    return ", ".join(named[:4]) + (" and more" if len(named) > 4 else "")
+
+
+def _words(parameter: str) -> str:
+    """A parameter as a person says it."""
+    first, *rest = parameter.split(".")
+    if first == "mast":
+        return "the mast's " + " ".join(rest).replace("_m", "").replace("_rad", "").replace("_", " ")
+    return f"{rest[1]} of {rest[0]}" if first == "cameras" else f"the {first}'s {rest[0].split('_')[0]}"

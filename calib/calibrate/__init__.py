@@ -1,0 +1,1 @@
+"""From measurements to a rig: surveys, benches, still scenes, hand-offs."""

@@ -1,0 +1,249 @@
+"""Fit a head on a bench: cameras, their place in the head, axes, joints' errors and boards, from pictures
+alone.
+
+The estimator is that of surveys (``calib.adjust.adjustment``), with boards of unknown pose and no station.
+Start (``calib.calibrate.starts.bench``), pulls bounded, what changed half-way told apart
+(``calib.adjust.changes``), blunders left out by the tests of ``calib.adjust.outliers``, terms chosen
+(``calib.adjust.model_terms``), least squares.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.adjust.adjustment import HUBER, Adjustment, Estimate
+from calib.adjust.changes import BenchChange, find_change
+from calib.adjust.drifts import find_drifts
+from calib.adjust.model_terms import Tested
+from calib.adjust.result import BenchCalibration
+from calib.adjust.robust import SurveyNotFitted, typical_length, weigh, without_blunders
+from calib.adjust.solver import Minimum, minimise
+from calib.calibrate.bench.problem import BenchOptions, BenchProblem, without_terms
+from calib.calibrate.bench.told import choose, told
+from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged
+from calib.survey.records import Survey
+
+WRONG_MINIMUM = 3.0
+"""A fit is refused if a camera's typical corner is this many times farther off than its sigma says, or than
+``corner_px`` of the survey where that is more: a print's errors are in no corner's own sigma."""
+
+SCAN_HUBER = 100.0
+"""Length in sigmas from which pulls are bounded while changes are looked for: these are no blunders."""
+
+SLIP_RAD, SLIP_ASIDE = 0.003, 0.1
+"""A board that moved by more than this about the pan axis, and by less than this part of it otherwise
+(radians and metres), did not move: pan slipped."""
+
+MENDS = 0.5
+"""A change that is tried where the fit is far off counts if the sum of squares falls to this part."""
+
+LONE = 6.0
+"""While changes are looked for, a corner so many times farther off than its image's median counts as
+wrong."""
+
+PART = 4
+"""As many pictures on one side of another are no blunders."""
+
+CHANGES = 4
+"""Boards that moved are looked for so many times."""
+
+
+def fit_bench(survey: Survey, options: BenchOptions | None = None) -> BenchCalibration:
+    """Fit a rig to a bench's pictures, every measurement weighted by its sigma.
+
+    Parameters
+    ----------
+    survey
+        With ``boards`` and ``corners``; check images take no part.
+    options
+        What is chosen.
+
+    Raises
+    ------
+    BenchNotFitted
+        If the pictures do not determine a rig, something changed while they were taken, or the fit ends far
+        from the noise: it is never reported as done.
+    """
+    began = time.perf_counter()
+    options = options or BenchOptions()
+    try:
+        return _fitted(BenchProblem(survey, options), began)
+    except SurveyNotFitted as error:
+        raise BenchNotFitted(str(error)) from None
+
+
+def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
+    """Fit everything, choose, fit again, and put together what it says."""
+    named = chosen = tuple(bench.options.terms or ())
+    tests: dict[str, Tested] = {}
+    every = bench.candidates()
+    bench, problem, start = _look_for_changes(bench, every)
+    _refuse_far(bench, problem, start)  # before blunders are looked for one by one where nothing fits
+    chooses = bench.options.terms is None
+    if chooses:
+        problem, fit = without_blunders(problem, start, bench.terms.images)
+        start, named = fit.state, every
+        chosen, tests = choose(bench, every, problem, fit)
+    start = without_terms(start, set(every) - set(chosen))
+    last = bench.problem(chosen, start).with_terms(problem.images, ())
+    problem, fit = without_blunders(last, start, bench.terms.images, bounded=not chooses)
+    _refuse_part(problem)
+    _refuse_far(bench, problem, fit.state)
+    # counts and the least of corners are known; what a simulated or lucky bench has less is no knowledge
+    weighed = weigh(problem, fit, bench.terms.images, narrows=False)
+    if not weighed.fit.settled:
+        raise BenchNotFitted(
+            f"the fit did not settle: after {weighed.fit.steps} steps it was still finding better values, so "
+            "that neither they nor their sigmas are good; take more pictures, at more pan and tilt angles "
+            "and distances"
+        )
+    return told(bench, (problem, fit), weighed, named, chosen, tests, began)
+
+
+def _look_for_changes(
+    bench: BenchProblem, chosen: Sequence[str]
+) -> tuple[BenchProblem, Adjustment, Estimate]:
+    """Return the bench, its problem with some terms, lone wrong corners left out, and its fit.
+
+    A board that moved counts as two placements. A change that is not sure is tried, and counts if the fit is
+    the better for it.
+
+    Raises
+    ------
+    BenchNotFitted
+        If a joint slipped, or a camera changed: nothing says which of its two states is the one to come.
+    """
+    strays = {n: s for view in bench.views.values() for n, s in view.strays.items()}
+    tried: tuple[BenchChange, BenchProblem, Adjustment, Minimum[Estimate]] | None = None
+    for left in range(CHANGES, -1, -1):
+        problem, fit = _roughly(bench, chosen, strays, bench.start)
+        if np.isfinite(fit.normal.cost) and bench.allow_inexact(problem, fit.state):
+            problem, fit = _roughly(bench, chosen, strays, fit.state)
+        problem = _without_lone_strays(problem, fit.state).with_huber(SCAN_HUBER)
+        fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-6)
+        if tried is not None:
+            if not fit.normal.cost < MENDS * tried[3].normal.cost:
+                _, bench, problem, fit = tried
+                break
+            _refuse(tried[0])
+            tried = None
+        if not np.isfinite(fit.normal.cost) or not left:
+            break
+        change = find_change(problem, fit.state)
+        _refuse_slip(bench, fit.state)
+        if change is None:
+            break
+        if change.sure:
+            if any(drift.chi2 > change.chi2 for drift in find_drifts(problem, fit.state)):
+                break  # the verdict names it, with its size
+            _refuse(change)
+        else:
+            tried, bench = (change, bench, problem, fit), bench.copied()
+        if change.board is None:
+            bench.read_otherwise(change.what, change.after, float(change.step[0]))
+        else:
+            bench.notes.append(f"{change.sentence}; from there on it counts as another placement")
+            bench.split_placement(change.board, change.after)
+        bench.begin()
+    return bench, problem.with_huber(HUBER), fit.state
+
+
+def _refuse(change: BenchChange) -> None:
+    """Raise if it was no board that moved."""
+    if change.board is None:
+        raise SomethingChanged(change.sentence)
+
+
+def _roughly(
+    bench: BenchProblem, chosen: Sequence[str], strays: Mapping[str, Any], start: Estimate
+) -> tuple[Adjustment, Minimum[Estimate]]:
+    """The problem with some terms, without what single cameras showed to be wrong, and a first fit of it."""
+    problem = bench.seen(chosen, start)
+    problem = problem.with_terms([replace(t, keep=t.keep & ~strays[t.name]) for t in problem.images], ())
+    return problem, minimise(problem, start, weak=problem.weak, gain=1e-4)
+
+
+def _refuse_slip(bench: BenchProblem, state: Estimate) -> None:
+    """Raise if a board that seems to have moved turned about the pan axis: then it was pan that
+    slipped."""
+    rover_from_mast = state.as_mast.rover_from_mast
+    for before, moved, after in bench.split:
+        poses = [rover_from_mast.inverse @ state.rover_from_board[b] for b in (before, moved)]
+        motion = poses[1] @ poses[0].inverse
+        turn = Rotation.from_matrix(motion.rotation).as_rotvec()
+        aside = np.linalg.norm(turn[:2]) + np.linalg.norm(motion.translation_m)
+        if abs(turn[2]) > SLIP_RAD and aside < SLIP_ASIDE * abs(turn[2]):
+            raise SomethingChanged(
+                f"pan slipped by about {1e3 * abs(turn[2]):.0f} mrad before picture {after}: the head no "
+                "longer points where it read before; tighten what holds it on its axis and take the "
+                "pictures again"
+            )
+
+
+def _without_lone_strays(problem: Adjustment, state: Estimate) -> Adjustment:
+    """Leave out corners far off in images of which most corners are less so."""
+    terms = []
+    for t in problem.images:
+        if not t.keep.any():
+            terms.append(t)
+            continue
+        length = np.linalg.norm(problem.image_residual(state, t).reshape(-1, 2), axis=1)
+        keep = t.keep.copy()
+        keep[keep] = length < LONE * max(float(np.median(length)), 1.0)
+        terms.append(replace(t, keep=keep))
+    return problem.with_terms(terms, ())
+
+
+def _refuse_part(problem: Adjustment) -> None:
+    """Raise if all pictures of a placement or a camera from some one on, or up to it, had to be left out."""
+    boards = [
+        ("placement " + b[1], [t for t in problem.images if t.board == b]) for b in _each(problem, "board")
+    ]
+    cameras = [
+        (f"camera {c}", [t for t in problem.images if t.camera == c]) for c in _each(problem, "camera")
+    ]
+    for what, shown in (*boards, *cameras):
+        out = np.array([not t.keep.any() for t in shown])
+        if out.sum() < PART or out.all():
+            continue
+        wrong = [
+            min((~out[:k]).sum() + out[k:].sum(), out[:k].sum() + (~out[k:]).sum())
+            for k in range(1, len(out))
+        ]
+        cut = int(np.argmin(wrong)) + 1
+        if wrong[cut - 1] <= 0.2 * out.sum():
+            raise BenchNotFitted(
+                f"{int(out.sum())} of {len(out)} pictures of {what} contradict the rest, all on one side of "
+                f"picture {shown[cut].name}: something changed before it; fasten board, head and cameras, "
+                "and take the pictures again, or take those out of images.csv"
+            )
+
+
+def _each(problem: Adjustment, what: str) -> list[Any]:
+    return list(dict.fromkeys(getattr(t, what) for t in problem.images))
+
+
+def _refuse_far(bench: BenchProblem, problem: Adjustment, state: Estimate) -> None:
+    """Raise if a camera's typical corner is far above its noise, or too many images were left out."""
+    for name in state.cameras:
+        mine = [t for t in problem.images if t.camera == name]
+        kept = [t for t in mine if t.keep.any()]
+        if len(kept) < max(2, len(mine) // 2):
+            raise BenchNotFitted(
+                f"camera {name}: {len(mine) - len(kept)} of its {len(mine)} pictures do not agree with the "
+                "rest; check that pan counts right and tilt up, that each picture's placement is the right "
+                "one, and that nothing but the head moved"
+            )
+        typical, noise_px = typical_length(problem, state, kept, bench.survey.sigma.corner_px)
+        if typical > WRONG_MINIMUM:
+            raise BenchNotFitted(
+                f"camera {name}: the fit leaves {typical:.1f} times the stated noise of a corner "
+                f"({noise_px:g} px): it ended in a wrong minimum, the lens is none of this model, the "
+                "board's measures are wrong, or the sigmas are too small"
+            )

@@ -1,0 +1,401 @@
+"""A bench as a least-squares problem: its terms, where it starts, and where its rover frame is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+
+from calib.adjust.adjustment import HUBER, Adjustment, Estimate
+from calib.adjust.model_terms import AXIS_TERMS, bow_of, candidate_terms, joint_numbers
+from calib.adjust.significance import MEDIAN_OF_TWO
+from calib.adjust.terms import ImageTerm, with_kept
+from calib.calibrate.starts.bench import BenchNotFitted, BenchStart, SomethingChanged, bench_start
+from calib.calibrate.starts.views import ViewPoses, ViewsTooFew, view_poses
+from calib.geometry.cahvor import Kind
+from calib.geometry.rig import JOINTS_NAMES, MAST_NAMES
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.survey.records import Survey, SurveyImage
+
+SUREST = 0.1
+"""Part of ``corner_px`` below which no corner's own sigma counts: what neighbours share is not in it."""
+
+FEWEST_CORNERS = 6
+"""An image with fewer takes no part: with four, a pose goes through them whatever they are."""
+
+
+@dataclass(frozen=True, eq=False)
+class BenchTerms:
+    """Images that are fitted, those that are not (purpose ``check``), the number of the head's standstills
+    among the former, and sentences on images that say nothing."""
+
+    images: tuple[ImageTerm, ...]
+    checks: tuple[ImageTerm, ...]
+    attitudes: int
+    notes: tuple[str, ...]
+
+
+def bench_terms(survey: Survey) -> BenchTerms:
+    """Return a bench's terms, in the order in which its images were taken.
+
+    Images of several cameras that follow each other at one placement and reading belong to one standstill:
+    what a reading is off is the same for all of them.
+    """
+    fitted: list[ImageTerm] = []
+    checks: list[ImageTerm] = []
+    notes: list[str] = []
+    standstills = _Standstills()
+    for image in survey.images:
+        corners = survey.corners.get(image.name)
+        if corners is None or not len(corners.ids):
+            continue
+        if len(corners.ids) < FEWEST_CORNERS:
+            notes.append(
+                f"image {image.name} is not used: it shows {len(corners.ids)} corners of board "
+                f"{image.board}, {FEWEST_CORNERS} at least are expected"
+            )
+            continue
+        on_head = survey.cameras[image.camera].on == "head"
+        check = image.purpose == "check"
+        attitude = None if not on_head else -1 if check else standstills.of(image)
+        board = survey.boards[image.board]
+        bend = np.stack(
+            [board.in_board_m(corners.ids, bow)[:, 2] for bow in ((1.0, 0.0), (0.0, 1.0))], axis=1
+        )
+        term = ImageTerm(
+            image.name,
+            image.camera,
+            (image.board, image.placement),
+            attitude,
+            float(image.pan_rad or 0.0) if on_head else 0.0,
+            float(image.tilt_rad or 0.0) if on_head else 0.0,
+            np.zeros(0, dtype=np.int64),
+            np.zeros(0, dtype=np.int64),
+            board.in_board_m(corners.ids),
+            corners.pixels_px,
+            np.maximum(corners.sigma_px, SUREST * survey.sigma.corner_px),
+            np.ones(len(corners.ids), dtype=bool),
+            (image.pan_approach, image.tilt_approach) if on_head else (0, 0),
+            bend,
+            corners.ids,
+        )
+        (checks if check else fitted).append(term)
+    return BenchTerms(tuple(fitted), tuple(checks), standstills.count, tuple(notes))
+
+
+class _Standstills:
+    """Counts the head's standstills as images go by."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._key: tuple[object, ...] | None = None
+        self._shown: set[tuple[str, str]] = set()
+
+    def of(self, image: SurveyImage) -> int:
+        """The index of the standstill that an image belongs to."""
+        key = (image.placement, image.pan_rad, image.tilt_rad, image.pan_approach, image.tilt_approach)
+        if key != self._key or (image.camera, image.board) in self._shown:
+            self.count, self._key, self._shown = self.count + 1, key, set()
+        self._shown.add((image.camera, image.board))
+        return self.count - 1
+
+
+MOVES = 4
+"""Boards that moved far are looked for so many times."""
+
+TURNABOUTS = 0.34
+"""A board stood at two places in turn if no cut divides its pictures but for this part of the fewer ones."""
+
+INEXACT = 1.15
+"""Corners that are typically so many of their own sigmas off are less exact than noise leaves them."""
+
+AXES = tuple(MAST_NAMES.index(t.parameters[0].removeprefix("mast.")) for t in AXIS_TERMS.values())
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """What is chosen and not measured.
+
+    Attributes
+    ----------
+    kind
+        Camera model of all cameras; None: as the survey says for each.
+    terms
+        The terms that enter; None: those that are significant.
+    rover_from_mast
+        Where the rover frame is: the mast's frame at zero angles in it, as a level and a tape give it.
+        Default: it is the mast's.
+    rover_from_board
+        Or the board and placement whose pose is known, and that pose.
+    """
+
+    kind: Kind | None = None
+    terms: Sequence[str] | None = None
+    rover_from_mast: Rigid | None = None
+    rover_from_board: tuple[tuple[str, str], Rigid] | None = None
+
+
+class BenchProblem:
+    """The problem of a bench's pictures; a board that turns out to have moved changes it.
+
+    Raises
+    ------
+    BenchNotFitted
+        If the pictures allow no start, or a board stood at two places in turn.
+    """
+
+    def __init__(self, survey: Survey, options: BenchOptions) -> None:
+        self.survey, self.options = survey, options
+        self.terms: BenchTerms = bench_terms(survey)
+        self.notes = list(self.terms.notes)
+        self.joint_rad = survey.sigma.joint_rad
+        if not any(t.attitude is not None for t in self.terms.images):
+            raise BenchNotFitted(
+                "no picture of a head camera shows a board: the head cannot be calibrated; at least 20 "
+                "pictures are expected, with pan and tilt both moved between them"
+            )
+        self.cameras = {t.camera: survey.cameras[t.camera] for t in self.terms.images}
+        self.boards = tuple(dict.fromkeys(t.board[0] for t in self.terms.images))
+        self.split: list[tuple[tuple[str, str], tuple[str, str], str]] = []
+        self.own_px = {t.name: t.sigma_px for t in (*self.terms.images, *self.terms.checks)}
+        self.inexact_m = 0.0
+        self.views = self._views()
+        self.begin()
+
+    def copied(self) -> BenchProblem:
+        """Return the same bench; a board that moves there has not moved here."""
+        other = copy(self)
+        other.notes, other.split = [*self.notes], [*self.split]
+        return other
+
+    def begin(self) -> None:
+        """Find where to start, and leave out placements that no head camera shows.
+
+        A board that stood elsewhere in all pictures from some one on counts as two placements.
+        """
+        start = self._start()
+        for _ in range(MOVES):
+            if not start.elsewhere:
+                break
+            board, elsewhere = next(iter(start.elsewhere.items()))
+            self._moved_far(board, elsewhere)
+            start = self._start()
+        self.notes += start.notes
+        images = [t for t in self.terms.images if t.board in start.estimate.rover_from_board]
+        checks = [t for t in self.terms.checks if t.board in start.estimate.rover_from_board]
+        self.terms = replace(self.terms, images=tuple(images), checks=tuple(checks))
+        self.start, self.doubtful = self._in_rover(start.estimate), start.doubtful
+        self.boards = tuple(dict.fromkeys(t.board[0] for t in images))
+
+    def _start(self) -> BenchStart:
+        return bench_start(self.terms.images, self.views, self.terms.attitudes if self.joint_rad > 0 else 0)
+
+    def _moved_far(self, board: tuple[str, str], elsewhere: frozenset[str]) -> None:
+        """Split the placement of a board that moved; refuse one that stood at two places in turn."""
+        shown = [t for t in self.terms.images if t.board == board]
+        there = np.array([t.name in elsewhere for t in shown])
+        changes = np.flatnonzero(there[1:] != there[:-1])
+        # A picture that says nothing clear may lie on either side: the change is where it divides best.
+        wrong = [
+            int(min((~there[:k]).sum() + there[k:].sum(), there[:k].sum() + (~there[k:]).sum()))
+            for k in range(len(shown) + 1)
+        ]
+        cut = int(np.argmin(wrong))
+        if wrong[cut] > TURNABOUTS * there.sum():
+            first = [shown[i + 1].name for i in changes[:3]]
+            raise SomethingChanged(
+                f"board {board[0]} of placement {board[1]} stands at two places, now at one and now at the "
+                f"other (pictures {', '.join(first)} and others): two boards have the same ids, or it was "
+                "moved and put back; leave one board only, or print the other with other ids (first_id)"
+            )
+        before, after = shown[cut - 1].name, shown[cut].name
+        self.notes.append(
+            f"board {board[0]} moved during placement {board[1]}, between pictures {before} and {after}; "
+            "from there on it counts as another placement"
+        )
+        self.split_placement(board, after)
+
+    def split_placement(self, board: tuple[str, str], after: str) -> None:
+        """Give the images of a board from one on a placement of their own."""
+        names = [i.name for i in self.survey.images]
+        first = names.index(after)
+        moved = (board[0], f"{board[1]} from {after} on")
+        self.split.append((board, moved, after))
+
+        def relabelled(terms: Sequence[ImageTerm]) -> tuple[ImageTerm, ...]:
+            return tuple(
+                replace(t, board=moved) if t.board == board and names.index(t.name) >= first else t
+                for t in terms
+            )
+
+        self.terms = replace(
+            self.terms, images=relabelled(self.terms.images), checks=relabelled(self.terms.checks)
+        )
+
+    def read_otherwise(self, joint: str, after: str, step_rad: float) -> None:
+        """Take a joint to have been further on than it read, in the images from one on."""
+        names = [i.name for i in self.survey.images]
+        first, key = names.index(after), f"{joint}_rad"
+
+        def turned(terms: Sequence[ImageTerm]) -> tuple[ImageTerm, ...]:
+            return tuple(
+                t
+                if t.attitude is None or names.index(t.name) < first
+                else replace(t, **{key: getattr(t, key) + step_rad})
+                for t in terms
+            )
+
+        self.terms = replace(self.terms, images=turned(self.terms.images), checks=turned(self.terms.checks))
+
+    def _views(self) -> dict[str, ViewPoses]:
+        """What each camera says by itself."""
+        views = {}
+        for name, camera in self.cameras.items():
+            mine = [t for t in self.terms.images if t.camera == name]
+            try:
+                views[name] = view_poses(
+                    mine, self.options.kind or camera.kind, camera.size_px, camera.focal_px or None
+                )
+            except ViewsTooFew as error:
+                raise BenchNotFitted(f"camera {name}: {error}") from None
+        return views
+
+    def _in_rover(self, state: Estimate) -> Estimate:
+        """The start, which is in the mast's frame, carried to where the rover frame was chosen to be."""
+        options, known = self.options, self.options.rover_from_board
+        state = replace(state, bows_m={b: np.zeros(2) for b, _ in state.rover_from_board})
+        if known is not None and known[0] not in state.rover_from_board:
+            there = ", ".join("/".join(board) for board in state.rover_from_board)
+            raise BenchNotFitted(
+                f"no picture shows the board {'/'.join(known[0])} that is known; there are {there}"
+            )
+        rover_from_mast = options.rover_from_mast
+        if known is not None:
+            rover_from_mast = known[1] @ state.rover_from_board[known[0]].inverse
+        if rover_from_mast is None:
+            return state
+        angles = Rotation.from_matrix(rover_from_mast.rotation).as_euler("XYZ")
+        mast = np.array([*rover_from_mast.translation_m, *angles, *state.mast[6:]])
+        boards = {b: rover_from_mast @ pose for b, pose in state.rover_from_board.items()}
+        cameras = {
+            n: m.moved(rover_from_mast) if self.cameras[n].on == "rover" else m
+            for n, m in state.cameras.items()
+        }
+        if known is not None:
+            boards[known[0]] = known[1]
+        return replace(state, cameras=cameras, mast=mast, rover_from_board=boards)
+
+    def problem(self, chosen: Sequence[str], state: Estimate) -> Adjustment:
+        """The least-squares problem with some terms."""
+        known = self.options.rover_from_board
+        axes = [i for i, term in zip(AXES, AXIS_TERMS, strict=True) if term in chosen]
+        return Adjustment(
+            with_kept(self.terms.images, self.doubtful),
+            (),
+            state,
+            mast_parameters=[*(() if known is None else range(6)), *axes],
+            joint_rad=self.joint_rad,
+            joint_errors=joint_numbers(chosen),
+            bowed=[b for b in self.boards if bow_of(b).name in chosen],
+            held=() if known is None else (known[0],),
+            huber=HUBER,
+        )
+
+    def seen(self, chosen: Sequence[str], start: Estimate) -> Adjustment:
+        """The problem without images whose corners have no pixel at the start."""
+        problem = self.problem(chosen, start)
+        unseen = {t.name for t in problem.images if not np.isfinite(problem.image_residual(start, t)).all()}
+        return problem.with_terms(with_kept(problem.images, unseen), ())
+
+    def allow_inexact(self, problem: Adjustment, state: Estimate) -> bool:
+        """Take corners for as inexact on the board as a fit shows them, where their own sigmas are less.
+
+        A print, and a lens that is only nearly of its model, are off by more than noise leaves of a corner.
+        What is added stays below ``corner_px``: more is no print. Returns whether sigmas changed.
+        """
+        every = (*self.terms.images, *self.terms.checks)
+        per_m = {t.name: _px_per_m(problem, state, t) for t in every}
+        kept = [t for t in problem.images if t.keep.any()]
+        own = np.concatenate([self.own_px[t.name][t.keep] for t in kept])
+        scale = np.concatenate([per_m[t.name][t.keep] for t in kept])
+        off_px = np.concatenate(
+            [problem.image_residual(state, t).reshape(-1, 2) * t.sigma_px[t.keep, None] for t in kept]
+        )
+        square = np.sum(off_px**2, axis=1)
+
+        def typical(inexact_m: float) -> float:
+            return float(np.median(square / (own**2 + (inexact_m * scale) ** 2)) / MEDIAN_OF_TWO)
+
+        most_px2 = self.survey.sigma.corner_px**2 - float(np.median(own)) ** 2
+        most_m = float(np.sqrt(max(most_px2, 0.0)) / np.median(scale))
+        found_m = 0.0
+        if most_m > 0.0 and typical(0.0) > INEXACT**2:
+            found_m = (
+                most_m if typical(most_m) > 1.0 else float(brentq(lambda m: typical(m) - 1.0, 0.0, most_m))
+            )
+        if abs(found_m - self.inexact_m) < 0.1 * max(found_m, self.inexact_m, 1e-9):
+            return False
+        self.inexact_m = found_m
+
+        def less_sure(terms: Sequence[ImageTerm]) -> tuple[ImageTerm, ...]:
+            return tuple(
+                replace(t, sigma_px=np.hypot(self.own_px[t.name], found_m * per_m[t.name])) for t in terms
+            )
+
+        self.terms = replace(
+            self.terms, images=less_sure(self.terms.images), checks=less_sure(self.terms.checks)
+        )
+        return True
+
+    def candidates(self) -> tuple[str, ...]:
+        """Terms that pictures could tell: backlash only where the axis came from both sides."""
+        found = []
+        approaches = np.array([t.approach for t in self.terms.images if t.attitude is not None])
+        for name, term in candidate_terms(self.boards).items():
+            if term.kind == "backlash":
+                sides = set(approaches[:, ("pan", "tilt").index(term.of)].tolist())
+                if not {-1, 1} <= sides:
+                    self.notes.append(_one_sided(name, term.of, sides))
+                    continue
+            found.append(name)
+        return tuple(found)
+
+
+def _px_per_m(problem: Adjustment, state: Estimate, term: ImageTerm) -> FloatArray:
+    """How many pixels (n,) a metre across the line of sight is where each corner of an image is."""
+    camera = state.cameras[term.camera]
+    away_m = np.linalg.norm(problem.in_camera(state, term) - camera.C, axis=1)
+    return np.asarray(np.linalg.norm(np.cross(camera.A, camera.H)) / away_m)
+
+
+def _one_sided(term: str, joint: str, sides: set[int]) -> str:
+    """Why a joint's backlash is not looked for."""
+    if not sides & {-1, 1}:
+        return f"{term} is not looked for: nobody knows from which side {joint} came to rest"
+    side = "smaller" if 1 in sides else "larger"
+    return (
+        f"{term} is not looked for: {joint} came to rest from {side} angles only, as in a head that "
+        "approaches every goal from one side; its play is then part of its zero, and no error"
+    )
+
+
+def without_terms(state: Estimate, terms: set[str]) -> Estimate:
+    """Return the state with some terms' numbers at nothing."""
+    mast, errors = state.mast.copy(), state.joint_errors.copy()
+    mast[[i for i, term in zip(AXES, AXIS_TERMS, strict=True) if term in terms]] = 0.0
+    errors[joint_numbers(list(terms))] = 0.0
+    bows = {b: np.zeros(2) if bow_of(b).name in terms else bow for b, bow in state.bows_m.items()}
+    return replace(state, mast=mast, joint_errors=errors, bows_m=bows)
+
+
+def term_values(state: Estimate) -> dict[str, float]:
+    """The values of all terms' numbers by their names."""
+    values = dict(zip(JOINTS_NAMES, state.joint_errors.tolist(), strict=True))
+    values |= {f"mast.{MAST_NAMES[i]}": float(state.mast[i]) for i in AXES}
+    for board, bow in state.bows_m.items():
+        values |= {f"board {board}.bow_m.{a}": float(b) for a, b in zip("xy", bow, strict=True)}
+    return values

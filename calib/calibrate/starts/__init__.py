@@ -1,0 +1,1 @@
+"""Where a fit begins, from rough focal lengths alone."""

@@ -1,0 +1,288 @@
+"""From pictures of boards that stand anywhere to a place where least squares can start.
+
+Each camera by itself says where the board was in each of its images (``calib.calibrate.starts.views``). With
+joint angles q, for boards p and images i,
+
+    rover_from_board[p] = rover_from_head(q_i) · head_from_camera · camera_from_board[i],
+
+which is linear in the two unknown rotations, then in the two unknown places (hand-eye and robot-world at
+once; Shah 2013). Weights that fall with the misfit take the pull from bad images; of two poses of an image
+that which fits is taken. The mast's frame is the rover's here, its axes taken to meet at a right angle,
+joints to read true.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.adjust.adjustment import Estimate
+from calib.adjust.terms import ImageTerm
+from calib.adjust.uncertainty import SEEN_RAD
+from calib.calibrate.starts.views import ViewPoses
+from calib.errors import CalibError
+from calib.geometry.rig import MAST_NAMES
+from calib.geometry.rigid import FloatArray, Rigid, rot_y, rot_z
+
+ROUNDS = 25
+"""Of weights; they settle in some ten."""
+
+SMALLEST_RAD, SMALLEST_M = 2e-3, 2e-3
+"""Misfits below these do not count as smaller."""
+
+GROSS = 8.0
+"""An image is doubtful if it misses by so many times the typical misfit."""
+
+NEAR_RAD, NEAR_M = 0.1, 0.05
+"""Poses of a board by single images that are the same place; what is nearer, least squares can tell apart."""
+
+FEWEST_ELSEWHERE = 3
+"""As many images that have a board at one other place are no blunders."""
+
+FEWEST_ATTITUDES = 4
+"""Standstills of the head with which a start is tried."""
+
+
+class BenchNotFitted(CalibError):
+    """The pictures do not determine what is asked of them, or contradict each other; the sentence says
+    how."""
+
+
+class SomethingChanged(BenchNotFitted):
+    """A joint slipped, a camera was knocked or refocused, two boards have the same ids: more pictures mend
+    nothing, somebody has to."""
+
+
+@dataclass(frozen=True, eq=False)
+class BenchStart:
+    """The state to begin with, images that do not agree with it, sentences for a person, and by board and
+    placement the images that agree with each other that it stood somewhere else (only such as do)."""
+
+    estimate: Estimate
+    doubtful: frozenset[str]
+    notes: tuple[str, ...]
+    elsewhere: Mapping[tuple[str, str], frozenset[str]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Tied:
+    """A camera tied to its boards: mount_from_camera, mast_from_board, and the latter as each image has
+    it."""
+
+    mount_from_camera: Rigid
+    mast_from_board: dict[tuple[str, str], Rigid]
+    by_image: dict[str, Rigid]
+
+
+def bench_start(images: Sequence[ImageTerm], views: Mapping[str, ViewPoses], attitudes: int) -> BenchStart:
+    """Return where to start the fit of a bench.
+
+    Parameters
+    ----------
+    images
+        All that are fitted; a head camera's have an attitude.
+    views
+        By camera what it says by itself.
+    attitudes
+        How many head attitudes have angles of their own; 0 where readings are exact.
+
+    Raises
+    ------
+    BenchNotFitted
+        If the head moved too little, or a body camera sees no board that a head camera sees.
+    """
+    on_head = {t.camera for t in images if t.attitude is not None}
+    notes: list[str] = []
+    elsewhere: dict[tuple[str, str], set[str]] = {}
+    doubtful = {name for view in views.values() for name in view.doubtful}
+    cameras, boards, weight = {}, {}, dict[tuple[str, str], int]()
+    for name in sorted(on_head, key=lambda n: -len(views[n].poses)):
+        mine = [t for t in images if t.camera == name and t.name in views[name].poses]
+        _refuse_still(name, mine)
+        tied = _tie(mine, views[name])
+        cameras[name] = views[name].model.moved(tied.mount_from_camera)
+        for board, pose in tied.mast_from_board.items():
+            count = sum(t.board == board for t in mine)
+            if count > weight.get(board, 0):
+                boards[board], weight[board] = pose, count
+        off = _far_off(mine, tied)
+        doubtful |= off
+        for board in tied.mast_from_board:
+            elsewhere.setdefault(board, set()).update(
+                _agreeing([t for t in mine if t.name in off and t.board == board], tied)
+            )
+    for name in views:
+        if name not in on_head:
+            mine = [
+                t for t in images if t.camera == name and t.name in views[name].poses and t.board in boards
+            ]
+            if not mine:
+                raise BenchNotFitted(
+                    f"camera {name} on the body sees no board that a head camera sees from where it stands: "
+                    "put a board where both see it, or leave the camera out"
+                )
+            cameras[name] = views[name].model.moved(_body(mine, views[name], boards))
+    lonely = {t.board for t in images} - set(boards)
+    for board in sorted(lonely):
+        notes.append(f"placement {board[1]} of board {board[0]} is not used: no head camera shows it well")
+    estimate = Estimate(
+        {n: cameras[n] for n in views}, np.zeros(len(MAST_NAMES)), {}, boards, {}, np.zeros((attitudes, 2))
+    )
+    return BenchStart(
+        estimate,
+        frozenset(doubtful),
+        tuple(notes),
+        {board: frozenset(names) for board, names in elsewhere.items() if len(names) >= FEWEST_ELSEWHERE},
+    )
+
+
+def _refuse_still(name: str, images: Sequence[ImageTerm]) -> None:
+    """Raise if a camera's images do not show both axes."""
+    attitudes = {t.attitude for t in images}
+    if len(attitudes) < FEWEST_ATTITUDES:
+        raise BenchNotFitted(
+            f"camera {name} shows a board at {len(attitudes)} head positions where {FEWEST_ATTITUDES} at "
+            "least, better 20, are expected: take more pictures, with pan and tilt both moved between them"
+        )
+    # A joint has to move while one placement is in view.
+    for axis, key in (("pan", "pan_rad"), ("tilt", "tilt_rad")):
+        by_board: dict[tuple[str, str], list[float]] = {}
+        for t in images:
+            by_board.setdefault(t.board, []).append(getattr(t, key))
+        moved = max(float(np.ptp(angles)) for angles in by_board.values())
+        if moved < SEEN_RAD:
+            raise BenchNotFitted(
+                f"{axis} moves by {np.degrees(moved):.1f}° at most while camera {name} sees one placement, "
+                f"so that its axis cannot be told: take pictures with {axis} at least "
+                f"{np.degrees(4 * SEEN_RAD):.0f}° apart in which the same placement is in view"
+            )
+
+
+def _tie(images: Sequence[ImageTerm], view: ViewPoses) -> _Tied:
+    """One head camera's place in the head and its boards' places, by weighted linear least squares."""
+    boards = list(dict.fromkeys(t.board for t in images))
+    gimbals = np.array([rot_z(t.pan_rad) @ rot_y(t.tilt_rad) for t in images])
+    at = np.array([boards.index(t.board) for t in images])
+    chosen = [view.poses[t.name][0] for t in images]
+    weight = np.ones(len(images))
+    for _ in range(ROUNDS):
+        seen = np.array([pose.rotation for pose in chosen])
+        in_head, in_mast = _rotations(gimbals, seen, at, len(boards), weight)
+        chosen = [
+            _nearest(view.poses[t.name], (gimbals[i] @ in_head).T @ in_mast[at[i]])
+            for i, t in enumerate(images)
+        ]
+        seen = np.array([pose.rotation for pose in chosen])
+        off = _angles(gimbals @ in_head @ seen, in_mast[at])
+        typical = max(float(np.median(off)), SMALLEST_RAD)
+        before, weight = weight, 1.0 / np.maximum(off, 0.5 * typical)
+        weight = weight / weight.max()
+        if np.abs(weight - before).max() < 1e-3:
+            break
+    good = off < GROSS * typical
+    shifts = np.array([pose.translation_m for pose in chosen])
+    place, places = _places(gimbals, gimbals @ in_head, shifts, at, len(boards), good)
+    head_from_camera = Rigid(in_head, place)
+    return _Tied(
+        head_from_camera,
+        {b: Rigid(in_mast[i], places[i]) for i, b in enumerate(boards)},
+        {t.name: Rigid(gimbals[i], np.zeros(3)) @ head_from_camera @ chosen[i] for i, t in enumerate(images)},
+    )
+
+
+def _rotations(
+    gimbals: FloatArray, seen: FloatArray, at: np.ndarray, boards: int, weight: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Head from camera (3, 3) and mast from board (b, 3, 3) with G X S = Z for all images, weighted."""
+    size = 9 * (1 + boards)
+    matrix = np.zeros((size, size))
+    # Row by row, vec(G X S) = (G kron Sᵀ) vec(X); each is orthogonal, so that the squares are identities.
+    known = np.einsum("nij,nlk->nikjl", gimbals, seen).reshape(-1, 9, 9)
+    matrix[:9, :9] = np.sum(weight**2) * np.eye(9)
+    for board in range(boards):
+        mine, part = at == board, slice(9 * (1 + board), 9 * (2 + board))
+        matrix[part, part] = np.sum(weight[mine] ** 2) * np.eye(9)
+        matrix[part, :9] = -np.einsum("n,nij->ij", weight[mine] ** 2, known[mine])
+        matrix[:9, part] = matrix[part, :9].T
+    _, vectors = np.linalg.eigh(matrix)
+    found = vectors[:, 0].reshape(-1, 3, 3)
+    if np.linalg.det(found[0]) < 0:
+        found = -found
+    left, _, right = np.linalg.svd(found)
+    turned = left @ right
+    return turned[0], turned[1:]
+
+
+def _places(
+    gimbals: FloatArray,
+    mast_from_camera: FloatArray,
+    shifts: FloatArray,
+    at: np.ndarray,
+    boards: int,
+    good: np.ndarray,
+) -> tuple[FloatArray, FloatArray]:
+    """The camera's place in the head (3,) and the boards' in the mast (b, 3), metres."""
+    weight = good.astype(np.float64)
+    for _ in range(ROUNDS):
+        rows = np.zeros((len(gimbals), 3, 3 * (1 + boards)))
+        rows[:, :, :3] = gimbals
+        for i, board in enumerate(at):
+            rows[i, :, 3 + 3 * board : 6 + 3 * board] = -np.eye(3)
+        wanted = -np.einsum("nij,nj->ni", mast_from_camera, shifts)
+        solved = np.linalg.lstsq(
+            (weight[:, None, None] * rows).reshape(-1, rows.shape[2]),
+            (weight[:, None] * wanted).ravel(),
+            rcond=None,
+        )[0]
+        off = np.linalg.norm(rows @ solved - wanted, axis=1)
+        typical = max(float(np.median(off[good])), SMALLEST_M)
+        weight = np.where(good, np.sqrt(1.0 / np.maximum(off, typical) * typical), 0.0)
+    return solved[:3], solved[3:].reshape(-1, 3)
+
+
+def _nearest(poses: Sequence[Rigid], rotation: FloatArray) -> Rigid:
+    """Of the poses of an image the one turned least from what the rest says."""
+    return max(poses, key=lambda pose: float(np.trace(pose.rotation.T @ rotation)))
+
+
+def _angles(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Angles (n,) between rotations (n, 3, 3)."""
+    between = np.einsum("nji,njk->nik", one, other)
+    return np.asarray(Rotation.from_matrix(between).magnitude())
+
+
+def _body(images: Sequence[ImageTerm], view: ViewPoses, boards: Mapping[tuple[str, str], Rigid]) -> Rigid:
+    """A body camera's place by the boards it sees: the pose that most of its images agree with."""
+    votes = [boards[t.board] @ pose.inverse for t in images for pose in view.poses[t.name]]
+    turns = np.array([pose.rotation for pose in votes])
+    apart = [np.median(_angles(np.broadcast_to(turn, turns.shape), turns)) for turn in turns]
+    return votes[int(np.argmin(apart))]
+
+
+def _far_off(images: Sequence[ImageTerm], tied: _Tied) -> set[str]:
+    """Images whose board stands far from where the others have it."""
+    off = np.array([_apart(tied.by_image[t.name], tied.mast_from_board[t.board]) for t in images])
+    limits = np.maximum(GROSS * np.median(off, axis=0), (NEAR_RAD, NEAR_M))
+    return {t.name for t, far in zip(images, (off > limits).any(axis=1), strict=True) if far}
+
+
+def _agreeing(images: Sequence[ImageTerm], tied: _Tied) -> set[str]:
+    """Of images that have a board elsewhere, those that most others of them agree with."""
+    best: set[str] = set()
+    for one in images:
+        near = {
+            t.name
+            for t in images
+            if (_apart(tied.by_image[t.name], tied.by_image[one.name]) < (NEAR_RAD, NEAR_M)).all()
+        }
+        best = max(best, near, key=len)
+    return best
+
+
+def _apart(one: Rigid, other: Rigid) -> FloatArray:
+    """Angle and distance between two poses, radians and metres."""
+    turn = Rotation.from_matrix(one.rotation.T @ other.rotation).magnitude()
+    return np.array([turn, np.linalg.norm(one.translation_m - other.translation_m)])

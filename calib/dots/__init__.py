@@ -1,1 +1,0 @@
-"""The dot board in a picture: found, put in order, measured."""

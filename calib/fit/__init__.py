@@ -1,1 +1,0 @@
-"""From measurements to a rig: starts, least squares, outliers, covariance."""

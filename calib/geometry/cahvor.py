@@ -1,0 +1,342 @@
+"""CAHV, CAHVOR and CAHVORE camera models: project, ray, Jacobians, motion.
+
+Pixels are (x, y) = (column, row), 0-based; the centre of the top-left pixel is (0, 0). H and V need not be at
+right angles, and mirrored images are as good as others.
+
+Sources: Yakimovsky and Cunningham 1978 (CAHV); Gennery 2001, 2006 (CAHVOR, CAHVORE); JPL's camera-model
+library as published with VICAR (``cmod_cahv*.c``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import inf, isfinite, nan, sqrt
+from numbers import Integral
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calib.geometry.lens import Lens
+from calib.geometry.projection import Place, Projection, project_as_published
+from calib.geometry.rigid import FloatArray, ReadOnlyArrays, Rigid, frozen_array, tangents
+
+Kind = Literal["CAHV", "CAHVOR", "CAHVORE"]
+
+_UNIT = 1e-9
+"""How far the length of A and O may be from 1."""
+
+_ROUNDING = 4e-16
+"""A length this close to 1 is 1: such vectors keep their bits when a file is read and written."""
+
+_FLAT = 1e-12
+"""Relative volume of H, V, A below which they lie in one plane."""
+
+
+class Rays(NamedTuple):
+    """Rays through pixels, in the model's frame; rows that do not exist are not-a-number.
+
+    origins_m (..., 3), directions (..., 3) unit length pointing into the scene, valid (...,) bool.
+    """
+
+    origins_m: FloatArray
+    directions: FloatArray
+    valid: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class CameraModel(ReadOnlyArrays):
+    """One camera of the CAHV family; A and O are unit vectors (see ``normalised``).
+
+    Attributes
+    ----------
+    kind
+        Says which letters count: CAHV ignores O, R and E, CAHVOR ignores E. Those that do not count are
+        kept as O = A, R = 0, E = 0.
+    size_px
+        (width, height).
+    C, A, H, V, O, R, E
+        (3,) each, read-only. C in metres; A and O unit vectors; H and V in pixels; R and E as published.
+    cahvore_type
+        1 (perspective, linearity 1), 2 (fisheye, linearity 0) or 3 (``linearity`` as given); 0 for CAHV
+        and CAHVOR.
+
+    Raises
+    ------
+    ValueError
+        If the numbers are no camera; the sentence names the letter.
+
+    Notes
+    -----
+    A point has a pixel if the lens reaches it: for CAHV and CAHVOR it is in front of C along A and along O,
+    for CAHVORE its ray is within the angle that the linearity allows (a right angle over ``linearity``, at
+    most half a turn), and for both it is nearer to O than where the polynomial of R first folds. Points so
+    near a CAHVORE lens that two rays of the image pass through them have none. Everything else comes out
+    as not-a-number and False. A point outside the image keeps its numbers.
+
+    Examples
+    --------
+    >>> H, V = [500, 0, 319.5], [0, 500, 239.5]
+    >>> camera = CameraModel("CAHV", (640, 480), C=[0, 0, 0], A=[0, 0, 1], H=H, V=V)
+    >>> pixel, valid = camera.project([0.1, 0.0, 1.0])
+    >>> pixel.tolist(), bool(valid)
+    ([369.5, 239.5], True)
+    """
+
+    kind: Kind
+    size_px: tuple[int, int]
+    C: FloatArray
+    A: FloatArray
+    H: FloatArray
+    V: FloatArray
+    O: FloatArray = None  # type: ignore[assignment]  # noqa: E741  the model's own letter; A if not given
+    R: FloatArray = None  # type: ignore[assignment]  # 0 if not given
+    E: FloatArray = None  # type: ignore[assignment]  # 0 if not given
+    cahvore_type: int = 0
+    linearity: float = 1.0
+    _rows: FloatArray = field(init=False, repr=False)  # C, H, V, A, and the lens frame's x, y, z = O
+    _projection: Projection = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._set_words()
+        for letter in "CAHV":
+            self._set(letter, _vector(letter, getattr(self, letter)))
+        for letter, default in (("O", self.A), ("R", np.zeros(3)), ("E", np.zeros(3))):
+            given = getattr(self, letter) if letter in self.kind else None
+            self._set(letter, _vector(letter, default if given is None else given))
+        for letter, axis in (("A", self.A), ("O", self.O)):
+            if not abs(sqrt(float(axis @ axis)) - 1.0) <= _UNIT:
+                raise ValueError(f"{letter} is {axis.tolist()} where a vector of length 1 is expected")
+        if not self.A @ self.O > 0.0:
+            raise ValueError(
+                f"O is {self.O.tolist()}, which is not within 90 degrees of A, {self.A.tolist()}"
+            )
+        if not 1.0 + self.R[0] > 0.0:
+            raise ValueError(f"R begins with {self.R[0]:g} where a number above -1 is expected")
+        hva = np.array([self.H, self.V, self.A])
+        lengths = np.sqrt(np.einsum("ij,ij->i", hva, hva))
+        if not lengths.all() or not abs(np.linalg.det(hva / lengths[:, None])) > _FLAT:
+            raise ValueError("H, V and A lie in one plane where three directions are expected")
+        axes = np.array([*tangents(self.O), self.O])
+        self._set("_rows", np.array([self.C, *hva, *axes]))
+        self._rows.setflags(write=False)
+        self._set("_projection", self._make_projection(hva @ axes.T))
+
+    def _set(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)
+
+    def _set_words(self) -> None:
+        """Check and settle what is not a vector: kind, size, type and linearity."""
+        if self.kind not in get_args(Kind):
+            raise ValueError(f"the kind is {self.kind!r} where CAHV, CAHVOR or CAHVORE is expected")
+        try:
+            sizes = [n if isinstance(n, Integral) and not isinstance(n, bool) else 0 for n in self.size_px]
+        except TypeError:
+            sizes = []
+        if len(sizes) != 2 or min(sizes) <= 0:
+            raise ValueError(f"the size is {self.size_px!r} where two whole numbers above 0 are expected")
+        self._set("size_px", (int(sizes[0]), int(sizes[1])))
+        types = (1, 2, 3) if self.kind == "CAHVORE" else (0,)
+        if self.cahvore_type not in types:
+            expected = "1, 2 or 3" if len(types) == 3 else "0"
+            raise ValueError(
+                f"the type is {self.cahvore_type!r} where {expected} is expected for {self.kind}"
+            )
+        linearity = float(self.linearity) if self.cahvore_type == 3 else 1.0 if self.cahvore_type < 2 else 0.0
+        if not isfinite(linearity):
+            raise ValueError(f"the linearity is {linearity} where a finite number is expected")
+        self._set("linearity", linearity)
+
+    def _make_projection(self, pixel_from_slope: FloatArray) -> Projection:
+        """Return what stays when the camera moves."""
+        r0, r1, r2 = self.R.tolist()
+        e0, e1, e2 = self.E.tolist()
+        slope_from_pixel = np.asarray(np.linalg.inv(pixel_from_slope), dtype=np.float64)
+        for matrix in (pixel_from_slope, slope_from_pixel):
+            matrix.setflags(write=False)
+        lens = Lens(
+            (r0, r1, r2),
+            (e0, e1, e2),
+            self.kind == "CAHVORE",
+            self.linearity,
+            _largest_slope(self.size_px, slope_from_pixel),
+        )
+        return Projection(lens, pixel_from_slope, slope_from_pixel)
+
+    @classmethod
+    def normalised(
+        cls,
+        kind: Kind,
+        size_px: tuple[int, int],
+        C: ArrayLike,
+        A: ArrayLike,
+        H: ArrayLike,
+        V: ArrayLike,
+        O: ArrayLike | None = None,  # noqa: E741
+        R: ArrayLike | None = None,
+        E: ArrayLike | None = None,
+        cahvore_type: int = 0,
+        linearity: float = 1.0,
+    ) -> tuple[CameraModel, float]:
+        """Return the model with A and O made unit vectors, and by how much that moves a pixel at most.
+
+        Arguments as the class, A and O of any length but zero. The change, in pixels, is the largest over
+        the image of points 1 m and 1 km away, against JPL's formulas with the vectors as given; infinite
+        if those give no pixel somewhere.
+
+        Raises
+        ------
+        ValueError
+            As the class, and if A or O is zero.
+        """
+        given = {"A": _vector("A", A)}
+        if O is not None and "O" in str(kind):
+            given["O"] = _vector("O", O)
+        units, stretched = {}, False
+        for letter, axis in given.items():
+            length = float(np.linalg.norm(axis))
+            if not 0.0 < length < inf:
+                raise ValueError(f"{letter} is {axis.tolist()} where a direction is expected")
+            is_unit = abs(length - 1.0) <= _ROUNDING
+            units[letter] = axis if is_unit else axis / length
+            stretched |= not is_unit
+        vectors = {"C": C, "H": H, "V": V, "O": None, "R": R, "E": E} | units
+        model = cls(kind, size_px, cahvore_type=cahvore_type, linearity=linearity, **vectors)  # type: ignore[arg-type]
+        if not stretched:
+            return model, 0.0
+        x, y = np.meshgrid(*(np.linspace(-0.5, n - 0.5, 17) for n in model.size_px))
+        pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
+        rays = model.ray(pixels)
+        letters = {letter: given.get(letter, getattr(model, letter)) for letter in "CAHVORE"}
+        if "O" not in given:
+            letters["O"] = given["A"]
+        curve = model.linearity if kind == "CAHVORE" else None
+        shift_px = 0.0
+        for range_m in (1.0, 1000.0):
+            points = rays.origins_m[rays.valid] + range_m * rays.directions[rays.valid]
+            published = project_as_published(points, linearity=curve, **letters)
+            far = np.hypot(*(published - pixels[rays.valid]).T)
+            shift_px = max(shift_px, float(np.where(np.isfinite(far), far, inf).max(initial=0.0)))
+        return model, shift_px
+
+    @property
+    def lens(self) -> Lens:
+        """Distortion, entrance point and reach: what stays when the camera moves."""
+        return self._projection.lens
+
+    @property
+    def image_center_px(self) -> tuple[float, float]:
+        """((w-1)/2, (h-1)/2): the middle of the image in pixel-centre coordinates."""
+        return ((self.size_px[0] - 1) / 2, (self.size_px[1] - 1) / 2)
+
+    def holds(self, pixel_px: ArrayLike, margin_px: float = 0.0) -> bool:
+        """Tell whether a pixel (2,) lies in the image, at least ``margin_px`` inside its outer border.
+
+        The border runs half a pixel outside the outer pixels' centres. Not-a-number lies outside.
+        """
+        x, y = np.asarray(pixel_px, dtype=np.float64)
+        low, (width, height) = margin_px - 0.5, self.size_px
+        return bool(low <= x <= width - 1 - low and low <= y <= height - 1 - low)
+
+    def moved(self, b_from_a: Rigid) -> CameraModel:
+        """Return the same camera with its vectors in frame b instead of a: C moves, A H V O turn."""
+        rows = self._rows @ b_from_a.rotation.T
+        rows[0] += b_from_a.translation_m
+        rows.setflags(write=False)
+        model = object.__new__(CameraModel)
+        letters = {"C": rows[0], "H": rows[1], "V": rows[2], "A": rows[3], "O": rows[6]}
+        model.__dict__.update(self.__dict__, _rows=rows, **letters)
+        model.__dict__.pop("_place", None)
+        return model
+
+    def project(self, points_m: ArrayLike) -> tuple[FloatArray, np.ndarray]:
+        """Return pixels (..., 2) of points (..., 3), metres in the model's frame, and which are valid (...).
+
+        Points that have no pixel (see the class) come out as not-a-number.
+        """
+        points = _as_rows(points_m, 3, "points")
+        if points.ndim == 1:
+            x_m, y_m, z_m = points.tolist()
+            x_px, y_px = self._projection.project_point(x_m, y_m, z_m, self._place)
+            return np.array([x_px, y_px]), np.array(x_px == x_px)
+        pixels, _, valid = self._projection.project(points.reshape(-1, 3), self.C, self._rows[3:], False)
+        return pixels.reshape(*points.shape[:-1], 2), valid.reshape(points.shape[:-1])
+
+    def project_jacobian(self, points_m: ArrayLike) -> tuple[FloatArray, FloatArray, np.ndarray]:
+        """Return pixels (..., 2), d pixel / d point (..., 2, 3) in px/m, and which are valid (...).
+
+        Points that have no pixel (see the class) come out as not-a-number.
+        """
+        points = _as_rows(points_m, 3, "points")
+        shape = points.shape[:-1]
+        pixels, jacobian, valid = self._projection.project(
+            points.reshape(-1, 3), self.C, self._rows[3:], True
+        )
+        return pixels.reshape(*shape, 2), jacobian.reshape(*shape, 2, 3), valid.reshape(shape)
+
+    def ray(self, pixels_px: ArrayLike) -> Rays:
+        """Return the rays through pixels (..., 2); a CAHVORE ray begins at the moved entrance point.
+
+        Pixels that no ray of the lens lands on come out as not-a-number.
+        """
+        pixels = _as_rows(pixels_px, 2, "pixels")
+        if pixels.ndim == 1:
+            x_px, y_px = pixels.tolist()
+            ray = self._projection.ray_of_pixel(x_px, y_px, self._place)
+            if ray is None:
+                return Rays(np.full(3, nan), np.full(3, nan), np.array(False))
+            return Rays(np.array(ray[0]), np.array(ray[1]), np.array(True))
+        shape = pixels.shape[:-1]
+        origins, directions, valid, _, _ = self._projection.rays(
+            pixels.reshape(-1, 2), self.C, self._axes, False
+        )
+        return Rays(origins.reshape(*shape, 3), directions.reshape(*shape, 3), valid.reshape(shape))
+
+    def ray_jacobian(self, pixels_px: ArrayLike) -> tuple[Rays, FloatArray, FloatArray]:
+        """Return the rays, d direction / d pixel (..., 3, 2) per px and d origin / d pixel (..., 3, 2), m/px.
+
+        Pixels that no ray of the lens lands on come out as not-a-number.
+        """
+        pixels = _as_rows(pixels_px, 2, "pixels")
+        shape = pixels.shape[:-1]
+        origins, directions, valid, d_directions, d_origins = self._projection.rays(
+            pixels.reshape(-1, 2), self.C, self._axes, True
+        )
+        rays = Rays(origins.reshape(*shape, 3), directions.reshape(*shape, 3), valid.reshape(shape))
+        return rays, d_directions.reshape(*shape, 3, 2), d_origins.reshape(*shape, 3, 2)
+
+    @property
+    def _axes(self) -> FloatArray:
+        """The lens frame's x, y and z = O, as rows."""
+        return self._rows[4:]
+
+    @cached_property
+    def _place(self) -> Place:
+        """C and the lens frame's axes as plain floats, for one point at a time."""
+        c, _, _, _, x, y, o = self._rows.tolist()
+        return c, x, y, o
+
+
+def _vector(letter: str, given: ArrayLike) -> FloatArray:
+    """Return one of the model's vectors, read-only, or say which letter is wrong."""
+    try:
+        return frozen_array(given, (3,))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{letter}: {error}") from None
+
+
+def _as_rows(values: ArrayLike, width: int, what: str) -> FloatArray:
+    """Return ``values`` as floats (..., width)."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != width:
+        raise ValueError(f"{what} of shape {array.shape} where (..., {width}) is expected")
+    return array
+
+
+def _largest_slope(size_px: tuple[int, int], slope_from_pixel: FloatArray) -> float:
+    """Return the largest distorted slope inside the image, which is at one of its four corners."""
+    x, y = size_px[0] - 0.5, size_px[1] - 0.5
+    corners = np.array([[-0.5, -0.5, 1.0], [x, -0.5, 1.0], [-0.5, y, 1.0], [x, y, 1.0]])
+    u, v, w = slope_from_pixel @ corners.T
+    return float((np.hypot(u, v) / w).max()) if (w > 0.0).all() else inf

@@ -1,0 +1,385 @@
+"""The covariance that a mast file carries, and a rig moved along it.
+
+A calibration leaves ``fit.parameters`` and ``fit.covariance`` in the mast file
+(docs/how-to/survey-calibration.md). The parameters are ``mast.KEY.x``, ``joints.pan.c1``
+(`calib.geometry.rig`) and ``cameras.NAME.C.x``, as `calib.geometry.parameters` orders a camera's step.
+
+How pixels, and the clicks of a point, depend on these parameters and on the joints (``JOINT_NAMES``) is in
+closed form, by the derivatives of the camera (`calib.geometry.parameters`) and of the mast
+(`calib.geometry.rig`).
+
+Whether two clicks mean one point follows: two rays have four coordinates and a point three. What is left
+over, how far the rays pass each other, is one number that is zero but for noise; its square over the variance
+that clicks and rig give it is chi-square with one degree of freedom. Along the epipolar line nothing can be
+told: there every pixel is a point at another range.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calib.errors import CalibError, NoStereoPoint
+from calib.geometry.parameters import parameter_names, predict, stepped
+from calib.geometry.rig import (
+    AXIS_NAMES,
+    JOINTS_NAMES,
+    MAST_NAMES,
+    UNKNOWN,
+    Approach,
+    Rig,
+    gimbal,
+    gimbal_rates,
+    joint_numbers_of,
+    joints_of,
+    mast_of,
+    numbers_of,
+)
+from calib.geometry.rigid import FloatArray, ReadOnlyArrays, frozen_array
+from calib.geometry.stereo import Triangulation, triangulate
+
+ROUNDING = 1e-4
+"""Of one: what a stored correlation may be off by, as where a file was written with few digits."""
+
+_MAST = tuple(f"mast.{name}" for name in MAST_NAMES)
+
+
+@dataclass(frozen=True, eq=False)
+class RigCovariance(ReadOnlyArrays):
+    """How sure a rig's parameters are: ``names`` (p,) and ``covariance`` (p, p), in the names' units.
+
+    Raises
+    ------
+    ValueError
+        If the covariance is not (p, p), finite, and without negative variances.
+    """
+
+    names: tuple[str, ...]
+    covariance: FloatArray
+
+    def __post_init__(self) -> None:
+        size = len(self.names)
+        object.__setattr__(self, "covariance", frozen_array(self.covariance, (size, size)))
+        if (np.diag(self.covariance) < 0.0).any():
+            raise ValueError("a covariance with a negative variance is none")
+
+    def of(self, cameras: Sequence[str]) -> RigCovariance:
+        """Return the part of the mast, of the joints and of some cameras."""
+        wanted = tuple(f"cameras.{name}." for name in cameras)
+        kept = [i for i, name in enumerate(self.names) if name.startswith(("mast.", "joints.", *wanted))]
+        return RigCovariance(tuple(self.names[i] for i in kept), self.covariance[np.ix_(kept, kept)])
+
+    def among(self, names: Sequence[str]) -> FloatArray:
+        """Return the covariance (k, k) of other names in their order; what has no place here is exact."""
+        at = {name: i for i, name in enumerate(self.names)}
+        theirs = [i for i, name in enumerate(names) if name in at]
+        mine = [at[names[i]] for i in theirs]
+        covariance = np.zeros((len(names), len(names)))
+        covariance[np.ix_(theirs, theirs)] = self.covariance[np.ix_(mine, mine)]
+        return covariance
+
+
+def stored_covariance(rig: Rig) -> RigCovariance | None:
+    """Return the covariance of a rig's mast file, or None if it has none.
+
+    Raises
+    ------
+    CalibError
+        If ``fit.parameters`` and ``fit.covariance`` do not fit each other or the rig.
+    """
+    if "covariance" not in rig.fit or "parameters" not in rig.fit:
+        return None
+    known = {
+        *_MAST,
+        *JOINTS_NAMES,
+        *(f"cameras.{n}.{p}" for n, c in rig.cameras.items() for p in parameter_names(c.model.kind)),
+    }
+    names = rig.fit["parameters"]
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise CalibError("fit.parameters of the mast file is not a list of names")
+    if strange := [name for name in names if name not in known]:
+        raise CalibError(f"fit.parameters of the mast file names {strange[0]!r}, which the rig does not have")
+    try:
+        covariance = np.array(rig.fit["covariance"], dtype=np.float64)
+    except (TypeError, ValueError):
+        covariance = np.empty(0)
+    square = covariance.shape == (len(names), len(names))
+    if not square or not np.isfinite(covariance).all() or (np.diag(covariance) < 0).any():
+        raise CalibError(
+            f"fit.covariance of the mast file is not {len(names)} rows of {len(names)} numbers with a "
+            "positive diagonal, as its fit.parameters ask"
+        )
+    if _impossible(covariance):
+        raise CalibError(
+            "fit.covariance of the mast file is none: it is not symmetric, or some direction has a negative "
+            "variance"
+        )
+    return RigCovariance(tuple(names), covariance)
+
+
+def _impossible(covariance: FloatArray) -> bool:
+    """Whether a matrix with a positive diagonal is no covariance, beyond what rounding does."""
+    scale = np.sqrt(np.diag(covariance))
+    scaled = covariance / np.outer(*2 * [np.where(scale > 0.0, scale, 1.0)])
+    if np.abs(scaled - scaled.T).max(initial=0.0) > ROUNDING:
+        return True
+    return bool(np.linalg.eigvalsh(scaled).min(initial=0.0) < -ROUNDING)
+
+
+def moved_rig(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:
+    """Return the rig with the named parameters moved by ``step`` (p,), in the names' units."""
+    at = dict(zip(names, step.tolist(), strict=True))
+    numbers = numbers_of(rig.mast) + np.array([at.get(name, 0.0) for name in _MAST])
+    joints = rig.joints
+    if any(at.get(name, 0.0) for name in JOINTS_NAMES):
+        joints = joints_of(joint_numbers_of(joints) + np.array([at.get(name, 0.0) for name in JOINTS_NAMES]))
+    cameras = dict(rig.cameras)
+    for name, camera in rig.cameras.items():
+        mine = [f"cameras.{name}.{part}" for part in parameter_names(camera.model.kind)]
+        if any(at.get(part, 0.0) for part in mine):
+            model = stepped(camera.model, np.array([at.get(part, 0.0) for part in mine]))
+            cameras[name] = replace(camera, model=model)
+    return replace(rig, mast=mast_of(numbers), joints=joints, cameras=cameras)
+
+
+JOINT_NAMES = ("pan_rad", "tilt_rad")
+
+_GIMBAL_NAMES = (*(f"mast.{name}" for name in MAST_NAMES), *JOINT_NAMES)
+"""A gimbal's ten numbers."""
+
+
+def pixel_rates(
+    rig: Rig,
+    names: Sequence[str],
+    camera: str,
+    pan_rad: float,
+    tilt_rad: float,
+    points_m: FloatArray,
+    approach: Approach = UNKNOWN,
+) -> tuple[FloatArray, FloatArray]:
+    """Return pixels (n, 2) of rover-frame points (n, 3) and their derivatives (n, 2, p) to named parameters.
+
+    ``names`` (p,) are ``mast.KEY.x``, ``joints.pan.c1`` (the readings held), ``cameras.NAME.C.x``,
+    ``pan_rad`` and ``tilt_rad``; what is not among them is held. The angles are true ones; from which side
+    the axes came there says how the backlash counts.
+    """
+    held = rig.cameras[camera]
+    at = {name: i for i, name in enumerate(names)}
+    out = np.zeros((len(points_m), 2, len(names)))
+    if held.on == "rover":
+        seen = predict(held.model, points_m)
+    else:
+        head = gimbal(numbers_of(rig.mast), pan_rad, tilt_rad)
+        seen = predict(held.model, (points_m - head.translation_m) @ head.rotation)
+        erring = [name for name in JOINTS_NAMES if name in at]
+        free = np.array(
+            [i for i, name in enumerate(_GIMBAL_NAMES) if name in at or (erring and name in JOINT_NAMES)],
+            dtype=int,
+        )
+        rates = -gimbal_rates(seen.d_points @ head.rotation.T, points_m, head, free)
+        for column, i in enumerate(free):
+            if _GIMBAL_NAMES[i] in at:
+                out[..., at[_GIMBAL_NAMES[i]]] = rates[..., column]
+        if erring:  # the last two columns are then those of pan and tilt
+            by_joints = _joint_rates(rig, (pan_rad, tilt_rad), approach)
+            for name in erring:
+                number = JOINTS_NAMES.index(name)
+                axis = number // len(AXIS_NAMES)
+                out[..., at[name]] = rates[..., axis - 2] * by_joints[number]
+    mine = [f"cameras.{camera}.{part}" for part in parameter_names(held.model.kind)]
+    known = [i for i, name in enumerate(mine) if name in at]
+    out[..., [at[mine[i]] for i in known]] = seen.d_step[..., known]
+    return seen.pixels_px, out
+
+
+def _joint_rates(rig: Rig, true_rad: tuple[float, float], approach: Approach) -> FloatArray:
+    """(10,) how each joint's true angle changes with the numbers of `JOINTS_NAMES`, its reading held."""
+    read = rig.joints.read_rad(true_rad, approach)
+    axes = zip((rig.joints.pan, rig.joints.tilt), read, approach, strict=True)
+    return np.concatenate([joint.rates(at, side) for joint, at, side in axes])
+
+
+def click_rates(
+    rig: Rig,
+    names: Sequence[str],
+    cameras: Sequence[str],
+    pan_rad: float,
+    tilt_rad: float,
+    position_m: FloatArray,
+    approach: Approach = UNKNOWN,
+) -> FloatArray:
+    """Return (2k, p): how far the clicks of a point in k cameras seem shifted as parameters change.
+
+    A model that moves its pixel of a point by something puts a click's ray where a click moved the other way
+    would. That is exact where the rays meet; where they pass each other it leaves out a part as small as
+    their gap beside the baseline.
+    """
+    point = position_m[None]
+    return -np.concatenate(
+        [pixel_rates(rig, names, camera, pan_rad, tilt_rad, point, approach)[1][0] for camera in cameras]
+    )
+
+
+def click_covariance(
+    rig: Rig,
+    cameras: Sequence[str],
+    pan_rad: float,
+    tilt_rad: float,
+    position_m: FloatArray,
+    *,
+    sigma_px: float,
+    sigma_rad: float = 0.0,
+    calibration: RigCovariance | None = None,
+) -> FloatArray:
+    """Return the covariance (2k, 2k), px², of a point's clicks in k cameras and of all that is off with them.
+
+    Parameters
+    ----------
+    rig, cameras, pan_rad, tilt_rad
+        Who sees it, and the true joint angles.
+    position_m
+        (3,) the point, rover frame.
+    sigma_px, sigma_rad
+        Of each pixel coordinate of a click, and of each joint reading.
+    calibration
+        Covariance of the rig; exact when left out.
+    """
+    total = sigma_px * sigma_px * np.eye(2 * len(cameras))
+    known = calibration.of(cameras) if calibration else None
+    names = (*(known.names if known else ()), *JOINT_NAMES)
+    rates = click_rates(rig, names, cameras, pan_rad, tilt_rad, position_m)
+    if known:
+        by_rig = rates[:, : len(known.names)]
+        total += by_rig @ known.covariance @ by_rig.T
+    turned = rates[:, -2:]
+    return np.asarray(total + sigma_rad * sigma_rad * (turned @ turned.T))
+
+
+FALSE_ALARMS = 0.001
+"""Chance that two clicks of one point are refused, if all stated sigmas are right."""
+
+MOST_SIGMAS = 3.2905
+"""Beyond it a normal error is, either side, in that part of cases."""
+
+RIG_PX = 1.0
+"""One sigma, each pixel coordinate, of what a camera is taken to be wrong by whose errors its rig does not
+tell: the residuals of the paper's mast calibration are 0.85 to 1.13 px rms."""
+
+
+@dataclass(frozen=True)
+class RayGap:
+    """How far two rays pass each other, and how far that is from what explains it.
+
+    Attributes
+    ----------
+    gap_m, sigma_m
+        The length of the rays' common normal, and one sigma of it.
+    across_px, across_sigma_px
+        The same in the right picture: how far its pixel is off the line on which the left one's ray lies.
+    """
+
+    gap_m: float
+    sigma_m: float
+    across_px: float
+    across_sigma_px: float
+
+    @property
+    def sigmas(self) -> float:
+        """The gap in standard deviations; infinite if it has none."""
+        return self.gap_m / self.sigma_m if self.sigma_m > 0.0 else math.inf if self.gap_m > 0.0 else 0.0
+
+
+def ray_gap(seen: Triangulation, clicks_px2: FloatArray) -> RayGap:
+    """Return the gap of a triangulation with its sigma; ``clicks_px2`` (4, 4) is the clicks' covariance."""
+    rates = seen.gap_m_per_px
+    sigma_m = math.sqrt(max(float(rates @ clicks_px2 @ rates), 0.0))
+    per_right_px = float(np.linalg.norm(rates[2:]))
+    return RayGap(seen.ray_gap_m, sigma_m, seen.ray_gap_m / per_right_px, sigma_m / per_right_px)
+
+
+def silent_cameras(pair: tuple[str, str], calibration: RigCovariance | None) -> tuple[str, ...]:
+    """Return the cameras of a pair of whose errors a rig's covariance says nothing: all if there is none."""
+    names = calibration.names if calibration else ()
+    return tuple(one for one in pair if not any(name.startswith(f"cameras.{one}.") for name in names))
+
+
+def refuse_two_points(gap: RayGap, pair: tuple[str, str], by: str) -> None:
+    """Refuse two clicks whose rays pass each other farther than their noise explains.
+
+    Parameters
+    ----------
+    gap
+        As `ray_gap` gives it.
+    pair
+        The cameras' names, left first.
+    by
+        What was taken to explain a gap, in words.
+
+    Raises
+    ------
+    NoStereoPoint
+        ``not_one_point``.
+    """
+    if gap.sigmas <= MOST_SIGMAS:
+        return
+    raise NoStereoPoint(
+        "not_one_point",
+        f"the two pixels do not mean one point: their rays pass each other at {1e3 * gap.gap_m:.3g} mm, "
+        f"{gap.sigmas:.1f} sigma; the pixel of {pair[1]} is {gap.across_px:.1f} px off the epipolar line of "
+        f"that of {pair[0]}, where {by} explain {MOST_SIGMAS * gap.across_sigma_px:.1f} px at most",
+    )
+
+
+def clicked_point(
+    rig: Rig,
+    pair: tuple[str, str],
+    pan_rad: float,
+    tilt_rad: float,
+    left_px: ArrayLike,
+    right_px: ArrayLike,
+    *,
+    sigma_px: float = 0.2,
+    sigma_rad: float = 0.0,
+    calibration: RigCovariance | None = None,
+) -> tuple[Triangulation, RayGap]:
+    """Return the point that two clicks in a pair's pictures mean, rover frame, and the gap of its rays.
+
+    Parameters
+    ----------
+    rig, pair, pan_rad, tilt_rad
+        Who sees it, left camera first, and the joint readings.
+    left_px, right_px
+        (2,) clicks.
+    sigma_px, sigma_rad
+        Of each pixel coordinate of a click, and of each joint reading.
+    calibration
+        Covariance of the rig. A camera of which it says nothing is taken to be wrong by ``RIG_PX``.
+
+    Raises
+    ------
+    NoStereoPoint
+        As `calib.geometry.stereo.triangulate`, and ``not_one_point``.
+    """
+    for name, pixel in zip(pair, (left_px, right_px), strict=True):
+        if np.shape(pixel) != (2,):
+            raise NoStereoPoint(
+                "bad_pixel", f"a pixel of {name} of shape {np.shape(pixel)} where (2,) is expected"
+            )
+    left, right = (rig.camera_in_rover(name, pan_rad, tilt_rad) for name in pair)
+    seen = triangulate(left, right, left_px, right_px, sigma_px)
+    allowed = click_covariance(
+        rig, pair, pan_rad, tilt_rad, seen.position_m,
+        sigma_px=sigma_px, sigma_rad=sigma_rad, calibration=calibration,
+    )  # fmt: skip
+    unknown = silent_cameras(pair, calibration)
+    allowed += np.diag(np.repeat([RIG_PX**2 if name in unknown else 0.0 for name in pair], 2))
+    gap = ray_gap(seen, allowed)
+    by = f"clicks good to {sigma_px:g} px and " + ("the mast file's covariance" if calibration else "the rig")
+    if calibration and unknown:
+        by += f", which knows nothing of {' and '.join(unknown)},"
+    refuse_two_points(gap, pair, by)
+    return seen, gap

@@ -1,0 +1,232 @@
+"""One camera beside another: how far apart two models are, and maps from one's picture to the other's.
+
+Models are compared by where they project. Parameters would not do: |A|, |O| and R0 are gauges, so that two
+models may agree in every pixel and in no number.
+
+Where a map is (map_x, map_y), pixel (x, y) of the new picture is what the old one shows at (map_x[y, x],
+map_y[y, x]): what cv2.initUndistortRectifyMap makes of OpenCV's own lenses for ``cv2.remap``, here for the
+whole CAHV family, ray by ray.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import FloatArray, Rigid, frozen_array
+
+GRID = 5
+"""Pixels of the comparison along each side of the image."""
+
+RANGES_M = (1.0, 100.0)
+"""Near and far range of the comparison, metres.
+
+At 1 m a shift of 1 µm moves a pixel as much as a turn of 1 µrad. Labels of six digits round positions
+and joint angles above 1 m and 1 rad to 2.9 µm and 2.9 µrad (one sigma), so these ranges weigh them as
+they deserve.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelDifference:
+    """How far one model of a camera is from another one, by where they project.
+
+    Attributes
+    ----------
+    position_m
+        (3,) the other's C minus the reference's, in their common frame.
+    rotation_rad
+        (3,) rotation vector that turns the reference's rays onto the other's, same frame.
+    shift_px
+        (n, 2) how far the other projects points far away from where the reference does, pixels of the other;
+        infinite where it does not see what the reference sees.
+    """
+
+    position_m: FloatArray
+    rotation_rad: FloatArray
+    shift_px: FloatArray
+
+
+def model_difference(reference: CameraModel, other: CameraModel) -> ModelDifference:
+    """Return how far ``other`` is from ``reference`` (two models of one camera in one frame), by where
+    they project.
+
+    The rotation is the one that turns a grid of the reference's rays onto the other's best (Kabsch).
+    Sizes may differ where one image is the other one binned.
+
+    Raises
+    ------
+    ValueError
+        If the two have fewer than two rays of the grid in common.
+    """
+    wanted_px = pixel_grid(other.size_px)
+    rays, other_rays = reference.ray(pixel_grid(reference.size_px)), other.ray(wanted_px)
+    px, valid = other.project(rays.origins_m + RANGES_M[1] * rays.directions)
+    both = rays.valid & other_rays.valid
+    if both.sum() < 2:
+        raise ValueError(
+            f"the two models have {int(both.sum())} of {len(both)} rays in common, at least 2 are expected"
+        )
+    rotation, _ = Rotation.align_vectors(other_rays.directions[both], rays.directions[both])
+    shift_px = np.where(valid[:, None], px - wanted_px, np.inf)[both]
+    return ModelDifference(other.C - reference.C, rotation.as_rotvec(), shift_px)
+
+
+def with_one_lens(models: Sequence[CameraModel], lens: CameraModel) -> tuple[CameraModel, ...]:
+    """Return ``lens`` put where each of the models stands, as told by its C, A and H.
+
+    For models whose lens changes from one to the next (interpolated over temperature): what stays of them is
+    position and orientation. It trusts parameters, so it holds within one calibration only: A means the same
+    direction in two models only if their R0 is the same.
+    """
+    from_lens = Rigid(camera_axes(lens), lens.C).inverse
+    return tuple(lens.moved(Rigid(camera_axes(model), model.C) @ from_lens) for model in models)
+
+
+def camera_axes(model: CameraModel) -> FloatArray:
+    """Return the rotation (3, 3) from camera axes (x right, y down, z along A) to the model's frame."""
+    across = model.H - (model.H @ model.A) * model.A
+    x = across / np.linalg.norm(across)
+    return np.stack([x, np.cross(model.A, x), model.A], axis=-1)
+
+
+def pixel_grid(size_px: tuple[int, int]) -> FloatArray:
+    """Return (25, 2) pixels spread evenly over an image: the same places of the view for a binned image."""
+    fractions = (np.arange(GRID) + 0.5) / GRID
+    x, y = np.meshgrid(fractions * size_px[0] - 0.5, fractions * size_px[1] - 0.5)
+    return np.stack([x.ravel(), y.ravel()], axis=-1)
+
+
+FAR_M = 100.0
+"""Where points along the new picture's rays are; only an entrance point that moves makes it matter."""
+
+NOWHERE = -1.0
+"""The place of a pixel that the old picture does not show: outside, where cv2.remap takes the border."""
+
+
+class Maps(NamedTuple):
+    """map_x and map_y (height, width), float32, for cv2.remap."""
+
+    map_x: np.ndarray
+    map_y: np.ndarray
+
+
+class RectifiedPair(NamedTuple):
+    """A pair whose rows are side by side.
+
+    left, right
+        Ideal cameras (CAHV) with one A, H, V but for C: a point has the same y in both, and x left less x
+        right is focal length times baseline over its depth.
+    left_maps, right_maps
+        From the old pictures to theirs.
+    depth
+        (4, 4) OpenCV's Q: (x, y, disparity, 1) to a homogeneous point in the left ideal camera's axes,
+        metres.
+    """
+
+    left: CameraModel
+    right: CameraModel
+    left_maps: Maps
+    right_maps: Maps
+    depth: FloatArray
+
+
+def ideal_camera(model: CameraModel, focal_px: float | None = None) -> CameraModel:
+    """Return the camera without a lens (CAHV) that stands where ``model`` does and looks along its A.
+
+    Its image has the same size and centre, H and V are at right angles, and its focal lengths are the
+    model's, or ``focal_px`` both: a smaller one shows more of a wide picture.
+
+    Raises
+    ------
+    ValueError
+        If the focal length is not above zero.
+    """
+    if focal_px is not None and not 0.0 < focal_px < np.inf:
+        raise ValueError(f"the focal length is {focal_px:g} px where a number above 0 is expected")
+    a = model.A
+    cx, cy = float(model.H @ a), float(model.V @ a)
+    across, down = model.H - cx * a, model.V - cy * a
+    fx, fy = float(np.linalg.norm(across)), float(np.linalg.norm(down))
+    x = across / fx
+    y = np.cross(a, x) * np.sign(np.cross(a, x) @ down)
+    if focal_px is not None:
+        fx = fy = focal_px
+    return CameraModel("CAHV", model.size_px, model.C, a, fx * x + cx * a, fy * y + cy * a)
+
+
+def maps_between(ideal: CameraModel, model: CameraModel, range_m: float = FAR_M) -> Maps:
+    """Return the maps that make of a picture of ``model`` the one that ``ideal`` would have taken.
+
+    Parameters
+    ----------
+    ideal, model
+        In one frame.
+    range_m
+        How far the things are, if the two do not look from one point.
+    """
+    width, height = ideal.size_px
+    x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    rays = ideal.ray(np.stack([x.ravel(), y.ravel()], axis=1))
+    pixels, valid = model.project(rays.origins_m + range_m * rays.directions)
+    pixels[~valid] = NOWHERE
+    both = pixels.T.reshape(2, height, width).astype(np.float32)
+    return Maps(np.ascontiguousarray(both[0]), np.ascontiguousarray(both[1]))
+
+
+def rectified_pair(left: CameraModel, right: CameraModel, focal_px: float | None = None) -> RectifiedPair:
+    """Return a pair with rows side by side: x along the baseline, looking where the two look between them.
+
+    Parameters
+    ----------
+    left, right
+        The cameras, in one frame, of one size.
+    focal_px
+        Of the ideal cameras; the mean of the pair's if not given.
+
+    Raises
+    ------
+    ValueError
+        If the sizes differ, the cameras stand in one place, or look along their baseline.
+    """
+    if left.size_px != right.size_px:
+        raise ValueError(f"the left picture has {left.size_px} px and the right one {right.size_px}")
+    baseline = right.C - left.C
+    length_m = float(np.linalg.norm(baseline))
+    if length_m < 1e-6:
+        raise ValueError("the two cameras stand in one place: there is no baseline")
+    x = baseline / length_m
+    ahead = left.A + right.A
+    z = ahead - (ahead @ x) * x
+    if np.linalg.norm(z) < 0.2:
+        raise ValueError("the two cameras look along their baseline: there are no rows to lay side by side")
+    z /= np.linalg.norm(z)
+    y = np.cross(z, x)
+    if focal_px is None:
+        sizes = [
+            np.linalg.norm(np.cross(one.A, letter)) for one in (left, right) for letter in (one.H, one.V)
+        ]
+        focal_px = float(np.mean(sizes))
+    cx, cy = left.image_center_px
+    h, v = focal_px * x + cx * z, focal_px * y + cy * z
+    eyes = [CameraModel("CAHV", left.size_px, one.C, z, h, v) for one in (left, right)]
+    depth = np.array(
+        [
+            [1.0, 0.0, 0.0, -cx],
+            [0.0, 1.0, 0.0, -cy],
+            [0.0, 0.0, 0.0, focal_px],
+            [0.0, 0.0, 1.0 / length_m, 0.0],
+        ]
+    )
+    return RectifiedPair(
+        eyes[0],
+        eyes[1],
+        maps_between(eyes[0], left),
+        maps_between(eyes[1], right),
+        frozen_array(depth, (4, 4)),
+    )

@@ -1,0 +1,295 @@
+"""Exact pointing: the joint angles that bring a target onto a chosen pixel of a head camera.
+
+The pixel's ray (origin c, unit direction d, both in the head frame) comes from the camera model itself, so
+lens distortion, a moving entrance point, oblique H and V and a principal point off centre are all exact, for
+any pixel. The paper (section IV) turns the camera by a small rotation vector instead, eqs. (19)-(22).
+The letters are those of calib.geometry.reach.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calib.errors import Unreachable
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.reach import EDGE, Axes, Ray, Triple, arm_points, axes_of, ray_of, why_not
+from calib.geometry.rig import Mast
+from calib.geometry.rigid import FloatArray
+from calib.geometry.solutions import Solution, Solutions, check_here, order
+
+_SAME_RAD = 1e-7
+"""Solutions closer than this are one: at the edge of reach two meet, good to the root of rounding."""
+
+_PARALLEL = 1e-3
+"""``|cos k|`` below this: the axes are parallel to a milliradian, and the mast is not a pan/tilt head."""
+
+_FARTHEST_M = 1e9
+"""Coordinates from here on are taken for a mistake; their squares would overflow in the end."""
+
+_MOST = 4
+"""Pairs of joint angles that a target can have: as many as the quartic has roots."""
+
+
+def solve(
+    mast: Mast,
+    camera_in_head: CameraModel,
+    target_in_rover_m: ArrayLike,
+    pixel_px: ArrayLike | None = None,
+    *,
+    from_pan_rad: float = 0.0,
+    from_tilt_rad: float = 0.0,
+) -> list[Solution]:
+    """Return every pair of joint angles that puts the target on the pixel, the best first.
+
+    Parameters
+    ----------
+    mast
+        Any two revolute axes.
+    camera_in_head
+        Camera model in the head frame (a rig camera that is ``on: head``).
+    target_in_rover_m
+        (3,) target in the rover frame, metres; or (..., 3) many of them.
+    pixel_px
+        (x, y) of the wanted pixel; the image centre if left out; or (..., 2), broadcast against the targets.
+    from_pan_rad, from_tilt_rad
+        Where the head is now, for the order.
+
+    Returns
+    -------
+    list of Solution
+        For arrays of more than one axis what ``solve_many`` returns, which says so to a type checker too.
+        For one target never empty. Upright solutions (tilt within ±π/2) first, then by the larger of
+        ``|Δpan|`` and ``|Δtilt|``. The differences are plain ones, not taken round the circle: a head with a
+        cable cannot pass ±π.
+        Each has the target in front of the camera (range_m > 0). Limits are left to ``choose``. For a target
+        on the pan axis every pan does; from_pan_rad is returned.
+
+    Raises
+    ------
+    Unreachable
+        ``blind_cone``: too near the pan axis, with the distance from the axis that could be reached.
+        ``too_near``: nearer than the ray can be brought, with both distances. ``bad_pixel``, ``bad_target``:
+        the pixel has no ray, or the target is not three finite numbers below 1e9 m. ``parallel_axes``:
+        ``|cos k|`` < 0.001. ``bad_joints``: where the head is now is not finite.
+
+    Notes
+    -----
+    Extends section IV of the paper, eqs. (11)-(25); see docs/explanation/pointing.md.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from calib.geometry.cahvor import CameraModel
+    >>> from calib.geometry.rig import Mast
+    >>> mast = Mast(np.array([0.0, 0.0, -1.5]), np.zeros(3))
+    >>> forward, right, down = np.eye(3)
+    >>> H, V = 100 * right + 50 * forward, 100 * down + 50 * forward
+    >>> camera = CameraModel("CAHV", (101, 101), np.zeros(3), forward, H, V)
+    >>> [best, over_the_shoulder] = solve(mast, camera, [0.0, 3.0, -1.5])
+    >>> round(best.pan_rad, 6), abs(round(best.tilt_rad, 6)), round(best.range_m, 6)
+    (1.570796, 0.0, 3.0)
+    """
+    check_here(from_pan_rad, from_tilt_rad)
+    target = np.asarray(target_in_rover_m, dtype=np.float64)
+    pixel = None if pixel_px is None else np.asarray(pixel_px, dtype=np.float64)
+    if target.ndim > 1 or (pixel is not None and pixel.ndim > 1):
+        return solve_many(  # type: ignore[return-value]  # a type checker cannot tell the shapes apart
+            mast, camera_in_head, target, pixel, from_pan_rad=from_pan_rad, from_tilt_rad=from_tilt_rad
+        )
+    x_px, y_px = camera_in_head.image_center_px if pixel is None else _two_numbers(pixel)
+    ray = _camera_ray(camera_in_head, x_px, y_px)
+    return _solve(axes_of(mast), ray, target, from_pan_rad, from_tilt_rad)
+
+
+def solve_many(
+    mast: Mast,
+    camera_in_head: CameraModel,
+    targets_in_rover_m: ArrayLike,
+    pixels_px: ArrayLike | None = None,
+    *,
+    from_pan_rad: float = 0.0,
+    from_tilt_rad: float = 0.0,
+) -> Solutions:
+    """Return the joint angles of many targets, each as ``solve`` gives them for that target alone.
+
+    A target that cannot be reached, or is no target, does not stop the others: ``refused`` has its code.
+
+    Parameters
+    ----------
+    mast, camera_in_head, from_pan_rad, from_tilt_rad
+        As ``solve``; the head stands there before each target.
+    targets_in_rover_m
+        (..., 3) targets in the rover frame, metres.
+    pixels_px
+        (..., 2) wanted pixels (x, y), broadcast against the targets; the image centre if left out.
+
+    Raises
+    ------
+    Unreachable
+        ``bad_target``, ``bad_pixel``: arrays of another shape, or that do not go together.
+        ``parallel_axes``, ``bad_joints``: as ``solve``.
+    """
+    check_here(from_pan_rad, from_tilt_rad)
+    axes = axes_of(mast)
+    targets = np.asarray(targets_in_rover_m, dtype=np.float64)
+    pixels = np.asarray(camera_in_head.image_center_px if pixels_px is None else pixels_px, dtype=np.float64)
+    for array, width, code, what in (
+        (targets, 3, "bad_target", "targets"),
+        (pixels, 2, "bad_pixel", "pixels"),
+    ):
+        if array.ndim == 0 or array.shape[-1] != width:
+            raise Unreachable(code, f"{what} of shape {array.shape} where (..., {width}) is expected")
+    try:
+        shape = np.broadcast_shapes(targets.shape[:-1], pixels.shape[:-1])
+    except ValueError:
+        raise Unreachable(
+            "bad_target",
+            f"targets of shape {targets.shape} and pixels of shape {pixels.shape} do not go together",
+        ) from None
+    each = zip(
+        np.broadcast_to(targets, (*shape, 3)).reshape(-1, 3),
+        np.broadcast_to(pixels, (*shape, 2)).reshape(-1, 2).tolist(),
+        strict=True,
+    )
+    found, refused = np.full((3, math.prod(shape), _MOST), np.nan), [""] * math.prod(shape)
+    for row, (target, (x_px, y_px)) in enumerate(each):
+        try:
+            ray = _camera_ray(camera_in_head, x_px, y_px)
+            some = _solve(axes, ray, target, from_pan_rad, from_tilt_rad, told=False)
+        except Unreachable as refusal:
+            if refusal.code == "parallel_axes":  # the mast's fault, not the target's
+                raise
+            refused[row] = refusal.code
+            continue
+        for column, one in enumerate(some[:_MOST]):
+            found[:, row, column] = one.pan_rad, one.tilt_rad, one.range_m
+    pan_rad, tilt_rad, range_m = found.reshape(3, *shape, _MOST)
+    codes = np.array(refused, dtype=np.str_).reshape(shape)
+    for rows in (pan_rad, tilt_rad, range_m, codes):
+        rows.setflags(write=False)
+    return Solutions(pan_rad, tilt_rad, range_m, codes)
+
+
+def solve_ray(
+    mast: Mast,
+    origin_in_head_m: ArrayLike,
+    direction_in_head: ArrayLike,
+    target_in_rover_m: ArrayLike,
+    *,
+    from_pan_rad: float = 0.0,
+    from_tilt_rad: float = 0.0,
+) -> list[Solution]:
+    """Return every pair of joint angles that puts the target on a ray fixed to the head; see ``solve``.
+
+    Parameters
+    ----------
+    mast
+        Any two revolute axes.
+    origin_in_head_m, direction_in_head
+        (3,) where the ray starts, metres, and (3,) its direction, of any length but zero, in the head frame.
+    target_in_rover_m
+        (3,) target in the rover frame, metres.
+    from_pan_rad, from_tilt_rad
+        Where the head is now, for the order.
+
+    Raises
+    ------
+    Unreachable
+        As ``solve``; ``bad_pixel`` for a ray that is not finite or has no direction.
+    """
+    check_here(from_pan_rad, from_tilt_rad)
+    origin = np.asarray(origin_in_head_m, dtype=np.float64)
+    direction = np.asarray(direction_in_head, dtype=np.float64)
+    length = float(np.linalg.norm(direction))
+    if not (np.isfinite(origin).all() and math.isfinite(length) and length > 0.0):
+        raise Unreachable(
+            "bad_pixel", f"ray from {origin.tolist()} along {direction.tolist()} has no finite direction"
+        )
+    ray = ray_of(origin.tolist(), (direction / length).tolist())
+    target = np.asarray(target_in_rover_m, dtype=np.float64)
+    return _solve(axes_of(mast), ray, target, from_pan_rad, from_tilt_rad)
+
+
+def _solve(
+    axes: Axes,
+    ray: Ray,
+    target: FloatArray,
+    from_pan_rad: float,
+    from_tilt_rad: float,
+    told: bool = True,
+) -> list[Solution]:
+    """Solve for one target; a refusal tells by how much only if asked, as that takes a search."""
+    x, y, z = _target_in_mast(axes, target)
+    if abs(axes.cos_k) < _PARALLEL:
+        raise Unreachable(
+            "parallel_axes", f"pan and tilt axes are parallel (cos k = {axes.cos_k:.2g}): not a pan/tilt head"
+        )
+    rho = math.hypot(x, y)
+    on_axis = rho <= EDGE * math.hypot(rho, z)
+    azimuth = math.atan2(y, x)
+    (cx, _, cz), (dx, _, dz) = ray.c, ray.d
+    found: list[Solution] = []
+    for u_x, u_y, s in arm_points(axes, ray, rho, z):
+        # q = Rot(y,tilt) w turns w_x, w_z in their plane; q_y = w_y.
+        q_x = u_x - axes.a
+        q_z = axes.cos_k * z - axes.sin_k * u_y
+        w_x = cx + s * dx
+        w_z = cz + s * dz
+        tilt = math.atan2(q_x * w_z - q_z * w_x, q_x * w_x + q_z * w_z)
+        pan = _wrapped(from_pan_rad if on_axis else azimuth - math.atan2(u_y, u_x))
+        if not any(_same(pan, other.pan_rad) and _same(tilt, other.tilt_rad) for other in found):
+            found.append(Solution(pan, _wrapped(tilt), s))
+    if not found:
+        raise why_not(axes, ray, rho, z, told)
+    if len(found) > 1:
+        found.sort(key=lambda one: order(one, from_pan_rad, from_tilt_rad))
+    return found
+
+
+@lru_cache(maxsize=256)
+def _camera_ray(camera_in_head: CameraModel, x_px: float, y_px: float) -> Ray:
+    rays = camera_in_head.ray(np.array([x_px, y_px]))
+    if not rays.valid:
+        raise Unreachable(
+            "bad_pixel", f"pixel ({x_px:g}, {y_px:g}) has no ray in this {camera_in_head.kind} camera"
+        )
+    return ray_of(rays.origins_m.tolist(), rays.directions.tolist())
+
+
+def _two_numbers(pixel: FloatArray) -> tuple[float, float]:
+    if pixel.shape != (2,) or not np.isfinite(pixel).all():
+        raise Unreachable("bad_pixel", f"pixel {pixel.tolist()} is not two finite numbers")
+    x_px, y_px = pixel.tolist()
+    return x_px, y_px
+
+
+def _target_in_mast(axes: Axes, target: FloatArray) -> Triple:
+    if target.shape != (3,):
+        raise Unreachable(
+            "bad_target", f"target of shape {target.shape} where three coordinates are expected"
+        )
+    x, y, z = target.tolist()
+    if not (abs(x) < _FARTHEST_M and abs(y) < _FARTHEST_M and abs(z) < _FARTHEST_M):
+        raise Unreachable("bad_target", f"target {[x, y, z]} is not three finite numbers below 1e9 m")
+    tx, ty, tz = axes.translation
+    x, y, z = x - tx, y - ty, z - tz
+    r0, r1, r2 = axes.rows
+    return (
+        r0[0] * x + r1[0] * y + r2[0] * z,
+        r0[1] * x + r1[1] * y + r2[1] * z,
+        r0[2] * x + r1[2] * y + r2[2] * z,
+    )
+
+
+def _wrapped(angle_rad: float) -> float:
+    """Return the angle in (-π, π]."""
+    wrapped = math.remainder(angle_rad, math.tau)
+    return wrapped if wrapped > -math.pi else math.pi
+
+
+def _same(one_rad: float, other_rad: float) -> bool:
+    return abs(math.remainder(one_rad - other_rad, math.tau)) < _SAME_RAD

@@ -1,0 +1,387 @@
+"""Pan/tilt mast kinematics and the rig: a mast with its cameras.
+
+rover_from_head(pan, tilt) = Trans(t) Rot(x,θx) Rot(y,θy) Rot(z,θz) · Rot(z,pan) · Trans(a,0,0) Rot(x,k) ·
+Rot(y,tilt) (paper eqs. (6)-(8); a and k make it any two revolute axes). Positive pan turns right, positive
+tilt looks up. Angles are true ones, not what an encoder reads (`calib.geometry.rig`).
+
+What a joint reads is wrong by true = u + Σ (c_i cos(i u) + s_i sin(i u)), where u is the angle read, less
+half the backlash if the axis came to rest from smaller angles, plus half of it if from larger ones. The first
+harmonic is an encoder's disc or magnet off its centre (an arm's sag looks the same in tilt), the second one
+that is oval. The kinematics speak of true angles, a head of read ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import (
+    FloatArray,
+    ReadOnlyArrays,
+    Rigid,
+    crossed,
+    finite_float,
+    frozen_array,
+    rot_x,
+    rot_y,
+    rot_z,
+)
+
+MOST_HARMONICS = 2
+STEEPEST = 0.25
+"""Σ i |(c_i, s_i)| of an axis at most: Newton's steps from the identity then come home from any angle."""
+LARGEST_BACKLASH_RAD = 0.2
+_ROUNDING_RAD = 1e-15
+_STEPS = 60  # four do for tens of milliradians
+
+AXIS_NAMES = ("c1", "s1", "c2", "s2", "backlash_rad")
+JOINTS_NAMES = tuple(f"joints.{axis}.{name}" for axis in ("pan", "tilt") for name in AXIS_NAMES)
+"""The ten numbers of both joints, in the order of `joint_numbers_of`."""
+
+Pair = tuple[float, float]
+Approach = tuple[float, float]
+"""From which side pan and tilt came to rest: +1 from smaller read angles, -1 from larger, 0 not known."""
+UNKNOWN: Approach = (0.0, 0.0)
+
+_Angle = TypeVar("_Angle", float, FloatArray)
+
+
+@dataclass(frozen=True)
+class AxisJoint:
+    """One joint's errors; the default reads true.
+
+    Attributes
+    ----------
+    harmonics_rad
+        (c_i, s_i) of the first and second harmonic over a turn; may be shorter.
+    backlash_rad
+        Full width of the play between encoder and load. An estimate of one that is none may be negative; a
+        mast file holds none such.
+
+    Raises
+    ------
+    ValueError
+        For more than two harmonics, numbers that are not finite, harmonics so large that two readings could
+        mean one angle, or a backlash above 0.2 rad.
+    """
+
+    harmonics_rad: tuple[Pair, ...] = ()
+    backlash_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        if len(self.harmonics_rad) > MOST_HARMONICS:
+            count = len(self.harmonics_rad)
+            raise ValueError(f"harmonics_rad has {count} pairs where {MOST_HARMONICS} at most are expected")
+        if any(len(pair) != 2 for pair in self.harmonics_rad):
+            raise ValueError("harmonics_rad holds something else than pairs [c, s]")
+        clean = tuple(
+            (finite_float("harmonics_rad", c), finite_float("harmonics_rad", s))
+            for c, s in self.harmonics_rad
+        )
+        object.__setattr__(self, "harmonics_rad", clean)
+        steepest = sum(i * math.hypot(c, s) for i, (c, s) in enumerate(clean, 1))
+        if steepest > STEEPEST:
+            raise ValueError(
+                f"harmonics_rad change the angle by up to {steepest:.3g} rad in a radian where at most "
+                f"{STEEPEST:g} is expected"
+            )
+        backlash = finite_float("backlash_rad", self.backlash_rad)
+        if not abs(backlash) <= LARGEST_BACKLASH_RAD:
+            raise ValueError(
+                f"backlash_rad is {backlash:g} rad where at most {LARGEST_BACKLASH_RAD:g} is expected"
+            )
+        object.__setattr__(self, "backlash_rad", backlash)
+
+    @property
+    def reads_true(self) -> bool:
+        """Whether read and true angles are the same."""
+        return self.backlash_rad == 0.0 and not any(any(pair) for pair in self.harmonics_rad)
+
+    def true_rad(self, read_rad: _Angle, approach: float | FloatArray = 0.0) -> _Angle:
+        """Return the true angle of a reading, or of an array (...) of them.
+
+        ``approach`` is +1 from smaller read angles, -1 from larger, 0 if not known: the middle; in between
+        where the load lies between the flanks.
+        """
+        return self._true(self._taken_up(read_rad, approach))
+
+    def read_rad(self, true_rad: _Angle, approach: float | FloatArray = 0.0) -> _Angle:
+        """Return the reading of a true angle (or of an array of them), exact to rounding."""
+        slack: Any = 0.5 * approach * self.backlash_rad
+        at = true_rad
+        for _ in range(_STEPS):
+            step = (self._true(at) - true_rad) / self._slope(at)
+            at = at - step
+            if np.max(np.abs(step), initial=0.0) <= _ROUNDING_RAD * (1.0 + np.max(np.abs(at), initial=0.0)):
+                break
+        found: _Angle = at + slack
+        return found
+
+    def goal_rad(self, true_rad: float, read_rad: float, approach: float = 0.0, turn: int = 0) -> float:
+        """Return the reading to send an axis to that stands at a reading, so that it comes to a true angle.
+
+        Parameters
+        ----------
+        true_rad
+            The true angle wanted.
+        read_rad, approach
+            Where it stands, and from which side it came there.
+        turn
+            1 or -1 for a head that comes to this goal from smaller or from larger angles by itself.
+        """
+        wanted, stands = self.read_rad(true_rad), self._taken_up(read_rad, approach)
+        turn = turn or (wanted > stands) - (wanted < stands)
+        return wanted + 0.5 * turn * self.backlash_rad if turn else read_rad
+
+    def slope(self, read_rad: _Angle, approach: float | FloatArray = 0.0) -> _Angle:
+        """Return by how much the true angle grows with the reading, radians in a radian."""
+        return self._slope(self._taken_up(read_rad, approach))
+
+    def rates(self, read_rad: ArrayLike, approach: ArrayLike = 0) -> FloatArray:
+        """Return (..., 5): how the true angle changes with the numbers `AXIS_NAMES`, the reading held.
+
+        ``read_rad`` and ``approach`` are (...), broadcast against each other.
+        """
+        side = np.asarray(approach, dtype=np.float64)
+        at = np.asarray(read_rad, dtype=np.float64) - 0.5 * side * self.backlash_rad
+        slack = -0.5 * side * self._slope(at)
+        return np.stack([np.cos(at), np.sin(at), np.cos(2.0 * at), np.sin(2.0 * at), slack], axis=-1)
+
+    def _taken_up(self, read_rad: _Angle, approach: float | FloatArray) -> _Angle:
+        """The reading without the play."""
+        slack: Any = 0.5 * approach * self.backlash_rad
+        taken_up: _Angle = read_rad - slack
+        return taken_up
+
+    def _true(self, at_rad: _Angle) -> _Angle:
+        true = at_rad
+        for i, (c, s) in enumerate(self.harmonics_rad, 1):
+            true = true + c * _cos(i * at_rad) + s * _sin(i * at_rad)
+        return true
+
+    def _slope(self, at_rad: _Angle) -> _Angle:
+        slope = 1.0 + 0.0 * at_rad
+        for i, (c, s) in enumerate(self.harmonics_rad, 1):
+            slope = slope + i * (s * _cos(i * at_rad) - c * _sin(i * at_rad))
+        return slope
+
+
+@dataclass(frozen=True)
+class JointErrors:
+    """The errors of both joints; the default reads true."""
+
+    pan: AxisJoint = field(default_factory=AxisJoint)
+    tilt: AxisJoint = field(default_factory=AxisJoint)
+
+    @property
+    def reads_true(self) -> bool:
+        """Whether read and true angles are the same in both."""
+        return self.pan.reads_true and self.tilt.reads_true
+
+    def true_rad(self, read_rad: Pair, approach: Approach = UNKNOWN) -> Pair:
+        """Return true (pan, tilt) of a reading."""
+        return self.pan.true_rad(read_rad[0], approach[0]), self.tilt.true_rad(read_rad[1], approach[1])
+
+    def read_rad(self, true_rad: Pair, approach: Approach = UNKNOWN) -> Pair:
+        """Return what (pan, tilt) read where they truly are."""
+        return self.pan.read_rad(true_rad[0], approach[0]), self.tilt.read_rad(true_rad[1], approach[1])
+
+
+def joint_numbers_of(joints: JointErrors) -> FloatArray:
+    """Return the ten numbers (10,) of both joints, in the order of `JOINTS_NAMES`."""
+    numbers = []
+    for axis in (joints.pan, joints.tilt):
+        pairs = (*axis.harmonics_rad, (0.0, 0.0), (0.0, 0.0))[:MOST_HARMONICS]
+        numbers += [*(part for pair in pairs for part in pair), axis.backlash_rad]
+    return np.array(numbers)
+
+
+def joints_of(numbers: FloatArray) -> JointErrors:
+    """Return the joints of ten numbers in the order of `JOINTS_NAMES`. Raises ValueError as `AxisJoint`."""
+    pan, tilt = (
+        AxisJoint(_without_zeros(((c1, s1), (c2, s2))), backlash)
+        for c1, s1, c2, s2, backlash in np.asarray(numbers, dtype=np.float64).reshape(2, 5).tolist()
+    )
+    return JointErrors(pan, tilt)
+
+
+def _without_zeros(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
+    """Leave out harmonics at the end that are nothing."""
+    while pairs and pairs[-1] == (0.0, 0.0):
+        pairs = pairs[:-1]
+    return pairs
+
+
+def _cos(at_rad: _Angle) -> _Angle:
+    return math.cos(at_rad) if isinstance(at_rad, float) else np.cos(at_rad)
+
+
+def _sin(at_rad: _Angle) -> _Angle:
+    return math.sin(at_rad) if isinstance(at_rad, float) else np.sin(at_rad)
+
+
+@dataclass(frozen=True, eq=False)
+class Mast(ReadOnlyArrays):
+    """Mast parameters: six of the paper, and axis offset a and twist k (0 in the paper's mast).
+
+    Attributes
+    ----------
+    translation_m
+        (3,) origin of the mast frame in the rover frame, metres.
+    rotation_rad
+        (3,) θx, θy, θz of the mast frame in the rover frame, radians.
+    axis_offset_m, axis_twist_rad
+        Length and twist of the common perpendicular from the pan axis to the tilt axis.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite.
+    """
+
+    translation_m: FloatArray
+    rotation_rad: FloatArray
+    axis_offset_m: float = 0.0
+    axis_twist_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "translation_m", frozen_array(self.translation_m, (3,)))
+        object.__setattr__(self, "rotation_rad", frozen_array(self.rotation_rad, (3,)))
+        for name in ("axis_offset_m", "axis_twist_rad"):
+            object.__setattr__(self, name, finite_float(name, getattr(self, name)))
+
+    @cached_property
+    def rover_from_mast(self) -> Rigid:
+        """The fixed part: mast frame in the rover frame (paper eq. (7))."""
+        x, y, z = self.rotation_rad
+        return Rigid(rot_x(x) @ rot_y(y) @ rot_z(z), self.translation_m)
+
+    def mast_from_head(self, pan_rad: float, tilt_rad: float) -> Rigid:
+        """Return the moving part: head frame in the mast frame (paper eq. (8), with a and k)."""
+        pan = rot_z(pan_rad)
+        return Rigid(
+            pan @ rot_x(self.axis_twist_rad) @ rot_y(tilt_rad),
+            pan @ np.array([self.axis_offset_m, 0.0, 0.0]),
+        )
+
+    def rover_from_head(self, pan_rad: float, tilt_rad: float) -> Rigid:
+        """Return the head frame in the rover frame at true joint angles, radians."""
+        return self.rover_from_mast @ self.mast_from_head(pan_rad, tilt_rad)
+
+
+@dataclass(frozen=True, eq=False)
+class RigCamera:
+    """A camera of a rig: its model in the frame of the thing it is mounted ``on``."""
+
+    on: Literal["head", "rover"]
+    model: CameraModel
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """A mast with its cameras: what a mast file holds.
+
+    ``stereo`` maps a pair name to its (left, right) camera names. ``joints`` is what the head's readings are
+    wrong by: all else here speaks of true angles. ``fit`` and ``provenance`` are carried through unread.
+    """
+
+    name: str
+    mast: Mast
+    cameras: Mapping[str, RigCamera]
+    stereo: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    fit: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    joints: JointErrors = field(default_factory=JointErrors)
+
+    def __post_init__(self) -> None:
+        for name in ("cameras", "stereo", "fit", "provenance"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel between processes: read-only views cannot be pickled."""
+        views = (self.cameras, self.stereo, self.fit, self.provenance)
+        return Rig, (self.name, self.mast, *map(dict, views), self.joints)
+
+    def camera_in_rover(self, name: str, pan_rad: float, tilt_rad: float) -> CameraModel:
+        """Return camera ``name`` in the rover frame at true joint angles; body cameras ignore them.
+
+        Raises
+        ------
+        KeyError
+            If the rig has no such camera.
+        """
+        camera = self.cameras[name]
+        if camera.on == "rover":
+            return camera.model
+        return camera.model.moved(self.mast.rover_from_head(pan_rad, tilt_rad))
+
+
+MAST_NAMES = (
+    *(f"translation_m.{axis}" for axis in "xyz"),
+    *(f"rotation_rad.{axis}" for axis in "xyz"),
+    "axis_offset_m",
+    "axis_twist_rad",
+)
+
+MAST_FREE = {4: (0, 1, 2, 5), 6: (0, 1, 2, 3, 4, 5), 8: (0, 1, 2, 3, 4, 5, 6, 7)}
+"""Which of the mast's eight numbers a fit of so many parameters moves; 4 is the mast taken as vertical."""
+
+
+def mast_of(numbers: FloatArray) -> Mast:
+    """Return the mast of eight numbers in the order of ``MAST_NAMES``."""
+    return Mast(numbers[:3], numbers[3:6], float(numbers[6]), float(numbers[7]))
+
+
+def numbers_of(mast: Mast) -> FloatArray:
+    """Return a mast's eight numbers in the order of ``MAST_NAMES``."""
+    return np.array([*mast.translation_m, *mast.rotation_rad, mast.axis_offset_m, mast.axis_twist_rad])
+
+
+class Gimbal(NamedTuple):
+    """rover_from_head and its rates: what turns about which axis through which point, in the rover frame."""
+
+    rotation: FloatArray
+    translation_m: FloatArray
+    axes: FloatArray
+    """(10, 3): the eight numbers of the mast, pan, tilt; for a shift its direction, for an angle its axis."""
+    mast_origin_m: FloatArray
+
+
+_ABOUT_MAST, _ABOUT_HEAD = (3, 4, 5, 8), (7, 9)
+"""Which of a gimbal's ten numbers are angles about axes through the mast's or the head's origin."""
+
+
+def gimbal(mast: FloatArray, pan_rad: float, tilt_rad: float) -> Gimbal:
+    """Return rover_from_head of the mast's eight numbers at joint angles, with its rates."""
+    x = rot_x(mast[3])
+    xy = x @ rot_y(mast[4])
+    xyz = xy @ rot_z(mast[5])
+    panned = xyz @ rot_z(pan_rad)
+    twisted = panned @ rot_x(mast[7])
+    origin = mast[:3]
+    place = origin + mast[6] * panned[:, 0]
+    eye = np.eye(3)
+    axes = np.array([*eye, eye[0], x[:, 1], xy[:, 2], panned[:, 0], panned[:, 0], xyz[:, 2], twisted[:, 1]])
+    return Gimbal(twisted @ rot_y(tilt_rad), place, axes, origin)
+
+
+def gimbal_rates(per_point: FloatArray, points_m: FloatArray, head: Gimbal, wanted: np.ndarray) -> FloatArray:
+    """Return (n, m, k): rates of something per rover-frame point (n, m, 3) as the head carries points along.
+
+    ``wanted`` (k,) picks from a gimbal's ten numbers.
+    """
+    about_mast = crossed((points_m - head.mast_origin_m)[:, None, :], per_point)
+    about_head = crossed((points_m - head.translation_m)[:, None, :], per_point)
+    columns = []
+    for index in wanted:
+        kind = about_head if index in _ABOUT_HEAD else about_mast if index in _ABOUT_MAST else per_point
+        columns.append(kind @ head.axes[index])
+    return np.stack(columns, axis=-1) if columns else np.zeros((*per_point.shape[:2], 0))

@@ -1,1 +1,0 @@
-"""From one stereo pair to another camera: predicted, refined by image, and what hand-offs say of the rig."""

@@ -1,0 +1,208 @@
+"""Find a pixel's partner in the other eye, and the surface that two eyes see there.
+
+Around the best place of a sweep along the pixel's ray (`calib.matching.sweep`) the surface is seen
+pixel by pixel (`calib.matching.relief`); carried over it, the patch is matched freely in both directions
+(`calib.matching.patch`), so the offset across the epipolar line is measured, not assumed:
+eyes that disagree there are out of calibration, or a picture is not what it claims to be.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calib.errors import NoStereoPoint
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import FloatArray, finite_float
+from calib.geometry.stereo import triangulate, triangulate_many
+from calib.matching.patch import match_patch
+from calib.matching.relief import surface_seen
+from calib.matching.sweep import Swept, sweep
+from calib.matching.verdict import MatchSettings, PatchMatch, no_match, rivalled
+from calib.matching.warp import GRAZING, SIDES, Grey, Plane, Relief, carry
+
+LAST_SEARCH_PX = 4.0
+
+AROUND_PX = 3  # the surface is seen as far beyond the patch: another view turns and slants it
+
+MATCHED_BACK_PX = 2.0  # the way back is not refined: half a pixel of the sweep, and slope
+
+
+@dataclass(frozen=True, eq=False)
+class StereoMatch:
+    """The partner of a pixel, the surface there, and whether the eyes agree.
+
+    Attributes
+    ----------
+    match
+        The partner pixel with its verdict; nothing below counts unless it is ``good``.
+    plane
+        The local surface: a plane that fits what both eyes see near the pixel.
+    across_px, across_sigma_px
+        Distance of the partner from the epipolar line, signed, and one sigma of the matching alone.
+    relief
+        What stands off the plane around the pixel, and what belongs to no surface there.
+    """
+
+    match: PatchMatch
+    plane: Plane | None = None
+    across_px: float = math.nan
+    across_sigma_px: float = math.nan
+    relief: Relief | None = None
+
+
+def find_partner(
+    image: Grey,
+    camera: CameraModel,
+    pixel_px: ArrayLike,
+    partner_image: Grey,
+    partner: CameraModel,
+    nearest_m: float = 0.4,
+    settings: MatchSettings | None = None,
+) -> StereoMatch:
+    """Find where the partner sees what the camera sees at a pixel.
+
+    Parameters
+    ----------
+    image, partner_image
+        (h, w) float32 grey of one moment.
+    camera, partner
+        Their models in one common frame with z down.
+    pixel_px
+        (2,) the target in ``image``, sub-pixel.
+    nearest_m
+        Where the sweep starts, metres.
+
+    Raises
+    ------
+    ValueError
+        If it starts at no finite distance ahead.
+    """
+    if not finite_float("nearest_m", nearest_m) > 0.0:
+        raise ValueError(f"nearest_m is {nearest_m} where a distance above 0 is expected")
+    settings = settings or MatchSettings()
+    pixel = np.asarray(pixel_px, dtype=np.float64)
+    # Most of the patch may lie on something nearer or farther than the target: then a smaller one tells.
+    sizes = [settings, *(_smaller(settings, settings.half_px // part) for part in (2, 3))]
+    refused: PatchMatch | None = None
+    for size in sizes:
+        swept = sweep(image, camera, pixel, partner_image, partner, nearest_m, size)
+        surface = _surface(image, camera, pixel, partner_image, partner, swept, settings)
+        if not isinstance(surface, PatchMatch):
+            break
+        refused = refused or surface
+        if surface.verdict in ("border", "flat"):
+            return StereoMatch(refused)
+    else:
+        assert refused is not None
+        return StereoMatch(refused)
+    plane, relief, second = surface
+    found = match_patch(image, camera, pixel, plane, partner_image, partner, LAST_SEARCH_PX, settings, relief)
+    if found.verdict != "good":
+        return StereoMatch(found)
+    try:
+        triangulate(camera, partner, pixel, found.pixel_px)
+    except NoStereoPoint as error:
+        return StereoMatch(no_match("weak", f"the two eyes see no point together: {error}", found.pixel_px))
+    across, sigma = _across(camera, pixel, partner, plane, found)
+    apart = math.inf
+    for size in sizes:
+        back = sweep(partner_image, partner, found.pixel_px, image, camera, nearest_m, size)
+        if not isinstance(back, PatchMatch):
+            apart = min(apart, float(np.linalg.norm(back.pixel_px - pixel)))
+        if apart <= MATCHED_BACK_PX + abs(across):
+            return StereoMatch(replace(found, second=max(found.second, second)), plane, across, sigma, relief)
+    told = "nowhere" if math.isinf(apart) else f"{apart:.0f} px from where it came"
+    words = f"matched back from the other eye it lands {told}: probably hidden from one eye"
+    return StereoMatch(no_match("weak", words, found.predicted_px, found.correlation, second))
+
+
+def _surface(
+    image: Grey,
+    camera: CameraModel,
+    pixel: FloatArray,
+    partner_image: Grey,
+    partner: CameraModel,
+    swept: Swept | PatchMatch,
+    settings: MatchSettings,
+) -> tuple[Plane, Relief, float] | PatchMatch:
+    """Return the surface at a sweep's best place and how well the next best fits, or why there is none."""
+    if isinstance(swept, PatchMatch):
+        return swept
+    facts = (swept.pixel_px, swept.score, swept.second)
+    if rivalled(swept.score, swept.second, settings):
+        words = (
+            f"a second place along the epipolar line fits nearly as well: {swept.second:.2f} "
+            f"beside {swept.score:.2f}"
+        )
+        return no_match("ambiguous", words, *facts)
+    half = settings.half_px + AROUND_PX
+    seen = surface_seen(image, camera, pixel, partner_image, partner, swept.plane, half, settings.noise_dn)
+    if seen is None:
+        words = "the two eyes see no surface together there: an edge, or hidden from one of them"
+        return no_match("weak", words, *facts)
+    return *seen, swept.second
+
+
+def _smaller(settings: MatchSettings, half_px: int) -> MatchSettings:
+    """The same matching with a smaller patch."""
+    return replace(settings, half_px=half_px, smallest_half_px=half_px)
+
+
+def normal_seen(
+    target_m: FloatArray,
+    camera: CameraModel,
+    partner: CameraModel,
+    plane: Plane,
+    found: PatchMatch,
+    own: PatchMatch | None = None,
+) -> FloatArray:
+    """Return the surface's unit normal (3,) that the deformations found by two eyes tell.
+
+    Parameters
+    ----------
+    target_m
+        (3,) the target.
+    plane
+        The surface over which the searched patches were warped; its normal is returned where the two eyes
+        see too little of a slope.
+    found
+        What was found in ``partner``.
+    own
+        What was found in ``camera``, if the patches come from a third picture and not from this one.
+    """
+    # Where the old plane carries neighbours of the target, and where the deformations say they really are.
+    offsets = 0.7 * found.half_px * SIDES
+    mine, valid = carry(found.predicted_px + offsets, partner, plane, camera)
+    if not valid.all():
+        return plane.normal
+    if own is not None:
+        mine = own.pixel_px + _deformed(mine - own.predicted_px, own)
+    theirs = found.pixel_px + _deformed(offsets, found)
+    left, right, top, bottom = triangulate_many(camera, partner, mine, theirs).position_m
+    normal = np.cross(right - left, bottom - top)
+    sight, length = target_m - camera.C, float(np.linalg.norm(normal))
+    # Written so that a neighbour without a point in both eyes falls back too.
+    if not abs(normal @ sight) > GRAZING * length * np.linalg.norm(sight):
+        return plane.normal
+    return np.asarray(normal / length)
+
+
+def _deformed(offsets: FloatArray, found: PatchMatch) -> FloatArray:
+    """Offsets (n, 2) from the target as a match saw them deformed."""
+    return offsets if found.deformation is None else offsets + offsets @ found.deformation.T
+
+
+def _across(
+    camera: CameraModel, pixel: FloatArray, partner: CameraModel, plane: Plane, found: PatchMatch
+) -> tuple[float, float]:
+    """Return the signed distance of the partner pixel from the epipolar line, and its sigma."""
+    ray = camera.ray(pixel)
+    range_m = float((plane.point_m - ray.origins_m) @ ray.directions)
+    ends, _ = partner.project(ray.origins_m + np.array([[0.99], [1.0], [1.01]]) * range_m * ray.directions)
+    along = ends[2] - ends[0]
+    normal = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+    return float(normal @ (found.pixel_px - ends[1])), float(np.sqrt(normal @ found.covariance_px2 @ normal))

@@ -1,0 +1,310 @@
+"""Find the target of one picture in another: warped template, correlation, sub-pixel place, verdict."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import FloatArray
+from calib.matching.least_squares import NARROW, match_least_squares
+from calib.matching.verdict import (
+    MatchSettings,
+    PatchFound,
+    PatchMatch,
+    expected_correlation,
+    judged,
+    no_match,
+    texture_lacks,
+    worst_px2,
+)
+from calib.matching.warp import (
+    SIDES,
+    Grey,
+    Plane,
+    Relief,
+    Template,
+    blurred_to,
+    carry,
+    parallax_px_m,
+    warp_patch,
+)
+
+MOST_ASPECT = 5.0  # of a weight that is round on a surface seen flat
+
+FLAT_DN2 = 0.1  # grey variance below which there is no noise either, and sums of single precision tell none
+
+COUNTS_TO = 2.2  # sigmas of that weight, beyond which pixels are left out
+
+
+def match_patch(
+    source_image: Grey,
+    source: CameraModel,
+    source_px: ArrayLike,
+    plane: Plane,
+    destination_image: Grey,
+    destination: CameraModel,
+    search_px: float,
+    settings: MatchSettings | None = None,
+    relief: Relief | None = None,
+) -> PatchMatch:
+    """Find the target at ``source_px`` of one picture in another.
+
+    Parameters
+    ----------
+    source_image, destination_image
+        (h, w) float32 grey, 0..255 (`calib.matching.warp.grey`).
+    source, destination
+        The cameras at the moments of the pictures, in one common frame.
+    source_px
+        (2,) the target, sub-pixel.
+    plane
+        The scene around the target, in the common frame.
+    search_px
+        Half side of the window around the predicted place, destination pixels.
+    relief
+        What stands off the plane around the target, if two eyes saw it: it is carried over as it stands, and
+        what is not seen to belong to the surface does not count.
+
+    Raises
+    ------
+    ValueError
+        If the window has no finite size.
+    """
+    if not 0.0 <= search_px < math.inf:
+        raise ValueError(f"search_px is {search_px} where a finite number, 0 or more, is expected")
+    settings = settings or MatchSettings()
+    target = np.asarray(source_px, dtype=np.float64)
+    seen, valid = carry(target, source, plane, destination)
+    if not bool(valid):
+        return no_match("border", "the target cannot be seen by the other camera by its position")
+    width, height = destination.size_px
+    if not (
+        -search_px <= seen[0] <= width - 1 + search_px and -search_px <= seen[1] <= height - 1 + search_px
+    ):
+        return no_match("border", f"the target is expected at {_at(seen)}, outside the picture", seen)
+    cut = _template(source_image, source, target, plane, destination, seen, settings, relief)
+    if cut is None:
+        return no_match("border", f"the patch around {_at(target)} is cut by the picture's border", seen)
+    template, near_px2 = cut
+    half = int(template.half_px.min())
+    lacking = texture_lacks(template.values, settings, template.counts)
+    if lacking:
+        return no_match("flat", lacking, seen, half_px=half)
+    found = _search(template, destination_image, search_px, settings, near_px2)
+    if isinstance(found, PatchMatch):
+        return found
+    roughness = settings.roughness
+    if settings.relief > 0:
+        explained = found.refined.correlation / expected_correlation(template.values, settings)
+        roughness *= 1.0 + max(0.0, 1.0 - explained) / settings.relief
+    surface = _surface_term(source, target, plane, destination, template, near_px2, roughness)
+    if relief is not None:
+        off = relief.sigma_inverse_m * parallax_px_m(source, target, plane, destination)
+        surface += np.outer(off, off)
+    middle = found.refined.middle
+    if middle is not None:
+        # The middle is noisier, but the target is nearer to its plane.
+        nearer = NARROW**2 * surface
+        if worst_px2(middle.covariance_px2 + nearer) < worst_px2(found.refined.covariance_px2 + surface):
+            found, surface = (
+                replace(found, refined=replace(middle, correlation=found.refined.correlation)),
+                nearer,
+            )
+    return judged(template, found, surface, settings)
+
+
+def _surface_term(
+    source: CameraModel,
+    target: FloatArray,
+    plane: Plane,
+    destination: CameraModel,
+    template: Template,
+    near_px2: FloatArray | None,
+    roughness: float,
+) -> FloatArray:
+    """Return the covariance (2, 2) px² that a target off the patch's plane adds: e eᵀ along the parallax.
+
+    The patch tells where its plane is; the target itself lies off it by ``roughness`` of the patch's half
+    extent on the plane, hence 1 / sine of the viewing angle as much along the source's ray.
+    """
+    ray, half = source.ray(target), template.half_px
+    if near_px2 is not None:
+        half = np.sqrt(3.0 * np.diag(near_px2))  # a box of this half side spreads as much
+    sides = template.target_px + half * SIDES
+    rays = destination.ray(sides)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ranges = ((plane.point_m - rays.origins_m) @ plane.normal) / (rays.directions @ plane.normal)
+        slope = float(ray.directions @ plane.normal)
+        range_m = float((plane.point_m - ray.origins_m) @ plane.normal) / slope
+    here = ray.origins_m + range_m * ray.directions
+    reach_m = float(np.linalg.norm(rays.origins_m + ranges[:, None] * rays.directions - here, axis=1).max())
+    off_m = min(roughness * reach_m / abs(slope), 0.2 * range_m)
+    places, valid = destination.project(np.array([here, here + off_m * ray.directions]))
+    if not (np.isfinite(off_m) and valid.all()):
+        return np.zeros((2, 2))
+    parallax = places[1] - places[0]
+    return np.outer(parallax, parallax)
+
+
+def _template(
+    image: Grey,
+    source: CameraModel,
+    target: FloatArray,
+    plane: Plane,
+    destination: CameraModel,
+    seen: FloatArray,
+    settings: MatchSettings,
+    relief: Relief | None = None,
+) -> tuple[Template, FloatArray | None] | None:
+    """Warp the largest patch that both pictures hold, sized by the coarser of the two; with its weight."""
+    around, ok = carry(seen + SIDES, destination, plane, source)
+    if not ok.all():
+        return None
+    # Destination pixels a source pixel, by area.
+    shrunk = abs(float(np.linalg.det(np.stack([around[1] - around[0], around[3] - around[2]]) / 2)))
+    grown = max(1.0, 1.0 / np.sqrt(max(shrunk, 1e-6)))
+    near_px2, half = None, np.full(2, min(round(settings.half_px * grown), settings.most_half_px))
+    if settings.near_px > 0:
+        near_px2 = near_covariance(plane, destination, seen, settings.near_px * grown)
+        half = np.minimum(near_half_px(near_px2), settings.most_half_px)
+    least = np.minimum(
+        half, round(settings.smallest_half_px * min(grown, settings.most_half_px / settings.half_px))
+    )
+    edge = np.minimum(seen, np.array(destination.size_px) - 1 - seen).astype(int) - 4
+    half = np.minimum(half, np.maximum(edge, least))
+    while True:
+        template = warp_patch(image, source, target, plane, destination, (int(half[0]), int(half[1])), relief)
+        if template is not None:
+            return template, near_px2
+        if (half == least).all():
+            return None
+        half = np.maximum(half - 3, least)
+
+
+def near_covariance(plane: Plane, camera: CameraModel, pixel: FloatArray, near_px: float) -> FloatArray:
+    """Return the covariance (2, 2) px² of a Gaussian that is round on the plane, of the area of a circle."""
+    ray = camera.ray(pixel)
+    range_m = float((plane.point_m - ray.origins_m) @ plane.normal) / float(ray.directions @ plane.normal)
+    _, rate, _ = camera.project_jacobian(ray.origins_m + range_m * ray.directions)
+    seen = rate @ plane.axes
+    values, vectors = np.linalg.eigh(seen @ seen.T)
+    aspect = min(float(np.sqrt(values[1] / max(values[0], 1e-12 * values[1]))), MOST_ASPECT)
+    return np.asarray((vectors * np.array([near_px**2 / aspect, near_px**2 * aspect])) @ vectors.T)
+
+
+def near_half_px(near_px2: FloatArray) -> NDArray[np.intp]:
+    """Return the half sides (x, y) of the patch that such a Gaussian weighs."""
+    return np.asarray(np.ceil(COUNTS_TO * np.sqrt(np.diag(near_px2))).astype(np.intp) + 2)
+
+
+def _search(
+    template: Template, image: Grey, search_px: float, settings: MatchSettings, near_px2: FloatArray | None
+) -> PatchFound | PatchMatch:
+    """Correlate over the window, then refine at the best place."""
+    half, reach = template.half_px, int(np.ceil(search_px))
+    window = template.centre_px - reach - half, template.centre_px + reach + half
+    low, high = np.maximum(window[0], 0), np.minimum(window[1], np.array(image.shape[::-1]) - 1)
+    if (high - low < 2 * half + 4).any():
+        words = f"the target is expected at {_at(template.target_px)}, too near the picture's border"
+        return no_match("border", words, template.target_px, half_px=int(half.min()))
+    margin = int(np.ceil(4 * max(template.magnification, 1.0))) + 16
+    cut_low = np.maximum(low - margin, 0)
+    cut = image[cut_low[1] : high[1] + 1 + margin, cut_low[0] : high[0] + 1 + margin]
+    cut = np.ascontiguousarray(blurred_to(cut, template.magnification))
+    inner = low - cut_low
+    searched = cut[inner[1] : inner[1] + high[1] - low[1] + 1, inner[0] : inner[0] + high[0] - low[0] + 1]
+    scores = correlations(searched, template.values, template.counts)
+    (x, y), best, second, _ = peaks(
+        scores, max(settings.apart_px, round(settings.apart_px * template.magnification))
+    )
+    facts = (best, second, int(half.min()))
+    least = 0.8 * settings.least_correlation * expected_correlation(template.values, settings)
+    if best < least:
+        words = f"no place in the window of {reach} px correlates by more than {best:.2f}"
+        return no_match("weak", words, template.target_px, *facts)
+    best_at = np.array([x, y])
+    begins, ends = best_at == 0, best_at == np.array(scores.shape[::-1]) - 1
+    if begins.any() or ends.any():
+        words = f"the best place is at the border of the window of {reach} px"
+        # Where the picture cut the window, the target may be outside; else the window shows something else.
+        outside = (begins & (low > window[0])).any() or (ends & (high < window[1])).any()
+        return no_match("border" if outside else "weak", words, template.target_px, *facts)
+    shift = low + half + np.array([x, y]) + _summit(scores, x, y) - template.centre_px
+    start = template.target_px + shift - cut_low
+    refined = match_least_squares(
+        template.values,
+        template.centre_px - cut_low,
+        template.target_px - cut_low,
+        cut,
+        start,
+        correlated_px=correlated_px(template.magnification),
+        near_px2=near_px2,
+        counts=template.counts,
+    )
+    if refined is None or float(np.abs(refined.pixel_px - start).max()) > 2.0 * max(
+        1.0, template.magnification
+    ):
+        words = f"the best place (correlation {best:.2f}) does not settle to a sub-pixel position"
+        return no_match("weak", words, template.target_px, *facts)
+    middle = refined.middle and replace(refined.middle, pixel_px=refined.middle.pixel_px + cut_low)
+    return PatchFound(replace(refined, pixel_px=refined.pixel_px + cut_low, middle=middle), best, second)
+
+
+def correlations(image: Grey, patch: Grey, counts: FloatArray | None) -> NDArray[np.float32]:
+    """Return the correlations of a patch with all places of an image, its pixels weighted by ``counts``.
+
+    Not OpenCV's own mask, with which it may return what is no number. Where the image is one grey value
+    (black, saturated) it correlates by 0.
+    """
+    if counts is None:
+        return np.asarray(cv2.matchTemplate(image, patch, cv2.TM_CCOEFF_NORMED), dtype=np.float32)
+    weights = counts.astype(np.float32)
+    total, shifted = max(float(weights.sum()), 1e-6), image - image.mean()
+    weighted = weights * (patch - np.float32((weights * patch).sum() / total))
+
+    def summed(one: Grey, by: Grey) -> FloatArray:
+        return cv2.matchTemplate(one, by, cv2.TM_CCORR).astype(np.float64)
+
+    spread = summed(shifted * shifted, weights) - summed(shifted, weights) ** 2 / total
+    length = np.sqrt(np.maximum(spread * float((weighted * patch).sum()), 1e-3))
+    scores = np.where(spread > FLAT_DN2 * total, summed(shifted, weighted) / length, 0.0)
+    return scores.astype(np.float32)
+
+
+def peaks(
+    scores: NDArray[np.float32], apart_px: int
+) -> tuple[tuple[int, int], float, float, tuple[int, int] | None]:
+    """Return the best place (x, y) of a score surface, its score, the second peak's score and place.
+
+    A second peak is a local maximum more than ``apart_px`` from the best; -1 and None if there is none.
+    """
+    scores = np.where(np.isfinite(scores), scores, np.float32(-1.0))
+    y, x = (int(v) for v in np.unravel_index(int(np.argmax(scores)), scores.shape))
+    local = (scores >= cv2.dilate(scores, np.ones((3, 3), np.uint8))) & (scores < 2.0)
+    local[max(0, y - apart_px) : y + apart_px + 1, max(0, x - apart_px) : x + apart_px + 1] = False
+    others = np.where(local, scores, np.float32(-1.0))
+    v, u = (int(w) for w in np.unravel_index(int(np.argmax(others)), others.shape))
+    second = float(others[v, u])
+    return (x, y), float(scores[y, x]), second, (u, v) if second > -1.0 else None
+
+
+def _summit(scores: NDArray[np.float32], x: int, y: int) -> FloatArray:
+    """Return how far (2,) the summit of a score surface lies from its highest pixel, by parabolas."""
+    around = np.array([scores[y, x - 1 : x + 2], scores[y - 1 : y + 2, x]], dtype=np.float64)
+    bend = 2.0 * around[:, 1] - around[:, 0] - around[:, 2]
+    return np.asarray(np.clip((around[:, 2] - around[:, 0]) / (2.0 * np.maximum(bend, 1e-9)), -0.5, 0.5))
+
+
+def correlated_px(magnification: float) -> int:
+    """Return over how many pixels grey differences hang together: three, more in an enlarged picture."""
+    return round(3 * max(1.0, magnification))
+
+
+def _at(pixel_px: FloatArray) -> str:
+    """Write a pixel."""
+    return f"({pixel_px[0]:.1f}, {pixel_px[1]:.1f}) px"

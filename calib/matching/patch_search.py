@@ -1,0 +1,239 @@
+"""Textured patches of a reduced picture, and where other pictures show them: quick, to a fraction of a pixel.
+
+What `calib.matching.patch` does for one target with care, this does for some twenty places at once in a
+millisecond or two: enough to tell which view a picture shows, not enough to measure a target. Pictures are
+reduced to some 256 columns by area, so that noise hardly counts and differences of scale and slope stay
+small.
+
+Each found patch is a vote for pan and tilt; most of them are right, and the view is that on which they agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.geometry.rigid import FloatArray
+from calib.matching.warp import Grey, Mask, square_grid
+
+COLUMNS = 256
+"""About as wide are the reduced pictures."""
+HALF = 7
+"""Half of a patch's side, reduced pixels: 15 of them are 60 of a picture of 1024 columns."""
+CELL = 22
+"""One patch, the best textured, of each square of this side, reduced pixels."""
+NOISE_DN = 1.0
+"""Grey noise of a reduced picture: a sixteenth of a pixel's variance, and rounding."""
+FLAT_SIGMA = 0.3
+"""A patch whose texture cannot hold this in its worst direction, reduced pixels, is too plain."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """A picture reduced ``step`` times along each side by area."""
+
+    grey: Grey
+    step: int
+
+    @classmethod
+    def of(cls, image: Grey) -> Reduced:
+        """Reduce a picture (h, w) to about `COLUMNS` columns; what fills no whole pixel is left out."""
+        step = max(1, round(image.shape[1] / COLUMNS))
+        height, width = (n // step for n in image.shape)
+        cut = image[: height * step, : width * step]
+        return cls(np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA)), step)
+
+    def from_full(self, pixels_px: FloatArray) -> FloatArray:
+        """Return places (..., 2) of the full picture as places of the reduced one."""
+        return np.asarray((pixels_px - (self.step - 1) / 2) / self.step)
+
+    def to_full(self, places: FloatArray) -> FloatArray:
+        """Return places (..., 2) of the reduced picture as pixels of the full one."""
+        return np.asarray(places * self.step + (self.step - 1) / 2)
+
+    def holds(self, places: FloatArray, margin: float) -> Mask:
+        """Tell which places (n, 2) lie at least ``margin`` inside the reduced picture."""
+        size = np.array(self.grey.shape[::-1])
+        with np.errstate(invalid="ignore"):
+            return np.asarray(((places >= margin) & (places <= size - 1 - margin)).all(axis=1))
+
+
+def textured(picture: Reduced) -> tuple[FloatArray, FloatArray]:
+    """Return the best textured place of each cell (n, 2), reduced pixels, and its strength (n,), row by row.
+
+    The strength is the smaller eigenvalue of the patch's summed gradient products over what `FLAT_SIGMA`
+    asks for: below 1 a patch is too plain to hold a place.
+    """
+    side = 2 * HALF + 1
+    eigen = cv2.cornerMinEigenVal(picture.grey, side, ksize=3)
+    # OpenCV scales its Sobel by 1 / (4 side), which is a difference per pixel times 8 / (4 side).
+    summed = eigen * (side**2 / 4.0) - 0.1875 * NOISE_DN**2 * side**2
+    wanted = 2.0 * NOISE_DN**2 / FLAT_SIGMA**2
+    inner = summed[HALF:-HALF, HALF:-HALF] / wanted
+    rows, columns = (n // CELL for n in inner.shape)
+    if min(rows, columns) == 0:
+        return np.empty((0, 2)), np.empty(0)
+    cells = inner[: rows * CELL, : columns * CELL].reshape(rows, CELL, columns, CELL)
+    flat = cells.transpose(0, 2, 1, 3).reshape(rows * columns, CELL * CELL)
+    best = np.argmax(flat, axis=1)
+    corner_y, corner_x = np.divmod(np.arange(rows * columns), columns)
+    places = np.stack([corner_x * CELL + best % CELL, corner_y * CELL + best // CELL], axis=1) + float(HALF)
+    strength = flat[np.arange(len(flat)), best].astype(np.float64)
+    return places, strength
+
+
+def cut(
+    picture: Reduced, places: FloatArray, shapes: FloatArray, centres: NDArray[np.intp], expected: FloatArray
+) -> NDArray[np.float32]:
+    """Return the patches (n, 15, 15) as another picture of the same reduction should show them.
+
+    Parameters
+    ----------
+    places
+        (n, 2) their middles in this picture, reduced pixels.
+    shapes
+        (n, 2, 2) how offsets of this picture become offsets of the other.
+    centres, expected
+        (n, 2) the whole pixel of the other picture that the patch is cut for, and where its middle is there.
+    """  # fmt: skip
+    offsets = square_grid(HALF) + (centres - expected)[:, None, None]
+    maps = places[:, None, None] + np.einsum("nij,nyxj->nyxi", np.linalg.inv(shapes), offsets)
+    side = 2 * HALF + 1
+    stacked = maps.astype(np.float32).reshape(-1, side, 2)
+    values = cv2.remap(
+        picture.grey, stacked[..., 0], stacked[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(values.reshape(-1, side, side))
+
+
+def found(
+    patch: NDArray[np.float32], picture: Reduced, centre: NDArray[np.intp], reach: tuple[int, int]
+) -> tuple[FloatArray, float]:
+    """Return the place (2,) where the picture shows a patch best, reduced pixels, and the correlation there.
+
+    Searched are whole pixels up to ``reach`` (x, y) from the centre, as far as the picture goes; the summit
+    is a parabola's. Not-a-number and -1 if the picture holds no place.
+    """
+    size = np.array(picture.grey.shape[::-1])
+    low = np.maximum(centre - reach - HALF, 0)
+    high = np.minimum(centre + reach + HALF + 1, size)
+    if (high - low < 2 * HALF + 1).any():
+        return np.full(2, np.nan), -1.0
+    searched = picture.grey[low[1] : high[1], low[0] : high[0]]
+    scores = cv2.matchTemplate(searched, patch, cv2.TM_CCOEFF_NORMED)
+    _, best, _, (x, y) = cv2.minMaxLoc(scores)
+    if not np.isfinite(best):
+        return np.full(2, np.nan), -1.0
+    place = np.array([x, y], dtype=np.float64)
+    for axis, at in enumerate((x, y)):
+        line = scores[y] if axis == 0 else scores[:, x]
+        if 0 < at < len(line) - 1:
+            before, here, after = (float(line[at + k]) for k in (-1, 0, 1))
+            bend = 2.0 * here - before - after
+            place[axis] += float(np.clip((after - before) / (2.0 * max(bend, 1e-9)), -0.5, 0.5))
+    return low + HALF + place, float(best)
+
+
+AGREEING = {"told": (5, 0.25), "any": (6, 0.4)}
+"""How many patches, and which share of those that a view should show, must agree on it: the told view needs
+fewer, since a large thing may have moved in the picture, than one that is looked for everywhere."""
+AGREE = 1.2
+"""Patches agree whose places differ by no more, reduced pixels: relief, shape, and the search itself."""
+SEARCH_SIGMA = 0.15
+"""Of one patch's place, reduced pixels; a smaller scatter of few patches is luck."""
+
+
+@dataclass(frozen=True, eq=False)
+class AgreedView:
+    """A view by the patches that agree on it.
+
+    Attributes
+    ----------
+    angles_rad, sigma_rad
+        (2,) pan and tilt with one sigma.
+    parallax_rad
+        (2,) the largest error by ranges that are not known.
+    rate_px_per_rad
+        (n, 2, 2) of the agreeing patches.
+    agreeing, expected
+        Patches that agree, and that the view should show.
+    correlation
+        Mean of the agreeing ones.
+    """
+
+    angles_rad: FloatArray
+    sigma_rad: FloatArray
+    parallax_rad: FloatArray
+    rate_px_per_rad: FloatArray
+    agreeing: int
+    expected: int
+    correlation: float
+
+    def holds(self, view: Literal["told", "any"]) -> bool:
+        """Tell whether enough patches agree."""
+        least, share = AGREEING[view]
+        return self.agreeing >= max(least, share * self.expected)
+
+
+def agreed_view(
+    view: FloatArray,
+    off_px: FloatArray,
+    rates: FloatArray,
+    open_px: FloatArray,
+    scores: FloatArray,
+    step: int,
+    expected: int,
+) -> AgreedView | None:
+    """Return the view on which most patches agree, None for fewer than two.
+
+    Parameters
+    ----------
+    view
+        (2,) pan and tilt, radians, from which the patches were looked for.
+    off_px
+        (n, 2) where they were found, from where that view has them.
+    rates
+        (n, 2, 2) how they move with pan and tilt, px/rad.
+    open_px
+        (n, 2) half of the way along which they may lie, since their ranges are not known.
+    scores
+        (n,) correlations.
+    step
+        Pixels of the full picture in one of the reduced.
+    expected
+        How many patches the view should show.
+    """
+    if len(off_px) < 2:
+        return None
+    votes = (np.linalg.pinv(rates) @ off_px[..., None])[..., 0]  # near the pan axis one patch tells no pan
+    rest = off_px[None] - np.einsum("nij,mj->mni", rates, votes)
+    length2 = np.maximum((open_px**2).sum(axis=1), 1e-12)
+    along = np.clip(np.einsum("mni,ni->mn", rest, open_px) / length2, -1.0, 1.0)
+    apart = np.linalg.norm(rest - along[..., None] * open_px, axis=2)
+    agree = apart <= AGREE * step
+    best = int(np.argmax(agree.sum(axis=1) - 1e-3 * np.where(agree, apart / step, 0.0).sum(axis=1)))
+    which = agree[best]
+    # What has a range says more than what has none.
+    weights = 1.0 / (1.0 + length2[which] / (SEARCH_SIGMA * step) ** 2)
+    weights /= weights.max()
+    weighted = rates[which] * weights[:, None, None]
+    inverse = np.linalg.pinv(np.einsum("nij,nik->jk", weighted, rates[which]))
+    change = inverse @ np.einsum("nij,ni->j", weighted, off_px[which])
+    left = off_px[which] - rates[which] @ change
+    freedom = max(2.0 * float(weights.sum()) - 2.0, 1.0)
+    variance_px2 = float(weights @ (left**2).sum(axis=1)) / freedom
+    covariance = inverse * max(variance_px2, (SEARCH_SIGMA * step) ** 2)
+    parallax = np.abs(np.einsum("jk,nik,ni->nj", inverse, weighted, open_px[which])).sum(axis=0)
+    return AgreedView(
+        view + change,
+        np.sqrt(np.diag(covariance)),
+        parallax,
+        rates[which],
+        int(which.sum()),
+        expected,
+        float(scores[which].mean()),
+    )

@@ -1,0 +1,216 @@
+"""A plane swept along a pixel's ray, from near to infinity: where the other eye shows what this one sees.
+
+At each inverse range the patch is laid on planes of a few slopes and looked up in the other picture, so slope
+and scale do not spoil the correlation; the line it follows is as curved as the lenses make it.
+
+The common frame has z down (rover, site): level ground is one of the planes tried.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.geometry.cahvor import CameraModel, Rays
+from calib.geometry.rigid import FloatArray
+from calib.matching.verdict import MatchSettings, PatchMatch, expected_correlation, no_match, texture_lacks
+from calib.matching.warp import GRAZING, Grey, Plane, sample, square_grid
+
+UP = np.array([0.0, 0.0, -1.0])
+
+FARTHEST_M = 1e4  # as good as infinity for any stereo base on a rover
+
+COARSE = 2  # the first sweep uses every second pixel of half-size pictures
+
+DENSE = 400  # points of the ray that tell the curve's length
+
+FINE_STEPS = np.arange(-3.0, 3.5, 0.5)  # px around each of the best coarse places
+
+BEST_KEPT = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Swept:
+    """The best place of a sweep, to half a pixel along the line."""
+
+    plane: Plane
+    pixel_px: FloatArray
+    score: float
+    second: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Patch:
+    """The source patch of a sweep, with the rays of its nine knots."""
+
+    values: NDArray[np.float32]
+    knots: Rays
+    weights: NDArray[np.float32]
+
+
+def sweep(
+    image: Grey,
+    camera: CameraModel,
+    pixel: FloatArray,
+    partner_image: Grey,
+    partner: CameraModel,
+    nearest_m: float,
+    settings: MatchSettings,
+) -> Swept | PatchMatch:
+    """Return the best place along the line, or why there is none."""
+    half = _room(pixel, camera, settings)
+    if half < settings.smallest_half_px:
+        return no_match("border", "the patch is cut by the picture's border")
+    values = sample(image, pixel + square_grid(half)).astype(np.float32)
+    lacking = texture_lacks(values, settings)
+    if lacking:
+        return no_match("flat", lacking, half_px=half)
+    ray = camera.ray(pixel)
+    if not bool(ray.valid):
+        return no_match("border", "the pixel has no ray in this camera")
+    inverse, places = _curve(ray, partner, nearest_m, settings.smallest_half_px)
+    if len(inverse) == 0:
+        return no_match("border", "nothing that this pixel may show lies in the other eye's picture")
+    normals = _normals(ray.directions)
+    small = np.asarray(cv2.pyrDown(image), np.float32)
+    partner_small = np.asarray(cv2.pyrDown(partner_image), np.float32)
+    coarse = _patch(small, camera, pixel, half, COARSE)
+    scores = _scores(coarse, ray, inverse, normals, partner, partner_small, COARSE).max(axis=1)
+    kept = _best_apart(scores, places, settings.apart_px)
+    fine = _patch(image, camera, pixel, half, 1)
+    tries: list[tuple[float, float, int]] = []
+    for index in kept:
+        near = _between(inverse, places, index)
+        table = _scores(fine, ray, near, normals, partner, partner_image, 1)
+        row, column = np.unravel_index(int(np.argmax(table)), table.shape)
+        tries.append((float(table[row, column]), float(near[row]), int(column)))
+    if not tries:
+        return no_match("weak", "no place along the epipolar line can be compared", half_px=half)
+    tries.sort(reverse=True)
+    score, best, which = tries[0]
+    seen, _ = partner.project(ray.origins_m + ray.directions / np.array([[one[1]] for one in tries]))
+    apart = np.linalg.norm(seen - seen[0], axis=1) > settings.apart_px
+    second = max((one[0] for one, far in zip(tries, apart, strict=True) if far), default=-1.0)
+    least = 0.8 * settings.least_correlation * expected_correlation(values, settings)
+    if score < least:
+        words = f"no place along the epipolar line correlates by more than {score:.2f}"
+        return no_match("weak", words, None, score, second, half)
+    plane = Plane(ray.origins_m + ray.directions / best, normals[which])
+    return Swept(plane, seen[0], score, second)
+
+
+def _room(pixel: FloatArray, camera: CameraModel, settings: MatchSettings) -> int:
+    """Return the half side of the largest patch around a pixel that the picture holds."""
+    edge = float(min(*(pixel - 1), *(np.array(camera.size_px) - 2 - pixel)))
+    return min(settings.half_px, math.floor(edge))
+
+
+def _curve(
+    ray: Rays, partner: CameraModel, nearest_m: float, margin_px: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return inverse ranges (m,) and pixels (m, 2) along the epipolar line, about two pixels apart."""
+    dense = np.linspace(1.0 / FARTHEST_M, 1.0 / nearest_m, DENSE)
+    seen, valid = partner.project(ray.origins_m + ray.directions / dense[:, None])
+    size = np.array(partner.size_px)
+    with np.errstate(invalid="ignore"):
+        inside = valid & ((seen >= margin_px) & (seen <= size - 1 - margin_px)).all(axis=1)
+    # The neighbours of an inside point count too: the line crosses the picture's border between them.
+    reach = inside.copy()
+    reach[1:] |= inside[:-1]
+    reach[:-1] |= inside[1:]
+    reach &= valid
+    dense, seen = dense[reach], seen[reach]
+    if len(dense) < 2:
+        return np.empty(0), np.empty((0, 2))
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(seen, axis=0), axis=1))])
+    steps = np.linspace(0.0, length[-1], max(2, math.ceil(length[-1] / COARSE) + 1))
+    inverse = np.interp(steps, length, dense)
+    places, valid = partner.project(ray.origins_m + ray.directions / inverse[:, None])
+    with np.errstate(invalid="ignore"):
+        keep = valid & ((places >= margin_px) & (places <= size - 1 - margin_px)).all(axis=1)
+    return inverse[keep], places[keep]
+
+
+def _normals(direction: FloatArray) -> FloatArray:
+    """Return the slopes to try (k, 3): facing the camera, level, and between the two."""
+    facing = -direction
+    between = facing + UP
+    slopes = [facing]
+    if abs(facing @ UP) > GRAZING:
+        slopes += [between / np.linalg.norm(between), UP]
+    return np.array(slopes)
+
+
+def _patch(image: Grey, camera: CameraModel, pixel: FloatArray, half: int, step: int) -> _Patch:
+    """Cut the patch out of a picture reduced ``step`` times and prepare its knots."""
+    count = half // step
+    offsets = square_grid(count) * step
+    maps = ((pixel + offsets) / step).astype(np.float32)
+    values = cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    values = values.reshape(-1) - values.mean()
+    length = float(np.linalg.norm(values))
+    knots = camera.ray(pixel + square_grid(1).reshape(9, 2) * (count * step))
+    axis = np.linspace(-1.0, 1.0, 2 * count + 1)
+    lagrange = np.stack([axis * (axis - 1) / 2, 1 - axis * axis, axis * (axis + 1) / 2], axis=1)
+    weights = np.einsum("yj,xi->yxji", lagrange, lagrange).reshape(len(values), 9)
+    return _Patch(values / max(length, 1e-6), knots, weights.astype(np.float32))
+
+
+def _scores(
+    patch: _Patch,
+    ray: Rays,
+    inverse: FloatArray,
+    normals: FloatArray,
+    partner: CameraModel,
+    partner_image: Grey,
+    step: int,
+) -> NDArray[np.float32]:
+    """Return the correlations (m, k) at inverse ranges (m,) and slopes (k, 3).
+
+    The map of a patch is biquadratic through its nine knots, each carried exactly.
+    """
+    points = ray.origins_m + ray.directions / inverse[:, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slope = normals @ patch.knots.directions.T  # (k, 9)
+        ahead = np.einsum("mkjc,kc->mkj", points[:, None, None] - patch.knots.origins_m, normals)
+        ranges = ahead / slope
+        ranges = np.where((ranges > 0) & (np.abs(slope) > GRAZING), ranges, np.nan)
+        hits = patch.knots.origins_m + ranges[..., None] * patch.knots.directions
+    pixels, _ = partner.project(hits)  # (m, k, 9, 2)
+    m, k = pixels.shape[:2]
+    known = np.isfinite(pixels).all(axis=(2, 3)).reshape(m * k)
+    maps = np.where(np.isfinite(pixels), pixels / step, 0.0).astype(np.float32).reshape(m * k, 9, 2)
+    map_x, map_y = maps[..., 0] @ patch.weights.T, maps[..., 1] @ patch.weights.T
+    seen = cv2.remap(partner_image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    seen -= seen.mean(axis=1, keepdims=True)
+    length = np.sqrt(np.einsum("ij,ij->i", seen, seen))
+    scores = (seen @ patch.values) / np.maximum(length, 1e-3)
+    return np.where(known, scores, np.float32(-1.0)).astype(np.float32).reshape(m, k)
+
+
+def _best_apart(scores: NDArray[np.float32], places: FloatArray, apart_px: float) -> list[int]:
+    """Return the indices of the best local maxima along the line, apart from each other, best first."""
+    padded = np.concatenate([[-2.0], scores, [-2.0]])
+    tops = np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:]))
+    kept: list[int] = []
+    for index in tops[np.argsort(-scores[tops])]:
+        if all(np.linalg.norm(places[index] - places[other]) > apart_px for other in kept):
+            kept.append(int(index))
+        if len(kept) == BEST_KEPT:
+            break
+    return kept
+
+
+def _between(inverse: FloatArray, places: FloatArray, index: int) -> FloatArray:
+    """Return inverse ranges half a pixel apart around a coarse place."""
+    if len(inverse) < 2:
+        return inverse
+    other = index + 1 if index + 1 < len(inverse) else index - 1
+    length = max(float(np.linalg.norm(places[other] - places[index])), 1e-6)
+    per_px = abs(inverse[other] - inverse[index]) / length
+    near: FloatArray = np.maximum(inverse[index] + FINE_STEPS * per_px, 1.0 / FARTHEST_M)
+    return near

@@ -1,0 +1,370 @@
+"""A followed target: its place with covariance, the picture it is known by, and how motion carries both.
+
+A motion of the rover carries the target over and adds the motion's own covariance (`moved_track`). Begun by
+`calib.matching.track`, seen again by `calib.matching.look`.
+
+A place is followed only if it can be told from its surroundings. What correlates with its own neighbourhood
+will be confused with it: an edge along its length, a pattern with its repetition. And a patch with little
+texture is found again only as long as the light stays: what else it shows is shading, and the edges of
+shadows, which move with the sun.
+
+The key picture is renewed when scale or view have changed, not at every step: each renewal hands on its
+error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from calib.errors import CalibError
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.covariance import ray_gap, refuse_two_points
+from calib.geometry.rigid import FloatArray, Rigid, carried_covariance, rigid_rates
+from calib.geometry.stereo import triangulate
+from calib.matching.handoff import Eye
+from calib.matching.least_squares import gaussian
+from calib.matching.partner import find_partner, normal_seen
+from calib.matching.patch import match_patch, near_covariance, near_half_px
+from calib.matching.verdict import MatchSettings, PatchMatch, texture_lacks
+from calib.matching.warp import Grey, Plane, patch_grid
+
+State = Literal["tracked", "lost"]
+
+SIZES = MatchSettings(half_px=12, near_px=6.0, roughness=0.04, relief=0.1, worst_ratio=0.7, least_lead=0.03)
+"""Smaller patches than a single match takes: seen flat from 10 m, 41 px of ground are 0.8 m long and no
+plane, and what lies off the plane pulls the place along as the view steepens. Roughness and relief make nine
+in ten and more of the range errors lie within two of the told sigmas. A second place may fit a little better
+than elsewhere: the other eye and the prediction must confirm the best."""
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """Thresholds of the tracking, with the reasons for their values.
+
+    Attributes
+    ----------
+    sigmas
+        Half width of the search window in standard deviations of the prediction.
+    least_px, most_px
+        Bounds of the window's half side.
+    model_px
+        One sigma of what the cameras' models are wrong by between two eyes and two pairs.
+    worst_chi2
+        Of the innovation, four pixel coordinates against the prior: 1 in 1000 good looks with both eyes is
+        above 18.5.
+    renew_grown, renew_shrunk
+        The key picture is renewed when the target's surface is seen this much larger or smaller...
+    renew_shape
+        ...or foreshortened this much otherwise: seen flat, a step nearer shows much that it did not.
+    renew_below
+        Or when the correlation falls below this: what is seen now is no longer what the key picture shows.
+        One eye that sees so little of it does not find a lost target again.
+    worst_drift_m
+        One sigma of the drift from the picked place; beyond it the target counts as lost.
+    """
+
+    sigmas: float = 3.5
+    least_px: float = 4.0
+    most_px: float = 120.0
+    model_px: float = 0.12
+    worst_chi2: float = 18.5
+    renew_grown: float = 1.8
+    renew_shrunk: float = 0.3
+    renew_shape: float = 1.5
+    renew_below: float = 0.8
+    worst_drift_m: float = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class KeyPicture:
+    """The picture that templates are cut from, its camera in the rover frame, the target's place in it.
+
+    Attributes
+    ----------
+    drift_m2
+        (3, 3) covariance, along the surface, of the place followed from the place picked: what the keys
+        before handed on.
+    """
+
+    eye: Eye
+    pixel_px: FloatArray
+    normal: FloatArray
+    drift_m2: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A followed target. Immutable: every step gives a new one.
+
+    Attributes
+    ----------
+    state
+        ``tracked``: the last look found it. ``lost``: it did not.
+    position_m, covariance_m2
+        (3,) and (3, 3) of the place that is followed, in the rover frame of the last motion.
+    key
+        The key picture.
+    standby
+        The key that the last look with both eyes would have given: what is looked for where a look by the
+        key loses the target, since the light has changed or another side shows. None after a renewal.
+    misses
+        Looks since it was last found.
+    motion_covariance
+        (6, 6) of the rover's motion since then, as `moved_track` takes it; it is part of ``covariance_m2``.
+    """
+
+    state: State
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    key: KeyPicture
+    standby: KeyPicture | None = None
+    misses: int = 0
+    motion_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+
+    @property
+    def target_covariance_m2(self) -> FloatArray:
+        """(3, 3) of the target that was picked: of the followed place, and of its drift from the picked one.
+
+        What pixels and motions tell; an error that all cameras of the mast file share is not in it, and one
+        that two eyes do not share is averaged by looks from one place as if it were noise.
+        """
+        return self.covariance_m2 + self.key.drift_m2
+
+
+def moved_track(track: Track, now_from_then: Rigid, covariance: FloatArray) -> Track:
+    """Carry a track over a motion of the rover.
+
+    Parameters
+    ----------
+    now_from_then
+        The rover frame of before in the one of now.
+    covariance
+        (6, 6) of that motion: small rotation (radians), then translation (metres), both in the frame of now:
+        true = (1 + rotation) believed + translation.
+
+    Raises
+    ------
+    CalibError
+        If the covariance is not (6, 6), finite and without negative variances.
+    """
+    spread = np.asarray(covariance, dtype=np.float64)
+    if spread.shape != (6, 6) or not np.isfinite(spread).all() or (np.diag(spread) < 0).any():
+        raise CalibError(
+            "a motion's covariance is 6 rows of 6 finite numbers: rotation in rad², then translation in m²"
+        )
+    position = now_from_then.points(track.position_m)
+    rate, turned = motion_rate(position), now_from_then.rotation
+    return replace(
+        track,
+        position_m=position,
+        covariance_m2=turned @ track.covariance_m2 @ turned.T + rate @ spread @ rate.T,
+        key=carried(track.key, now_from_then),
+        standby=track.standby and carried(track.standby, now_from_then),
+        motion_covariance=carried_covariance(track.motion_covariance, now_from_then) + spread,
+    )
+
+
+def motion_rate(position_m: FloatArray) -> FloatArray:
+    """Return d position / d motion (3, 6): how a small rotation, then a translation, move a point."""
+    return np.asarray(rigid_rates(np.eye(3)[None], position_m[None], np.zeros(3))[0])
+
+
+def carried(key: KeyPicture, motion: Rigid) -> KeyPicture:
+    """The key in another frame."""
+    return KeyPicture(
+        replace(key.eye, camera=key.eye.camera.moved(motion)),
+        key.pixel_px,
+        motion.vectors(key.normal),
+        motion.rotation @ key.drift_m2 @ motion.rotation.T,
+    )
+
+
+AROUND_PX = 80
+"""How far around is compared: as far as a heading that is wrong by 1.2 degrees puts a target in a Pancam."""
+MOST_ALIKE = 0.9
+"""Correlation with another place: the simulated rover's rocks and ground were seen to stay below 0.86,
+edges of its shadows to have 0.97."""
+WORST_SIGMA_PX = 0.2
+"""In the worst direction, of what grey noise alone would leave."""
+
+
+def indistinct(
+    image: Grey, camera: CameraModel, pixel_px: FloatArray, plane: Plane, settings: MatchSettings
+) -> str:
+    """Return why a target could not be told from what surrounds it, empty if it can.
+
+    Parameters
+    ----------
+    image
+        (h, w) float32 grey.
+    pixel_px
+        (2,) the target.
+    plane
+        The surface there, at an angle to the pixel's ray.
+    settings
+        Of the matching that will look for it; ``near_px`` sizes and weighs the patch.
+    """
+    near_px2 = near_covariance(plane, camera, pixel_px, settings.near_px)
+    half = near_half_px(near_px2)
+    middle = np.rint(pixel_px).astype(int)
+    low, high = middle - half, middle + half + 1
+    if (low < 0).any() or (high > image.shape[::-1]).any():
+        return "the patch around it is cut by the picture's border"
+    patch = image[low[1] : high[1], low[0] : high[0]]
+    counts = gaussian(patch_grid((int(half[0]), int(half[1]))) + (middle - pixel_px), near_px2)
+    lacking = texture_lacks(patch, replace(settings, flat_sigma_px=WORST_SIGMA_PX), counts)
+    if lacking:
+        return lacking
+    first = np.maximum(low - AROUND_PX, 0)
+    around = image[first[1] : high[1] + AROUND_PX, first[0] : high[0] + AROUND_PX]
+    scores = cv2.matchTemplate(np.ascontiguousarray(around), patch, cv2.TM_CCOEFF_NORMED)
+    x, y = low - first
+    beside = settings.apart_px
+    scores[max(0, y - beside) : y + beside + 1, max(0, x - beside) : x + beside + 1] = -1.0
+    _, alike, _, where = cv2.minMaxLoc(np.nan_to_num(scores, nan=-1.0, posinf=-1.0, neginf=-1.0))
+    if alike > MOST_ALIKE:
+        away = math.dist(where, (x, y))
+        return (
+            f"an edge, a smooth place or a repeated pattern: what is {away:.0f} px beside it correlates by "
+            f"{alike:.2f}, at most {MOST_ALIKE:g} is allowed"
+        )
+    return ""
+
+
+MIDDLE_SEARCH_PX = 4.0
+"""How far the range of a patch's middle may put it from where the whole patch puts it, at the start."""
+
+EYES_PX = 0.4
+"""One sigma, each pixel coordinate, of what two eyes' models may be wrong by where a track is begun: what is
+found 2 px off the epipolar line is another thing, or the mast file is off."""
+
+
+def start_track(left: Eye, right: Eye, left_px: FloatArray, sigma_px: float = 0.2) -> Track:
+    """Begin a track from a click in the left picture of a pair.
+
+    Parameters
+    ----------
+    left, right
+        Pictures of one moment with their cameras in the rover frame.
+    left_px
+        (2,) the target.
+    sigma_px
+        Of the click; it says how well the place of what was meant is known.
+
+    Raises
+    ------
+    CalibError
+        With the reason, if the target cannot be followed: sky, plain surface, an edge, repeated pattern,
+        hidden from the other eye, outside the picture.
+    """
+    pixel = np.asarray(left_px, dtype=np.float64)
+    if pixel.shape != (2,) or not np.isfinite(pixel).all():
+        raise CalibError(f"target pixel {pixel.tolist()} is not two finite numbers")
+    width, height = left.camera.size_px
+    if not (0 <= pixel[0] <= width - 1 and 0 <= pixel[1] <= height - 1):
+        raise CalibError(
+            f"the target pixel ({pixel[0]:.1f}, {pixel[1]:.1f}) is outside the picture of {width} x {height}"
+        )
+    found = find_partner(left.image, left.camera, pixel, right.image, right.camera)
+    if found.match.verdict != "good" or found.plane is None:
+        raise CalibError(f"the target cannot be followed: {found.match.reason}")
+    # The patch that tells the surface reaches beyond it on a rock: the range is that of its middle.
+    middle = match_patch(
+        left.image, left.camera, pixel, found.plane, right.image, right.camera, MIDDLE_SEARCH_PX, SIZES
+    )
+    reason = middle.reason or indistinct(left.image, left.camera, pixel, found.plane, SIZES)
+    if reason:
+        raise CalibError(f"the target cannot be followed: {reason}")
+    noise = max(sigma_px, float(middle.sigma_px.max()))
+    seen = triangulate(left.camera, right.camera, pixel, middle.pixel_px, noise)
+    gap = ray_gap(seen, (noise**2 + EYES_PX**2) * np.eye(4))
+    by = f"a match good to {noise:.2g} px and cameras good to {EYES_PX:g} px"
+    try:
+        refuse_two_points(gap, ("the left eye", "the right eye"), by)
+    except CalibError as error:
+        raise CalibError(f"the target cannot be followed: {error}") from None
+    key = KeyPicture(left, pixel, found.plane.normal)
+    return Track("tracked", seen.position_m, seen.covariance_m2, key)
+
+
+def anchored(track: Track) -> KeyPicture | None:
+    """The key with its camera shifted so that the target's ray meets the believed position.
+
+    Rover motion is never exact: what counts is how the key camera stood to the target, and the shift across
+    the ray is small beside the range.
+    """
+    camera = track.key.eye.camera
+    ray = camera.ray(track.key.pixel_px)
+    between = track.position_m - ray.origins_m
+    along = float(between @ ray.directions)
+    if not bool(ray.valid) or along <= 0:
+        return None
+    shift = Rigid(np.eye(3), between - along * ray.directions)
+    return replace(track.key, eye=replace(track.key.eye, camera=camera.moved(shift)))
+
+
+def fresh_key(
+    key: KeyPicture,
+    eyes: Mapping[str, Eye],
+    good: Mapping[str, PatchMatch],
+    plane: Plane,
+    slope: Plane | None,
+) -> KeyPicture | None:
+    """A key from the pictures of this look; None if one eye alone saw the target.
+
+    ``slope`` is the surface that one eye asked through the other told. Without it both were asked through the
+    key, over ``plane``, and tell the surface together.
+    """
+    if len(good) < 2:
+        return None
+    first, second = list(eyes)[:2]
+    left, right = good[first], good[second]
+    surface = slope or plane
+    normal = surface.normal
+    if slope is None:
+        normal = normal_seen(plane.point_m, eyes[first].camera, eyes[second].camera, plane, right, left)
+    drift = key.drift_m2 + on_surface(left.covariance_px2, eyes[first].camera, surface)
+    return KeyPicture(eyes[first], left.pixel_px, normal, drift)
+
+
+def on_surface(covariance_px2: FloatArray, camera: CameraModel, plane: Plane) -> FloatArray:
+    """A pixel's covariance (2, 2) as that of its place on the surface (3, 3), square metres."""
+    _, rate, _ = camera.project_jacobian(plane.point_m)
+    to_surface = plane.axes @ np.linalg.inv(rate @ plane.axes)
+    return np.asarray(to_surface @ covariance_px2 @ to_surface.T)
+
+
+def outgrown(
+    key: KeyPicture,
+    eyes: Mapping[str, Eye],
+    good: Mapping[str, PatchMatch],
+    plane: Plane,
+    settings: TrackSettings,
+) -> bool:
+    """Whether scale, view or light have changed so much that the key should be exchanged."""
+    scale, shape = _seen_larger(next(iter(eyes.values())).camera, key.eye.camera, plane)
+    alike = min(one.correlation for one in good.values()) >= settings.renew_below
+    return not (
+        settings.renew_shrunk < scale < settings.renew_grown and shape < settings.renew_shape and alike
+    )
+
+
+def _seen_larger(camera: CameraModel, key: CameraModel, plane: Plane) -> tuple[float, float]:
+    """How much larger a camera sees the target's surface than the key's did, and how much another shape."""
+    rates = [one.project_jacobian(plane.point_m) for one in (camera, key)]
+    if not all(bool(valid) for _, _, valid in rates):
+        return math.nan, math.nan
+    now, then = (rate @ plane.axes for _, rate, _ in rates)
+    larger, smaller = np.linalg.svd(now @ np.linalg.inv(then), compute_uv=False).tolist()
+    return math.sqrt(larger * smaller), larger / smaller
+
+
+def drifted_m(key: KeyPicture) -> float:
+    """One sigma, metres, of the drift that the keys before handed on, in its worst direction."""
+    return math.sqrt(max(float(np.linalg.eigvalsh(key.drift_m2)[-1]), 0.0))

@@ -1,0 +1,324 @@
+"""What pictures of boards tell of a rig: their information, before and after they are taken.
+
+Unknown are the cameras, the mast's axis offset and twist, the errors of both joints and one pose for each
+placement of a board. Where the mast frame stands in the rover frame, and so pan zero and tilt zero, no board
+of unknown pose can tell: the mast frame is held as the present estimate has it.
+
+Each shot (all cameras at one attitude of the head) adds JᵀJ of its weighted pixel rates, with the reading
+errors of its two joints eliminated. What is known beforehand is so wide that it only keeps directions closed
+that no picture has shown yet.
+
+From that follows how well the rig would point, over the whole of where it points: the figure that the choice
+of poses lowers. A target is clicked in a pair of the head at one attitude, ranged by it, and brought to the
+image centre by the closed form. What the rig's parameters are off by moves the ranged place, and where the
+head then looks. With the picture of the landing as truth the residual is, at first order,
+
+    e = -(d pixel / d rig + d pixel / d point . d point / d rig),
+
+the rates of the landing's picture, and the ranged point as both clicks hold it. A single camera is told the
+range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from calib.errors import CalibError
+from calib.geometry.parameters import parameter_names, parameter_part, predict
+from calib.geometry.pointing import solve
+from calib.geometry.rig import JOINTS_NAMES, Gimbal, Rig, gimbal, gimbal_rates, numbers_of
+from calib.geometry.rigid import FloatArray, Rigid, rigid_rates
+
+AXES = ("mast.axis_offset_m", "mast.axis_twist_rad")
+BEFOREHAND = {"C": 0.2, "A": 0.2, "H": 0.3, "V": 0.3, "O": 0.02, "R": 0.3, "E": 0.1}
+"""Sigma of a camera's letters before any picture: metres, radians, and of one focal length for H and V."""
+AXIS_OFFSET_M, AXIS_TWIST_RAD, JOINT_ERROR_RAD = 0.05, 0.05, 0.01
+"""Sigma beforehand of the axes, and of each term of a joint: hobby encoders are off by 6 to 9 mrad."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoardView:
+    """Corners of a board in one camera's picture: where on the board (n, 3), metres, and sigma (n,), px."""
+
+    camera: str
+    in_board_m: FloatArray
+    sigma_px: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class BenchShot:
+    """All cameras' pictures at one attitude: the read angles, radians, and from where each joint came.
+
+    ``pan_approach`` and ``tilt_approach`` are 1 from smaller angles, -1 from larger, 0 where nobody knows.
+    """
+
+    placement: str
+    pan_rad: float
+    tilt_rad: float
+    views: tuple[BoardView, ...]
+    pan_approach: int = 0
+    tilt_approach: int = 0
+
+
+class Rates(NamedTuple):
+    """Pixels (n, 2) of points (n, 3), their rates to the rig's unknowns (n, 2, p), to the points (n, 2, 3)
+    and to the two joint readings (n, 2, 2)."""
+
+    pixels_px: FloatArray
+    to_rig: FloatArray
+    to_points: FloatArray
+    to_joints: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """A rig as it is estimated now, with the boards' poses, and what to make of shots of them.
+
+    Attributes
+    ----------
+    rig
+        Cameras, mast and joints of the present estimate.
+    boards
+        Placement to rover_from_board.
+    joint_sigma_rad
+        Of one reading of a joint, such as of its whole counts.
+    """
+
+    rig: Rig
+    boards: Mapping[str, Rigid]
+    joint_sigma_rad: float = 0.0
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The rig's unknowns: cameras, axes, joints."""
+        return (*(n for name in self.rig.cameras for n in self._camera_names(name)), *AXES, *JOINTS_NAMES)
+
+    @cached_property
+    def beforehand(self) -> FloatArray:
+        """Information (p, p) from before any picture."""
+        sigma: list[float] = []
+        for camera in self.rig.cameras.values():
+            kind = camera.model.kind
+            mine = np.empty(len(parameter_names(kind)))
+            for letter in dict.fromkeys(kind):
+                scale = float(np.linalg.norm(camera.model.H)) if letter in "HV" else 1.0
+                mine[parameter_part(kind, letter)] = BEFOREHAND[letter] * scale
+            sigma += mine.tolist()
+        sigma += [AXIS_OFFSET_M, AXIS_TWIST_RAD, *len(JOINTS_NAMES) * [JOINT_ERROR_RAD]]
+        return np.diag(np.array(sigma) ** -2.0)
+
+    def information(self, shots: Iterable[BenchShot]) -> FloatArray:
+        """Return what shots tell of the rig (p, p), boards' poses eliminated, and what was known before."""
+        total = self.beforehand.copy()
+        by_board: dict[str, list[BenchShot]] = {}
+        for shot in shots:
+            by_board.setdefault(shot.placement, []).append(shot)
+        for mine in by_board.values():
+            total += without_board(sum(self.of_shot(shot) for shot in mine))  # type: ignore[arg-type]
+        return total
+
+    def of_shot(self, shot: BenchShot) -> FloatArray:
+        """Return what one shot tells of the rig and of its board's pose: (p + 6, p + 6)."""
+        rows, turned = [], []
+        board = self.boards[shot.placement]
+        for view in shot.views:
+            points = board.points(view.in_board_m)
+            seen = self.rates(view.camera, shot, points)
+            to_board = rigid_rates(seen.to_points, points, board.translation_m)
+            weight = 1.0 / view.sigma_px[:, None, None]
+            both = np.concatenate([seen.to_rig, to_board], axis=2) * weight
+            good = np.isfinite(both).all(axis=(1, 2))
+            rows.append(both[good].reshape(-1, both.shape[2]))
+            turned.append((seen.to_joints * weight)[good].reshape(-1, 2))
+        size = len(self.names) + 6
+        if not rows:
+            return np.zeros((size, size))
+        jacobian = np.concatenate(rows)
+        told = jacobian.T @ jacobian
+        if self.joint_sigma_rad > 0.0:
+            by_joint = np.concatenate(turned)
+            across = by_joint.T @ jacobian
+            own = by_joint.T @ by_joint + np.eye(2) / self.joint_sigma_rad**2
+            told -= across.T @ np.linalg.solve(own, across)
+        return np.asarray(told)
+
+    def rates(self, camera: str, shot: BenchShot, points_m: FloatArray) -> Rates:
+        """Return where a camera sees points (n, 3) of the rover frame, and how that depends on everything."""
+        held = self.rig.cameras[camera]
+        count, size = len(points_m), len(self.names)
+        to_rig, to_joints = np.zeros((count, 2, size)), np.zeros((count, 2, 2))
+        mine = self._at[camera]
+        if held.on == "rover":
+            seen = predict(held.model, points_m)
+            to_rig[..., mine] = seen.d_step
+            return Rates(seen.pixels_px, to_rig, seen.d_points, to_joints)
+        head = self.head(shot)
+        seen = predict(held.model, (points_m - head.translation_m) @ head.rotation)
+        in_rover = seen.d_points @ head.rotation.T
+        to_rig[..., mine] = seen.d_step
+        moved = -gimbal_rates(in_rover, points_m, head, np.array([6, 7, 8, 9]))
+        to_rig[..., self._at["axes"]] = moved[..., :2]
+        to_joints = moved[..., 2:]
+        joints = self.rig.joints
+        by_pan = joints.pan.rates(shot.pan_rad, shot.pan_approach)
+        by_tilt = joints.tilt.rates(shot.tilt_rad, shot.tilt_approach)
+        terms = [moved[..., 2, None] * by_pan, moved[..., 3, None] * by_tilt]
+        to_rig[..., self._at["joints"]] = np.concatenate(terms, axis=-1)
+        return Rates(seen.pixels_px, to_rig, in_rover, to_joints)
+
+    def head(self, shot: BenchShot) -> Gimbal:
+        """Return where the head truly is, as the estimate has it."""
+        true_rad = self.rig.joints.true_rad(
+            (shot.pan_rad, shot.tilt_rad), (shot.pan_approach, shot.tilt_approach)
+        )
+        return gimbal(numbers_of(self.rig.mast), *true_rad)
+
+    @cached_property
+    def _at(self) -> Mapping[str, slice]:
+        """Where each camera's, the axes' and the joints' unknowns are."""
+        out, begin = {}, 0
+        sizes = [(name, len(self._camera_names(name))) for name in self.rig.cameras]
+        for name, size in (*sizes, ("axes", len(AXES)), ("joints", len(JOINTS_NAMES))):
+            out[name] = slice(begin, begin + size)
+            begin += size
+        return out
+
+    def _camera_names(self, camera: str) -> Sequence[str]:
+        kind = self.rig.cameras[camera].model.kind
+        return [f"cameras.{camera}.{part}" for part in parameter_names(kind)]
+
+
+def without_board(told: FloatArray) -> FloatArray:
+    """Return what is left of (p + 6, p + 6) about the rig, (p, p), if nobody knows the board."""
+    rig, across, board = told[:-6, :-6], told[:-6, -6:], told[-6:, -6:]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(board), 1e-300))
+    own = np.linalg.pinv(board * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
+    return np.asarray(rig - across @ own @ across.T)
+
+
+RANGES_M = (2.0, 6.0, 10.0)
+CLICKS = ((0.15, 0.2), (0.85, 0.8), (0.85, 0.2), (0.15, 0.8))
+"""Where in the picture targets are clicked, in parts of its width and height: towards its corners."""
+STEPS = (5, 3)
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Where a rig points: joint angles at which targets are clicked, and how far away they are.
+
+    Attributes
+    ----------
+    cameras
+        The clicked camera, and its partner if there is one.
+    pan_rad, tilt_rad
+        From where to where.
+    ranges_m
+        Of the targets.
+    one_sided
+        Whether the head approaches every goal from the same side by itself, so that backlash is no error.
+    """
+
+    cameras: tuple[str, ...]
+    pan_rad: tuple[float, float]
+    tilt_rad: tuple[float, float]
+    ranges_m: Sequence[float] = RANGES_M
+    one_sided: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedPointing:
+    """How landings (2k) depend on the rig's unknowns (2k, p) and on the four joint readings (2k, 4).
+
+    ``places`` (k) are pan and tilt of the click, radians, and the target's range, metres.
+    """
+
+    to_rig: FloatArray
+    to_joints: FloatArray
+    places: tuple[tuple[float, float, float], ...] = ()
+
+    def rms_px(self, covariance: FloatArray) -> float:
+        """Return the rms per axis of the landings that an uncertainty (p, p) of the rig makes."""
+        return float(np.sqrt(max(np.sum(self._weights * covariance), 0.0)))
+
+    @cached_property
+    def _weights(self) -> FloatArray:
+        """The matrix (p, p) whose product with a covariance has the mean square per axis as trace."""
+        return np.asarray(self.to_rig.T @ self.to_rig / max(len(self.to_rig), 1))
+
+    def by_counts_px(self, joint_sigma_rad: float) -> float:
+        """Return the rms per axis that the readings alone leave, however well the rig is known."""
+        squares = np.sum(self.to_joints**2) / max(len(self.to_joints), 1)
+        return float(joint_sigma_rad * np.sqrt(squares))
+
+
+def pointing(known: Knowledge, where: Workspace) -> ExpectedPointing:
+    """Return how pointing over the workspace depends on what is unknown.
+
+    Raises
+    ------
+    CalibError
+        If nothing of the workspace can be pointed at.
+    """
+    rows, joints, places = [], [], []
+    approach = 0
+    for pan in np.linspace(*where.pan_rad, STEPS[0]):
+        for tilt in np.linspace(*where.tilt_rad, STEPS[1]):
+            for range_m in where.ranges_m:
+                for click in CLICKS:
+                    # Backlash shows where click and landing were approached from different sides.
+                    approach = 0 if where.one_sided else 1 if approach != 1 else -1
+                    clicked = BenchShot("", float(pan), float(tilt), (), approach, approach)
+                    try:
+                        row = _landing(known, where.cameras, clicked, click, range_m)
+                    except CalibError:
+                        continue
+                    rows.append(row[0])
+                    joints.append(row[1])
+                    places.append((float(pan), float(tilt), float(range_m)))
+    if not rows:
+        raise CalibError(f"camera {where.cameras[0]} can be pointed at nothing of the workspace")
+    return ExpectedPointing(np.concatenate(rows), np.concatenate(joints), tuple(places))
+
+
+def _landing(
+    known: Knowledge, cameras: Sequence[str], clicked: BenchShot, click: tuple[float, float], range_m: float
+) -> tuple[FloatArray, FloatArray]:
+    """One target's two rows: to the rig, and to the readings before and after the move."""
+    rig = known.rig
+    model = rig.cameras[cameras[0]].model
+    width, height = model.size_px
+    ray = model.ray(np.array([click[0] * width, click[1] * height]))
+    head = known.head(clicked)
+    point = head.rotation @ (ray.origins_m + range_m * ray.directions) + head.translation_m
+    seen = [known.rates(camera, clicked, point[None]) for camera in cameras]
+    by_point = np.concatenate([one.to_points[0] for one in seen])
+    by_rig = np.concatenate([one.to_rig[0] for one in seen])
+    by_joints = np.concatenate([one.to_joints[0] for one in seen])
+    if len(cameras) == 1:  # its range is told: a row of its own, weighed as much as a pixel's
+        along = head.rotation @ ray.directions
+        by_point = np.vstack([by_point, along * float(np.linalg.norm(model.H)) / range_m])
+        by_rig = np.vstack([by_rig, np.zeros(by_rig.shape[1])])
+        by_joints = np.vstack([by_joints, np.zeros(2)])
+    back = np.linalg.pinv(by_point)
+    angles = solve(rig.mast, model, point, from_pan_rad=clicked.pan_rad, from_tilt_rad=clicked.tilt_rad)[0]
+    landed = BenchShot(
+        "",
+        float(rig.joints.pan.read_rad(angles.pan_rad, -clicked.pan_approach)),
+        float(rig.joints.tilt.read_rad(angles.tilt_rad, -clicked.tilt_approach)),
+        (),
+        -clicked.pan_approach,
+        -clicked.tilt_approach,
+    )
+    there = known.rates(cameras[0], landed, point[None])
+    to_point = there.to_points[0]
+    if not (np.isfinite(by_rig).all() and np.isfinite(there.to_rig).all()):
+        raise CalibError("outside the lens")
+    return (
+        to_point @ back @ by_rig - there.to_rig[0],
+        np.concatenate([-there.to_joints[0], to_point @ back @ by_joints], axis=1),
+    )

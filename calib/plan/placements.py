@@ -1,0 +1,265 @@
+"""Where a board should stand next: places in words that a person can follow, and which tells most.
+
+A camera on the body is tied to the head by boards that both see. It does not move: however many pictures are
+taken, each placement shows it the board once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.adjust.solver import covariance_of
+from calib.errors import CalibError, Unreachable
+from calib.geometry.parameters import predict
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.plan.knowledge import BenchShot, ExpectedPointing, Knowledge, without_board
+from calib.plan.poses import Sought, readings, seen
+
+RANGES_M = (0.8, 1.2, 1.8, 2.6)
+BEARINGS_DEG = (-50.0, -25.0, 0.0, 25.0, 50.0)
+HEIGHTS_DEG = (-25.0, -8.0, 8.0)
+TURNS_DEG = ((0.0, 0.0), (30.0, 0.0), (-30.0, 0.0), (0.0, 30.0), (0.0, -30.0))
+SMALLEST_PART = 0.2
+"""Of the picture's width that a board should fill at least: farther away it tells little."""
+
+PATTERN = ((0.5, 0.5), (0.2, 0.25), (0.8, 0.75), (0.8, 0.25), (0.2, 0.75))
+"""Where in the picture the middle of a board that does not stand yet is supposed to be, shot by shot."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A place for a board, as it is asked for.
+
+    Attributes
+    ----------
+    range_m
+        From the head's axes to the board's middle.
+    bearing_deg, height_deg
+        To the right of pan zero, and above the height of the axes.
+    turned_deg
+        By how much its face is turned away from the head: to the head's right, and upwards.
+    """
+
+    range_m: float
+    bearing_deg: float
+    height_deg: float
+    turned_deg: tuple[float, float] = (0.0, 0.0)
+
+    def words(self) -> str:
+        """Return the placement as one says it to a person."""
+        side = _side(self.bearing_deg, "left", "right", "straight ahead")
+        level = _side(self.height_deg, "below", "above", "")
+        where = f"{side} at the head's height" if not level else f"{side}, {level} the head's height"
+        turned = [
+            f"turned {abs(angle):.0f} degrees {word}"
+            for angle, word in (
+                (self.turned_deg[0], "to the right" if self.turned_deg[0] > 0 else "to the left"),
+                (self.turned_deg[1], "upwards" if self.turned_deg[1] > 0 else "downwards"),
+            )
+            if abs(angle) >= 5
+        ]
+        how = " and ".join(turned) if turned else "facing the head"
+        return f"{where}, {self.range_m:.1f} m away, {how}"
+
+    def rover_from_board(self, head_in_rover: Rigid) -> Rigid:
+        """Return the pose (board: x right, y down, z into it) with the head at zero standing so."""
+        bearing, height = math.radians(self.bearing_deg), math.radians(self.height_deg)
+        sight = np.array(
+            [math.cos(height) * math.cos(bearing), math.cos(height) * math.sin(bearing), -math.sin(height)]
+        )
+        # The face of a board that is turned to the right looks to the right: its normal, away from the head,
+        # then points to the left of the line of sight.
+        yaw = bearing - math.radians(self.turned_deg[0])
+        pitch = height - math.radians(self.turned_deg[1])
+        into = np.array([math.cos(pitch) * math.cos(yaw), math.cos(pitch) * math.sin(yaw), -math.sin(pitch)])
+        right = np.array([-math.sin(yaw), math.cos(yaw), 0.0])
+        rotation = np.column_stack([right, np.cross(into, right), into])
+        return head_in_rover @ Rigid(rotation, self.range_m * sight)
+
+
+@dataclass(frozen=True)
+class Advice:
+    """A placement, and the rms per axis of pointing that a few shots of it would lead to, pixels."""
+
+    placement: Placement
+    expected_px: float
+
+
+def _side(angle_deg: float, negative: str, positive: str, none: str) -> str:
+    if abs(angle_deg) < 3.0:
+        return none
+    return f"{abs(angle_deg):.0f} degrees {negative if angle_deg < 0 else positive}"
+
+
+def first_placement(known: Knowledge, sought: Sought) -> Placement:
+    """Return where the first board should stand: ahead, near, with room about it, turned a bit."""
+    bearing_deg, height_deg = _inside(0.0, sought.pan_limits_rad), _inside(0.0, sought.tilt_limits_rad)
+    return Placement(_near_m(known, sought), bearing_deg, height_deg, (20.0, 0.0))
+
+
+def _near_m(known: Knowledge, sought: Sought) -> float:
+    """The smallest range at which the board fills no more than about half of the narrowest picture."""
+    size = np.ptp(sought.in_board_m[:, :2], axis=0)
+    need = [
+        max(size[0] * np.linalg.norm(c.model.H) / c.model.size_px[0],
+            size[1] * np.linalg.norm(c.model.V) / c.model.size_px[1]) / 0.55
+        for c in known.rig.cameras.values() if c.on == "head"
+    ]  # fmt: skip
+    return float(round(max(0.5, *need), 1))
+
+
+def _inside(bearing_deg: float, limits_rad: tuple[float, float]) -> float:
+    low, high = (math.degrees(limit) for limit in limits_rad)
+    return min(max(bearing_deg, low + 10.0), high - 10.0) if high - low > 20.0 else (low + high) / 2
+
+
+def placements(known: Knowledge, sought: Sought) -> Iterator[Placement]:
+    """Yield places that the head's cameras can see, at ranges where the board tells something."""
+    near_m = _near_m(known, sought)
+    width_m = float(np.ptp(sought.in_board_m[:, 0]))
+    far_m = min(
+        width_m * float(np.linalg.norm(c.model.H)) / (SMALLEST_PART * c.model.size_px[0])
+        for c in known.rig.cameras.values() if c.on == "head"
+    )  # fmt: skip
+    pan, tilt = (
+        [math.degrees(x) for x in limits] for limits in (sought.pan_limits_rad, sought.tilt_limits_rad)
+    )
+    ranges = [r for r in RANGES_M if near_m * 0.95 <= r <= max(far_m, near_m)] or [near_m]
+    for range_m in ranges:
+        for bearing in BEARINGS_DEG:
+            for height in HEIGHTS_DEG:
+                if pan[0] <= bearing <= pan[1] and tilt[0] <= height <= tilt[1]:
+                    for turned in TURNS_DEG:
+                        yield Placement(range_m, bearing, height, turned)
+
+
+def advise(
+    known: Knowledge,
+    sought: Sought,
+    shots: Sequence[BenchShot],
+    aim: ExpectedPointing,
+    most: int = 90,
+    seed: int = 0,
+) -> Advice | None:
+    """Return the placement of which a few shots would tell most, or None if none can be seen.
+
+    ``most`` placements are tried, drawn by ``seed``.
+    """
+    every = list(placements(known, sought))
+    rng = np.random.default_rng(seed)
+    if len(every) > most:
+        every = [every[k] for k in sorted(rng.choice(len(every), most, replace=False))]
+    base = known.information(shots)
+    best: Advice | None = None
+    for placement in every:
+        told = told_by(known, sought, placement)
+        if told is None:
+            continue
+        rms = aim.rms_px(covariance_of(base + told))
+        if best is None or rms < best.expected_px:
+            best = Advice(placement, rms)
+    return best
+
+
+def told_by(known: Knowledge, sought: Sought, placement: Placement) -> FloatArray | None:
+    """Return what a pattern of shots of a board that stood so would tell of the rig; None of too few."""
+    head = known.rig.mast.rover_from_head(0.0, 0.0)
+    supposed = replace(known, boards={"": placement.rover_from_board(head)})
+    camera = next(c for c in known.rig.cameras.values() if c.on == "head")
+    width, height = camera.model.size_px
+    told, middle = [], supposed.boards[""].translation_m
+    for k, (x, y) in enumerate(PATTERN):
+        try:
+            pan, tilt = readings(known.rig, sought, camera.model, middle, (x * width, y * height))
+        except (Unreachable, CalibError, ValueError):
+            continue
+        side = 0 if sought.one_sided else 1 if k % 2 else -1
+        shown = seen(supposed, sought, BenchShot("", pan, tilt, (), side, side))
+        if shown is not None:
+            told.append(supposed.of_shot(shown))
+    if len(told) < 3:
+        return None
+    return without_board(np.sum(told, axis=0))
+
+
+BODY_HEIGHTS_DEG = (-60.0, -50.0, -40.0, -30.0, -15.0)
+"""Body cameras mostly look down, at what is near."""
+
+BELOW_M = 0.3
+"""How far below a body camera the middle of a board is supposed to find room over the ground."""
+
+RANGE_M = 2.0
+GRID = 5
+"""Where a body camera's pixels are judged: so far away, in so many rows and columns."""
+
+FEWEST = 2
+"""Placements that a body camera has to see: of one, focal length and distance trade for each other."""
+
+
+def body_cameras(known: Knowledge) -> tuple[str, ...]:
+    """Return the names of the cameras on the body."""
+    return tuple(name for name, camera in known.rig.cameras.items() if camera.on == "rover")
+
+
+def body_px(known: Knowledge, covariance: FloatArray, camera: str) -> float:
+    """Return what a body camera's pixels of points 2 m away are off by, rms per axis.
+
+    ``covariance`` is that of ``known.names``.
+    """
+    model = known.rig.cameras[camera].model
+    width, height = model.size_px
+    x, y = np.meshgrid(*((np.arange(GRID) + 0.5) / GRID * size for size in (width, height)))
+    rays = model.ray(np.stack([x.ravel(), y.ravel()], axis=-1))
+    points = rays.origins_m[rays.valid] + RANGE_M * rays.directions[rays.valid]
+    rates = predict(model, points).d_step
+    mine = [k for k, name in enumerate(known.names) if name.startswith(f"cameras.{camera}.")]
+    squares = np.einsum("nip,pq,niq->ni", rates, covariance[np.ix_(mine, mine)], rates)
+    return float(np.sqrt(np.mean(squares[np.isfinite(squares)])))
+
+
+def advise_for_body(
+    known: Knowledge, sought: Sought, shots: Collection[BenchShot], cameras: Collection[str]
+) -> Advice | None:
+    """Return the placement that tells most of some body cameras, or None if none shows them a board that the
+    head can see; ``expected_px`` is then what their pixels are off by."""
+    base = known.information(shots)
+    best: tuple[int, float, Placement] | None = None
+    for placement in _low_placements(known, sought):
+        see = _sees(known, sought, placement) & set(cameras)
+        told = told_by(known, sought, placement) if see else None
+        if told is None:
+            continue
+        covariance = covariance_of(base + told)
+        off_px = float(np.mean([body_px(known, covariance, name) for name in cameras]))
+        if best is None or (-len(see), off_px) < best[:2]:
+            best = -len(see), off_px, placement
+    return None if best is None else Advice(best[2], best[1])
+
+
+def _low_placements(known: Knowledge, sought: Sought) -> Iterator[Placement]:
+    """Places around and below, where there should be room over the ground."""
+    head = known.rig.mast.rover_from_head(0.0, 0.0)
+    lowest_m = max(known.rig.cameras[name].model.C[2] for name in body_cameras(known)) + BELOW_M
+    pan, tilt = np.degrees(sought.pan_limits_rad), np.degrees(sought.tilt_limits_rad)
+    for range_m in RANGES_M:
+        for bearing in BEARINGS_DEG:
+            for height in BODY_HEIGHTS_DEG:
+                if not (pan[0] <= bearing <= pan[1] and tilt[0] <= height <= tilt[1]):
+                    continue
+                for turned in TURNS_DEG:
+                    placement = Placement(range_m, bearing, height, turned)
+                    if placement.rover_from_board(head).translation_m[2] <= lowest_m:
+                        yield placement
+
+
+def _sees(known: Knowledge, sought: Sought, placement: Placement) -> set[str]:
+    """Which body cameras see a board that stands so."""
+    pose = placement.rover_from_board(known.rig.mast.rover_from_head(0.0, 0.0))
+    fixed = {name: known.rig.cameras[name] for name in body_cameras(known)}
+    on_body = Knowledge(replace(known.rig, cameras=fixed, stereo={}), {"": pose})
+    shown = seen(on_body, sought, BenchShot("", 0.0, 0.0, ()))
+    return set() if shown is None else {view.camera for view in shown.views}

@@ -1,0 +1,343 @@
+"""Attitudes of the head that show a board, and the one among them that tells most.
+
+Where a board is, one picture of it and a rig that is known roughly say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.adjust.solver import covariance_of
+from calib.errors import CalibError, Unreachable
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.maps import camera_axes
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.geometry.solutions import Solution, choose
+from calib.plan.knowledge import BenchShot, BoardView, ExpectedPointing, Knowledge
+
+PLACES = (-0.05, 0.12, 0.31, 0.5, 0.69, 0.88, 1.05)
+"""Where in a camera's picture the board's middle is tried, in parts of its width and of its height."""
+
+EDGE_PX = 6.0
+"""Corners nearer to the picture's edge are not counted on."""
+
+FLATTEST = 0.35
+"""Cosine of the angle between a board's normal and the line of sight below which no corner is counted on."""
+
+APART_RAD = 0.02
+"""Attitudes nearer to one that did not show the board, or was taken already, are not tried again."""
+
+
+SIDES_TRIED = 8
+"""Of how many of the best attitudes every way to approach them is tried."""
+
+EXCHANGES = 2
+"""Rounds in which each of some shots that are chosen together may give way to a better one."""
+
+ANYWHERE = 1e-6
+"""What is known of a board's pose before any picture: it is within some kilometre (1/m², 1/rad²)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sought:
+    """What a shot has to show, and where the head may look.
+
+    Attributes
+    ----------
+    in_board_m
+        (n, 3) all corners of the board.
+    sigma_px
+        Of a corner.
+    least
+        Corners that a picture must show to count; all of them for a board whose parts cannot be told apart.
+    pan_limits_rad, tilt_limits_rad
+        The head's.
+    one_sided
+        Whether the head itself approaches from one side: from which one then makes no difference.
+    """
+
+    in_board_m: FloatArray
+    sigma_px: float
+    least: int
+    pan_limits_rad: tuple[float, float]
+    tilt_limits_rad: tuple[float, float]
+    one_sided: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudeChoice:
+    """The next shot, and the rms per axis of pointing that is expected after it, pixels."""
+
+    shot: BenchShot
+    expected_px: float
+
+
+def seen(known: Knowledge, sought: Sought, shot: BenchShot) -> BenchShot | None:
+    """Return the shot with the corners that each camera is expected to see, or None if none sees enough."""
+    views = []
+    for name in known.rig.cameras:
+        inside = shown(known, sought, shot, name)
+        if int(inside.sum()) >= sought.least:
+            corners = sought.in_board_m[inside]
+            views.append(BoardView(name, corners, np.full(len(corners), sought.sigma_px)))
+    return replace(shot, views=tuple(views)) if views else None
+
+
+def shown(
+    known: Knowledge, sought: Sought, shot: BenchShot, name: str, edge_px: float = EDGE_PX
+) -> NDArray[np.bool_]:
+    """Return which of the board's corners (n,) a camera is expected to see, farther than ``edge_px`` from its
+    picture's edges; negative: those too that lie so far outside."""
+    board, camera = known.boards[shot.placement], known.rig.cameras[name]
+    here, normal = board.points(sought.in_board_m), board.rotation[:, 2]
+    if camera.on == "head":
+        head = known.head(shot)
+        here, normal = (here - head.translation_m) @ head.rotation, normal @ head.rotation
+    sight = here.mean(axis=0) - camera.model.C
+    if sight @ normal < FLATTEST * float(np.linalg.norm(sight)):
+        return np.zeros(len(here), dtype=bool)
+    pixels, valid = camera.model.project(here)
+    size = np.array(camera.model.size_px)
+    return np.asarray(valid & ((pixels > edge_px) & (pixels < size - 1 - edge_px)).all(axis=1))
+
+
+def readings(
+    rig: Rig,
+    sought: Sought,
+    camera: CameraModel,
+    point_in_rover_m: FloatArray,
+    pixel_px: tuple[float, float] | None = None,
+) -> tuple[float, float]:
+    """Return what the joints read, within the head's limits, when a head camera has a point at a pixel.
+
+    By default that is the image's centre.
+
+    Raises
+    ------
+    Unreachable, CalibError, ValueError
+        If no reading does.
+    """
+
+    def read_rad(angles: Solution) -> tuple[float, float]:
+        return rig.joints.read_rad((angles.pan_rad, angles.tilt_rad))
+
+    found = solve(rig.mast, camera, point_in_rover_m, pixel_px)
+    return read_rad(choose(found, sought.pan_limits_rad, sought.tilt_limits_rad, read=read_rad))
+
+
+def attitudes(known: Knowledge, sought: Sought, placement: str) -> Iterator[tuple[float, float]]:
+    """Yield joint readings, radians, that bring the board's middle to places all over each head camera."""
+    middle = known.boards[placement].translation_m
+    for camera in known.rig.cameras.values():
+        if camera.on != "head":
+            continue
+        width, height = camera.model.size_px
+        for x in PLACES:
+            for y in PLACES:
+                try:
+                    yield readings(known.rig, sought, camera.model, middle, (x * width, y * height))
+                except (Unreachable, CalibError, ValueError):
+                    continue
+
+
+def next_shot(
+    known: Knowledge,
+    sought: Sought,
+    shots: Sequence[BenchShot],
+    placement: str,
+    aim: ExpectedPointing,
+    avoid: Collection[tuple[float, float]] = (),
+    ahead: int = 1,
+) -> AttitudeChoice | None:
+    """Return the next shot of a placed board for pointing to be best in the end; None if none shows it.
+
+    Parameters
+    ----------
+    known
+        The present estimate, with the board's pose.
+    sought
+        What a shot has to show.
+    shots
+        What was taken, of every placement.
+    placement
+        Where the board stands now.
+    aim
+        What the rig is for.
+    avoid
+        Attitudes (pan, tilt), radians, that are no use, as where the board was not found.
+    ahead
+        How many more shots there will be of this placement, this one among them. They are chosen together:
+        the best one by itself is seldom the beginning of the best few.
+    """
+    base = with_board(known, shots, placement)
+    known, base, aim = _of_head(known, base, aim)
+    here = [shot for shot in shots if shot.placement == placement]
+    choices = list(candidates(known, sought, here, placement, avoid))
+    if not choices:
+        return None
+    told = np.array([known.of_shot(shot) for shot in choices])
+    plan = _together(base, told, aim, ahead)
+    first = min(plan, key=dict(zip(plan, _left_px(base, told[plan], aim), strict=True)).__getitem__)
+    others = [index for index in plan if index != first]
+    if not sought.one_sided:
+        # From which side a joint comes tells its backlash alone: that is asked of the best attitudes only.
+        beside = base + told[others].sum(axis=0)
+        best = [i for i in np.argsort(_left_px(beside, told, aim)) if i not in others][:SIDES_TRIED]
+        sides = [other for i in best for other in _other_sides(choices[i])]
+        choices += sides
+        told = np.concatenate([told, [known.of_shot(shot) for shot in sides]])
+        tried = [*best, *range(len(choices) - len(sides), len(choices))]
+        first = tried[int(np.argmin(_left_px(beside, told[tried], aim)))]
+    return AttitudeChoice(choices[first], float(_left_px(base, told[[first]], aim)[0]))
+
+
+def _of_head(
+    known: Knowledge, base: FloatArray, aim: ExpectedPointing
+) -> tuple[Knowledge, FloatArray, ExpectedPointing]:
+    """The same without the cameras on the body, which see a board alike from every attitude: what was told of
+    them and of all else together (p + 6, p + 6) stays told of all else."""
+    cameras = {name: camera for name, camera in known.rig.cameras.items() if camera.on == "head"}
+    if len(cameras) == len(known.rig.cameras):
+        return known, base, aim
+    rig = replace(known.rig, cameras=cameras, stereo={})
+    of_head = Knowledge(rig, known.boards, known.joint_sigma_rad)
+    names = set(of_head.names)
+    left = np.array([name in names for name in known.names])
+    mine = np.concatenate([left, np.ones(6, dtype=bool)])
+    scale = 1.0 / np.sqrt(np.diag(base)[~mine])
+    across = base[np.ix_(mine, ~mine)] * scale
+    own = base[np.ix_(~mine, ~mine)] * np.outer(scale, scale)
+    rest = base[np.ix_(mine, mine)] - across @ np.linalg.solve(own, across.T)
+    return of_head, rest, replace(aim, to_rig=aim.to_rig[:, left])
+
+
+def _together(base: FloatArray, told: FloatArray, aim: ExpectedPointing, count: int) -> list[int]:
+    """Which of some shots (n, p + 6, p + 6) tell most together beside ``base``: one after the other, then
+    each exchanged for a better one while there is any (Fedorov's exchange)."""
+    plan: list[int] = []
+    whole = base.copy()
+    for _ in range(min(count, len(told))):
+        left = _left_px(whole, told, aim)
+        left[plan] = np.inf
+        plan.append(int(np.argmin(left)))
+        whole = whole + told[plan[-1]]
+    for _ in range(EXCHANGES if len(plan) > 1 else 0):
+        before = list(plan)
+        for place, index in enumerate(before):
+            rest = whole - told[index]
+            left = _left_px(rest, told, aim)
+            left[[other for other in plan if other != index]] = np.inf
+            plan[place] = int(np.argmin(left))
+            whole = rest + told[plan[place]]
+        if plan == before:
+            break
+    return plan
+
+
+def _left_px(base: FloatArray, told: FloatArray, aim: ExpectedPointing) -> FloatArray:
+    """Return the rms per axis (n,) of pointing that each of some shots (n, p + 6, p + 6) beside ``base``
+    would leave, pixels."""
+    whole = base + told
+    whole[:, -6:, -6:] += ANYWHERE * np.eye(6)
+    scale = 1.0 / np.sqrt(np.einsum("nii->ni", whole))
+    whole *= scale[:, :, None] * scale[:, None, :]
+    covariance = np.linalg.inv(whole) * scale[:, :, None] * scale[:, None, :]
+    return np.array([aim.rms_px(one) for one in covariance[:, :-6, :-6]])
+
+
+def _other_sides(shot: BenchShot) -> list[BenchShot]:
+    """The same attitude, come to from other sides."""
+    pan, tilt = shot.pan_approach, shot.tilt_approach
+    return [
+        replace(shot, pan_approach=i * pan, tilt_approach=j * tilt) for i, j in ((-1, 1), (1, -1), (-1, -1))
+    ]
+
+
+def with_board(known: Knowledge, shots: Sequence[BenchShot], placement: str) -> FloatArray:
+    """Return what shots tell of the rig and of one placement's board: information (p + 6, p + 6)."""
+    size = len(known.names)
+    told = np.zeros((size + 6, size + 6))
+    told[:size, :size] = known.information(shot for shot in shots if shot.placement != placement)
+    return sum((known.of_shot(shot) for shot in shots if shot.placement == placement), told)
+
+
+def candidates(
+    known: Knowledge,
+    sought: Sought,
+    here: Sequence[BenchShot],
+    placement: str,
+    avoid: Collection[tuple[float, float]] = (),
+) -> Iterator[BenchShot]:
+    """Yield shots that show the board, apart from those taken, each from the side that is on the way.
+
+    A head that does not choose its side comes from where it stands: from the attitude of the last shot.
+    """
+    useless = [*avoid, *((shot.pan_rad, shot.tilt_rad) for shot in here)]
+    last = (here[-1].pan_rad, here[-1].tilt_rad) if here else (0.0, 0.0)
+    for pan, tilt in attitudes(known, sought, placement):
+        if any(max(abs(a - pan), abs(b - tilt)) < APART_RAD for a, b in useless):
+            continue
+        sides = (0, 0) if sought.one_sided else (1 if pan > last[0] else -1, 1 if tilt > last[1] else -1)
+        shown = seen(known, sought, BenchShot(placement, pan, tilt, (), *sides))
+        if shown is not None:
+            yield shown
+
+
+def expected_px(known: Knowledge, shots: Sequence[BenchShot], aim: ExpectedPointing) -> float:
+    """Return the rms per axis of pointing, pixels, that shots leave on paper."""
+    return aim.rms_px(covariance_of(known.information(shots)))
+
+
+FEWEST = 4
+
+
+def rover_from_board(
+    rig: Rig, camera: str, pan_rad: float, tilt_rad: float, in_board_m: FloatArray, pixels_px: FloatArray
+) -> Rigid:
+    """Return the pose of a flat board in the rover frame.
+
+    Parameters
+    ----------
+    rig, camera
+        Who sees it.
+    pan_rad, tilt_rad
+        True joint angles, radians.
+    in_board_m, pixels_px
+        (n, 3) and (n, 2), at least four corners that are not in one line.
+
+    Raises
+    ------
+    CalibError
+        If they do not fix a pose in front of the camera.
+    """
+    held = rig.cameras[camera]
+    model = held.model
+    axes = camera_axes(model)
+    rays = model.ray(pixels_px).directions @ axes
+    if len(rays) < FEWEST:
+        raise CalibError(f"{len(rays)} corners where {FEWEST} at least fix a board")
+    flat = np.ascontiguousarray(rays[:, :2] / rays[:, 2:])
+    try:
+        done, turn, place = cv2.solvePnP(
+            np.ascontiguousarray(in_board_m), flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+        )
+    except cv2.error:
+        done = False
+    if not done or not np.isfinite(place).all() or place[2, 0] <= 0.0:
+        raise CalibError(f"the corners in the picture of {camera} fix no board")
+    rotation = axes @ cv2.Rodrigues(turn)[0]
+    here = Rigid(_right(rotation), axes @ place[:, 0] + model.C)
+    return here if held.on == "rover" else rig.mast.rover_from_head(pan_rad, tilt_rad) @ here
+
+
+def _right(rotation: FloatArray) -> FloatArray:
+    """The nearest rotation."""
+    left, _, right = np.linalg.svd(rotation)
+    return np.asarray(left @ right)

@@ -1,0 +1,192 @@
+"""Find the dots in all pictures of a survey, several at a time.
+
+Where the board should be comes from the station (prisms, tapes) and the rough camera, carried to each image's
+joint angles by a plain mast: pan about a vertical axis amid the head's rough cameras, tilt about y. Rough
+cameras are good to 20 cm and 10 degrees, and so is this. Cameras without a rough place are taken as upright.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor, Future, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import FloatArray, Rigid, rot_y, rot_z
+from calib.survey.alignment import NotAligned, rover_from_station, station_from_board
+from calib.survey.folder import spoiled_png
+from calib.survey.records import Survey, SurveyCamera, SurveyImage
+from calib.targets.boards import Board, Dots
+from calib.targets.dot_grid import DetectionFailure
+from calib.targets.dot_order import PredictedBoard, Upright
+from calib.targets.dots import DotsFound, find_dots
+
+AHEAD = np.array([1.0, 0.0, 0.0])
+DOWN = np.array([0.0, 0.0, 1.0])
+CAMERA_FROM_CARRIER = Rigid(np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]), np.zeros(3))
+
+Progress = Callable[[int, int, str], None]
+"""Called with how many images are done, of how many, and the name of the last."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyDots:
+    """``dots`` by image name, also those that the survey had already; ``failures``, a sentence each."""
+
+    dots: Mapping[str, Dots]
+    failures: Mapping[str, str]
+
+
+def detect_survey(
+    survey: Survey, executor: Executor | None = None, progress: Progress | None = None
+) -> SurveyDots:
+    """Return the dots of every image of a survey, found in its picture where dots.csv has none.
+
+    Parameters
+    ----------
+    survey
+        With its folder, under which the pictures are.
+    executor
+        Where the work is done, e.g. a ``ProcessPoolExecutor`` (its workers must reach the pictures); here
+        and now if None. The result does not depend on it.
+    progress
+        Called after each image, in this thread.
+    """
+    wanted = [image for image in survey.images if image.name not in survey.dots and _has_picture(image)]
+    expected = expectations(survey)
+    found: dict[str, DotsFound | DetectionFailure] = {}
+
+    def tell(image: str) -> None:
+        if progress is not None:
+            progress(len(found), len(wanted), image)
+
+    tasks = [
+        (survey.folder / image.file, survey.cameras[image.camera].size_px, survey.board, expected[image.name])
+        for image in wanted
+    ]
+    if executor is None:
+        for image, task in zip(wanted, tasks, strict=True):
+            found[image.name] = find_in_file(*task)
+            tell(image.name)
+    else:
+        futures: dict[Future[DotsFound | DetectionFailure], str] = {
+            executor.submit(find_in_file, *task): image.name
+            for image, task in zip(wanted, tasks, strict=True)
+        }
+        for future in as_completed(futures):
+            found[futures[future]] = future.result()
+            tell(futures[future])
+    dots, failures = {}, {}
+    for image in survey.images:
+        result = found.get(image.name)
+        if image.name in survey.dots:
+            dots[image.name] = survey.dots[image.name]
+        elif isinstance(result, DotsFound):
+            dots[image.name] = result.as_dots()
+        elif result is not None:
+            failures[image.name] = result.reason
+    return SurveyDots(dots, failures)
+
+
+def find_in_file(
+    path: Path, size_px: tuple[int, int], board: Board, expected: PredictedBoard | Upright | None
+) -> DotsFound | DetectionFailure:
+    """Find the dots in a picture file; a file that cannot be used is a failure with a reason."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        return DetectionFailure(f"{path.name} cannot be read: {error.strerror or error}")
+    spoiled = spoiled_png(data)
+    if spoiled is not None:
+        return DetectionFailure(f"{path.name} is not a picture that can be read: {spoiled}")
+    content = np.frombuffer(data, dtype=np.uint8)
+    # The pixels as the file has them: all bits, and not turned as a camera's tag may ask.
+    how = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(content, how) if len(content) else None
+    if image is None:
+        return DetectionFailure(f"{path.name} is not a picture that can be read")
+    height, width = image.shape[:2]
+    if (width, height) != tuple(size_px):
+        return DetectionFailure(
+            f"{path.name} is {width} x {height} px where {size_px[0]} x {size_px[1]} are expected"
+        )
+    if image.dtype not in (np.uint8, np.uint16):
+        return DetectionFailure(f"{path.name} holds {image.dtype} where 8 or 16 bits a pixel are expected")
+    return find_dots(image, board, expected)  # type: ignore[arg-type]  # of OpenCV's many types one of those
+
+
+def expectations(survey: Survey) -> dict[str, PredictedBoard | Upright | None]:
+    """Return what is known beforehand of each image's board, by image name.
+
+    None where the station data do not tell the board's pose.
+    """
+    try:
+        setups = {name: fit.b_from_a for name, fit in rover_from_station(survey).items()}
+        placements = {key: fit.b_from_a for key, fit in station_from_board(survey).items()}
+    except NotAligned:
+        setups, placements = {}, {}
+    heads = [c.rough_C_m for c in survey.cameras.values() if c.on == "head" and c.rough_C_m is not None]
+    pivot = np.mean(heads, axis=0) if heads else np.zeros(3)
+    first: dict[str, SurveyImage] = {}
+    for image in survey.images:
+        first.setdefault(image.camera, image)
+    told: dict[str, PredictedBoard | Upright | None] = {}
+    for image in survey.images:
+        camera = survey.cameras[image.camera]
+        key = (image.setup, image.placement)
+        if image.setup not in setups or key not in placements:
+            told[image.name] = None
+            continue
+        rover_from_board = setups[image.setup] @ placements[key]
+        turn = _head_turn(image, camera)
+        if camera.rough_C_m is None or camera.rough_A is None:
+            down = rover_from_board.inverse.vectors(turn @ DOWN)
+            # A body camera looks down as well, but its picture's down is nearest to the rover's.
+            upright = _rough_model(camera, np.zeros(3), AHEAD, np.eye(3), np.eye(3))
+            told[image.name] = Upright(upright.moved(CAMERA_FROM_CARRIER), down)
+        else:
+            turned = turn @ _head_turn(first[image.camera], camera).T
+            C = pivot + turned @ (camera.rough_C_m - pivot) if camera.on == "head" else camera.rough_C_m
+            told[image.name] = PredictedBoard(
+                _rough_model(camera, C, camera.rough_A, turn, turned), rover_from_board
+            )
+    return told
+
+
+def _has_picture(image: SurveyImage) -> bool:
+    return image.file != Path()
+
+
+def _head_turn(image: SurveyImage, camera: SurveyCamera) -> FloatArray:
+    """The head's axes in the rover frame, for a mast that stands upright; (3, 3)."""
+    if camera.on != "head" or image.pan_rad is None or image.tilt_rad is None:
+        return np.eye(3)
+    return np.asarray(rot_z(image.pan_rad) @ rot_y(image.tilt_rad))
+
+
+def _rough_model(
+    camera: SurveyCamera, C: FloatArray, first_A: FloatArray, turn: FloatArray, turned: FloatArray
+) -> CameraModel:
+    """An ideal camera there: its rows are level in its carrier, its lens a pinhole or an even fisheye."""
+    A = turned @ first_A
+    right = np.cross(turn @ DOWN, A)
+    if float(np.linalg.norm(right)) < 1e-3:  # straight down: the top of the image is ahead
+        right = turn @ np.array([0.0, 1.0, 0.0])
+    right = right / np.linalg.norm(right)
+    right = right - (right @ A) * A
+    right = right / np.linalg.norm(right)
+    x_px, y_px = ((n - 1) / 2 for n in camera.size_px)
+    wide = camera.kind == "CAHVORE"
+    return CameraModel(
+        "CAHVORE" if wide else "CAHV",
+        camera.size_px,
+        C,
+        A / np.linalg.norm(A),
+        camera.focal_px * right + x_px * A,
+        camera.focal_px * np.cross(A, right) + y_px * A,
+        cahvore_type=2 if wide else 0,
+    )

@@ -1,0 +1,418 @@
+"""Find the corners of a board in an image, or say in a sentence why there are none.
+
+Markers say which corners are where to a pixel or two (`calib.targets.markers`), each corner is fitted to its
+grey levels (`calib.targets.saddles`), corners beside those that were found are looked for where these say
+they are, and what does not fit the smooth map of the others is dropped. Dots are left to
+`calib.targets.dots`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.geometry.rigid import FloatArray
+from calib.targets.board_file import FAMILIES
+from calib.targets.boards import AnyBoard, AprilGrid, Board, Charuco, Checkerboard, Corners, DotBoard
+from calib.targets.dot_grid import fit_plane_map
+from calib.targets.dots import DotsFound, find_dots
+from calib.targets.markers import (
+    Image,
+    MarkerBoard,
+    Markers,
+    MeasuredCorners,
+    StandingMarkers,
+    chessboard_corners,
+    count_of,
+    detect,
+    predicted,
+    search,
+    standing,
+)
+from calib.targets.pattern import Cells, pattern_of
+from calib.targets.saddles import Crossings, Levels, Saddles, fit_saddles
+
+DARK_DN = 40
+"""Where next to no pixel is brighter, there is no light."""
+
+FLAT_DN = 20
+"""Between the darkest and the brightest pixels: less is no picture."""
+
+MOST_ELSEWHERE = 0.5
+"""Of the markers found; if more do not stand as on the board, it is another."""
+
+OTHERS = (
+    ("DICT_4X4_1000", 1), ("DICT_5X5_1000", 1), ("DICT_6X6_1000", 1), ("DICT_7X7_1000", 1),
+    ("DICT_ARUCO_ORIGINAL", 1), ("DICT_APRILTAG_36h11", 1), ("DICT_APRILTAG_36h11", 2),
+)  # fmt: skip
+BLURRED_PX, SMEARED, SMOOTH_PX = 2.0, 2.0, 1.0
+"""Standard deviation of a blur that is told; of one direction against the other; of what takes noise off."""
+
+FEWEST_OTHERS = 6
+FEWEST_MIRRORED = 3
+
+
+def doubled(board: MarkerBoard, markers: Markers, stands: StandingMarkers | None) -> str:
+    """Say that two boards with the same markers are in view; '' if not."""
+    ids = [int(number) for number in markers.ids if 0 <= number - board.first_id < count_of(board)]
+    twice = sorted({number for number in ids if ids.count(number) > 1})
+    if len(twice) < 2:
+        return ""
+    middles = [markers.corners_px[k].mean(axis=0) for k in np.flatnonzero(markers.ids == twice[0])[:2]]
+    if stands is not None:
+        # the same marker read twice at one place is one marker
+        side = float(np.linalg.norm(stands.corners_px[0, 1] - stands.corners_px[0, 0]))
+        if np.linalg.norm(middles[1] - middles[0]) < side:
+            return ""
+    places = " and ".join(f"({x:.0f}, {y:.0f})" for x, y in middles)
+    return (
+        f"two boards with the same markers are in view: {len(twice)} markers are there twice, "
+        f"marker {twice[0]} at {places} px; one is to be covered"
+    )
+
+
+def why_not_this_board(board: MarkerBoard, markers: Markers, stands: StandingMarkers | None) -> str:
+    """Say that the markers in view are of a board drawn otherwise; '' if they are of this one."""
+    found = len(markers.ids)
+    standing_count = 0 if stands is None else len(stands.ids)
+    last = board.first_id + count_of(board) - 1
+    outside = [int(number) for number in markers.ids if not board.first_id <= number <= last]
+    mine = found - len(outside)  # others may be of a second board, which is no harm
+    if found < 4 or standing_count == mine > 0:
+        return ""
+    if isinstance(board, Charuco):
+        flipped = standing(markers, replace(board, legacy=not board.legacy))
+        if flipped is not None and len(flipped.ids) > standing_count:
+            today, before = (
+                "as OpenCV draws it today (legacy: false)",
+                "as OpenCV before 4.6 draws it (legacy: true)",
+            )
+            drawn = today if board.legacy else before
+            return f"the markers in view stand as on another board: {drawn}; BOARD.yaml says otherwise"
+    if mine and standing_count >= MOST_ELSEWHERE * mine:
+        return ""
+    for other, what in _relatives(board):
+        others = standing(markers, other)
+        if others is not None and len(others.ids) > max(0.8 * found, standing_count):
+            return f"the markers in view stand as on another board: {what}, where {_drawn(board)} is expected"
+    if len(outside) > MOST_ELSEWHERE * found:
+        wanted = f"{board.first_id} to {last} are expected"
+        return f"another board is in view: its markers are {_some(outside)}, where {wanted}"
+    return f"another board is in view: its {found} markers do not stand as on one of {_drawn(board)}"
+
+
+def why_nothing(board: AnyBoard, image: Image) -> str:
+    """Say why no board is seen."""
+    dark, bright = (float(value) for value in np.percentile(image, (1.0, 99.5)))
+    if bright < DARK_DN:
+        return f"the picture is too dark: all but the brightest 0.5 % of it is below {bright:.0f} of 255"
+    if bright - dark < FLAT_DN:
+        return f"the picture shows next to nothing: its levels are between {dark:.0f} and {bright:.0f} of 255"
+    if isinstance(board, Charuco | AprilGrid):
+        told = _mirrored(board, image) or _others(board, image)
+        if told:
+            return told
+    return _blurred(image) or (
+        "the board is not in the picture, or too far away, too slanted or too much covered to be read"
+    )
+
+
+def _mirrored(board: MarkerBoard, image: Image) -> str:
+    flipped = detect(np.ascontiguousarray(image[:, ::-1]), board)
+    if standing(flipped, board) is None or len(flipped.ids) < FEWEST_MIRRORED:
+        return ""
+    return "the board is mirrored: it was printed or the picture was taken the wrong way round"
+
+
+def _blurred(image: Image) -> str:
+    """Say over how many pixels the sharpest edges of a picture are spread, if that is too much."""
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTH_PX)
+    range_dn = float(np.ptp(np.percentile(smooth, (1.0, 99.5))))
+    widths = []
+    for axis in (1, 0):
+        steepest = float(np.percentile(np.abs(np.gradient(smooth, axis=axis)), 99.8))
+        # an edge blurred by a normal distribution is steepest in its middle
+        spread = range_dn / max(steepest, 1e-6) / np.sqrt(2 * np.pi)
+        widths.append(float(np.sqrt(max(spread**2 - SMOOTH_PX**2, 0.0))))
+    across, down = widths
+    if max(widths) > BLURRED_PX and max(widths) > SMEARED * min(widths):
+        way = "across" if across > down else "down"
+        wide = f"its sharpest edges that way are spread over {2 * max(widths):.0f} px"
+        return f"no board can be read; the picture moved {way} during its exposure: {wide}"
+    if min(widths) > BLURRED_PX:
+        wide = f"its sharpest edges are spread over {2 * min(widths):.0f} px"
+        return f"no board can be read; the picture is blurred: {wide}"
+    return ""
+
+
+def _others(board: MarkerBoard, image: Image) -> str:
+    """Markers of another dictionary."""
+    mine = board.dictionary if isinstance(board, Charuco) else FAMILIES[board.family]
+    border = board.border if isinstance(board, AprilGrid) else 1
+    for dictionary, width in OTHERS:
+        if (dictionary.split("_")[:2], width) == (mine.split("_")[:2], border):
+            continue
+        found = search(image, dictionary, width)
+        if len(found.ids) >= FEWEST_OTHERS:
+            other = f"{dictionary} with a border of {width}" if "APRIL" in dictionary else dictionary
+            return f"another board is in view: its markers are of {other}, not of {mine}"
+    return ""
+
+
+def _relatives(board: MarkerBoard) -> list[tuple[MarkerBoard, str]]:
+    """Boards that are easily taken for this one, and how they differ."""
+    return [
+        (replace(board, columns=columns, rows=rows), f"{columns} columns")
+        for columns in range(3 if isinstance(board, Charuco) else 2, 31)
+        for rows in [max(3, 2 * count_of(board) // columns + 2)]
+        if columns != board.columns
+    ]
+
+
+def _drawn(board: MarkerBoard) -> str:
+    what = "tags" if isinstance(board, AprilGrid) else "squares"
+    return f"{board.columns} x {board.rows} {what}"
+
+
+def _some(numbers: list[int]) -> str:
+    told = ", ".join(map(str, sorted(numbers)[:4]))
+    return told + (f" and {len(numbers) - 4} more" if len(numbers) > 4 else "")
+
+
+LEAST_SIGMA_PX = 0.001
+"""What aliasing and whole grey levels leave at best."""
+
+FARTHEST_PX = 4.0
+"""A corner is looked for so far from where the markers say that it is."""
+
+WORST_SIGMA_PX = 0.3
+UNSURE = 6.0
+"""A corner is dropped if it is so much less sure than the others: half covered."""
+
+BESIDE_RIM = 2.0
+"""Standard deviations of the blur that a corner is away from the picture's rim at least."""
+
+CONTRAST = 0.35
+"""Of the others' median, at least; a corner half behind something has less."""
+
+WIDEST = 1.7
+"""Of the others' median, what blurs an edge at most: something that lies across it makes it wider."""
+
+LEFT_OVER = 0.12
+"""Of its contrast, at most, or three times what is usual in the image."""
+
+FAR_OFF = 6.0
+"""Sigmas from the map of all corners, beyond which a corner is dropped."""
+
+FEWEST = 4
+ROUNDS = 6
+
+
+class CornersNotFound(NamedTuple):
+    """Why there are no corners: one plain sentence."""
+
+    reason: str
+
+
+def find_corners(board: AnyBoard, image: Levels) -> Corners | CornersNotFound:
+    """Return the corners of a board that an image shows, or why there are none.
+
+    Part of a board is enough where its markers say which part; chessboards and dots must be seen whole, their
+    upper side up in the image where the print does not tell.
+
+    Parameters
+    ----------
+    board
+        What is printed.
+    image
+        (h, w) or (h, w, 3) levels of 8 or 16 bits; the centre of the top-left pixel is (0, 0).
+
+    Returns
+    -------
+    Corners | CornersNotFound
+        sigma_px is what noise, blur and slant leave of each corner, by what the fit of its grey levels left
+        over: errors that neighbours share, as of the print, are not in it.
+
+    Raises
+    ------
+    ValueError
+        If the image is none of these.
+    """
+    levels = _grey(image)
+    eight = _in_8_bits(levels)
+    if isinstance(board, DotBoard):
+        return _dots(board, levels)
+    pattern = pattern_of(board)
+    assert isinstance(pattern, Cells)
+    if isinstance(board, Checkerboard):
+        start = chessboard_corners(board, eight)
+        if start is None:
+            return CornersNotFound(why_nothing(board, eight))
+    else:
+        stands = _standing(board, eight)
+        if isinstance(stands, CornersNotFound):
+            return stands
+        start = _beside(board, stands)
+    found = _inside(_fitted(board, levels, pattern, start), levels.shape)
+    if len(found.ids) < FEWEST:
+        return CornersNotFound(
+            "markers of the board are seen, but its corners are covered, blurred or too small"
+        )
+    return _agreeing(board, found)
+
+
+class _Found(NamedTuple):
+    """Corners that were fitted: ids (n,), and what `fit_saddles` says of them."""
+
+    ids: NDArray[np.int64]
+    saddles: Saddles
+
+
+def _standing(board: MarkerBoard, image: Image) -> StandingMarkers | CornersNotFound:
+    """The markers that stand as on the board, or what is wrong."""
+    markers = detect(image, board)
+    stands = standing(markers, board)
+    twice = doubled(board, markers, stands)
+    if twice:
+        return CornersNotFound(twice)
+    another = why_not_this_board(board, markers, stands)
+    if another:
+        return CornersNotFound(another)
+    if stands is None:
+        return CornersNotFound(why_nothing(board, image))
+    return stands
+
+
+def _beside(board: MarkerBoard, stands: StandingMarkers) -> MeasuredCorners:
+    """The corners next to markers, predicted from these."""
+    known = MeasuredCorners(stands.corners_m.reshape(-1, 2), stands.corners_px.reshape(-1, 2))
+    ids = board.ids
+    places = board.in_board_m(ids)[:, :2]
+    away = np.linalg.norm(places[:, None] - known.points_m[None], axis=-1).min(axis=1)
+    reach = 0.5 * (board.gap_m if isinstance(board, AprilGrid) else board.square_m)
+    near = away < reach
+    return predicted(known, ids[near], places[near])
+
+
+def _fitted(
+    board: Charuco | AprilGrid | Checkerboard, levels: Levels, pattern: Cells, start: MeasuredCorners
+) -> _Found:
+    """The corners that the start names, and those that lie beside what was found."""
+    places = board.in_board_m(board.ids)[:, :2]
+    printed = Crossings(pattern, places, _insets_m(board))
+    ids, found = start.ids, None
+    tried = set(map(int, ids))
+    while len(ids):
+        new = fit_saddles(levels, printed.some(ids), start.pixels_px, start.jacobians, FARTHEST_PX)
+        both = (
+            new
+            if found is None
+            else Saddles(*(np.concatenate(two) for two in zip(found.saddles, new, strict=True)))
+        )
+        every = ids if found is None else np.concatenate([found.ids, ids])
+        good = _good(both)
+        found = _Found(every[good], Saddles(*(part[good] for part in both)))
+        if len(found.ids) < FEWEST:
+            break
+        rest = np.array([one for one in board.ids if int(one) not in tried], dtype=np.int64)
+        if not len(rest):
+            break
+        known = MeasuredCorners(places[found.ids], found.saddles.pixels_px)
+        ids = known.next_to(rest, places, board.lines_m)
+        tried |= set(map(int, ids))
+        start = predicted(known, ids, places[ids])
+        ids = start.ids  # less where the corners found lie too badly to say where the next one is
+    if found is None:
+        return _Found(ids, fit_saddles(levels, printed.some(ids), start.pixels_px, start.jacobians, 0.0))
+    return found
+
+
+def _insets_m(board: Charuco | AprilGrid | Checkerboard) -> FloatArray:
+    """How far from a corner, across and down, markers begin in the white squares; infinite if there are
+    none.
+    """
+    if not isinstance(board, Charuco):
+        return np.full(2, np.inf)
+    return (board.square_m - board.marker_m) / 2 * np.array([1.0, board.aspect])
+
+
+def _inside(found: _Found, shape: tuple[int, ...]) -> _Found:
+    """Leave out what is nearer to the image's rim than the blur reaches, or beside it."""
+    rim = BESIDE_RIM * found.saddles.wide_px.max(axis=1, initial=0.0) - 0.5
+    x, y = found.saddles.pixels_px.T
+    kept = (x > rim) & (y > rim) & (x < shape[1] - 1 - rim) & (y < shape[0] - 1 - rim)
+    return _Found(found.ids[kept], Saddles(*(part[kept] for part in found.saddles)))
+
+
+def _good(saddles: Saddles) -> NDArray[np.bool_]:
+    """Which corners look like the others."""
+    fitted = np.isfinite(saddles.sigma_px)
+    if not fitted.any():
+        return fitted
+    with np.errstate(invalid="ignore", divide="ignore"):
+        left_over = saddles.noise / saddles.contrast
+        good = fitted & (
+            saddles.sigma_px < min(WORST_SIGMA_PX, UNSURE * float(np.nanmedian(saddles.sigma_px)))
+        )
+        good &= saddles.contrast > CONTRAST * np.nanmedian(saddles.contrast)
+        good &= (saddles.wide_px < WIDEST * np.nanmedian(saddles.wide_px, axis=0)).all(axis=1)
+        return np.asarray(good & (left_over < max(LEFT_OVER, 3.0 * float(np.nanmedian(left_over)))))
+
+
+def _agreeing(board: AnyBoard, found: _Found) -> Corners | CornersNotFound:
+    """The corners that fit a smooth map of all."""
+    points = board.in_board_m(found.ids)[:, :2]
+    pixels = found.saddles.pixels_px
+    sigma = np.hypot(found.saddles.sigma_px, LEAST_SIGMA_PX)
+    good = np.ones(len(points), dtype=bool)
+    for _ in range(ROUNDS):
+        plane_map = fit_plane_map(points[good], pixels[good])
+        if plane_map is None or 2 * int(good.sum()) - plane_map.parameters < 6:
+            break
+        # what the map has no room for, a lens near by or a bent board, is in all of them
+        least = np.maximum(sigma, float(np.median(sigma[good])))
+        off = np.linalg.norm(plane_map.pixels(points) - pixels, axis=-1) / least
+        # by the median: a corner far off does not excuse itself
+        usual = float(np.median(off[good])) / 1.177
+        far = good & (off > FAR_OFF * max(1.0, usual))
+        if not far.any() or good.sum() - far.sum() < FEWEST:
+            break
+        good &= ~far
+    order = np.argsort(found.ids[good])
+    return Corners(found.ids[good][order], pixels[good][order], sigma[good][order])
+
+
+def _dots(board: DotBoard, levels: Levels) -> Corners | CornersNotFound:
+    """The dots, rows to the right in the image."""
+    found = find_dots(levels, Board(board.rows, board.columns, board.spacing_m, board.dot_diameter_m, {}))
+    if not isinstance(found, DotsFound):
+        return CornersNotFound(found.reason)
+    return Corners(found.rows * board.columns + found.columns, found.pixels_px, found.sigma_px)
+
+
+def _grey(image: Levels) -> Levels:
+    if (
+        image.dtype not in (np.uint8, np.uint16)
+        or image.ndim not in (2, 3)
+        or (image.ndim == 3 and image.shape[2] != 3)
+    ):
+        raise ValueError(
+            f"an image of {image.shape} {image.dtype} where (h, w) or (h, w, 3) uint8 or uint16 is expected"
+        )
+    if image.ndim == 2:
+        return image
+    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    return grey.astype(np.uint8) if image.dtype == np.uint8 else grey.astype(np.uint16)
+
+
+def _in_8_bits(levels: Levels) -> Image:
+    """The image in 8 bits: all levels but the darkest and the brightest thousandth, spread over them."""
+    if levels.dtype == np.uint8:
+        return levels.astype(np.uint8, copy=False)
+    dark, bright = np.percentile(levels, (0.1, 99.9))
+    spread = (levels - dark) * (255.0 / max(bright - dark, 1.0))
+    return np.asarray(np.clip(np.rint(spread), 0, 255), dtype=np.uint8)

@@ -1,0 +1,391 @@
+"""The board's grid out of spots that may be its dots: neighbours linked, the whole board cut out.
+
+The shape of a dot's image tells the local tilt: undone, the four neighbours of a dot stand at one spacing in
+two directions at right angles. From neighbour to neighbour the grid grows over the board; each step adapts to
+the last, so perspective and lens distortion bend it freely.
+
+The map from the board's plane to the image follows without any camera model: a homography and, on top, a
+polynomial in the place on the board for what a lens bends. It carries dots that were missed to where they
+must be, gives every dot's shape and the bias of its centre, and tells dots that do not fit the others.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from calib.geometry.rigid import FloatArray, IntArray
+from calib.targets.boards import Board
+from calib.targets.dot_spots import UNEVEN_AT_MOST, Candidates, Image, centred, contrasts
+
+DEGREES = (0, 3, 5)
+"""Of the polynomial; the number of dots decides which."""
+
+DOTS_FOR_DEGREE = (0, 40, 90)
+STEP = 1e-4  # of the numeric derivative, in units of the board's half size
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneMap:
+    """Places on the board, metres, to pixels.
+
+    ``homography`` (3, 3) acts on metres; ``bend`` (terms, 2), px, on the powers of metres / ``scale_m``.
+    """
+
+    homography: FloatArray
+    bend: FloatArray
+    degree: int
+    scale_m: float
+
+    def pixels(self, points_m: ArrayLike) -> FloatArray:
+        """Return pixels (..., 2) of points (..., 2), metres in the board's plane."""
+        points = np.asarray(points_m, dtype=np.float64)
+        carried = points @ self.homography[:, :2].T + self.homography[:, 2]
+        pixels = carried[..., :2] / carried[..., 2:]
+        if self.degree:
+            pixels = pixels + _powers(points / self.scale_m, self.degree) @ self.bend
+        return np.asarray(pixels)
+
+    def jacobian(self, points_m: ArrayLike) -> FloatArray:
+        """Return d pixel / d point (..., 2, 2), px/m."""
+        points = np.asarray(points_m, dtype=np.float64)
+        step = STEP * self.scale_m
+        sides = [
+            (self.pixels(points + step * axis) - self.pixels(points - step * axis)) / (2 * step)
+            for axis in np.eye(2)
+        ]
+        return np.stack(sides, axis=-1)
+
+    @property
+    def parameters(self) -> int:
+        """How many numbers were fitted."""
+        return 8 + 2 * max(0, len(self.bend) - 4)
+
+
+def fit_plane_map(points_m: FloatArray, pixels_px: FloatArray) -> PlaneMap | None:
+    """Return the map that fits the dots (n, 2) best, or None where they do not tell one (fewer than 6)."""
+    if len(points_m) < 6:
+        return None
+    scale = float(np.abs(points_m).max())
+    middle = pixels_px.mean(axis=0)
+    H, _ = cv2.findHomography(points_m / scale, pixels_px - middle, 0)
+    if H is None or not np.isfinite(H).all():
+        return None
+    back = np.array([[1.0, 0.0, middle[0]], [0.0, 1.0, middle[1]], [0.0, 0.0, 1.0]])
+    homography = np.asarray(back @ H @ np.diag([1 / scale, 1 / scale, 1.0]), dtype=np.float64)
+    degree = max(d for d, least in zip(DEGREES, DOTS_FOR_DEGREE, strict=True) if len(points_m) >= least)
+    flat = PlaneMap(homography, np.empty((0, 2)), 0, scale)
+    if not degree:
+        return flat
+    powers = _powers(points_m / scale, degree)
+    bend, _, rank, _ = np.linalg.lstsq(powers, pixels_px - flat.pixels(points_m), rcond=1e-9)
+    if rank < powers.shape[1]:
+        return flat
+    return PlaneMap(homography, np.asarray(bend, dtype=np.float64), degree, scale)
+
+
+def _powers(points: FloatArray, degree: int) -> FloatArray:
+    """x**i y**j for i + j up to the degree, along the last axis."""
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)
+
+
+NEAR = 0.35  # how far a neighbour may be from where it is expected, in spacings
+SIZES = (0.5, 2.0)  # areas of neighbours, one to the other
+LOOK_AT = 10  # nearest spots looked at for each
+LEAST_GRID = 6
+
+
+class Lattice(NamedTuple):
+    """Spots with whole coordinates: ``spots`` (n,) index the candidates, ``places`` (n, 2) count i and j."""
+
+    spots: IntArray
+    places: IntArray
+
+
+def grow_lattices(found: Candidates, spacing_over_radius: float) -> list[Lattice]:
+    """Return the grids among the candidates, the largest first.
+
+    ``spacing_over_radius`` is that of the board: distance of neighbours over the radius of a dot.
+    """
+    links = _links(found, spacing_over_radius)
+    free = set(range(len(found.middles_px)))
+    lattices = []
+    # Dots with four neighbours are the surest to start from.
+    for start in sorted(free, key=lambda i: -len(links[i])):
+        if start in free and len(links[start]) >= 2:
+            lattice = _grown(found.middles_px, links, start)
+            if lattice is not None:
+                free -= set(lattice.spots.tolist())
+                lattices.append(lattice)
+    return sorted(lattices, key=lambda lattice: -len(lattice.spots))
+
+
+def _links(found: Candidates, spacing_over_radius: float) -> list[list[int]]:
+    """For each spot, those that could be its four neighbours, judged from both sides."""
+    count = len(found.middles_px)
+    if count < 2:
+        return [[] for _ in range(count)]
+    nearest = cKDTree(found.middles_px).query(found.middles_px, k=min(LOOK_AT + 1, count))[1]
+    near = np.asarray(nearest)[:, 1:]
+    offsets = found.middles_px[near] - found.middles_px[:, None, :]
+    there = _in_circles(np.linalg.inv(found.shapes_px)[:, None], offsets)
+    back = _in_circles(np.linalg.inv(found.shapes_px)[near], offsets)
+    area = np.abs(np.linalg.det(found.shapes_px))
+    ratio = area[near] / area[:, None]
+    off = np.maximum(abs(there / spacing_over_radius - 1.0), abs(back / spacing_over_radius - 1.0))
+    good = (off < NEAR) & (ratio > SIZES[0]) & (ratio < SIZES[1])
+    return [near[i][good[i]].tolist() for i in range(count)]
+
+
+def _in_circles(undo: NDArray[Any], offsets: FloatArray) -> FloatArray:
+    """Lengths of offsets with the tilt undone, in dot radii."""
+    return np.asarray(np.linalg.norm(np.einsum("...ij,...j->...i", undo, offsets), axis=-1))
+
+
+def _grown(middles: FloatArray, links: list[list[int]], start: int) -> Lattice | None:
+    """Give whole coordinates to everything that hangs together with ``start``."""
+    basis = _first_basis(middles, links, start)
+    if basis is None:
+        return None
+    place = {start: (0, 0)}
+    taken = {(0, 0): start}
+    bases = {start: basis}
+    queue = deque([start])
+    while queue:
+        i = queue.popleft()
+        undo = np.linalg.inv(bases[i])
+        for j in links[i]:
+            step = middles[j] - middles[i]
+            local = undo @ step
+            whole = np.rint(local)
+            if abs(whole).sum() != 1 or abs(local - whole).max() > NEAR:
+                continue
+            there = (place[i][0] + int(whole[0]), place[i][1] + int(whole[1]))
+            if j in place or there in taken:
+                continue
+            place[j], taken[there] = there, j
+            axis = int(whole[1] != 0)
+            bases[j] = bases[i].copy()
+            bases[j][:, axis] = step * whole[axis]
+            queue.append(j)
+    if len(place) < LEAST_GRID:
+        return None
+    return Lattice(np.array(list(place)), _unsheared(np.array(list(place.values()))))
+
+
+def _unsheared(places: IntArray) -> IntArray:
+    """The same lattice counted so that it fills the smallest box, from 0.
+
+    A small dot seen at a slant is blurred round, and a neighbour across the diagonal taken for the one
+    beside: such a grid is whole but counted aslant.
+    """
+    turns = [np.eye(2, dtype=np.int64)]
+    for k in (-1, 1):
+        turns += [np.array([[1, k], [0, 1]]), np.array([[1, 0], [k, 1]])]
+    while True:
+        box = [int(np.prod(np.ptp(places @ turn.T, axis=0) + 1)) for turn in turns]
+        best = int(np.argmin(box))
+        if best == 0:
+            return np.asarray(places - places.min(axis=0))
+        places = places @ turns[best].T
+
+
+def _first_basis(middles: FloatArray, links: list[list[int]], start: int) -> FloatArray | None:
+    """Two steps to neighbours as columns: those that span the smallest cell, nearest to a right angle."""
+    steps = [middles[j] - middles[start] for j in links[start]]
+    pairs = []
+    for k, a in enumerate(steps):
+        for b in steps[:k]:
+            cell = abs(a[0] * b[1] - a[1] * b[0])
+            lengths = np.linalg.norm(a) * np.linalg.norm(b)
+            if cell > 0.3 * lengths:
+                pairs.append((cell, cell / lengths, np.stack([a, b], axis=-1)))
+    if not pairs:
+        return None
+    smallest = min(pair[0] for pair in pairs)
+    return max((pair for pair in pairs if pair[0] < 1.4 * smallest), key=lambda pair: pair[1])[2]
+
+
+MOST_MISSING = 0.2
+"""Share of dots that may be hidden; then the others are still counted safely."""
+
+
+class DetectionFailure(NamedTuple):
+    """Why there are no dots: one plain sentence."""
+
+    reason: str
+
+
+class BoardGrid(NamedTuple):
+    """Dots with places 0 to counts - 1 along i and j, and their middles to some tenths of a pixel."""
+
+    places: IntArray
+    middles_px: FloatArray
+    counts: tuple[int, int]
+    map: PlaneMap  # from places to pixels
+
+
+def best_grid(image: Image, found: Candidates, board: Board) -> tuple[BoardGrid | DetectionFailure, int]:
+    """The board's grid, grown, else by OpenCV's clustering; and how many spots hang together."""
+    wanted = board.rows * board.columns
+    lattices = grow_lattices(found, 2.0 * board.spacing_m / board.dot_diameter_m)
+    largest = len(lattices[0].spots) if lattices else 0
+    grids = [
+        _complete(image, found, lattice, board) for lattice in lattices[:3] if len(lattice.spots) > wanted / 3
+    ]
+    whole: list[BoardGrid] = []
+    for grid in grids:
+        # Two pieces of one board are both filled up to the same grid.
+        if isinstance(grid, BoardGrid) and not any(_same(grid, other) for other in whole):
+            whole.append(grid)
+    if len(whole) > 1:
+        told = f"{len(whole)} grids of {board.rows} x {board.columns} dots are in the image"
+        return DetectionFailure(told), largest
+    if whole:
+        return whole[0], largest
+    clustered = _clustered(found, board)
+    if clustered is not None:
+        grid = _complete(image, found, clustered, board)
+        if isinstance(grid, BoardGrid):
+            return grid, wanted
+    if grids:
+        return grids[0], largest
+    spots = len(found.middles_px)
+    told = (
+        f"{spots} spots look like dots, and at most {largest} of them stand in a grid, "
+        f"where {wanted} are expected"
+    )
+    return DetectionFailure(told), largest
+
+
+def _same(one: BoardGrid, other: BoardGrid) -> bool:
+    """Whether two grids stand at the same place."""
+    apart = np.linalg.norm(one.middles_px.mean(axis=0) - other.middles_px.mean(axis=0))
+    return bool(apart < 0.25 * np.ptp(one.middles_px, axis=0).max())
+
+
+def _clustered(found: Candidates, board: Board) -> Lattice | None:
+    """OpenCV's grid finder on the candidates, if they are few enough for it to end soon."""
+    wanted = board.rows * board.columns
+    if not wanted <= len(found.middles_px) <= 1.5 * wanted:
+        return None
+    points = found.middles_px.astype(np.float32).reshape(-1, 1, 2)
+    flags = cv2.CALIB_CB_SYMMETRIC_GRID + cv2.CALIB_CB_CLUSTERING
+    size = (board.columns, board.rows)
+    # Without a detector OpenCV takes the picture for the points; its type hints do not know.
+    finder: Any = cv2.findCirclesGrid
+    done, corners = finder(points, size, flags, None, cv2.CirclesGridFinderParameters())
+    if not done or corners is None:
+        return None
+    corners = corners.reshape(-1, 2)
+    spots = np.linalg.norm(found.middles_px[None] - corners[:, None], axis=-1).argmin(axis=1)
+    rows, columns = np.divmod(np.arange(wanted), board.columns)
+    return Lattice(spots, np.stack([columns, rows], axis=-1))
+
+
+def _complete(
+    image: Image, found: Candidates, lattice: Lattice, board: Board
+) -> BoardGrid | DetectionFailure:
+    """Fill the gaps of a lattice and cut the board out of it, or say what is missing."""
+    places, middles = lattice.places, found.middles_px[lattice.spots]
+    radius = board.dot_diameter_m / 2 / board.spacing_m
+    contrast = float(np.median(contrasts(image, middles, found.shapes_px[lattice.spots])[0]))
+    for _ in range(3):
+        plane_map = _consistent_map(places, middles)
+        if plane_map is None:
+            return DetectionFailure("spots that look like dots do not make a flat grid")
+        at = plane_map.pixels(places.astype(np.float64))
+        step = np.sqrt(np.abs(np.linalg.det(plane_map.jacobian(places.astype(np.float64)))))
+        fits = np.linalg.norm(middles - at, axis=-1) < 0.15 * step
+        places, middles = places[fits], middles[fits]
+        more, at = _gaps(image, places, plane_map, radius, contrast)
+        if not len(more):
+            break
+        places, middles = np.concatenate([places, more]), np.concatenate([middles, at])
+    return _cut_out(image, places, middles, board)
+
+
+def _consistent_map(places: IntArray, middles: FloatArray) -> PlaneMap | None:
+    """The map from places to pixels, fitted again without spots that do not fit it."""
+    points = places.astype(np.float64)
+    plane_map = fit_plane_map(points, middles)
+    if plane_map is None:
+        return None
+    off = np.linalg.norm(plane_map.pixels(points) - middles, axis=-1)
+    good = off <= max(0.5, 4.0 * float(np.median(off)))
+    return plane_map if good.all() else fit_plane_map(points[good], middles[good])
+
+
+def _gaps(
+    image: Image, places: IntArray, plane_map: PlaneMap, radius: float, contrast_dn: float
+) -> tuple[IntArray, FloatArray]:
+    """Places inside and one beyond the lattice without a spot that hold a dot after all, and where."""
+    low, high = places.min(axis=0) - 1, places.max(axis=0) + 1
+    i, j = (a.ravel() for a in np.mgrid[low[0] : high[0] + 1, low[1] : high[1] + 1])
+    known = set(map(tuple, places.tolist()))
+    free = np.array([p for p in zip(i.tolist(), j.tolist(), strict=True) if p not in known], dtype=np.int64)
+    points = free.astype(np.float64)
+    at, shapes = plane_map.pixels(points), plane_map.jacobian(points) * radius
+    darker, spread = contrasts(image, at, shapes)
+    with np.errstate(invalid="ignore"):
+        dots = (darker > 0.5 * contrast_dn) & (spread < UNEVEN_AT_MOST * darker)
+    at = at[dots]
+    return free[dots], centred(image, at, shapes[dots]) if len(at) else at
+
+
+def _cut_out(
+    image: Image, places: IntArray, middles: FloatArray, board: Board
+) -> BoardGrid | DetectionFailure:
+    """The window of the lattice that is the board, if there is only one."""
+    wanted = board.rows * board.columns
+    low, high = places.min(axis=0), places.max(axis=0)
+    windows = []
+    for counts in sorted({(board.columns, board.rows), (board.rows, board.columns)}):
+        for i in range(low[0], max(low[0], high[0] - counts[0] + 1) + 1):
+            for j in range(low[1], max(low[1], high[1] - counts[1] + 1) + 1):
+                inside = ((places >= [i, j]) & (places < [i + counts[0], j + counts[1]])).all(axis=1)
+                windows.append((int(inside.sum()), (i, j), counts, inside))
+    windows.sort(key=lambda window: -window[0])
+    number, origin, counts, inside = windows[0]
+    spans = high - low + 1
+    if number < (1.0 - MOST_MISSING) * wanted or min(spans) < min(counts) or max(spans) < max(counts):
+        return DetectionFailure(_too_few(image, number, spans, middles, board))
+    own = places[inside] - np.array(origin)
+    for axis in (0, 1):
+        for line in (0, counts[axis] - 1):
+            # An outer line that is hardly there could as well be the one beyond the other side.
+            if (own[:, axis] == line).sum() < counts[1 - axis] / 2:
+                return DetectionFailure(_too_few(image, number, spans, middles, board))
+    if len(windows) > 1 and windows[1][0] > number - 3:
+        return DetectionFailure(f"the grid is larger than {board.rows} x {board.columns} dots")
+    plane_map = fit_plane_map(own.astype(np.float64), middles[inside])
+    if plane_map is None:
+        return DetectionFailure("spots that look like dots do not make a flat grid")
+    return BoardGrid(own, middles[inside], counts, plane_map)
+
+
+def _too_few(image: Image, number: int, spans: IntArray, middles: FloatArray, board: Board) -> str:
+    """A sentence about a part of a board."""
+    height, width = image.shape
+    step = np.sqrt(np.prod(np.ptp(middles, axis=0) + 1) / np.prod(spans))
+    low, high = middles.min(axis=0), middles.max(axis=0)
+    beyond = [
+        side
+        for side, near in (
+            ("left", low[0] < step),
+            ("top", low[1] < step),
+            ("right", high[0] > width - 1 - step),
+            ("bottom", high[1] > height - 1 - step),
+        )
+        if near
+    ]
+    told = f"only {number} dots in a grid of {min(spans)} x {max(spans)} are seen"
+    told += f" where {board.rows} x {board.columns} are expected"
+    return told + (f"; the board reaches over the {' and '.join(beyond)} edge of the image" if beyond else "")

@@ -1,0 +1,280 @@
+"""Which corners of a board are where in an image, to a pixel or two: by markers, or as a plain chessboard.
+
+OpenCV finds both; what is here decides which markers stand as on the board, tells where corners are that have
+not been measured yet, and turns a chessboard the way round that its colours say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.geometry.rigid import FloatArray, IntArray
+from calib.targets.board_file import FAMILIES
+from calib.targets.boards import AprilGrid, Charuco, Checkerboard
+
+NEIGHBOURS = 16
+FEWEST_NEIGHBOURS = 4
+LEAST_TOLD = 1e-9
+NEXT = 1.3
+"""A corner lies next to a known one if it is no farther than so many of the widest steps of the grid."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredCorners:
+    """Points of a board, and where they are in the image.
+
+    points_m, pixels_px (n, 2); where they were predicted as corners, ids (n,) and jacobians (n, 2, 2) px/m.
+    """
+
+    points_m: FloatArray
+    pixels_px: FloatArray
+    ids: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    jacobians: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
+
+    def next_to(
+        self, ids: IntArray, places_m: FloatArray, lines_m: tuple[FloatArray, FloatArray]
+    ) -> IntArray:
+        """Return those of ``ids`` (their places on the board by id) that lie next to a known point."""
+        step_m = NEXT * max(float(np.diff(line).max()) for line in lines_m)
+        away = np.linalg.norm(places_m[ids][:, None] - self.points_m[None], axis=-1).min(axis=1)
+        return np.asarray(ids[away < step_m])
+
+
+def predicted(known: MeasuredCorners, ids: IntArray, places_m: FloatArray) -> MeasuredCorners:
+    """Return corners where the known points nearest to each say that they are.
+
+    A homography of the neighbourhood: what the lens bends within it is below a pixel. Left out are corners
+    whose neighbours do not tell one.
+    """
+    count = min(NEIGHBOURS, len(known.points_m))
+    if not len(ids) or count < FEWEST_NEIGHBOURS:
+        return MeasuredCorners(np.empty((0, 2)), np.empty((0, 2)))
+    away = np.linalg.norm(known.points_m - places_m[:, None], axis=2)
+    near = np.argpartition(away, count - 1, axis=1)[:, :count]
+    scale = np.maximum(np.take_along_axis(away, near, axis=1).max(axis=1), 1e-6)
+    points = (known.points_m[near] - places_m[:, None]) / scale[:, None, None]
+    middles = known.pixels_px[near].mean(axis=1)
+    pixels = known.pixels_px[near] - middles[:, None]
+    reach = np.maximum(np.abs(pixels).max(axis=(1, 2)), 1e-6)
+    H, told = _homographies(points, pixels / reach[:, None, None])
+    at = H[:, :2, 2] * reach[:, None]
+    # of (H x) / (h x) at 0
+    jacobians = (reach / scale)[:, None, None] * (H[:, :2, :2] - H[:, :2, 2:] * H[:, 2:, :2])
+    kept = told & np.isfinite(at).all(axis=1) & (np.linalg.det(jacobians) > 0.0)
+    return MeasuredCorners(np.empty((0, 2)), (at + middles)[kept], np.asarray(ids)[kept], jacobians[kept])
+
+
+def _homographies(points: FloatArray, pixels: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return the homographies (n, 3, 3), lower right 1, of points (n, k, 2) to pixels (n, k, 2), by two
+    rounds of least squares, and which are told; what a point is divided by weighs its equation in the second.
+    """
+    n, k, _ = points.shape
+    ones, none = np.ones((n, k)), np.zeros((n, k, 3))
+    whole = np.dstack([points, ones])
+    rows = np.stack(
+        [
+            np.concatenate([whole, none, -pixels[..., :1] * points], axis=2),
+            np.concatenate([none, whole, -pixels[..., 1:] * points], axis=2),
+        ],
+        axis=2,
+    )
+    weights = ones
+    for _ in range(2):
+        weighted = rows * weights[..., None, None]
+        A = weighted.reshape(n, 2 * k, 8)
+        b = (pixels * weights[..., None]).reshape(n, 2 * k, 1)
+        normal = A.transpose(0, 2, 1) @ A
+        values = np.linalg.eigvalsh(normal)
+        told = values[:, 0] > LEAST_TOLD * values[:, -1]
+        normal[~told] = np.eye(8)
+        h = np.linalg.solve(normal, A.transpose(0, 2, 1) @ b)[..., 0]
+        below = np.einsum("nki,ni->nk", points, h[:, 6:]) + 1.0
+        told &= (below > 0.1).all(axis=1)
+        weights = 1.0 / np.maximum(below, 0.1)
+    return np.concatenate([h, np.ones((n, 1))], axis=1).reshape(n, 3, 3), told
+
+
+Image = NDArray[np.uint8]
+MarkerBoard = Charuco | AprilGrid
+
+LEAST_PERIMETER = 0.01
+"""Of a marker, against the image's longer side; OpenCV's 0.03 loses a far board in a large picture."""
+
+FEW = 0.5
+"""Where fewer of the board's markers are found, the image is searched a second time, twice as large."""
+
+FEWEST = 2
+STANDS_WITHIN = 0.35
+"""A marker stands as on the board if its corners are within so much of its side from there (a lens bends)."""
+
+
+class Markers(NamedTuple):
+    """What OpenCV found: ids (n,); corners_px (n, 4, 2) in the order of the markers' own upright pictures."""
+
+    ids: IntArray
+    corners_px: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class StandingMarkers:
+    """Markers that stand as on the board, each id once.
+
+    ids (n,); corners_px (n, 4, 2); corners_m (n, 4, 2) on the board; homography (3, 3) from metres to pixels.
+    """
+
+    ids: IntArray
+    corners_px: FloatArray
+    corners_m: FloatArray
+    homography: FloatArray
+
+
+def detect(image: Image, board: MarkerBoard) -> Markers:
+    """Return all markers of the board's dictionary in an image."""
+    dictionary = board.dictionary if isinstance(board, Charuco) else FAMILIES[board.family]
+    border = board.border if isinstance(board, AprilGrid) else 1
+    found = search(image, dictionary, border)
+    if len(found.ids) < FEW * count_of(board) and max(image.shape) < 5000:
+        large = cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC)
+        again = search(np.asarray(large, dtype=np.uint8), dictionary, border)
+        if len(again.ids) > len(found.ids):
+            # the centre of the upper left pixel is (0, 0) in both
+            return Markers(again.ids, (again.corners_px + 0.5) / 2.0 - 0.5)
+    return found
+
+
+def search(image: Image, dictionary: str, border: int) -> Markers:
+    """Return all markers of a dictionary by OpenCV's name."""
+    corners, ids, _ = _detector(dictionary, border).detectMarkers(image)
+    if ids is None or len(ids) == 0:
+        return Markers(np.empty(0, np.int64), np.empty((0, 4, 2)))
+    return Markers(
+        np.asarray(ids, dtype=np.int64).ravel(), np.array(corners, dtype=np.float64).reshape(-1, 4, 2)
+    )
+
+
+@lru_cache(maxsize=32)
+def _detector(dictionary: str, border: int) -> Any:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = border
+    parameters.minMarkerPerimeterRate = LEAST_PERIMETER
+    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    return cv2.aruco.ArucoDetector(known, parameters)
+
+
+def count_of(board: MarkerBoard) -> int:
+    """Return how many markers a board has."""
+    return board.rows * board.columns if isinstance(board, AprilGrid) else board.rows * board.columns // 2
+
+
+def corners_on_board_m(board: MarkerBoard) -> FloatArray:
+    """Return the corners (n, 4, 2) of all markers, metres, in the order in which OpenCV tells them."""
+    if isinstance(board, AprilGrid):
+        step, side = board.tag_m + board.gap_m, board.tag_m
+        up, column = np.divmod(np.arange(board.rows * board.columns), board.columns)
+        middles = np.stack(
+            [(column - (board.columns - 1) / 2) * step, ((board.rows - 1) / 2 - up) * step], axis=-1
+        )
+        half = -side / 2  # OpenCV's tags are upside down
+    else:
+        row, column = np.divmod(np.arange(board.rows * board.columns), board.columns)
+        white = (row + column) % 2 == int(not _white_first(board))
+        row, column = row[white], column[white]
+        middles = (
+            np.stack([(column - (board.columns - 1) / 2), (row - (board.rows - 1) / 2)], axis=-1)
+            * board.square_m
+        )
+        half = board.marker_m / 2
+    square = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    return np.asarray((middles[:, None] + square) * [1.0, board.aspect], dtype=np.float64)
+
+
+def standing(markers: Markers, board: MarkerBoard) -> StandingMarkers | None:
+    """Return the markers that stand as on the board; None if too few do."""
+    on_board = corners_on_board_m(board)
+    mine = (markers.ids >= board.first_id) & (markers.ids < board.first_id + len(on_board))
+    ids, pixels = markers.ids[mine] - board.first_id, markers.corners_px[mine]
+    if len(ids) < FEWEST:
+        return None
+    metres = on_board[ids]
+    sides_px = np.linalg.norm(np.diff(pixels, axis=1, append=pixels[:, :1]), axis=-1).mean(axis=1)
+    H, _ = cv2.findHomography(
+        metres.reshape(-1, 2),
+        pixels.reshape(-1, 2),
+        cv2.RANSAC,
+        STANDS_WITHIN * float(np.median(sides_px)),
+        maxIters=4000,
+    )
+    if H is None or not np.isfinite(H).all():
+        return None
+    off = np.linalg.norm(carried(np.asarray(H, dtype=np.float64), metres) - pixels, axis=-1).max(axis=1)
+    keep = off < STANDS_WITHIN * np.maximum(sides_px, 6.0)
+    nearest = np.lexsort((off, ids))
+    first = nearest[np.unique(ids[nearest], return_index=True)[1]]
+    keep &= np.isin(np.arange(len(ids)), first)
+    if keep.sum() < FEWEST:
+        return None
+    return StandingMarkers(ids[keep], pixels[keep], metres[keep], np.asarray(H))
+
+
+def carried(homography: FloatArray, points: FloatArray) -> FloatArray:
+    """Return points (..., 2) after a homography (3, 3)."""
+    whole = points @ homography[:, :2].T + homography[:, 2]
+    return np.asarray(whole[..., :2] / whole[..., 2:])
+
+
+def _white_first(board: Charuco) -> bool:
+    """Whether the square in the upper left corner is white."""
+    return board.legacy and board.rows % 2 == 0
+
+
+def chessboard_corners(board: Checkerboard, image: Image) -> MeasuredCorners | None:
+    """Return the corners of a chessboard to a pixel; None if it is not seen whole.
+
+    Counted so that the colours are those of the print, and if they are so both ways, upright in the image.
+    """
+    across, down = board.columns - 1, board.rows - 1
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+    found, corners = cv2.findChessboardCornersSB(image, (across, down), flags=flags)
+    if not found:
+        found, corners = cv2.findChessboardCorners(
+            image, (across, down), flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+        )
+    if not found:
+        return None
+    grid = np.asarray(corners, dtype=np.float64).reshape(down, across, 2)
+    ways = [grid, grid[::-1, ::-1], grid[:, ::-1], grid[::-1]]
+    if across == down:
+        ways += [way.transpose(1, 0, 2) for way in ways]
+    ways = [way for way in ways if _handed(way) > 0]
+    dark = [_dark_first(image, way) for way in ways]
+    # both ways may be right by colour; then the one whose rows run to the right
+    likely = [way for way, first in zip(ways, dark, strict=True) if first] or ways
+    upright = max(likely, key=lambda way: float((way[:, -1] - way[:, 0]).sum(axis=0)[0]))
+    places = board.in_board_m(board.ids)[:, :2]
+    return predicted(MeasuredCorners(places, upright.reshape(-1, 2)), board.ids, places)
+
+
+def _handed(grid: np.ndarray) -> float:
+    """Above 0 where rows to the right and columns down are so in the image, not mirrored."""
+    right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    return float(right[0] * down[1] - right[1] * down[0])
+
+
+def _dark_first(image: Image, grid: np.ndarray) -> bool:
+    """Whether the squares on the diagonal of the first four corners are darker than their neighbours."""
+    dark: list[int] = []
+    light: list[int] = []
+    height, width = image.shape
+    for row in range(grid.shape[0] - 1):
+        for column in range(grid.shape[1] - 1):
+            x, y = np.rint(grid[row : row + 2, column : column + 2].mean(axis=(0, 1))).astype(int)
+            if 0 <= x < width and 0 <= y < height:
+                (dark if (row + column) % 2 == 0 else light).append(int(image[y, x]))
+    # the square right below and right of the first corner has the upper left one's colour
+    return bool(np.mean(dark) < np.mean(light))

@@ -1,1 +1,0 @@
-"""One target followed while the rover moves."""

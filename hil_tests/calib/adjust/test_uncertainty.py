@@ -1,0 +1,190 @@
+"""Stated uncertainty against scatter, open directions in words, and what a fitted file is good for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.adjust.result import Calibration
+from calib.adjust.uncertainty import pixel_covariance, pointing_covariance, rig_moved_along
+from calib.calibrate.paper import fit_paper
+from calib.calibrate.survey import fit_joint
+from calib.geometry.covariance import pixel_rates
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig
+from calib.geometry.stereo import triangulate
+from drivers.sim_survey.survey import SurveyPlan, simulate_survey
+from hil_tests.calib.adjust.small_surveys import held, rings, survey_of
+
+SURVEYS = 16
+SMALL = SurveyPlan(rings=rings(2), mast_boards=5, check_boards=0)
+CHI_SQUARE_OFF = 4.0
+"""Standard deviations that a mean over surveys may be off."""
+
+POINTING_PX, HANDOFF_PX, CLICK_PX = 0.3, 0.6, 0.2
+
+
+@pytest.fixture(scope="module")
+def fits(navcams: Rig) -> list[Calibration]:
+    """Small surveys of the Navcams."""
+    return [fit_joint(survey_of(navcams, 100 + seed, SMALL)) for seed in range(SURVEYS)]
+
+
+def test_stated_sigmas_are_the_scatter(fits: list[Calibration], true_rig: Rig) -> None:
+    truth = np.array([*true_rig.mast.translation_m, *true_rig.mast.rotation_rad])
+    errors = np.array([f.estimate[:6] - truth for f in fits])
+    whitened = [
+        float(e @ np.linalg.solve(f.covariance[:6, :6], e)) for e, f in zip(errors, fits, strict=True)
+    ]
+    off = (np.mean(whitened) - 6) / np.sqrt(2 * 6 / SURVEYS)
+    assert abs(off) < CHI_SQUARE_OFF, f"mean of squares {np.mean(whitened):.2f} where 6 is expected"
+
+
+def test_predicted_pixels_scatter_as_stated(fits: list[Calibration], true_rig: Rig) -> None:
+    squares = []
+    for fit in fits:
+        rays = true_rig.camera_in_rover("navcam_left", 0.5, -0.4).ray([(500.0, 400.0)])
+        point = rays.origins_m + 4.0 * rays.directions
+        predicted, covariance = pixel_covariance(fit, "navcam_left", 0.5, -0.4, point)
+        error = predicted[0] - [500.0, 400.0]
+        squares.append(float(error @ np.linalg.solve(covariance[0], error)))
+    off = (np.mean(squares) - 2) / np.sqrt(2 * 2 / SURVEYS)
+    assert abs(off) < CHI_SQUARE_OFF, f"mean of squares {np.mean(squares):.2f} where 2 is expected"
+
+
+def test_weighted_sum_of_squares_is_chi_square(fits: list[Calibration]) -> None:
+    off = [(f.chi2 - f.degrees_of_freedom) / np.sqrt(2 * f.degrees_of_freedom) for f in fits]
+    assert abs(np.mean(off)) * np.sqrt(SURVEYS) < CHI_SQUARE_OFF
+    assert 0.5 < np.std(off) < 1.6
+    assert np.mean([len(f.outliers) for f in fits]) < 0.3
+
+
+def test_the_papers_sigmas_hold_its_scatter(navcams: Rig) -> None:
+    truth = np.array([*navcams.mast.translation_m, *navcams.mast.rotation_rad])
+    squares = []
+    for seed in range(12):
+        fit = fit_paper(survey_of(navcams, 300 + seed, SMALL))
+        error = fit.estimate[:6] - truth
+        squares.append(float(error @ np.linalg.solve(fit.covariance[:6, :6], error)))
+    off = (np.mean(squares) - 6) / np.sqrt(2 * 6 / 12)
+    assert abs(off) < CHI_SQUARE_OFF, f"mean of squares {np.mean(squares):.2f} where 6 is expected"
+
+
+def test_pixel_rates_are_those_of_differences(joint: Calibration) -> None:
+    points = np.array([[4.0, 0.5, -0.5], [6.0, 1.0, 0.0]])
+    for camera in ("navcam_left", "hazcam_right"):
+        _, rates = pixel_rates(joint.rig, joint.parameter_names, camera, 0.2, -0.3, points)
+        every = np.arange(len(joint.parameter_names))
+        for column, name in enumerate(joint.parameter_names):
+            step = np.zeros(len(every))
+            step[column] = 1e-3 if name.split(".")[2][0] in "HV" else 1e-6
+            ends = [
+                rig_moved_along(joint, every, s * step).camera_in_rover(camera, 0.2, -0.3).project(points)[0]
+                for s in (1, -1)
+            ]
+            difference = (ends[0] - ends[1]) / (2 * step[column])
+            scale = max(float(np.abs(difference).max()), 1.0)
+            assert np.abs(rates[..., column] - difference).max() < 1e-4 * scale, name
+
+
+@pytest.mark.parametrize(
+    ("joint", "plan", "still"),
+    [
+        ("pan_rad", SurveyPlan(pan_rad=0.0), "pan hardly moved"),
+        ("tilt_rad", SurveyPlan(tilt_rad=(-0.17, -0.2)), "tilt hardly moved"),
+    ],
+)
+def test_a_joint_that_does_not_move_is_named(navcams: Rig, joint: str, plan: SurveyPlan, still: str) -> None:
+    survey = held(simulate_survey(navcams, 2, plan), joint, 0.0 if joint == "pan_rad" else -0.17)
+    for method in (fit_joint, fit_paper):
+        fit = method(survey)
+        assert fit.degenerate
+        assert all("the survey does not fix" in d.sentence for d in fit.degenerate)
+        assert any(still in d.sentence and "the mast's" in d.sentence for d in fit.degenerate)
+
+
+def test_a_full_survey_leaves_nothing_open(joint: Calibration, paper: Calibration) -> None:
+    assert joint.degenerate == () and paper.degenerate == ()
+
+
+def test_sigmas_have_the_mast_files_keys(joint: Calibration) -> None:
+    assert set(joint.sigma["mast"]) == {
+        "translation_m",
+        "rotation_rad",
+        "axis_offset_m",
+        "axis_twist_rad",
+    }
+    assert joint.sigma["mast"]["axis_offset_m"] == 0.0
+    for name, camera in joint.rig.cameras.items():
+        assert set(joint.sigma["cameras"][name]) == set(camera.model.kind)
+        assert joint.sigma["cameras"][name]["R"][0] == 0.0
+
+
+def test_check_images_are_predicted_and_never_fitted(joint: Calibration) -> None:
+    checks = [i for i in joint.images if i.purpose == "check"]
+    assert checks and not any(i.used.any() for i in checks)
+    assert {i.camera for i in checks} == set(joint.check_rms_px)
+    assert max(max(rms) for rms in joint.check_rms_px.values()) < 3.0
+
+
+def landed(true: Rig, fit: Calibration, seed: int, distance_m: float, count: int) -> np.ndarray:
+    """Where ground targets truly land, pixels off the centre of the left Navcam, after one pointing."""
+    rng = np.random.default_rng(seed)
+    model = true.cameras["navcam_left"].model
+    centre = np.array(model.image_center_px)
+    errors: list[np.ndarray] = []
+    while len(errors) < count:
+        azimuth = rng.uniform(-1, 1)
+        target = np.array([*true.mast.translation_m[:2], rng.normal(0, 0.1)])
+        target += distance_m * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        first = solve(true.mast, model, target, centre + rng.uniform(-0.2, 0.2, 2) * model.size_px)[0]
+        at = first.pan_rad, first.tilt_rad
+        clicks, seen = [], True
+        for name in ("navcam_left", "navcam_right"):
+            pixel, valid = true.camera_in_rover(name, *at).project(target)
+            seen &= bool(valid)
+            clicks.append(pixel + rng.normal(0, CLICK_PX, 2))
+        if not seen:
+            continue
+        left, right = (fit.rig.camera_in_rover(n, *at) for n in ("navcam_left", "navcam_right"))
+        found = triangulate(left, right, *clicks)
+        then = solve(fit.rig.mast, fit.rig.cameras["navcam_left"].model, found.position_m)[0]
+        pixel, _ = true.camera_in_rover("navcam_left", then.pan_rad, then.tilt_rad).project(target)
+        errors.append(pixel - centre)
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("distance_m", [10.0, 6.0, 2.0])
+def test_pointing_from_the_fitted_rig(joint: Calibration, true_rig: Rig, distance_m: float) -> None:
+    rms = np.sqrt((landed(true_rig, joint, 7, distance_m, 60) ** 2).mean(axis=0))
+    assert rms.max() < POINTING_PX
+
+
+@pytest.mark.parametrize("distance_m", [10.0, 6.0, 2.0])
+def test_hand_off_from_pancam_to_navcam(joint: Calibration, true_rig: Rig, distance_m: float) -> None:
+    rng, worst, count = np.random.default_rng(3), 0.0, 0
+    while count < 60:
+        at = rng.uniform(-1, 1), -np.arctan2(1.45, distance_m)
+        left = rng.uniform([100, 100], [920, 660])
+        rays = true_rig.camera_in_rover("pancam_left", *at).ray(left)
+        target = rays.origins_m + distance_m * rays.directions
+        right, valid = true_rig.camera_in_rover("pancam_right", *at).project(target)
+        if not valid or (right < 0).any() or (right > [1023, 767]).any():
+            continue
+        cameras = (joint.rig.camera_in_rover(n, *at) for n in ("pancam_left", "pancam_right"))
+        found = triangulate(*cameras, left, right)
+        for name in ("navcam_left", "navcam_right"):
+            wanted, _ = true_rig.camera_in_rover(name, *at).project(target)
+            given, _ = joint.rig.camera_in_rover(name, *at).project(found.position_m)
+            worst = max(worst, float(np.abs(given - wanted).max()))
+        count += 1
+    assert worst < HANDOFF_PX
+
+
+def test_stated_pointing_uncertainty_is_that_of_the_clicks_and_the_fit(joint: Calibration) -> None:
+    pair = ("navcam_left", "navcam_right")
+    pixel = np.array([400.0, 300.0])
+    alone = pointing_covariance(joint, pair, 0.3, -0.3, pixel, 4.0)
+    clicked = pointing_covariance(joint, pair, 0.3, -0.3, pixel, 4.0, click_px=CLICK_PX)
+    assert 0 < np.sqrt(alone[0, 0]) < 0.1 and 0 < np.sqrt(alone[1, 1]) < 0.15
+    assert CLICK_PX / 2 < np.sqrt(clicked[0, 0]) < POINTING_PX

@@ -1,0 +1,115 @@
+"""What has changed since reference pictures: the truth is the campaign's own pinholes and turns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.calibrate.scene.drift import ALARM_SIGMAS, VIEW_SIGMA, ViewShift, find_drift, view_change
+from tools.campaigns.sentinel import RESTS, SIZE, Site, Truth, rig, shown
+
+SEED = 11
+
+
+def look_at(truth: Truth, seed: int = SEED):  # type: ignore[no-untyped-def]
+    return Site(np.random.default_rng(seed)).look(truth)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_days_of_weather_light_and_moving_rocks_are_no_change(seed: int) -> None:
+    drift = look_at(Truth(), seed)
+    assert drift.named is None
+    assert drift.sentence == ""
+    assert max(change.sigmas for change in drift.changes) < ALARM_SIGMAS - 1.0
+
+
+@pytest.mark.parametrize(
+    ("truth", "what", "value"),
+    [
+        (Truth(turned={"navcam_left": np.array([0.0, 1.8e-3, 0.0])}), "navcam_left turned", 1.8e-3),
+        (Truth(focal={"navcam_right": 3e-3}), "navcam_right refocused", 3e-3),
+        (Truth(slip=(3e-3, 0.0)), "pan slipped", 3e-3),
+        (Truth(slip=(0.0, -3e-3)), "tilt slipped", -3e-3),
+        (Truth(rover=np.array([4e-3, 0.0, 0.0])), "rover turned", 4e-3),
+    ],
+    ids=["bump", "focus", "pan", "tilt", "rover"],
+)
+def test_a_change_is_named_with_its_size(truth: Truth, what: str, value: float) -> None:
+    drift = look_at(truth)
+    assert drift.named is not None
+    assert drift.named.what == what
+    largest = drift.named.values[np.abs(drift.named.values).argmax()]
+    assert largest == pytest.approx(value, abs=0.15 * abs(value) + 2e-4)
+    assert drift.named.sigmas >= ALARM_SIGMAS
+
+
+def test_the_sentence_says_who_turned_how_far_about_what_and_how_sure_that_is() -> None:
+    drift = look_at(Truth(turned={"navcam_left": np.array([0.0, 1.8e-3, 0.0])}))
+    words = drift.sentence
+    assert words.startswith("navcam_left turned 1.")
+    assert " mrad about y, " in words
+    assert words.endswith(" sigma")
+
+
+def test_rocks_that_move_together_do_not_move_a_view() -> None:
+    rng = np.random.default_rng(SEED)
+    pixels = rng.uniform(50, 700, (40, 2))
+    moved = 0.05 * rng.normal(size=(40, 2)) + np.array([1.5, -0.5])
+    moved[:12] += [8.0, 6.0]
+    change = view_change(ViewShift("navcam_left", 0, 0.0, 0.0, pixels, moved, np.full(40, 0.05)), SIZE)
+    assert change is not None
+    middle = (np.array(SIZE) - 1) / 2
+    assert change.agreeing == pytest.approx(28 / 40, abs=0.05)
+    # the numbers are of the picture's middle
+    predicted = change.numbers[:2] + change.numbers[3] * (pixels.mean(axis=0) - middle)
+    np.testing.assert_allclose(predicted, [1.5, -0.5], atol=0.1)
+
+
+@pytest.mark.parametrize("times", [1.0, 3.0], ids=["as told", "three times as told"])
+def test_a_view_is_as_unsure_as_its_features_scatter(times: float) -> None:
+    rng = np.random.default_rng(SEED)
+    normalised = []
+    for _ in range(300):
+        pixels = rng.uniform(50, 700, (60, 2))
+        moved = times * 0.1 * rng.normal(size=(60, 2))
+        change = view_change(ViewShift("navcam_left", 0, 0.0, 0.0, pixels, moved, np.full(60, 0.1)), SIZE)
+        assert change is not None
+        own = change.covariance - np.diag(VIEW_SIGMA**2)
+        normalised.append(change.numbers @ np.linalg.solve(own, change.numbers) / 4)
+    # robust weights cost a tenth; the mean over 300 views of four numbers is good to 4 %
+    assert 0.8 < np.mean(normalised) < 1.1
+
+
+def test_another_scene_says_nothing_instead_of_something() -> None:
+    rng = np.random.default_rng(SEED)
+    views = [
+        ViewShift(
+            eye,
+            pose,
+            0.5 * pose,
+            -0.3,
+            rng.uniform(0, 700, (30, 2)),
+            rng.uniform(-25, 25, (30, 2)),
+            np.full(30, 0.1),
+        )
+        for pose in range(4)
+        for eye in ("navcam_left", "navcam_right")
+    ]
+    drift = find_drift(rig(), views)
+    assert (drift.views, drift.named) == (0, None)
+    assert len(drift.silent) == 8
+    assert "navcam_left at rest 0" in drift.silent
+
+
+def test_one_eye_at_one_rest_cannot_tell_a_bump_from_a_slip_and_says_so() -> None:
+    rng = np.random.default_rng(SEED)
+    site = Site(rng)
+    then = site.then[1, "navcam_left"]
+    pan, tilt = RESTS[1]
+    now = shown(site.points[1, "navcam_left"], "navcam_left", pan, tilt, Truth(slip=(0.0, 5e-3)))
+    moved = now - then + 0.05 * rng.normal(size=then.shape)
+    drift = find_drift(rig(), [ViewShift("navcam_left", 1, pan, tilt, then, moved, np.full(len(then), 0.05))])
+    assert drift.named is not None
+    named = {drift.named.what, *drift.instead}
+    assert {"tilt slipped"} < named
+    assert "these pictures cannot tell" in drift.sentence
