@@ -97,6 +97,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installe
     return Installed(environment, clean)
 
 
+@pytest.mark.long(2, "an environment of its own from the built wheel")
 def test_the_installed_command_points_a_small_rover_and_checks_it(
     installed: Installed, tmp_path: Path
 ) -> None:

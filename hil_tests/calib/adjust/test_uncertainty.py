@@ -30,6 +30,7 @@ def fits(navcams: Rig) -> list[Calibration]:
     return [fit_joint(survey_of(navcams, 100 + seed, SMALL)) for seed in range(SURVEYS)]
 
 
+@pytest.mark.long(1, "a scatter of many fits; one fit beside its covariance is in the quick run")
 def test_stated_sigmas_are_the_scatter(fits: list[Calibration], true_rig: Rig) -> None:
     truth = np.array([*true_rig.mast.translation_m, *true_rig.mast.rotation_rad])
     errors = np.array([f.estimate[:6] - truth for f in fits])

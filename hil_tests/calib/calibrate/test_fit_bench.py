@@ -108,6 +108,7 @@ def test_joint_readings_count_as_measurements_where_changes_are_looked_for(
     assert asked == [pytest.approx(fit.degrees_of_freedom, abs=terms)]
 
 
+@pytest.mark.long(3, "two whole fits of a bench; names of terms are tested quickly beside it")
 def test_a_board_may_have_the_name_of_another_term() -> None:
     plan = BenchPlan(attitudes=16, bow_m=(0.002, -0.001), **SERVO)
     survey = simulate_bench(1, plan)

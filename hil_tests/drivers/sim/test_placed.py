@@ -269,6 +269,7 @@ def test_things_over_one_another_are_apart() -> None:
     scene_settings({"boards": [board], "bricks": [{"x_m": 3, "y_m": 0.0}]}, Path())
 
 
+@pytest.mark.long(1, "a scene is built for every part")
 def test_every_random_part_follows_the_seed(scene: Scene) -> None:
     """Same settings, same bits; another seed, other relief, hills, stones, gravel, soil and bricks."""
     again = build_scene(scene.settings)

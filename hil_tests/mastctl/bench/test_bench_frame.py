@@ -77,6 +77,7 @@ def moved(true: Rig) -> Rig:
     return replace(true, mast=STANDS, cameras=cameras)
 
 
+@pytest.mark.long(2, "a whole driven bench with body cameras")
 def test_a_board_at_a_known_place_a_level_and_tape_and_body_cameras_give_the_rover_frame_that_is_true(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

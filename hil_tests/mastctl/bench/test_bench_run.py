@@ -52,6 +52,7 @@ def test_a_bench_ends_by_itself_with_what_was_wanted_met_on_paper_and_kept(
     assert any("p2" in line for line in teller.told)
 
 
+@pytest.mark.long(2, "a whole driven bench with one camera")
 def test_a_single_camera_is_calibrated_the_same_way_and_pointed_by_the_range_of_the_board_that_stands_there(
     repository: Path, tmp_path: Path
 ) -> None:
@@ -147,6 +148,7 @@ def test_a_run_that_died_goes_on_at_the_same_placement_without_asking_again(
     assert again.known.predicted_px() <= 0.2
 
 
+@pytest.mark.long(2, "a whole driven bench; the run that goes on is tested in the quick run")
 def test_a_board_that_moved_while_the_run_was_dead_begins_another_placement(
     repository: Path, tmp_path: Path
 ) -> None:
@@ -192,6 +194,7 @@ def test_a_board_that_is_taken_away_ends_the_run_and_loses_nothing(repository: P
     assert len(list(looks_of(read_survey(tmp_path / "bench")))) == 5
 
 
+@pytest.mark.long(2, "a whole driven bench; the fit of both is tested quickly on drawn corners")
 def test_play_and_harmonics_are_found_where_the_head_has_them(repository: Path, tmp_path: Path) -> None:
     bench = corner_bench(
         repository, one_sided=False, harmonics_rad=((0.0, 0.006), (0.002, 0.0)), backlash_rad=0.004
@@ -263,6 +266,7 @@ def _files(folder: Path) -> list[str]:
         return []
 
 
+@pytest.mark.long(2, "a whole driven bench; a slip is named quickly by the fit on drawn corners")
 def test_a_head_that_slipped_ends_the_run_with_the_placement_and_names_it(
     repository: Path, tmp_path: Path
 ) -> None:

@@ -109,6 +109,7 @@ def test_what_a_real_head_and_camera_add_is_told_from_the_offset(rig: Rig) -> No
     assert fit.rolling_s == pytest.approx(rig.rolling_s, abs=4 * (fit.rolling_sigma_s or 0.0) + 2e-4)
 
 
+@pytest.mark.long(4, "a scatter of many fits")
 def test_the_sigma_is_what_the_errors_are() -> None:
     """Over many rigs the error in sigmas is about 1, and none is far out."""
     rigs = [

@@ -109,6 +109,9 @@ def check_truth(told: dict[str, Any]) -> None:
     assert told["rms_px"]["after"] < 0.5 * told["rms_px"]["before"]
 
 
+@pytest.mark.long(
+    3, "a whole run is recorded and refined; test_cli_refine_scene.py asks the same of stored pictures"
+)
 def test_a_recorded_run_tells_how_the_camera_is_turned_and_predicts_pictures_of_other_rests(
     recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -141,6 +144,7 @@ def as_folder(pictures: list[tuple[float, float, np.ndarray]], folder: Path, cam
     return folder
 
 
+@pytest.mark.long(3, "needs the recorded run of the test above")
 def test_a_folder_of_pictures_with_their_angles_tells_the_same(
     recorded: Recorded,
     pictures: list[tuple[float, float, np.ndarray]],
@@ -151,6 +155,7 @@ def test_a_folder_of_pictures_with_their_angles_tells_the_same(
     check_truth(json.loads(capsys.readouterr().out))
 
 
+@pytest.mark.long(3, "needs the recorded run of the test above")
 def test_a_joint_that_slipped_half_way_is_named_and_nothing_is_written(
     recorded: Recorded,
     pictures: list[tuple[float, float, np.ndarray]],

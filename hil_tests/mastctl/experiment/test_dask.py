@@ -151,6 +151,9 @@ def told(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
     return dict(json.loads(capsys.readouterr().out))
 
 
+@pytest.mark.long(
+    3, "a cluster and every task by itself, 20 s of processor time; its parts are tested quickly beside it"
+)
 def test_tasks_run_one_by_one_give_the_same_document_as_a_cluster(
     address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

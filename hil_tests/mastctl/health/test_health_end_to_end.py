@@ -41,6 +41,7 @@ def config_of(folder: Path, bump_rad: float) -> Config:
 AS_CALIBRATED = pytest.mark.long(3, "the case of no bump; test_evidence.py has honest days quickly")
 
 
+@pytest.mark.long(4, "days of pointings on two rendered rovers; the evidence is tested quickly on numbers")
 @pytest.mark.parametrize(
     "bump_rad", [pytest.param(0.0, marks=AS_CALIBRATED), BUMP_RAD], ids=["as calibrated", "bumped"]
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tools.campaigns.joints import CASES, Task, point
 
@@ -11,6 +12,7 @@ OTHER_PX = 0.4
 """The packaged calibration, the match and the arm's sag."""
 
 
+@pytest.mark.long(1, "a campaign in small: a bench, its fit and pointings")
 def test_with_joints_told_the_first_pointing_lands_within_what_counts_allow() -> None:
     told, not_told = (point(Task(case, 10.0, 2, 1)) for case in CASES[1:3])
     assert not told.errors and len(told.first_px) == 2

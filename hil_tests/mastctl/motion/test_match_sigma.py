@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from calib.files.mast_file import load_rig
 from mastctl.packaged import config_folder
@@ -21,6 +22,7 @@ def rows_on(relief_m: float) -> Rows:
     return together([run_look(Look(rig, relief_m, seed, 0, TARGETS)) for seed in SEEDS])
 
 
+@pytest.mark.long(1, "a campaign in small: many rendered matches for one scatter")
 def test_the_loops_matches_on_rough_ground_are_off_by_what_they_tell() -> None:
     found = rows_on(0.5)["the loop's", "other eye"]
     assert len(found.error_px) > TARGETS

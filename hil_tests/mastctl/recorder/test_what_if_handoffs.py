@@ -61,6 +61,9 @@ def handed(files: dict[str, Path], mast: str, capsys: pytest.CaptureFixture[str]
     return rows
 
 
+@pytest.mark.long(
+    4, "hand-offs are recorded on a rendered rover; the pointings of a recording are in the quick run"
+)
 def test_the_right_mast_file_is_said_to_hand_over_to_where_the_target_was_seen(
     files: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -18,6 +18,7 @@ from tools.campaigns.soak_ledger import EVERYTHING, Ledger
 from tools.living_daemon import Vitals
 
 
+@pytest.mark.long(2, "a soak in small, 15 s of processor time")
 def test_a_daemon_among_faults_and_bad_clients_does_as_wanted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

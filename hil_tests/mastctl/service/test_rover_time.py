@@ -59,6 +59,7 @@ def a_run(seed: int, pause_s: float) -> tuple[str, list[np.ndarray[Any, Any]]]:
     return json.dumps(told, sort_keys=True), pictures
 
 
+@pytest.mark.long(1, "three daemons that point on rendered pictures")
 def test_two_runs_of_one_seed_are_the_same_to_the_last_bit_and_another_seed_is_another() -> None:
     first, again = a_run(3, 0.0), a_run(3, 0.07)
     assert json.loads(first[0])[0]["state"] == "done"

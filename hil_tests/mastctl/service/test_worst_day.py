@@ -51,6 +51,7 @@ def pointed(service: Service, pixel_px: tuple[float, float]) -> tuple[dict[str, 
     return told, np.asarray(rover.true_pixel("navcam_left", later.sequence, point_m)) - AIM_PX
 
 
+@pytest.mark.long(1, "the worst day is rendered with all its lenses and light")
 def test_on_the_worst_day_the_second_pointing_lands_and_tells_the_truth() -> None:
     with worst_day() as service:
         for pixel_px in CLICKS:
@@ -61,6 +62,7 @@ def test_on_the_worst_day_the_second_pointing_lands_and_tells_the_truth() -> Non
             assert (off_px < 3.0 * np.array(told["residual_sigma_px"])).all()
 
 
+@pytest.mark.long(1, "the worst day is rendered with all its lenses and light")
 def test_who_does_not_let_the_mast_settle_is_told_no_residual() -> None:
     with worst_day(settle_s=0.0) as service:
         for pixel_px in CLICKS:

@@ -1044,6 +1044,9 @@ def test_refusals_speak_the_units_that_were_typed(pair: BOTH, visit: Visits) -> 
     assert told.startswith('name: "{a}" where a name of 1 to 40 letters, digits')
 
 
+@pytest.mark.long(
+    2, "axe looks at the whole page in both schemes; the bench panel is looked at in the quick run"
+)
 def test_axe_finds_nothing_serious_in_dark_and_light(pair: BOTH, visit: Visits) -> None:
     one = visit(pair[0].url, color_scheme="dark")
     one.choose()
