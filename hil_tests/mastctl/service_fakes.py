@@ -21,6 +21,8 @@ from calib.geometry.rig import Mast, Rig, RigCamera
 from drivers.clock import Clock, SystemClock
 from drivers.interfaces import Camera, Frame, PanTilt, Reading
 from hil_tests.waiting import NET_S
+from mastctl.client import Client
+from mastctl.client.connection import finished
 from mastctl.config import load_config
 
 if TYPE_CHECKING:
@@ -267,3 +269,8 @@ pan_tilt: {{driver: fake}}
 cameras: {{navcam_left: {{driver: fake}}, navcam_right: {{driver: fake}}, hazcam_left: {{driver: fake}}}}
 limits: {{pan_rad: [-2.0, 2.0], tilt_rad: [-1.0, 1.0], speed_rad_per_s: 0.5}}
 """
+
+
+def asked_plainly(client: Client, method: str, path: str, **options: Any) -> dict[str, Any]:
+    """What a client is answered where it has no method that asks so."""
+    return finished(client._calls._daemon.json(dict[str, Any], method, path, **options))

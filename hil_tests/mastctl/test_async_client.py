@@ -1,4 +1,4 @@
-"""The client for asyncio: comes of the one that waits, and does the same."""
+"""The client for asyncio: has the questions of the one that waits, and does the same."""
 
 from __future__ import annotations
 
@@ -13,15 +13,8 @@ from hil_tests.mastctl.web.network import network_daemon
 from hil_tests.waiting import NET_S, until
 from mastctl.client import AsyncClient, Client, ClientError
 from mastctl.daemon import RunningDaemon
-from tools.async_client import FILES, FOLDER, written
 
 BOTH = tuple[RunningDaemon, FakeHardware]
-
-
-@pytest.mark.parametrize("source", FILES)
-def test_it_comes_of_its_source(source: str) -> None:
-    made = (FOLDER / FILES[source]).read_text()
-    assert made == written((FOLDER / source).read_text()), "run python -m tools.async_client"
 
 
 def test_both_clients_have_the_same_methods_with_the_same_parameters() -> None:

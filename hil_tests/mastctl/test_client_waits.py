@@ -125,8 +125,8 @@ def test_a_daemon_that_is_killed_while_a_client_listens_is_one_plain_sentence(
 ) -> None:
     heard, listens = connection_module.DaemonHttp.heard, threading.Event()
 
-    def noted(self: Any, *args: Any) -> Any:
-        for event in heard(self, *args):
+    async def noted(self: Any, *args: Any) -> Any:
+        async for event in heard(self, *args):
             listens.set()
             yield event
 
@@ -160,8 +160,8 @@ def test_a_stream_that_breaks_is_begun_again(
     operation = client.point(pan_rad=0.0, tilt_rad=0.0)
     heard, broken = connection_module.DaemonHttp.heard, []
 
-    def breaking(self: Any, *args: Any) -> Any:
-        for event in heard(self, *args):
+    async def breaking(self: Any, *args: Any) -> Any:
+        async for event in heard(self, *args):
             yield event
             if len(broken) < 2:
                 broken.append(event)

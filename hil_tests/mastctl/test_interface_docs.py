@@ -12,7 +12,7 @@ import pytest
 
 from hil_tests.mastctl.service_fakes import HTTP, fake_daemon
 from mastctl.cli.main import MODULES, build_parser
-from mastctl.client import client, jog
+from mastctl.client import calls, jog, keeping_calls, lease, simulation_calls
 from mastctl.web import PREFIX
 
 
@@ -85,8 +85,8 @@ def test_every_route_has_its_row_and_no_other(routes: set[tuple[str, str]], repo
 
 
 def test_the_client_asks_for_every_route(routes: set[tuple[str, str]]) -> None:
-    source = inspect.getsource(client) + inspect.getsource(jog)
+    source = "".join(map(inspect.getsource, (calls, jog, keeping_calls, lease, simulation_calls)))
     asked = re.findall(r'"(GET|POST|DELETE)", f?"([^"]+)"', source)
-    asked += [("GET", path) for path in re.findall(r'events\("([^"]+)"', source)]
+    asked += [("GET", path) for path in re.findall(r'heard\("([^"]+)"', source)]
     monitors = {("GET", path) for path in ("/metrics", "/health/live", "/health/ready")}
     assert {(method, plain(path)) for method, path in asked} == routes - monitors

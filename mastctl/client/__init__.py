@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mastctl.client.async_client import AsyncClient
-from mastctl.client.client import DEFAULT_URL, Client
+from mastctl.client.client import DEFAULT_URL, AsyncClient, Client
 from mastctl.client.connection import ClientError
 
 if TYPE_CHECKING:

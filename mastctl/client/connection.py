@@ -1,7 +1,12 @@
-"""Questions to a daemon over HTTP; whatever goes wrong is a `ClientError`."""
+"""Questions to a daemon over HTTP; whatever goes wrong is a `ClientError`.
+
+What is asked, how often, and what an answer means stands once, in `Daemon`, which waits for nothing itself.
+Of the two that send, `DaemonHttp` has the calling thread wait, and `AsyncDaemonHttp` asyncio.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import secrets
@@ -9,10 +14,11 @@ import socket
 import ssl
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 from urllib.parse import unquote, urlsplit
 
 import httpx
@@ -83,8 +89,14 @@ class Broken(ClientError):
     """The connection broke: whether the daemon got the request is not known."""
 
 
-class Connection:
-    """A connection to one daemon, by whichever transport; parameters and errors as `Client` has them."""
+class Daemon(ABC):
+    """A connection to one daemon by either transport; parameters and errors as of `mastctl.client.Client`.
+
+    Attributes
+    ----------
+    lease_id
+        Goes with whatever is asked; None for no lease.
+    """
 
     def __init__(self, url: str, timeout_s: float, name: str | None = None, token: str | None = None) -> None:
         self.url = url
@@ -93,47 +105,90 @@ class Connection:
             raise ClientError("bad_token", "the token has signs that no token has", exit_code=2)
         self.timeout_s = timeout_s
         self.name = plain_name(name or program_name())
-        self.lease_id: str | None = None  # goes with whatever is asked
+        self.lease_id: str | None = None
 
     def beside(self, timeout_s: float) -> DaemonHttp:
-        """Return another connection of the same program, under the same lease."""
+        """Return another connection of the same program, under the same lease, for a thread of its own."""
         other = DaemonHttp(self.url, timeout_s, self.name, self._token)
         other.lease_id = self.lease_id
         return other
 
-    @property
-    def _socket(self) -> str | None:
-        """Path of the daemon's Unix socket, if it has one."""
-        if not self.url.startswith("unix:"):
-            return None
-        return unquote(self.url.removeprefix("unix:").removeprefix("//"))
-
-    def _made(self, kind: Callable[..., T], transport: object) -> T:
-        """Make the client of httpx. Raises ClientError ``bad_url``."""
-        base = "http://localhost" if self._socket is not None else self.url.rstrip("/")
-        shown = {"Authorization": f"Bearer {self._token}"} if self._token else {}
+    async def json(self, kind: type[T], method: str, path: str, **options: Any) -> T:
+        """Ask, and return the answer, a JSON object of a kind."""
+        answer = await self.ask(method, path, **options)
         try:
-            parts = urlsplit(base)
-            if parts.scheme not in ("http", "https") or not parts.hostname or (parts.port or 1) < 1:
-                raise ValueError
-            # No proxy of the environment: the daemon is on this machine, or reached by a tunnel to it.
-            return kind(
-                base_url=base,
-                timeout=self.timeout_s,
-                headers={"Mastctl-Client": self.name, **shown},
-                trust_env=False,
-                transport=transport,
-                verify=_trusted() if parts.scheme == "https" else False,
-            )
-        except (ValueError, httpx.InvalidURL):
-            raise ClientError(
-                "bad_url",
-                f"'{self.url}' is no address of a daemon; http://127.0.0.1:8420 or unix:/path is expected",
-                exit_code=2,
-            ) from None
+            document = answer.json()
+        except ValueError:
+            document = None
+        if not isinstance(document, dict):
+            raise self.bad_answer("the answer is not a JSON object")
+        return cast(T, document)
 
-    def refused(self, answer: httpx.Response) -> ClientError:
-        """Return what an answer says that is not a good one."""
+    async def command(
+        self,
+        kind: type[T],
+        method: str,
+        path: str,
+        body: Mapping[str, Any] | None = None,
+        *,
+        key: str | None = None,
+        deadline_s: float | None = None,
+        **options: Any,
+    ) -> T:
+        """Have something done once, and return the answer.
+
+        Where the connection breaks it is asked again with the same key, by which the daemon gives the first
+        one's answer and does nothing twice.
+        """
+        headers = _headers_of(key, deadline_s)
+        if body is not None:
+            options["json"] = body
+        for pause_s in AGAIN_S:
+            try:
+                return await self.json(kind, method, path, headers=headers, **options)
+            except Broken:
+                await self.pause(pause_s)
+        return await self.json(kind, method, path, headers=headers, **options)
+
+    async def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+        """Ask, and return a good answer; everything else is a ClientError."""
+        if self.lease_id is not None:
+            options["headers"] = {"Mastctl-Lease": self.lease_id, **(options.get("headers") or {})}
+        answer = await self.send(method, PREFIX + path, **options)
+        if answer.is_success:
+            return answer
+        raise self._refused(answer)
+
+    async def send(self, method: str, path: str, **options: Any) -> httpx.Response:
+        """Ask for a path of the whole address, and return the answer whatever it is."""
+        with self._failures(f"the daemon at {self.url} took the request but did not answer"):
+            return await self._request(method, path, options)
+
+    async def heard(
+        self, path: str, query: Mapping[str, Any] | None = None, silent_s: float | None = None
+    ) -> AsyncGenerator[dict[str, Any] | None]:
+        """Yield what a stream of the daemon tells, and None for each sign of life, until the daemon ends.
+
+        ``timeout`` is raised if it is silent for ``silent_s`` seconds, those of each request by default.
+        """
+        with self._failures(f"the daemon at {self.url} fell silent"):
+            answer = await self._opened(PREFIX + path, query, silent_s or self.timeout_s)
+            try:
+                if not answer.is_success:
+                    await self._read(answer)
+                    raise self._refused(answer)
+                async for line in self._lines(answer):
+                    if line.startswith((":", "data:")):
+                        yield self._event(line)
+            finally:
+                await self._closed(answer)
+
+    def bad_answer(self, reason: str) -> ClientError:
+        """Return the error of an answer that no daemon of this program gives."""
+        return ClientError("bad_answer", f"what answers at {self.url} is no mastctl daemon: {reason}")
+
+    def _refused(self, answer: httpx.Response) -> ClientError:
+        """What an answer says that is not a good one."""
         try:
             told = answer.json()["error"]
             code, message, detail = str(told["code"]), str(told["message"]), told.get("detail")
@@ -142,9 +197,14 @@ class Connection:
         exit_code = 2 if answer.status_code in _BAD_INPUT else 1
         return ClientError(code, message, detail if isinstance(detail, dict) else None, exit_code)
 
-    def bad_answer(self, reason: str) -> ClientError:
-        """Return the error of an answer that no daemon of this program gives."""
-        return ClientError("bad_answer", f"what answers at {self.url} is no mastctl daemon: {reason}")
+    def _event(self, line: str) -> dict[str, Any] | None:
+        """What a line of a stream tells, None for a sign of life."""
+        if line.startswith(":"):
+            return None
+        try:
+            return dict(json.loads(line.removeprefix("data:")))
+        except (ValueError, TypeError):
+            raise self.bad_answer("an event of the stream is not JSON") from None
 
     @contextmanager
     def _failures(self, silent: str) -> Iterator[None]:
@@ -161,108 +221,161 @@ class Connection:
         except httpx.HTTPError as error:
             raise Broken("no_daemon", f"the connection to {self.url} broke: {error}") from None
 
-    def _document(self, answer: httpx.Response) -> dict[str, Any]:
-        """Return what an answer holds, which must be a JSON object."""
-        try:
-            document = answer.json()
-        except ValueError:
-            document = None
-        if not isinstance(document, dict):
-            raise self.bad_answer("the answer is not a JSON object")
-        return document
-
-    def _leased(self, options: dict[str, Any]) -> dict[str, Any]:
-        """Return a request's options with the lease in its headers."""
-        if self.lease_id is None:
-            return options
-        return options | {"headers": {"Mastctl-Lease": self.lease_id, **(options.get("headers") or {})}}
-
-    def _event(self, line: str) -> dict[str, Any] | None:
-        """Return what a line of a stream tells, None for a sign of life."""
-        if line.startswith(":"):
+    @property
+    def _socket(self) -> str | None:
+        """Path of the daemon's Unix socket, if it has one."""
+        if not self.url.startswith("unix:"):
             return None
+        return unquote(self.url.removeprefix("unix:").removeprefix("//"))
+
+    def _made(self, kind: Callable[..., T], transport: Callable[..., object]) -> T:
+        """Make the client of httpx. Raises ClientError ``bad_url``."""
+        path = self._socket
+        base = "http://localhost" if path is not None else self.url.rstrip("/")
+        shown = {"Authorization": f"Bearer {self._token}"} if self._token else {}
         try:
-            return dict(json.loads(line.removeprefix("data:")))
-        except (ValueError, TypeError):
-            raise self.bad_answer("an event of the stream is not JSON") from None
+            parts = urlsplit(base)
+            if parts.scheme not in ("http", "https") or not parts.hostname or (parts.port or 1) < 1:
+                raise ValueError
+            # No proxy of the environment: the daemon is on this machine, or reached by a tunnel to it.
+            return kind(
+                base_url=base,
+                timeout=self.timeout_s,
+                headers={"Mastctl-Client": self.name, **shown},
+                trust_env=False,
+                transport=None if path is None else transport(uds=path),
+                verify=_trusted() if parts.scheme == "https" else False,
+            )
+        except (ValueError, httpx.InvalidURL):
+            raise ClientError(
+                "bad_url",
+                f"'{self.url}' is no address of a daemon; http://127.0.0.1:8420 or unix:/path is expected",
+                exit_code=2,
+            ) from None
+
+    # What waits
+
+    @abstractmethod
+    async def _request(self, method: str, path: str, options: Mapping[str, Any]) -> httpx.Response: ...
+
+    @abstractmethod
+    async def _opened(
+        self, path: str, query: Mapping[str, Any] | None, silent_s: float
+    ) -> httpx.Response: ...
+
+    @abstractmethod
+    async def _read(self, answer: httpx.Response) -> None: ...
+
+    @abstractmethod
+    def _lines(self, answer: httpx.Response) -> AsyncIterator[str]: ...
+
+    @abstractmethod
+    async def _closed(self, answer: httpx.Response) -> None: ...
+
+    @abstractmethod
+    async def pause(self, seconds: float) -> None:
+        """Wait for some seconds."""
+
+    @abstractmethod
+    async def away(self, work: Callable[[], T]) -> T:
+        """Return what a function returns that waits for a thread."""
+
+    @abstractmethod
+    async def close(self) -> None:
+        """Let go of the connection."""
 
 
-class DaemonHttp(Connection):
-    """A connection whose questions are waited for; parameters and errors as `Client` has them."""
+class DaemonHttp(Daemon):
+    """A connection whose questions the calling thread waits for: its coroutines are `finished` at once."""
 
     def __init__(self, url: str, timeout_s: float, name: str | None = None, token: str | None = None) -> None:
         super().__init__(url, timeout_s, name, token)
-        transport = None if self._socket is None else httpx.HTTPTransport(uds=self._socket)
-        self._http = self._made(httpx.Client, transport)
+        self._http = self._made(httpx.Client, httpx.HTTPTransport)
 
-    def json(self, method: str, path: str, **options: Any) -> dict[str, Any]:
-        """Ask, and return the answer, which must be a JSON object."""
-        return self._document(self.ask(method, path, **options))
+    async def _request(self, method: str, path: str, options: Mapping[str, Any]) -> httpx.Response:
+        return self._http.request(method, path, **options)
 
-    def command(
-        self,
-        method: str,
-        path: str,
-        body: Mapping[str, Any] | None = None,
-        *,
-        key: str | None = None,
-        deadline_s: float | None = None,
-        **options: Any,
-    ) -> dict[str, Any]:
-        """Have something done once, and return the answer.
+    async def _opened(self, path: str, query: Mapping[str, Any] | None, silent_s: float) -> httpx.Response:
+        request = self._http.build_request("GET", path, params=query, timeout=silent_s)
+        return self._http.send(request, stream=True)
 
-        Where the connection breaks it is asked again with the same key, by which the daemon gives the first
-        one's answer and does nothing twice.
-        """
-        headers = _headers_of(key, deadline_s)
-        if body is not None:
-            options["json"] = body
-        for pause_s in AGAIN_S:
-            try:
-                return self.json(method, path, headers=headers, **options)
-            except Broken:
-                time.sleep(pause_s)
-        return self.json(method, path, headers=headers, **options)
+    async def _read(self, answer: httpx.Response) -> None:
+        answer.read()
 
-    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Ask, and return a good answer; everything else is a ClientError."""
-        answer = self.send(method, PREFIX + path, **self._leased(options))
-        if answer.is_success:
-            return answer
-        raise self.refused(answer)
+    async def _lines(self, answer: httpx.Response) -> AsyncIterator[str]:
+        for line in answer.iter_lines():
+            yield line
 
-    def send(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Ask for a path of the whole address, and return the answer whatever it is."""
-        with self._failures(f"the daemon at {self.url} took the request but did not answer"):
-            return self._http.request(method, path, **options)
+    async def _closed(self, answer: httpx.Response) -> None:
+        answer.close()
 
-    def heard(
-        self, path: str, query: Mapping[str, Any] | None = None, silent_s: float | None = None
-    ) -> Iterator[dict[str, Any] | None]:
-        """Yield what a stream of the daemon tells, and None for each sign of life, until the daemon ends.
+    async def pause(self, seconds: float) -> None:
+        time.sleep(seconds)
 
-        ``timeout`` is raised if it is silent for ``silent_s`` seconds, those of each request by default.
-        """
-        with (
-            self._failures(f"the daemon at {self.url} fell silent"),
-            self._http.stream(
-                "GET", PREFIX + path, params=query, timeout=silent_s or self.timeout_s
-            ) as answer,
-        ):
-            if not answer.is_success:
-                answer.read()
-                raise self.refused(answer)
-            for line in answer.iter_lines():
-                if line.startswith((":", "data:")):
-                    yield self._event(line)
+    async def away(self, work: Callable[[], T]) -> T:
+        return work()
 
-    def events(self, path: str, query: Mapping[str, Any] | None = None) -> Iterator[dict[str, Any]]:
-        """Yield what a stream of the daemon tells, until the daemon ends."""
-        yield from (event for event in self.heard(path, query) if event is not None)
-
-    def close(self) -> None:
-        """Let go of the connection."""
+    async def close(self) -> None:
         self._http.close()
+
+
+class AsyncDaemonHttp(Daemon):
+    """A connection whose questions are waited for by asyncio."""
+
+    def __init__(self, url: str, timeout_s: float, name: str | None = None, token: str | None = None) -> None:
+        super().__init__(url, timeout_s, name, token)
+        self._http = self._made(httpx.AsyncClient, httpx.AsyncHTTPTransport)
+
+    async def _request(self, method: str, path: str, options: Mapping[str, Any]) -> httpx.Response:
+        return await self._http.request(method, path, **options)
+
+    async def _opened(self, path: str, query: Mapping[str, Any] | None, silent_s: float) -> httpx.Response:
+        request = self._http.build_request("GET", path, params=query, timeout=silent_s)
+        return await self._http.send(request, stream=True)
+
+    async def _read(self, answer: httpx.Response) -> None:
+        await answer.aread()
+
+    def _lines(self, answer: httpx.Response) -> AsyncIterator[str]:
+        return answer.aiter_lines()
+
+    async def _closed(self, answer: httpx.Response) -> None:
+        await answer.aclose()
+
+    async def pause(self, seconds: float) -> None:
+        await asyncio.sleep(seconds)
+
+    async def away(self, work: Callable[[], T]) -> T:
+        return await asyncio.to_thread(work)
+
+    async def close(self) -> None:
+        await self._http.aclose()
+
+
+def finished(work: Awaitable[T]) -> T:
+    """Return what a coroutine returns that has the calling thread wait wherever it waits, as those of a
+    `DaemonHttp` do.
+    """
+    steps: Generator[Any, Any, T] = work.__await__()
+    try:
+        steps.send(None)
+    except StopIteration as end:
+        return cast(T, end.value)
+    steps.close()
+    raise RuntimeError("a question that this thread should have waited for waits for an event loop")
+
+
+def iterated(stream: AsyncGenerator[T]) -> Iterator[T]:
+    """Yield what such an asynchronous generator yields."""
+    try:
+        while True:
+            try:
+                value = finished(anext(stream))
+            except StopAsyncIteration:
+                return
+            yield value
+    finally:
+        finished(stream.aclose())
 
 
 def _headers_of(key: str | None, deadline_s: float | None) -> dict[str, str]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
+from contextlib import aclosing
 from typing import Any, TypeVar, cast
 
-from mastctl.client.connection import Broken, ClientError, DaemonHttp
+from mastctl.client.connection import Broken, ClientError, Daemon
 
 T = TypeVar("T")
 
@@ -17,12 +18,12 @@ PASSING = ("no_daemon", "timeout", "closing")
 ASK_S = 0.25  # between questions to a daemon that has no stream left
 
 
-def followed(
-    daemon: DaemonHttp,
+async def followed(
+    daemon: Daemon,
     query: Mapping[str, Any],
-    ask: Callable[[], T],
+    ask: Callable[[], Awaitable[T]],
     timeout_s: float,
-) -> Iterator[T]:
+) -> AsyncGenerator[T]:
     """Yield a value as it is, then at each change, for some seconds.
 
     The value is asked for before each stream, and each stream begins with what is known, so that no end of
@@ -44,11 +45,12 @@ def followed(
     pauses: list[float] = []  # a daemon that does not answer at the beginning is told at once
     while True:
         try:
-            yield ask()
+            yield await ask()
             pauses = pauses or list(AGAIN_S)  # it answers
-            for value in _stream(daemon, query, until_s):
-                pauses = list(AGAIN_S)
-                yield cast(T, value)
+            async with aclosing(_stream(daemon, query, until_s)) as values:
+                async for value in values:
+                    pauses = list(AGAIN_S)
+                    yield cast(T, value)
         except ClientError as error:
             if error.code == "too_many":
                 pauses = [ASK_S, *AGAIN_S]
@@ -56,20 +58,21 @@ def followed(
                 raise
             if not pauses:
                 raise
-            time.sleep(max(0.0, min(pauses.pop(0), until_s - time.monotonic())))
+            await daemon.pause(max(0.0, min(pauses.pop(0), until_s - time.monotonic())))
         if time.monotonic() >= until_s:
             return
 
 
-def _stream(daemon: DaemonHttp, query: Mapping[str, Any], until_s: float) -> Iterator[dict[str, Any]]:
+async def _stream(daemon: Daemon, query: Mapping[str, Any], until_s: float) -> AsyncGenerator[dict[str, Any]]:
     """Yield a stream's values until it ends, or a time, or some seconds before it."""
     left_s = until_s - time.monotonic()
     if left_s <= 0:
         return
     last = left_s <= LAST_S
-    for event in daemon.heard("/events", query, min(left_s, SILENT_S)):
-        if event is not None:
-            yield event["value"]
-        left_s = until_s - time.monotonic()
-        if left_s <= (0.0 if last else LAST_S):
-            return
+    async with aclosing(daemon.heard("/events", query, min(left_s, SILENT_S))) as events:
+        async for event in events:
+            if event is not None:
+                yield event["value"]
+            left_s = until_s - time.monotonic()
+            if left_s <= (0.0 if last else LAST_S):
+                return

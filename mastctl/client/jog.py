@@ -9,7 +9,8 @@ from collections.abc import Callable
 from typing import Any
 from urllib.parse import quote
 
-from mastctl.client.connection import ClientError, DaemonHttp
+from mastctl.answers import JogTold, OperationTold
+from mastctl.client.connection import ClientError, DaemonHttp, finished
 
 BEAT_S = 0.12  # the daemon waits 0.5 s: three may get lost
 ANSWER_S = 1.0
@@ -74,7 +75,7 @@ class Jog:
             self._rates, self._ending = (0.0, 0.0), True
             self._changed.notify_all()
         self._thread.join(3 * ANSWER_S)
-        self._daemon.close()
+        finished(self._daemon.close())
         if kind is None:
             self.check()
 
@@ -109,8 +110,8 @@ class Jog:
         body["sequence"] = self._sequence
         if self._id is not None:
             body["id"] = self._id
-        answer = self._daemon.json("POST", "/jog", json=body)
-        self._id, self._held = answer.get("id"), dict(answer.get("held") or {})
+        answer = finished(self._daemon.json(JogTold, "POST", "/jog", json=body))
+        self._id, self._held = answer["id"], answer["held"]
         if rates == (0.0, 0.0) and self._id is not None:
             self._wait_ended(self._id)
             self._id = None
@@ -119,7 +120,7 @@ class Jog:
         """Wait until the head was told to stop, so that what is asked next is not refused for this jog."""
         until_s = time.monotonic() + ANSWER_S
         while time.monotonic() < until_s:
-            state = self._daemon.json("GET", f"/operations/{quote(jog, safe='')}").get("state")
-            if state not in ("queued", "running"):
+            path = f"/operations/{quote(jog, safe='')}"
+            if finished(self._daemon.json(OperationTold, "GET", path))["state"] not in ("queued", "running"):
                 return
             time.sleep(LOOK_S)

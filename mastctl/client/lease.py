@@ -1,23 +1,23 @@
-"""A lease that a client holds: renewed in time by a thread, under asyncio too, released at the end."""
+"""The lease that a client steers under: asked for, and held by a thread, under asyncio too."""
 
 from __future__ import annotations
 
 import contextlib
 import threading
 import time
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
 
-from mastctl.client.connection import Broken, ClientError, Connection
-
-if TYPE_CHECKING:
-    from mastctl.client.answers import LeaseGranted
+from mastctl.answers import ControlTold, LeaseGranted, LeaseTold
+from mastctl.client.connection import Broken, ClientError, Daemon, finished, plain_name
 
 RENEWALS = 3  # within a lease's time, so that one may be lost
 LEAST_TIMEOUT_S = 0.5
 
 
 class HeldLease:
-    """The right to steer, as long as nobody takes over; `Client.lease` makes one.
+    """The right to steer, as long as nobody takes over; `LeaseCalls.lease` makes one.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class HeldLease:
         Why the lease is no longer held, None while it is; the next command is refused with the same reason.
     """
 
-    def __init__(self, daemon: Connection, granted: LeaseGranted, for_s: float) -> None:
+    def __init__(self, daemon: Daemon, granted: LeaseGranted, for_s: float) -> None:
         self.id = str(granted["lease_id"])
         self.holder = str(granted["holder"])
         self.lost: ClientError | None = None
@@ -47,15 +47,16 @@ class HeldLease:
         self._thread.join()
         if self.lost is None:
             with contextlib.suppress(ClientError):
-                self._daemon.json("DELETE", "/lease")
-        self._daemon.close()
+                finished(self._daemon.json(LeaseTold, "DELETE", "/lease"))
+        finished(self._daemon.close())
 
     def _renew(self) -> None:
         """Renew until the end; a daemon that does not answer is asked again until the lease is over."""
         while not self._ended.wait(self._for_s / RENEWALS):
             asked_s = time.monotonic()
             try:
-                self._daemon.json("POST", "/lease/renew", json={"for_s": self._for_s})
+                renewal = {"for_s": self._for_s}
+                finished(self._daemon.json(LeaseGranted, "POST", "/lease/renew", json=renewal))
                 self._until_s = asked_s + self._for_s
             except ClientError as error:
                 passing = isinstance(error, Broken) or error.code in ("no_daemon", "timeout")
@@ -63,3 +64,97 @@ class HeldLease:
                     continue
                 self.lost = error
                 return
+
+
+class LeaseCalls:
+    """Acquiring, renewing and releasing a lease."""
+
+    _daemon: Daemon
+
+    @asynccontextmanager
+    async def lease(
+        self,
+        name: str | None = None,
+        for_s: float = 30.0,
+        take_over: str | None = None,
+        gives_way: bool = False,
+        ends_with_stop: bool = False,
+    ) -> AsyncIterator[HeldLease]:
+        """Steer alone inside the block: a thread renews the lease, and this client's commands carry it.
+
+        Parameters
+        ----------
+        name
+            The holder's, by default this client's.
+        for_s
+            How long it outlives a holder that falls silent, 1 to 3600 s.
+        take_over
+            Why it is taken from whoever steers; None waits for nobody and takes nothing away.
+        gives_way
+            Whether it ends as soon as anybody else wants to steer, or stops the head: for what is done when
+            nobody needs the head.
+        ends_with_stop
+            Whether it ends as soon as anybody stops the head: for a program that would go on with its next
+            move otherwise.
+
+        Yields
+        ------
+        lease
+            Whose ``lost`` says if somebody took over meanwhile.
+
+        Raises
+        ------
+        ClientError
+            ``leased`` if somebody else steers.
+        """
+        granted = await self.acquire_lease(name, for_s, take_over, gives_way, ends_with_stop)
+        before, held = self._daemon.lease_id, HeldLease(self._daemon, granted, for_s)
+        self._daemon.lease_id = held.id
+        try:
+            yield held
+        finally:
+            self._daemon.lease_id = before
+            await self._daemon.away(held.end)
+
+    async def control(self) -> ControlTold | None:
+        """Return who steers, or None: ``holder``, ``kind`` (lease, operation), ``for_s``, ``until``."""
+        return (await self._daemon.json(LeaseTold, "GET", "/lease"))["control"]
+
+    async def acquire_lease(
+        self,
+        name: str | None = None,
+        for_s: float = 30.0,
+        take_over: str | None = None,
+        gives_way: bool = False,
+        ends_with_stop: bool = False,
+    ) -> LeaseGranted:
+        """Acquire or take over a lease that nobody renews; arguments as for `lease`.
+
+        Returns ``lease_id``, ``holder``, ``for_s`` and ``until``; `use_lease` has commands carry it.
+        """
+        body: dict[str, Any] = {"for_s": float(for_s)}
+        if name is not None:
+            body["name"] = name
+        if take_over is not None:
+            return await self._daemon.command(
+                LeaseGranted, "POST", "/lease/take", body | {"reason": take_over}
+            )
+        if gives_way:
+            body["gives_way"] = True
+        if ends_with_stop:
+            body["ends_with_stop"] = True
+        return await self._daemon.command(LeaseGranted, "POST", "/lease", body)
+
+    def use_lease(self, lease_id: str | None) -> None:
+        """Have each command carry a lease from now on, or none."""
+        self._daemon.lease_id = None if lease_id is None else plain_name(lease_id)
+
+    async def renew_lease(self, for_s: float | None = None) -> LeaseGranted:
+        """Have the lease in use run for ``for_s`` seconds from now on, by default as long as at first."""
+        return await self._daemon.command(
+            LeaseGranted, "POST", "/lease/renew", {} if for_s is None else {"for_s": float(for_s)}
+        )
+
+    async def release_lease(self) -> None:
+        """Release the lease in use."""
+        await self._daemon.command(LeaseTold, "DELETE", "/lease")

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, field
-from typing import Literal
 
+from mastctl.answers import Role
 from mastctl.errors import NotAllowed, one_line
 
-Role = Literal["view", "operate", "admin"]
-
 ROLES: tuple[Role, ...] = ("view", "operate", "admin")
-"""Each may do what those before it may: view only reads, operate drives the rover, admin sets it up."""
 
 ANONYMOUS = "anonymous"
 LONGEST_NAME = 80

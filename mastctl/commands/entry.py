@@ -18,9 +18,10 @@ from datetime import UTC, datetime
 from typing import Any, Protocol
 
 from drivers.clock import Clock
+from mastctl.answers import Role
 from mastctl.as_json import writable
 from mastctl.commands.audit import AuditLog
-from mastctl.commands.caller import ANONYMOUS, NETWORK, Caller, Role
+from mastctl.commands.caller import ANONYMOUS, NETWORK, Caller
 from mastctl.commands.idempotency import Answer, Answers
 from mastctl.commands.lease import Leases, StopCame
 from mastctl.errors import BadRequest, MastctlError, NotNow, Stopped, error_body
@@ -319,7 +320,7 @@ class Entry:
         self,
         command: Command,
         asked: Asked,
-        answer: Answer | None,
+        answer: Mapping[str, Any] | None,
         error: BaseException | None,
         again: bool = False,
         begins: bool = True,
@@ -374,7 +375,7 @@ def _who(command: str, caller: Caller) -> dict[str, Any]:
     return who | ({"address": caller.address} if caller.address else {})
 
 
-def _operation_of(answer: Answer) -> str | None:
+def _operation_of(answer: Mapping[str, Any]) -> str | None:
     """The id of the operation that an answer names."""
     found = answer.get("id", answer.get("operation"))
     return found if isinstance(found, str) else None

@@ -10,12 +10,12 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from drivers.clock import Clock, SystemClock
 from mastctl.errors import BadRequest, MastctlError, NotNow
 
-Answer = dict[str, Any]
+Answer = TypeVar("Answer", bound=Mapping[str, Any])
 
 KEPT_S = 600.0
 KEPT, KEPT_BYTES = 4096, 4 << 20  # keys, and their answers; for more, the oldest is forgotten before its time
@@ -99,7 +99,7 @@ class Answers:
                 self._changed.notify_all()
         return answer, False
 
-    def _answered(self, known: _Kept, key: str, digest: bytes) -> Answer:
+    def _answered(self, known: _Kept, key: str, digest: bytes) -> Any:
         """Return the answer that the first got, or gets; the lock is held."""
         if known.digest != digest:
             words = f"Idempotency-Key '{key[:40]}' came before with another request; take a new one"
@@ -113,7 +113,7 @@ class Answers:
             self._changed.wait(left_s, idle=True)
         if known.error is not None:
             raise known.error
-        return dict(json.loads(known.answer))
+        return json.loads(known.answer)
 
     def _old(self, one: _Kept) -> bool:
         return one.done and self._clock.now_s() - one.since_s >= KEPT_S

@@ -17,9 +17,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
-from typing import Any, Literal
+from typing import Literal
 
 from drivers.clock import Clock
+from mastctl.answers import ControlTold, LeaseRuns
 from mastctl.commands.caller import Caller
 from mastctl.errors import BadRequest, NotNow
 
@@ -79,10 +80,10 @@ class Control:
     kind: Literal["lease", "operation"]
     until_s: float | None = None
 
-    def told(self, now_s: float) -> dict[str, Any]:
+    def told(self, now_s: float) -> ControlTold:
         """Return it as JSON: what is left in seconds, and when that is by the wall clock (UTC)."""
         left_s = None if self.until_s is None else max(0.0, self.until_s - now_s)
-        until = None if left_s is None else (datetime.now(UTC) + timedelta(seconds=left_s)).isoformat()
+        until = None if left_s is None else _by_the_wall(left_s)
         return {"holder": self.holder, "kind": self.kind, "for_s": left_s, "until": until}
 
     def sentence(self, now_s: float) -> str:
@@ -141,14 +142,15 @@ class Leases:
         party = under_way or (self._party if self._running() else None)
         return None if party is None else Control(party, "operation")
 
-    def told(self) -> dict[str, Any] | None:
+    def told(self) -> ControlTold | None:
         """Return who steers as ``GET /status`` tells it."""
         control = self.control()
         return None if control is None else control.told(self._clock.now_s())
 
-    def told_of(self, lease: Lease) -> dict[str, Any]:
-        """Return a lease as `told` would, whoever steers meanwhile."""
-        return Control(lease.holder, "lease", lease.until_s).told(self._clock.now_s())
+    def told_of(self, lease: Lease) -> LeaseRuns:
+        """Return a lease as its holder is told of it, whoever steers meanwhile."""
+        left_s = max(0.0, lease.until_s - self._clock.now_s())
+        return {"holder": lease.holder, "for_s": left_s, "until": _by_the_wall(left_s)}
 
     @property
     def last_stop(self) -> StopCame:
@@ -369,6 +371,10 @@ class Leases:
         while len(self._over) > REMEMBERED:
             del self._over[next(iter(self._over))]
         self._lease = None
+
+
+def _by_the_wall(left_s: float) -> str:
+    return (datetime.now(UTC) + timedelta(seconds=left_s)).isoformat()
 
 
 def _check_time(for_s: float) -> None:

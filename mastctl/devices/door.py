@@ -11,7 +11,6 @@ import logging
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from calib.geometry.rigid import FloatArray
 from drivers.clock import Clock
 from drivers.errors import BadOptions
 from drivers.interfaces import AxisMotion, PanTilt, Reading, StatesMotion
+from mastctl.answers import SunTold
 from mastctl.devices.keep_out import Box, KeepOuts, KeptOut, Pair, Span
 from mastctl.devices.limits import Limits
 from mastctl.devices.sun import SUN, Sun, sun_boxes
@@ -290,7 +290,7 @@ class Door:
         passes = (box for box in keep_outs.holding(start) if box.name not in held)
         return next((box.name for box in (*ends_in, *passes)), None)
 
-    def told(self) -> dict[str, Any]:
+    def told(self) -> SunTold:
         """Return the sun as ``GET /limits/sun`` tells it."""
         sun, now_s = self._sun, self._clock.now_s()
         if sun is None:

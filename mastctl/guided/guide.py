@@ -24,12 +24,13 @@ from typing import Any, Protocol
 
 from calib.errors import BadFile
 from drivers.errors import DriverError
+from mastctl.answers import BenchState, BenchTold
 from mastctl.commands.caller import Caller
 from mastctl.commands.lease import Lease, Leases, StopCame
 from mastctl.errors import BadRequest, MastctlError, NotNow, Unable
 from mastctl.guided.child import Child
 from mastctl.guided.runs import Folder, Runs, board_bytes, keep_board, known_boards
-from mastctl.guided.told import Run, State, ended, heard
+from mastctl.guided.told import Run, ended, heard
 from mastctl.state.publisher import Published, Publisher, ThreadSubscription
 
 log = logging.getLogger(__name__)
@@ -185,14 +186,14 @@ class Guide:
         work = self._work
         return None if work is None else work.run
 
-    def told(self) -> dict[str, Any]:
+    def told(self) -> BenchTold:
         """Return what ``GET /bench`` tells; reads the folders."""
         now = self.run
         working = None if now is None or now.over else now.name
-        runs = [
-            {**one, "state": "running", "sentence": ""} if one["name"] == working else one
-            for one in self.runs.listed()
-        ]
+        runs = list(self.runs.listed())
+        for one in runs:
+            if one["name"] == working:
+                one["state"], one["sentence"] = "running", ""
         return {
             "run": None if now is None else now.told(),
             "runs": runs,
@@ -254,7 +255,7 @@ class Guide:
         self._finish(work, "interrupted", "left", f"{who} ended the run; {GOES_ON}", and_motion=True)
         return work.run
 
-    def forget(self, name: str) -> dict[str, Any]:
+    def forget(self, name: str) -> BenchTold:
         """Remove a run that is over, with all it saw and its report; return what is left, as `told`.
 
         Its mast file stays where it is.
@@ -439,7 +440,7 @@ class Guide:
             self._finish(work, "interrupted", "silent", words, and_motion=True)
 
     def _finish(
-        self, work: _Work, state: State, code: str | None, sentence: str, *, and_motion: bool = False
+        self, work: _Work, state: BenchState, code: str | None, sentence: str, *, and_motion: bool = False
     ) -> None:
         """End a run, once: the program first, then its right to steer, then what it has moving."""
         with self._telling:

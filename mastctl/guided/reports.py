@@ -14,6 +14,7 @@ from pathlib import Path
 
 from calib.errors import BadFile
 from calib.files import read_bytes
+from mastctl.answers import ReportListed
 from mastctl.errors import NotKnown
 from mastctl.guided.runs import Runs
 
@@ -32,7 +33,7 @@ class Report:
     title: str
     written: str
 
-    def told(self) -> dict[str, str]:
+    def told(self) -> ReportListed:
         """Return it as JSON, without its place."""
         return {"name": self.name, "title": self.title, "written": self.written}
 

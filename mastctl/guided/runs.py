@@ -22,6 +22,7 @@ from calib.files import read_bytes
 from calib.files.atomic import replace_bytes
 from calib.targets.board_file import parse_board
 from calib.targets.boards import AnyBoard
+from mastctl.answers import BenchListed
 from mastctl.errors import BadRequest, NotKnown, Unable
 from mastctl.guided.told import Run
 from mastctl.packaged import config_folder
@@ -91,10 +92,10 @@ class Folder:
         }
         StateFile(self.path / "end.json", END_SCHEMA).write(told)
 
-    def listed(self) -> dict[str, Any]:
+    def listed(self) -> BenchListed:
         """Return the run as the list of runs has it. Raises BadFile."""
         asked, end = self.asked(), self.end() or {}
-        state = str(end.get("state", "interrupted"))
+        state: Any = str(end.get("state", "interrupted"))
         cut = "it was cut off: the daemon or its machine ended meanwhile"
         return {
             "name": self.name,
@@ -161,7 +162,7 @@ class Runs:
             if one.is_dir() and not one.is_symlink() and (one / "run.json").is_file()
         ]
 
-    def listed(self) -> Iterator[dict[str, Any]]:
+    def listed(self) -> Iterator[BenchListed]:
         """Yield the newest as JSON; of a damaged one that it is."""
         for one in self.all()[:SHOWN]:
             try:

@@ -9,16 +9,14 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, cast
 
+from mastctl.answers import MOST_CELLS, BenchRunTold, BenchState, BenchStep
 from mastctl.errors import one_line
-
-State = Literal["running", "asking", "done", "interrupted"]
-Step = Literal["begin", "place", "search", "pictures", "check", "fit", "over"]
 
 MOST_SENTENCES, LONGEST_SENTENCE = 40, 400
 MOST_ON_CURVE = 600
-MOST_CAMERAS, MOST_CELLS = 16, 48
+MOST_CAMERAS = 16
 
 
 class Odd(ValueError):
@@ -98,8 +96,8 @@ class Run:
     name: str
     begun: str
     by: str
-    state: State = "running"
-    step: Step = "begin"
+    state: BenchState = "running"
+    step: BenchStep = "begin"
     code: str | None = None
     sentence: str = ""
     simulated: bool | None = None
@@ -128,9 +126,9 @@ class Run:
         """Whether nothing more will come of it."""
         return self.state in ("done", "interrupted")
 
-    def told(self) -> dict[str, Any]:
+    def told(self) -> BenchRunTold:
         """Return it as JSON."""
-        return asdict(self)
+        return cast(BenchRunTold, asdict(self))
 
 
 def heard(run: Run, line: bytes) -> Run:
@@ -144,7 +142,7 @@ def heard(run: Run, line: bytes) -> Run:
         return replace(run, odd=run.odd + 1)
 
 
-def ended(run: Run, state: State, code: str | None, sentence: str) -> Run:
+def ended(run: Run, state: BenchState, code: str | None, sentence: str) -> Run:
     """Return a run that is over; one that is over already stays as it is."""
     if run.over:
         return run
@@ -192,7 +190,7 @@ def _place(run: Run, event: Mapping[str, Any]) -> Run:
         _words(event["words"]),
         bool(event["waits"]),
     )
-    state: State = "asking" if asked.waits else "running"
+    state: BenchState = "asking" if asked.waits else "running"
     return replace(run, asked=asked, placements=run.placements + 1, step="place", state=state)
 
 

@@ -21,9 +21,9 @@ from prometheus_client.core import (
 )
 from prometheus_client.process_collector import ProcessCollector
 
+from mastctl.answers import Word
 from mastctl.operations.records import Operation
 from mastctl.state.publisher import Published, Publisher
-from mastctl.state.standing import Word
 
 log = logging.getLogger(__name__)
 
@@ -118,7 +118,8 @@ class Metrics:
         if operation.state not in ENDED:
             return
         told = operation.told()
-        self._operations.labels(operation.state, (told["error"] or {}).get("code", "")).inc()
+        error = told["error"]
+        self._operations.labels(operation.state, "" if error is None else error["code"]).inc()
         for step in told["steps"]:
             if step.get("duration_s") is not None:
                 self._step.labels(str(step["name"])).observe(step["duration_s"])

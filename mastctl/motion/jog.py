@@ -21,6 +21,7 @@ from typing import Any, Protocol
 
 from drivers.clock import Clock, SystemClock
 from drivers.interfaces import Reading
+from mastctl.answers import JogTold
 from mastctl.devices.door import Door
 from mastctl.devices.keep_out import KeptOut, Pair
 from mastctl.errors import MastctlError, NotNow
@@ -139,7 +140,7 @@ class Jogs:
                 self._nameless[counts] = now_s, since
             raise
 
-    def beat(self, beat: Beat, may_begin: bool = True) -> dict[str, Any]:
+    def beat(self, beat: Beat, may_begin: bool = True) -> JogTold:
         """Take a heartbeat; return the jog's ``id``, whether it was ``taken``, and what holds an axis.
 
         ``may_begin`` is what `heard` yielded.
@@ -224,7 +225,7 @@ class _Jog:
             self._gone = True
             self._changed.notify_all()
 
-    def take(self, beat: Beat, name: str) -> dict[str, Any]:
+    def take(self, beat: Beat, name: str) -> JogTold:
         """Take a heartbeat, unless a later one came before it."""
         self._heard_s = self._people.now_s()
         with self._changed:
@@ -236,7 +237,7 @@ class _Jog:
                 self._changed.notify_all()
         return self.told(name, True)
 
-    def told(self, name: str, taken: bool) -> dict[str, Any]:
+    def told(self, name: str, taken: bool) -> JogTold:
         """What a heartbeat is answered."""
         return {"id": name, "taken": taken, "held": dict(self._held)}
 

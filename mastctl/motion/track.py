@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from calib.geometry.rigid import FloatArray, Rigid, carried_covariance, quaternion_of
 from calib.matching.track import Track, moved_track
-from mastctl.as_json import as_json, picked
+from mastctl.answers import PoseTold, TrackStands, TrackState
+from mastctl.as_json import as_json
 from mastctl.errors import BadRequest, NotNow
 from mastctl.motion.target_look import TrackSighting
 from mastctl.operations.records import Operation
@@ -46,7 +47,7 @@ class RoverPose:
     time_s: float | None = None
     received_s: float = 0.0
 
-    def told(self, now_s: float) -> dict[str, Any]:
+    def told(self, now_s: float) -> PoseTold:
         """Return it as JSON, with its age."""
         return {
             "position_m": self.site_from_rover.translation_m.tolist(),
@@ -157,7 +158,6 @@ class Carried:
         return Carried(moved_track(self.track, motion, covariance), pose), ""
 
 
-TrackState = Literal["idle", "starting", "tracking", "lost", "stopped"]
 ACTIVE: frozenset[TrackState] = frozenset({"starting", "tracking", "lost"})
 
 
@@ -222,7 +222,7 @@ class TrackStatus:
     operation: str | None = None
     changed_s: float = 0.0
 
-    def told(self, now_s: float) -> dict[str, Any]:
+    def told(self, now_s: float) -> TrackStands:
         """Return it as ``GET /track`` tells it."""
         position, covariance = self.position_m, self.covariance_m2
         in_site = position
@@ -232,12 +232,24 @@ class TrackStatus:
             position = moved.points(position)
             if covariance is not None:
                 covariance = moved.rotation @ covariance @ moved.rotation.T
-        nothing = {"pixels": {}, "renewed": False, "pose_doubt": ""} if self.seen is None else {}
+        seen = self.seen
         return {
-            **picked(self, "sequence", "state", "reason", "id", "predicted", "operation"),
-            **picked(self, "looks", "misses", "handoffs", "renewals"),
-            **picked(self.seen, "range_m", "pair", "pixels", "chi2", "renewed", "pose_doubt"),
-            **nothing,
+            "sequence": self.sequence,
+            "state": self.state,
+            "reason": self.reason,
+            "id": self.id,
+            "predicted": self.predicted,
+            "operation": self.operation,
+            "looks": self.looks,
+            "misses": self.misses,
+            "handoffs": as_json(self.handoffs),
+            "renewals": self.renewals,
+            "range_m": None if seen is None else as_json(seen.range_m),
+            "pair": None if seen is None else seen.pair,
+            "pixels": {} if seen is None else as_json(seen.pixels),
+            "chi2": None if seen is None else as_json(seen.chi2),
+            "renewed": False if seen is None else seen.renewed,
+            "pose_doubt": "" if seen is None else seen.pose_doubt,
             "position_m": as_json(position),
             "position_in_site_m": as_json(in_site),
             "covariance_m2": as_json(covariance),

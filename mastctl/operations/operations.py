@@ -23,8 +23,9 @@ from typing import Any, Protocol
 from calib.errors import CalibError
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import DriverError
+from mastctl.answers import OperationState
 from mastctl.errors import MastctlError, NotKnown, NotNow, Stopped, Unable, error_body
-from mastctl.operations.records import Operation, OperationState, last_residual
+from mastctl.operations.records import Operation, last_residual
 from mastctl.state.machine import Machine
 from mastctl.state.refusals import Need
 from mastctl.state.words import CLOSING

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any
 
+from mastctl.answers import OperationListed, OperationState, OperationTold
 from mastctl.as_json import as_json
 from mastctl.state.standing import Residual
-
-OperationState = Literal["queued", "running", "done", "failed", "stopped"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,29 +25,35 @@ class Operation:
     result: Any = None
     error: Mapping[str, Any] | None = None
 
-    def told(self, *, steps: bool = True) -> dict[str, Any]:
-        """Return the record as JSON; in front the last pointing's residual too, or why a jog ended."""
-        told: dict[str, Any] = as_json(self if steps else replace(self, steps=()))
-        made = told.pop("result")
+    def listed(self) -> OperationListed:
+        """Return the record as JSON without its steps; in front the last pointing's residual."""
+        made = as_json(self.result)
         result = made if isinstance(made, dict) else {}
         pointings = result.get("pointings") or []
         last = pointings[-1] if pointings else {}
-        if not steps:
-            del told["steps"]
-        ended = {"ended_because": result["ended_because"]} if "ended_because" in result else {}
-        return (
-            told
-            | ended
-            | {
-                "residual_px": last.get("residual_px"),
-                "residual_sigma_px": last.get("residual_sigma_px"),
-                "position_m": result.get("position_m"),
-                "range_m": result.get("range_m"),
-                "range_from": result.get("range_from", ""),
-                "range_interval_m": result.get("range_interval_m"),
-                "pointings": pointings,
-            }
-        )
+        told: OperationListed = {
+            "id": self.id,
+            "state": self.state,
+            "request": as_json(self.request),
+            "created_s": self.created_s,
+            "started_s": self.started_s,
+            "ended_s": self.ended_s,
+            "error": as_json(self.error),
+            "residual_px": last.get("residual_px"),
+            "residual_sigma_px": last.get("residual_sigma_px"),
+            "position_m": result.get("position_m"),
+            "range_m": result.get("range_m"),
+            "range_from": result.get("range_from", ""),
+            "range_interval_m": result.get("range_interval_m"),
+            "pointings": pointings,
+        }
+        if "ended_because" in result:
+            told["ended_because"] = result["ended_because"]
+        return told
+
+    def told(self) -> OperationTold:
+        """Return the record as JSON with its steps."""
+        return {**self.listed(), "steps": as_json(self.steps)}
 
 
 def last_residual(result: Any, name: str) -> Residual | None:

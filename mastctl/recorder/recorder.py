@@ -19,10 +19,11 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from calib.geometry.rig import Rig
 from drivers.clock import Clock
+from mastctl.answers import RecorderTold, RecordingDeleted, RecordingEnded, RecordingListed
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError, NotKnown, NotNow, Unable
 from mastctl.recorder.entries import Entries
@@ -32,6 +33,7 @@ from mastctl.recorder.writer import Attached, Clocks, RecordFile
 from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 NAME = "recorder"
 QUEUE_BYTES = 64 << 20
@@ -167,7 +169,7 @@ class Recorder:
         with self._lock:
             self.settings, self._ring_s, self._others = settings, settings.ring_s or 0.0, others
 
-    def told(self) -> dict[str, Any]:
+    def told(self) -> RecorderTold:
         """Return what is recorded now, as JSON: the run's name, sizes in 10⁶ bytes, what was dropped."""
         now = self._now
         file = now.file
@@ -203,7 +205,7 @@ class Recorder:
             found.append(StandingFault(NAME, "slow", words, busy[1], "the disk answers"))
         return tuple(found)
 
-    def recordings(self) -> list[dict[str, object]]:
+    def recordings(self) -> list[RecordingListed]:
         """Return what lies in the folder, as JSON. Raises Unable ``unreadable``."""
         try:
             return [one.told() for one in self._shelf.all()]
@@ -231,7 +233,7 @@ class Recorder:
             raise NotNow("recording", f"{file} is being written; it can be read when that has ended")
         return found
 
-    def delete(self, name: str) -> dict[str, Any]:
+    def delete(self, name: str) -> RecordingDeleted:
         """Delete a run, or what a fault kept; return what is left, as `recordings`.
 
         Raises
@@ -255,7 +257,7 @@ class Recorder:
             raise NotKnown("recording_unknown", f"there is no recording {name[:80]}")
         return found
 
-    def start_run(self, name: str) -> dict[str, Any]:
+    def start_run(self, name: str) -> RecorderTold:
         """Begin a run and return `told`.
 
         Raises
@@ -267,7 +269,7 @@ class Recorder:
         """
         return self._asked(lambda: self._start_run(name))
 
-    def stop_run(self) -> dict[str, Any]:
+    def stop_run(self) -> RecordingEnded:
         """End the run and return its name and size; what is recorded then is the ring again.
 
         Raises
@@ -292,9 +294,9 @@ class Recorder:
         with self._lock:
             return dict(self._dropped)
 
-    def _asked(self, act: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    def _asked(self, act: Callable[[], T]) -> T:
         """Have the writing thread do something, and wait for it."""
-        answer: Future[dict[str, Any]] = Future()
+        answer: Future[T] = Future()
         with self._lock:
             if self._closing:
                 raise Unable("closing", "the service is closing")
@@ -511,7 +513,7 @@ class Recorder:
         if file is not None:
             file.finish(wait=wait)
 
-    def _start_run(self, name: str) -> dict[str, Any]:
+    def _start_run(self, name: str) -> RecorderTold:
         if self._now.run is not None:
             raise NotNow("recording", f"the run {self._now.run} is recorded already; end it first")
         self._end_file()
@@ -523,7 +525,7 @@ class Recorder:
         log.info("run %s is recorded", path.stem)
         return self.told()
 
-    def _delete(self, name: str) -> dict[str, Any]:
+    def _delete(self, name: str) -> RecordingDeleted:
         one = self._found(name)
         if one.kind == "ring":
             words = "the ring is written over and over; record.ring_s in the configuration says how long"
@@ -537,7 +539,7 @@ class Recorder:
         log.info("the recording %s was deleted", name)
         return {"recordings": self.recordings()}
 
-    def _stop_run(self) -> dict[str, Any]:
+    def _stop_run(self) -> RecordingEnded:
         file, run = self._now.file, self._now.run
         if file is None or run is None:
             raise NotNow("not_recording", "no run is recorded; 'record start' begins one")
@@ -546,5 +548,6 @@ class Recorder:
             raise Unable("run_gone", self._now.words.message)
         self._end_file()
         log.info("run %s has ended", run)
-        lost = {"dropped": self._dropped_so_far()}
-        return {"run": run, "file": str(file.path), "size_mb": file.path.stat().st_size / MB, **lost}
+        dropped = self._dropped_so_far()
+        size_mb = file.path.stat().st_size / MB
+        return {"run": run, "file": str(file.path), "size_mb": size_mb, "dropped": dropped}

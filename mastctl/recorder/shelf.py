@@ -20,6 +20,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from mastctl.answers import RecordingKind, RecordingListed
+
 SUFFIX = ".mcap"
 MB = 1e6
 _NUMBER = re.compile(r"(\d{6,})-")
@@ -31,11 +33,11 @@ class Recorded:
     """One recording on the disk: a run, what was kept at a fault, or the ring."""
 
     name: str
-    kind: str
+    kind: RecordingKind
     files: tuple[Path, ...]
     size_bytes: int
 
-    def told(self) -> dict[str, object]:
+    def told(self) -> RecordingListed:
         """Return it as JSON."""
         return {
             "name": self.name,
@@ -165,7 +167,7 @@ def _next_number(paths: Iterable[Path]) -> int:
     return max((_order(path)[0] for path in paths), default=0) + 1
 
 
-def _recorded(name: str, kind: str, files: Iterable[Path]) -> Recorded:
+def _recorded(name: str, kind: RecordingKind, files: Iterable[Path]) -> Recorded:
     sizes = {}
     for path in files:
         with contextlib.suppress(FileNotFoundError):  # it went round meanwhile

@@ -21,8 +21,9 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
+from mastctl.answers import EstopTold, StopTold
 from mastctl.errors import MastctlError, error_body
 from mastctl.safety.stop_threads import StopsHang, StopThreads
 
@@ -44,10 +45,10 @@ THREADS = 2
 class Stops(Protocol):
     """What the socket carries out."""
 
-    def stop_told(self) -> dict[str, Any]:
+    def stop_told(self) -> StopTold:
         """Stop the mast; return what is to be told."""
 
-    def estop(self, reason: str | None, name: str | None) -> dict[str, Any]:
+    def estop(self, reason: str | None, name: str | None) -> EstopTold:
         """Stop it and latch; return what is to be told."""
 
     def latch_estop(self, reason: str | None, name: str | None) -> object:
@@ -193,7 +194,7 @@ class StopSocket:
         peer.asked_s = time.monotonic()
         words = line.decode("utf-8", "replace").strip()
         verb, _, rest = words.partition(" ")
-        work: Callable[[], dict[str, Any]]
+        work: Callable[[], StopTold | EstopTold]
         if verb == "stop" and not rest:
             work = self._stops.stop_told
         elif verb == "estop":
@@ -255,7 +256,7 @@ class _Peer:
             self._socket.close()
 
 
-def _told(verb: str, future: Future[dict[str, Any]]) -> str:
+def _told(verb: str, future: Future[StopTold | EstopTold]) -> str:
     """The answer's line: the verb and what was done as JSON, or ``failed`` and a sentence."""
     error = future.exception()
     if error is not None:

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from calib.errors import BadFile, CalibError
 from calib.files import read_bytes
@@ -14,6 +13,7 @@ from calib.files.mast_file import StoredRig, parse_rig
 from calib.files.yaml_text import MAX_BYTES
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
+from mastctl.answers import MastTold
 from mastctl.config import Config, check_cameras
 from mastctl.devices.opening import Bounds
 from mastctl.errors import BadRequest
@@ -37,7 +37,7 @@ class MastInUse:
     data: bytes
     path: Path
 
-    def told(self) -> dict[str, Any]:
+    def told(self) -> MastTold:
         """Return its file, name and digest as JSON."""
         return {"file": self.path.name, "name": self.stored.rig.name, "digest": self.stored.digest}
 

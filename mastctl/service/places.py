@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from calib.errors import BadFile
+from mastctl.answers import PlacesTold, PlaceTold
 from mastctl.errors import BadRequest, NotKnown, Unable
 from mastctl.safety.state_file import StateFile
 
@@ -23,6 +24,10 @@ class Place(NamedTuple):
 
     pan_rad: float
     tilt_rad: float
+
+    def told(self) -> PlaceTold:
+        """Return it as JSON."""
+        return {"pan_rad": self.pan_rad, "tilt_rad": self.tilt_rad}
 
 
 AT_HOME = Place(0.0, 0.0)
@@ -44,13 +49,13 @@ class Places:
         self._file = StateFile(folder / FILE, SCHEMA)
         self._writing = threading.Lock()
 
-    def told(self) -> dict[str, Any]:
+    def told(self) -> PlacesTold:
         """Return every place by its name as JSON, home first. Raises Unable ``unreadable``."""
         kept = self._read()
         ordered = {HOME: kept.pop(HOME, AT_HOME), **dict(sorted(kept.items()))}
-        return {"places": {name: place._asdict() for name, place in ordered.items()}}
+        return {"places": {name: place.told() for name, place in ordered.items()}}
 
-    def keep(self, name: str, place: Place) -> dict[str, Any]:
+    def keep(self, name: str, place: Place) -> PlacesTold:
         """Keep a place by a name, in the place of a former one, and return all.
 
         Raises
@@ -69,7 +74,7 @@ class Places:
             self._write({**kept, name: place})
         return self.told()
 
-    def forget(self, name: str) -> dict[str, Any]:
+    def forget(self, name: str) -> PlacesTold:
         """Forget a place and return all that are left; a forgotten home is 0, 0 again.
 
         Raises
@@ -99,7 +104,7 @@ class Places:
 
     def _write(self, places: Mapping[str, Place]) -> None:
         try:
-            self._file.write({"places": {name: place._asdict() for name, place in places.items()}})
+            self._file.write({"places": {name: place.told() for name, place in places.items()}})
         except BadFile as error:
             raise Unable("not_saved", str(error)) from None
 

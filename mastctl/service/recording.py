@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from calib.matching.handed_over import MatchedHandoff
 from drivers.clock import Clock
+from mastctl.answers import Recordings
 from mastctl.config import Config
 from mastctl.devices.frames import StampedFrame
 from mastctl.handoff.log import line_of
@@ -86,7 +86,7 @@ class Recording:
         """Return what keeps it from recording."""
         return self.recorder.faults()
 
-    def told(self) -> dict[str, Any]:
+    def told(self) -> Recordings:
         """Return every recording, and what is recorded now, as ``GET /recordings`` has it. Raises Unable."""
         return {
             "recordings": self.recorder.recordings(),

@@ -11,13 +11,14 @@ import threading
 from collections.abc import Callable
 from dataclasses import asdict
 from importlib.metadata import version
-from typing import Any
+from typing import cast
 
 from calib.files.mast_file import StoredRig
 from calib.matching.handed_over import MatchedHandoff
 from drivers.clock import Clock, SystemClock
 from drivers.hardware import Hardware
 from drivers.known import clock_for, head_name
+from mastctl.answers import CalibrationTold, SelfCheck, SentinelTold, TrackTold
 from mastctl.commands.audit import STRANGERS, STRANGERS_FILES, AuditLog
 from mastctl.commands.entry import Entry
 from mastctl.commands.idempotency import Answers
@@ -312,15 +313,15 @@ class Service:
             track=self.tracker.status,
             faults=faults,
             control=self.leases.told(),
-            calibration=self.health.verdict.told(),
-            sentinel=self.sentinel.told(),
+            calibration=cast(CalibrationTold, self.health.verdict.told()),
+            sentinel=cast(SentinelTold | None, self.sentinel.told()),
             stop_socket=None if self.stop_socket is None else str(self.stop_socket.path),
         )
 
-    def track_told(self, status: TrackStatus | None = None) -> dict[str, Any]:
+    def track_told(self, status: TrackStatus | None = None) -> TrackTold:
         """Return the track, as it is or was, and the self-check of now as ``GET /track`` tells them."""
         told = (status or self.tracker.status).told(self.clock.now_s())
-        return {**told, "self_check": self.handoffs.told()}
+        return {**told, "self_check": cast(SelfCheck, self.handoffs.told())}
 
     def track_in(self, frame: StampedFrame) -> dict[str, float] | None:
         """Return where a frame should show the track's target, pixels, with one sigma as an ellipse.

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from mastctl.answers import EstopTold, StopTold
 from mastctl.commands.caller import Caller
 from mastctl.commands.entry import ESTOP, STOP, Asked, Entry
 from mastctl.safety.stop_socket import Stops
@@ -26,11 +25,11 @@ class SocketStops:
         self._stops = stops
         self._entry = entry
 
-    def stop_told(self) -> dict[str, Any]:
+    def stop_told(self) -> StopTold:
         """Stop the mast; return what is to be told."""
         return self._entry.first(STOP, Asked(Caller(role="view", via=VIA)), self._stops.stop_told)
 
-    def estop(self, reason: str | None, name: str | None) -> dict[str, Any]:
+    def estop(self, reason: str | None, name: str | None) -> EstopTold:
         """Stop it and latch; return what is to be told."""
         asked = Asked(Caller(role="view", via=VIA), request={"reason": reason, "name": name})
         return self._entry.first(ESTOP, asked, lambda: self._stops.estop(reason, name))

@@ -7,20 +7,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from drivers.interfaces import AxisMotion
-from mastctl.as_json import as_json, picked
+from mastctl.answers import (
+    CalibrationTold,
+    CameraTold,
+    ControlTold,
+    FaultTold,
+    Joints,
+    MastTold,
+    SentinelTold,
+    StandingTold,
+    Status,
+)
+from mastctl.as_json import as_json
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.limits import Limits
 from mastctl.motion.track import TrackStatus
 from mastctl.state.faults import StandingFault
 from mastctl.state.standing import Standing
-
-AS_THEY_ARE = (
-    "hardware", "moving", "limits", "mast", "former_mast", "version", "now_s", "stop_socket",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -59,8 +65,8 @@ class State:
     started_s: float
     version: str
     hardware: str
-    mast: Mapping[str, Any]
-    former_mast: Mapping[str, Any] | None
+    mast: MastTold
+    former_mast: MastTold | None
     limits: Limits
     axes: Mapping[str, AxisMotion]
     reading: HeadReading | None
@@ -69,16 +75,16 @@ class State:
     track: TrackStatus
     faults: tuple[StandingFault, ...]
     stop_socket: str | None = None
-    calibration: Mapping[str, Any] | None = None
-    sentinel: Mapping[str, Any] | None = None
-    control: Mapping[str, Any] | None = None
+    calibration: CalibrationTold | None = None
+    sentinel: SentinelTold | None = None
+    control: ControlTold | None = None
 
     @property
     def moving(self) -> bool:
         """Whether the head was under way when it was last read."""
         return self.reading is not None and self.reading.moving
 
-    def told(self) -> dict[str, Any]:
+    def told(self) -> Status:
         """Return the snapshot as ``GET /status`` tells it: JSON, ages instead of times."""
         reading, track = self.reading, self.track
         return {
@@ -86,7 +92,7 @@ class State:
             "simulated": self.hardware == "simulated",
             "joints": None if reading is None else joints_told(reading, self.now_s),
             "pose": None if track.pose is None else track.pose.told(self.now_s),
-            "track": picked(track, "state", "reason", "id"),
+            "track": {"state": track.state, "reason": track.reason, "id": track.id},
             "control": self.control,
             "calibration": self.calibration,
             "sentinel": self.sentinel,
@@ -94,21 +100,21 @@ class State:
                 name: {"count_rad": axis.count_rad, "one_sided": axis.rising_below_rad is not None}
                 for name, axis in self.axes.items()
             },
-            "cameras": {
-                name: picked(frame, "frame_id", "sequence", "exposure_s")
-                | {"age_s": None if frame is None else self._age_s(frame.mid_exposure_s)}
-                for name, frame in self.frames.items()
-            },
+            "cameras": {name: frame_told(frame, self.now_s) for name, frame in self.frames.items()},
             "faults": [fault_told(fault, self.now_s) for fault in self.faults],
             "uptime_s": self.now_s - self.started_s,
-            **picked(self, *AS_THEY_ARE),
+            "hardware": self.hardware,
+            "moving": self.moving,
+            "limits": as_json(self.limits),
+            "mast": self.mast,
+            "former_mast": self.former_mast,
+            "version": self.version,
+            "now_s": self.now_s,
+            "stop_socket": self.stop_socket,
         }
 
-    def _age_s(self, time_s: float) -> float:
-        return max(0.0, self.now_s - time_s)
 
-
-def standing_told(now: Standing, now_s: float) -> dict[str, Any]:
+def standing_told(now: Standing, now_s: float) -> StandingTold:
     """Return what the daemon is doing as ``GET /status`` tells it."""
     return {
         "state": now.word,
@@ -122,21 +128,38 @@ def standing_told(now: Standing, now_s: float) -> dict[str, Any]:
     }
 
 
-def joints_told(reading: HeadReading, now_s: float) -> dict[str, Any]:
-    """Return a reading of the head as ``GET /status`` tells it."""
-    age_s = max(0.0, now_s - reading.time_s)
+def frame_told(frame: StampedFrame | None, now_s: float) -> CameraTold:
+    """Return a camera's newest frame as ``GET /status`` tells it."""
+    if frame is None:
+        return {"frame_id": None, "sequence": None, "exposure_s": None, "age_s": None}
     return {
-        **picked(reading, "pan_rad", "tilt_rad"),
+        "frame_id": frame.frame_id,
+        "sequence": frame.sequence,
+        "exposure_s": frame.exposure_s,
+        "age_s": max(0.0, now_s - frame.mid_exposure_s),
+    }
+
+
+def joints_told(reading: HeadReading, now_s: float) -> Joints:
+    """Return a reading of the head as ``GET /status`` tells it."""
+    return {
+        "pan_rad": reading.pan_rad,
+        "tilt_rad": reading.tilt_rad,
         "true_pan_rad": reading.true_rad[0],
         "true_tilt_rad": reading.true_rad[1],
         "pan_approach": reading.approach[0],
         "tilt_approach": reading.approach[1],
         "measured_s": reading.time_s,
-        "age_s": age_s,
+        "age_s": max(0.0, now_s - reading.time_s),
     }
 
 
-def fault_told(fault: StandingFault, now_s: float) -> dict[str, Any]:
+def fault_told(fault: StandingFault, now_s: float) -> FaultTold:
     """Return what is wrong with a device as ``GET /status`` tells it."""
-    for_s = max(0.0, now_s - fault.since_s)
-    return picked(fault, "device", "code", "message", "until") | {"for_s": for_s}
+    return {
+        "device": fault.device,
+        "code": fault.code,
+        "message": fault.message,
+        "until": fault.until,
+        "for_s": max(0.0, now_s - fault.since_s),
+    }

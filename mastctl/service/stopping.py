@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from dataclasses import asdict
-from typing import Any
 
 from drivers.errors import DriverError
+from mastctl.answers import EstopTold, ResetTold, StopTold
 from mastctl.devices.devices import Devices
 from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.motion.tracker import Tracker
@@ -62,7 +61,7 @@ class Stopping:
                 self._tracker.stop(reason)
         return stopped
 
-    def stop_told(self) -> dict[str, Any]:
+    def stop_told(self) -> StopTold:
         """Stop as `stop`; return what ``POST /stop`` tells."""
         return {"stopped": True, "operation": self.stop()}
 
@@ -75,7 +74,7 @@ class Stopping:
         if running is not None and self._operations.running == running:
             self._operations.stop()
 
-    def estop(self, reason: str | None = None, name: str | None = None) -> dict[str, Any]:
+    def estop(self, reason: str | None = None, name: str | None = None) -> EstopTold:
         """Stop the mast, and let nothing move it before `reset`, across restarts too.
 
         The head first; then what runs and the track end; then it is told whether the disk holds the stop.
@@ -104,8 +103,18 @@ class Stopping:
         if unconfirmed is not None:
             words = f"the emergency stop is latched, but the head did not confirm it: {unconfirmed}"
             raise Unable("stop_unconfirmed", f"{words}; {why}" if why else words)
-        told = {"stopped": True, "latched": True, "kept": kept, "operation": stopped, **asdict(held)}
-        return told | ({"message": why} if why else {})
+        told: EstopTold = {
+            "stopped": True,
+            "latched": True,
+            "kept": kept,
+            "operation": stopped,
+            "reason": held.reason,
+            "name": held.name,
+            "at": held.at,
+        }
+        if why:
+            told["message"] = why
+        return told
 
     def latch_estop(self, reason: str | None, name: str | None) -> Latched:
         """Let no move out from now on; the head is told by `estop`. Returns the stop that is latched."""
@@ -118,7 +127,7 @@ class Stopping:
             self._machine.stop_ended()
         return held
 
-    def reset(self, reason: str, name: str, of: str | None = None) -> dict[str, Any]:
+    def reset(self, reason: str, name: str, of: str | None = None) -> ResetTold:
         """Release one emergency stop; nothing moves before the last is released, and a command comes.
 
         Parameters
@@ -150,8 +159,8 @@ class Stopping:
             held = self._latch.release(reason, name, of)
             self._devices.allow_moves(held)  # and not what another one blocks that came meanwhile
             self._machine.reset(name, reason, lambda: self._latch.entries)
-            left = [asdict(one) for one in self._latch.entries]
-        return {"latched": bool(left), "released": asdict(held), "left": left}
+            left = [one.told() for one in self._latch.entries]
+        return {"latched": bool(left), "released": held.told(), "left": left}
 
 
 def state_faults(folder: StateFolder, latch: Latch, started_s: float) -> Iterator[StandingFault]:

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
+from mastctl.answers import EstopHeld, Word
 from mastctl.state.faults import StandingFault
-
-Word = Literal[
-    "starting", "ready", "moving", "tracking", "holding", "stopping", "stopped", "fault", "closing"
-]
 
 
 @dataclass(frozen=True)
@@ -37,6 +34,10 @@ class Latched:
     name: str
     reason: str
     at: str
+
+    def told(self) -> EstopHeld:
+        """Return it as JSON."""
+        return {"name": self.name, "reason": self.reason, "at": self.at}
 
     @property
     def sentence(self) -> str:

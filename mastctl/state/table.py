@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Literal, get_args
 
-from mastctl.state.standing import Standing, Word
+from mastctl.answers import Word
+from mastctl.state.standing import Standing
 
 Event = Literal[
     "operation_began",

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict
 from starlette.responses import JSONResponse
 
 HEADERS: Mapping[str, str] = {
@@ -24,29 +23,6 @@ PAGE = (
 """The Content-Security-Policy of a page: its own files only, no script inside it, in nobody's frame."""
 
 Headers = list[tuple[bytes, bytes]]
-
-
-class Told(BaseModel):
-    """An answer, or a part of one. Each key is there unless it has a default; others may come later.
-
-    Only the description needs these models, so they are built when it is asked for.
-    """
-
-    model_config = ConfigDict(strict=True, allow_inf_nan=False, defer_build=True)
-
-
-class ErrorTold(Told):
-    """Why something was refused: a word for programs, a sentence for people, more where there is more."""
-
-    code: str
-    message: str
-    detail: dict[str, Any] | None = None
-
-
-class ErrorBody(Told):
-    """Every answer that is not a success."""
-
-    error: ErrorTold
 
 
 class GuardError(Exception):

@@ -8,34 +8,30 @@ Every refusal is ``{"error": {"code", "message", "detail"}}``.
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Coroutine
 from functools import cache
 from importlib.metadata import version
+from typing import Any
 
 from fastapi import FastAPI, Request, Response
+from fastapi.routing import APIRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
+from typing_extensions import get_type_hints, is_typeddict
 
+from mastctl.answers import ErrorBody
 from mastctl.service.service import Service
-from mastctl.web.answer import ErrorBody
-from mastctl.web.bench import add_bench
-from mastctl.web.commands import Commands
 from mastctl.web.entrance import Entrance
-from mastctl.web.estop import add_estop
 from mastctl.web.events import add_events
 from mastctl.web.guard import Guard
 from mastctl.web.images import add_images
-from mastctl.web.lease import add_lease
-from mastctl.web.limits import add_limits
+from mastctl.web.keeping import add_bench, add_masts, add_places, add_recordings
 from mastctl.web.packed import text_answer
 from mastctl.web.page import add_page
 from mastctl.web.parts import Here, Parts
-from mastctl.web.pictures import add_pictures
-from mastctl.web.places import add_places
-from mastctl.web.recordings import add_recordings
 from mastctl.web.refusals import add_errors
-from mastctl.web.reload import add_reload
-from mastctl.web.routes import add_pointing, add_tracking
 from mastctl.web.sessions import add_sessions
 from mastctl.web.simulation import add_simulation
+from mastctl.web.steering import add_estop, add_lease, add_limits, add_pointing, add_tracking
 from mastctl.web.streams import Streams
 from mastctl.web.waiting import Waiting
 from mastctl.web.watching import add_watching
@@ -61,7 +57,7 @@ def create_app(
     waiting = waiting or Waiting(service.clock)
     entrance = entrance or Entrance()
     streams = streams or Streams(service.machine.publisher)
-    parts = Parts(service, waiting, Commands(service, waiting), streams, entrance)
+    parts = Parts(service, waiting, streams, entrance)
     routes = api()
 
     async def served(scope: Scope, receive: Receive, send: Send) -> None:
@@ -69,6 +65,33 @@ def create_app(
         await routes(scope, receive, send)
 
     return Guard(served, entrance, service.entry)
+
+
+class _Read(Request):
+    """A request whose body the guard has read."""
+
+    async def json(self) -> Any:
+        return self.scope["state"]["json"]
+
+
+class _Route(APIRoute):
+    """A route whose body was read before, and whose answer goes out as it is made.
+
+    The answer's type is for the type checker and the description.
+    """
+
+    def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
+        if is_typeddict(get_type_hints(endpoint).get("return")):
+            options["response_model"] = dict[str, Any]
+        super().__init__(path, endpoint, **options)
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        handle = super().get_route_handler()
+
+        async def read(request: Request) -> Response:
+            return await handle(_Read(request.scope, request.receive))
+
+        return read
 
 
 @cache
@@ -83,11 +106,11 @@ def api() -> FastAPI:
         docs_url=None,
         redoc_url=None,
     )
+    app.router.route_class = _Route
     add_errors(app)
     for add in (
-        *(add_sessions, add_pointing, add_estop, add_lease, add_tracking, add_limits, add_pictures),
-        *(add_places, add_recordings, add_bench, add_reload, add_simulation, add_watching, add_events),
-        *(add_images, add_page),
+        *(add_sessions, add_pointing, add_estop, add_lease, add_tracking, add_limits, add_masts, add_places),
+        *(add_recordings, add_bench, add_simulation, add_watching, add_events, add_images, add_page),
     ):
         add(app)
 

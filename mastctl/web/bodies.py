@@ -39,8 +39,8 @@ def _too_large() -> NoReturn:
     raise GuardError(413, "too_large", f"the body is larger than {LARGEST_BODY_BYTES} bytes")
 
 
-def check_json(body: bytes, headers: Mapping[str, str]) -> None:
-    """Pass nothing, or JSON with finite numbers and each key once.
+def read_json(body: bytes, headers: Mapping[str, str]) -> Any:
+    """Return what a body holds: JSON with finite numbers and each key once; None for nothing.
 
     Raises
     ------
@@ -48,12 +48,14 @@ def check_json(body: bytes, headers: Mapping[str, str]) -> None:
         ``not_json``; ``bad_request`` for a number that is JSON and larger than any float.
     """
     if not body.strip():
-        return
+        return None
     kind = headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != "application/json":
         raise GuardError(415, "not_json", f"Content-Type is '{kind[:60]}' where application/json is expected")
     try:
-        json.loads(body, parse_constant=_no_constant, parse_float=_finite, object_pairs_hook=_no_duplicates)
+        return json.loads(
+            body, parse_constant=_no_constant, parse_float=_finite, object_pairs_hook=_no_duplicates
+        )
     except RecursionError:
         raise GuardError(400, "not_json", "the body is nested too deeply") from None
     except ValueError as error:

@@ -1,12 +1,17 @@
-"""How a request becomes a command: who asks, by which headers, and in whose thread it is carried out."""
+"""How a request becomes a command: one way for all of them, and the other way round for a stop."""
 
 from __future__ import annotations
 
 import asyncio
+import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from inspect import Parameter
 from typing import Annotated, Any, TypeVar
 
-from fastapi import Depends, Header, Request
+from fastapi import Depends, FastAPI, Header, Request
+from pydantic import BaseModel
 
 from mastctl.commands.caller import Caller, told_name
 from mastctl.commands.entry import Asked, Command
@@ -14,34 +19,20 @@ from mastctl.commands.idempotency import Answer
 from mastctl.errors import Unable
 from mastctl.safety.stop_threads import StopsHang
 from mastctl.service.service import Service
+from mastctl.web import PREFIX
 from mastctl.web.models import DeadlineS
-from mastctl.web.waiting import Waiting
+from mastctl.web.parts import Here, Parts
 
 T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Mapping[str, Any]])
 
 STOP_ANSWER_S = 3.0  # the devices give a stop 1 s; beyond this it is told that nothing is known
 NOTHING: Mapping[str, Any] = {}
 
 
-class Came:
-    """What the headers of a request for a command say; a dependency of its route."""
-
-    def __init__(
-        self, request: Request, lease: str | None, key: str | None, deadline_s: float | None
-    ) -> None:
-        self.caller = caller_of(request)
-        self.lease = lease
-        self.key = key
-        self.deadline_s = deadline_s
-        self._state: dict[str, Any] = request.scope.setdefault("state", {})
-
-    def recorded(self) -> None:
-        """Say that whatever comes of it is recorded as a command."""
-        self._state["recorded"] = True
-
-
-async def _came(
+async def _asked(
     request: Request,
+    here: Here,
     mastctl_client: Annotated[
         str | None, Header(description="What the program that asks calls itself")
     ] = None,
@@ -52,93 +43,112 @@ async def _came(
     deadline_s: Annotated[
         DeadlineS | None, Header(description="How long the command is given, seconds")
     ] = None,
-) -> Came:
-    return Came(request, mastctl_lease, idempotency_key, deadline_s)
+) -> Asked:
+    service = here.service
+    now_s, last_stop = service.clock.now_s(), service.leases.last_stop
+    return Asked(caller_of(request), now_s, NOTHING, mastctl_lease, idempotency_key, deadline_s, last_stop)
 
 
-Headers = Annotated[Came, Depends(_came)]
+Asks = Annotated[Asked, Depends(_asked)]
+"""What the headers of a request for a command say, and when it came."""
 
 
-def caller_of(request: Request) -> Caller:
-    """Return who asks, as whoever let the request in found; else by its name alone."""
-    caller = request.scope.get("state", {}).get("caller")
-    return caller if isinstance(caller, Caller) else Caller(told_name(request.headers.get("mastctl-client")))
+def command(
+    app: FastAPI,
+    route: str,
+    kind: Command,
+    summary: str,
+    *,
+    usual_s: Callable[..., float] | None = None,
+    recorded: Callable[..., Mapping[str, Any]] | None = None,
+    beside: bool = False,
+    status_code: int = 200,
+) -> Callable[[F], F]:
+    """Add the route of a command, whose function carries it out, in a worker thread, once the entry lets it.
 
-
-class Commands:
-    """The commands of one daemon's routes; used on its event loop only.
+    The function takes what the path, the query and the body hold, and ``here`` and ``asked`` (`Asks`) if it
+    needs them.
 
     Parameters
     ----------
-    service
-        Carries them out, through its entry.
-    waiting
-        Runs what may wait.
+    route
+        Method and path below the prefix, ``POST /point``.
+    usual_s
+        What an operation of it is given if nothing else was asked for, from ``here`` and what the function
+        takes.
+    recorded
+        What it is recorded and known again by, from what the function takes; by default the path, the query
+        and the body.
+    beside
+        Whether it stops something: it runs in the stops' own threads then, and each try is carried out.
     """
+    method, _, path = route.partition(" ")
 
-    def __init__(self, service: Service, waiting: Waiting) -> None:
-        self._service = service
-        self._waiting = waiting
+    def add(act: F) -> F:
+        wanted = inspect.signature(act, eval_str=True)
 
-    async def run(
-        self,
-        command: Command,
-        came: Came,
-        request: Mapping[str, Any],
-        act: Callable[[], Answer],
-        usual_s: float | None = None,
-    ) -> Answer:
-        """Return the answer of a command, carried out in a worker thread.
+        async def endpoint(request: Request, here: Parts, asked: Asked, **given: Any) -> Mapping[str, Any]:
+            own = {name: one for name, one in (("here", here), ("asked", asked)) if name in wanted.parameters}
+            told = recorded(**given, **own) if recorded is not None else _told(given)
+            allowed_s = None if usual_s is None else usual_s(here, **given)
+            work = partial(act, **given, **own)
+            return await carried_out(here, request, kind, asked, told, work, allowed_s, beside)
 
-        Parameters
-        ----------
-        command
-            Its kind.
-        came
-            The request's headers.
-        request
-            What is asked, as JSON; a ``deadline_s`` in it counts as the header does, the shorter of both.
-        act, usual_s
-            As `mastctl.commands.entry.Entry.run`, whose refusals this raises too.
-        """
-        asked = self._asked(came, request)
-        return await self._waiting.run(lambda: self._service.entry.run(command, asked, act, usual_s))
+        kinds = {"request": Request, "here": Here, "asked": Asks}
+        parameters = [Parameter(name, Parameter.KEYWORD_ONLY, annotation=one) for name, one in kinds.items()]
+        parameters += [
+            one.replace(kind=Parameter.KEYWORD_ONLY)
+            for name, one in wanted.parameters.items()
+            if name not in kinds
+        ]
+        endpoint.__signature__ = wanted.replace(parameters=parameters)  # type: ignore[attr-defined]
+        endpoint.__annotations__ = {"return": wanted.return_annotation}
+        endpoint.__name__ = act.__name__
+        app.add_api_route(PREFIX + path, endpoint, methods=[method], summary=summary, status_code=status_code)
+        return act
 
-    async def run_beside(self, command: Command, came: Came, act: Callable[[], Answer]) -> Answer:
-        """Return the answer of a command that stops something: as `run`, in the stops' own threads, and each
-        try is carried out."""
-        asked = self._asked(came, NOTHING, keyed=False)
-        return await stopped(self._service, lambda: self._service.entry.run(command, asked, act))
+    return add
 
-    async def first(
-        self,
-        command: Command,
-        request: Request,
-        act: Callable[[], Answer],
-        told: Mapping[str, Any] = NOTHING,
-    ) -> Answer:
-        """Return the answer of a stop: nothing is asked and no header is judged before it acts."""
-        asked = Asked(caller_of(request), request=told, lease=request.headers.get("mastctl-lease"))
-        entry = self._service.entry
-        try:
-            return await stopped(self._service, lambda: entry.first(command, asked, act))
-        except StopsHang as error:
-            entry.not_begun(command, asked, error)
-            raise
 
-    def _asked(self, came: Came, request: Mapping[str, Any], keyed: bool = True) -> Asked:
-        times_s = [time_s for time_s in (came.deadline_s, request.get("deadline_s")) if time_s is not None]
-        asked = Asked(
-            came.caller,
-            self._service.clock.now_s(),
-            request,
-            came.lease,
-            came.key if keyed else None,
-            min(times_s, default=None),
-            self._service.leases.last_stop,
-        )
-        came.recorded()
-        return asked
+async def carried_out(
+    here: Parts,
+    request: Request,
+    kind: Command,
+    asked: Asked,
+    told: Mapping[str, Any],
+    act: Callable[[], Answer],
+    usual_s: float | None = None,
+    beside: bool = False,
+) -> Answer:
+    """Return the answer of a command, whose refusals are those of `mastctl.commands.entry.Entry.run`.
+
+    A ``deadline_s`` in what is ``told`` counts as the header does, the shorter of both. ``beside``: of the
+    request nothing is kept but who asks, when, and under which lease.
+    """
+    request.scope["state"]["recorded"] = True  # whatever comes of it
+    deadline_s = _shorter(asked.deadline_s, told.get("deadline_s"))
+    if beside:
+        asked = replace(asked, key=None)
+        return await stopped(here.service, lambda: here.service.entry.run(kind, asked, act))
+    asked = replace(asked, request=told, deadline_s=deadline_s)
+    return await here.waiting.run(lambda: here.service.entry.run(kind, asked, act, usual_s))
+
+
+async def stop_first(
+    here: Parts,
+    kind: Command,
+    request: Request,
+    act: Callable[[], Answer],
+    told: Mapping[str, Any] = NOTHING,
+) -> Answer:
+    """Return the answer of a stop: nothing is asked and no header is judged before it acts."""
+    asked = Asked(caller_of(request), request=told, lease=request.headers.get("mastctl-lease"))
+    entry = here.service.entry
+    try:
+        return await stopped(here.service, lambda: entry.first(kind, asked, act))
+    except StopsHang as error:
+        entry.not_begun(kind, asked, error)
+        raise
 
 
 async def stopped(service: Service, stop: Callable[[], T]) -> T:
@@ -148,3 +158,24 @@ async def stopped(service: Service, stop: Callable[[], T]) -> T:
     except TimeoutError:
         words = f"the stop did not come back within {STOP_ANSWER_S:g} s; the head may still move"
         raise Unable("stop_pending", words) from None
+
+
+def caller_of(request: Request) -> Caller:
+    """Return who asks, as whoever let the request in found; else by its name alone."""
+    caller = request.scope.get("state", {}).get("caller")
+    return caller if isinstance(caller, Caller) else Caller(told_name(request.headers.get("mastctl-client")))
+
+
+def _told(given: Mapping[str, Any]) -> dict[str, Any]:
+    """What a request says in its path, its query and its body."""
+    told: dict[str, Any] = {}
+    for name, value in given.items():
+        if isinstance(value, BaseModel):
+            told |= value.model_dump(exclude_none=True)
+        elif value is not None:
+            told[name] = value
+    return told
+
+
+def _shorter(one_s: float | None, other_s: float | None) -> float | None:
+    return min((time_s for time_s in (one_s, other_s) if time_s is not None), default=None)

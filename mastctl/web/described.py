@@ -1,86 +1,29 @@
-"""How /openapi.json describes the answers: a model for each route, without a cost when an answer is given."""
+"""How /openapi.json describes the answers: by the types that the routes are annotated with, whose cost nobody
+pays who only gets an answer.
+"""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
 from functools import cache
-from typing import Any
+from typing import Annotated, Any, cast
 
 from fastapi import FastAPI
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel
-from pydantic.json_schema import models_json_schema
+from fastapi.routing import APIRoute
+from pydantic import Field, TypeAdapter
+from pydantic.json_schema import JsonSchemaMode
+from typing_extensions import get_type_hints, is_typeddict
 
+from mastctl.answers import Event, HistoryTold, TrackTold
 from mastctl.frame_facts import described_headers
 from mastctl.web import PREFIX
-from mastctl.web import answers as told
-from mastctl.web import bench_answers as bench
-from mastctl.web.event_answers import Event
 
-ANSWERS: Mapping[str, type[BaseModel]] = {
-    "GET /calibration/health": told.CalibrationHealthTold,
-    "GET /sentinel": told.SentinelTold,
-    "GET /status": told.Status,
-    "POST /point": told.Started,
-    "POST /point/preview": told.PreviewTold,
-    "GET /operations": told.Operations,
-    "GET /operations/{operation_id}": told.OperationTold,
-    "POST /stop": told.StopTold,
-    "POST /estop": told.EstopTold,
-    "POST /reset": told.ResetTold,
-    "POST /pose": told.PoseTaken,
-    "GET /track": told.TrackTold,
-    "POST /track": told.Started,
-    "POST /track/look": told.Started,
-    "POST /track/stop": told.TrackTold,
-    "POST /jog": told.JogTold,
-    "GET /history": told.HistoryTold,
-    "GET /recordings": told.Recordings,
-    "POST /recordings/start": told.RecorderTold,
-    "POST /recordings/stop": told.RecordingEnded,
-    "DELETE /recordings/{name}": told.RecordingDeleted,
-    "GET /limits/sun": told.SunTold,
-    "POST /limits/sun": told.SunTold,
-    "DELETE /limits/sun": told.SunTold,
-    "GET /lease": told.LeaseTold,
-    "POST /lease": told.LeaseGranted,
-    "POST /lease/renew": told.LeaseGranted,
-    "POST /lease/take": told.LeaseGranted,
-    "DELETE /lease": told.LeaseTold,
-    "GET /places": told.PlacesTold,
-    "POST /places/{name}": told.PlacesTold,
-    "DELETE /places/{name}": told.PlacesTold,
-    "POST /reload": told.ReloadTold,
-    "POST /mast": told.MastsTold,
-    "POST /mast/back": told.MastsTold,
-    "GET /simulation/pose": told.StandTold,
-    "POST /simulation/pose": told.StandTold,
-    "GET /simulation/boards": told.BoardsTold,
-    "POST /simulation/boards/{name}": told.BoardStands,
-    "DELETE /simulation/boards/{name}": told.BoardsTold,
-    "GET /simulation/time": told.TimeTold,
-    "POST /simulation/time": told.TimeTold,
-    "GET /simulation/faults": told.FaultsSet,
-    "POST /simulation/faults": told.FaultsSet,
-    "DELETE /simulation/faults": told.FaultsSet,
-    "GET /simulation/words": told.WordsTold,
-    "GET /simulation/truth": told.TruthTold,
-    "GET /health/live": told.LiveTold,
-    "GET /health/ready": told.ReadyTold,
-    "GET /rig": told.RigTold,
-    "GET /bench": bench.BenchTold,
-    "POST /bench": bench.BenchBegun,
-    "POST /bench/stands": bench.BenchBegun,
-    "POST /bench/leave": bench.BenchBegun,
-    "DELETE /bench/runs/{name}": bench.BenchTold,
-    "GET /reports": bench.ReportsTold,
-    "GET /session": told.SessionTold,
-    "POST /login": told.SessionTold,
-    "POST /logout": told.LoggedOut,
-}
-EVENTS: Mapping[str, type[BaseModel]] = {"GET /events": Event, "GET /track/stream": told.TrackTold}
-"""Server-sent events without an end: one line each, ``data:`` and the model's JSON."""
+TEXTS: Mapping[str, type] = {"GET /history": HistoryTold}
+"""Answers that a route makes a text of itself."""
+EVENTS: Mapping[str, str] = {"GET /events": "Event", "GET /track/stream": TrackTold.__name__}
+"""Server-sent events without an end: one line each, ``data:`` and the JSON of this kind."""
 FILES: Mapping[str, tuple[str, ...]] = {
     "GET /snapshot/{camera}": ("image/png", "image/jpeg"),
     "GET /mast": ("application/yaml",),
@@ -107,27 +50,42 @@ def is_made() -> bool:
 @cache
 def _made(app: FastAPI) -> bytes:
     document = app.openapi()
-    _describe(document)
+    _describe(document, answers_of(app))
     return bytes(JSONResponse(document).body)
 
 
-def answer_schemas() -> dict[str, Any]:
-    """Return the JSON schema of each model of an answer, by its name."""
-    models = {*ANSWERS.values(), *EVENTS.values()}
-    pairs = sorted(((one, "serialization") for one in models), key=lambda pair: pair[0].__name__)
-    _, schemas = models_json_schema(pairs, ref_template=_REFERENCE)  # type: ignore[arg-type]
-    return dict(schemas["$defs"])
+def answers_of(app: FastAPI) -> dict[str, type]:
+    """Return the type of each route's answer, where that is a JSON object."""
+    told = dict(TEXTS)
+    for route in app.routes:
+        if isinstance(route, APIRoute) and route.include_in_schema:
+            kind = get_type_hints(route.endpoint).get("return")
+            if is_typeddict(kind):
+                names = (f"{method} {route.path.removeprefix(PREFIX)}" for method in route.methods or ())
+                told |= dict.fromkeys(names, cast(type, kind))
+    return told
 
 
-def _describe(document: dict[str, Any]) -> None:
-    """Put the models, events and files where they are answered."""
-    document["components"]["schemas"].update(answer_schemas())
+def schemas_of(kinds: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the JSON schema of each kind of answer and of its parts, by their names."""
+    one: JsonSchemaMode = "serialization"
+    inputs = [(name, one, TypeAdapter(kind)) for name, kind in sorted(kinds.items())]
+    whole, parts = TypeAdapter.json_schemas(inputs, ref_template=_REFERENCE)
+    named = {name: schema for (name, _), schema in whole.items() if "$ref" not in schema}
+    return dict(parts["$defs"]) | named
+
+
+def _describe(document: dict[str, Any], answers: Mapping[str, type]) -> None:
+    """Put the answers, events and files where they are answered."""
+    one = Field(discriminator="topic", title="Event", description="One event of ``/events``.")
+    kinds = {kind.__name__: kind for kind in (*answers.values(), TrackTold)}
+    document["components"]["schemas"].update(schemas_of({**kinds, "Event": Annotated[Event, one]}))
     _without_null(document)
     for route, success in _successes(document).items():
-        if route in ANSWERS:
-            model = ANSWERS[route]
-            success["description"] = (model.__doc__ or model.__name__).strip().splitlines()[0]
-            success["content"] = {"application/json": {"schema": _reference(model)}}
+        if route in answers:
+            kind = answers[route]
+            success["description"] = (kind.__doc__ or kind.__name__).strip().splitlines()[0]
+            success["content"] = {"application/json": {"schema": _reference(kind.__name__)}}
         elif route in EVENTS:
             stream = {"schema": {"type": "string"}, "x-endless": True, "x-event": _reference(EVENTS[route])}
             success["content"] = {"text/event-stream": stream}
@@ -165,5 +123,5 @@ def _successes(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     }
 
 
-def _reference(model: type[BaseModel]) -> dict[str, str]:
-    return {"$ref": _REFERENCE.format(model=model.__name__)}
+def _reference(name: str) -> dict[str, str]:
+    return {"$ref": _REFERENCE.format(model=name)}

@@ -19,7 +19,7 @@ from mastctl.commands.caller import Caller
 from mastctl.errors import MastctlError, one_line
 from mastctl.web import PREFIX
 from mastctl.web.answer import GuardError, error_response, marked
-from mastctl.web.bodies import check_json, once, whole_body
+from mastctl.web.bodies import once, read_json, whole_body
 from mastctl.web.entrance import Entrance, Rate, changes
 from mastctl.web.refusals import told
 from mastctl.web.stop_address import STOPS, TRACK_STOP, stop_named
@@ -116,7 +116,7 @@ class Guard:
                     body = b""
                     if scope["path"] not in UNREAD:
                         body = await whole_body(receive, headers)
-                        check_json(body, headers)
+                        scope.setdefault("state", {})["json"] = read_json(body, headers)
                     receive = once(body, receive)
             await self._app(scope, receive, send_marked)
         except (GuardError, MastctlError) as refused:

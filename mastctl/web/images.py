@@ -1,4 +1,4 @@
-"""Live pictures through one WebSocket: the newest of each camera, at the pace at which they are shown.
+"""Pictures with their facts: one at a time, or through a WebSocket at the pace at which they are shown.
 
 A message is 4 bytes (the length of what follows, little-endian), the picture's facts as JSON, and the
 picture as JPEG. Whoever has shown one sends ``CAMERA`` or ``CAMERA MOST_BYTES`` back, and is sent another one
@@ -11,20 +11,23 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import FastAPI, WebSocket
+from fastapi import FastAPI, Query, Response, WebSocket
 from pydantic import ValidationError
 from starlette.websockets import WebSocketDisconnect
 
 from mastctl.as_json import as_json
 from mastctl.errors import MastctlError
+from mastctl.frame_facts import headers_of
 from mastctl.live.pictures import Picture, Watcher
+from mastctl.report.pictures import encoded
 from mastctl.service.service import Service
+from mastctl.web import PREFIX
 from mastctl.web.answer import error_response
 from mastctl.web.connections import IMAGES
 from mastctl.web.events import GOING_AWAY
-from mastctl.web.models import ImagesQuery
+from mastctl.web.models import ImagesQuery, SnapshotQuery
 from mastctl.web.parts import Here
 from mastctl.web.refusals import told as refused
 from mastctl.web.sentences import sentence
@@ -34,7 +37,28 @@ ASKS = "?"
 
 
 def add_images(app: FastAPI) -> None:
-    """The WebSocket of live pictures."""
+    """A picture with its facts, and the WebSocket of live pictures."""
+
+    @app.get(
+        f"{PREFIX}/snapshot/{{camera}}",
+        summary="A picture; its facts are in X-Mastctl headers",
+        response_class=Response,
+        responses={200: {"content": {"image/png": {}, "image/jpeg": {}}}},
+    )
+    async def snapshot(camera: str, query: Annotated[SnapshotQuery, Query()], here: Here) -> Response:
+        service, waiting = here.service, here.waiting
+        service.check_camera(camera)
+        frame_id = query.frame_id
+
+        def picture() -> Response:
+            if frame_id is None:
+                frame = service.snapshot(camera, query.fresh)
+            else:
+                frame = service.kept_frame(camera, frame_id)
+            data = waiting.encode(lambda: encoded(frame.image, query.format))
+            return Response(data, media_type=f"image/{query.format}", headers=headers_of(frame))
+
+        return await waiting.picture(camera, picture, kept=frame_id is not None)
 
     @app.websocket(IMAGES)
     async def socket(line: WebSocket, here: Here) -> None:

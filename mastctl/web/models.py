@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import Annotated, Any, Literal, Self, cast
 
 import numpy as np
@@ -153,16 +154,22 @@ class PointBody(TrackBody):
         if angles == 1:
             missing = "tilt_rad" if self.tilt_rad is None else "pan_rad"
             raise ValueError(f"{missing} is missing; pan_rad and tilt_rad go together")
-        self.request()
+        _ = self.request
 
+    @cached_property
     def request(self) -> PointRequest:
-        """Return it as the pointing loop takes it. Raises ValueError."""
+        """It as the pointing loop takes it. Raises ValueError."""
         target: Target
         if self.pan_rad is None or self.tilt_rad is None:
             target = self.target()
         else:
             target = AnglesTarget(self.pan_rad, self.tilt_rad)
         return PointRequest(target, self.aim, self.pointings, self.range_m, self.plane)
+
+    @property
+    def looks(self) -> int:
+        """How many pictures it takes."""
+        return 0 if isinstance(self.request.target, AnglesTarget) else self.pointings
 
 
 class PreviewBody(_Strict):
@@ -175,11 +182,12 @@ class PreviewBody(_Strict):
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
-        self.request()
+        _ = self.request
         return self
 
+    @cached_property
     def request(self) -> PointRequest:
-        """Return it as the pointing loop takes it. Raises ValueError."""
+        """It as the pointing loop takes it. Raises ValueError."""
         return PointRequest(self.pixel, self.aim, range_m=self.range_m, plane=self.plane)
 
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from fastapi import FastAPI, Request
 from fastapi.responses import Response
 
 from calib.geometry.rig import RigCamera
+from mastctl.answers import CameraMountTold, RigTold
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
 from mastctl.web.packed import ASK_AGAIN, FOR_GOOD, digest, text_answer
@@ -25,6 +27,8 @@ KINDS = {
     "svg": "image/svg+xml",
 }
 MOST_MAST_FILES = 100
+
+Stereo = Mapping[str, tuple[str, str]]
 
 
 def page_files() -> dict[str, bytes]:
@@ -52,7 +56,7 @@ def add_page(app: FastAPI) -> None:
             app.add_api_route(place, give, methods=["GET"], include_in_schema=False)
 
     @app.get(f"{PREFIX}/rig", summary="The configured cameras by the mast file in use")
-    async def rig(here: Here) -> dict[str, Any]:
+    async def rig(here: Here) -> RigTold:
         return await here.waiting.run(lambda: rig_told(here.service))
 
 
@@ -63,7 +67,7 @@ def _giver(data: bytes, kind: str, keep: str) -> Any:
     return give
 
 
-def rig_told(service: Service) -> dict[str, Any]:
+def rig_told(service: Service) -> RigTold:
     """Return what of the rig is drawn. Reads the folder of the mast file."""
     stored = service.stored
     names = service.config.hardware.cameras
@@ -75,7 +79,7 @@ def rig_told(service: Service) -> dict[str, Any]:
         "made": None if made is None else str(made)[:40],
         "written_s": _written_s(service.masts.in_use.path),
         "cameras": {
-            name: _mount(camera) | _partners(name, stored.rig.stereo, names)
+            name: _mount(name, camera, stored.rig.stereo, names)
             for name, camera in stored.rig.cameras.items()
             if name in names
         },
@@ -90,11 +94,12 @@ def _written_s(path: Path) -> float | None:
         return None
 
 
-def _mount(camera: RigCamera) -> dict[str, Any]:
+def _mount(name: str, camera: RigCamera, stereo: Stereo, names: Collection[str]) -> CameraMountTold:
     model = camera.model
     width, height = model.size_px
     x, y = (width - 1) / 2, (height - 1) / 2
     places = [(x, y), (0, y), (width - 1, y), (x, 0), (x, height - 1)]
+    pair, eye, partner = _partners(name, stereo)
     middle, left, right, top, bottom = model.ray(np.array(places, dtype=float)).directions
     return {
         "on": camera.on,
@@ -103,6 +108,9 @@ def _mount(camera: RigCamera) -> dict[str, Any]:
         "elevation_rad": math.asin(float(np.clip(-middle[2], -1.0, 1.0))),
         "width_rad": _between(left, right),
         "height_rad": _between(top, bottom),
+        "pair": pair,
+        "eye": eye,
+        "partner": partner if partner in names else None,
     }
 
 
@@ -110,10 +118,11 @@ def _between(one: np.ndarray, other: np.ndarray) -> float:
     return math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other))
 
 
-def _partners(name: str, stereo: Any, names: Any) -> dict[str, Any]:
+def _partners(name: str, stereo: Stereo) -> tuple[str | None, Literal["left", "right"] | None, str | None]:
+    """The pair of a camera, which eye of it, and the other one."""
     for pair, (left, right) in stereo.items():
-        if name in (left, right):
-            other = right if name == left else left
-            eye = "left" if name == left else "right"
-            return {"pair": pair, "eye": eye, "partner": other if other in names else None}
-    return {"pair": None, "eye": None, "partner": None}
+        if name == left:
+            return pair, "left", right
+        if name == right:
+            return pair, "right", left
+    return None, None, None

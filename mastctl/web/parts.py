@@ -12,7 +12,6 @@ from fastapi import Depends
 from fastapi.requests import HTTPConnection
 
 from mastctl.service.service import Service
-from mastctl.web.commands import Commands
 from mastctl.web.entrance import Entrance
 from mastctl.web.streams import Streams
 from mastctl.web.waiting import Waiting
@@ -28,8 +27,6 @@ class Parts:
         What the daemon holds.
     waiting
         Runs what may wait.
-    commands
-        Carries commands out.
     streams
         Who listens to events.
     entrance
@@ -38,7 +35,6 @@ class Parts:
 
     service: Service
     waiting: Waiting
-    commands: Commands
     streams: Streams
     entrance: Entrance
 

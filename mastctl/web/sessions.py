@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from fastapi import FastAPI, Request, Response
 
 from mastctl.access.access import SESSION_S
-from mastctl.commands.caller import Caller, Role
+from mastctl.answers import LoggedOut, Role, SessionTold
+from mastctl.commands.caller import Caller
 from mastctl.errors import NotNow
 from mastctl.web import PREFIX
 from mastctl.web.entrance import address_of, cookie_name, credentials
@@ -19,7 +18,7 @@ def add_sessions(app: FastAPI) -> None:
     """Log-in, log-out, and who one is."""
 
     @app.get(f"{PREFIX}/session", summary="Who asks, and what it may do")
-    async def session(request: Request, here: Here) -> dict[str, Any]:
+    async def session(request: Request, here: Here) -> SessionTold:
         access = here.entrance.access
         caller: Caller = request.scope["state"]["caller"]
         shown = credentials(request.scope, request.headers)
@@ -30,7 +29,7 @@ def add_sessions(app: FastAPI) -> None:
         return _told(caller.name, caller.role, caller.via, left_s, access is not None)
 
     @app.post(f"{PREFIX}/login", summary="Begin a page's session by a token")
-    async def login(body: LoginBody, request: Request, response: Response, here: Here) -> dict[str, Any]:
+    async def login(body: LoginBody, request: Request, response: Response, here: Here) -> SessionTold:
         access = here.entrance.access
         if access is None:
             raise NotNow("no_login", "nobody needs a token here: the daemon serves this machine only")
@@ -47,7 +46,7 @@ def add_sessions(app: FastAPI) -> None:
         return _told(token.name, token.role, "token", SESSION_S, True)
 
     @app.post(f"{PREFIX}/logout", summary="End a page's session")
-    async def logout(request: Request, response: Response, here: Here) -> dict[str, Any]:
+    async def logout(request: Request, response: Response, here: Here) -> LoggedOut:
         access, secure = here.entrance.access, here.entrance.names.secure
         shown = credentials(request.scope, request.headers)
         if access is not None and shown.session is not None:
@@ -57,5 +56,5 @@ def add_sessions(app: FastAPI) -> None:
         return {"logged_out": True}
 
 
-def _told(name: str, role: Role, via: str, ends_in_s: float | None, needs_token: bool) -> dict[str, Any]:
+def _told(name: str, role: Role, via: str, ends_in_s: float | None, needs_token: bool) -> SessionTold:
     return {"name": name, "role": role, "via": via, "ends_in_s": ends_in_s, "needs_token": needs_token}

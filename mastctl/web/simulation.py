@@ -14,6 +14,18 @@ from calib.targets.board_file import board_of, document_of
 from drivers.faults import BOUNDS, WHEN, FaultPanel
 from drivers.faults import Fault as SetFault
 from drivers.simulation_clock import MAX, SimulationClock
+from mastctl.answers import (
+    BoardStands,
+    BoardsTold,
+    FaultSet,
+    FaultsSet,
+    ParameterTold,
+    StandTold,
+    TimeTold,
+    TruthTold,
+    WordsTold,
+    WordTold,
+)
 from mastctl.as_json import as_json
 from mastctl.commands.entry import (
     SIMULATION_BOARD,
@@ -27,7 +39,7 @@ from mastctl.errors import BadRequest, NoLonger, NotKnown, NotNow
 from mastctl.motion.track import RoverPose
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
-from mastctl.web.commands import Headers
+from mastctl.web.commands import command
 from mastctl.web.models import BoardBody, FaultBody, FaultsQuery, StandBody, TimeBody, TruthQuery
 from mastctl.web.parts import Here
 
@@ -48,101 +60,91 @@ def add_simulation(app: FastAPI) -> None:
     """The fault switches of a simulated rover, and where it truly stands."""
 
     @app.get(f"{PREFIX}/simulation/pose", summary="Where the simulated rover truly stands")
-    async def true_pose(here: Here) -> dict[str, Any]:
+    async def true_pose(here: Here) -> StandTold:
         return await here.waiting.run(lambda: _stand_told(_rover(here.service, "true poses")))
 
-    @app.post(f"{PREFIX}/simulation/pose", summary="Put the simulated rover somewhere on its ground")
-    async def stand(body: StandBody, came: Headers, here: Here) -> dict[str, Any]:
-        def put() -> dict[str, Any]:
-            rover = _rover(here.service, "true poses")
-            rover.stand(body.x_m, body.y_m, body.heading_rad, body.pitch_rad, body.roll_rad)
-            return _stand_told(rover)
-
-        return await here.commands.run(SIMULATION_POSE, came, body.model_dump(), put)
+    @command(app, "POST /simulation/pose", SIMULATION_POSE, "Put the simulated rover somewhere on its ground")
+    def stand(body: StandBody, here: Here) -> StandTold:
+        rover = _rover(here.service, "true poses")
+        rover.stand(body.x_m, body.y_m, body.heading_rad, body.pitch_rad, body.roll_rad)
+        return _stand_told(rover)
 
     @app.get(f"{PREFIX}/simulation/boards", summary="The boards held up before the simulated rover")
-    async def boards(here: Here) -> dict[str, Any]:
+    async def boards(here: Here) -> BoardsTold:
         return await here.waiting.run(lambda: _boards_told(_rover(here.service, "boards")))
 
-    @app.post(f"{PREFIX}/simulation/boards/{{name}}", summary="Hold up a board, or move it")
-    async def put_board(name: BoardName, body: BoardBody, came: Headers, here: Here) -> dict[str, Any]:
-        def put() -> dict[str, Any]:
-            rover = _rover(here.service, "boards")
-            printed = None
-            if body.board is not None:
-                document = {key: value for key, value in body.board.items() if key != "schema"}
-                try:
-                    printed = board_of(name, "board", document)
-                except BadFile as error:
-                    raise BadRequest("bad_board", f"{error.place}: {error.reason}") from None
-            stands = rover.put_board(
-                name,
-                printed,
-                body.position_m,
-                turned_rad=body.turned_rad or (0.0, 0.0, 0.0),
-                rotation=body.rotation,
-                bow_m=(body.bow_m[0], body.bow_m[1]) if body.bow_m is not None else None,
-            )
-            return _board_told(rover, stands)
+    @command(app, "POST /simulation/boards/{name}", SIMULATION_BOARD, "Hold up a board, or move it")
+    def put_board(name: BoardName, body: BoardBody, here: Here) -> BoardStands:
+        rover = _rover(here.service, "boards")
+        printed = None
+        if body.board is not None:
+            document = {key: value for key, value in body.board.items() if key != "schema"}
+            try:
+                printed = board_of(name, "board", document)
+            except BadFile as error:
+                raise BadRequest("bad_board", f"{error.place}: {error.reason}") from None
+        stands = rover.put_board(
+            name,
+            printed,
+            body.position_m,
+            turned_rad=body.turned_rad or (0.0, 0.0, 0.0),
+            rotation=body.rotation,
+            bow_m=(body.bow_m[0], body.bow_m[1]) if body.bow_m is not None else None,
+        )
+        return _board_told(rover, stands)
 
-        return await here.commands.run(SIMULATION_BOARD, came, {"name": name, **body.model_dump()}, put)
-
-    @app.delete(f"{PREFIX}/simulation/boards/{{name}}", summary="Take a board away from the simulated rover")
-    async def take_board(name: BoardName, came: Headers, here: Here) -> dict[str, Any]:
-        def take() -> dict[str, Any]:
-            rover = _rover(here.service, "boards")
-            rover.take_board(name)
-            return _boards_told(rover)
-
-        return await here.commands.run(SIMULATION_BOARD_GONE, came, {"name": name}, take)
+    @command(
+        app,
+        "DELETE /simulation/boards/{name}",
+        SIMULATION_BOARD_GONE,
+        "Take a board away from the simulated rover",
+    )
+    def take_board(name: BoardName, here: Here) -> BoardsTold:
+        rover = _rover(here.service, "boards")
+        rover.take_board(name)
+        return _boards_told(rover)
 
     @app.get(f"{PREFIX}/simulation/time", summary="The simulated rover's time, and how fast it goes")
-    async def time(here: Here) -> dict[str, Any]:
+    async def time(here: Here) -> TimeTold:
         return await here.waiting.run(lambda: _time_told(here.service))
 
-    @app.post(f"{PREFIX}/simulation/time", summary="Let time pass where it does not pass by itself")
-    async def advance(body: TimeBody, came: Headers, here: Here) -> dict[str, Any]:
-        def pass_by() -> dict[str, Any]:
-            speed = _time_told(here.service)["speed"]
-            if speed != MAX:
-                words = f"at simulation.speed {speed:g} time passes by itself; it is let pass only at {MAX}"
-                raise NotNow("time_passes", words)
-            here.service.clock.sleep(body.advance_s)
-            return _time_told(here.service)
-
-        return await here.commands.run(SIMULATION_TIME, came, body.model_dump(), pass_by)
+    @command(app, "POST /simulation/time", SIMULATION_TIME, "Let time pass where it does not pass by itself")
+    def advance(body: TimeBody, here: Here) -> TimeTold:
+        speed = _time_told(here.service)["speed"]
+        if speed != MAX:
+            words = f"at simulation.speed {speed:g} time passes by itself; it is let pass only at {MAX}"
+            raise NotNow("time_passes", words)
+        here.service.clock.sleep(body.advance_s)
+        return _time_told(here.service)
 
     @app.get(f"{PREFIX}/simulation/truth", summary="What a pixel of a frame truly shows, or where a point is")
-    async def truth(query: Annotated[TruthQuery, Query()], here: Here) -> dict[str, Any]:
+    async def truth(query: Annotated[TruthQuery, Query()], here: Here) -> TruthTold:
         return await here.waiting.run(lambda: _truth(here.service, query))
 
     @app.get(f"{PREFIX}/simulation/words", summary="The fault words of each device, with their parameters")
-    async def words(here: Here) -> dict[str, Any]:
+    async def words(here: Here) -> WordsTold:
         return await here.waiting.run(lambda: {"devices": _words_told(_panel(here.service))})
 
     @app.get(f"{PREFIX}/simulation/faults", summary="The faults that are switched on")
-    async def faults(here: Here) -> dict[str, Any]:
+    async def faults(here: Here) -> FaultsSet:
         return await here.waiting.run(lambda: _faults_told(_panel(here.service)))
 
-    @app.post(f"{PREFIX}/simulation/faults", summary="Switch a fault on")
-    async def set_fault(body: FaultBody, came: Headers, here: Here) -> dict[str, Any]:
-        def act() -> dict[str, Any]:
-            panel = _panel(here.service)
-            panel.set(body.device, body.word, **body.parameters)
-            return _faults_told(panel)
+    @command(app, "POST /simulation/faults", SIMULATION_FAULT, "Switch a fault on")
+    def set_fault(body: FaultBody, here: Here) -> FaultsSet:
+        panel = _panel(here.service)
+        panel.set(body.device, body.word, **body.parameters)
+        return _faults_told(panel)
 
-        return await here.commands.run(SIMULATION_FAULT, came, body.model_dump(), act)
-
-    @app.delete(f"{PREFIX}/simulation/faults", summary="Switch the faults of one device, or all, off")
-    async def clear_faults(
-        query: Annotated[FaultsQuery, Query()], came: Headers, here: Here
-    ) -> dict[str, Any]:
-        def act() -> dict[str, Any]:
-            panel = _panel(here.service)
-            panel.clear(query.device)
-            return _faults_told(panel)
-
-        return await here.commands.run(SIMULATION_FAULTS_OFF, came, query.model_dump(exclude_none=True), act)
+    @command(
+        app,
+        "DELETE /simulation/faults",
+        SIMULATION_FAULTS_OFF,
+        "Switch the faults of one device, or all, off",
+    )
+    def clear_faults(query: Annotated[FaultsQuery, Query()], here: Here) -> FaultsSet:
+        panel = _panel(here.service)
+        panel.clear(query.device)
+        return _faults_told(panel)
 
 
 def _rover(service: Service, what: str) -> SimulatedRover:
@@ -158,12 +160,12 @@ def _panel(service: Service) -> FaultPanel:
     return _rover(service, "faults").faults
 
 
-def _stand_told(rover: SimulatedRover) -> dict[str, Any]:
+def _stand_told(rover: SimulatedRover) -> StandTold:
     pose = RoverPose(rover.site_from_rover).told(0.0)
     return {"position_m": pose["position_m"], "quaternion": pose["quaternion"]}
 
 
-def _board_told(rover: SimulatedRover, stands: BenchBoard) -> dict[str, Any]:
+def _board_told(rover: SimulatedRover, stands: BenchBoard) -> BoardStands:
     pose = rover.site_from_rover.inverse @ stands.site_from_board
     return {
         "board": document_of(stands.board),
@@ -173,18 +175,18 @@ def _board_told(rover: SimulatedRover, stands: BenchBoard) -> dict[str, Any]:
     }
 
 
-def _boards_told(rover: SimulatedRover) -> dict[str, Any]:
+def _boards_told(rover: SimulatedRover) -> BoardsTold:
     return {"boards": {name: _board_told(rover, one) for name, one in rover.boards.items()}}
 
 
-def _time_told(service: Service) -> dict[str, Any]:
+def _time_told(service: Service) -> TimeTold:
     _rover(service, "clocks")
     clock = service.clock
     speed = clock.speed if isinstance(clock, SimulationClock) else 1.0
-    return {"now_s": clock.now_s(), "speed": MAX if speed == math.inf else speed}
+    return {"now_s": clock.now_s(), "speed": "max" if speed == math.inf else speed}
 
 
-def _truth(service: Service, query: TruthQuery) -> dict[str, Any]:
+def _truth(service: Service, query: TruthQuery) -> TruthTold:
     """What a pixel of a frame truly shows, or where a point is. Raises NoLonger and as `frame_by_id`."""
     rover = _rover(service, "truths")
     frame = service.devices.frame_by_id(query.frame_id)
@@ -199,7 +201,7 @@ def _truth(service: Service, query: TruthQuery) -> dict[str, Any]:
         raise NoLonger("frame_too_old", str(error.args[0])) from None
 
 
-def _truth_told(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: Any) -> dict[str, Any]:
+def _truth_told(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: Any) -> TruthTold:
     """A point of the rover frame and its pixel as JSON; without a point nothing is known."""
     if point_m is None:
         return {"position_in_site_m": None, "position_m": None, "pixel_px": None}
@@ -211,10 +213,10 @@ def _truth_told(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: An
     }
 
 
-def _words_told(panel: FaultPanel) -> dict[str, Any]:
+def _words_told(panel: FaultPanel) -> dict[str, dict[str, WordTold]]:
     """What each device takes as JSON; what has no end is null."""
 
-    def parameter(name: str, usual: float) -> dict[str, float | None]:
+    def parameter(name: str, usual: float) -> ParameterTold:
         least, most = BOUNDS[name]
         return {"usual": as_json(usual), "least": least, "most": as_json(most)}
 
@@ -232,12 +234,17 @@ def _words_told(panel: FaultPanel) -> dict[str, Any]:
     }
 
 
-def _faults_told(panel: FaultPanel) -> dict[str, Any]:
+def _faults_told(panel: FaultPanel) -> FaultsSet:
     return {"faults": [_fault_told(fault) for fault in panel.active()]}
 
 
-def _fault_told(fault: SetFault) -> dict[str, Any]:
+def _fault_told(fault: SetFault) -> FaultSet:
     """A set fault as JSON; one without an end has ``end_s`` null."""
     finite = {name: value for name, value in fault.parameters.items() if math.isfinite(value)}
-    told = {"device": fault.device, "word": fault.word, "parameters": finite}
-    return {**told, "begin_s": fault.begin_s, "end_s": as_json(fault.end_s)}
+    return {
+        "device": fault.device,
+        "word": fault.word,
+        "parameters": finite,
+        "begin_s": fault.begin_s,
+        "end_s": as_json(fault.end_s),
+    }

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import cast
 
 from fastapi import FastAPI, Request, Response
 
+from mastctl.answers import CalibrationHealthTold, LiveTold, ReadyTold, SentinelTold, Word
 from mastctl.errors import Unable
 from mastctl.metrics.metrics import CONTENT_TYPE
 from mastctl.sentinel.folder import SENTINEL_FOLDER
 from mastctl.sentinel.standing import findings
-from mastctl.state.standing import Word
 from mastctl.web import PREFIX
 from mastctl.web.packed import passing_answer
 from mastctl.web.parts import Here
@@ -28,14 +28,14 @@ def add_watching(app: FastAPI) -> None:
         return Response(here.service.metrics.text(), media_type=CONTENT_TYPE)
 
     @app.get(f"{PREFIX}/health/live", summary="Whether requests are answered: they are")
-    async def live() -> dict[str, bool]:
+    async def live() -> LiveTold:
         return {"live": True}
 
     @app.get(
         f"{PREFIX}/health/ready",
         summary="Whether commands are carried out: 200 if they are, else 503 and why not",
     )
-    async def ready(here: Here) -> dict[str, str | bool]:
+    async def ready(here: Here) -> ReadyTold:
         now = here.service.machine.standing
         if now.word not in WELL:
             raise Unable("not_ready", f"{now.word}: {now.reason}" if now.reason else now.word)
@@ -56,12 +56,12 @@ def add_watching(app: FastAPI) -> None:
         f"{PREFIX}/calibration/health",
         summary="Whether residuals of the last days are as the mast file predicts",
     )
-    async def calibration(here: Here) -> dict[str, Any]:
+    async def calibration(here: Here) -> CalibrationHealthTold:
         service = here.service
-        return {**service.health.told(), "sentinel": service.sentinel.told()}
+        return cast(CalibrationHealthTold, {**service.health.told(), "sentinel": service.sentinel.told()})
 
     @app.get(f"{PREFIX}/sentinel", summary="What the drift sentinel's looks say, and how old the last one is")
-    async def sentinel(here: Here) -> dict[str, Any]:
+    async def sentinel(here: Here) -> SentinelTold:
         service = here.service
         folder = service.folder.path / SENTINEL_FOLDER
-        return await here.waiting.run(lambda: findings(folder, service.stored.digest))
+        return cast(SentinelTold, await here.waiting.run(lambda: findings(folder, service.stored.digest)))

@@ -22,7 +22,15 @@ from calib.matching.handed_over import Landed, MatchedHandoff
 from calib.matching.handoff import Eye
 from calib.matching.track import KeyPicture, Track
 from drivers.errors import NoReply
-from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, Hang, ScriptedLoop, fake_daemon, rig
+from hil_tests.mastctl.service_fakes import (
+    CONFIG,
+    FakeHardware,
+    Hang,
+    ScriptedLoop,
+    asked_plainly,
+    fake_daemon,
+    rig,
+)
 from hil_tests.waiting import NET_S, until
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
@@ -294,9 +302,9 @@ def test_hand_offs_that_tell_an_offset_say_so(
     until(lambda: path.exists() and len(read_log(path).handoffs) == 12, "the record is written")
     folder = daemon.service.config.mast_file.parent
     save_rig(replace(rig(), name="better"), folder / "better.yaml")
-    client._daemon.json("POST", "/mast", json={"file": "better.yaml"})
+    asked_plainly(client, "POST", "/mast", json={"file": "better.yaml"})
     assert client.track()["self_check"] == {"handoffs": 0, "offsets": []}
-    client._daemon.json("POST", "/mast/back")
+    asked_plainly(client, "POST", "/mast/back")
     assert len(client.track()["self_check"]["offsets"]) == 1
 
 
@@ -427,7 +435,7 @@ def test_bodies_of_poses_that_make_no_sense_are_refused(
 ) -> None:
     body = {"position_m": [0, 0, 0], "quaternion": [1, 0, 0, 0], **change}
     with pytest.raises(ClientError) as refused:
-        client._daemon.json("POST", "/pose", json=body)
+        asked_plainly(client, "POST", "/pose", json=body)
     assert (refused.value.code, refused.value.exit_code) == ("bad_request", 2)
     assert words in str(refused.value)
     assert client.track()["pose"] is None
@@ -646,7 +654,7 @@ def test_another_mast_file_ends_the_track(client: Client, daemon: RunningDaemon)
         replace(rig(), name="better", mast=Mast(np.array([0.31, 0, -1.41]), np.zeros(3))),
         folder / "better.yaml",
     )
-    client._daemon.json("POST", "/mast", json={"file": "better.yaml"})
+    asked_plainly(client, "POST", "/mast", json={"file": "better.yaml"})
     track = client.track()
     assert track["state"] == "stopped"
     assert "mast file better.yaml came into use" in track["reason"]

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import BadOptions, NoReply
+from hil_tests.mastctl.service_fakes import asked_plainly
 from hil_tests.waiting import NET_S, joined, until
 from mastctl.client import Client, ClientError
 from mastctl.config import Config, load_config
@@ -131,7 +132,7 @@ def test_a_wait_ends_with_the_operation_and_its_own_time_is_that_of_who_waits() 
         assert record["state"] == "done"
         assert record["ended_s"] - record["started_s"] > 2.0
         assert client.wait_state("ready", timeout_s=NET_S)["state"] == "ready"
-        jog = client._daemon.json("POST", "/jog", json={"pan_rad_per_s": 0.2, "tilt_rad_per_s": 0.0})["id"]
+        jog = asked_plainly(client, "POST", "/jog", json={"pan_rad_per_s": 0.2, "tilt_rad_per_s": 0.0})["id"]
         with pytest.raises(ClientError, match=r"has not ended after 0\.3 s") as refused:
             client.wait(jog, timeout_s=0.3)  # the rover's time stands: no heartbeat is missed
         assert refused.value.code == "timeout"

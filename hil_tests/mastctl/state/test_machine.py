@@ -16,11 +16,12 @@ import pytest
 
 from drivers.clock import ManualClock
 from hil_tests.waiting import joined
+from mastctl.answers import Word
 from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.state.faults import StandingFault
 from mastctl.state.machine import Machine
 from mastctl.state.publisher import Publisher, Topic
-from mastctl.state.standing import Latched, Residual, Standing, Word
+from mastctl.state.standing import Latched, Residual, Standing
 from mastctl.state.table import CHOICES, EVENTS, HAPPENS, MEANINGS, TABLE, WORDS, leads_to
 
 LATCH = Latched("Ana", "a hand in the way", "2026-01-02T03:04:05Z")

@@ -15,7 +15,7 @@ import pytest
 from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, fake_daemon
 from hil_tests.waiting import NET_S
 from mastctl.access.tokens import TokenList
-from mastctl.commands.caller import Role
+from mastctl.answers import Role
 from mastctl.daemon import RunningDaemon
 
 NAME = "rover.test"

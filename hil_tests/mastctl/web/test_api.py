@@ -605,10 +605,10 @@ def test_the_description_is_made_once_and_holds_no_stop_up(
 ) -> None:
     making, plain, made = Hang(), described_module._describe, []
 
-    def slow(document: Any) -> None:
+    def slow(document: Any, answers: Any) -> None:
         making()
         made.append(document)
-        plain(document)
+        plain(document, answers)
 
     monkeypatch.setattr(described_module, "_describe", slow)
     described_module._made.cache_clear()

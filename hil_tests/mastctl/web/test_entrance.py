@@ -20,7 +20,7 @@ from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, fake_daemon
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
 from hil_tests.waiting import NET_S, until
 from mastctl.access.guesses import MOST_OF_ONE
-from mastctl.commands.caller import Role
+from mastctl.answers import Role
 from mastctl.web import guard
 
 ANGLES = {"pan_rad": 0.1, "tilt_rad": -0.1}

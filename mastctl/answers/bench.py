@@ -1,22 +1,19 @@
-"""What is told of guided bench calibrations and of reports, as /openapi.json describes it."""
+"""What is answered of guided bench calibrations and of reports."""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from annotated_types import Len
+from typing_extensions import TypedDict
 
-from mastctl.guided.told import MOST_CELLS, State, Step
-from mastctl.web.answer import Told
-from mastctl.web.answers import Angles, Count, MaybePixel, Pixel
+from mastctl.answers.words import MOST_CELLS, Angles, BenchState, BenchStep, Count, MaybePixel, Pixel
 
-Cells = Annotated[list[Count], Field(min_length=MOST_CELLS, max_length=MOST_CELLS)]
-Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
-OnCurve = Annotated[list[float], Field(min_length=2, max_length=2)]
-"""Pictures of a camera, and the rms predicted with them, pixels."""
+Cells = Annotated[list[Count], Len(MOST_CELLS, MOST_CELLS)]
+Pair = Annotated[list[float], Len(2, 2)]
 
 
-class PlacementAsked(Told):
+class PlacementAsked(TypedDict):
     """Where a board is asked for, from the head's axes; ``waits``: until somebody says that it stands.
 
     ``bearing_deg`` to the right of pan zero, ``height_deg`` above the axes, ``turned_deg``: its face, to the
@@ -32,21 +29,21 @@ class PlacementAsked(Told):
     waits: bool
 
 
-class CoverageTold(Told):
+class CoverageTold(TypedDict):
     """How many corners were seen in each cell of a camera's picture, 8 in a row, 6 rows."""
 
-    size_px: Annotated[list[Count], Field(min_length=2, max_length=2)]
+    size_px: Annotated[list[Count], Len(2, 2)]
     cells: Cells
 
 
-class ReasonTold(Told):
+class ReasonTold(TypedDict):
     """One reason of a verdict."""
 
     grade: str
     sentence: str
 
 
-class VerdictTold(Told):
+class VerdictTold(TypedDict):
     """Whether to trust a calibration: ``good``, ``care``, ``bad``, and why."""
 
     grade: str
@@ -54,7 +51,7 @@ class VerdictTold(Told):
     reasons: list[ReasonTold]
 
 
-class ResidualTold(Told):
+class ResidualTold(TypedDict):
     """Rms of a camera's corners: fitted, not fitted, and what was promised of those that were not."""
 
     camera: str
@@ -63,7 +60,7 @@ class ResidualTold(Told):
     promised_px: float | None
 
 
-class BenchResult(Told):
+class BenchResult(TypedDict):
     """What came of a bench calibration.
 
     ``pointing_...``: corners that were pointed at, measured and promised; ``calibrated_px``, ``counts_px``:
@@ -83,14 +80,14 @@ class BenchResult(Told):
     notes: list[str]
 
 
-class BenchRunTold(Told):
+class BenchRunTold(TypedDict):
     """A bench calibration as far as it is known; ``asking`` waits for a placement."""
 
     name: str
     begun: str
     by: str
-    state: State
-    step: Step
+    state: BenchState
+    step: BenchStep
     code: str | None
     sentence: str
     simulated: bool | None
@@ -107,7 +104,7 @@ class BenchRunTold(Told):
     expected_px: float | None
     next_rad: Angles | None
     cameras: dict[str, CoverageTold]
-    curve: list[OnCurve]
+    curve: list[Pair]
     sentences: list[str]
     odd: Count
     result: BenchResult | None
@@ -115,7 +112,7 @@ class BenchRunTold(Told):
     report: str | None
 
 
-class BenchListed(Told):
+class BenchListed(TypedDict):
     """A bench calibration whose folder is there; ``size_mb``: of its pictures."""
 
     name: str
@@ -131,7 +128,7 @@ class BenchListed(Told):
     report: str | None
 
 
-class BenchTold(Told):
+class BenchTold(TypedDict):
     """The bench calibration at work or the last one, those whose folders are there, and packaged boards."""
 
     run: BenchRunTold | None
@@ -142,13 +139,13 @@ class BenchTold(Told):
     simulated: bool
 
 
-class BenchBegun(Told):
+class BenchBegun(TypedDict):
     """A bench calibration that has begun or goes on, is answered, or has ended."""
 
     run: BenchRunTold
 
 
-class ReportListed(Told):
+class ReportListed(TypedDict):
     """A report that can be read."""
 
     name: str
@@ -156,7 +153,7 @@ class ReportListed(Told):
     written: str
 
 
-class ReportsTold(Told):
+class ReportsTold(TypedDict):
     """The reports, the newest first, and the folder where others may be put."""
 
     reports: list[ReportListed]

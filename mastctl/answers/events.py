@@ -1,26 +1,15 @@
-"""What the event stream tells, as /openapi.json describes it: by the models of the routes' answers."""
+"""What the event stream tells: by the answers of the routes, where a route tells the same."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal, NotRequired
 
-from pydantic import Field, RootModel
+from typing_extensions import TypedDict
 
-from mastctl.commands.caller import Role
-from mastctl.web.answer import Told
-from mastctl.web.answers import (
-    Count,
-    FaultTold,
-    Joints,
-    Json,
-    LeaseTold,
-    MastTold,
-    OperationTold,
-    Seconds,
-    StandingTold,
-    TrackTold,
-)
-from mastctl.web.bench_answers import BenchRunTold
+from mastctl.answers.bench import BenchRunTold
+from mastctl.answers.motion import OperationTold, TrackTold
+from mastctl.answers.status import FaultTold, Joints, LeaseTold, MastTold, StandingTold
+from mastctl.answers.words import Count, Json, Role, Seconds
 
 
 class HeadTold(Joints):
@@ -36,7 +25,7 @@ class StateTold(StandingTold):
     moving: bool
 
 
-class FrameTold(Told):
+class FrameTold(TypedDict):
     """The facts of a camera's newest frame, without its picture."""
 
     frame_id: str
@@ -55,7 +44,7 @@ class FrameTold(Told):
     age_s: Seconds
 
 
-class CommandTold(Told):
+class CommandTold(TypedDict):
     """A command as it is recorded, or (``ended``) how the operation ended that it began."""
 
     number: Count
@@ -65,19 +54,19 @@ class CommandTold(Told):
     who: str
     role: Role
     via: str
-    address: str | None = None
-    request: Json | None = None
-    lease: str | None = None
-    again: bool = False
-    result: str | None = None
-    message: str | None = None
-    operation: str | None = None
-    ended: str | None = None
-    state: str | None = None
-    code: str | None = None
+    address: NotRequired[str | None]
+    request: NotRequired[Json | None]
+    lease: NotRequired[str | None]
+    again: NotRequired[bool]
+    result: NotRequired[str | None]
+    message: NotRequired[str | None]
+    operation: NotRequired[str | None]
+    ended: NotRequired[str | None]
+    state: NotRequired[str | None]
+    code: NotRequired[str | None]
 
 
-class _Event(Told):
+class _Event(TypedDict):
     """``sequence`` grows with each event; ``lost``: how many this listener was too slow to get, so far."""
 
     key: str
@@ -155,7 +144,7 @@ class BenchEvent(_Event):
     value: BenchRunTold
 
 
-Kinds = (
+Event = (
     StateEvent
     | JointsEvent
     | OperationEvent
@@ -167,7 +156,4 @@ Kinds = (
     | LeaseEvent
     | BenchEvent
 )
-
-
-class Event(RootModel[Annotated[Kinds, Field(discriminator="topic")]]):
-    """One event of ``/events``."""
+"""One event of ``/events``, told apart by its ``topic``."""

@@ -1,0 +1,14 @@
+"""What the daemon tells, key by key: the service makes these records, the web side describes them, and the
+event stream, recordings and clients have them.
+
+They are plain dictionaries; a type checker holds whoever makes or reads one to its keys. Each key is there
+unless it is ``NotRequired``; others may come later.
+"""
+
+from mastctl.answers.bench import *  # noqa: F403
+from mastctl.answers.events import *  # noqa: F403
+from mastctl.answers.keeping import *  # noqa: F403
+from mastctl.answers.motion import *  # noqa: F403
+from mastctl.answers.simulation import *  # noqa: F403
+from mastctl.answers.status import *  # noqa: F403
+from mastctl.answers.words import *  # noqa: F403

@@ -1,0 +1,243 @@
+"""What is answered where the head is sent, turned or stopped: operations, previews, stops, the track."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, NotRequired
+
+from annotated_types import Len
+from typing_extensions import TypedDict
+
+from mastctl.answers.status import EstopHeld, PoseTold
+from mastctl.answers.words import (
+    Angles,
+    Count,
+    ErrorTold,
+    Json,
+    MaybePixel,
+    OperationState,
+    Pixel,
+    Point,
+    Seconds,
+    TrackState,
+)
+
+
+class StepTold(TypedDict):
+    """One step of an operation; ``detail`` has units in its names."""
+
+    name: str
+    state: Literal["done", "failed"]
+    started_s: float
+    duration_s: float
+    detail: Json
+
+
+class PointingTold(TypedDict):
+    """One pointing, and what was measured after it in a new picture."""
+
+    commanded_pan_rad: float
+    commanded_tilt_rad: float
+    measured_pan_rad: float
+    measured_tilt_rad: float
+    true_pan_rad: float
+    true_tilt_rad: float
+    camera: str
+    frame_id: str
+    aim_px: Pixel | None
+    predicted_px: Pixel | None
+    target_px: Pixel | None
+    residual_px: MaybePixel | None
+    residual_sigma_px: MaybePixel | None
+    predicted_sigma_px: Pixel | None
+    predicted_covariance_px2: list[Pixel] | None
+    note: str
+    motion_evidence: dict[str, Json]
+
+
+class OperationListed(TypedDict):
+    """An operation without its steps; ``ended_because`` of a jog. Times of CLOCK_MONOTONIC."""
+
+    id: str
+    state: OperationState
+    request: Json
+    created_s: float
+    started_s: float | None
+    ended_s: float | None
+    error: ErrorTold | None
+    residual_px: MaybePixel | None
+    residual_sigma_px: MaybePixel | None
+    position_m: Point | None
+    range_m: float | None
+    range_from: str
+    range_interval_m: list[float | None] | None
+    pointings: list[PointingTold]
+    ended_because: NotRequired[str | None]
+
+
+class OperationTold(OperationListed):
+    """``GET /operations/{id}``: the same with its steps."""
+
+    steps: list[StepTold]
+
+
+class Operations(TypedDict):
+    """``GET /operations``: the newest first."""
+
+    operations: list[OperationListed]
+
+
+class Started(TypedDict):
+    """What was started: the id of its operation."""
+
+    id: str
+
+
+class AimTold(TypedDict):
+    """Where a target would come."""
+
+    camera: str
+    x_px: float
+    y_px: float
+
+
+class RefusedTold(TypedDict):
+    """Why the head would not be sent."""
+
+    code: str
+    message: str
+
+
+class PreviewTold(TypedDict):
+    """``POST /point/preview``: what a clicked pixel shows, before anything moves."""
+
+    camera: str
+    frame_id: str
+    pixel_px: Pixel
+    other_camera: str | None
+    other_frame_id: str | None
+    other_pixel_px: Pixel | None
+    other_sigma_px: Pixel | None
+    correlation: float | None
+    second: float | None
+    across_px: float | None
+    position_m: Point
+    sigma_m: Point | None
+    range_m: float
+    range_sigma_m: float | None
+    range_from: str
+    range_interval_m: list[float | None] | None
+    aim: AimTold
+    goal_rad: Angles | None
+    refused: RefusedTold | None
+
+
+class JogTold(TypedDict):
+    """``POST /jog``: the jog's operation, whether the heartbeat was taken, and what holds an axis."""
+
+    id: str | None
+    taken: bool
+    held: dict[str, str]
+
+
+class StopTold(TypedDict):
+    """``POST /stop``: the head has confirmed it; the operation that was stopped with it."""
+
+    stopped: Literal[True]
+    operation: str | None
+
+
+class EstopTold(EstopHeld):
+    """``POST /estop``: confirmed. ``kept``: a restart would find it; else ``message`` says why not."""
+
+    stopped: Literal[True]
+    latched: Literal[True]
+    kept: bool
+    operation: str | None
+    message: NotRequired[str | None]
+
+
+class ResetTold(TypedDict):
+    """``POST /reset``: the emergency stop that was released, and those that are ``left``."""
+
+    latched: bool
+    released: EstopHeld
+    left: list[EstopHeld]
+
+
+class EyeTold(TypedDict):
+    """What one eye told of the target; pixel and sigma are null without a good verdict."""
+
+    frame_id: str
+    verdict: str
+    reason: str
+    x_px: float | None
+    y_px: float | None
+    sigma_px: MaybePixel
+    correlation: float | None
+
+
+class HandoffTold(TypedDict):
+    """The target went from one pair to another, at a range of the new one."""
+
+    from_pair: str
+    to_pair: str
+    range_m: float
+
+
+class OffsetTold(TypedDict):
+    """What hand-offs from ``source`` to ``camera`` tell by more than chance: found less predicted."""
+
+    source: str
+    camera: str
+    handoffs: Count
+    left_out: Count
+    offset_px: Pixel
+    sigma_px: Pixel
+    sigmas: float
+    sentence: str
+
+
+class SelfCheck(TypedDict):
+    """How the mast file in use agrees with the hand-offs."""
+
+    handoffs: Count
+    offsets: list[OffsetTold]
+
+
+class TrackStands(TypedDict):
+    """How a track stands, without what its hand-offs say of the mast file."""
+
+    sequence: Count
+    state: TrackState
+    reason: str
+    id: str | None
+    predicted: bool
+    operation: str | None
+    looks: Count
+    misses: Count
+    handoffs: list[HandoffTold]
+    renewals: Count
+    range_m: float | None
+    pair: str | None
+    pixels: dict[str, EyeTold]
+    chi2: float | None
+    renewed: bool
+    pose_doubt: str
+    position_m: Point | None
+    position_in_site_m: Point | None
+    covariance_m2: Annotated[list[Point], Len(3, 3)] | None
+    pose: PoseTold | None
+    age_s: Seconds
+
+
+class TrackTold(TrackStands):
+    """``GET /track``, and each event of ``GET /track/stream``."""
+
+    self_check: SelfCheck
+
+
+class PoseTaken(TypedDict):
+    """``POST /pose``: the look that follows, if one does, and the track."""
+
+    operation: str | None
+    track: TrackTold

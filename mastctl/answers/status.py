@@ -1,0 +1,233 @@
+"""What a daemon is and does at this moment: `Status`, and the parts that others have too."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from typing_extensions import TypedDict
+
+from mastctl.answers.words import Angles, Count, Json, Pixel, Point, Quaternion, Seconds, TrackState, Word
+
+
+class LiveTold(TypedDict):
+    """``GET /health/live``."""
+
+    live: Literal[True]
+
+
+class ReadyTold(TypedDict):
+    """``GET /health/ready`` where commands are carried out: the state with its reason."""
+
+    ready: Literal[True]
+    state: Word
+    reason: str
+
+
+class Joints(TypedDict):
+    """The head's joints as last measured, radians; ``measured_s`` of CLOCK_MONOTONIC.
+
+    ``true_...`` by the mast file's ``joints``; ``..._approach``: from which side an axis came, 1 from smaller
+    readings, -1 from larger, 0 not known.
+    """
+
+    pan_rad: float
+    tilt_rad: float
+    true_pan_rad: float
+    true_tilt_rad: float
+    pan_approach: float
+    tilt_approach: float
+    measured_s: float
+    age_s: Seconds
+
+
+class AxisTold(TypedDict):
+    """How an axis of the head moves; ``count_rad`` null where nobody knows."""
+
+    count_rad: float | None
+    one_sided: bool
+
+
+class BoxTold(TypedDict):
+    """Where the head must not be: [lowest, highest] of each joint, radians."""
+
+    name: str
+    pan_rad: Angles
+    tilt_rad: Angles
+
+
+class SoftLimits(TypedDict):
+    """[lowest, highest] of each joint, radians, the fastest speed, rad/s, and where the head must not be."""
+
+    pan_rad: Angles
+    tilt_rad: Angles
+    speed_rad_per_s: float
+    margin_rad: float
+    acceleration_rad_per_s2: float | None
+    keep_out: list[BoxTold]
+
+
+class Sun(TypedDict):
+    """The direction that no head camera looks into; ``left_s``: how long that holds, null for good."""
+
+    direction: Point
+    frame: Literal["site", "rover"]
+    half_angle_rad: float
+    left_s: Seconds | None
+    holds: bool
+
+
+class SunTold(TypedDict):
+    """``GET /limits/sun``; null where none was told. ``boxes``: of joints, within its cone while it holds."""
+
+    sun: Sun | None
+    boxes: list[BoxTold]
+
+
+class CameraTold(TypedDict):
+    """A camera's newest frame; all null before the first."""
+
+    frame_id: str | None
+    sequence: int | None
+    exposure_s: float | None
+    age_s: Seconds | None
+
+
+class FaultTold(TypedDict):
+    """What is wrong with a device, in plain words, for how long, and what takes it back."""
+
+    device: str
+    code: str
+    message: str
+    until: str
+    for_s: Seconds
+
+
+class PoseTold(TypedDict):
+    """Where the rover stands in the site; ``time_s`` by the sender's clock."""
+
+    position_m: Point
+    quaternion: Quaternion
+    time_s: float | None
+    age_s: Seconds
+
+
+class TrackWord(TypedDict):
+    """The track in a word."""
+
+    state: TrackState
+    reason: str
+    id: str | None
+
+
+class MastTold(TypedDict):
+    """A mast file: its name on disk, the mast's, and the SHA-256 of its bytes."""
+
+    file: str
+    name: str
+    digest: str
+
+
+class SentinelTold(TypedDict):
+    """``GET /sentinel``: what its looks say together; ``none`` without a reference.
+
+    ``reference``, ``last_look`` and ``since`` (of a change) as ISO 8601.
+    """
+
+    level: Literal["none", "good", "unsure", "bad"]
+    sentence: str
+    looks: Count
+    since: str | None
+    last_look: str | None
+    age_s: Seconds | None
+    reference: str | None
+
+
+class CalibrationTold(TypedDict):
+    """Whether residuals are as the mast file predicts; ``since`` (ISO 8601, UTC) where they are not."""
+
+    verdict: Literal["good", "drifts", "few", "unknown"]
+    sentence: str
+    pointings: Count
+    since: str | None
+
+
+class LastResidual(TypedDict):
+    """The last measured residual, with one sigma, and the operation that measured it."""
+
+    residual_px: Pixel
+    residual_sigma_px: Pixel
+    operation: str
+
+
+class ControlTold(TypedDict):
+    """Who steers, by a lease or by what runs; ``until`` by the wall clock, null for as long as it runs."""
+
+    holder: str
+    kind: Literal["lease", "operation"]
+    for_s: Seconds | None
+    until: str | None
+
+
+class LeaseTold(TypedDict):
+    """``GET /lease``: who steers; null for nobody."""
+
+    control: ControlTold | None
+
+
+class LeaseRuns(TypedDict):
+    """How long a lease runs on, and when it ends by the wall clock."""
+
+    holder: str
+    for_s: Seconds
+    until: str
+
+
+class LeaseGranted(LeaseRuns):
+    """A lease that commands carry as ``Mastctl-Lease``."""
+
+    lease_id: str
+
+
+class EstopHeld(TypedDict):
+    """The emergency stop that is latched: why, by whom, when (ISO 8601, UTC)."""
+
+    reason: str
+    name: str
+    at: str
+
+
+class StandingTold(TypedDict):
+    """What the daemon is doing: the state's word, why, for how long, and what it rests on."""
+
+    state: Word
+    reason: str
+    state_for_s: Seconds
+    operation: str | None
+    target: Json | None
+    last_residual: LastResidual | None
+    estop: EstopHeld | None
+    estops: list[EstopHeld]
+
+
+class Status(StandingTold):
+    """``GET /status``."""
+
+    simulated: bool
+    hardware: str
+    moving: bool
+    joints: Joints | None
+    axes: dict[str, AxisTold]
+    limits: SoftLimits
+    pose: PoseTold | None
+    track: TrackWord
+    control: ControlTold | None
+    stop_socket: str | None
+    calibration: CalibrationTold | None
+    sentinel: SentinelTold | None
+    cameras: dict[str, CameraTold]
+    faults: list[FaultTold]
+    mast: MastTold
+    former_mast: MastTold | None
+    version: str
+    now_s: float
+    uptime_s: Seconds

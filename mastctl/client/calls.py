@@ -1,0 +1,396 @@
+"""Every question of a client, once for the one that waits and the one for asyncio.
+
+A question is a coroutine over a `mastctl.client.connection.Daemon`, which alone sends and waits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal, cast
+from urllib.parse import quote
+
+from mastctl.answers import (
+    EstopTold,
+    Event,
+    OperationListed,
+    Operations,
+    OperationTold,
+    PoseTaken,
+    PreviewTold,
+    ResetTold,
+    Started,
+    StateTold,
+    Status,
+    StepTold,
+    StopTold,
+    TrackTold,
+)
+from mastctl.client.connection import ClientError, Daemon
+from mastctl.client.following import followed
+from mastctl.client.jog import ANSWER_S, Jog
+from mastctl.client.keeping_calls import KeepingCalls
+from mastctl.client.lease import LeaseCalls
+from mastctl.client.simulation_calls import SimulationCalls
+
+if TYPE_CHECKING:
+    from mastctl.client.snapshot import Snapshot
+
+ENDED = ("done", "failed", "stopped")
+
+
+class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
+    """The questions to one daemon; errors as `mastctl.client.Client` has them.
+
+    Parameters
+    ----------
+    daemon
+        The connection that they go through.
+    """
+
+    def __init__(self, daemon: Daemon) -> None:
+        self._daemon = daemon
+
+    async def status(self) -> Status:
+        """Return what the daemon knows at this moment."""
+        return await self._daemon.json(Status, "GET", "/status")
+
+    async def point(
+        self,
+        *,
+        pixel: tuple[str, str, float, float] | None = None,
+        position_m: Sequence[float] | None = None,
+        frame: Literal["rover", "site"] | None = None,
+        pan_rad: float | None = None,
+        tilt_rad: float | None = None,
+        aim: tuple[str, float, float] | None = None,
+        pointings: int | None = None,
+        range_m: float | None = None,
+        plane: Mapping[str, Sequence[float]] | None = None,
+        deadline_s: float | None = None,
+        idempotency_key: str | None = None,
+    ) -> str:
+        """Start a pointing operation and return its id.
+
+        Parameters
+        ----------
+        pixel
+            (camera, frame id, x, y), pixels; or
+        position_m, frame
+            a point, metres, in the ``rover`` (default) or ``site`` frame; or
+        pan_rad, tilt_rad
+            joint angles.
+        aim
+            (camera, x, y): where the target shall come; the daemon's default when left out.
+        pointings
+            1 (default) or 2.
+        range_m, plane
+            How far what the pixel shows is from its camera, metres, or a plane of the rover frame in which it
+            lies: ``{"point_m": (x, y, z), "normal": (x, y, z)}``, level without ``normal``. The pair's other
+            eye is not asked then.
+        deadline_s
+            How long it is given, seconds of the daemon's clock; then the head is stopped and the operation
+            fails with ``deadline_passed``. By default from the longest way and the speed.
+        idempotency_key
+            The same for each try of one command; a new one by default.
+        """
+        body = _target(pixel, position_m, frame)
+        if aim is not None:
+            body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
+        others = {"pan_rad": pan_rad, "tilt_rad": tilt_rad, "pointings": pointings}
+        body |= _how_far(range_m, plane)
+        body |= {key: value for key, value in others.items() if value is not None}
+        started = await self._daemon.command(
+            Started, "POST", "/point", body, key=idempotency_key, deadline_s=deadline_s
+        )
+        return started["id"]
+
+    async def preview(
+        self,
+        pixel: tuple[str, str, float, float],
+        *,
+        aim: tuple[str, float, float] | None = None,
+        range_m: float | None = None,
+        plane: Mapping[str, Sequence[float]] | None = None,
+    ) -> PreviewTold:
+        """Return what a pixel (camera, frame id, x, y) shows and where `point` would send the head.
+
+        Nothing moves. ``position_m`` with ``sigma_m``, ``range_m``, the match in the other eye, ``goal_rad``,
+        and ``refused`` where the head would not be sent. ``range_m`` and ``plane`` as for `point`.
+        """
+        body = _target(pixel, None, None) | _how_far(range_m, plane)
+        if aim is not None:
+            body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
+        return await self._daemon.json(PreviewTold, "POST", "/point/preview", json=body)
+
+    async def operation(self, operation_id: str) -> OperationTold:
+        """Return an operation's record."""
+        return await self._daemon.json(OperationTold, "GET", f"/operations/{quote(operation_id, safe='')}")
+
+    async def operations(self) -> list[OperationListed]:
+        """Return the newest operations, newest first, without their steps."""
+        return (await self._daemon.json(Operations, "GET", "/operations"))["operations"]
+
+    async def wait(
+        self,
+        operation_id: str,
+        timeout_s: float = 60.0,
+        on_step: Callable[[StepTold], None] | None = None,
+    ) -> OperationTold:
+        """Wait until an operation has ended (done, failed or stopped) and return its record.
+
+        Parameters
+        ----------
+        on_step
+            Called with each step as it comes.
+
+        Raises
+        ------
+        ClientError
+            ``timeout``, if it has not ended in time; it goes on.
+        """
+        told = 0
+        query = {"topics": "operation", "key": operation_id}
+        changes = followed(self._daemon, query, lambda: self.operation(operation_id), timeout_s)
+        async for record in changes:
+            for step in record["steps"][told:]:
+                told += 1
+                if on_step is not None:
+                    on_step(step)
+            if record["state"] in ENDED:
+                return record
+        raise ClientError("timeout", f"operation {operation_id} has not ended after {timeout_s:g} s")
+
+    async def wait_state(
+        self,
+        *states: str,
+        timeout_s: float = 60.0,
+        on_change: Callable[[Status | StateTold], None] | None = None,
+    ) -> Status | StateTold:
+        """Wait until the daemon's state is one of some words; return ``state``, ``reason`` and what goes with
+        them in the status.
+
+        Parameters
+        ----------
+        on_change
+            Called with the same at the beginning and at each change.
+
+        Raises
+        ------
+        ClientError
+            ``timeout``, if it was none of them in time.
+        """
+        word = ""
+        async for told in followed(self._daemon, {"topics": "state"}, self.status, timeout_s):
+            word = told["state"]
+            if on_change is not None:
+                on_change(told)
+            if word in states:
+                return told
+        wanted = " or ".join(states)
+        raise ClientError("timeout", f"the state is {word} and not {wanted} after {timeout_s:g} s")
+
+    async def events(self, *topics: str, keys: Sequence[str] = ()) -> AsyncGenerator[Event]:
+        """Yield each change of some topics (all without any) and keys, beginning with what is known, until
+        the daemon ends: ``topic``, ``key``, ``sequence``, ``lost``, ``value``.
+        """
+        query: dict[str, Any] = {"key": list(keys)} if keys else {}
+        if topics:
+            query["topics"] = ",".join(topics)
+        async for event in self._daemon.heard("/events", query):
+            if event is not None:
+                yield cast(Event, event)
+
+    async def stop(self) -> StopTold:
+        """Stop the mast and the running operation."""
+        return await self._daemon.json(StopTold, "POST", "/stop")
+
+    async def estop(self, *, reason: str | None = None, name: str | None = None) -> EstopTold:
+        """Stop the mast and let nothing move it until `reset`; ``kept`` says whether a restart would know."""
+        body = {"reason": reason, "name": name}
+        told = {key: value for key, value in body.items() if value is not None}
+        return await self._daemon.json(EstopTold, "POST", "/estop", json=told)
+
+    async def reset(self, *, reason: str, name: str, of: str | None = None) -> ResetTold:
+        """Release an emergency stop, of several that of ``of``; nothing moves before the next command."""
+        told = {"reason": reason, "name": name, **({} if of is None else {"of": of})}
+        return await self._daemon.json(ResetTold, "POST", "/reset", json=told)
+
+    async def pose(
+        self,
+        position_m: Sequence[float],
+        quaternion: Sequence[float],
+        *,
+        covariance: Sequence[Sequence[float]] | None = None,
+        sigma: tuple[float, float] | None = None,
+        time_s: float | None = None,
+        look: bool = True,
+    ) -> PoseTaken:
+        """Say where the rover stands; return the track as it is then, and the ``operation`` of a look.
+
+        Parameters
+        ----------
+        position_m, quaternion
+            site_from_rover: (x, y, z), metres, and (w, x, y, z).
+        covariance
+            6 rows of 6 of the motion since the pose before, along the rover's axes of this pose: x, y, z in
+            metres, then the turns about them in radians; or
+        sigma
+            (metres, radians): one sigma of each axis of its translation and of its rotation.
+        time_s
+            By the sender's clock.
+        look
+            Whether a track's target shall be looked for.
+        """
+        body: dict[str, Any] = {
+            "position_m": [float(value) for value in position_m],
+            "quaternion": [float(value) for value in quaternion],
+            "look": look,
+        }
+        if covariance is not None:
+            body["covariance"] = [[float(value) for value in row] for row in covariance]
+        if sigma is not None:
+            body["sigma"] = {"position_m": sigma[0], "rotation_rad": sigma[1]}
+        if time_s is not None:
+            body["time_s"] = time_s
+        return await self._daemon.json(PoseTaken, "POST", "/pose", json=body)
+
+    async def track(self) -> TrackTold:
+        """Return the track as it is."""
+        return await self._daemon.json(TrackTold, "GET", "/track")
+
+    async def start_track(
+        self,
+        *,
+        pixel: tuple[str, str, float, float] | None = None,
+        position_m: Sequence[float] | None = None,
+        frame: Literal["rover", "site"] | None = None,
+        deadline_s: float | None = None,
+        idempotency_key: str | None = None,
+    ) -> str:
+        """Start to follow a target and return the operation's id; arguments as for `point`."""
+        body = _target(pixel, position_m, frame)
+        started = await self._daemon.command(
+            Started, "POST", "/track", body, key=idempotency_key, deadline_s=deadline_s
+        )
+        return started["id"]
+
+    async def look(self, *, deadline_s: float | None = None, idempotency_key: str | None = None) -> str:
+        """Look for the track's target once more; return the operation's id."""
+        started = await self._daemon.command(
+            Started, "POST", "/track/look", key=idempotency_key, deadline_s=deadline_s
+        )
+        return started["id"]
+
+    async def wait_track(
+        self,
+        operation_id: str | None,
+        timeout_s: float = 60.0,
+        on_step: Callable[[StepTold], None] | None = None,
+    ) -> TrackTold:
+        """Wait until a start or a look of the track has ended; return the track after it.
+
+        ``None`` for the operation returns the track as it is. Raises ClientError as `wait`.
+        """
+        if operation_id is not None:
+            await self.wait(operation_id, timeout_s, on_step)
+        async for track in followed(self._daemon, {"topics": "track"}, self.track, timeout_s):
+            if operation_id is None or track["operation"] != operation_id:
+                return track
+        raise ClientError("timeout", f"the track did not take up operation {operation_id}")
+
+    async def watch_track(self) -> AsyncGenerator[TrackTold]:
+        """Yield the track as it is, and again at each change, until the daemon ends."""
+        async for track in self._daemon.heard("/track/stream"):
+            if track is not None:
+                yield cast(TrackTold, track)
+
+    async def stop_track(self) -> TrackTold:
+        """End the track; return it as it is then."""
+        return await self._daemon.json(TrackTold, "POST", "/track/stop")
+
+    def jog(self) -> Jog:
+        """Return a context in which the head turns at rates; it sends the heartbeats itself.
+
+        Examples
+        --------
+        ::
+
+            with client.jog() as jog:
+                jog.rates(0.2, 0.0)      # rad/s
+                time.sleep(1.5)
+        """
+        return Jog(lambda: self._daemon.beside(ANSWER_S))
+
+    async def snapshot(
+        self,
+        camera: str,
+        *,
+        fresh: bool = True,
+        frame_id: str | None = None,
+        format: Literal["png", "jpeg"] = "png",
+    ) -> Snapshot:
+        """Return a picture with its facts.
+
+        Parameters
+        ----------
+        camera
+            The camera's name.
+        fresh
+            Whether it must be exposed after the daemon got the request; else it is at most a second old.
+        frame_id
+            A frame that the daemon still keeps, instead of a new one.
+        format
+            ``png`` is lossless.
+        """
+        from mastctl.client.snapshot import read_snapshot  # the image library, only where there is an image
+
+        query: dict[str, str] = {"format": format}
+        if frame_id is None:
+            query["fresh"] = "true" if fresh else "false"
+        else:
+            query["frame_id"] = frame_id
+        answer = await self._daemon.ask("GET", f"/snapshot/{quote(camera, safe='')}", params=query)
+        try:
+            return read_snapshot(answer.content, answer.headers)
+        except ValueError as reason:
+            raise self._daemon.bad_answer(str(reason)) from None
+
+    async def _started(
+        self,
+        method: str,
+        path: str,
+        body: Mapping[str, Any] | None,
+        key: str | None,
+        deadline_s: float | None,
+    ) -> str:
+        """The id of an operation that is begun once."""
+        answer = await self._daemon.command(Started, method, path, body, key=key, deadline_s=deadline_s)
+        return answer["id"]
+
+    async def close(self) -> None:
+        """Let go of the connection."""
+        await self._daemon.close()
+
+
+def _how_far(range_m: float | None, plane: Mapping[str, Sequence[float]] | None) -> dict[str, Any]:
+    """What says how far a pixel's thing is, as a body has it."""
+    told: dict[str, Any] = {} if range_m is None else {"range_m": range_m}
+    if plane is not None:
+        told["plane"] = {key: list(values) for key, values in plane.items()}
+    return told
+
+
+def _target(
+    pixel: tuple[str, str, float, float] | None,
+    position_m: Sequence[float] | None,
+    frame: Literal["rover", "site"] | None,
+) -> dict[str, Any]:
+    """What a request says of its target: a pixel of a frame, or a point; what was not given is left out."""
+    body: dict[str, Any] = {}
+    if pixel is not None:
+        body["pixel"] = dict(zip(("camera", "frame_id", "x_px", "y_px"), pixel, strict=True))
+    if position_m is not None:
+        body["position_m"] = [float(value) for value in position_m]
+    if frame is not None:
+        body["frame"] = frame
+    return body

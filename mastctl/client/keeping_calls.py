@@ -1,0 +1,210 @@
+"""What a client asks of what a daemon keeps: its configuration, mast files, recordings, places, benches."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+from urllib.parse import quote
+
+from mastctl.answers import (
+    BenchBegun,
+    BenchRunTold,
+    BenchTold,
+    CalibrationHealthTold,
+    HistoryTold,
+    LoggedOut,
+    MastsTold,
+    PlacesTold,
+    PlaceTold,
+    RecorderTold,
+    RecordingDeleted,
+    RecordingEnded,
+    Recordings,
+    ReloadTold,
+    ReportsTold,
+    RigTold,
+    SentinelTold,
+    SessionTold,
+    SunTold,
+)
+from mastctl.client.connection import Daemon
+
+
+class KeepingCalls:
+    """What is asked of a daemon that moves no head."""
+
+    _daemon: Daemon
+
+    async def reload(self) -> ReloadTold:
+        """Have the daemon read its configuration again; return ``changed``, ``mast`` and ``notes``.
+
+        All of what it says comes into use while the head rests, or nothing (``restart_needed``,
+        ``bad_config``, ``bad_mast_file``, ``busy``, ``moving``).
+        """
+        return await self._daemon.command(ReloadTold, "POST", "/reload")
+
+    async def calibration_health(self) -> CalibrationHealthTold:
+        """Return whether residuals of the last days are as the mast file predicts, with the figures."""
+        return await self._daemon.json(CalibrationHealthTold, "GET", "/calibration/health")
+
+    async def sentinel(self) -> SentinelTold:
+        """Return what the drift sentinel in the daemon's state folder has found, and how long ago."""
+        return await self._daemon.json(SentinelTold, "GET", "/sentinel")
+
+    async def rig(self) -> RigTold:
+        """Return the configured cameras by the mast file in use: where each looks and how much it sees."""
+        return await self._daemon.json(RigTold, "GET", "/rig")
+
+    async def bench(self) -> BenchTold:
+        """Return the bench calibration at work or the last one (``run``), and those that are kept."""
+        return await self._daemon.json(BenchTold, "GET", "/bench")
+
+    async def begin_bench(
+        self,
+        board: str | None = None,
+        *,
+        board_file: str | None = None,
+        goes_on: str | None = None,
+        wanted_px: float | None = None,
+        pictures: int | None = None,
+        by_hand: bool | None = None,
+    ) -> BenchRunTold:
+        """Have the daemon begin a bench calibration, or go on with one, and return it as it is then.
+
+        Parameters
+        ----------
+        board, board_file, goes_on
+            One of them: the name of a packaged board, the text of a BOARD.yaml, the name of a run.
+        wanted_px, pictures
+            What the calibration may leave of a first pointing, rms an axis, and how many pictures of each
+            camera at most; by default 0.2 and 60, or as the run had them.
+        by_hand
+            Whether a simulated board waits for `board_stands` too, as a real one does.
+
+        Raises
+        ------
+        ClientError
+            ``bench_runs``, ``bench_done``, ``bench_unknown``, ``bad_board``, ``unwritable``, ``disk_low``.
+        """
+        told: dict[str, Any] = {"board": board, "board_file": board_file, "goes_on": goes_on}
+        told |= {"wanted_px": wanted_px, "pictures": pictures, "by_hand": by_hand}
+        body = {key: value for key, value in told.items() if value is not None}
+        return (await self._daemon.command(BenchBegun, "POST", "/bench", body))["run"]
+
+    async def board_stands(self) -> BenchRunTold:
+        """Say that the board stands where it was asked for."""
+        return (await self._daemon.command(BenchBegun, "POST", "/bench/stands"))["run"]
+
+    async def leave_bench(self) -> BenchRunTold:
+        """End the bench calibration; it can go on later (`begin_bench`, ``goes_on``)."""
+        return (await self._daemon.command(BenchBegun, "POST", "/bench/leave"))["run"]
+
+    async def forget_bench(self, name: str) -> BenchTold:
+        """Remove a bench calibration that is over, with its pictures and report; its mast file stays.
+
+        Returns what is left, as `bench`. Refused with ``bench_runs``, ``bench_unknown``, ``unwritable``.
+        """
+        return await self._daemon.command(BenchTold, "DELETE", f"/bench/runs/{quote(name, safe='')}")
+
+    async def reports(self) -> ReportsTold:
+        """Return the reports that can be read, the newest first."""
+        return await self._daemon.json(ReportsTold, "GET", "/reports")
+
+    async def report(self, name: str) -> bytes:
+        """Return a report, HTML."""
+        return bytes((await self._daemon.ask("GET", f"/reports/{quote(name, safe='')}")).content)
+
+    async def history(self) -> HistoryTold:
+        """Return joints, temperatures and events of the last hours, oldest first."""
+        return await self._daemon.json(HistoryTold, "GET", "/history")
+
+    async def recordings(self) -> Recordings:
+        """Return the daemon's recordings, and what it records now."""
+        return await self._daemon.json(Recordings, "GET", "/recordings")
+
+    async def start_recording(self, name: str = "") -> RecorderTold:
+        """Have the daemon record until `stop_recording`; return what it records then."""
+        return await self._daemon.command(RecorderTold, "POST", "/recordings/start", {"name": name})
+
+    async def stop_recording(self) -> RecordingEnded:
+        """End the recording; return its file on the daemon's machine, its size and what was dropped."""
+        return await self._daemon.command(RecordingEnded, "POST", "/recordings/stop")
+
+    async def recording(self, name: str, file: str) -> bytes:
+        """Return a file of a recording whole, by the names that `recordings` tells."""
+        name, file = quote(name, safe=""), quote(file, safe="")
+        return bytes((await self._daemon.ask("GET", f"/recordings/{name}/{file}")).content)
+
+    async def delete_recording(self, name: str) -> RecordingDeleted:
+        """Delete a run, or what was kept at a fault; return what is left."""
+        return await self._daemon.command(RecordingDeleted, "DELETE", f"/recordings/{quote(name, safe='')}")
+
+    async def mast_file(self) -> bytes:
+        """Return the mast file that the daemon uses, byte for byte."""
+        return bytes((await self._daemon.ask("GET", "/mast")).content)
+
+    async def use_mast(self, file: str) -> MastsTold:
+        """Use another mast file of the same folder; return which is in use now, and the former one."""
+        return await self._daemon.command(MastsTold, "POST", "/mast", {"file": file})
+
+    async def use_former_mast(self) -> MastsTold:
+        """Go back to the mast file that was in use before; return which is in use now, and the former one."""
+        return await self._daemon.command(MastsTold, "POST", "/mast/back")
+
+    async def places(self) -> dict[str, PlaceTold]:
+        """Return the places of the head that are kept, by name; ``home`` is always among them."""
+        return (await self._daemon.json(PlacesTold, "GET", "/places"))["places"]
+
+    async def keep_place(self, name: str, pan_rad: float, tilt_rad: float) -> dict[str, PlaceTold]:
+        """Keep a place of the head by a name, for everybody; return all."""
+        body = {"pan_rad": pan_rad, "tilt_rad": tilt_rad}
+        return (await self._daemon.command(PlacesTold, "POST", f"/places/{quote(name, safe='')}", body))[
+            "places"
+        ]
+
+    async def forget_place(self, name: str) -> dict[str, PlaceTold]:
+        """Forget a place; return those that are left. Raises ClientError ``place_unknown``."""
+        return (await self._daemon.command(PlacesTold, "DELETE", f"/places/{quote(name, safe='')}"))["places"]
+
+    async def sun(self) -> SunTold:
+        """Return the direction that no head camera looks into: ``sun``, null where none was told."""
+        return await self._daemon.json(SunTold, "GET", "/limits/sun")
+
+    async def keep_off_sun(
+        self,
+        azimuth_rad: float,
+        elevation_rad: float,
+        half_angle_rad: float,
+        *,
+        frame: Literal["site", "rover"] = "site",
+        valid_s: float | None = None,
+    ) -> SunTold:
+        """Say where the sun stands: azimuth from north over east (forward over right), elevation up.
+
+        Parameters
+        ----------
+        half_angle_rad
+            How near a head camera's axis may come.
+        valid_s
+            How long that holds, seconds; left out, until another is told.
+        """
+        body: dict[str, Any] = {"azimuth_rad": azimuth_rad, "elevation_rad": elevation_rad}
+        body |= {"half_angle_rad": half_angle_rad, "frame": frame}
+        if valid_s is not None:
+            body["valid_s"] = valid_s
+        return await self._daemon.command(SunTold, "POST", "/limits/sun", body)
+
+    async def forget_sun(self) -> SunTold:
+        """Keep the head off no sun any more."""
+        return await self._daemon.command(SunTold, "DELETE", "/limits/sun")
+
+    async def session(self) -> SessionTold:
+        """Return who asks: ``name``, ``role``, ``via``, and whether the daemon asks for a token at all."""
+        return await self._daemon.json(SessionTold, "GET", "/session")
+
+    async def login(self, token: str) -> SessionTold:
+        """Begin a session as a page does: this client then needs its token no longer, for some hours."""
+        return await self._daemon.json(SessionTold, "POST", "/login", json={"token": token})
+
+    async def logout(self) -> None:
+        """End the session that `login` began."""
+        await self._daemon.json(LoggedOut, "POST", "/logout")

@@ -1,0 +1,148 @@
+"""What a client asks of a simulated rover."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+from urllib.parse import quote
+
+from mastctl.answers import (
+    BoardStands,
+    BoardsTold,
+    FaultSet,
+    FaultsSet,
+    StandTold,
+    TimeTold,
+    TruthTold,
+    WordsTold,
+    WordTold,
+)
+from mastctl.client.connection import Daemon
+
+
+class SimulationCalls:
+    """Where the rover truly stands, boards before it, its time, its faults; only of a simulated one."""
+
+    _daemon: Daemon
+
+    async def true_pose(self) -> StandTold:
+        """Return where a simulated rover truly stands: ``position_m`` and ``quaternion``, site_from_rover."""
+        return await self._daemon.json(StandTold, "GET", "/simulation/pose")
+
+    async def stand(
+        self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
+    ) -> StandTold:
+        """Put a simulated rover somewhere on its ground, truly; return its true pose."""
+        body = {"x_m": x_m, "y_m": y_m, "heading_rad": heading_rad}
+        body |= {"pitch_rad": pitch_rad, "roll_rad": roll_rad}
+        return await self._daemon.command(StandTold, "POST", "/simulation/pose", body)
+
+    async def boards(self) -> dict[str, BoardStands]:
+        """Return the boards held up before a simulated rover, by name: ``board``, ``position_m``,
+        ``quaternion`` (rover_from_board), ``bow_m``.
+        """
+        return (await self._daemon.json(BoardsTold, "GET", "/simulation/boards"))["boards"]
+
+    async def put_board(
+        self,
+        name: str,
+        position_m: Sequence[float],
+        board: Mapping[str, Any] | None = None,
+        turned_rad: Sequence[float] | None = None,
+        quaternion: Sequence[float] | None = None,
+        bow_m: Sequence[float] | None = None,
+    ) -> BoardStands:
+        """Hold a board up before a simulated rover, or move it; frames exposed from now on show it there.
+
+        Parameters
+        ----------
+        position_m
+            (3,) of its middle in the rover frame as the rover truly stands.
+        board
+            What its BOARD.yaml holds; left out, the board of this name is moved that is there already.
+        turned_rad
+            How it is turned about its own x, y and z after facing the mast upright: the upper edge nearer,
+            the right edge nearer, clockwise.
+        quaternion
+            rover_from_board (w, x, y, z) instead of that.
+        bow_m
+            How far its middle stands out, across and down; left out: as before, flat at first.
+
+        Raises
+        ------
+        ClientError
+            ``not_simulated``, ``bad_options``, ``bad_board``.
+        """
+        body: dict[str, Any] = {"position_m": [float(value) for value in position_m]}
+        if board is not None:
+            body["board"] = dict(board)
+        for key, values in (("turned_rad", turned_rad), ("quaternion", quaternion), ("bow_m", bow_m)):
+            if values is not None:
+                body[key] = [float(value) for value in values]
+        return await self._daemon.command(
+            BoardStands, "POST", f"/simulation/boards/{quote(name, safe='')}", body
+        )
+
+    async def take_board(self, name: str) -> None:
+        """Take a board away from a simulated rover."""
+        await self._daemon.command(BoardsTold, "DELETE", f"/simulation/boards/{quote(name, safe='')}")
+
+    async def simulation_time(self) -> TimeTold:
+        """Return a simulated rover's time: ``now_s``, and ``speed``, a number or ``max``."""
+        return await self._daemon.json(TimeTold, "GET", "/simulation/time")
+
+    async def advance(self, duration_s: float) -> TimeTold:
+        """Let time pass for a simulated rover whose ``simulation.speed`` is ``max``; return it as
+        `simulation_time` does.
+
+        Raises
+        ------
+        ClientError
+            ``time_passes`` where time passes by itself, ``not_simulated``.
+        """
+        return await self._daemon.command(TimeTold, "POST", "/simulation/time", {"advance_s": duration_s})
+
+    async def truth(
+        self,
+        frame_id: str,
+        *,
+        pixel: tuple[float, float] | None = None,
+        position_in_site_m: Sequence[float] | None = None,
+    ) -> TruthTold:
+        """Return what a pixel (x, y) of a frame truly shows, or where a point of the site truly lies in it.
+
+        Returns
+        -------
+        told
+            ``position_in_site_m``, ``position_m`` in the rover frame when the frame was taken, ``pixel_px``;
+            null where the camera could not see it, all where a pixel shows the sky.
+
+        Raises
+        ------
+        ClientError
+            ``not_simulated``; ``frame_too_old`` and such for a frame that is not kept.
+        """
+        asked: dict[str, Any] = {"frame_id": frame_id}
+        if pixel is not None:
+            asked |= dict(zip(("x_px", "y_px"), pixel, strict=True))
+        if position_in_site_m is not None:
+            asked |= dict(zip(("x_m", "y_m", "z_m"), position_in_site_m, strict=True))
+        return await self._daemon.json(TruthTold, "GET", "/simulation/truth", params=asked)
+
+    async def fault_words(self) -> dict[str, dict[str, WordTold]]:
+        """Return the fault words of each simulated device: what each ``does``, and its ``parameters``."""
+        return (await self._daemon.json(WordsTold, "GET", "/simulation/words"))["devices"]
+
+    async def faults(self) -> list[FaultSet]:
+        """Return the faults that are switched on in a simulated rover."""
+        return (await self._daemon.json(FaultsSet, "GET", "/simulation/faults"))["faults"]
+
+    async def set_fault(self, /, device: str, word: str, **parameters: float) -> list[FaultSet]:
+        """Switch a fault of a simulated device on; return all that are on."""
+        body = {"device": device, "word": word, "parameters": parameters}
+        return (await self._daemon.command(FaultsSet, "POST", "/simulation/faults", body))["faults"]
+
+    async def clear_faults(self, device: str | None = None) -> None:
+        """Switch the faults of one simulated device off, or all."""
+        params = {} if device is None else {"device": device}
+        await self._daemon.command(FaultsSet, "DELETE", "/simulation/faults", params=params)

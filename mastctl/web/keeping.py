@@ -1,0 +1,209 @@
+"""Routes of what a daemon keeps: mast files, places, recordings, its configuration, benches and reports."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Annotated, Any
+
+from fastapi import FastAPI, Path, Request
+from fastapi.responses import FileResponse, Response
+
+from mastctl.answers import (
+    BenchBegun,
+    BenchTold,
+    MastsTold,
+    PlacesTold,
+    RecorderTold,
+    RecordingDeleted,
+    RecordingEnded,
+    Recordings,
+    ReloadTold,
+    ReportsTold,
+)
+from mastctl.commands.entry import (
+    BENCH,
+    BENCH_FORGET,
+    BENCH_LEAVE,
+    BENCH_STANDS,
+    MAST,
+    MAST_BACK,
+    PLACE_FORGET,
+    PLACE_KEEP,
+    RECORD_DELETE,
+    RECORD_START,
+    RECORD_STOP,
+    RELOAD,
+)
+from mastctl.guided.runs import NAME
+from mastctl.service.mast_in_use import MastInUse
+from mastctl.service.masts import Masts
+from mastctl.service.places import Place
+from mastctl.service.reload import reload
+from mastctl.web import PREFIX
+from mastctl.web.commands import Asks, command
+from mastctl.web.models import BenchBody, MastBody, PlaceBody, RecordBody
+from mastctl.web.parts import Here
+
+REPORT = (
+    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'"
+)
+"""The Content-Security-Policy of a report: its own styles and drawings, no script, an origin of nobody's."""
+PlaceName = Annotated[
+    str,
+    Path(
+        pattern=r"^[\w+−-][\w .,:°+−-]{0,39}$",
+        description="a name of 1 to 40 letters, digits, spaces and . , : ° + - that begins with no space",
+    ),
+]
+RunName = Annotated[
+    str, Path(pattern=f"^{NAME.pattern}$", description="a run's name, such as 20261126-093000,")
+]
+ReportName = Annotated[
+    str,
+    Path(
+        pattern="^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$",
+        description="1 to 100 letters a to z, digits, '.', '_' and '-', the first a letter or digit,",
+    ),
+]
+
+
+def add_masts(app: FastAPI) -> None:
+    """The mast file in use, another one, and the configuration read again."""
+
+    @app.get(f"{PREFIX}/mast", summary="The mast file in use, byte for byte", response_class=Response)
+    async def mast(here: Here) -> Response:
+        in_use = here.service.masts.in_use
+        return Response(
+            in_use.data,
+            media_type="application/yaml",
+            headers={"X-Mastctl-Mast-Digest": in_use.stored.digest},
+        )
+
+    @command(app, "POST /mast", MAST, "Use another mast file, or the former one, from now on")
+    def load_mast(body: MastBody, here: Here) -> MastsTold:
+        masts = here.service.masts
+        return _masts_told(masts, masts.back() if body.file is None else masts.load(body.file))
+
+    @command(app, "POST /mast/back", MAST_BACK, "Go back to the former mast file")
+    def back(here: Here) -> MastsTold:
+        masts = here.service.masts
+        return _masts_told(masts, masts.back())
+
+    @command(
+        app, "POST /reload", RELOAD, "Read the configuration again: all of it comes into use, or nothing"
+    )
+    def read_again(here: Here) -> ReloadTold:
+        return reload(here.service)
+
+
+def _masts_told(masts: Masts, mast: MastInUse) -> MastsTold:
+    former = masts.former
+    return {"mast": mast.told(), "former_mast": None if former is None else former.told()}
+
+
+def add_places(app: FastAPI) -> None:
+    """Places of the head by a name; who goes there asks `POST /point` for its angles."""
+
+    @app.get(f"{PREFIX}/places", summary="The places of the head that are kept by a name")
+    async def told(here: Here) -> PlacesTold:
+        return await here.waiting.run(here.service.places.told)
+
+    @command(app, "POST /places/{name}", PLACE_KEEP, "Keep a place by a name")
+    def keep(name: PlaceName, body: PlaceBody, here: Here) -> PlacesTold:
+        return here.service.places.keep(name, Place(body.pan_rad, body.tilt_rad))
+
+    @command(app, "DELETE /places/{name}", PLACE_FORGET, "Forget a place")
+    def forget(name: PlaceName, here: Here) -> PlacesTold:
+        return here.service.places.forget(name)
+
+
+def add_recordings(app: FastAPI) -> None:
+    """What is recorded, its files, and runs begun, ended and deleted."""
+
+    @app.get(f"{PREFIX}/recordings", summary="Every recording, and what is recorded now")
+    async def recordings(here: Here) -> Recordings:
+        return await here.waiting.run(here.service.recording.told)
+
+    @command(
+        app, "POST /recordings/start", RECORD_START, "Record until it is ended, or there is no room left"
+    )
+    def start(body: RecordBody, here: Here) -> RecorderTold:
+        return here.service.recording.recorder.start_run(body.name)
+
+    @command(app, "POST /recordings/stop", RECORD_STOP, "End the recording that was begun")
+    def stop(here: Here) -> RecordingEnded:
+        return here.service.recording.recorder.stop_run()
+
+    @app.get(
+        f"{PREFIX}/recordings/{{name}}/{{file}}", summary="A recording's file", response_class=FileResponse
+    )
+    async def read(name: str, file: str, request: Request, here: Here) -> FileResponse:
+        path = await here.waiting.run(lambda: here.service.recording.recorder.file(name, file))
+        headers = request.scope["headers"]
+        request.scope["headers"] = [one for one in headers if one[0] != b"range"]  # it is given whole
+        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+    @command(app, "DELETE /recordings/{name}", RECORD_DELETE, "Delete a run, or what was kept at a fault")
+    def delete(name: str, here: Here) -> RecordingDeleted:
+        return here.service.recording.recorder.delete(name)
+
+
+def add_bench(app: FastAPI) -> None:
+    """A bench calibration begun, answered, ended; reports."""
+
+    @app.get(f"{PREFIX}/bench", summary="The bench calibration at work, and those that are kept")
+    async def bench(here: Here) -> BenchTold:
+        return await here.waiting.run(here.service.guide.told)
+
+    @command(
+        app,
+        "POST /bench",
+        BENCH,
+        "Begin a bench calibration, or go on with one",
+        status_code=202,
+        recorded=lambda body, **_: _without_file(body),
+    )
+    def begin(body: BenchBody, here: Here, asked: Asks) -> BenchBegun:
+        started = here.service.guide.start(body.wanted(), asked.caller.name, asked.last_stop)
+        return {"run": started.told()}
+
+    @command(app, "POST /bench/stands", BENCH_STANDS, "Say that the board stands where it was asked for")
+    def stands(here: Here) -> BenchBegun:
+        return {"run": here.service.guide.stands().told()}
+
+    @command(
+        app, "POST /bench/leave", BENCH_LEAVE, "End the bench calibration; it can go on later", beside=True
+    )
+    def leave(here: Here, asked: Asks) -> BenchBegun:
+        return {"run": here.service.guide.leave(asked.caller.name).told()}
+
+    @command(
+        app,
+        "DELETE /bench/runs/{name}",
+        BENCH_FORGET,
+        "Remove a bench calibration that is over, pictures and report",
+    )
+    def forget(name: RunName, here: Here) -> BenchTold:
+        return here.service.guide.forget(name)
+
+    @app.get(f"{PREFIX}/reports", summary="The reports that can be read")
+    async def listed(here: Here) -> ReportsTold:
+        reports = here.service.reports
+        found = await here.waiting.run(reports.all)
+        return {"reports": [one.told() for one in found], "folder": str(reports.folder)}
+
+    @app.get(f"{PREFIX}/reports/{{name}}", summary="A report", response_class=Response)
+    async def report(name: ReportName, here: Here) -> Response:
+        page = await here.waiting.run(lambda: here.service.reports.page(name))
+        headers = {"Content-Security-Policy": REPORT, "Cross-Origin-Opener-Policy": "same-origin"}
+        return Response(page, media_type="text/html; charset=utf-8", headers=headers)
+
+
+def _without_file(body: BenchBody) -> dict[str, Any]:
+    """What is recorded of a request: of a board's file its size and its digest."""
+    told = body.model_dump(exclude_none=True)
+    if body.board_file is not None:
+        digest = hashlib.sha256(body.board_file.encode("utf-8", "surrogatepass")).hexdigest()
+        told["board_file"] = f"{len(body.board_file)} signs, SHA-256 {digest[:16]}"
+    return told

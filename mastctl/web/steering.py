@@ -1,0 +1,309 @@
+"""Routes of what moves the head, and of what stops it: operations, jog, track, lease, limits, stops."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import threading
+from typing import Any
+
+from fastapi import FastAPI, Request
+
+from mastctl.answers import (
+    EstopTold,
+    JogTold,
+    LeaseGranted,
+    LeaseTold,
+    Operations,
+    OperationTold,
+    PoseTaken,
+    PreviewTold,
+    ResetTold,
+    Started,
+    Status,
+    StopTold,
+    SunTold,
+    TrackTold,
+)
+from mastctl.as_json import as_json
+from mastctl.commands.caller import told_name
+from mastctl.commands.deadlines import usual_s
+from mastctl.commands.entry import (
+    ESTOP,
+    JOG,
+    LEASE,
+    LEASE_RELEASE,
+    LEASE_RENEW,
+    LEASE_TAKE,
+    POINT,
+    POSE,
+    RESET,
+    STOP,
+    SUN,
+    SUN_FORGET,
+    TRACK,
+    TRACK_LOOK,
+    TRACK_STOP,
+    Asked,
+)
+from mastctl.commands.lease import Lease, Leases
+from mastctl.errors import BadRequest, NotNow, Unable, one_line
+from mastctl.motion.results import PointingError
+from mastctl.safety.latch import LONGEST
+from mastctl.safety.stop_threads import StopsHang
+from mastctl.service.service import Service
+from mastctl.web import PREFIX
+from mastctl.web.commands import Asks, carried_out, command, stop_first
+from mastctl.web.models import (
+    EstopBody,
+    JogBody,
+    LeaseBody,
+    PointBody,
+    PoseBody,
+    PreviewBody,
+    RenewBody,
+    ResetBody,
+    SunBody,
+    TakeBody,
+    TrackBody,
+)
+from mastctl.web.parts import Here, Parts
+
+BODY_S = 0.05  # a body comes with its request; who sends it later is stopped without its words
+LARGEST_BODY_BYTES = 4096
+ANY_BODY = {"anyOf": [EstopBody.model_json_schema(), {}]}  # a stop is refused for no body
+
+
+def add_pointing(app: FastAPI) -> None:
+    """State, operations and the stop."""
+
+    @app.get(f"{PREFIX}/status", summary="What is known at this moment")
+    async def status(here: Here) -> Status:
+        return here.service.state().told()
+
+    @command(
+        app,
+        "POST /point",
+        POINT,
+        "Point at a pixel, a position, or joint angles",
+        status_code=202,
+        usual_s=lambda here, body: usual_s(here.service.config.limits, body.looks),
+    )
+    def point(body: PointBody, here: Here) -> Started:
+        told = body.model_dump(exclude_none=True)
+        return {"id": here.service.steering.point(body.request, told).id}
+
+    @app.post(f"{PREFIX}/point/preview", summary="What a pixel shows, before anything moves")
+    async def preview(body: PreviewBody, here: Here) -> PreviewTold:
+        service = here.service
+        service.check_camera(body.pixel.camera)
+        cancelled = threading.Event()
+        try:
+            seen: PreviewTold = await here.waiting.picture(
+                body.pixel.camera, lambda: as_json(service.steering.preview(body.request, cancelled))
+            )
+        except PointingError as error:
+            kind = NotNow if error.code in ("head_moving", "stopped") else BadRequest
+            raise kind(error.code, str(error)) from None
+        finally:
+            cancelled.set()
+        return seen
+
+    @app.get(f"{PREFIX}/operations", summary="The newest operations, without their steps")
+    async def operations(here: Here) -> Operations:
+        return {"operations": [entry.listed() for entry in here.service.operations.all()]}
+
+    @app.get(f"{PREFIX}/operations/{{operation_id}}", summary="One operation's record")
+    async def operation(operation_id: str, here: Here) -> OperationTold:
+        return here.service.operations.get(operation_id).told()
+
+    @app.post(f"{PREFIX}/stop", summary="Stop the mast and the running operation, at once")
+    async def stop(request: Request, here: Here) -> StopTold:
+        return await stop_first(here, STOP, request, here.service.stopping.stop_told)
+
+
+def add_estop(app: FastAPI) -> None:
+    """The emergency stop, which needs no body that makes sense, and the reset, which does."""
+
+    @app.post(
+        f"{PREFIX}/estop",
+        summary="Stop the mast and let nothing move it until it is reset, across restarts too",
+        openapi_extra={"requestBody": {"content": {"application/json": {"schema": ANY_BODY}}}},
+    )
+    async def estop(request: Request, here: Here) -> EstopTold:
+        told = await _words(request)
+        words = told.get("reason"), told.get("name")
+        stopping, asked = here.service.stopping, {"reason": words[0], "name": words[1]}
+        try:
+            return await stop_first(here, ESTOP, request, lambda: stopping.estop(*words), asked)
+        except StopsHang as error:
+            await here.waiting.run(lambda: stopping.latch_estop(*words))
+            raise Unable("stop_unconfirmed", f"the emergency stop is latched, but {error}") from None
+
+    @command(app, "POST /reset", RESET, "Release an emergency stop; nothing moves before the next command")
+    def reset(body: ResetBody, here: Here) -> ResetTold:
+        return here.service.stopping.reset(body.reason, body.name, body.of)
+
+
+async def _words(request: Request) -> dict[str, str]:
+    """What words the body has, if it comes at once and has any."""
+    data = b""
+    try:
+        async with asyncio.timeout(BODY_S):
+            async for part in request.stream():
+                data += part
+                if len(data) > LARGEST_BODY_BYTES:
+                    return {}
+        found = json.loads(data)
+    except Exception:  # late, broken off, no JSON: a stop is not refused for its words
+        return {}
+    return (
+        {key: one_line(value, LONGEST) for key, value in found.items() if isinstance(value, str)}
+        if isinstance(found, dict)
+        else {}
+    )
+
+
+def add_tracking(app: FastAPI) -> None:
+    """The rover's pose, and the track."""
+
+    def one_look_s(here: Parts, **_: Any) -> float:
+        return usual_s(here.service.config.limits, 1)
+
+    @command(
+        app,
+        "POST /pose",
+        POSE,
+        "Say where the rover stands; a track is carried over and looked for",
+        usual_s=one_look_s,
+    )
+    def pose(body: PoseBody, here: Here, asked: Asks) -> PoseTaken:
+        operation = here.service.steering.take_pose(body.pose(asked.asked_s), body.look)
+        stop_before_keep_outs(here.service)  # a sun of the site frame turns with the rover
+        return {"operation": operation, "track": here.service.track_told()}
+
+    @app.get(f"{PREFIX}/track", summary="The track at this moment")
+    async def track(here: Here) -> TrackTold:
+        return here.service.track_told()
+
+    @command(
+        app,
+        "POST /track",
+        TRACK,
+        "Follow what a pixel shows, or is at a position",
+        status_code=202,
+        usual_s=one_look_s,
+    )
+    def start(body: TrackBody, here: Here) -> Started:
+        told = {"track": body.model_dump(exclude_none=True)}
+        return {"id": here.service.steering.start_track(body.target(), told).id}
+
+    @command(
+        app,
+        "POST /track/look",
+        TRACK_LOOK,
+        "Look for the target once more",
+        status_code=202,
+        usual_s=one_look_s,
+    )
+    def look(here: Here) -> Started:
+        return {"id": here.service.steering.look().id}
+
+    @app.post(f"{PREFIX}/track/stop", summary="End the track; the head stops if it moves for it")
+    async def stop(request: Request, here: Here, asked: Asks) -> TrackTold:
+        def act() -> dict[str, Any]:  # no id: it begins nothing
+            here.service.stopping.stop_track()
+            return {}
+
+        await carried_out(here, request, TRACK_STOP, asked, {}, act, beside=True)
+        return here.service.track_told()
+
+
+def add_limits(app: FastAPI) -> None:
+    """The jog, and the sun."""
+
+    @app.post(f"{PREFIX}/jog", summary="A heartbeat: turn the head at a rate, for half a second")
+    async def jog(body: JogBody, asked: Asks, here: Here, request: Request) -> JogTold:
+        told, beat, jogs = body.model_dump(exclude_none=True), body.beat(), here.service.jogs
+        with jogs.heard(beat) as may_begin:  # from its arrival on
+            return await carried_out(here, request, JOG, asked, told, lambda: jogs.beat(beat, may_begin))
+
+    @app.get(f"{PREFIX}/limits/sun", summary="The direction that no head camera looks into")
+    async def sun(here: Here) -> SunTold:
+        return here.service.devices.door.told()
+
+    @command(app, "POST /limits/sun", SUN, "Say where the sun stands; the head keeps off it")
+    def tell(body: SunBody, here: Here, asked: Asks) -> SunTold:
+        door = here.service.devices.door
+        door.use_sun(body.sun(asked.asked_s))
+        stop_before_keep_outs(here.service)
+        return door.told()
+
+    @command(app, "DELETE /limits/sun", SUN_FORGET, "Keep the head off no sun any more")
+    def forget(here: Here) -> SunTold:
+        door = here.service.devices.door
+        door.use_sun(None)
+        return door.told()
+
+
+def stop_before_keep_outs(service: Service) -> None:
+    """Stop a head that is under way into what has come to be kept out. Raises DriverError."""
+    name = service.devices.door.in_the_way(service.devices.last_reading)
+    if name is not None:
+        service.operations.stop(f"the keep-out {name} came to lie in the head's way")
+
+
+def add_lease(app: FastAPI) -> None:
+    """Who steers: acquired, renewed, released, taken over."""
+
+    @app.get(f"{PREFIX}/lease", summary="Who steers")
+    async def control(here: Here) -> LeaseTold:
+        return {"control": here.service.leases.told()}
+
+    @command(app, "POST /lease", LEASE, "Acquire the lease, if nobody else steers")
+    def acquire(body: LeaseBody, here: Here, asked: Asks) -> LeaseGranted:
+        leases, name = here.service.leases, None if body.name is None else told_name(body.name)
+        granted = leases.acquire(asked.caller, name, body.for_s, body.gives_way, body.ends_with_stop)
+        return _granted(leases, granted)
+
+    @command(
+        app,
+        "POST /lease/renew",
+        LEASE_RENEW,
+        "Have the lease run for its time from now on",
+        recorded=lambda asked, body, **_: {"for_s": None if body is None else body.for_s, **_which(asked)},
+    )
+    def renew(here: Here, asked: Asks, body: RenewBody | None = None) -> LeaseGranted:
+        leases = here.service.leases
+        return _granted(leases, leases.renew(_lease_of(asked), None if body is None else body.for_s))
+
+    @command(
+        app, "DELETE /lease", LEASE_RELEASE, "Release the lease", recorded=lambda asked, **_: _which(asked)
+    )
+    def release(here: Here, asked: Asks) -> LeaseTold:
+        leases = here.service.leases
+        leases.release(_lease_of(asked))
+        return {"control": leases.told()}
+
+    @command(app, "POST /lease/take", LEASE_TAKE, "Take over, whoever steers; what runs goes on")
+    def take(body: TakeBody, here: Here, asked: Asks) -> LeaseGranted:
+        leases, name = here.service.leases, None if body.name is None else told_name(body.name)
+        return _granted(leases, leases.take(asked.caller, body.reason, name, body.for_s))
+
+
+def _granted(leases: Leases, lease: Lease) -> LeaseGranted:
+    return {"lease_id": lease.id, **leases.told_of(lease)}
+
+
+def _which(asked: Asked) -> dict[str, str]:
+    """What tells a lease from another in the record, without being it: a key that came with one is not good
+    for the next."""
+    return {"of": hashlib.sha256(_lease_of(asked).encode()).hexdigest()[:16]}
+
+
+def _lease_of(asked: Asked) -> str:
+    """The lease that a request speaks of. Raises BadRequest."""
+    if asked.lease is None:
+        raise BadRequest("bad_request", "Mastctl-Lease is missing; the id of the lease is expected")
+    return asked.lease
