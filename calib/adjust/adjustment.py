@@ -20,30 +20,41 @@ dense block that is summed into the normal equations at once; these (some 300 un
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from calib.adjust.solver import Normal
 from calib.adjust.terms import DRAWING, JOINTS, ImageTerm, StationTerm, lens_knowledge, widened_images
-from calib.geometry.cahvor import CameraModel
-from calib.geometry.parameters import Prediction, parameter_names, parameter_part, predict, stepped
+from calib.adjust.unknowns import (
+    JOINT_ERRORS,
+    MAST,
+    Estimate,
+    Key,
+    Known,
+    ResidualBlock,
+    Unknown,
+    Unknowns,
+)
+from calib.geometry.parameters import (
+    Prediction,
+    camera_numbers,
+    parameter_names,
+    parameter_part,
+    predict,
+    stepped,
+)
 from calib.geometry.rig import (
     JOINTS_NAMES,
     MAST_FREE,
     MAST_NAMES,
     AxisJoint,
     Gimbal,
-    JointErrors,
-    Mast,
     gimbal,
     gimbal_rates,
-    joints_of,
-    mast_of,
 )
-from calib.geometry.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
+from calib.geometry.rigid import FloatArray, moved_rigid, rigid_rates
 
 HUBER = 3.0
 """Length of a residual, in sigmas, from which its pull no longer grows while blunders are looked for."""
@@ -53,51 +64,6 @@ USUAL_JOINT_RAD = 0.01
 
 USUAL_BOW_M = 0.005
 """How far a board's edges are usually from flat, one sigma, metres."""
-
-KNOWN_BEFOREHAND = "usual "
-"""How the names begin of blocks that are no measurements but what lenses, joints and boards are like."""
-
-Key = Hashable
-MAST: Key = ("mast",)
-JOINT_ERRORS: Key = ("joints",)
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """A state of the fit. ``mast`` holds the eight numbers of ``MAST_NAMES``, ``joints_rad`` (k, 2) what is
-    added to the readings of each head attitude, ``joint_errors`` (10,) the numbers of
-    ``calib.geometry.rig.JOINTS_NAMES``, ``bows_m`` by board (2,) how far the middles of its sides, right and
-    left, top and bottom, lie behind its centre, metres."""
-
-    cameras: Mapping[str, CameraModel]
-    mast: FloatArray
-    rover_from_station: Mapping[str, Rigid]
-    rover_from_board: Mapping[tuple[str, str], Rigid]
-    prisms_in_rover_m: Mapping[str, FloatArray]
-    joints_rad: FloatArray
-    joint_errors: FloatArray = field(default_factory=lambda: np.zeros(len(JOINTS_NAMES)))
-    bows_m: Mapping[str, FloatArray] = field(default_factory=dict)
-
-    @property
-    def as_mast(self) -> Mast:
-        """The mast of ``calib.geometry.rig``."""
-        return mast_of(self.mast)
-
-    @cached_property
-    def as_joints(self) -> JointErrors:
-        """The joints of ``calib.geometry.rig``; ValueError if their errors are too large to be any."""
-        return joints_of(self.joint_errors)
-
-
-@dataclass(frozen=True, eq=False)
-class ResidualBlock:
-    """Residuals (m,) of one group, in sigmas and unweighted, and their Jacobian (m, k) on unknowns (k,)."""
-
-    residual: FloatArray
-    jacobian: FloatArray
-    columns: np.ndarray
-    width: int
-    """How many residuals belong together (2: a dot, 3: a point of the station, 1: a single number)."""
 
 
 class Adjustment:
@@ -149,31 +115,55 @@ class Adjustment:
         self.mast_free = np.array(mast_parameters, dtype=int)
         self.joint_errors = np.array(joint_errors, dtype=int)
         self.bowed, self.held = tuple(bowed), frozenset(held)
-        self.parts: dict[Key, slice] = {}
-        self.names: list[str] = []
-        for name, model in start.cameras.items():
-            self._add(("camera", name), [f"cameras.{name}.{p}" for p in parameter_names(model.kind)])
-        self._add(MAST, [f"mast.{MAST_NAMES[i]}" for i in self.mast_free])
-        self._add(JOINT_ERRORS, [JOINTS_NAMES[i] for i in self.joint_errors])
-        for board in self.bowed:
-            self._add(("bow", board), [f"board {board}.bow_m.{a}" for a in "xy"])
-        rigid = [*(f"turn_rad.{a}" for a in "xyz"), *(f"shift_m.{a}" for a in "xyz")]
-        for setup in start.rover_from_station:
-            self._add(("setup", setup), [f"set-up {setup}.{p}" for p in rigid])
-        for pose in start.rover_from_board:
-            if pose not in self.held:
-                self._add(("board", pose), [f"placement {pose[0]}/{pose[1]}.{p}" for p in rigid])
-        if prism_cad_m > 0:
-            for prism in start.prisms_in_rover_m:
-                self._add(("prism", prism), [f"prism {prism}.{a}" for a in "xyz"])
-        if joint_rad > 0:
-            for index in range(len(start.joints_rad)):
-                self._add(("attitude", index), [f"attitude {index}.{j}" for j in ("pan_rad", "tilt_rad")])
-        self.weak = self._weak(start)
+        self.unknowns = Unknowns(self._declared(start))
 
-    def _add(self, key: Key, names: Sequence[str]) -> None:
-        self.parts[key] = slice(len(self.names), len(self.names) + len(names))
-        self.names.extend(names)
+    def _declared(self, start: Estimate) -> Iterator[Unknown]:
+        """Every unknown, once."""
+        for name, model in start.cameras.items():
+            names = tuple(f"cameras.{name}.{p}" for p in parameter_names(model.kind))
+            step, usual = np.ones(len(names)), np.zeros(len(names), dtype=bool)
+            for letter in dict.fromkeys(model.kind):
+                part = parameter_part(model.kind, letter)
+                step[part] = float(np.linalg.norm(model.H)) if letter in "HV" else 1.0
+                usual[part] = letter in "ORE"
+            yield Unknown(("camera", name), names, step, usual=usual)
+        yield Unknown(
+            MAST, tuple(f"mast.{MAST_NAMES[i]}" for i in self.mast_free), np.ones(len(self.mast_free))
+        )
+        errors = tuple(JOINTS_NAMES[i] for i in self.joint_errors)
+        yield _usual(JOINT_ERRORS, errors, USUAL_JOINT_RAD)
+        for board in self.bowed:
+            yield _usual(("bow", board), tuple(f"board {board}.bow_m.{a}" for a in "xy"), USUAL_BOW_M)
+        for setup in start.rover_from_station:
+            yield _pose(("setup", setup), f"set-up {setup}")
+        for placement in start.rover_from_board:
+            if placement not in self.held:
+                yield _pose(("board", placement), f"placement {placement[0]}/{placement[1]}")
+        if self.prism_cad_m > 0:
+            for prism in start.prisms_in_rover_m:
+                names, drawn = tuple(f"prism {prism}.{a}" for a in "xyz"), self.prisms_cad_m.get(prism)
+                sigma = None if drawn is None else np.full(3, self.prism_cad_m)
+                yield Unknown(("prism", prism), names, np.ones(3), drawn, sigma, DRAWING)
+        if self.joint_rad > 0:
+            for index in range(len(start.joints_rad)):
+                names = tuple(f"attitude {index}.{joint}" for joint in ("pan_rad", "tilt_rad"))
+                key, sigma = ("attitude", index), np.full(2, self.joint_rad)
+                yield Unknown(key, names, np.ones(2), np.zeros(2), sigma, JOINTS)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(p,) the names of all numbers."""
+        return self.unknowns.names
+
+    @property
+    def weak(self) -> FloatArray:
+        """(p,) how firmly a number stays where it is if the data leave it open."""
+        return self.unknowns.weak
+
+    @property
+    def upright(self) -> bool:
+        """Whether the mast is taken as upright: it turns and shifts, but does not lean."""
+        return set(self.mast_free.tolist()) == set(MAST_FREE[4])
 
     def with_huber(self, huber: float | None) -> Adjustment:
         """Return the same problem with another bound on pulls."""
@@ -188,6 +178,7 @@ class Adjustment:
         return self._copy(
             images=widened_images(self.images, factors),
             station=tuple(replace(p, sigma_m=p.sigma_m * factors.get(p.kind, 1.0)) for p in self.station),
+            unknowns=self.unknowns.with_sigmas(factors),
             joint_rad=self.joint_rad * factors.get(JOINTS, 1.0),
             prism_cad_m=self.prism_cad_m * factors.get(DRAWING, 1.0),
         )
@@ -201,49 +192,38 @@ class Adjustment:
         other.__dict__.update(self.__dict__, **changed)
         return other
 
-    def _weak(self, start: Estimate) -> FloatArray:
-        """One over the square of how far an unknown could be off at all; see ``least_squares.minimise``."""
-        sigma = np.ones(len(self.names))
-        for name, model in start.cameras.items():
-            part = np.ones(len(parameter_names(model.kind)))
-            for letter in "HV":
-                part[parameter_part(model.kind, letter)] = float(np.linalg.norm(model.H))
-            sigma[self.parts["camera", name]] = part
-        sigma[self.parts[JOINT_ERRORS]] = 1e3  # these have their own knowledge beforehand
-        for board in self.bowed:
-            sigma[self.parts["bow", board]] = 1e3
-        return np.asarray(sigma**-2.0)
-
     def stepped(self, state: Estimate, step: FloatArray) -> Estimate:
         """Return the state moved by a step; ValueError if a camera is none any more."""
         if not np.isfinite(step).all():
             raise ValueError("the step is not finite")
+
+        def of(key: Key) -> FloatArray:
+            return step[self.unknowns.part(key)]
+
         mast = state.mast.copy()
-        mast[self.mast_free] += step[self.parts[MAST]]
+        mast[self.mast_free] += of(MAST)
         errors = state.joint_errors.copy()
-        errors[self.joint_errors] += step[self.parts[JOINT_ERRORS]]
+        errors[self.joint_errors] += of(JOINT_ERRORS)
         prisms, joints = state.prisms_in_rover_m, state.joints_rad
         if self.prism_cad_m > 0:
-            prisms = {name: p + step[self.parts["prism", name]] for name, p in prisms.items()}
+            prisms = {name: p + of(("prism", name)) for name, p in prisms.items()}
         if self.joint_rad > 0 and len(joints):
-            joints = joints + np.array([step[self.parts["attitude", i]] for i in range(len(joints))])
+            joints = joints + np.array([of(("attitude", i)) for i in range(len(joints))])
         moved = replace(
             state,
-            cameras={n: stepped(m, step[self.parts["camera", n]]) for n, m in state.cameras.items()},
+            cameras={n: stepped(m, of(("camera", n))) for n, m in state.cameras.items()},
             mast=mast,
             rover_from_station={
-                n: moved_rigid(p, step[self.parts["setup", n]]) for n, p in state.rover_from_station.items()
+                n: moved_rigid(p, of(("setup", n))) for n, p in state.rover_from_station.items()
             },
             rover_from_board={
-                n: p if n in self.held else moved_rigid(p, step[self.parts["board", n]])
+                n: p if n in self.held else moved_rigid(p, of(("board", n)))
                 for n, p in state.rover_from_board.items()
             },
             prisms_in_rover_m=prisms,
             joints_rad=joints,
             joint_errors=errors,
-            bows_m={
-                n: b + step[self.parts["bow", n]] if n in self.bowed else b for n, b in state.bows_m.items()
-            },
+            bows_m={n: b + of(("bow", n)) if n in self.bowed else b for n, b in state.bows_m.items()},
         )
         if len(self.joint_errors):
             _ = moved.as_joints
@@ -282,8 +262,8 @@ class Adjustment:
             gradient[columns] += jacobian.T @ residual
         return Normal(cost, matrix, gradient)
 
-    def blocks(self, state: Estimate) -> Iterator[tuple[ImageTerm | StationTerm | str, ResidualBlock]]:
-        """Yield every group that counts, residuals and Jacobian; a name for what is known beforehand."""
+    def blocks(self, state: Estimate) -> Iterator[tuple[ImageTerm | StationTerm | Known, ResidualBlock]]:
+        """Yield every group that counts, residuals and Jacobian."""
         for _, images in self._by_camera():
             yield from zip(images, self.image_blocks(state, images), strict=True)
         for point in self.station:
@@ -374,38 +354,31 @@ class Adjustment:
         """One image whose points (n, 3) of the rover frame are seen so."""
         keep = image.keep
         board = state.rover_from_board[image.board]
-        parts, columns = [seen.d_step], [self.at(("camera", image.camera))]
+        rates: dict[Key, FloatArray] = {("camera", image.camera): seen.d_step}
         in_rover = seen.d_points
         if head is not None:
             in_rover = in_rover @ head.rotation.T
             turned = self.joint_rad > 0 or len(self.joint_errors) > 0
             wanted = np.array([*self.mast_free, *((8, 9) if turned else ())], dtype=int)
-            rates = -gimbal_rates(in_rover, points, head, wanted)
-            parts.append(rates[..., : len(self.mast_free)])
-            columns.append(self.at(MAST))
+            by_head = -gimbal_rates(in_rover, points, head, wanted)
+            rates[MAST], by_angles = np.split(by_head, [len(self.mast_free)], axis=2)
             both = list(zip(self._axes(state), self.reading(state, image), image.approach, strict=True))
             if len(self.joint_errors):
                 per_number = np.stack([joint.rates(read, side) for joint, read, side in both])
-                per_joint = rates[..., -2:, None] * per_number
-                parts.append(per_joint.reshape(*rates.shape[:2], -1)[..., self.joint_errors])
-                columns.append(self.at(JOINT_ERRORS))
+                per_joint = by_angles[..., None] * per_number
+                rates[JOINT_ERRORS] = per_joint.reshape(*by_head.shape[:2], -1)[..., self.joint_errors]
             if self.joint_rad > 0:
                 slopes = np.array([joint.slope(read, side) for joint, read, side in both])
-                parts.append(rates[..., -2:] * slopes)
-                columns.append(self.at(("attitude", image.attitude)))
+                rates["attitude", image.attitude] = by_angles * slopes
         if image.board[0] in self.bowed:
             behind = (in_rover @ board.rotation[:, 2])[..., None]
-            parts.append(behind * image.bend[keep][:, None, :])
-            columns.append(self.at(("bow", image.board[0])))
+            rates["bow", image.board[0]] = behind * image.bend[keep][:, None, :]
         if image.board not in self.held:
-            parts.append(rigid_rates(in_rover, points, board.translation_m))
-            columns.append(self.at(("board", image.board)))
+            rates["board", image.board] = rigid_rates(in_rover, points, board.translation_m)
         sigma = image.sigma_px[keep]
         residual = (seen.pixels_px - image.pixels_px[keep]) / sigma[:, None]
-        jacobian = np.concatenate(parts, axis=2) / sigma[:, None, None]
-        return ResidualBlock(
-            residual.ravel(), jacobian.reshape(residual.size, -1), np.concatenate(columns), width=2
-        )
+        flat = {key: (one / sigma[:, None, None]).reshape(residual.size, -1) for key, one in rates.items()}
+        return ResidualBlock.of(self.unknowns, residual.ravel(), flat, width=2)
 
     def station_residual(self, state: Estimate, point: StationTerm) -> FloatArray:
         """Measured less expected place of a prism or tape, in the rover frame and in sigmas, (3,)."""
@@ -419,60 +392,74 @@ class Adjustment:
     def station_block(self, state: Estimate, point: StationTerm) -> ResidualBlock:
         """One point of the station."""
         setup = state.rover_from_station[point.setup]
-        eye = np.eye(3)[None]
-        parts = [rigid_rates(eye, setup.points(point.position_m)[None], setup.translation_m)]
-        columns = [self.at(("setup", point.setup))]
+        eye = np.eye(3)
+        measured = rigid_rates(eye[None], setup.points(point.position_m)[None], setup.translation_m)[0]
+        rates: dict[Key, FloatArray] = {("setup", point.setup): measured / point.sigma_m}
         if point.board is not None:
             board = state.rover_from_board[point.board]
-            parts.append(-rigid_rates(eye, board.points(point.in_board_m)[None], board.translation_m))
-            columns.append(self.at(("board", point.board)))
+            expected = rigid_rates(eye[None], board.points(point.in_board_m)[None], board.translation_m)[0]
+            rates["board", point.board] = -expected / point.sigma_m
         elif self.prism_cad_m > 0:
-            parts.append(-eye)
-            columns.append(self.at(("prism", point.point)))
-        jacobian = np.concatenate(parts, axis=2)[0] / point.sigma_m
-        return ResidualBlock(self.station_residual(state, point), jacobian, np.concatenate(columns), width=3)
+            rates["prism", point.point] = -eye / point.sigma_m
+        return ResidualBlock.of(self.unknowns, self.station_residual(state, point), rates, width=3)
 
-    def known(self, state: Estimate) -> Iterator[tuple[str, ResidualBlock]]:
-        """What is known beforehand: usual lenses, prisms from CAD, joint readings."""
-        for name, model in state.cameras.items():
-            if "O" in model.kind:
-                residual, jacobian = lens_knowledge(model)
-                yield (
-                    f"{KNOWN_BEFOREHAND}lens {name}",
-                    ResidualBlock(residual, jacobian, self.at(("camera", name)), width=1),
-                )
-        if len(self.joint_errors):
-            size = len(self.joint_errors)
-            usual = state.joint_errors[self.joint_errors] / USUAL_JOINT_RAD
-            yield (
-                f"{KNOWN_BEFOREHAND}joints",
-                ResidualBlock(usual, np.eye(size) / USUAL_JOINT_RAD, self.at(JOINT_ERRORS), 1),
-            )
-        for board in self.bowed:
-            bow = state.bows_m[board] / USUAL_BOW_M
-            yield (
-                f"{KNOWN_BEFOREHAND}board {board}",
-                ResidualBlock(bow, np.eye(2) / USUAL_BOW_M, self.at(("bow", board)), width=1),
-            )
-        if self.prism_cad_m > 0:
-            for name, place in self.prisms_cad_m.items():
-                residual = (state.prisms_in_rover_m[name] - place) / self.prism_cad_m
-                yield (
-                    f"prism {name}",
-                    ResidualBlock(residual, np.eye(3) / self.prism_cad_m, self.at(("prism", name)), width=1),
-                )
-        if self.joint_rad > 0:
-            for index, joints in enumerate(state.joints_rad):
-                at = self.at(("attitude", index))
-                yield (
-                    f"attitude {index}",
-                    ResidualBlock(joints / self.joint_rad, np.eye(2) / self.joint_rad, at, width=1),
-                )
+    def known(self, state: Estimate) -> Iterator[tuple[Known, ResidualBlock]]:
+        """What is known beforehand: usual lenses, joints and boards, prisms from CAD, joint readings."""
+        for key, unknown in self.unknowns.items():
+            kind, *which = key
+            if kind == "camera":
+                model = state.cameras[str(which[0])]
+                if "O" in model.kind:
+                    residual, rates = lens_knowledge(model)
+                    yield Known(key, None), ResidualBlock.of(self.unknowns, residual, {key: rates}, width=1)
+            elif unknown.prior is not None and unknown.sigma is not None and len(unknown.names):
+                if kind == "attitude" and not self.joint_rad:
+                    continue
+                residual = (self.numbers(state, key) - unknown.prior) / unknown.sigma
+                rates = np.diag(1.0 / unknown.sigma)
+                yield Known(key, unknown.kind), ResidualBlock.of(self.unknowns, residual, {key: rates}, 1)
+
+    def numbers(self, state: Estimate, key: Key) -> FloatArray:
+        """Return an unknown's numbers in a state; 0 for a camera's A and O, which count from its own.
+
+        A pose has none: it is turned and shifted.
+        """
+        kind, which = key[0], key[-1]
+        if kind == "camera":
+            return camera_numbers(state.cameras[str(which)])
+        if key == MAST:
+            return np.asarray(state.mast[self.mast_free])
+        if key == JOINT_ERRORS:
+            return np.asarray(state.joint_errors[self.joint_errors])
+        if kind == "attitude":
+            return np.asarray(state.joints_rad[which])  # type: ignore[call-overload]
+        return (state.bows_m if kind == "bow" else state.prisms_in_rover_m)[str(which)]
+
+    def values(self, state: Estimate, *kinds: str) -> dict[str, float]:
+        """Return the numbers of all unknowns of some kinds by name, the kinds in the order asked for."""
+        return {
+            name: float(value)
+            for kind in kinds
+            for key, unknown in self.unknowns.items()
+            if key[0] == kind
+            for name, value in zip(unknown.names, self.numbers(state, key), strict=True)
+        }
 
     def at(self, key: Key) -> np.ndarray:
         """Return the indices of an unknown's numbers."""
-        part = self.parts[key]
-        return np.arange(part.start, part.stop)
+        return self.unknowns.at(key)
+
+
+def _usual(key: Key, names: tuple[str, ...], sigma: float) -> Unknown:
+    """Numbers that are usually nothing, to so much; where the data leave them open, that alone decides."""
+    size = len(names)
+    return Unknown(key, names, np.full(size, 1e3), np.zeros(size), np.full(size, sigma))
+
+
+def _pose(key: Key, name: str) -> Unknown:
+    """A rigid motion: a turn about its own origin, and a shift."""
+    turn, shift = (tuple(f"{name}.{what}.{axis}" for axis in "xyz") for what in ("turn_rad", "shift_m"))
+    return Unknown(key, (*turn, *shift), np.ones(6))
 
 
 def bounded_weights(residual: FloatArray, width: int, huber: float | None) -> FloatArray:

@@ -15,13 +15,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.adjust.adjustment import Adjustment, Estimate, bounded_weights
+from calib.adjust.adjustment import Adjustment, bounded_weights
 from calib.adjust.goodness import goodness
+from calib.adjust.score import Score
 from calib.adjust.significance import chance
 from calib.adjust.solver import covariance_of
 from calib.adjust.terms import ImageTerm
+from calib.adjust.unknowns import Estimate, ResidualBlock
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.rigid import FloatArray, Rigid, moved_rigid
+from calib.geometry.rigid import FloatArray
 
 UNLIKELY = 1e-7
 """A change is told if so large a gain, were it none, had less than this chance over all that were tried."""
@@ -112,13 +114,10 @@ def _milli(size: float | np.floating) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """One image's weighted residuals (m,), Jacobian (m, k) on columns (k,), and rates (m, e) by what may
-    change."""
+    """One image's residuals (m,) as the fit weighs them, and their rates (m, e) by what may change."""
 
     image: ImageTerm
-    residual: FloatArray
-    jacobian: FloatArray
-    columns: np.ndarray
+    block: ResidualBlock
     rates: dict[str, FloatArray]
 
 
@@ -134,12 +133,10 @@ def find_change(problem: Adjustment, state: Estimate) -> BenchChange | None:
     # Of this very state: what is left of a change that others nearly take up is a small difference.
     chi2, matrix, gradient = problem.normal(state)
     covariance = covariance_of(matrix, problem.weak)
-    # Where the fit has not quite settled, what its last step would still do is none of the change's.
-    settling = covariance @ gradient
     found: list[BenchChange] = []
     count = 0
     for what, board, camera, mine in _subjects(problem, state, rows):
-        changes = _tried(what, board, camera, mine, covariance, settling)
+        changes = _tried(what, board, camera, mine, covariance, gradient)
         count += len(changes)
         found += [change for change in changes if change.chi2 < chi2]
     if not found:
@@ -183,46 +180,24 @@ def _tried(
     camera: str,
     rows: Sequence[Rows],
     covariance: FloatArray,
-    settling: FloatArray,
+    gradient: FloatArray,
 ) -> list[BenchChange]:
     """The gain of every picture from which something may have changed."""
-    size = rows[0].rates[what].shape[1]
+    score = Score(rows[0].rates[what].shape[1], len(gradient))
     found = []
-    own, pull = np.zeros((size, size)), np.zeros(size)
-    shared = np.zeros((size, len(covariance)))
     for index in range(len(rows) - 1, 0, -1):
         row, before = rows[index], rows[index - 1]
-        rates = row.rates[what]
-        own += rates.T @ rates
-        pull += rates.T @ row.residual
-        shared[:, row.columns] += rates.T @ row.jacobian
+        score.add(row.block, row.rates[what])
         if _same_standstill(before.image, row.image):
             continue
         if min(_standstills(rows[:index]), _standstills(rows[index:])) < SIDE:
             continue
-        left = own - shared @ covariance @ shared.T
-        gain, step = gain_of(left, own, pull - shared @ settling)
-        if what != "board" and np.linalg.norm(step) > LARGEST:
+        gain = score.beside(covariance, gradient).gain(least=UNSEEN)
+        if what != "board" and np.linalg.norm(gain.values) > LARGEST:
             continue
-        found.append(BenchChange(what, board, camera, before.image.name, row.image.name, step, gain))
+        names = before.image.name, row.image.name
+        found.append(BenchChange(what, board, camera, *names, gain.values, gain.chi2))
     return found
-
-
-def gain_of(left: FloatArray, own: FloatArray, pull: FloatArray) -> tuple[float, FloatArray]:
-    """Return what numbers (k,) explain, and their values, without directions that the other unknowns take up.
-
-    ``own`` and ``left`` (k, k) are their normal equations without and with the other unknowns giving way,
-    ``pull`` (k,) is their gradient.
-    """
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(own), 1e-300))
-    if not np.isfinite(left).all() or not np.isfinite(pull).all():
-        return 0.0, np.zeros(len(pull))
-    values, vectors = np.linalg.eigh(left * np.outer(scale, scale))
-    seen = values > UNSEEN
-    along = vectors.T @ (scale * pull)
-    gain = float(np.sum(along[seen] ** 2 / values[seen]))
-    step = -scale * (vectors[:, seen] @ (along[seen] / values[seen]))
-    return gain, np.asarray(step)
 
 
 def _same_standstill(one: ImageTerm, other: ImageTerm) -> bool:
@@ -241,24 +216,22 @@ def rows_of(problem: Adjustment, state: Estimate, image: ImageTerm) -> Rows:
     weight = np.sqrt(bounded_weights(block.residual, 2, problem.huber))
     rates: dict[str, FloatArray] = {}
     if image.board not in problem.held:
-        rates["board"] = block.jacobian[:, -6:]  # a board's pose comes last
+        rates["board"] = block.rates(("board", image.board))
     if image.attitude is not None:
         both = reading_rates(problem, state, image)
         rates["pan"], rates["tilt"] = both[:, :1], both[:, 1:]
     camera = state.cameras[image.camera]
     rates["focus"] = _difference(
-        problem, state, _with(state, image, zoomed(camera, STEP)), image, block.residual
+        problem, state, _with(state, image, camera.zoomed(STEP)), image, block.residual
     )[:, None]
     turned = [
-        _difference(problem, state, _with(state, image, _turned(camera, STEP * axis)), image, block.residual)
+        _difference(problem, state, _with(state, image, camera.turned(STEP * axis)), image, block.residual)
         for axis in np.eye(3)
     ]
     rates["knock"] = np.stack(turned, axis=1)
     return Rows(
         image,
-        weight * block.residual,
-        weight[:, None] * block.jacobian,
-        block.columns,
+        replace(block, residual=weight * block.residual, jacobian=weight[:, None] * block.jacobian),
         {what: weight[:, None] * rate for what, rate in rates.items()},
     )
 
@@ -273,15 +246,15 @@ def reading_rows(problem: Adjustment, state: Estimate, rows: Sequence[Rows]) -> 
     on_head = [row for row in rows if row.image.attitude is not None]
     if problem.joint_rad == 0.0:
         return on_head
-    blocks = {what: block for what, block in problem.known(state) if what.startswith("attitude ")}
+    blocks = {what.key: block for what, block in problem.known(state)}
     found = []
     for row in on_head:
-        block = blocks.pop(f"attitude {row.image.attitude}", None)
-        columns = problem.at(("attitude", row.image.attitude))
-        residual = np.zeros(0) if block is None else block.residual
-        jacobian = np.zeros((0, 2)) if block is None else block.jacobian
-        rates = {"pan": -jacobian[:, :1], "tilt": -jacobian[:, 1:]}
-        found.append(Rows(row.image, residual, jacobian, columns, rates))
+        attitude = ("attitude", row.image.attitude)
+        block, columns = blocks.pop(attitude, None), problem.at(attitude)
+        if block is None:
+            block = ResidualBlock(np.zeros(0), np.zeros((0, 2)), columns, 1)
+        rates = {"pan": -block.jacobian[:, :1], "tilt": -block.jacobian[:, 1:]}
+        found.append(Rows(row.image, block, rates))
     return found
 
 
@@ -295,8 +268,9 @@ def scatter(readings: Sequence[Rows], axis: str, covariance: FloatArray, gain: f
         rates = row.rates[axis]
         size = float(np.sum(rates**2))
         if size:
-            taken = row.jacobian @ covariance[np.ix_(row.columns, row.columns)] @ row.jacobian.T
-            squares += float((rates.T @ row.residual)[0] ** 2) / size
+            one = row.block
+            taken = one.jacobian @ covariance[np.ix_(one.columns, one.columns)] @ one.jacobian.T
+            squares += float((rates.T @ one.residual)[0] ** 2) / size
             redundancy += 1.0 - float((rates.T @ taken @ rates)[0, 0]) / size
     return (squares - gain) / max(redundancy - 1.0, 1.0)
 
@@ -318,16 +292,3 @@ def _difference(
 
 def _with(state: Estimate, image: ImageTerm, camera: CameraModel) -> Estimate:
     return replace(state, cameras={**state.cameras, image.camera: camera})
-
-
-def zoomed(camera: CameraModel, part: float) -> CameraModel:
-    """Return the camera with a focal length larger by a part of it."""
-    axis = camera.A
-    h, v = camera.H @ axis * axis, camera.V @ axis * axis
-    return replace(camera, H=h + (1 + part) * (camera.H - h), V=v + (1 + part) * (camera.V - v))
-
-
-def _turned(camera: CameraModel, turn: FloatArray) -> CameraModel:
-    """The camera turned about C."""
-    pose = moved_rigid(Rigid.identity(), np.concatenate([turn, np.zeros(3)]))
-    return camera.moved(Rigid(pose.rotation, camera.C - pose.rotation @ camera.C))

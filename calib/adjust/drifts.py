@@ -11,12 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.adjust.adjustment import Adjustment, Estimate, ResidualBlock
-from calib.adjust.changes import Rows, gain_of, reading_rows, rows_of, scatter
+from calib.adjust.adjustment import Adjustment
+from calib.adjust.changes import UNSEEN, Rows, reading_rows, rows_of, scatter
 from calib.adjust.goodness import goodness
 from calib.adjust.left_out import left_out
+from calib.adjust.score import scored
 from calib.adjust.significance import chance
 from calib.adjust.solver import covariance_of
+from calib.adjust.unknowns import Estimate, ResidualBlock
 from calib.geometry.rigid import FloatArray
 
 
@@ -71,7 +73,6 @@ def find_drifts(problem: Adjustment, state: Estimate) -> tuple[BenchDrift, ...]:
     passed = {row.image.name: k / max(len(rows) - 1, 1) for k, row in enumerate(rows)}
     chi2, matrix, gradient = problem.normal(state)
     covariance = covariance_of(matrix, problem.weak)
-    settling = covariance @ gradient
     _, freedom = goodness(problem, state, covariance)
     on_head = [row for row in rows if row.image.attitude is not None]
     readings = reading_rows(problem, state, rows)
@@ -87,21 +88,18 @@ def find_drifts(problem: Adjustment, state: Estimate) -> tuple[BenchDrift, ...]:
         def drifting(row: Rows, names: tuple[str, ...] = names) -> FloatArray:
             return np.asarray(passed[row.image.name] * np.hstack([row.rates[name] for name in names]))
 
-        size = drifting(measured[0]).shape[1]
-        own, pull, shared = np.zeros((size, size)), np.zeros(size), np.zeros((size, len(covariance)))
-        for row in measured:
-            rates = drifting(row)
-            own += rates.T @ rates
-            pull += rates.T @ row.residual
-            shared[:, row.columns] += rates.T @ row.jacobian
-        gain, step = gain_of(own - shared @ covariance @ shared.T, own, pull - shared @ settling)
-        scale = max((chi2 - gain) / max(freedom, 1.0), 0.1)
+        gain = scored(((row.block, drifting(row)) for row in measured), covariance, gradient).gain(
+            least=UNSEEN
+        )
+        scale = max((chi2 - gain.chi2) / max(freedom, 1.0), 0.1)
         if what in ("pan", "tilt"):
-            scale = max(scale, scatter(readings, what, covariance, gain))
-        likely = chance(gain, size, scale, max(freedom, 1.0))
-        off_px = [drifting(row) @ step * np.repeat(row.image.sigma_px[row.image.keep], 2) for row in moving]
+            scale = max(scale, scatter(readings, what, covariance, gain.chi2))
+        likely = chance(gain.chi2, len(gain.values), scale, max(freedom, 1.0))
+        off_px = [
+            drifting(row) @ gain.values * np.repeat(row.image.sigma_px[row.image.keep], 2) for row in moving
+        ]
         moves_px = float(np.sqrt(np.mean(np.concatenate(off_px) ** 2)))
-        found.append(BenchDrift(what, step, gain, min(1.0, len(asked) * likely), moves_px))
+        found.append(BenchDrift(what, gain.values, gain.chi2, min(1.0, len(asked) * likely), moves_px))
     return tuple(sorted(found, key=lambda drift: drift.chance))
 
 

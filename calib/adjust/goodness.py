@@ -18,8 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtr, chdtrc, fdtrc
 
-from calib.adjust.adjustment import KNOWN_BEFOREHAND, Adjustment, Estimate, ResidualBlock
-from calib.adjust.terms import DRAWING, JOINTS, PRISMS, TAPES, ImageTerm, StationTerm
+from calib.adjust.adjustment import Adjustment
+from calib.adjust.terms import PRISMS, TAPES, ImageTerm, StationTerm
+from calib.adjust.unknowns import Estimate, Known, ResidualBlock
 from calib.geometry.rigid import FloatArray
 
 FEWEST = 3.0
@@ -37,8 +38,6 @@ STAYS = 20.0
 
 APART = 0.001
 """Tapes and prisms are one instrument's, unless chance makes them differ so seldom."""
-
-_KNOWN = {"attitude": JOINTS, "prism": DRAWING}
 
 
 @dataclass(frozen=True)
@@ -79,13 +78,8 @@ class Component:
         return self.weighed < 1.0
 
 
-def kind_of(what: ImageTerm | StationTerm | str) -> str | None:
-    """Return the kind of a group of residuals; None for what is no measurement."""
-    return _KNOWN.get(what.split()[0]) if isinstance(what, str) else what.kind
-
-
 def variance_components(
-    blocks: Iterable[tuple[ImageTerm | StationTerm | str, ResidualBlock]],
+    blocks: Iterable[tuple[ImageTerm | StationTerm | Known, ResidualBlock]],
     covariance: FloatArray,
     weighed: Mapping[str, float] | None = None,
 ) -> tuple[Component, ...]:
@@ -106,7 +100,7 @@ def variance_components(
     counts: dict[str, int] = {}
     normals: dict[str, FloatArray] = {}
     for what, block in blocks:
-        kind = kind_of(what)
+        kind = what.kind
         if kind is None:
             continue
         matrix = normals.setdefault(kind, np.zeros((size, size)))
@@ -174,7 +168,7 @@ def goodness(problem: Adjustment, state: Estimate, covariance: FloatArray) -> tu
     """
     total, count, paid = 0.0, 0, 0.0
     for what, block in problem.blocks(state):
-        if isinstance(what, str) and what.startswith(KNOWN_BEFOREHAND):
+        if what.kind is None:
             continue
         total += float(block.residual @ block.residual)
         count += len(block.residual)

@@ -22,10 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from calib.adjust.adjustment import MAST, Adjustment, Estimate, ResidualBlock, bounded_weights
+from calib.adjust.adjustment import Adjustment, bounded_weights
 from calib.adjust.significance import chance
 from calib.adjust.solver import Minimum
 from calib.adjust.terms import ImageTerm, StationTerm
+from calib.adjust.unknowns import MAST, Estimate, Known, ResidualBlock
 from calib.geometry.rigid import FloatArray
 
 REDUNDANT = 0.02
@@ -132,10 +133,6 @@ def dot_statistics(
     return np.asarray(np.nan_to_num((along**2 / np.maximum(values, REDUNDANT)).sum(axis=1), nan=np.inf))
 
 
-POSE = 6
-"""Numbers of a board's pose: the last unknowns of its images and of its tapes."""
-
-
 @dataclass(frozen=True, eq=False)
 class LeftOutBoard:
     """A board as the others predict it.
@@ -184,7 +181,7 @@ def left_out_boards(
     """
     groups: dict[tuple[str, str], list[tuple[ImageTerm | StationTerm, ResidualBlock]]] = {}
     for what, block in problem.blocks(fit.state):
-        if not isinstance(what, str) and what.board is not None:
+        if not isinstance(what, Known) and what.board is not None:
             groups.setdefault(what.board, []).append((what, block))
     mast = problem.at(MAST)
     of_mast = covariance[np.ix_(mast, mast)]
@@ -224,8 +221,8 @@ def _left_out(
     except np.linalg.LinAlgError:  # the others leave open what this board alone tells
         nan = float("nan")
         return LeftOutBoard(board, dots, nan, nan, nan, 0, 1.0, nan, 1.0)
-    chi2, freedom = squares + float(pull @ step), max(count - POSE, 1)
-    fitted, predicted = _dots(group, step)
+    chi2, freedom = squares + float(pull @ step), max(count - len(own), 1)
+    fitted, predicted = _dots(board, group, step)
     moved, by_luck = _pull(step[mast], without.T @ to_mast, of_mast)
     return LeftOutBoard(board, dots, fitted, predicted, chi2, freedom, chance(chi2, freedom), moved, by_luck)
 
@@ -243,11 +240,11 @@ def _pull(step: FloatArray, without: FloatArray, of_mast: FloatArray) -> tuple[f
 
 
 def _dots(
-    group: list[tuple[ImageTerm | StationTerm, ResidualBlock]], step: FloatArray
+    board: tuple[str, str], group: list[tuple[ImageTerm | StationTerm, ResidualBlock]], step: FloatArray
 ) -> tuple[float, float]:
     """Rms of a board's dots as fitted, and by the others with its pose fitted again, pixels."""
     ahead = [block.residual + block.jacobian @ step[block.columns] for _, block in group]
-    poses = [block.jacobian[:, -POSE:] for _, block in group]
+    poses = [block.rates(("board", board)) for _, block in group]
     pose = np.linalg.lstsq(np.concatenate(poses), -np.concatenate(ahead), rcond=None)[0]
     fitted, predicted = [], []
     for (what, block), residual, rates in zip(group, ahead, poses, strict=True):

@@ -20,10 +20,11 @@ from typing import Literal
 
 import numpy as np
 
-from calib.adjust.adjustment import Adjustment, Estimate
+from calib.adjust.adjustment import Adjustment
 from calib.adjust.significance import THREE_SIGMAS, chance
 from calib.adjust.terms import ImageTerm
-from calib.geometry.rig import AXIS_NAMES, JOINTS_NAMES
+from calib.adjust.unknowns import Estimate
+from calib.geometry.rig import AXIS_NAMES, JOINTS_NAMES, MAST_NAMES
 from calib.geometry.rigid import FloatArray
 
 Kind = Literal["harmonic 1", "harmonic 2", "backlash", "offset", "twist", "bow"]
@@ -31,10 +32,15 @@ Kind = Literal["harmonic 1", "harmonic 2", "backlash", "offset", "twist", "bow"]
 
 @dataclass(frozen=True)
 class ModelTerm:
-    """A part of the model: its kind, what it is of (a joint, ``axis``, a board), its parameters' names."""
+    """A part of the model: its kind, and what it is of (a joint, ``axis``, a board).
+
+    ``numbers`` are its places among ``JOINTS_NAMES`` (a joint's), ``MAST_NAMES`` (the axes') or a bow's two,
+    ``parameters`` their names.
+    """
 
     kind: Kind
     of: str
+    numbers: tuple[int, ...]
     parameters: tuple[str, ...]
 
     @property
@@ -52,22 +58,26 @@ def _by_name(terms: Iterable[ModelTerm]) -> dict[str, ModelTerm]:
     return {term.name: term for term in terms}
 
 
-_JOINT_KINDS: dict[Kind, tuple[str, ...]] = {
-    "harmonic 1": ("c1", "s1"),
-    "harmonic 2": ("c2", "s2"),
-    "backlash": ("backlash_rad",),
-}
+def _joint_term(kind: Kind, joint: int, numbers: tuple[int, ...]) -> ModelTerm:
+    """A term of one joint by which of its numbers (``AXIS_NAMES``) it has."""
+    places = tuple(joint * len(AXIS_NAMES) + number for number in numbers)
+    return ModelTerm(kind, ("pan", "tilt")[joint], places, tuple(JOINTS_NAMES[i] for i in places))
+
+
+def _axis_term(kind: Kind, place: int) -> ModelTerm:
+    """A term of the axes."""
+    return ModelTerm(kind, "axis", (place,), (f"mast.{MAST_NAMES[place]}",))
+
+
+_JOINT_KINDS: tuple[tuple[Kind, tuple[int, ...]], ...] = (
+    ("harmonic 1", (0, 1)), ("harmonic 2", (2, 3)), ("backlash", (4,)),
+)  # fmt: skip
 JOINT_TERMS = _by_name(
-    ModelTerm(kind, joint, tuple(f"joints.{joint}.{number}" for number in numbers))
-    for joint in ("pan", "tilt")
-    for kind, numbers in _JOINT_KINDS.items()
+    _joint_term(kind, joint, numbers) for joint in (0, 1) for kind, numbers in _JOINT_KINDS
 )
-AXIS_TERMS = _by_name(
-    (
-        ModelTerm("offset", "axis", ("mast.axis_offset_m",)),
-        ModelTerm("twist", "axis", ("mast.axis_twist_rad",)),
-    )
-)
+AXIS_TERMS = _by_name((_axis_term("offset", 6), _axis_term("twist", 7)))
+TERM_KINDS = ("joints", "mast", "bow")
+"""The kinds of unknowns (``calib.adjust.unknowns``) that terms are numbers of."""
 
 HIDDEN_PX = 0.1
 """What may hide in a term that is left out, one sigma, rms: half of what a person's click is off by."""
@@ -75,7 +85,7 @@ HIDDEN_PX = 0.1
 
 def bow_of(board: str) -> ModelTerm:
     """Return the term of a board that is not flat."""
-    return ModelTerm("bow", board, tuple(f"board {board}.bow_m.{a}" for a in "xy"))
+    return ModelTerm("bow", board, (0, 1), tuple(f"board {board}.bow_m.{a}" for a in "xy"))
 
 
 def candidate_terms(boards: Sequence[str]) -> dict[str, ModelTerm]:
@@ -183,10 +193,14 @@ def choose_terms(
     return chosen, found
 
 
-def joint_numbers(chosen: Sequence[str]) -> list[int]:
+def joint_numbers(chosen: Iterable[str]) -> list[int]:
     """Return which of the ten numbers of ``calib.geometry.rig.JOINTS_NAMES`` some terms have."""
-    wanted = [name for term in chosen if term in JOINT_TERMS for name in JOINT_TERMS[term].parameters]
-    return sorted(JOINTS_NAMES.index(name) for name in wanted)
+    return sorted(number for term in chosen if term in JOINT_TERMS for number in JOINT_TERMS[term].numbers)
+
+
+def axis_numbers(chosen: Iterable[str]) -> list[int]:
+    """Return which of the mast's eight numbers some terms have."""
+    return sorted(number for term in chosen if term in AXIS_TERMS for number in AXIS_TERMS[term].numbers)
 
 
 def moves_px(
@@ -233,25 +247,24 @@ def term_motions(
             if group[0] not in JOINT_TERMS and set(mine) <= set(place):
                 moved = sigma[:, None] * block.jacobian[:, [place[n] for n in mine]]
                 found[group] += moved.T @ moved
-    for group, mine in names.items():
+    for group in names:
         if group[0] in JOINT_TERMS:
-            found[group] = _by_joint(problem, state, mine)
+            found[group] = _by_joint(problem, state, [JOINT_TERMS[term] for term in group])
         else:
             found[group] /= max(count, 1)
     return found
 
 
-def _by_joint(problem: Adjustment, state: Estimate, names: Sequence[str]) -> FloatArray:
+def _by_joint(problem: Adjustment, state: Estimate, terms: Sequence[ModelTerm]) -> FloatArray:
     """How numbers of one joint move pixels, in the direction in which the joint turns."""
-    axis = names[0].split(".")[1]
-    joint = getattr(state.as_joints, axis)
-    which = 0 if axis == "pan" else 1
+    which = ("pan", "tilt").index(terms[0].of)
+    joint = (state.as_joints.pan, state.as_joints.tilt)[which]
     rates, focal = [], []
     for image in problem.images:
         if image.attitude is not None and image.keep.any():
             rates.append(joint.rates(problem.reading(state, image)[which], image.approach[which]))
             focal.append(float(np.linalg.norm(state.cameras[image.camera].H)))
-    numbers = [AXIS_NAMES.index(name.split(".")[2]) for name in names]
+    numbers = [number % len(AXIS_NAMES) for term in terms for number in term.numbers]
     apart = np.array(rates)[:, numbers]
     apart = (apart - apart.mean(axis=0)) * float(np.median(focal))
     return np.asarray(apart.T @ apart / len(apart))

@@ -22,9 +22,11 @@ from typing import Literal
 import numpy as np
 from scipy.special import chdtri
 
-from calib.adjust.adjustment import Adjustment, Estimate
+from calib.adjust.adjustment import Adjustment
 from calib.adjust.left_out import REDUNDANT, LeftOut, dot_statistics, left_out
+from calib.adjust.significance import typical_scale
 from calib.adjust.terms import ImageTerm, StationTerm
+from calib.adjust.unknowns import Estimate
 from calib.geometry.rigid import FloatArray, moved_rigid
 
 
@@ -239,7 +241,10 @@ def _tested(
         if t.keep and p.freedom == 3
     ]
     count = sum(len(one.dots) for one in seen)
-    return seen, points, _Limits(count, len(seen), len(points), _scale(kept, 2), _scale(whole, 3))
+    scales = (
+        max(1.0, typical_scale(np.concatenate(s or [np.ones(0)]), n)) for s, n in ((kept, 2), (whole, 3))
+    )
+    return seen, points, _Limits(count, len(seen), len(points), *scales)
 
 
 def _image(
@@ -291,7 +296,7 @@ def _board_misfit(
         cost = float(sum(b.residual @ b.residual for b in blocks))
         if not np.isfinite(cost):
             return float("inf")
-        jacobian = np.concatenate([b.jacobian[:, -6:] for b in blocks])  # a board's pose comes last
+        jacobian = np.concatenate([b.rates(("board", board)) for b in blocks])
         residual = np.concatenate([b.residual for b in blocks])
         step = np.linalg.lstsq(jacobian, -residual, rcond=None)[0]
         moved = moved_rigid(state.rover_from_board[board], step)
@@ -307,12 +312,4 @@ def _may_go(problem: Adjustment, point: StationTerm) -> bool:
     if point.board is not None:
         return True
     kept = sum(p.setup == point.setup and p.board is None and p.keep for p in problem.station)
-    return kept > PRISMS_LEFT and len(problem.mast_free) != 4
-
-
-def _scale(statistics: Sequence[FloatArray], freedom: int) -> float:
-    """By how much the typical statistic is larger than it should be; at least 1."""
-    if not statistics:
-        return 1.0
-    typical = float(np.median(np.concatenate([s.ravel() for s in statistics])))
-    return max(1.0, typical / float(chdtri(freedom, 0.5)))
+    return kept > PRISMS_LEFT and not problem.upright

@@ -14,9 +14,11 @@ from calib.adjust.left_out import LeftOutBoard
 from calib.adjust.model_terms import ModelTerm
 from calib.adjust.outliers import Outlier
 from calib.adjust.significance import THREE_SIGMAS
+from calib.adjust.unknowns import Estimate
 from calib.adjust.wider import WiderModel
-from calib.geometry.rig import Rig
+from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import FloatArray, Rigid
+from calib.survey.records import Survey
 
 HELD_FIXED = (
     "R0 of every camera is held at 0: whatever it does, A, H and V do as well",
@@ -71,82 +73,58 @@ class Degenerate:
     sentence: str
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """A fitted rig and everything that is needed to judge it.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FittedRig:
+    """A fitted rig and what is needed to judge it, whatever it was fitted to.
 
     Attributes
     ----------
-    method
-        How it was fitted.
-    mast_parameters
-        4, 6 or 8.
     rig
-        Mast and cameras; ``rig.fit`` and ``rig.provenance`` are empty.
-    parameter_names
-        (p,) of mast and cameras, as ``mast.translation_m.x`` and ``cameras.navcam_left.H.x``. A and O of a
-        camera have two each (``A.1``, ``A.2``): radians along ``calib.geometry.parameters.tangents``.
-    estimate
-        (p,) values; 0 for the two of an A or O, which count from the rig's own.
-    covariance
-        (p, p) of those.
+        Mast, joints and cameras; ``rig.fit`` and ``rig.provenance`` are empty.
+    parameter_names, covariance
+        (p,) and (p, p) of what was fitted of the mast, the joints and the cameras, as
+        ``mast.translation_m.x`` and ``cameras.navcam_left.H.x`` (``calib.geometry.covariance``); what was
+        held is exact. A and O of a camera have two each (``A.1``, ``A.2``): radians along
+        ``calib.geometry.rigid.tangents``.
     sigma
         Standard deviations under the mast file's keys: ``{"mast": {...}, "cameras": {name: {C: [3], ...}}}``.
-    rms_px
-        Camera to (x, y) rms of the fitted images' dots, pixels.
-    check_rms_px
-        Camera to (x, y) rms of the check images' dots and clicks, which were not fitted; without images whose
-        board, as it is named, the camera cannot see.
-    outliers
-        What was left out.
-    degenerate
-        What the survey leaves open.
+    rms_px, check_rms_px
+        Camera to (x, y) rms of what was fitted in images, and of check images, which were not; pixels.
+        Without images whose board, as it is named, the camera cannot see.
+    images
+        What remains of every image.
+    outliers, degenerate
+        What was left out, each with its reason, and what the measurements leave open.
     notes
         What else a person should know, a sentence each.
-    chi2, degrees_of_freedom
-        Sum of squares of the residuals in stated sigmas, and what it is expected to be.
-    chi2_probability
-        The chance of a larger ``chi2`` were all sigmas right; nan where the method does not weigh by them.
+    chi2, degrees_of_freedom, chi2_probability
+        Sum of squares of the residuals in stated sigmas, what it is expected to be, and the chance of a
+        larger one were all sigmas right; nan where the method does not weigh by them.
     components
         How large the errors of each kind of measurement are, against its stated sigma; empty where the method
-        does not weigh by them.
-    wider, left_out_boards
-        What further numbers would gain, the likeliest first, and what the rest says of each board; empty
-        where the method does not weigh by sigmas.
-    images, station
-        What remains of every measurement.
-    rover_from_station, rover_from_board
-        By set-up, and by (set-up, placement).
-    prisms_in_rover_m
-        Refined where the CAD has a sigma.
+        does not weigh by them. The covariance is by what they were.
+    rover_from_board
+        Poses by set-up, or board, and placement.
     seconds
         How long it took.
     """
 
-    method: Literal["paper", "joint"]
-    mast_parameters: int
     rig: Rig
     parameter_names: tuple[str, ...]
-    estimate: FloatArray
     covariance: FloatArray
     sigma: Mapping[str, Any]
     rms_px: Mapping[str, tuple[float, float]]
     check_rms_px: Mapping[str, tuple[float, float]]
+    images: tuple[ImageResiduals, ...]
     outliers: tuple[Outlier, ...]
     degenerate: tuple[Degenerate, ...]
     notes: tuple[str, ...]
     chi2: float
     degrees_of_freedom: float
     chi2_probability: float
-    images: tuple[ImageResiduals, ...]
-    station: tuple[StationResidual, ...]
-    rover_from_station: Mapping[str, Rigid]
-    rover_from_board: Mapping[tuple[str, str], Rigid]
-    prisms_in_rover_m: Mapping[str, FloatArray]
-    seconds: float
     components: tuple[Component, ...] = ()
-    wider: tuple[WiderModel, ...] = ()
-    left_out_boards: tuple[LeftOutBoard, ...] = ()
+    rover_from_board: Mapping[tuple[str, str], Rigid]
+    seconds: float
 
     def widened(self, kind: str) -> float:
         """Return by how much the fit takes a kind of measurement for worse than stated; 1 if it does not."""
@@ -154,9 +132,38 @@ class Calibration:
 
     def part(self, prefix: str) -> np.ndarray:
         """Return where the parameters that begin with ``prefix`` are, as indices."""
-        return np.array(
-            [i for i, name in enumerate(self.parameter_names) if name.startswith(prefix)], dtype=int
-        )
+        return np.array([i for i, n in enumerate(self.parameter_names) if n.startswith(prefix)], dtype=int)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Calibration(FittedRig):
+    """A rig fitted to a survey.
+
+    Attributes
+    ----------
+    method, mast_parameters
+        How it was fitted; 4, 6 or 8.
+    estimate
+        (p,) values of the parameters; 0 for the two of an A or O, which count from the rig's own.
+    wider, left_out_boards
+        What further numbers would gain, the likeliest first, and what the rest says of each board; empty
+        where the method does not weigh by sigmas.
+    station
+        What remains of every prism and tape.
+    rover_from_station
+        By set-up.
+    prisms_in_rover_m
+        Refined where the CAD has a sigma.
+    """
+
+    method: Literal["paper", "joint"]
+    mast_parameters: int
+    estimate: FloatArray
+    station: tuple[StationResidual, ...]
+    rover_from_station: Mapping[str, Rigid]
+    prisms_in_rover_m: Mapping[str, FloatArray]
+    wider: tuple[WiderModel, ...] = ()
+    left_out_boards: tuple[LeftOutBoard, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,74 +229,43 @@ class CheckExpected(NamedTuple):
     chance: float
 
 
-@dataclass(frozen=True, eq=False)
-class BenchCalibration:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BenchCalibration(FittedRig):
     """A rig fitted to pictures of boards that stood anywhere.
 
     Attributes
     ----------
-    rig
-        Cameras, mast and joints; ``rig.fit`` and ``rig.provenance`` are empty.
-    parameter_names, covariance
-        (p,) and (p, p) of the mast's, the joints' and the cameras' parameters that were fitted
-        (``calib.geometry.covariance``); what was held is exact.
     terms
         Every term that could have entered.
-    rms_px, check_rms_px
-        Camera to (x, y) rms of the corners that were fitted, and of those of check images.
     checks
         Camera to what check images should be off by, and how likely it is that they are off by more.
-    images
-        What remains of every image.
-    outliers
-        What was left out, each with its reason.
-    degenerate
-        What the pictures leave open.
-    gauges, notes
-        What pictures cannot know and how it was fixed; what else a person should know. Sentences.
-    chi2, degrees_of_freedom, chi2_probability
-        Weighted sum of squares, what it is expected to be, and the chance of a larger one, by stated sigmas.
+    gauges
+        What pictures cannot know and how it was fixed, a sentence each.
     placements
         Each placement held against the others, the least likely first.
     drifts
         How far each joint and each camera drifts, the least likely first.
-    components
-        How large errors were against what was stated; the covariance is by what they were.
     joint_rad
         What one joint reading is off by, besides its joint's errors.
     inexact_m
         What corners are off by on the board beyond their own sigmas; 0 where these explain them.
-    rover_from_board, bows_m
-        Poses by board and placement; by board its bow (across, down), metres.
-    seconds
-        How long it took.
+    bows_m
+        By board its bow (across, down), metres.
     """
 
-    rig: Rig
-    parameter_names: tuple[str, ...]
-    covariance: FloatArray
-    sigma: Mapping[str, Any]
     terms: tuple[TermGain, ...]
-    rms_px: Mapping[str, tuple[float, float]]
-    check_rms_px: Mapping[str, tuple[float, float]]
     checks: Mapping[str, CheckExpected]
-    images: tuple[ImageResiduals, ...]
-    outliers: tuple[Outlier, ...]
-    degenerate: tuple[Degenerate, ...]
     gauges: tuple[str, ...]
-    notes: tuple[str, ...]
-    chi2: float
-    degrees_of_freedom: float
-    chi2_probability: float
     placements: tuple[OtherPlacements, ...]
     drifts: tuple[BenchDrift, ...]
-    components: tuple[Component, ...]
     joint_rad: float
     inexact_m: float
-    rover_from_board: Mapping[tuple[str, str], Rigid]
     bows_m: Mapping[str, FloatArray]
-    seconds: float
 
-    def part(self, prefix: str) -> np.ndarray:
-        """Return where the parameters that begin with ``prefix`` are, as indices."""
-        return np.array([i for i, n in enumerate(self.parameter_names) if n.startswith(prefix)], dtype=int)
+
+def rig_of(survey: Survey, state: Estimate) -> Rig:
+    """Return the rig of a state; it has the survey folder's name."""
+    cameras = {n: RigCamera(survey.cameras[n].on, m) for n, m in state.cameras.items()}
+    stereo = {p: pair for p, pair in survey.stereo.items() if set(pair) <= set(cameras)}
+    name = survey.folder.name or "calibrated"
+    return Rig(name, state.as_mast, cameras, stereo, joints=state.as_joints)

@@ -12,12 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.adjust.adjustment import HUBER, Adjustment, Estimate
+from calib.adjust.adjustment import HUBER, Adjustment
 from calib.adjust.goodness import Component, found_sigmas, variance_components
 from calib.adjust.outliers import judge
-from calib.adjust.significance import MEDIAN_OF_TWO
+from calib.adjust.significance import typical_scale
 from calib.adjust.solver import Minimum, Normal, covariance_of, minimise
 from calib.adjust.terms import ImageTerm, StationTerm, widened_images
+from calib.adjust.unknowns import Estimate
 from calib.errors import CalibError
 from calib.geometry.rigid import FloatArray
 
@@ -132,4 +133,4 @@ def typical_length(
     told_px = np.maximum(own_px, least_px)
     residuals = np.concatenate([problem.image_residual(state, t).reshape(-1, 2) for t in images])
     lengths = np.linalg.norm(residuals, axis=1) * own_px / told_px
-    return float(np.median(lengths) / np.sqrt(MEDIAN_OF_TWO)), float(np.median(told_px))
+    return float(np.sqrt(typical_scale(lengths**2))), float(np.median(told_px))

@@ -11,11 +11,12 @@ make up for. Nothing is fitted again, so that hundreds of wider models cost as m
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from calib.adjust.adjustment import ResidualBlock
+from calib.adjust.unknowns import ResidualBlock
 from calib.geometry.rigid import FloatArray
 
 MADE_UP = 1e-7
@@ -47,8 +48,9 @@ class Score:
         self.pull = np.zeros(count)
         self.touched = np.zeros(count)
 
-    def add(self, block: ResidualBlock, at: np.ndarray, columns: FloatArray) -> None:
-        """Add a group of residuals (m,) with its Jacobian ``columns`` (m, k) on the numbers ``at`` (k,)."""
+    def add(self, block: ResidualBlock, columns: FloatArray, at: np.ndarray | None = None) -> None:
+        """Add residuals (m,) with their Jacobian ``columns`` (m, k) on the numbers ``at`` (k,), or on all."""
+        at = np.arange(len(self.pull)) if at is None else at
         self.own[np.ix_(at, at)] += columns.T @ columns
         self.cross[np.ix_(at, block.columns)] += columns.T @ block.jacobian
         self.pull[at] += columns.T @ block.residual
@@ -71,13 +73,19 @@ class Beside:
     pull: FloatArray
     touched: FloatArray
 
-    def gain(self, combined: FloatArray | None = None) -> Gain:
-        """Return what the numbers, or ``combined`` (k, c) of them, would gain."""
+    def gain(self, combined: FloatArray | None = None, least: float = MADE_UP) -> Gain:
+        """Return what the numbers, or ``combined`` (k, c) of them, would gain.
+
+        A direction of which the fitted numbers leave less than the part ``least`` is not looked at. Where
+        something is not finite, nothing is gained.
+        """
         t = np.eye(len(self.pull)) if combined is None else combined
         own, left, pull = t.T @ self.own @ t, t.T @ self.left @ t, t.T @ self.pull
         scale = np.sqrt(np.maximum(np.diag(own), 1e-300))
+        if not (np.isfinite(left).all() and np.isfinite(pull).all()):
+            return Gain(0.0, 0, np.zeros(len(pull)), np.full(len(pull), np.nan), 0.0)
         values, vectors = np.linalg.eigh(left / np.outer(scale, scale))
-        count = values > MADE_UP
+        count = values > least
         along = vectors[:, count].T @ (pull / scale)
         found = -vectors[:, count] @ (along / values[count]) / scale
         spread = np.sqrt(np.sum(vectors[:, count] ** 2 / values[count], axis=1)) / scale
@@ -90,3 +98,15 @@ class Beside:
             np.where(free, spread, np.nan),
             float(np.sqrt(found @ own @ found / touched)),
         )
+
+
+def scored(
+    parts: Iterable[tuple[ResidualBlock, FloatArray]], covariance: FloatArray, gradient: FloatArray
+) -> Beside:
+    """Return the equations of numbers (k,) that some residuals depend on, all at rates (m, k)."""
+    score: Score | None = None
+    for block, rates in parts:
+        score = score or Score(rates.shape[1], len(gradient))
+        score.add(block, rates)
+    assert score is not None
+    return score.beside(covariance, gradient)

@@ -94,7 +94,18 @@ def rare_sum(probability: float, weights: FloatArray) -> float:
     return float(brentq(lambda total: chance_of_sum(total, weights) - probability, low, high, rtol=1e-9))
 
 
+def typical_scale(squares: FloatArray, freedom: int = 2) -> float:
+    """Return by how much the typical square (n,), in sigmas, is larger than chance makes it.
+
+    Squares are chi-square with ``freedom``; their median over what that should be. 1 of none.
+    """
+    from scipy.special import chdtri  # slow to load, and a daemon that starts does not need it
+
+    median = MEDIAN_OF_TWO if freedom == 2 else float(chdtri(freedom, 0.5))
+    return float(np.median(squares) / median) if len(squares) else 1.0
+
+
 def typical_px(residuals_px: FloatArray) -> float:
     """Return the sigma of a coordinate that the median length of residuals (n, 2) tells, pixels."""
     square = np.nan_to_num((residuals_px**2).sum(axis=1), nan=np.inf)
-    return float(np.sqrt(np.median(square) / MEDIAN_OF_TWO)) if len(square) else float("inf")
+    return float(np.sqrt(typical_scale(square))) if len(square) else float("inf")

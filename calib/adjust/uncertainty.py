@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 from scipy.optimize import approx_fprime
 
-from calib.adjust.adjustment import Adjustment, Estimate
+from calib.adjust.adjustment import Adjustment
 from calib.adjust.result import Calibration, Degenerate, ImageResiduals, StationResidual
 from calib.adjust.terms import ImageTerm
+from calib.adjust.unknowns import MAST, Estimate
 from calib.errors import CalibError
 from calib.geometry import covariance as rig_covariance
 from calib.geometry.covariance import pixel_rates
-from calib.geometry.parameters import parameter_part
+from calib.geometry.parameters import parameter_names, parameter_part
 from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig, gimbal
 from calib.geometry.rigid import FloatArray, tangents
@@ -150,13 +151,14 @@ def sigma_by_key(rig: Rig, names: Sequence[str], covariance: FloatArray) -> dict
         for key in ("translation_m", "rotation_rad")
     }
     mast |= {key: deviation.get(f"mast.{key}", 0.0) for key in ("axis_offset_m", "axis_twist_rad")}
+    at = {name: i for i, name in enumerate(names)}
     cameras: dict[str, Any] = {}
     for name, camera in rig.cameras.items():
-        first = [i for i, n in enumerate(names) if n.startswith(f"cameras.{name}.")]
+        kind = camera.model.kind
+        first = [at[one] for p in parameter_names(kind) if (one := f"cameras.{name}.{p}") in at]
         if not first:
             continue
         mine = covariance[np.ix_(first, first)]
-        kind = camera.model.kind
         cameras[name] = {}
         for letter in dict.fromkeys(kind):
             part = parameter_part(kind, letter)
@@ -271,16 +273,17 @@ def open_parameters(
     return tuple(found)
 
 
-def open_directions(
-    problem: Adjustment, names: Sequence[str], covariance: FloatArray
-) -> tuple[Degenerate, ...]:
-    """Return the directions of mast and cameras that a survey leaves open, in words.
+def open_directions(problem: Adjustment, covariance: FloatArray) -> tuple[Degenerate, ...]:
+    """Return the directions of cameras and mast that a survey leaves open, in words.
 
-    ``covariance`` is of ``names``, the first of the problem's unknowns, with the problem's weak knowledge
+    ``covariance`` is of the numbers of the problem's cameras and mast, in this order, with its weak knowledge
     added.
     """
-    shown = [i for i, n in enumerate(names) if n.startswith("mast.") or n.split(".")[2] not in "ORE"]
-    found = open_parameters([names[i] for i in shown], covariance[np.ix_(shown, shown)], problem.weak[shown])
+    rig = problem.unknowns.of_kinds("camera", "mast")
+    asked = ~problem.unknowns.usual[rig]
+    shown = rig[asked]
+    names = [problem.names[i] for i in shown]
+    found = open_parameters(names, covariance[np.ix_(asked, asked)], problem.weak[shown])
     return tuple(Degenerate(parts, _reason(problem, parts)) for parts in found)
 
 
@@ -288,9 +291,9 @@ def _reason(problem: Adjustment, parameters: Sequence[str]) -> str:
     """Why a direction is open, and what to measure."""
     what = f"the survey does not fix {in_words(parameters)}"
     head = [t for t in problem.images if t.attitude is not None and t.keep.any()]
-    on_mast = any(p.startswith("mast.") for p in parameters)
-    cameras = {p.split(".")[1] for p in parameters if p.startswith("cameras.")}
-    if head and (on_mast or cameras & {t.camera for t in head}):
+    owners = {problem.unknowns.owner(name) for name in parameters}
+    cameras = {str(key[1]) for key in owners if key[0] == "camera"}
+    if head and (MAST in owners or cameras & {t.camera for t in head}):
         pan = np.ptp([t.pan_rad for t in head])
         tilt = np.ptp([t.tilt_rad for t in head])
         still = [n for n, moved in (("pan", pan), ("tilt", tilt)) if moved < SEEN_RAD]

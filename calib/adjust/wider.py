@@ -16,10 +16,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import null_space
 
-from calib.adjust.adjustment import Adjustment, Estimate, ResidualBlock
-from calib.adjust.score import Beside, Gain, Score
+from calib.adjust.adjustment import Adjustment
+from calib.adjust.score import Beside, Gain, Score, scored
 from calib.adjust.significance import chance
 from calib.adjust.terms import DRAWING, ImageTerm
+from calib.adjust.unknowns import Estimate, ResidualBlock
 from calib.geometry.rig import MAST_NAMES, Gimbal, gimbal, gimbal_rates
 from calib.geometry.rigid import FloatArray, rigid_rates
 
@@ -141,8 +142,8 @@ class _View:
         board = state.rover_from_board[image.board]
         in_board = image.in_board_m[image.keep]
         head = None if image.attitude is None else gimbal(state.mast, *problem.joints(state, image))
-        # A board's shift comes last among the unknowns of an image, and moves every point alike.
-        per_point = block.jacobian[:, -3:].reshape(len(in_board), 2, 3)
+        # A board's shift, after its turn, moves every point alike.
+        per_point = block.rates(("board", image.board))[:, 3:].reshape(len(in_board), 2, 3)
         return cls(image, block, per_point, board.points(in_board), board.rotation, in_board, head)
 
     def gimbal_columns(self, wanted: Sequence[int]) -> FloatArray:
@@ -187,14 +188,7 @@ class _Tests:
 
     def scored(self, views: Sequence[_View], columns: Callable[[_View], FloatArray]) -> Beside:
         """The equations of numbers that all of some images depend on."""
-        score: Score | None = None
-        for view in views:
-            mine = columns(view)
-            if score is None:
-                score = Score(mine.shape[1], len(self.gradient))
-            score.add(view.block, np.arange(mine.shape[1]), mine)
-        assert score is not None
-        return score.beside(self.covariance, self.gradient)
+        return scored(((view.block, columns(view)) for view in views), self.covariance, self.gradient)
 
     def each(self, groups: Sequence[Sequence[_View]], columns: Callable[[_View], FloatArray]) -> Beside:
         """The equations of numbers that every group of images has for itself."""
@@ -202,7 +196,7 @@ class _Tests:
         score = Score(count * len(groups), len(self.gradient))
         for index, group in enumerate(groups):
             for view in group:
-                score.add(view.block, index * count + np.arange(count), columns(view))
+                score.add(view.block, columns(view), index * count + np.arange(count))
         return score.beside(self.covariance, self.gradient)
 
     def model(self, name: str, gain: Gain, sentence: str, alternatives: int = 1) -> WiderModel:
@@ -362,7 +356,7 @@ class _Tests:
             for point in mine:
                 rates = rigid_rates(eye, pose.points(point.in_board_m)[None], pose.translation_m)[0]
                 block = self.problem.station_block(self.state, point)
-                score.add(block, np.arange(6), -rates / point.sigma_m)
+                score.add(block, -rates / point.sigma_m)
             gains[key] = score.beside(self.covariance, self.gradient).gain()
         if not gains:
             return
@@ -385,7 +379,7 @@ class _Tests:
         score = Score(3 * len(names), len(self.gradient))
         for point in mine:
             block = self.problem.station_block(self.state, point)
-            score.add(block, 3 * names.index(point.point) + np.arange(3), -np.eye(3) / point.sigma_m)
+            score.add(block, -np.eye(3) / point.sigma_m, 3 * names.index(point.point) + np.arange(3))
         # All prisms moved as one body are another rover frame, which no survey tells.
         places = np.array([self.state.prisms_in_rover_m[name] for name in names])
         as_one = rigid_rates(np.eye(3)[None], places, places.mean(axis=0)).reshape(-1, 6)

@@ -23,9 +23,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.adjust.adjustment import KNOWN_BEFOREHAND, MAST, Adjustment, Estimate
+from calib.adjust.adjustment import Adjustment
 from calib.adjust.outliers import Outlier
-from calib.adjust.result import Calibration, ImageResiduals
+from calib.adjust.result import Calibration, ImageResiduals, rig_of
 from calib.adjust.robust import SurveyNotFitted
 from calib.adjust.solver import covariance_of
 from calib.adjust.terms import ImageTerm, lens_knowledge, lens_notes, with_kept
@@ -37,10 +37,10 @@ from calib.adjust.uncertainty import (
     sigma_by_key,
     station_residuals,
 )
+from calib.adjust.unknowns import MAST, Estimate
 from calib.calibrate.starts.mast import MastNotFitted, fit_mast
 from calib.calibrate.starts.stray_dots import without_stray_dots
 from calib.calibrate.starts.survey import Start, at_setting, camera_from_points, mast_views, start_values
-from calib.calibrate.survey import estimate_values, mast_first, rig_of
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.parameters import parameter_names, parameter_part, predict, stepped
 from calib.geometry.rig import gimbal, gimbal_rates, mast_of
@@ -71,21 +71,21 @@ class TwoSteps:
     def covariance(self, camera_images: set[str]) -> tuple[FloatArray, FloatArray]:
         """Covariance of cameras in the head (or rover) and mast: all of it, and for noise of dots alone."""
         problem = self.problem
-        size, total = problem.parts[MAST].stop, len(problem.names)
+        total = len(problem.names)
         first, second = np.zeros((total, total)), np.zeros((total, total))
         for term in problem.images:
             if term.keep.any():
                 block = self._block(term)
                 at = np.ix_(block.columns, block.columns)
                 (first if term.name in camera_images else second)[at] += block.jacobian.T @ block.jacobian
-        k, m = np.arange(problem.parts[MAST].start), np.arange(problem.parts[MAST].start, size)
-        s = np.arange(size, total)
+        k, m = problem.unknowns.of_kinds("camera"), problem.at(MAST)
+        s = np.setdiff1d(np.arange(total), np.concatenate([k, m]))
         camera_matrix = first[np.ix_(k, k)] + np.diag(problem.weak[k])
         for name, model in self.cameras.items():
             if "O" in model.kind:
                 _, rows = lens_knowledge(model)
-                part = problem.parts["camera", name]
-                camera_matrix[part, part] += rows.T @ rows
+                part = np.searchsorted(k, problem.at(("camera", name)))
+                camera_matrix[np.ix_(part, part)] += rows.T @ rows
         by_dots_k = covariance_of(camera_matrix)
         k_by_s = -by_dots_k @ first[np.ix_(k, s)]
         by_dots_m = covariance_of(second[np.ix_(m, m)], problem.weak[m]) if len(m) else np.zeros((0, 0))
@@ -95,7 +95,7 @@ class TwoSteps:
         dots = follow @ by_dots_k @ follow.T
         dots[len(k) :, len(k) :] += by_dots_m
         by_s = np.concatenate([k_by_s, m_by_s])
-        to_head = self._to_head(size)
+        to_head = self._to_head(np.concatenate([k, m]))
         station = by_s @ self._station(s) @ by_s.T
         return to_head @ (dots + station) @ to_head.T, to_head @ dots @ to_head.T
 
@@ -108,8 +108,8 @@ class TwoSteps:
                 continue
             block = problem.station_block(self.state, point)
             matrix[np.ix_(block.columns, block.columns)] += block.jacobian.T @ block.jacobian
-        for name, block in problem.known(self.state):
-            if not name.startswith(KNOWN_BEFOREHAND):
+        for what, block in problem.known(self.state):
+            if what.kind is not None:
                 matrix[np.ix_(block.columns, block.columns)] += block.jacobian.T @ block.jacobian
         return covariance_of(matrix[np.ix_(s, s)])
 
@@ -144,13 +144,14 @@ class TwoSteps:
         jacobian = np.concatenate(parts, axis=2) / term.sigma_px[keep, None, None]
         return _Block(jacobian.reshape(2 * len(points), -1), np.concatenate(columns))
 
-    def _to_head(self, size: int) -> FloatArray:
-        """(size, size): from steps of cameras in the rover frame and of the mast to those of head cameras."""
-        matrix = np.eye(size)
+    def _to_head(self, rig: np.ndarray) -> FloatArray:
+        """(k, k), of the ``rig``'s numbers: from steps of the mast and of cameras in the rover frame to those
+        of head cameras."""
+        matrix = np.eye(len(self.problem.names))
         for name, at in self.reference_rad.items():
-            part = self.problem.parts["camera", name]
-            columns = np.concatenate([self.problem.at(("camera", name)), self.problem.at(MAST)])
-            count = part.stop - part.start
+            part = self.problem.at(("camera", name))
+            columns = np.concatenate([part, self.problem.at(MAST)])
+            count = len(part)
             nominal, in_rover = self.state.cameras[name], self.cameras[name]
             scale = np.full(len(columns), 1e-6)
             for letter in "HV":
@@ -160,7 +161,7 @@ class TwoSteps:
                 step[index] = scale[index]
                 ends = [self._in_head(in_rover, at, nominal, sign * step, count) for sign in (1.0, -1.0)]
                 matrix[part, column] = (ends[0] - ends[1]) / (2 * scale[index])
-        return matrix
+        return np.asarray(matrix[np.ix_(rig, rig)])
 
     def _in_head(
         self,
@@ -253,33 +254,32 @@ def _fit(survey: Survey, mast_parameters: int, began: float) -> Calibration:
     )
     parts = TwoSteps(problem, state, cameras, from_here.reference_rad)
     covariance, mast_alone = parts.covariance({t.name for t in camera_images})
-    size = problem.parts[MAST].stop
-    names = problem.names[:size]
     images = image_residuals(survey, problem, state, from_here.images, from_here.checks)
     in_sigmas = [
         np.sum((i.residuals_px[i.used] / i.sigma_px[i.used, None]) ** 2) for i in images if i.used.any()
     ]
     count = sum(2 * int(i.used.sum()) for i in images)
-    order = mast_first(names)
-    ordered = [names[i] for i in order]
-    rig = rig_of(survey, state)
-    sigma = sigma_by_key(rig, ordered, covariance[np.ix_(order, order)])
+    rig, values = rig_of(survey, state), problem.values(state, "mast", "camera")
+    place = {number: i for i, number in enumerate(problem.unknowns.of_kinds("camera", "mast").tolist())}
+    order = [place[number] for number in problem.unknowns.of_kinds("mast", "camera").tolist()]
+    covariance = covariance[np.ix_(order, order)]
+    sigma = sigma_by_key(rig, tuple(values), covariance)
     notes = [*from_here.notes, *_bent_notes(from_here), *lens_notes(rig, sigma)]
     return Calibration(
         method="paper",
         mast_parameters=mast_parameters,
         rig=rig,
-        parameter_names=tuple(ordered),
-        estimate=estimate_values(ordered, state),
-        covariance=covariance[np.ix_(order, order)],
+        parameter_names=tuple(values),
+        estimate=np.array(list(values.values())),
+        covariance=covariance,
         sigma=sigma,
         rms_px=rms_by_camera(images),
         check_rms_px=check_rms(survey, state, images),
         outliers=(*from_here.blunders, *_left_out(images, {**dict.fromkeys(left_out, np.nan), **doubtful})),
-        degenerate=open_directions(problem, names, mast_alone),
+        degenerate=open_directions(problem, mast_alone),
         notes=tuple(notes),
         chi2=float(sum(in_sigmas)),
-        degrees_of_freedom=float(count - size),
+        degrees_of_freedom=float(count - len(values)),
         chi2_probability=float("nan"),
         images=images,
         station=station_residuals(problem, state),

@@ -7,17 +7,16 @@ and with sigmas as they are found (`calib.adjust.robust`). A fit that ends far a
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
-from calib.adjust.adjustment import HUBER, MAST, Adjustment, Estimate
+from calib.adjust.adjustment import HUBER, Adjustment
 from calib.adjust.goodness import goodness
 from calib.adjust.left_out import left_out_boards
 from calib.adjust.outliers import name_outliers
-from calib.adjust.result import Calibration
+from calib.adjust.result import Calibration, rig_of
 from calib.adjust.robust import SurveyNotFitted, Weighed, typical_length, weigh, without_blunders
 from calib.adjust.solver import Minimum, covariance_of
 from calib.adjust.terms import lens_notes, with_kept
@@ -29,10 +28,9 @@ from calib.adjust.uncertainty import (
     sigma_by_key,
     station_residuals,
 )
+from calib.adjust.unknowns import Estimate
 from calib.adjust.wider import WiderModel, explaining, wider_models
 from calib.calibrate.starts.survey import Start, start_values
-from calib.geometry.rig import Rig, RigCamera
-from calib.geometry.rigid import FloatArray
 from calib.survey.records import Survey
 
 WRONG_MINIMUM = 6.0
@@ -102,7 +100,7 @@ def _refuse_wrong_minimum(problem: Adjustment, state: Estimate, dot_px: float) -
     """Raise if a camera's typical dot is far above its noise, or if the station contradicts the rest."""
     tapes = [p for p in problem.station if p.board is not None]
     left_out = sum(not p.keep for p in tapes)
-    if left_out > max(3, MANY * len(tapes)) and len(problem.mast_free) != 4:
+    if left_out > max(3, MANY * len(tapes)) and not problem.upright:
         raise SurveyNotFitted(
             f"{left_out} of {len(tapes)} tapes do not agree with the images: too many for blunders; check "
             "the sigmas and the joint angles, and whether the mast's axes meet at a right angle (else fit "
@@ -135,10 +133,10 @@ def _calibration(
 ) -> Calibration:
     """Put together what the fit says, with the stated sigmas and with those that were found."""
     problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
-    size = problem.parts[MAST].stop
-    names = problem.names[:size]
+    rig_numbers = problem.unknowns.of_kinds("camera", "mast")
     notes = list(from_here.notes)
-    mine = covariance[:size, :size]
+    order = problem.unknowns.of_kinds("mast", "camera")
+    mine = covariance[np.ix_(order, order)]
     chi_square, freedom = goodness(problem, state, covariance)
     if freedom > 0 and chdtrc(freedom, chi_square) < 0.001:
         notes.append(
@@ -149,25 +147,22 @@ def _calibration(
     stated, first = as_stated
     notes += _prism_notes(stated, first.state, mast_parameters)
     chi_square, freedom = goodness(stated, first.state, covariance_of(first.normal.matrix, stated.weak))
-    rig = rig_of(survey, state)
-    order = mast_first(names)
-    names = [names[i] for i in order]
-    mine = mine[np.ix_(order, order)]
-    sigma = sigma_by_key(rig, names, mine)
+    rig, values = rig_of(survey, state), problem.values(state, "mast", "camera")
+    sigma = sigma_by_key(rig, tuple(values), mine)
     notes += lens_notes(rig, sigma)
     images = image_residuals(survey, problem, state, from_here.images, from_here.checks)
     return Calibration(
         method="joint",
         mast_parameters=mast_parameters,
         rig=rig,
-        parameter_names=tuple(names),
-        estimate=estimate_values(names, state),
+        parameter_names=tuple(values),
+        estimate=np.array(list(values.values())),
         covariance=mine,
         sigma=sigma,
         rms_px=rms_by_camera(images),
         check_rms_px=check_rms(survey, state, images),
         outliers=(*name_outliers(problem, state, covariance, weighed.images), *from_here.stray_checks),
-        degenerate=open_directions(problem, problem.names[:size], covariance[:size, :size]),
+        degenerate=open_directions(problem, covariance[np.ix_(rig_numbers, rig_numbers)]),
         notes=tuple(notes),
         chi2=chi_square,
         degrees_of_freedom=freedom,
@@ -209,33 +204,3 @@ def _prism_notes(problem: Adjustment, state: Estimate, mast_parameters: int) -> 
                 f"the prisms of set-up {setup} do not agree with {why}: they are off by up to {worst:.1f} mm"
             )
     return notes
-
-
-def mast_first(names: Sequence[str]) -> list[int]:
-    """Return the order of parameters that a calibration has: the mast's, then the cameras'."""
-    return sorted(range(len(names)), key=lambda i: not names[i].startswith("mast."))
-
-
-def estimate_values(names: Sequence[str], state: Estimate) -> FloatArray:
-    """Return the values of parameters by name; 0 for those of A and O, which count from the camera's own."""
-    mast = {"translation_m": state.mast[:3], "rotation_rad": state.mast[3:6]}
-    values = []
-    for name in names:
-        owner, *rest = name.split(".")
-        if owner == "mast":
-            if rest[0] in mast:
-                values.append(float(mast[rest[0]]["xyz".index(rest[1])]))
-            else:
-                values.append(float(state.mast[6 if rest[0] == "axis_offset_m" else 7]))
-            continue
-        camera, letter, which = rest
-        index = int(which) if which.isdigit() else "xyz".index(which)
-        values.append(0.0 if letter in "AO" else float(getattr(state.cameras[camera], letter)[index]))
-    return np.array(values)
-
-
-def rig_of(survey: Survey, state: Estimate) -> Rig:
-    """Return the rig of a state; it has the survey folder's name."""
-    cameras = {n: RigCamera(survey.cameras[n].on, m) for n, m in state.cameras.items()}
-    stereo = {p: pair for p, pair in survey.stereo.items() if set(pair) <= set(cameras)}
-    return Rig(survey.folder.name or "calibrated", state.as_mast, cameras, stereo)

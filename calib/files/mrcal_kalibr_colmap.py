@@ -153,10 +153,8 @@ def format_mrcal(camera: CameraModel | OpencvCamera, frame: str) -> bytes:
 def _numbers_of(model: CameraModel) -> tuple[str, list[float], Rigid]:
     """Lens model, intrinsics and pose of a camera of the CAHV family."""
     hc, vc = float(model.H @ model.A), float(model.V @ model.A)
-    across = model.H - hc * model.A
-    x = across / np.linalg.norm(across)
-    y = np.cross(model.A, x)
-    pose = Rigid(np.stack([x, y, model.A], axis=1), model.C)
+    pose = model.pose
+    x, y, _ = pose.rotation.T
     core = [float(model.H @ x), float(model.V @ y), hc, vc]
     if model.kind == "CAHV":
         return "LENSMODEL_PINHOLE", core, pose

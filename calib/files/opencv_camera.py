@@ -274,7 +274,7 @@ class PlumbBob(ReadOnlyArrays):
         return _pixels(_numbers(self.matrix_px, self.distortion), points)
 
 
-def camera_axes(model: CameraModel) -> FloatArray:
+def even_axes(model: CameraModel) -> FloatArray:
     """Return (3, 3): columns are the camera's x, y, z in the model's frame; z along A, x as H and V say."""
     z = model.A
     right = model.H - (model.H @ z) * z
@@ -295,14 +295,14 @@ def nearest_plumb_bob(model: CameraModel) -> PlumbBob:
     width, height = model.size_px
     columns, rows = np.linspace(0.0, width - 1.0, GRID[0]), np.linspace(0.0, height - 1.0, GRID[1])
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    axes = camera_axes(model)
+    axes = even_axes(model)
     rays = model.ray(pixels)
     directions = rays.directions @ axes
     seen = rays.valid & (directions[:, 2] > 0.05)
     if np.count_nonzero(seen) < len(pixels) // 2:
         raise ValueError("more than half of the image looks sideways or backwards; plumb_bob cannot say that")
     pixels, directions = pixels[seen], directions[seen]
-    focal = [float(np.linalg.norm(np.cross(model.A, letter))) for letter in (model.H, model.V)]
+    focal = list(model.focal_px)
     start = np.array([*focal, model.A @ model.H, model.A @ model.V, 0.0, 0.0, 0.0, 0.0, 0.0])
     scale = np.array([focal[0], focal[1], width, height, 1.0, 1.0, 0.1, 0.1, 1.0])
 

@@ -15,7 +15,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from scipy.optimize import least_squares
 
-from calib.files.opencv_camera import LensKind, OpencvCamera
+from calib.files.opencv_camera import LensKind, OpencvCamera, even_axes
 from calib.geometry.cahvor import CameraModel, Kind, Rays
 from calib.geometry.parameters import parameter_names, predict, stepped
 from calib.geometry.rigid import FloatArray, Rigid, moved_rigid
@@ -258,13 +258,14 @@ def nearest_square(model: CameraModel) -> CameraModel:
     E, R0 and linearity stay what they are.
     """
     pixels, points = _what_it_sees(model)
-    across, down = model.H - (model.H @ model.A) * model.A, model.V - (model.V @ model.A) * model.A
-    x = across / np.linalg.norm(across)
-    x = x + np.cross(down / np.linalg.norm(down), model.A)
-    x /= np.linalg.norm(x)
-    place = Rigid(np.stack([x, np.cross(model.A, x), model.A], axis=1), model.C)
+    place = Rigid(even_axes(model), model.C)
     start = np.zeros(7 if model.kind == "CAHV" else 11)
-    start[3:7] = model.H @ x, model.V @ place.rotation[:, 1], model.H @ model.A, model.V @ model.A
+    start[3:7] = (
+        model.H @ place.rotation[:, 0],
+        model.V @ place.rotation[:, 1],
+        model.H @ model.A,
+        model.V @ model.A,
+    )
     scale = np.concatenate([np.full(3, 0.001), np.full(4, 10.0), np.full(len(start) - 7, 0.01)])
 
     def build(numbers: FloatArray) -> CameraModel:

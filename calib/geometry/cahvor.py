@@ -9,7 +9,7 @@ library as published with VICAR (``cmod_cahv*.c``).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import inf, isfinite, nan, sqrt
 from numbers import Integral
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from calib.geometry.lens import Lens
 from calib.geometry.projection import Place, Projection, project_as_published
-from calib.geometry.rigid import FloatArray, ReadOnlyArrays, Rigid, frozen_array, tangents
+from calib.geometry.rigid import FloatArray, ReadOnlyArrays, Rigid, frozen_array, tangents, turning
 
 Kind = Literal["CAHV", "CAHVOR", "CAHVORE"]
 
@@ -249,6 +249,34 @@ class CameraModel(ReadOnlyArrays):
         model.__dict__.update(self.__dict__, _rows=rows, **letters)
         model.__dict__.pop("_place", None)
         return model
+
+    def turned(self, turn_rad: ArrayLike) -> CameraModel:
+        """Return the camera turned about its C by a rotation vector (3,), radians."""
+        rotation = turning(np.asarray(turn_rad, dtype=np.float64))
+        return self.moved(Rigid(rotation, self.C - rotation @ self.C))
+
+    def zoomed(self, part: float) -> CameraModel:
+        """Return the camera with a focal length longer by a part of itself."""
+        h, v = (letter + part * (letter - (letter @ self.A) * self.A) for letter in (self.H, self.V))
+        return replace(self, H=h, V=v)
+
+    @property
+    def focal_px(self) -> tuple[float, float]:
+        """Focal lengths across and down, pixels: |A x H| and |A x V|."""
+        across, down = (float(np.linalg.norm(np.cross(self.A, letter))) for letter in (self.H, self.V))
+        return across, down
+
+    @property
+    def axes(self) -> FloatArray:
+        """(3, 3): columns are x right, y down and z along A, in the model's frame."""
+        across = self.H - (self.H @ self.A) * self.A
+        x = across / np.linalg.norm(across)
+        return np.stack([x, np.cross(self.A, x), self.A], axis=-1)
+
+    @property
+    def pose(self) -> Rigid:
+        """Where the camera is: its ``axes`` at C."""
+        return Rigid(self.axes, self.C)
 
     def project(self, points_m: ArrayLike) -> tuple[FloatArray, np.ndarray]:
         """Return pixels (..., 2) of points (..., 3), metres in the model's frame, and which are valid (...).

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.rigid import FloatArray, Rigid, frozen_array
+from calib.geometry.rigid import FloatArray, frozen_array
 
 GRID = 5
 """Pixels of the comparison along each side of the image."""
@@ -84,15 +84,7 @@ def with_one_lens(models: Sequence[CameraModel], lens: CameraModel) -> tuple[Cam
     position and orientation. It trusts parameters, so it holds within one calibration only: A means the same
     direction in two models only if their R0 is the same.
     """
-    from_lens = Rigid(camera_axes(lens), lens.C).inverse
-    return tuple(lens.moved(Rigid(camera_axes(model), model.C) @ from_lens) for model in models)
-
-
-def camera_axes(model: CameraModel) -> FloatArray:
-    """Return the rotation (3, 3) from camera axes (x right, y down, z along A) to the model's frame."""
-    across = model.H - (model.H @ model.A) * model.A
-    x = across / np.linalg.norm(across)
-    return np.stack([x, np.cross(model.A, x), model.A], axis=-1)
+    return tuple(lens.moved(model.pose @ lens.pose.inverse) for model in models)
 
 
 def pixel_grid(size_px: tuple[int, int]) -> FloatArray:
@@ -208,9 +200,7 @@ def rectified_pair(left: CameraModel, right: CameraModel, focal_px: float | None
     z /= np.linalg.norm(z)
     y = np.cross(z, x)
     if focal_px is None:
-        sizes = [
-            np.linalg.norm(np.cross(one.A, letter)) for one in (left, right) for letter in (one.H, one.V)
-        ]
+        sizes = [focal for one in (left, right) for focal in one.focal_px]
         focal_px = float(np.mean(sizes))
     cx, cy = left.image_center_px
     h, v = focal_px * x + cx * z, focal_px * y + cy * z

@@ -60,6 +60,12 @@ def parameter_part(kind: Kind, letter: str) -> slice:
     raise KeyError(letter)
 
 
+def camera_numbers(model: CameraModel) -> FloatArray:
+    """Return the values (p,) of a camera's parameters; 0 for those of A and O, which count from its own."""
+    values = {"A": np.zeros(2), "O": np.zeros(2), "R": model.R[1:]}
+    return np.concatenate([values.get(letter, getattr(model, letter)) for letter in model.kind])
+
+
 def stepped(model: CameraModel, step: FloatArray) -> CameraModel:
     """Return the camera moved by a step (p,), in the order of ``parameter_names``.
 

@@ -219,12 +219,16 @@ def carried_covariance(covariance: FloatArray, now_from_then: Rigid) -> FloatArr
     return np.asarray(moved)
 
 
-def moved_rigid(pose: Rigid, step: FloatArray) -> Rigid:
-    """Return a pose turned by the rotation vector step[:3] about its origin and shifted by step[3:]."""
+def turning(turn_rad: FloatArray) -> FloatArray:
+    """Return the rotation (3, 3) of a rotation vector (3,), radians."""
     from scipy.spatial.transform import Rotation  # slow to load, and a command on files needs no fit
 
-    turned = Rotation.from_rotvec(step[:3]).as_matrix() @ pose.rotation
-    return Rigid(turned, pose.translation_m + step[3:])
+    return np.asarray(Rotation.from_rotvec(turn_rad).as_matrix())
+
+
+def moved_rigid(pose: Rigid, step: FloatArray) -> Rigid:
+    """Return a pose turned by the rotation vector step[:3] about its origin and shifted by step[3:]."""
+    return Rigid(turning(step[:3]) @ pose.rotation, pose.translation_m + step[3:])
 
 
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]

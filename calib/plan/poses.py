@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from calib.adjust.solver import covariance_of
 from calib.errors import CalibError, Unreachable
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.maps import camera_axes
 from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
@@ -319,7 +318,7 @@ def rover_from_board(
     """
     held = rig.cameras[camera]
     model = held.model
-    axes = camera_axes(model)
+    axes = model.axes
     rays = model.ray(pixels_px).directions @ axes
     if len(rays) < FEWEST:
         raise CalibError(f"{len(rays)} corners where {FEWEST} at least fix a board")

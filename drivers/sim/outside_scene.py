@@ -131,7 +131,7 @@ class OutsideRenderer(Renderer):
         image = np.zeros((height, width), dtype=np.float32)
         turned = site_from_camera_frame.rotation.T
         centre_m = site_from_camera_frame.points(camera.C)
-        pitch_rad = 1.0 / (samples * float(np.linalg.norm(np.cross(camera.A, camera.H))))
+        pitch_rad = 1.0 / (samples * camera.focal_px[0])
         first, last = rows or (0, height)
         step = max(1, RAYS_AT_ONCE // (width * q))
         for top in range(first, last, step):

@@ -372,7 +372,7 @@ class SimulatedRover:
     ) -> NDArray[np.float32] | None:
         """The mean of a few renderings along the head's way; None if one is enough."""
         model = self._model(name, begin_s + 0.5 * exposure_s)
-        focal_px = float(np.linalg.norm(np.cross(model.A, model.H)))
+        focal_px = model.focal_px[0]
         steps = min(BLUR_STEPS, max(1, math.ceil(way_rad * focal_px / BLUR_STEP_PX)))
         if steps == 1:
             return None

@@ -318,7 +318,7 @@ class _Surveyor:
         camera = self.rig.cameras[name]
         model = camera.model
         rng = np.random.default_rng([self.seed, *name.encode()])
-        focal_px = float(np.linalg.norm(np.cross(model.A, model.H))) * (1 + rng.uniform(-0.05, 0.05))
+        focal_px = model.focal_px[0] * (1 + rng.uniform(-0.05, 0.05))
         rough: dict[str, FloatArray] = {}
         if self.plan.rough:
             first = next(image for image in self.images if image.camera == name)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.maps import camera_axes
 from calib.geometry.parameters import predict
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
@@ -91,7 +90,7 @@ def implied_motion(pairs: Sequence[tuple[CameraModel, CameraModel]]) -> tuple[Ri
         What is left of pixels, rms per axis.
     """
     new, former = pairs[0]
-    axes, old = camera_axes(new), camera_axes(former)
+    axes, old = new.axes, former.axes
     moved = Rigid(axes @ old.T, new.C - axes @ old.T @ former.C)
     for _ in range(STEPS):
         rates, off = [], []

@@ -279,7 +279,7 @@ def _by_joint(calibration: BenchCalibration, survey: Survey, joint: str) -> list
         side = sides[image.name]
         camera = calibration.rig.cameras[image.camera].model
         part = 0 if joint == "pan" else 1
-        focal_px = float(np.linalg.norm(np.cross(camera.A, camera.H if joint == "pan" else camera.V)))
+        focal_px = camera.focal_px[0 if joint == "pan" else 1]
         shrunk = np.cos(image.tilt_rad or 0.0) if joint == "pan" else 1.0
         # A head that truly turned further right shows everything further left: predicted less measured grows.
         sign = 1.0 if joint == "pan" else -1.0

@@ -189,13 +189,12 @@ def kept_frame(folder: Path) -> Frame:
 
 def survey_cameras(rig: Rig, names: Mapping[str, tuple[int, int]]) -> dict[str, SurveyCamera]:
     """Return what a survey says of a rig's cameras beforehand; ``names`` gives their pictures' sizes."""
-    import numpy as np
 
     cameras = {}
     for name, size_px in names.items():
         held = rig.cameras[name]
         model = held.model
-        focal_px = float(np.linalg.norm(np.cross(model.A, model.H)))
+        focal_px = model.focal_px[0]
         kind = "CAHVOR" if model.kind == "CAHV" else model.kind
         cameras[name] = SurveyCamera(name, held.on, size_px, cast(Any, kind), round(focal_px, 1))
     return cameras

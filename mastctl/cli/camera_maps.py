@@ -83,7 +83,7 @@ def _told(camera: CameraModel, before: str) -> dict[str, np.ndarray]:
     import numpy as np
 
     cx, cy = camera.H @ camera.A, camera.V @ camera.A
-    fx, fy = (np.linalg.norm(np.cross(camera.A, letter)) for letter in (camera.H, camera.V))
+    fx, fy = camera.focal_px
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     return {f"{before}K": matrix, **{f"{before}{letter}": getattr(camera, letter) for letter in "CAHV"}}
 

@@ -130,7 +130,7 @@ class OneCamera:
         at = min(max(float(off @ along) / length2, low), high) if length2 > 0.0 else 0.0
         beside_px = float(np.linalg.norm(off - at * along))
         model = now.camera
-        focal_px = float(np.linalg.norm(np.cross(model.A, model.H)))
+        focal_px = model.focal_px[0]
         most_px = self._settings.eyes_px + self._settings.view.floor_rad * focal_px
         if beside_px > most_px:
             raise PointingError(

@@ -134,7 +134,7 @@ def _looked_at(
     between = position_m - (left.C + right.C) / 2
     range_m = float(np.linalg.norm(between))
     steep_rad = math.asin(float(between[2]) / range_m)
-    focal_px = float(np.linalg.norm(np.cross(left.A, left.H)))
+    focal_px = left.focal_px[0]
     baseline_m = float(np.linalg.norm(right.C - left.C))
     error_m = stereo_range_error_m(range_m, focal_px, baseline_m, rules.disparity_error_px)
     bounds = rules.pairs.get(name, PairBounds())

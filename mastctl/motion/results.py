@@ -265,7 +265,7 @@ def counts_told(head: object, tilt_rad: float, model: CameraModel | None) -> dic
         told[name]["left_rad"] = round(axis.left_rad, 7)
         if model is not None:
             # Yakimovsky and Cunningham (1978): the focal lengths of columns and rows
-            focal_px = float(np.linalg.norm(np.cross(model.A, model.H if name == "pan" else model.V)))
+            focal_px = model.focal_px[0 if name == "pan" else 1]
             share = math.cos(tilt_rad) if name == "pan" else 1.0
             left_px = axis.left_px(focal_px)
             told[name]["left_px"] = None if left_px is None else round(share * left_px, 3)

@@ -16,7 +16,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from calib.files.opencv_camera import PlumbBob, camera_axes, nearest_plumb_bob
+from calib.files.opencv_camera import PlumbBob, even_axes, nearest_plumb_bob
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid, quaternion_of
@@ -89,7 +89,7 @@ def transforms(rig: Rig, pan_rad: float, tilt_rad: float, time_ns: int) -> Messa
         ("mast", "head", mast.mast_from_head(pan_rad, tilt_rad)),
     ]
     for name, camera in rig.cameras.items():
-        known.append((camera.on, name, Rigid(camera_axes(camera.model), camera.model.C)))
+        known.append((camera.on, name, Rigid(even_axes(camera.model), camera.model.C)))
     return FrameTransforms(transforms=[_transform(*one, time_ns) for one in known])
 
 

@@ -21,9 +21,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.adjust.adjustment import Adjustment, Estimate
+from calib.adjust.adjustment import Adjustment
 from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm
+from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.views import view_poses
 from calib.errors import CalibError
 from calib.targets.board_file import load_board

@@ -43,9 +43,10 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
 
-from calib.adjust.adjustment import Adjustment, Estimate
+from calib.adjust.adjustment import Adjustment
 from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm
+from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.camera import FixedPoints, fit_camera, pinhole
 from calib.calibrate.starts.views import view_poses
 from calib.geometry.cahvor import CameraModel

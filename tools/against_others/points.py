@@ -113,7 +113,7 @@ def simulated_survey(seed: int) -> Points:
     rays = true.ray(grid.reshape(-1, 2))
     probe = np.concatenate([rays.origins_m + r * rays.directions for r in (3.0, 6.0, 10.0)])
     seen = _as_published(true, where)
-    focal = float(np.linalg.norm(np.cross(true.A, true.H)))
+    focal = true.focal_px[0]
     return Points("simulated survey of a Navcam", true.size_px, focal, where,
                   seen + NOISE_PX * rng.standard_normal(seen.shape), np.concatenate(images), probe,
                   _as_published(true, probe))  # fmt: skip

@@ -128,7 +128,7 @@ def percentile(values: np.ndarray, percent: float) -> float | None:
 
 def focal_px(camera: CameraModel) -> float:
     """Pixels a radian in the middle of the picture, across."""
-    return float(np.linalg.norm(np.cross(camera.A, camera.H)))
+    return camera.focal_px[0]
 
 
 def rms(values: np.ndarray) -> float | None:

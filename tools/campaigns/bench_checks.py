@@ -20,11 +20,10 @@ from unittest import mock
 
 import numpy as np
 
-from calib.adjust.adjustment import KNOWN_BEFOREHAND
 from calib.adjust.changes import reading_rates
 from calib.adjust.robust import Weighed
 from calib.adjust.significance import chance_of_sum
-from calib.adjust.terms import ImageTerm
+from calib.adjust.terms import JOINTS, ImageTerm
 from calib.calibrate.bench.fit import fit_bench
 from calib.calibrate.bench.problem import BenchProblem
 from calib.calibrate.bench.told import UNPREDICTED, check_weights
@@ -82,11 +81,10 @@ def drawn_steps(weighed: Weighed, count: int, rng: np.random.Generator) -> np.nd
     """Return what drawn errors of all measurements make of the unknowns, (count, p)."""
     pull = np.zeros((count, len(weighed.covariance)))
     for what, block in weighed.problem.blocks(weighed.fit.state):
-        if isinstance(what, str) and what.startswith(KNOWN_BEFOREHAND):
+        if what.kind is None:
             continue
         size = (count, len(block.residual))
-        reading = isinstance(what, str) and what.startswith("attitude")
-        errors = rng.uniform(-(3**0.5), 3**0.5, size) if reading else rng.standard_normal(size)
+        errors = rng.uniform(-(3**0.5), 3**0.5, size) if what.kind == JOINTS else rng.standard_normal(size)
         pull[:, block.columns] += errors @ block.jacobian
     return np.asarray(pull @ weighed.covariance)
 

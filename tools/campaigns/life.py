@@ -208,7 +208,7 @@ def offs(head: LivedHead) -> tuple[Offs, Offs]:
 def px_per_rad(rig: Rig, pair: str) -> float:
     """A pair's left focal length."""
     model = rig.cameras[rig.stereo[pair][0]].model
-    return float(np.linalg.norm(np.cross(model.A, model.H)))
+    return model.focal_px[0]
 
 
 def spread(px: Offs) -> tuple[float, float]:

@@ -34,7 +34,7 @@ from calib.adjust.solver import Minimum, Normal, covariance_of, minimise
 from calib.adjust.uncertainty import SEEN_RAD, in_words, open_parameters
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.maps import RANGES_M, ModelDifference, camera_axes, model_difference, pixel_grid
+from calib.geometry.maps import RANGES_M, ModelDifference, model_difference, pixel_grid
 from calib.geometry.rig import MAST_FREE, MAST_NAMES, Mast, gimbal, gimbal_rates, mast_of, numbers_of
 from calib.geometry.rigid import FloatArray, Rigid, moved_rigid, rigid_rates, rot_x, rot_y, rot_z
 
@@ -252,7 +252,7 @@ def _start(
     hand-eye problem). Positions are then linear in t, a and the camera's place in the head.
     """
     eye = np.eye(3)
-    rotations = [camera_axes(model) for model in models]
+    rotations = [model.axes for model in models]
     best_value, best_vector, twist = np.inf, np.zeros(18), 0.0
     for trial in twists_rad:
         gimbals = [rot_z(p) @ rot_x(trial) @ rot_y(t) for p, t in zip(pan_rad, tilt_rad, strict=True)]

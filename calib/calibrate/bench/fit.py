@@ -17,13 +17,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.adjust.adjustment import HUBER, Adjustment, Estimate
+from calib.adjust.adjustment import HUBER, Adjustment
 from calib.adjust.changes import BenchChange, find_change
 from calib.adjust.drifts import find_drifts
 from calib.adjust.model_terms import Tested
 from calib.adjust.result import BenchCalibration
 from calib.adjust.robust import SurveyNotFitted, typical_length, weigh, without_blunders
 from calib.adjust.solver import Minimum, minimise
+from calib.adjust.unknowns import Estimate
 from calib.calibrate.bench.problem import BenchOptions, BenchProblem, without_terms
 from calib.calibrate.bench.told import choose, told
 from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged

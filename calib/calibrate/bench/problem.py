@@ -10,14 +10,14 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from calib.adjust.adjustment import HUBER, Adjustment, Estimate
-from calib.adjust.model_terms import AXIS_TERMS, bow_of, candidate_terms, joint_numbers
-from calib.adjust.significance import MEDIAN_OF_TWO
+from calib.adjust.adjustment import HUBER, Adjustment
+from calib.adjust.model_terms import axis_numbers, bow_of, candidate_terms, joint_numbers
+from calib.adjust.significance import typical_scale
 from calib.adjust.terms import ImageTerm, with_kept
+from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.bench import BenchNotFitted, BenchStart, SomethingChanged, bench_start
 from calib.calibrate.starts.views import ViewPoses, ViewsTooFew, view_poses
 from calib.geometry.cahvor import Kind
-from calib.geometry.rig import JOINTS_NAMES, MAST_NAMES
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.survey.records import Survey, SurveyImage
 
@@ -112,8 +112,6 @@ TURNABOUTS = 0.34
 
 INEXACT = 1.15
 """Corners that are typically so many of their own sigmas off are less exact than noise leaves them."""
-
-AXES = tuple(MAST_NAMES.index(t.parameters[0].removeprefix("mast.")) for t in AXIS_TERMS.values())
 
 
 @dataclass(frozen=True)
@@ -292,12 +290,11 @@ class BenchProblem:
     def problem(self, chosen: Sequence[str], state: Estimate) -> Adjustment:
         """The least-squares problem with some terms."""
         known = self.options.rover_from_board
-        axes = [i for i, term in zip(AXES, AXIS_TERMS, strict=True) if term in chosen]
         return Adjustment(
             with_kept(self.terms.images, self.doubtful),
             (),
             state,
-            mast_parameters=[*(() if known is None else range(6)), *axes],
+            mast_parameters=[*(() if known is None else range(6)), *axis_numbers(chosen)],
             joint_rad=self.joint_rad,
             joint_errors=joint_numbers(chosen),
             bowed=[b for b in self.boards if bow_of(b).name in chosen],
@@ -328,7 +325,7 @@ class BenchProblem:
         square = np.sum(off_px**2, axis=1)
 
         def typical(inexact_m: float) -> float:
-            return float(np.median(square / (own**2 + (inexact_m * scale) ** 2)) / MEDIAN_OF_TWO)
+            return typical_scale(square / (own**2 + (inexact_m * scale) ** 2))
 
         most_px2 = self.survey.sigma.corner_px**2 - float(np.median(own)) ** 2
         most_m = float(np.sqrt(max(most_px2, 0.0)) / np.median(scale))
@@ -369,7 +366,7 @@ def _px_per_m(problem: Adjustment, state: Estimate, term: ImageTerm) -> FloatArr
     """How many pixels (n,) a metre across the line of sight is where each corner of an image is."""
     camera = state.cameras[term.camera]
     away_m = np.linalg.norm(problem.in_camera(state, term) - camera.C, axis=1)
-    return np.asarray(np.linalg.norm(np.cross(camera.A, camera.H)) / away_m)
+    return np.asarray(camera.focal_px[0] / away_m)
 
 
 def _one_sided(term: str, joint: str, sides: set[int]) -> str:
@@ -386,16 +383,7 @@ def _one_sided(term: str, joint: str, sides: set[int]) -> str:
 def without_terms(state: Estimate, terms: set[str]) -> Estimate:
     """Return the state with some terms' numbers at nothing."""
     mast, errors = state.mast.copy(), state.joint_errors.copy()
-    mast[[i for i, term in zip(AXES, AXIS_TERMS, strict=True) if term in terms]] = 0.0
-    errors[joint_numbers(list(terms))] = 0.0
+    mast[axis_numbers(terms)] = 0.0
+    errors[joint_numbers(terms)] = 0.0
     bows = {b: np.zeros(2) if bow_of(b).name in terms else bow for b, bow in state.bows_m.items()}
     return replace(state, mast=mast, joint_errors=errors, bows_m=bows)
-
-
-def term_values(state: Estimate) -> dict[str, float]:
-    """The values of all terms' numbers by their names."""
-    values = dict(zip(JOINTS_NAMES, state.joint_errors.tolist(), strict=True))
-    values |= {f"mast.{MAST_NAMES[i]}": float(state.mast[i]) for i in AXES}
-    for board, bow in state.bows_m.items():
-        values |= {f"board {board}.bow_m.{a}": float(b) for a, b in zip("xy", bow, strict=True)}
-    return values

@@ -9,22 +9,22 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtrc
 
-from calib.adjust.adjustment import MAST, Adjustment, Estimate
+from calib.adjust.adjustment import Adjustment
 from calib.adjust.changes import reading_rates
 from calib.adjust.drifts import by_other_placements, find_drifts
 from calib.adjust.goodness import goodness
-from calib.adjust.model_terms import Tested, candidate_terms, choose_terms, moves_px, term_motions
+from calib.adjust.model_terms import TERM_KINDS, Tested, candidate_terms, choose_terms, moves_px, term_motions
 from calib.adjust.outliers import name_outliers
-from calib.adjust.result import BenchCalibration, CheckExpected, ImageResiduals, TermGain
+from calib.adjust.result import BenchCalibration, CheckExpected, ImageResiduals, TermGain, rig_of
 from calib.adjust.robust import Weighed
 from calib.adjust.significance import chance_of_sum, rare_sum
 from calib.adjust.solver import Minimum, covariance_of
 from calib.adjust.terms import ImageTerm, lens_notes
 from calib.adjust.uncertainty import image_residuals, open_directions, rms_by_camera, sigma_by_key
-from calib.calibrate.bench.problem import BenchProblem, term_values
+from calib.adjust.unknowns import Estimate
+from calib.calibrate.bench.problem import BenchProblem
 from calib.calibrate.starts.stray_dots import stray_points
 from calib.geometry.covariance import RigCovariance
-from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import FloatArray
 
 UNPREDICTED = 3e-5
@@ -38,7 +38,7 @@ def choose(
     covariance = covariance_of(fit.normal.matrix, problem.weak)
     total, freedom = goodness(problem, fit.state, covariance)
     every = candidate_terms(bench.boards)
-    values = term_values(fit.state)
+    values = problem.values(fit.state, *TERM_KINDS)
     return choose_terms(
         {term: every[term] for term in candidates},
         problem.names,
@@ -61,7 +61,8 @@ def told(
 ) -> BenchCalibration:
     """Put together what the fit says; chi-square is that of the stated sigmas."""
     problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
-    total, freedom = goodness(*_at_fit(stated))
+    first = stated[1]
+    total, freedom = goodness(stated[0], first.state, covariance_of(first.normal.matrix, stated[0].weak))
     for one in weighed.components:
         if one.wrong or one.generous:
             bench.notes.append(
@@ -69,13 +70,12 @@ def told(
                 "sigma; they count with that"
             )
     # A parameter that is not seen keeps what is weakly known of it, and is told as open.
-    mine = _order(problem)
-    rig = _rig(bench, state)
-    known = _part(problem.names, covariance, mine)
+    rig, mine = rig_of(bench.survey, state), problem.unknowns.of_kinds("mast", "joints", "camera")
+    known = RigCovariance(tuple(problem.names[i] for i in mine), covariance[np.ix_(mine, mine)])
     sigma = sigma_by_key(rig, known.names, known.covariance)
+    rig_numbers = problem.unknowns.of_kinds("camera", "mast")
     images = image_residuals(bench.survey, problem, state, bench.terms.images, bench.terms.checks)
     checked = _checked(images, bench.terms.checks)
-    size = problem.parts[MAST].stop
     return BenchCalibration(
         rig=rig,
         parameter_names=known.names,
@@ -87,7 +87,7 @@ def told(
         checks=_expected(bench, weighed, checked),
         images=images,
         outliers=name_outliers(problem, state, covariance, weighed.images),
-        degenerate=open_directions(problem, problem.names[:size], covariance[:size, :size]),
+        degenerate=open_directions(problem, covariance[np.ix_(rig_numbers, rig_numbers)]),
         gauges=_gauges(bench, chosen),
         notes=(*bench.notes, *lens_notes(rig, sigma)),
         chi2=total,
@@ -156,13 +156,6 @@ def check_weights(weighed: Weighed, terms: Sequence[ImageTerm]) -> FloatArray:
     return weights
 
 
-def _rig(bench: BenchProblem, state: Estimate) -> Rig:
-    cameras = {n: RigCamera(bench.survey.cameras[n].on, m) for n, m in state.cameras.items()}
-    stereo = {p: pair for p, pair in bench.survey.stereo.items() if set(pair) <= set(cameras)}
-    name = bench.survey.folder.name or "calibrated"
-    return Rig(name, state.as_mast, cameras, stereo, joints=state.as_joints)
-
-
 def _gains(
     bench: BenchProblem,
     candidates: Sequence[str],
@@ -174,7 +167,9 @@ def _gains(
     """Every term with what it gains."""
     every = candidate_terms(bench.boards)
     _, now = choose(bench, chosen, problem, Minimum(state, problem.with_huber(None).normal(state), True, 0))
-    moves = moves_px(problem, state, {term: every[term] for term in chosen}, term_values(state))
+    moves = moves_px(
+        problem, state, {term: every[term] for term in chosen}, problem.values(state, *TERM_KINDS)
+    )
     found = []
     for term in candidates:
         test = now[term] if term in chosen else tests[term]
@@ -216,14 +211,6 @@ def _gauges(bench: BenchProblem, chosen: Sequence[str]) -> tuple[str, ...]:
     return tuple(told)
 
 
-def _at_fit(
-    stated: tuple[Adjustment, Minimum[Estimate]],
-) -> tuple[Adjustment, Estimate, FloatArray]:
-    """A problem, its fit's state, and the covariance there."""
-    problem, fit = stated
-    return problem, fit.state, covariance_of(fit.normal.matrix, problem.weak)
-
-
 def _checked(images: Sequence[ImageResiduals], checks: Sequence[ImageTerm]) -> list[ImageResiduals]:
     """The check images, less corners that disagree with the rest of their own image."""
     strays = {t.name: stray_points(t.in_board_m[:, :2], t.pixels_px, t.sigma_px) for t in checks}
@@ -238,14 +225,3 @@ def _root(covariance: FloatArray) -> FloatArray:
     """A square root of a covariance."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
-
-
-def _order(problem: Adjustment) -> list[int]:
-    """Indices of the rig's parameters, mast first, joints, cameras."""
-    first = {"mast": 0, "joints": 1, "cameras": 2}
-    owner = [name.split(".")[0] for name in problem.names]
-    return sorted((i for i, o in enumerate(owner) if o in first), key=lambda i: (first[owner[i]], i))
-
-
-def _part(names: Sequence[str], covariance: FloatArray, at: Sequence[int]) -> RigCovariance:
-    return RigCovariance(tuple(names[i] for i in at), covariance[np.ix_(at, at)])

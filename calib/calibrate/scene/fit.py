@@ -256,12 +256,11 @@ def _quadratic(problem: SceneProblem, state: SceneState) -> Quadratic:
 
 def _possible(problem: SceneProblem, term: Term, fitted: SceneMinimum, free: np.ndarray) -> bool:
     """Whether a term's numbers may be: a play of less than nothing is none."""
-    (name, *others) = term.names
-    if others or not name.endswith("backlash_rad"):
+    if not term.play_of:
         return True
     joints = problem.rig.joints
-    held = (joints.pan if ".pan." in name else joints.tilt).backlash_rad
-    at = int((free | _where(problem, term))[: problem.names.index(name)].sum())
+    held = {"pan": joints.pan, "tilt": joints.tilt}[term.play_of].backlash_rad
+    at = int((free | _where(problem, term))[: problem.names.index(term.names[0])].sum())
     return bool(held + fitted.numbers[at] >= 0.0)
 
 

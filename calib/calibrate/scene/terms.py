@@ -10,7 +10,7 @@ import numpy as np
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import JOINTS_NAMES, UNKNOWN, Approach, Rig, RigCamera, joints_of
 from calib.geometry.rig import joint_numbers_of as joint_numbers
-from calib.geometry.rigid import FloatArray, Rigid
+from calib.geometry.rigid import FloatArray
 from calib.matching.warp import Grey
 
 FARTHEST_M, NEAREST_M = 1e3, 1.5
@@ -104,11 +104,15 @@ LEAST_A_SIDE = 4
 
 @dataclass(frozen=True)
 class Term:
-    """Numbers of the rig that enter together: their names, what they are in words, and after which others."""
+    """Numbers of the rig that enter together: their names, what they are in words, and after which others.
+
+    ``play_of`` is the joint, ``pan`` or ``tilt``, whose play the number is.
+    """
 
     names: tuple[str, ...]
     words: str
     after: str = ""
+    play_of: str = ""
 
 
 def terms_of(rig: Rig, views: Sequence[SceneView]) -> tuple[Term, ...]:
@@ -131,7 +135,7 @@ def terms_of(rig: Rig, views: Sequence[SceneView]) -> tuple[Term, ...]:
         if many >= LEAST_RESTS_TWICE and np.ptp(read) >= LEAST_SPAN_TWICE_RAD:
             found.append(Term((f"{joint}.c2", f"{joint}.s2"), twice, after=once))
         if min((side > 0).sum(), (side < 0).sum()) >= LEAST_A_SIDE:
-            found.append(Term((f"{joint}.backlash_rad",), f"{axis} has play"))
+            found.append(Term((f"{joint}.backlash_rad",), f"{axis} has play", play_of=axis))
     return tuple(found)
 
 
@@ -161,7 +165,7 @@ def corrected(rig: Rig, names: Sequence[str], values: FloatArray) -> Rig:
             turns.setdefault(camera, np.zeros(3))["xyz".index(axis)] = value
     for camera, turn in turns.items():
         held = cameras[camera]
-        cameras[camera] = RigCamera(held.on, turned(held.model, turn))
+        cameras[camera] = RigCamera(held.on, held.model.turned(turn))
     for camera, numbers_of_lens in lenses.items():
         held = cameras[camera]
         cameras[camera] = RigCamera(held.on, lensed(held.model, **numbers_of_lens))
@@ -169,16 +173,6 @@ def corrected(rig: Rig, names: Sequence[str], values: FloatArray) -> Rig:
     return replace(rig, cameras=cameras, mast=mast, joints=joints_of(numbers))
 
 
-def turned(model: CameraModel, turn_rad: FloatArray) -> CameraModel:
-    """Return a camera turned about its C by a rotation vector (3,)."""
-    from scipy.spatial.transform import Rotation  # slow to load, and a daemon that starts does not need it
-
-    rotation = Rotation.from_rotvec(turn_rad).as_matrix()
-    return model.moved(Rigid(rotation, model.C - rotation @ model.C))
-
-
 def lensed(model: CameraModel, scale: float = 0.0, r1: float = 0.0) -> CameraModel:
     """Return a camera of a focal length longer by a part ``scale`` of itself, and of R1 larger by ``r1``."""
-    a = model.A
-    h, v = (letter + scale * (letter - (letter @ a) * a) for letter in (model.H, model.V))
-    return replace(model, H=h, V=v, R=model.R + np.array([0.0, r1, 0.0]))
+    return replace(model.zoomed(scale), R=model.R + np.array([0.0, r1, 0.0]))

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.adjust.adjustment import Estimate
 from calib.adjust.terms import ImageTerm
 from calib.adjust.uncertainty import SEEN_RAD
+from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.views import ViewPoses
 from calib.errors import CalibError
 from calib.geometry.rig import MAST_NAMES

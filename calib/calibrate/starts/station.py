@@ -17,10 +17,11 @@ from typing import Literal
 import numpy as np
 from scipy.special import chdtri
 
-from calib.adjust.adjustment import Adjustment, Estimate
+from calib.adjust.adjustment import Adjustment
 from calib.adjust.outliers import Outlier
 from calib.adjust.solver import covariance_of, minimise
 from calib.adjust.terms import StationTerm, station_terms
+from calib.adjust.unknowns import Estimate
 from calib.geometry.rig import MAST_NAMES
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.survey.alignment import (

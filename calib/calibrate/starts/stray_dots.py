@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from calib.adjust.outliers import Outlier
-from calib.adjust.significance import MEDIAN_OF_TWO
+from calib.adjust.significance import typical_scale
 from calib.geometry.rigid import FloatArray
 from calib.survey.records import Survey
 from calib.targets.boards import Dots
@@ -105,7 +105,7 @@ def _degree(dots: int) -> int:
 
 def _typical(statistic: FloatArray) -> float:
     """By how much the typical statistic is larger than it should be; at least 1."""
-    return max(1.0, float(np.median(statistic) / MEDIAN_OF_TWO))
+    return max(1.0, typical_scale(statistic))
 
 
 def _off_polynomial(

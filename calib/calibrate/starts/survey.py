@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.adjust.adjustment import Estimate
 from calib.adjust.outliers import Outlier
 from calib.adjust.robust import SurveyNotFitted
 from calib.adjust.terms import ImageTerm, StationTerm, image_terms, station_terms
+from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.camera import CameraFit, CameraNotFitted, fit_camera
 from calib.calibrate.starts.mast import MastNotFitted, MastView, fit_mast
 from calib.calibrate.starts.station import station_poses

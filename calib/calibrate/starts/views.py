@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from calib.adjust.adjustment import HUBER, Adjustment, Estimate
+from calib.adjust.adjustment import HUBER, Adjustment
 from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm
+from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.stray_dots import stray_points
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel, Kind
@@ -203,15 +204,7 @@ def _lens(images: Sequence[ImageTerm], start: CameraModel, most: int) -> tuple[f
     ]
     model = fit.state.cameras[terms[0].camera]
     # Boards that are free leave the camera's place open: put it back to where it began.
-    home = _camera_frame(model)
-    return float(np.median(np.concatenate(lengths))), model.moved(home.inverse)
-
-
-def _camera_frame(model: CameraModel) -> Rigid:
-    """The frame with x right, y down and z along A at C."""
-    x = model.H - (model.H @ model.A) * model.A
-    x = x / np.linalg.norm(x)
-    return Rigid(np.stack([x, np.cross(model.A, x), model.A], axis=1), model.C)
+    return float(np.median(np.concatenate(lengths))), model.moved(model.pose.inverse)
 
 
 def _spread(images: Sequence[ImageTerm], most: int) -> list[ImageTerm]:

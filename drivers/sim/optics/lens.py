@@ -98,7 +98,7 @@ class Lens:
 
     @property
     def _focal_px(self) -> float:
-        return float(np.linalg.norm(np.cross(self.camera.A, self.camera.H)))
+        return self.camera.focal_px[0]
 
     def discs_px(self, pose: Rigid) -> Float32:
         """Return (h, w) the diameter of the disc that a point of each pixel's range makes, pixels."""

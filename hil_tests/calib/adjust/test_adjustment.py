@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from calib.adjust.adjustment import MAST, Adjustment
+from calib.adjust.adjustment import Adjustment
 from calib.adjust.robust import SurveyNotFitted
 from calib.adjust.solver import Normal, minimise
 from calib.adjust.terms import lens_knowledge
+from calib.adjust.unknowns import MAST, Key, ResidualBlock, Unknowns
 from calib.calibrate.starts.survey import start_values
 from calib.calibrate.survey import fit_joint, joint_problem
 from calib.geometry.parameters import parameter_names, stepped
 from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
 from calib.survey.records import Sigma, Survey
 from drivers.sim_survey.plan import BOARD, SurveyPlan, rover_from_head
 from hil_tests.calib.adjust.small_surveys import of_cameras, rings, survey_of
@@ -155,3 +158,29 @@ def test_normal_equations_are_those_of_the_state_where_a_fit_ended(gain: float) 
     assert found.normal.cost == there.cost
     assert np.array_equal(found.normal.matrix, there.matrix)
     assert np.array_equal(found.normal.gradient, there.gradient)
+
+
+def test_no_meaning_hangs_on_the_order_in_which_unknowns_are_declared(
+    survey: Survey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = fit_joint(survey)
+    declared = Adjustment._declared
+    monkeypatch.setattr(Adjustment, "_declared", lambda self, start: reversed(list(declared(self, start))))
+    made = ResidualBlock.of
+
+    def turned_round(
+        unknowns: Unknowns, residual: FloatArray, rates: Mapping[Key, FloatArray], width: int
+    ) -> ResidualBlock:
+        return made(unknowns, residual, dict(reversed(rates.items())), width)
+
+    monkeypatch.setattr(ResidualBlock, "of", turned_round)
+    other = fit_joint(survey)
+    assert other.parameter_names[:6] == one.parameter_names[:6]  # the mast's come first whatever is declared
+    at = [other.parameter_names.index(name) for name in one.parameter_names]
+    np.testing.assert_allclose(other.estimate[at], one.estimate, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(np.diag(other.covariance)[at], np.diag(one.covariance), rtol=1e-4)
+    assert [board.board for board in other.left_out_boards] == [board.board for board in one.left_out_boards]
+    for mine, its in zip(other.left_out_boards, one.left_out_boards, strict=True):
+        assert mine.predicted_px == pytest.approx(its.predicted_px, rel=1e-4)
+    gains = {model.name: model.gain for model in one.wider}
+    assert {m.name: m.gain for m in other.wider} == pytest.approx(gains, rel=1e-3, abs=1e-3)

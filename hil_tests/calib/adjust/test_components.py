@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.adjust.adjustment import ResidualBlock
 from calib.adjust.goodness import RARELY, Component, found_sigmas, variance_components
 from calib.adjust.result import Calibration
 from calib.adjust.terms import StationTerm
+from calib.adjust.unknowns import ResidualBlock
 from calib.calibrate.survey import fit_joint
 from calib.geometry.rig import Rig
 from calib.survey.records import Sigma, Survey

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.adjust.adjustment import ResidualBlock
 from calib.adjust.outliers import judge
 from calib.adjust.result import Calibration
 from calib.adjust.robust import SurveyNotFitted
 from calib.adjust.terms import ImageTerm
+from calib.adjust.unknowns import ResidualBlock
 from calib.calibrate.paper import fit_paper
 from calib.calibrate.survey import fit_joint
 from calib.geometry.rig import Rig

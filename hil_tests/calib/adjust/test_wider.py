@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.adjust.adjustment import ResidualBlock
 from calib.adjust.result import Calibration
 from calib.adjust.score import Score
+from calib.adjust.unknowns import ResidualBlock
 from calib.calibrate.survey import fit_joint
 from calib.geometry.rig import Rig
 from calib.survey.records import Sigma, Survey
@@ -136,7 +136,7 @@ def test_the_gain_is_what_a_fit_of_both_would_find() -> None:
     residual = -(0.7 * x + noise)
     residual -= residual.mean()
     score = Score(1, 1)
-    score.add(ResidualBlock(residual, np.ones((40, 1)), np.array([0]), 1), np.array([0]), x[:, None])
+    score.add(ResidualBlock(residual, np.ones((40, 1)), np.array([0]), 1), x[:, None])
     gain = score.beside(np.array([[1 / 40]]), np.zeros(1)).gain()
     both = np.column_stack([np.ones(40), x])
     found, left, *_ = np.linalg.lstsq(both, -residual, rcond=None)
@@ -149,9 +149,7 @@ def test_what_the_fit_makes_up_for_gains_nothing() -> None:
     residual = np.random.default_rng(3).normal(0, 1, 40)
     residual -= residual.mean()
     score = Score(1, 1)
-    score.add(
-        ResidualBlock(residual, np.ones((40, 1)), np.array([0]), 1), np.array([0]), np.full((40, 1), 5.0)
-    )
+    score.add(ResidualBlock(residual, np.ones((40, 1)), np.array([0]), 1), np.full((40, 1), 5.0))
     gain = score.beside(np.array([[1 / 40]]), np.zeros(1)).gain()
     assert (gain.chi2, gain.freedom) == (0.0, 0) and np.isnan(gain.sigma[0])
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from calib.adjust import changes as bench_changes
-from calib.adjust.adjustment import ResidualBlock
 from calib.adjust.drifts import find_drifts
 from calib.adjust.model_terms import candidate_terms, entering_together
 from calib.adjust.result import BenchCalibration
 from calib.adjust.terms import ImageTerm
 from calib.adjust.uncertainty import pixel_covariance
+from calib.adjust.unknowns import ResidualBlock
 from calib.calibrate.bench.fit import fit_bench
 from calib.calibrate.bench.problem import BenchOptions, BenchProblem
 from calib.calibrate.bench.told import check_weights
