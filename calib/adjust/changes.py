@@ -69,6 +69,8 @@ class BenchChange:
         What it explains of the weighted sum of squares.
     sure
         Whether little would be left then; else only another fit tells, for far from it nothing is linear.
+    chance
+        Of so large a gain without any change, all that were tried counted.
     """
 
     what: str
@@ -79,6 +81,7 @@ class BenchChange:
     step: FloatArray
     chi2: float
     sure: bool = True
+    chance: float = 0.0
 
     @property
     def sentence(self) -> str:
@@ -151,11 +154,12 @@ def find_change(problem: Adjustment, state: Estimate) -> BenchChange | None:
         return None
     if best.what in ("pan", "tilt"):
         scale = max(scale, scatter(reading_rows(problem, state, rows), best.what, covariance, best.chi2))
-    if chance(best.chi2, len(best.step), scale, max(freedom, 1.0)) * count > UNLIKELY:
+    by_chance = chance(best.chi2, len(best.step), scale, max(freedom, 1.0)) * count
+    if by_chance > UNLIKELY:
         return None
     if len(best.step) > 1 and best.chi2 < LEAST_PART * chi2:
         return None
-    return replace(best, sure=sure)
+    return replace(best, sure=sure, chance=by_chance)
 
 
 def _subjects(

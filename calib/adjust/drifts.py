@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
-from calib.adjust.changes import UNSEEN, Rows, reading_rows, rows_of, scatter
+from calib.adjust.changes import UNSEEN, BenchChange, Rows, reading_rows, rows_of, scatter
 from calib.adjust.goodness import goodness
 from calib.adjust.left_out import left_out
 from calib.adjust.score import scored
@@ -45,6 +45,14 @@ class BenchDrift:
     chi2: float
     chance: float
     moves_px: float
+
+    def tells_more(self, change: BenchChange) -> bool:
+        """Whether the drift is less likely by chance than a sudden change.
+
+        It may have more numbers to explain with. Where no float is as small as both chances, chi-squares of
+        hundreds are compared, beside which few numbers more count nothing.
+        """
+        return (self.chance, -self.chi2) < (change.chance, -change.chi2)
 
     @property
     def sentence(self) -> str:

@@ -6,19 +6,22 @@ grey differences r, with the template's gradient for the image's: step = -(WᵀJ
 model's derivatives; W the same of the slightly smoothed template (instrumental variables: the template's own
 noise is in r too, and must not weigh it).
 
-Covariance, with N = WᵀJ:
+Covariance, by leaving out one block b of pixels at a time (the jackknife of Tukey 1958; over groups, Bell and
+McCaffrey 2002), with N = WᵀJ:
 
-    cov = N⁻¹ M N⁻ᵀ · n / (n - 8),     M = Σ_i Σ_k w(k) W_i r_i (W_{i+k} r_{i+k})ᵀ,
+    cov = (B - 1) / B · Σ_b d_b d_bᵀ,     d_b = (N - N_b)⁻¹ Σ_{i in b} W_i r_i.
 
-w a triangle over neighbouring pixels (Bartlett; White 1980, Newey and West 1987 in two dimensions).
-Differences of neighbours are not independent: interpolation and blur spread noise over two or three pixels,
-relief and a wrong plane over more. The usual σ²N⁻¹ would call such a position too good.
+Differences of neighbours are not independent: interpolation, blur and colour filters spread noise over two or
+three pixels, relief and a wrong plane over more, and all along an edge alike. The usual σ²N⁻¹ would call such
+a position too good. So would the sum of W_i r_i (W_k r_k)ᵀ over near pairs (White 1980, Newey and West 1987)
+where few strong edges hold the place, since these are what the fit has fitted.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +72,7 @@ def match_least_squares(
     image: Grey,
     start_px: FloatArray,
     deforming: bool = True,
-    correlated_px: int = 3,
+    block_px: float = 6.0,
     near_px2: FloatArray | None = None,
     counts: FloatArray | None = None,
 ) -> LeastSquaresMatch | None:
@@ -87,8 +90,8 @@ def match_least_squares(
         (2,) about where the target is in the image.
     deforming
         Whether D is free; else it stays zero.
-    correlated_px
-        Over how many pixels grey differences depend on each other.
+    block_px
+        Side of the blocks of pixels: over how many grey differences may depend on each other.
     near_px2
         (2, 2) covariance of a Gaussian around the target by which pixels count; all alike if not given.
     counts
@@ -123,17 +126,17 @@ def match_least_squares(
     first = _PatchFit(start, np.zeros((2, 2)))
     if near_px2 is None and counts is None:
         whole = settled(first, np.ones(t.shape), deforming, STEP_ENOUGH_PX)
-        return _refined(whole, correlated_px) if whole else None
+        return _refined(whole, block_px) if whole else None
     held = np.ones(t.shape) if counts is None else np.asarray(counts, dtype=np.float64)[inner]
     wide = held if near_px2 is None else held * gaussian(q, near_px2)
     begun = settled(first, wide, False, 0.05)
     # What bends and hides more than the deformation can follow still has a place.
     whole = (settled(begun, wide, deforming, 10 * STEP_ENOUGH_PX) or begun) if begun else None
-    refined = _refined(whole, correlated_px) if whole else None
+    refined = _refined(whole, block_px) if whole else None
     if whole is None or refined is None or near_px2 is None:
         return refined
     middle = settled(whole, held * gaussian(q, NARROW**2 * near_px2), False, 10 * STEP_ENOUGH_PX)
-    return replace(refined, middle=_refined(middle, correlated_px) if middle else None)
+    return replace(refined, middle=_refined(middle, block_px) if middle else None)
 
 
 def _counting(counts: FloatArray) -> tuple[slice, slice] | None:
@@ -152,18 +155,29 @@ def gaussian(q: FloatArray, covariance_px2: FloatArray) -> FloatArray:
     return np.asarray(np.exp(-0.5 * squares), dtype=np.float64)
 
 
-def _refined(fit: _PatchFit, correlated_px: int) -> LeastSquaresMatch | None:
+def _refined(fit: _PatchFit, block_px: float) -> LeastSquaresMatch | None:
     """The place of a settled fit with its covariance; None if that is not finite."""
     t = fit.template
-    scores = (fit.weights * fit.rest[:, None]).reshape(*t.shape, -1)
-    meat = _sum_of_neighbours(scores, correlated_px)
-    n = float(fit.counts.sum() ** 2 / (fit.counts**2).sum())
-    parameters = fit.inverse @ meat @ fit.inverse.T * (n / max(n - len(meat), 1.0)) / fit.gain**2
-    covariance = parameters[:2, :2] + FLOOR_PX**2 * np.eye(2)
+    rows, columns = (np.linspace(0, side, max(2, round(side / block_px)) + 1).astype(int) for side in t.shape)
+    weights, rates = (one.reshape(*t.shape, -1) for one in (fit.weights, fit.rates))
+    rest, terms = fit.rest.reshape(t.shape), weights.shape[-1]
+    normals, pulls = [], []
+    for y, x in product(pairwise(rows), pairwise(columns)):
+        block = slice(*y), slice(*x)
+        own = weights[block].reshape(-1, terms)
+        normals.append(own.T @ rates[block].reshape(-1, terms))
+        pulls.append(own.T @ rest[block].reshape(-1))
+    try:
+        others = np.sum(normals, axis=0) - np.array(normals)
+        moved = np.linalg.solve(others, np.array(pulls)[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        return None
+    place = moved[:, :2] / fit.gain
+    covariance = (1.0 - 1.0 / len(place)) * place.T @ place + FLOOR_PX**2 * np.eye(2)
     correlation = _correlation(t.reshape(-1), fit.rest + fit.gain * t.reshape(-1), fit.counts.reshape(-1))
     if not np.isfinite(covariance).all() or not np.isfinite(correlation):
         return None
-    return LeastSquaresMatch(fit.position, (covariance + covariance.T) / 2, fit.deformation, correlation)
+    return LeastSquaresMatch(fit.position, covariance, fit.deformation, correlation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +191,7 @@ class _PatchFit:
     rest: FloatArray = field(default_factory=lambda: np.empty(0))
     counts: FloatArray = field(default_factory=lambda: np.empty(0))
     weights: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    inverse: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    rates: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
 
 
 def _settled(
@@ -223,7 +237,7 @@ def _settled(
         if np.linalg.norm(deformation) > WORST_DEFORMATION:
             return None
         if length < enough_px:
-            return _PatchFit(position, deformation, gain, t, rest, counts, weighted, inverse)
+            return _PatchFit(position, deformation, gain, t, rest, counts, weighted, jacobian)
     return None
 
 
@@ -265,16 +279,3 @@ def _correlation(a: FloatArray, b: FloatArray, counts: FloatArray) -> float:
     a, b = a - float(counts @ a) / total, b - float(counts @ b) / total
     weighted = counts * a
     return float(weighted @ b) / math.sqrt(max(float(weighted @ a) * float((counts * b) @ b), 1e-12))
-
-
-def _sum_of_neighbours(scores: FloatArray, reach_px: int) -> FloatArray:
-    """Return Σ_i Σ_k w(k) s_i s_{i+k}ᵀ (p, p) of scores (h, w, p), w a triangle of half-width reach + 1."""
-    from scipy import ndimage  # slow to load, and a daemon that starts does not need it
-
-    triangle = 1.0 - np.abs(np.arange(-reach_px, reach_px + 1)) / (reach_px + 1.0)
-    spread = scores
-    for axis in (0, 1):
-        spread = ndimage.correlate1d(spread, triangle, axis=axis, mode="constant", cval=0.0)
-    p = scores.shape[-1]
-    meat = scores.reshape(-1, p).T @ spread.reshape(-1, p)
-    return np.asarray((meat + meat.T) / 2)

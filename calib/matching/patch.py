@@ -98,9 +98,11 @@ def match_patch(
     found = _search(template, destination_image, search_px, settings, near_px2)
     if isinstance(found, PatchMatch):
         return found
-    roughness = settings.roughness
+    roughness = settings.roughness if relief is None or settings.rough_beside_relief else 0.0
     if settings.relief > 0:
-        explained = found.refined.correlation / expected_correlation(template.values, settings)
+        explained = found.refined.correlation / expected_correlation(
+            template.values, settings, template.counts
+        )
         roughness *= 1.0 + max(0.0, 1.0 - explained) / settings.relief
     surface = _surface_term(source, target, plane, destination, template, near_px2, roughness)
     if relief is not None:
@@ -223,7 +225,8 @@ def _search(
         scores, max(settings.apart_px, round(settings.apart_px * template.magnification))
     )
     facts = (best, second, int(half.min()))
-    least = 0.8 * settings.least_correlation * expected_correlation(template.values, settings)
+    by_noise = expected_correlation(template.values, settings, template.counts)
+    least = 0.8 * settings.least_correlation * by_noise
     if best < least:
         words = f"no place in the window of {reach} px correlates by more than {best:.2f}"
         return no_match("weak", words, template.target_px, *facts)
@@ -242,7 +245,7 @@ def _search(
         template.target_px - cut_low,
         cut,
         start,
-        correlated_px=correlated_px(template.magnification),
+        block_px=block_px(template.magnification, near_px2 is not None),
         near_px2=near_px2,
         counts=template.counts,
     )
@@ -300,9 +303,13 @@ def _summit(scores: NDArray[np.float32], x: int, y: int) -> FloatArray:
     return np.asarray(np.clip((around[:, 2] - around[:, 0]) / (2.0 * np.maximum(bend, 1e-9)), -0.5, 0.5))
 
 
-def correlated_px(magnification: float) -> int:
-    """Return over how many pixels grey differences hang together: three, more in an enlarged picture."""
-    return round(3 * max(1.0, magnification))
+def block_px(magnification: float, near: bool) -> float:
+    """Return over how many pixels grey differences may depend on each other: more in an enlarged picture.
+
+    Six, since errors of colour filters and JPEG reach over several; four where only what is ``near`` counts,
+    which is some fifty pixels.
+    """
+    return (4.0 if near else 6.0) * max(1.0, magnification)
 
 
 def _at(pixel_px: FloatArray) -> str:

@@ -46,9 +46,10 @@ LEAST_PIXELS = 30
 ROBUST_PX = 0.3
 """What lies farther off the fitted plane counts less."""
 SIGMA_PX = 0.05
-"""One sigma of a smoothed place along the epipolar line on smooth ground..."""
+"""One sigma of a place along the epipolar line as single windows tell it on smooth ground..."""
 NEAR_PX = 3
-"""...to which what the windows within so many pixels differ by is added: rough, curved, or a step."""
+"""...to which what the windows within so many pixels differ by is added: rough, curved, or a step. Where they
+differ by no more than that the target lies on the plane, which all of the patch tells better."""
 FIT_STEPS = 4
 
 
@@ -182,8 +183,10 @@ def _off_plane(
     edge = np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)
     counts = cv2.erode(held, edge, borderType=cv2.BORDER_CONSTANT, borderValue=1)
     near = slice(half_px - NEAR_PX, half_px + NEAR_PX + 1)
-    around = cv2.medianBlur(off_px.astype(np.float32), 3)[near, near]
-    sigma_px = float(np.hypot(SIGMA_PX, around.std()))
+    differ_px = float(cv2.medianBlur(off_px.astype(np.float32), 3)[near, near].std())
+    stands_off = max(0.0, 1.0 - (SIGMA_PX / max(differ_px, 1e-6)) ** 2)  # Stein's share
+    smooth[half_px, half_px] *= stands_off
+    sigma_px = float(np.hypot(stands_off * SIGMA_PX, differ_px))
     return _Seen(
         smooth.astype(np.float32), counts.astype(np.float32), px_m, sigma_px, bool(held[half_px, half_px])
     )

@@ -55,6 +55,8 @@ class MatchSettings:
         How far the target may lie off the patch's plane, one sigma, as a part of the patch's half extent on
         it. It counts as far as the two cameras stand apart. 0 for what is known to be plane; the default
         is what makes sigmas true on the simulated rover's ground and rocks.
+    rough_beside_relief
+        Whether ``roughness`` counts too where two eyes saw what stands off the plane.
     near_px
         By how much nearer pixels count more in the refinement: one sigma of a Gaussian that is round on the
         surface and as large as a circle of this radius in the destination. 0: all of the patch alike.
@@ -74,6 +76,7 @@ class MatchSettings:
     apart_px: int = 5
     worst_sigma_px: float = 0.5
     roughness: float = 0.01
+    rough_beside_relief: bool = True
     near_px: float = 0.0
     relief: float = 0.0
 
@@ -151,7 +154,7 @@ def judged(
     """Return the match with its verdict, from correlation, rival and certainty."""
     refined, half = found.refined, int(template.half_px.min())
     facts = (refined.correlation, found.second, half)
-    least = settings.least_correlation * expected_correlation(template.values, settings)
+    least = settings.least_correlation * expected_correlation(template.values, settings, template.counts)
     if refined.correlation < least:
         words = f"the best place correlates by {refined.correlation:.2f}, at least {least:.2f} is expected"
         return no_match("weak", words, template.target_px, *facts)
@@ -204,9 +207,16 @@ def texture_lacks(values: Grey, settings: MatchSettings, counts: FloatArray | No
     return "the patch has too little texture to hold a position"
 
 
-def expected_correlation(values: Grey, settings: MatchSettings) -> float:
-    """Return what correlation noise alone would leave between two pictures of this patch."""
-    variance = float(values.var())
+def expected_correlation(values: Grey, settings: MatchSettings, counts: FloatArray | None = None) -> float:
+    """Return what correlation noise alone would leave between two pictures of this patch (h, w).
+
+    Pixels count by ``counts`` (h, w), all alike if not given.
+    """
+    if counts is None:
+        variance = float(values.var())
+    else:
+        shares = counts / max(float(counts.sum()), 1e-9)
+        variance = float((shares * (values - (shares * values).sum()) ** 2).sum())
     return float(np.clip(1.0 - settings.noise_dn**2 / max(variance, 1e-9), 0.3, 1.0))
 
 

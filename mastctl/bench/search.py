@@ -22,6 +22,9 @@ OVERLAP = 0.7
 TELLING = ("another board", "mirrored", "two boards")
 """What `calib.targets.corners` says of a board in view that is not the one that is looked for."""
 
+MOST_LOOKS = 100
+"""A narrow view would take hundreds, a quarter of an hour: whoever put the board up is asked again before."""
+
 LOOKS_BESIDE = 8
 """Looks after such a one: the right board may hang beside it."""
 
@@ -69,11 +72,14 @@ class Search:
                     return look
                 instead.looked([one.why for one in look.seen if one.why], at_rad)
             if instead.looks == 1:
-                words = f"({instead.told}); looking around, {len(attitudes) - 1} looks at most"
+                most = min(len(attitudes), MOST_LOOKS) - 1
+                words = f"({instead.told}); looking around, {most} looks at most"
                 self._teller.say(f"the board is not where it was asked for {words}")
-            if instead.another_board:
+            if instead.another_board or instead.looks == MOST_LOOKS:
+                everywhere = "" if instead.another_board else " around where it was asked for"
                 break
-        everywhere = "" if instead.another_board else " all over the head's limits"
+        else:
+            everywhere = " all over the head's limits"
         raise BoardNotFound(
             f"the board was not found in {_counted(instead.looks)}{everywhere} ({instead.told}); place it as "
             "asked, in the light, facing the head, and start the same command again"

@@ -166,9 +166,8 @@ class RigCameras:
             ``target_...`` if the match is not good, ``eyes_disagree`` if it lies off the line.
         """
         settings = self._settings
-        sizes = replace(settings.match, roughness=0.0)  # the eyes see how rough it is
         found = find_partner(
-            view.image, view.camera, pixel_px, other.image, other.camera, settings.nearest_m, sizes
+            view.image, view.camera, pixel_px, other.image, other.camera, settings.nearest_m, settings.match
         )
         _good(found.match, other)
         if abs(found.across_px) > settings.eyes_px + 5.0 * found.across_sigma_px:
@@ -199,8 +198,7 @@ class RigCameras:
                 found.append(
                     match_patch(
                         clicked.view.image, clicked.view.camera, clicked.pixel_px, plane,
-                        now.image, now.camera, search,
-                        sizes if relief is None else replace(sizes, roughness=0.0), relief,
+                        now.image, now.camera, search, sizes, relief,
                     )
                 )  # fmt: skip
                 if found[-1].verdict == "good":

@@ -70,8 +70,8 @@ class PointingSettings:
     match, small_half_px
         Of the matching itself; and the half patch that is tried after a move where the usual one fits
         nowhere. ``roughness`` and ``relief`` decide sigmas only, and only where no second eye saw the
-        surface. A second place may fit a little better than elsewhere, as along a rock's smooth edge: the
-        prediction and the other eye must confirm the best.
+        surface (``rough_beside_relief`` is False). A second place may fit a little better than elsewhere, as
+        along a rock's smooth edge: the prediction and the other eye must confirm the best.
     """
 
     poll_s: float = 0.02
@@ -98,7 +98,9 @@ class PointingSettings:
     small_half_px: int = 12
     view: ViewLimits = field(default_factory=ViewLimits)
     match: MatchSettings = field(
-        default_factory=partial(MatchSettings, roughness=0.02, relief=0.01, least_lead=0.03)
+        default_factory=partial(
+            MatchSettings, roughness=0.02, rough_beside_relief=False, relief=0.01, least_lead=0.03
+        )
     )
 
 

@@ -1,6 +1,7 @@
 """How true the residuals are that the daemon tells, of clicks at random pixels of rocks and of ground.
 
     .venv/bin/python -m tools.campaigns.residuals [--cases 200] [--seed 1] [--day kind worst] [--json]
+    .venv/bin/python -m tools.campaigns.residuals --day worst --without colour
 
 The packaged rover in scenes drawn anew, through a daemon. A case turns the head to a random view, clicks a
 random pixel of the left Navcam that shows a rock (or ground) 2 to 10 m away, and points once. No texture is
@@ -9,6 +10,9 @@ and the point is projected into the new picture. Told are the cases, those refus
 of these the other eye cannot see; z, which is the measured minus the true residual over the told sigma, of
 both axes together (rms, of x and y, the worst); what is beyond three sigmas, percent of targets; the error in
 px; medians of sigma.
+
+A day without some of what it does to head and pictures (``--without``) has the same scenes and, but for
+rounding, the same clicks: what is left out is the cause where z falls.
 """
 
 from __future__ import annotations
@@ -16,7 +20,8 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -38,9 +43,22 @@ from mastctl.packaged import config_folder
 from tools.arguments import end
 from tools.campaign import options, rms, run_cases, show
 
-DAYS = {"kind": "default.yaml", "worst": "worst_day.yaml", "still": "worst_day.yaml"}
-RINGING = ("ring_hz", "ring_damping", "settle_s")
-"""Of the head's options, which the still day is without."""
+DAYS = {"kind": "default.yaml", "worst": "worst_day.yaml"}
+PARTS: Mapping[str, tuple[str, ...]] = {
+    "ringing": ("head.ring_hz", "head.ring_damping", "head.settle_s"),
+    "harmonics": ("head.pan_harmonics_rad", "head.tilt_harmonics_rad"),
+    "play": ("head.gravity_turnover_rad", "head.gravity_friction"),
+    "clocks": ("clocks",),
+    "temperature": ("temperature",),
+    "shutter": ("cameras.smear", "cameras.row_time_s"),
+    "exposure": ("cameras.exposure",),
+    "falloff": ("cameras.lens.falloff",),
+    "defocus": ("cameras.lens.f_number", "cameras.lens.focus_m", "cameras.lens.pitch_um"),
+    "dust": ("cameras.lens.dust", "cameras.lens.dust_um", "cameras.lens.dust_gap_um"),
+    "colour": ("cameras.colour",),
+    "jpeg": ("cameras.jpeg_quality",),
+}
+"""What a day may be without, as keys of a configuration's simulation."""
 GROUPS = ("rocks", "ground")
 LEFT, RIGHT = "navcam_left", "navcam_right"
 NEAR_M, FAR_M = 2.0, 10.0
@@ -62,9 +80,10 @@ VIEWS = 40
 
 @dataclass(frozen=True)
 class Task:
-    """So many clicks of one group, in one scene of its own."""
+    """So many clicks of one group, in one scene of its own, on a day without some of its `PARTS`."""
 
     day: str
+    without: tuple[str, ...]
     group: str
     seed: int
     number: int
@@ -94,13 +113,16 @@ class Click:
     sigma_px: tuple[float, float] | None = None
 
 
-def config_of(day: str, scene_seed: int) -> Config:
+def config_of(day: str, scene_seed: int, without: Sequence[str] = ()) -> Config:
     """The packaged rover with its Navcams on such a day, in a scene of its own."""
     config = own_config(load_config(config_folder() / DAYS[day]), head=None, wire=None, speed=MAX)
-    simulation = {**config.hardware.simulation, "seed": scene_seed}
-    if day == "still":
-        head = simulation["head"].items()
-        simulation["head"] = {key: value for key, value in head if key not in RINGING}
+    simulation = {**deepcopy(config.hardware.simulation), "seed": scene_seed}
+    for key in (key for part in without for key in PARTS[part]):
+        *sections, name = key.split(".")
+        section = simulation
+        for each in sections:
+            section = section.get(each, {})
+        section.pop(name, None)
     cameras = {name: config.hardware.cameras[name] for name in (LEFT, RIGHT)}
     return replace(config, hardware=replace(config.hardware, simulation=simulation, cameras=cameras))
 
@@ -110,7 +132,7 @@ def click_all(task: Task) -> list[Click]:
     scene_seed = int(np.random.default_rng([task.seed, task.number, 1]).integers(1, 2**31))
     rng = np.random.default_rng([task.seed, task.number, GROUPS.index(task.group), 2])
     with (
-        RunningDaemon(config_of(task.day, scene_seed)) as daemon,
+        RunningDaemon(config_of(task.day, scene_seed, task.without)) as daemon,
         Client(daemon.url, timeout_s=120.0) as client,
     ):
         rover = daemon.hardware.simulation
@@ -259,12 +281,19 @@ def main() -> int:
     """Click, and print a table or a document."""
     parser = options(__doc__, 200, "clicks a group and day", as_json=True)
     parser.add_argument(
-        "--day", choices=DAYS, nargs="+", default=["kind", "worst"], metavar="DAY",
-        help="kind, worst, or still: the worst with a mast that does not ring (default kind worst)",
-    )  # fmt: skip
+        "--day",
+        choices=DAYS,
+        nargs="+",
+        default=["kind", "worst"],
+        metavar="DAY",
+        help="(default kind worst)",
+    )
+    parser.add_argument(
+        "--without", choices=PARTS, nargs="+", default=[], metavar="PART", help=f"of {', '.join(PARTS)}"
+    )
     args = parser.parse_args()
     tasks = [
-        Task(day, group, args.seed, number, min(A_TASK, args.cases - number * A_TASK))
+        Task(day, tuple(args.without), group, args.seed, number, min(A_TASK, args.cases - number * A_TASK))
         for number in range(math.ceil(args.cases / A_TASK))
         for day in args.day
         for group in GROUPS

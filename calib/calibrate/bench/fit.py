@@ -141,7 +141,7 @@ def _look_for_changes(
         if change is None:
             break
         if change.sure:
-            if any(drift.chi2 > change.chi2 for drift in find_drifts(problem, fit.state)):
+            if any(drift.tells_more(change) for drift in find_drifts(problem, fit.state)):
                 break  # the verdict names it, with its size
             _refuse(change)
         else:

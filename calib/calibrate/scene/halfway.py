@@ -19,7 +19,7 @@ import numpy as np
 from calib.adjust.significance import THREE_SIGMAS, chance, sigmas
 from calib.adjust.solver import covariance_of
 from calib.calibrate.scene.problem import Linear, SceneProblem, SceneState
-from calib.calibrate.scene.terms import PRIOR
+from calib.calibrate.scene.terms import PRIOR, alike
 from calib.geometry.rigid import FloatArray
 
 _ROUNDS, _SETTLED = 60, 3e-3
@@ -112,9 +112,6 @@ LEAST_JOINED = 3
 
 PRIOR_TURN_RAD, PRIOR_SHIFT_M = 0.05, 0.2
 
-SAME_READING_RAD = 0.01
-"""Rests whose readings of a joint differ by less than some such angle err alike."""
-
 
 class ChangeHalfway(NamedTuple):
     """What changed, by how much, after which rest's number, and how unlikely the pictures are without."""
@@ -174,7 +171,7 @@ def errs_by_reading(problem: SceneProblem, state: SceneState) -> ByReading | Non
     rests = len({view.pose for view in seen})
     found: list[ByReading] = []
     for axis, joint in enumerate(("pan", "tilt")):
-        read = np.rint([(view.pan_rad, view.tilt_rad)[axis] / SAME_READING_RAD for view in seen])
+        read = alike(np.array([(view.pan_rad, view.tilt_rad)[axis] for view in seen]))
         readings = np.unique(read)
         if not 1 < len(readings) < rests:  # an angle that no two rests share: that is their scatter
             continue

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import JOINTS_NAMES, UNKNOWN, Approach, Rig, RigCamera, joints_of
@@ -102,6 +103,10 @@ LEAST_A_SIDE = 4
 """Rests from either side that tell an axis's backlash."""
 
 
+SAME_READING_RAD = 0.01
+"""Rests whose readings of a joint have no such gap between them read the same."""
+
+
 @dataclass(frozen=True)
 class Term:
     """Numbers of the rig that enter together: their names, what they are in words, and after which others.
@@ -128,7 +133,7 @@ def terms_of(rig: Rig, views: Sequence[SceneView]) -> tuple[Term, ...]:
     rests = {view.pose: (view.pan_rad, view.tilt_rad, *view.approach) for view in views}
     pan, tilt, pan_side, tilt_side = np.array(list(rests.values())).T
     for axis, read, side in (("pan", pan, pan_side), ("tilt", tilt, tilt_side)):
-        joint, many = f"joints.{axis}", len(np.unique(read))
+        joint, many = f"joints.{axis}", int(alike(read).max()) + 1
         once, twice = (f"{axis} reads wrong {often} a turn" for often in ("once", "twice"))
         if many >= LEAST_RESTS and np.ptp(read) >= LEAST_SPAN_RAD:
             found.append(Term((f"{joint}.c1", f"{joint}.s1"), once))
@@ -137,6 +142,14 @@ def terms_of(rig: Rig, views: Sequence[SceneView]) -> tuple[Term, ...]:
         if min((side > 0).sum(), (side < 0).sum()) >= LEAST_A_SIDE:
             found.append(Term((f"{joint}.backlash_rad",), f"{axis} has play", play_of=axis))
     return tuple(found)
+
+
+def alike(readings_rad: FloatArray) -> NDArray[np.intp]:
+    """Return the numbers (n,) of readings (n,) in order of size, from 0, those that read the same alike."""
+    order = np.argsort(readings_rad)
+    numbers = np.empty(len(order), dtype=np.intp)
+    numbers[order] = np.cumsum(np.diff(readings_rad[order], prepend=-np.inf) > SAME_READING_RAD) - 1
+    return numbers
 
 
 def prior_of(name: str) -> float:

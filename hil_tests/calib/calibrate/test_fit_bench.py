@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from calib.adjust import changes as bench_changes
-from calib.adjust.drifts import find_drifts
+from calib.adjust.drifts import BenchDrift, find_drifts
 from calib.adjust.model_terms import candidate_terms, entering_together
 from calib.adjust.result import BenchCalibration
+from calib.adjust.significance import chance
 from calib.adjust.terms import ImageTerm
 from calib.adjust.uncertainty import pixel_covariance
 from calib.adjust.unknowns import ResidualBlock
@@ -239,6 +240,21 @@ def test_what_drifts_is_named_with_its_size_and_is_no_slip() -> None:
     assert "pan drifts off its reading, by +0." in drifts["pan"].sentence
     # what the second placement says of the camera is not what the first one says
     assert fit.placements[0].chance < 1e-6
+
+
+def test_a_drift_of_many_numbers_has_to_explain_more_than_a_change_of_few() -> None:
+    def drift(chi2: float) -> BenchDrift:
+        return BenchDrift("navcam_left", np.zeros(4), chi2, chance(chi2, 4), 0.01)
+
+    def refocused(chi2: float) -> bench_changes.BenchChange:
+        return bench_changes.BenchChange(
+            "focus", None, "navcam_left", "p1-003", "p1-004", np.array([1e-4]), chi2, chance=chance(chi2, 1)
+        )
+
+    assert not drift(50.0).tells_more(refocused(45.0))
+    assert drift(60.0).tells_more(refocused(45.0))
+    assert drift(3100.0).tells_more(refocused(3000.0))  # no float is as small as these chances
+    assert not drift(3000.0).tells_more(refocused(3100.0))
 
 
 def test_a_camera_without_a_picture_left_is_asked_for_no_drift() -> None:

@@ -71,16 +71,18 @@ def scene(
     moved: tuple[int, float] | None = None,
     round_by: float = 2 * np.pi,
     twice: float = 0.0,
+    astride: float = 0.0,
 ) -> tuple[list[SceneView], list[Feature]]:
     """Rests all round at two tilts, and features on rough ground, each seen where the true rig shows it.
 
     From the rest that ``moved`` names on, the rover stands so many metres farther ahead and turned by a
     hundredth of that, in radians, about its forward axis. With ``play`` each other rest is reached from
     larger angles of pan. ``pan_harmonic`` and ``twice`` are what pan reads wrong once and twice a turn.
+    With ``astride`` the same pan reads by that more at the lower tilt, half a hundredth off round angles.
     """
     rng = np.random.default_rng(seed)
     reads = [
-        (pan, tilt)
+        (pan + (0.005 + np.copysign(astride / 2, -0.3 - tilt) if astride else 0.0), tilt)
         for tilt in (-0.15, -0.45)
         for pan in np.linspace(-round_by / 2, round_by / 2, pans, endpoint=False)
     ]
@@ -188,8 +190,9 @@ def test_an_encoder_wrong_seen_from_five_pans_beside_a_turned_eye_is_told_too() 
     assert np.abs(off).max() < 4.0
 
 
-def test_a_joint_wrong_at_too_few_readings_to_tell_how_is_refused_by_name() -> None:
-    views, features = scene(1, BUMP, twice=3e-3, pans=5, round_by=3.0, count=400)
+@pytest.mark.parametrize("astride", [0.0, 0.001])
+def test_a_joint_wrong_at_too_few_readings_to_tell_how_is_refused_by_name(astride: float) -> None:
+    views, features = scene(1, BUMP, twice=3e-3, pans=5, round_by=3.0, count=400, astride=astride)
     with pytest.raises(NoCorrection, match=r"at its 5 readings pan is off by .* mrad rms") as refused:
         fit_scene(believed(), views, features)
     assert refused.value.code == "errs_by_reading"

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from bench_world import corner_bench, run_of
 
@@ -212,6 +213,21 @@ def test_dark_blurred_or_empty_views_do_not_end_a_search_before_the_board_beside
     bench.stand(replace(asked, bearing_deg=math.degrees(ASIDE_RAD)))
     look = Search(bench, run.known.now, run.known.sought, teller).find(asked)
     assert look.found and bench.looks > 24
+
+
+def test_a_search_through_a_narrow_view_ends_after_a_hundred_looks(
+    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = corner_bench(repository)
+    run, teller = run_of(bench, tmp_path / "bench")
+    monkeypatch.setattr("mastctl.bench.search.OVERLAP", 0.1)
+    looks: list[tuple[float, float]] = []
+    bench.look = lambda *at: looks.append(at) or Look((), 0, 0, 1.0)  # type: ignore
+    asked = Placement(2.0, 0.0, 0.0, (0.0, 0.0))
+    with pytest.raises(BoardNotFound, match=r"not found in 100 looks around where it was asked for \("):
+        Search(bench, run.known.now, run.known.sought, teller).find(asked)
+    pans, tilts = np.ptp(looks, axis=0)
+    assert len(looks) == 100 and pans < 1.0 and tilts < 1.0
 
 
 def test_a_search_that_found_nothing_says_what_was_seen_where(repository: Path, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import pytest
 
 from calib.matching.same_patches import Posed
 from calib.matching.shown_view import shown_view
-from drivers.errors import NoReply
+from drivers.errors import NoFreshFrame, NoReply
 from hil_tests.mastctl.motion.pointing_world import SIZE_PX, World, clean, click, moving_world, rig, run
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
@@ -147,6 +147,23 @@ def test_a_residual_is_told_with_how_old_the_pictures_behind_it_may_be() -> None
     once, steps = run(world, click(world.shoot(), *CLICK_PX), settings=PointingSettings(repeat_after_s=0.0))
     assert "repeat" not in [step.name for step in steps]
     assert "fresh_to_s" not in once.pointings[0].motion_evidence["navcam_left"]
+
+
+def test_a_slow_cameras_second_picture_is_waited_for_beyond_the_time_after_which_it_is_asked() -> None:
+    """Frames come once in 5 s; the second one is asked for 7 s after the first, a frame is due within 8 s."""
+    world = World()
+    frames = world.frames
+
+    def slow(cameras: Sequence[str], exposed_after_s: float, timeout_s: float) -> dict[str, StampedFrame]:
+        waits_s = exposed_after_s + 5.0 - world.clock.now_s()
+        if waits_s > timeout_s:
+            raise NoFreshFrame(f"no frame came within {timeout_s:.3g} s", device=cameras[0])
+        return frames(cameras, exposed_after_s + 4.9, timeout_s)
+
+    frame = world.shoot()
+    world.frames = slow  # type: ignore[method-assign]
+    result, _ = run(world, click(frame, *CLICK_PX), settings=PointingSettings(repeat_after_s=7.0))
+    assert result.pointings[0].motion_evidence["navcam_left"]["repeated_after_s"] >= 7.0
 
 
 def test_a_target_or_a_rover_that_moves_is_told_as_that() -> None:
