@@ -24,6 +24,7 @@ extensions = [
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 4
 exclude_patterns = ["_build"]
+copybutton_prompt_text = "$ "  # commands are copied without it, and without what they print
 html_theme = "furo"
 html_title = "mastctl"
 autodoc_typehints = "description"

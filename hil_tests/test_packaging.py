@@ -200,7 +200,7 @@ def project(repository: Path, tmp_path: Path) -> Path:
         (tmp_path / name).write_text(text)
     head = named["test_lookout.py"].partition("def test")[0]
     (tmp_path / "test_further.py").write_text(head + "".join(text for name, text in blocks if not name))
-    rows = FAULT_ROW.findall(page.partition("## Faults, and")[2].partition("\n## ")[0])
+    rows = FAULT_ROW.findall(page.partition("## Faults, and how")[2].partition("\n## ")[0])
     assert len(rows) > 12
     (tmp_path / "test_faults.py").write_text(FAULT_TABLE.format(rows=rows))
     (tmp_path / "pytest.ini").write_text("[pytest]\naddopts = --strict-markers --strict-config\n")

@@ -1,4 +1,4 @@
-"""Targets carried between two frames of Opportunity, as docs/how-to/tracking.md reports; some of them."""
+"""Targets carried between two frames of Opportunity, as docs/evidence/tracking.md reports; some of them."""
 
 from __future__ import annotations
 
