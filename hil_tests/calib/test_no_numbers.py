@@ -34,9 +34,9 @@ from calib.survey.alignment import NotAligned, align, mirrored
 from calib.survey.find_dots import find_in_file
 from calib.targets.dot_order import PredictedBoard
 from calib.targets.dots import DotsFound
-from drivers.sim_survey.board import draw_board, photograph
 from hil_tests.calib.adjust.small_surveys import survey_of, with_shifted_dots
 from hil_tests.calib.targets.boards import BOARD, COLUMNS, ROWS, SIZE_PX, camera, gravel, pose
+from tools.sim_survey.board import draw_board, photograph
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf)
 HEAD = CameraModel("CAHV", (101, 101), np.zeros(3), [1, 0, 0], [50, 100, 0], [50, 0, 100])

@@ -20,10 +20,10 @@ from calib.adjust.result import Calibration
 from calib.adjust.robust import SurveyNotFitted
 from calib.files.mast_file import load_rig
 from calib.survey.records import Sigma, Survey
-from drivers.sim_survey.survey import SurveyPlan
 from hil_tests.mastctl.calibration.survey_world import RIG_FILE
 from mastctl.calibration.run import FITS
 from mastctl.experiment.tasks import NoExecutor, Work, open_executor
+from tools.sim_survey.survey import SurveyPlan
 from tools.studies.calibration import main, study_as_json, table_iv, table_v, write_study_report
 from tools.studies.calibration_survey import (
     CalibrationExperiment,

@@ -27,11 +27,11 @@ from calib.adjust.terms import JOINTS, ImageTerm
 from calib.calibrate.bench.fit import fit_bench
 from calib.calibrate.bench.problem import BenchProblem
 from calib.calibrate.bench.told import UNPREDICTED, check_weights
-from drivers.sim_survey.bench import simulate_bench
 from mastctl.cli.output import at_least
 from tools.arguments import end
 from tools.campaign import options, run_cases
 from tools.campaigns.bench_coverage import CHANCES, HEADS, plan_of
+from tools.sim_survey.bench import simulate_bench
 
 GEOMETRIES = 12
 

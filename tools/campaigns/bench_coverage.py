@@ -5,7 +5,7 @@ points.
     .venv/bin/python -m tools.campaigns.bench_coverage --cases 200 --seed 1 --head servo
     .venv/bin/python -m tools.campaigns.bench_coverage --cases 100 --head driven --attitudes 8 --checks 3
 
-Benches are simulated (`drivers.sim_survey.bench`): a Navcam pair, an A2 board at three placements, corners
+Benches are simulated (`tools.sim_survey.bench`): a Navcam pair, an A2 board at three placements, corners
 with 0.1 px noise and some of them wrong. ``--head ptu`` reads true but for counts of 0.05 mrad; ``--head
 servo`` has 4096 counts a turn, harmonics of 6 and 2 mrad, 4 mrad of backlash and a board that bends by 1 mm.
 ``--head driven`` has what a driven bench has: two placements, corners with 0.01 px noise and none wrong;
@@ -45,10 +45,10 @@ from calib.geometry.rig import JOINTS_NAMES, Mast, Rig, numbers_of
 from calib.geometry.rig import joint_numbers_of as joint_numbers
 from calib.geometry.rigid import tangents
 from calib.geometry.stereo import triangulate
-from drivers.sim_survey.bench import BenchPlan, Placement, simulate_bench
 from mastctl.cli.output import at_least
 from tools.arguments import end
 from tools.campaign import held_percent, options, rms, run_cases
+from tools.sim_survey.bench import BenchPlan, Placement, simulate_bench
 
 LEVEL, Z = 0.95, 1.959964
 LOWEST = 88.0

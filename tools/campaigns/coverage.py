@@ -5,7 +5,7 @@
     .venv/bin/python -m tools.campaigns.coverage --cases 100 --seed 1 --mast 8
     .venv/bin/python -m tools.campaigns.coverage --cases 200 --seed 1 --gross 0.05
 
-Surveys are simulated (`drivers.sim_survey.survey`). Prints, over the surveys, how often the 95 % interval of
+Surveys are simulated (`tools.sim_survey.survey`). Prints, over the surveys, how often the 95 % interval of
 each mast parameter and of predicted pixels (points at 2 to 10 m, three directions, every camera) holds the
 truth, both pooled, and how the weighted sum of squares compares with its chi-square.
 
@@ -35,13 +35,13 @@ from calib.files.mast_file import load_rig
 from calib.geometry.rig import MAST_NAMES, Rig
 from calib.geometry.rigid import rigid_rates
 from calib.survey.records import Sigma, Survey
-from drivers.sim_survey.blunders import with_fewer_dots, with_moved_tape, with_scattered_dots
-from drivers.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
 from mastctl.calibration.run import FITS, Method
 from mastctl.cli.output import not_negative
 from mastctl.packaged import config_folder
 from tools.arguments import end
 from tools.campaign import held_percent, options, rms, run_cases
+from tools.sim_survey.blunders import with_fewer_dots, with_moved_tape, with_scattered_dots
+from tools.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
 
 DIRECTIONS_RAD = ((-0.8, -0.2), (0.0, -0.4), (0.7, -0.7))
 RANGES_M = (2.0, 6.0, 10.0)

@@ -26,10 +26,10 @@ from calib.targets.dot_order import PredictedBoard
 from calib.targets.dots import DotsFound, find_dots
 from drivers.sim.render import Renderer
 from drivers.sim.scene import SceneSettings, build_scene
-from drivers.sim_survey.board import BoardLook, draw_board, half_size_m, photograph
 from tools.arguments import end
 from tools.campaign import options, run_cases
 from tools.campaigns.board_photos import keep_pictures
+from tools.sim_survey.board import BoardLook, draw_board, half_size_m, photograph
 
 BOARD = Board(10, 10, 0.08, 0.04, {})
 SIZE_PX = (1024, 768)

@@ -31,7 +31,6 @@ from drivers.sim.optics.readout import Readout
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 from drivers.sim.sensor import Noise
-from drivers.sim_survey.board import photograph
 from mastctl.cli.output import at_least, not_negative
 from mastctl.devices.frames import StampedFrame
 from mastctl.experiment.targets import texture_mask
@@ -41,6 +40,7 @@ from mastctl.motion.settings import PointingSettings
 from mastctl.packaged import config_folder
 from tools.arguments import end
 from tools.campaign import options, run_cases, show
+from tools.sim_survey.board import photograph
 
 LEFT, RIGHT = "navcam_left", "navcam_right"
 NEAR_M, FAR_M = 1.8, 11.0

@@ -30,10 +30,6 @@ from calib.errors import CalibError
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.survey.records import Survey
-from drivers.sim_survey.bench import BenchPlan, Mishap, simulate_bench
-from drivers.sim_survey.blunders import with_slipped_joint
-from drivers.sim_survey.plan import SurveyPlan
-from drivers.sim_survey.survey import simulate_survey
 from mastctl.calibration.bench_verdict import judge_bench
 from mastctl.calibration.expected import RARELY
 from mastctl.cli.output import at_least
@@ -41,6 +37,10 @@ from mastctl.packaged import config_folder
 from tools.arguments import end
 from tools.campaign import heading, line, options, run_cases
 from tools.campaigns.bench_coverage import plan_of
+from tools.sim_survey.bench import BenchPlan, Mishap, simulate_bench
+from tools.sim_survey.blunders import with_slipped_joint
+from tools.sim_survey.plan import SurveyPlan
+from tools.sim_survey.survey import simulate_survey
 
 LOOKS = 8
 What = Literal["board", "pan", "tilt", "focus", "knock"]

@@ -2,7 +2,7 @@
 
     .venv/bin/python -m tools.campaigns.provoked_surveys --cases 200 --seed 1
 
-Each case is a simulated survey (`drivers.sim_survey`) with one thing wrong, a fifth of them with none; what
+Each case is a simulated survey (`tools.sim_survey`) with one thing wrong, a fifth of them with none; what
 is wrong and how much is drawn (`tools.campaigns.survey_provocations`). It is checked, fitted and judged as
 `mastctl calibrate` does it. The verdict is held against the simulator's rig:
 
@@ -42,7 +42,6 @@ from calib.geometry.rig import MAST_NAMES, Rig, numbers_of
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import triangulate
 from calib.survey.records import Sigma, Survey
-from drivers.sim_survey.plan import SurveyPlan, rover_from_head
 from mastctl.calibration import expected
 from mastctl.calibration.expected import check_sizes
 from mastctl.calibration.run import SurveyRefused, checked_survey
@@ -51,6 +50,7 @@ from mastctl.packaged import config_folder
 from tools.arguments import end
 from tools.campaign import options, rms, run_cases
 from tools.campaigns.survey_provocations import PROVOCATIONS, Provoked
+from tools.sim_survey.plan import SurveyPlan, rover_from_head
 
 DIRECTIONS_RAD = ((-0.8, -0.2), (0.0, -0.4), (0.7, -0.7))
 RANGES_M = (2.0, 6.0, 10.0)

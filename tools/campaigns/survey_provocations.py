@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.survey.records import Sigma, Survey
-from drivers.sim_survey.blunders import (
+from tools.sim_survey.blunders import (
     with_bowed_board,
     with_changed_focus,
     with_drifting_focus,
@@ -28,8 +28,8 @@ from drivers.sim_survey.blunders import (
     with_slipped_joint,
     with_wrong_prism,
 )
-from drivers.sim_survey.plan import SurveyPlan
-from drivers.sim_survey.survey import simulate_survey
+from tools.sim_survey.plan import SurveyPlan
+from tools.sim_survey.survey import simulate_survey
 
 Waves = Mapping[str, tuple[complex, complex]]
 
@@ -45,7 +45,7 @@ class Provoked:
     rig
         The rig as it is in the end: its joints' zeros are those of the last readings.
     waves
-        By how much a joint's reading is off around the turn (`drivers.sim_survey.blunders`).
+        By how much a joint's reading is off around the turn (`tools.sim_survey.blunders`).
     words
         What was done, and how much of it.
     """

@@ -15,8 +15,8 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.plan.placements import Placement
 from calib.targets.boards import AnyBoard, Corners
-from drivers.sim_survey.survey import rover_from_head
 from mastctl.bench.eyes import Head, Look, Seen
+from tools.sim_survey.survey import rover_from_head
 
 EDGE_PX = 3.0
 FLATTEST = math.cos(math.radians(72.0))

@@ -25,10 +25,10 @@ from calib.survey.reader import read_survey
 from calib.survey.records import Sigma
 from calib.survey.writer import write_survey
 from drivers.sim.pan_tilt import PRESETS
-from drivers.sim_survey.survey import Ring, SurveyPlan, simulate_survey
 from mastctl.calibration.run import Calibrated, calibrate, checked_survey
 from mastctl.cli.output import at_least
 from tools.arguments import end
+from tools.sim_survey.survey import Ring, SurveyPlan, simulate_survey
 from tools.simulated.check import (
     hazcam_range_error_m,
     pointing_error_px,

@@ -22,10 +22,10 @@ from calib.survey.records import Sigma, Survey
 from calib.survey.writer import write_survey
 from drivers.sim.render import Renderer
 from drivers.sim.scene import build_scene
-from drivers.sim_survey.board import draw_board, photograph
-from drivers.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
 from mastctl.cli.output import at_least, not_negative
 from tools.arguments import end
+from tools.sim_survey.board import draw_board, photograph
+from tools.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
 
 BLUR_PX, NOISE_DN = 0.7, 2.0
 

@@ -20,9 +20,9 @@ from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.survey.records import Sigma
-from drivers.sim_survey.survey import SurveyPlan, simulate_survey
 from mastctl.calibration.landing import click, handoff_errors_px, pointing_error_px, seen
 from mastctl.calibration.run import FITS, Method
+from tools.sim_survey.survey import SurveyPlan, simulate_survey
 
 METHODS: tuple[Method, ...] = ("paper", "joint")
 PAPER_STATION_M = 0.002

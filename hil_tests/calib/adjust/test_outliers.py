@@ -17,13 +17,13 @@ from calib.calibrate.paper import fit_paper
 from calib.calibrate.survey import fit_joint
 from calib.geometry.rig import Rig
 from calib.survey.records import Survey
-from drivers.sim_survey.blunders import (
+from hil_tests.calib.adjust.small_surveys import survey_of, with_shifted_dots, with_swapped_dots
+from tools.sim_survey.blunders import (
     with_fewer_dots,
     with_moved_tape,
     with_scattered_dots,
     with_wrong_prism,
 )
-from hil_tests.calib.adjust.small_surveys import survey_of, with_shifted_dots, with_swapped_dots
 
 SEED = 6
 SIGMAS_OFF = 3.0

@@ -23,7 +23,7 @@ from calib.calibrate.bench.told import check_weights
 from calib.calibrate.starts.bench import BenchNotFitted
 from calib.geometry.rig import Mast
 from calib.geometry.rigid import Rigid
-from drivers.sim_survey.bench import NAVCAMS, BenchCamera, BenchPlan, Mishap, Placement, simulate_bench
+from tools.sim_survey.bench import NAVCAMS, BenchCamera, BenchPlan, Mishap, Placement, simulate_bench
 
 SERVO = {
     "pan_harmonics": ((0.004, 0.0045), (0.001, -0.0017)),

@@ -10,7 +10,7 @@ from calib.calibrate.starts.camera import CameraFit, CameraNotFitted, fit_camera
 from calib.calibrate.starts.mast import MastNotFitted, fit_mast
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
-from drivers.sim_survey.plan import BOARD
+from tools.sim_survey.plan import BOARD
 
 ROWS, COLUMNS = np.divmod(np.arange(100), 10)
 PIXEL = 2e-3

@@ -15,8 +15,8 @@ from calib.calibrate.starts.survey import start_values
 from calib.calibrate.survey import fit_joint
 from calib.geometry.rig import Rig
 from calib.survey.records import Sigma, Survey
-from drivers.sim_survey.plan import Ring, SurveyPlan, rover_from_head
 from hil_tests.calib.adjust.small_surveys import rings, survey_of, with_shifted_dots
+from tools.sim_survey.plan import Ring, SurveyPlan, rover_from_head
 
 SMALL = SurveyPlan(rings=rings(2), mast_boards=5, check_boards=1)
 NEAR_M, NEAR_RAD = 0.01, 0.02

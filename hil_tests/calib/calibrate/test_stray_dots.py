@@ -14,8 +14,8 @@ from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.survey.records import Survey
 from calib.targets.boards import Dots
-from drivers.sim_survey.blunders import with_fewer_dots, with_outlier_dots, with_scattered_dots
-from drivers.sim_survey.survey import simulate_survey
+from tools.sim_survey.blunders import with_fewer_dots, with_outlier_dots, with_scattered_dots
+from tools.sim_survey.survey import simulate_survey
 
 ROOT = Path(__file__).resolve().parents[3]
 

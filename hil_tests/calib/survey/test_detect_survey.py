@@ -15,9 +15,9 @@ from calib.files.mast_file import load_rig
 from calib.survey.find_dots import detect_survey, expectations
 from calib.survey.records import Survey
 from calib.targets.dot_order import PredictedBoard, Upright
-from drivers.sim_survey.board import draw_board, photograph
-from drivers.sim_survey.survey import Ring, SurveyPlan, simulate_survey
 from hil_tests.calib.targets.boards import gravel
+from tools.sim_survey.board import draw_board, photograph
+from tools.sim_survey.survey import Ring, SurveyPlan, simulate_survey
 
 RMS_PX = 0.03
 PICTURES = 6

@@ -12,7 +12,7 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
 from calib.targets.boards import Board
 from calib.targets.dot_order import PredictedBoard
-from drivers.sim_survey.board import BoardLook, draw_board, photograph
+from tools.sim_survey.board import BoardLook, draw_board, photograph
 
 BOARD = Board(10, 10, 0.08, 0.04, {})
 LOOK = BoardLook()

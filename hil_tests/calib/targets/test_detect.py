@@ -15,7 +15,6 @@ from calib.targets.dot_grid import BoardGrid, DetectionFailure, best_grid
 from calib.targets.dot_order import PredictedBoard, Upright
 from calib.targets.dot_spots import Candidates, dot_candidates
 from calib.targets.dots import DotsFound, find_dots
-from drivers.sim_survey.board import BoardLook
 from hil_tests.calib.targets.boards import (
     BOARD,
     COLUMNS,
@@ -28,6 +27,7 @@ from hil_tests.calib.targets.boards import (
     pose,
     shoot,
 )
+from tools.sim_survey.board import BoardLook
 
 WANTED_PX = 0.03
 WANTED_FAR_PX = 0.08

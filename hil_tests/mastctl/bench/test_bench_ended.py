@@ -24,7 +24,6 @@ from calib.survey.reader import read_survey
 from calib.survey.writer import NotWritten, write_survey
 from calib.targets.board_file import save_board
 from calib.targets.boards import Charuco
-from drivers.sim_survey.bench import BenchPlan, simulate_bench
 from mastctl.bench.eyes import Interrupted, Look, NoLight
 from mastctl.bench.folder import Kept, looks_of
 from mastctl.bench.run import BenchRun
@@ -32,6 +31,7 @@ from mastctl.bench.search import BoardNotFound, Search
 from mastctl.bench.teller import Terminal
 from mastctl.cli import calibrate_bench
 from mastctl.cli.main import main
+from tools.sim_survey.bench import BenchPlan, simulate_bench
 from tools.simulated.bench import CornerBench
 
 FULL = OSError(errno.ENOSPC, "No space left on device")

@@ -20,13 +20,13 @@ from calib.geometry.rig import Mast, Rig
 from calib.survey.reader import read_survey
 from calib.survey.records import Survey
 from calib.survey.writer import write_survey
-from drivers.sim_survey.bench import NAVCAMS, BenchCamera, BenchPlan, Placement, simulate_bench
 from mastctl.bench import frame
 from mastctl.bench.fitting import fit_in_rover
 from mastctl.bench.folder import FORMER
 from mastctl.bench.frame import Frame
 from mastctl.calibration.bench_verdict import judge_bench
 from mastctl.cli.main import main
+from tools.sim_survey.bench import NAVCAMS, BenchCamera, BenchPlan, Placement, simulate_bench
 
 HAZCAM = BenchCamera(
     "rover", (640, 480), (420.0, 421.0), (318.0, 242.0), (-0.05, 0.01), (0.1, 0.05, 0.9), (0.02, 0.25, 0.03)

@@ -13,8 +13,8 @@ import pytest
 from calib.files.mast_file import load_rig
 from calib.geometry.covariance import stored_covariance
 from calib.survey.writer import write_survey
-from drivers.sim_survey.bench import BenchPlan, Mishap, simulate_bench
 from mastctl.cli.main import main
+from tools.sim_survey.bench import BenchPlan, Mishap, simulate_bench
 
 PLAN = BenchPlan(attitudes=9, checks=3, backlash_rad=0.004, count_rad=2 * np.pi / 4096)
 

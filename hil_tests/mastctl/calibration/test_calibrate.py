@@ -16,10 +16,10 @@ import pytest
 from calib.files.mast_file import load_rig, save_rig
 from calib.survey.reader import read_survey
 from calib.survey.records import Sigma
-from drivers.sim_survey.board import draw_board, photograph
 from hil_tests.mastctl.calibration.survey_world import edit_yaml, navcam_rig, navcam_survey, write_folder
 from mastctl.calibration.detection import missing, with_dots
 from mastctl.cli.main import main
+from tools.sim_survey.board import draw_board, photograph
 
 SIGMAS = 4.5
 """How many stated sigmas the truth may be off in one seeded survey."""

@@ -19,18 +19,18 @@ from calib.survey.check import check_survey
 from calib.survey.reader import read_survey
 from calib.survey.records import Survey, SurveyImage
 from calib.targets.boards import Dots
-from drivers.sim_survey.blunders import (
-    with_moved_tape,
-    with_outlier_dots,
-    with_swapped_boards,
-    with_wrong_prism,
-)
-from drivers.sim_survey.survey import Ring
 from hil_tests.calib.adjust.small_surveys import with_shifted_dots
 from hil_tests.mastctl.calibration.survey_world import edit_yaml, navcam_survey, write_folder
 from mastctl.calibration.detection import with_dots
 from mastctl.calibration.run import sentence_of
 from mastctl.cli.main import main
+from tools.sim_survey.blunders import (
+    with_moved_tape,
+    with_outlier_dots,
+    with_swapped_boards,
+    with_wrong_prism,
+)
+from tools.sim_survey.survey import Ring
 
 Cells = dict[str, str]
 IMAGE = "navcam_left-021"

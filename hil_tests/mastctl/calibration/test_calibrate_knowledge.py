@@ -15,10 +15,10 @@ from calib.files.mast_file import load_rig
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.survey.records import Sigma, SurveyImage
-from drivers.sim_survey.survey import Ring, SurveyPlan, simulate_survey
 from hil_tests.calib.adjust.small_surveys import held
 from hil_tests.mastctl.calibration.survey_world import edit_yaml, navcam_survey, write_folder
 from mastctl.cli.main import main
+from tools.sim_survey.survey import Ring, SurveyPlan, simulate_survey
 
 SIGMAS = 4.5
 """How many stated sigmas the truth may be off in one seeded survey."""

@@ -17,15 +17,15 @@ from calib.geometry.rigid import Rigid
 from calib.survey.reader import read_survey
 from calib.survey.records import Sigma, Survey
 from calib.survey.writer import write_survey
-from drivers.sim_survey.blunders import (
+from tools.sim_survey.blunders import (
     with_moved_tape,
     with_outlier_dots,
     with_swapped_boards,
     with_wrong_prism,
 )
-from drivers.sim_survey.survey import Ring, SurveyPlan, SurveyTruth, simulate_survey
+from tools.sim_survey.survey import Ring, SurveyPlan, SurveyTruth, simulate_survey
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 RIG_FILE = ROOT / "configs/sim/rocky8.yaml"
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
 from calib.targets.boards import Board
-from drivers.sim_survey.board import BoardLook, draw_board, photograph
+from tools.sim_survey.board import BoardLook, draw_board, photograph
 
 BOARD = Board(4, 5, 0.08, 0.04, {})
 LOOK = BoardLook(paper_dn=200.0, dot_dn=40.0, margin_m=0.08)

@@ -18,7 +18,7 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.survey.records import Purpose, StationKind, StationPoint, Survey, SurveyCamera, SurveyImage
 from calib.targets.boards import Dots
-from drivers.sim_survey.plan import BOARD, PRISMS_IN_ROVER_M, Ring, SurveyPlan, SurveyTruth, rover_from_head
+from tools.sim_survey.plan import BOARD, PRISMS_IN_ROVER_M, Ring, SurveyPlan, SurveyTruth, rover_from_head
 
 __all__ = ["Ring", "SurveyPlan", "SurveyTruth", "simulate_survey"]
 

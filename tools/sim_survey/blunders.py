@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.survey.records import StationKind, StationPoint, Survey, SurveyImage
 from calib.targets.boards import Dots
-from drivers.sim_survey.plan import SurveyTruth
+from tools.sim_survey.plan import SurveyTruth
 
 
 def with_moved_tape(survey: Survey, setup: str, placement: str, tape: str, shift_m: ArrayLike) -> Survey:
