@@ -1,7 +1,7 @@
 """The one door to hardware: from a configuration's driver names to open devices.
 
 Nothing else knows real and simulated drivers both. A name is ``dynamixel``, ``flir_ptu``, ``v4l2``, ``sim``,
-``replay``, or ``package.module:factory`` for a driver from outside this repository (contract section 5).
+``replay``, or ``package.module:factory`` for a driver from outside this repository (docs/how-to/drivers.md).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The configuration of one daemon (contract section 2), read strictly.
+"""The configuration of one daemon (docs/reference/configuration.md), read strictly.
 
 It is checked in two steps: what the file says by itself here, and what it says about the mast file when that
 is read (`check_cameras`). Options of drivers are handed through as they stand; the drivers judge them.

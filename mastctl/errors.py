@@ -1,7 +1,7 @@
-"""Errors of the service floor: ``code`` is what programs read, the text is one plain sentence.
+"""Errors of the service: programs read ``code``, people read the message, one plain sentence.
 
-A family says what its caller can do; the word says what it is about. A class of its own is for what
-somebody catches, or what carries more than a word.
+A family says what its caller can do; the code says what it is about. An error has a class of its own where
+code catches it, or where it carries more than a code.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ class _Family(MastctlError):
 
 
 class BadRequest(_Family):
-    """What was asked makes no sense for this rig: asked otherwise it may."""
+    """The request makes no sense for this rig; a changed request may."""
 
 
 class NotLetIn(_Family):
-    """Who asks has not shown who it is."""
+    """The client has shown no valid token."""
 
 
 class TooMany(_Family):
-    """Somebody asks too often; it may ask again after ``retry_after_s`` seconds."""
+    """The client asks too often; it may ask again after ``retry_after_s`` seconds."""
 
     def __init__(self, code: str, message: str, retry_after_s: float = 1.0) -> None:
         self.retry_after_s = retry_after_s
@@ -58,23 +58,23 @@ class TooMany(_Family):
 
 
 class NotAllowed(_Family):
-    """Who asks may not: somebody else may."""
+    """The client's role does not permit the request; another role may."""
 
 
 class NotKnown(_Family):
-    """Something was named that is not here."""
+    """The request names something that does not exist here."""
 
 
 class NoLonger(_Family):
-    """Something was named that was here and is not kept."""
+    """The request names something that existed and is no longer kept."""
 
 
 class NotNow(_Family):
-    """What was asked does not fit the moment: what runs, moves or is in use stands against it."""
+    """The present state of the daemon does not allow the request; a later one may."""
 
 
 class Unable(_Family):
-    """The service cannot do it, whoever asks; it may be asked again after ``retry_after_s`` seconds."""
+    """The service cannot do it for any client; ask again after ``retry_after_s`` seconds."""
 
     def __init__(self, code: str, message: str, retry_after_s: float | None = None) -> None:
         self.retry_after_s = retry_after_s
@@ -82,7 +82,7 @@ class Unable(_Family):
 
 
 class Stopped(NotNow):
-    """A stop was asked for; the move was not sent or was cut short."""
+    """A stop was requested; the move was not sent or was cut short."""
 
     def __init__(self, message: str) -> None:
         super().__init__("stopped", message)

@@ -1,4 +1,4 @@
-"""Pages of the reference that are written from the code at each build: commands, HTTP, Python names.
+"""Pages of the reference, written from the code at each build: commands, HTTP, error codes, Python names.
 
 `write_pages` fills ``docs/reference/generated``, which git ignores. Nothing here states a fact of its own.
 """
@@ -16,6 +16,7 @@ import calib
 from mastctl.cli.main import build_parser
 from mastctl.web.app import api
 from mastctl.web.described import description
+from tools import error_codes
 
 PYTHON = {
     "Pointing, calibration and cameras: `calib`": ["calib"],
@@ -30,7 +31,11 @@ BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiv
 
 def write_pages(folder: Path) -> None:
     """Write all pages; one whose text has not changed keeps its time stamp, so that builds stay quick."""
-    pages = {"commands.md": commands_page(), "http-api.md": http_page(json.loads(description(api())))}
+    pages = {
+        "commands.md": commands_page(),
+        "http-api.md": http_page(json.loads(description(api()))),
+        "error-codes.md": error_codes_page(),
+    }
     for title, modules in PYTHON.items():
         pages[f"python-{modules[0].replace('.', '-')}.md"] = python_page(title, modules)
     folder.mkdir(exist_ok=True)
@@ -154,6 +159,34 @@ def _kind(schema: dict[str, Any]) -> str:
         return f"list of {_kind(items)}"
     bounds = [f"{sign} {schema[key]:g}" for key, sign in BOUNDS.items() if key in schema]
     return " ".join([kind, *bounds])
+
+
+def error_codes_page() -> str:
+    """Return every error code with its meaning; those of commands alone stand apart."""
+    rows = [(f"`{code}`", *(_cell(text) for text in cells)) for code, *cells in error_codes.rows()]
+    lines = [
+        "# Error codes",
+        "",
+        "For programs that read `error.code`. Written from the code and from",
+        "[the table of refusals](../http.md#refusals). A value that a message fills in is shown as …;",
+        "*or* separates two messages of one code.",
+        "",
+        "## In answers and operations",
+        "",
+        "| code | status | meaning | remedy |",
+        "| --- | --- | --- | --- |",
+        *(f"| {' | '.join(row)} |" for row in rows if row[1]),
+        "",
+        "## In commands and Python calls alone",
+        "",
+        "The daemon answers those of the geometry, such as `blind_cone`, with status 422.",
+        "",
+        "| code | meaning |",
+        "| --- | --- |",
+        *(f"| {code} | {meaning} |" for code, status, meaning, _ in rows if not status),
+        "",
+    ]
+    return "\n".join(lines)
 
 
 def python_page(title: str, modules: list[str]) -> str:

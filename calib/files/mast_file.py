@@ -195,7 +195,7 @@ def _model(section: Section) -> tuple[CameraModel, tuple[str, ...]]:
 
 
 def _model_keys(model: CameraModel) -> dict[str, Any]:
-    """Return one camera model's keys in the contract's order."""
+    """Return one camera model's keys in the order of docs/reference/configuration.md."""
     keys: dict[str, Any] = {"size_px": list(model.size_px), "model": model.kind}
     keys.update({letter: getattr(model, letter) for letter in _LETTERS[model.kind]})
     if model.kind == "CAHVORE":
@@ -220,7 +220,7 @@ def _joints(section: Section) -> JointErrors:
 
 
 def joint_keys(joints: JointErrors) -> dict[str, Any]:
-    """Return both joints' keys in the contract's order."""
+    """Return both joints' keys in the order of docs/reference/configuration.md."""
     return {
         name: {
             "harmonics_rad": [[float(part) for part in pair] for pair in axis.harmonics_rad],

@@ -1,4 +1,4 @@
-"""Read a survey folder (contract section 2) strictly: what is wrong is refused with file, line and column.
+"""Read a survey folder strictly: what is wrong is refused with file, line and column.
 
 A bench's folder has boards whose places nobody measured, and no station.
 """

@@ -1,4 +1,4 @@
-"""A survey: the measurements of one calibration (the folder of contract section 2)."""
+"""A survey: the measurements of one calibration (the folder of docs/how-to/survey-calibration.md)."""
 
 from __future__ import annotations
 

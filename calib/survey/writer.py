@@ -1,4 +1,4 @@
-"""Write a survey folder (contract section 2): whole or not at all, and never over another one.
+"""Write a survey folder: whole or not at all, and never over another one.
 
 A bench's folder is written at once too, or picture by picture while it is measured.
 """

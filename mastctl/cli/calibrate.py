@@ -189,7 +189,7 @@ def _report(args: argparse.Namespace, done: Calibrated, in_use: StoredRig | None
 
 
 def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> dict[str, Any]:
-    """The contract's keys, and what else a program may want."""
+    """The document that ``--json`` prints."""
     from calib.adjust.result import HELD_FIXED
     from calib.files.yaml_text import plain
     from mastctl.calibration.mast_file import as_lists, mast_keys

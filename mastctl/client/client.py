@@ -74,16 +74,15 @@ class Client:
     url
         ``http://127.0.0.1:8420``, or ``unix:/path/of/socket``.
     timeout_s
-        What each request is given, seconds.
+        Longest time of each request, seconds.
     name
-        What this program calls itself, for the daemon's record and for who else wants to steer; by default
+        The name of this program, for the daemon's record and for other clients that want to steer; by default
         ``program@host:pid``. Clients of one name are one party.
-
-    A command goes out again where the connection breaks, with a key by which the daemon carries it out once.
     token
-        What a daemon asks for that is reached from other machines; by default that of ``$MASTCTL_TOKEN``.
-        Without TLS it can be read on the way. The certificates that are trusted beside the system's may
-        stand in the file ``$MASTCTL_CA_FILE``.
+        The token that a daemon expects from other machines; by default that of ``$MASTCTL_TOKEN``. Without TLS
+        others can read it on the way. The file ``$MASTCTL_CA_FILE`` may hold further trusted certificates.
+
+    Where the connection breaks, the client sends a command again, with a key by which the daemon executes it once.
 
     Raises
     ------

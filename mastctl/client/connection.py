@@ -102,7 +102,7 @@ class Daemon(ABC):
         self.url = url
         self._token = token or os.environ.get("MASTCTL_TOKEN")
         if self._token and not (self._token.isascii() and self._token.isprintable()):
-            raise ClientError("bad_token", "the token has signs that no token has", exit_code=2)
+            raise ClientError("bad_token", "the token has characters that no token has", exit_code=2)
         self.timeout_s = timeout_s
         self.name = plain_name(name or program_name())
         self.lease_id: str | None = None

@@ -35,8 +35,7 @@ class Sun:
     Attributes
     ----------
     direction
-        Unit vector towards it in ``frame``, whose axes are as those of the contract: x forward (north), y
-        right (east), z down.
+        Unit vector towards it in ``frame``: x forward (north), y right (east), z down.
     frame
         ``rover``, or ``site``: then it turns with the rover's pose.
     half_angle_rad

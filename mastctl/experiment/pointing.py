@@ -90,7 +90,7 @@ class PointingExperiment:
     notes: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """Return the document of contract section 3, with what else is known of each distance."""
+        """Return the document that ``--json`` prints, with all that is known of each distance."""
         return {
             "url": self.url,
             "hardware": self.status.get("hardware"),
@@ -108,7 +108,7 @@ class PointingExperiment:
 
 
 def _row_as_json(row: DistanceSummary) -> dict[str, Any]:
-    """One distance for programs; the keys of the contract first."""
+    """One distance for programs."""
     document: dict[str, Any] = {
         "distance_m": row.distance_m,
         "targets": row.targets,

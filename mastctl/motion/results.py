@@ -160,7 +160,17 @@ class PointingResult:
 
 
 class PointingError(MastctlError):
-    """The request failed; the mast was told to stop.
+    """The request failed; the daemon stopped the mast.
+
+    The four verdicts of a search for the target that found none:
+
+    ``target_flat``: The image around the target has too little texture, or texture along one direction only.
+
+    ``target_ambiguous``: A second place in the image fits nearly as well as the target.
+
+    ``target_border``: The target lies at the border of an image or of the search window.
+
+    ``target_not_found``: No place in the search window fits the target: hidden, changed, or at another range.
 
     Attributes
     ----------

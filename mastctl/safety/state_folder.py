@@ -119,7 +119,7 @@ class StateFolder:
         return cls(path)
 
     def note_daemon(self, config: Path, url: str, stop_socket: Path | None) -> None:
-        """Write down whose folder this is, for `Told`; what the disk refuses stands in `refused`."""
+        """Write which daemon uses this folder, for a command that finds it; a disk's refusal stands in `refused`."""
         told = {
             "pid": os.getpid(),
             "url": url,

@@ -40,7 +40,7 @@ class GuardError(Exception):
 def error_response(
     status: int, code: str, message: str, detail: Any = None, headers: Mapping[str, str] | None = None
 ) -> JSONResponse:
-    """Return an error as the contract has it."""
+    """Return an error in the one form of docs/reference/http.md."""
     body = {"error": {"code": code, "message": message, "detail": detail}}
     told = {**HEADERS, "content-security-policy": NO_PAGE, **(headers or {})}
     return JSONResponse(body, status_code=status, headers=told)

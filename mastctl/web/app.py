@@ -1,4 +1,4 @@
-"""The HTTP interface (contract section 4): JSON under /api/v1, described by /openapi.json.
+"""The HTTP interface (docs/reference/http.md): JSON under /api/v1, described by /openapi.json.
 
 The event loop only reads snapshots. Whatever takes a lock, a file or a device runs in worker threads
 (`mastctl.web.waiting`); ``POST /stop`` has threads of its own, so that it never waits behind them.

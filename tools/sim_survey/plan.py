@@ -129,7 +129,7 @@ class SurveyTruth:
 
 
 def rover_from_head(mast: Mast, pan_rad: float, tilt_rad: float) -> Rigid:
-    """Return the head's true pose: the contract's kinematics, written with SciPy's rotations."""
+    """Return the head's true pose: the documented kinematics, written with SciPy's rotations."""
     panned = Rotation.from_euler("XYZ", mast.rotation_rad) * Rotation.from_rotvec([0, 0, pan_rad])
     head = panned * Rotation.from_rotvec([mast.axis_twist_rad, 0, 0]) * Rotation.from_rotvec([0, tilt_rad, 0])
     return Rigid(head.as_matrix(), mast.translation_m + panned.apply([mast.axis_offset_m, 0.0, 0.0]))

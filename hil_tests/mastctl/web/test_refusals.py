@@ -30,6 +30,7 @@ from mastctl.errors import (
 from mastctl.motion.results import PointingError
 from mastctl.web.answer import GuardError, error_response
 from mastctl.web.refusals import status_of
+from tools import error_codes
 
 KINDS = (BadRequest, NotAllowed, NotKnown, NotLetIn, NoLonger, NotNow, TooMany, Unable)
 FAMILIES = {kind.__name__: kind for kind in KINDS}
@@ -122,6 +123,16 @@ def test_each_error_class_of_service_and_drivers_has_its_own_code_and_stands_in_
             told = vars(kind).get("code") or kind.__name__ in ("_Family", PointingError.__name__)
             assert told, f"{kind.__name__} has neither a family nor a code of its own"
             assert told is True or told in known | NO_ANSWER, kind.__name__
+
+
+def test_the_page_of_error_codes_explains_each_code_of_the_table(documented: dict[str, set[str]]) -> None:
+    explained = {code: (status, meaning) for code, status, meaning, _ in error_codes.rows()}
+    for status, codes in documented.items():
+        for code in codes:
+            assert status in explained[code][0], code
+            assert len(explained[code][1]) > 10, f"{code} has no meaning in the code"
+    assert explained["no_reply"][1] == NoReply.__doc__
+    assert "not_predictive" in explained, "a code of commands alone"
 
 
 def test_no_code_has_two_statuses(documented: dict[str, set[str]]) -> None:
