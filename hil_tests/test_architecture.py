@@ -45,6 +45,7 @@ def test_no_page_links_or_names_a_file_of_the_checkout_that_is_not_there(reposit
     for one in pages:
         text = one.read_text()
         links = [link for link in re.findall(r"\]\(([^)#\s]+)", text) if "://" not in link]
+        links = [link for link in links if "generated/" not in link]  # the build of the site checks those
         named = re.findall(r"`((?:calib|configs|docs|drivers|hil_tests|mastctl|tools)/[\w./-]+\.\w+)`", text)
         named = [name for name in named if "NAME" not in name]
         seen += len(links) + len(named)

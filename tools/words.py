@@ -48,8 +48,8 @@ class Finding(NamedTuple):
 
     @property
     def counted_under(self) -> str:
-        """The row of the budget: a page itself, a module by its folder."""
-        return self.file if self.file.endswith(".md") else Path(self.file).parent.as_posix()
+        """The row of the budget: a page, or the package of a module."""
+        return self.file if self.file.endswith(".md") else self.file.partition("/")[0]
 
 
 def replaced_words(glossary: str) -> re.Pattern[str]:

@@ -145,7 +145,7 @@ def _show_saved(proposal: Proposal, saved: StoredRig, previous: Path | None) -> 
         "its covariance is that after the correction"
         if covariance
         else "it has no covariance, as the former file has none",
-        "nothing uses it before a daemon is told to (docs/how-to/survey-calibration.md, Using it)",
+        "a daemon uses it after 'mastctl mast use' (docs/how-to/survey-calibration.md, Use the mast file)",
     ]
     notes += [f"kept from before: {previous}"] if previous is not None else []
     output.print_table(

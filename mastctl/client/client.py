@@ -79,10 +79,10 @@ class Client:
         The name of this program, for the daemon's record and for other clients that want to steer; by default
         ``program@host:pid``. Clients of one name are one party.
     token
-        The token that a daemon expects from other machines; by default that of ``$MASTCTL_TOKEN``. Without TLS
-        others can read it on the way. The file ``$MASTCTL_CA_FILE`` may hold further trusted certificates.
+        The token that a daemon expects from other machines; by default that of ``$MASTCTL_TOKEN``. Others
+        can read it on the way without TLS. The file ``$MASTCTL_CA_FILE`` may hold further trusted certificates.
 
-    Where the connection breaks, the client sends a command again, with a key by which the daemon executes it once.
+    Where the connection breaks, the client sends a command again; its key lets the daemon execute it once.
 
     Raises
     ------
