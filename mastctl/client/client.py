@@ -80,7 +80,7 @@ class Client:
         ``program@host:pid``. Clients of one name are one party.
     token
         The token that a daemon expects from other machines; by default that of ``$MASTCTL_TOKEN``. Others
-        can read it on the way without TLS. The file ``$MASTCTL_CA_FILE`` may hold further trusted certificates.
+        can read it on the way without TLS. The file ``$MASTCTL_CA_FILE`` may name further certificates.
 
     Where the connection breaks, the client sends a command again; its key lets the daemon execute it once.
 

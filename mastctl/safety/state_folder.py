@@ -119,7 +119,7 @@ class StateFolder:
         return cls(path)
 
     def note_daemon(self, config: Path, url: str, stop_socket: Path | None) -> None:
-        """Write which daemon uses this folder, for a command that finds it; `refused` has a disk's refusal."""
+        """Write which daemon uses this folder, for commands that find it; `refused` has a disk's refusal."""
         told = {
             "pid": os.getpid(),
             "url": url,
