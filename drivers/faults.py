@@ -140,7 +140,7 @@ CAMERA_WORDS: Mapping[str, Word] = MappingProxyType(
 
 LOG_WORDS: Mapping[str, Word] = MappingProxyType(
     {
-        "stalled": Word("nobody reads what the daemon says: what it writes to stderr and stdout waits", {}),
+        "stalled": Word("no program reads the daemon's stderr and stdout: its output waits", {}),
     }
 )
 """Words of the daemon's log, which is a device of its own here."""

@@ -27,7 +27,7 @@ from hil_tests.drivers.turned import turned
 def listed(repository: Path) -> dict[str, set[str]]:
     """Register names by what writes them, from the page's table."""
     page = (repository / "docs" / "how-to" / "hardware.md").read_text(encoding="utf-8")
-    part = page.split("\n## What is changed for good\n", 1)[1].split("\n## ", 1)[0]
+    part = page.split("\n## Permanent changes\n", 1)[1].split("\n## ", 1)[0]
     found: dict[str, set[str]] = {}
     for line in part.splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
