@@ -41,26 +41,26 @@ MEANINGS: Mapping[Word, str] = {
     "moving": "an operation runs, or the head moves",
     "tracking": "a track is active",
     "holding": "at rest after a stop, a reset or a fault: the goal was dropped; the next command starts",
-    "stopping": "a stop was asked for; the head has not confirmed it, or what ran has not ended",
+    "stopping": "a stop was requested; the head has not confirmed it, or the operation has not ended",
     "stopped": "an emergency stop is latched: nothing moves until a reset, not even after a restart",
-    "fault": "something is wrong with the head; it is told what, and what clears it",
-    "closing": "the daemon ends; the head was told to stop",
+    "fault": "the head has a fault; the status has its cause, and the event that clears it",
+    "closing": "the daemon ends; it has sent a stop to the head",
 }
 
 HAPPENS: Mapping[Event, str] = {
     "operation_began": "an operation was started: a pointing, a look, a jog",
     "operation_ended": "it was done, failed or was stopped",
-    "head_moves": "a reading says that the head moves",
-    "head_rests": "a reading says that it rests; the first reading is one or the other",
+    "head_moves": "a reading shows that the head moves",
+    "head_rests": "a reading shows that it rests; the first reading is one or the other",
     "track_began": "a track was started",
     "track_ended": "it was stopped, or its start found nothing",
-    "stop_asked": "a stop was asked for; the head is told before anything else",
+    "stop_asked": "a stop was requested; the head gets it before anything else",
     "stop_ended": "the head has confirmed the stop, or has not done so in its time, which is a fault",
-    "estop_asked": "an emergency stop was asked for: a stop that latches",
-    "reset": "somebody released the latch, with name and reason",
+    "estop_asked": "an emergency stop was requested: a stop that latches",
+    "reset": "an operator released the latch, with name and reason",
     "fault_stands": "a device call of the head failed, or the head reports a fault",
     "fault_cleared": "no fault of the head is left",
-    "closing": "the daemon was told to end",
+    "closing": "the daemon got the signal to end",
 }
 
 _ENDS: Mapping[Event, To] = {"stop_asked": "stopping", "estop_asked": "stopping", "closing": "closing"}
@@ -131,7 +131,7 @@ TABLE: Mapping[Word, Mapping[Event, To]] = {
 
 
 def what_goes_on(now: Standing) -> Word:
-    """Return the state of a head that nothing keeps: tracking, moving, holding or ready."""
+    """Return the state of a free head: tracking, moving, holding or ready."""
     if now.track is not None:
         return "tracking"
     if now.operation is not None or now.head_moves:

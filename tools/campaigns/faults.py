@@ -3,7 +3,7 @@
     python -m tools.campaigns.faults [--head memory|dynamixel|ptu] [--during pointing|tracking]
         [--word WORD ...]
 
-Prints the tables of docs/explanation/safety.md. A daemon in a process of its own on a simulated rover. For
+Prints the tables of docs/evidence/safety.md. A daemon in a process of its own on a simulated rover. For
 each word of the head and of a camera a pointing at a place is sent off, or a track is followed while the
 rover drives a step; the fault is set under way and taken back after some seconds. Told are when and as what
 the status or the operation names it, the states reached, how the operation and the track ended, and how long
@@ -90,7 +90,7 @@ def main() -> int:
     for during in args.during or DURING:
         print(f"\nHead {args.head}, while {during}, load {os.getloadavg()[0]:.1f}.\n")
         track = ("track",) if during == "tracking" else ()
-        columns = ("fault", "told after", "as", "states", "operation", *track, "well after")
+        columns = ("fault", "reported after", "as", "states", "operation", *track, "well after")
         print(heading(columns), flush=True)
         with tempfile.TemporaryDirectory() as folder:
             for trial in trials(Path(folder), args.head, during, args.word):

@@ -1,4 +1,4 @@
-"""Short forms of campaigns that docs/explanation/safety.md reports: a soak, and faults under way."""
+"""Short forms of campaigns that docs/evidence/safety.md reports: a soak, and faults under way."""
 
 from __future__ import annotations
 
