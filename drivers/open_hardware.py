@@ -237,7 +237,7 @@ class _Opener:
             raise BadOptions(
                 f"the simulated rover has no such camera{nearest(name, self.rover.cameras)}", device=name
             )
-        from drivers.sim.hanging import HangingCamera
+        from drivers.sim.cameras import HangingCamera
 
         size_px = self.rover.rig.cameras[name].model.size_px
         return HangingCamera(self.rover.cameras[name], size_px, self._clock, self.rover.faults)

@@ -16,9 +16,9 @@ from calib.calibrate.scene.terms import SceneView
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
+from drivers.sim.optics.readout import Noise
 from drivers.sim.render import Renderer
 from drivers.sim.scene import SceneSettings, build_scene
-from drivers.sim.sensor import Noise
 
 RIG = Path(__file__).resolve().parents[1] / "configs" / "sim" / "rocky8.yaml"
 NAVCAMS = ("navcam_left", "navcam_right")

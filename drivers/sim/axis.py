@@ -1,21 +1,114 @@
-"""One axis through time: motor in counts, encoder, backlash, sag, ringing, and approach from one side.
+"""One axis through time: motor in counts, encoder, play of the gears, sag, ringing, approach from one side.
 
 Three angles are kept apart. The *motor* angle, as its encoder has it, follows a trapezoid profile to the
 goal, rounded to the nearest count. The *reading* is that angle in whole counts, since the encoder sits on the
 motor's side of the gears. The *mechanical* angle is what the cameras ride on: the motor's true angle, which
 differs by the encoder's harmonics, through the backlash, less the sag of the tilt axis, and ringing. Only the
 simulated cameras and the experiments see it.
+
+Ringing: the load hangs on its motor through something elastic (mast, bearings, gears), so the angle x by
+which it is ahead of the motor obeys
+
+    x'' + 2 ζ ω x' + ω² x = -g a(t)
+
+with the motor's acceleration a. A profile's acceleration is constant in pieces, so x is a sum of answers to
+steps (and, where an axis seizes, to a jump in velocity), each in closed form. Neither the encoder nor the
+play of the gears notices.
 """
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from drivers.sim.gears import load_after_rad, shaft_rad
 from drivers.sim.motion import Motion
-from drivers.sim.ringing import Ringing
+
+Harmonics = Sequence[tuple[float, float]]
+"""Cosine and sine parts, radians, of the first, second, ... harmonic over a turn."""
+
+STILL_RAD = 1e-8
+"""What is left of a step's answer below this is none: 3e-5 px at a focal length of 3441 px."""
+
+
+def shaft_rad(read_rad: float, harmonics_rad: Harmonics) -> float:
+    """Return where a shaft truly is whose encoder reads an angle.
+
+    A disc that sits off its centre is wrong by the first harmonic, one that is oval by the second.
+    """
+    if not harmonics_rad:
+        return read_rad
+    once_round = cmath.exp(1j * read_rad)
+    wave = 0j
+    for cosine, sine in reversed(harmonics_rad):
+        wave = (wave + complex(cosine, -sine)) * once_round
+    return read_rad + wave.real
+
+
+def load_after_rad(
+    before_rad: float, to_rad: float, gap_rad: float, turnover_rad: float, friction: float
+) -> float:
+    """Return where the load ends when the shaft has turned one way from within the gap.
+
+    Gravity pulls with sin(turnover - load) of its largest torque, downwards below the turnover. Beyond
+    ``friction`` of it the load hangs on the flank that it is pulled to; within, it stays until a flank takes
+    it along.
+
+    Parameters
+    ----------
+    before_rad, to_rad
+        The load before, and the shaft now.
+    gap_rad
+        Full width of the play.
+    turnover_rad
+        Load angle at which the centre of mass is straight above the axis.
+    friction
+        Part of the largest torque of gravity that friction holds; 1: all of it.
+    """
+    load = min(max(before_rad, to_rad - gap_rad / 2), to_rad + gap_rad / 2)
+    if friction >= 1.0:
+        return load
+    torque = math.sin(turnover_rad - load)
+    if abs(torque) <= friction:
+        return load
+    return to_rad - math.copysign(gap_rad / 2, torque)
+
+
+@dataclass(frozen=True)
+class Ringing:
+    """A mode.
+
+    Attributes
+    ----------
+    frequency_hz
+        Natural frequency ω/2π, above zero.
+    damping
+        ζ, between 0 and 1, both excluded.
+    gain
+        g: 1 if all of the load takes part, as on a motor that turns it through a spring.
+    """
+
+    frequency_hz: float
+    damping: float
+    gain: float
+
+    def ahead_rad(self, motion: Motion, time_s: float) -> float:
+        """Return by how much the load is ahead of where the gears put it, radians."""
+        omega = math.tau * self.frequency_hz
+        decay = self.damping * omega
+        damped = omega * math.sqrt(1 - self.damping**2)
+        left, acceleration = 0.0, 0.0
+        for shock in motion.shocks(time_s):
+            step, acceleration = shock.acceleration_rad_per_s2 - acceleration, shock.acceleration_rad_per_s2
+            by_step, by_jump = step / omega**2, shock.jump_rad_per_s / damped
+            envelope = math.exp(-decay * (time_s - shock.time_s))
+            if self.gain * (2 * abs(by_step) + abs(by_jump)) * envelope < STILL_RAD:
+                continue
+            phase = damped * (time_s - shock.time_s)
+            swing = by_step * (math.cos(phase) + decay / damped * math.sin(phase))
+            left += envelope * (swing - by_jump * math.sin(phase))
+        return self.gain * (left - acceleration / omega**2)
 
 
 @dataclass(frozen=True)
@@ -42,9 +135,9 @@ class AxisSettings:
         The angle at which the load's centre of mass is straight above the axis, and the part of gravity's
         largest torque that friction holds. 1: all; the load stays where it was left in the gap.
     harmonics_rad
-        What the encoder is wrong by over a turn (`drivers.sim.gears`); empty: it reads true.
+        What the encoder is wrong by over a turn (`drivers.sim.axis`); empty: it reads true.
     ring_hz, ring_damping, ring_gain
-        The mode that rings after a move (`drivers.sim.ringing`); 0 Hz: none.
+        The mode that rings after a move (`drivers.sim.axis`); 0 Hz: none.
     settle_s
         How long after it has come to rest the head in memory says that it moves.
     """

@@ -21,8 +21,7 @@ from calib.targets.boards import FLAT, AnyBoard, Bow
 from calib.targets.pattern import pattern_of
 from drivers.errors import BadOptions
 from drivers.sim.placed import REACH_M
-from drivers.sim.rays import ray_table
-from drivers.sim.render import DrawsPictures, camera_key
+from drivers.sim.render import DrawsPictures, camera_key, ray_table
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

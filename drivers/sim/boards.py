@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions
-from drivers.sim import bricks, texture
-from drivers.sim.bricks import Brick
-from drivers.sim.compiled import kernels
+from drivers.sim import ground, rocks
+from drivers.sim.kept import kernels
 from drivers.sim.placed import (
     BOARD_M,
     DICTIONARIES,
@@ -27,6 +26,7 @@ from drivers.sim.placed import (
     PlacedBoard,
     read_picture,
 )
+from drivers.sim.rocks import Brick
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -81,14 +81,14 @@ def meshes(boards: Sequence[Board]) -> Any:
                                [-width_m, height_m]])  # fmt: skip
         corners = np.concatenate([np.column_stack([flat, np.full(4, z_m)]) for z_m in (0.0, BOARD_M)])
         boxes.append(Brick(board.site_from_board.points(corners)))
-    return bricks.meshes(boxes)._replace(boards=np.arange(len(boards)))
+    return rocks.meshes(boxes)._replace(boards=np.arange(len(boards)))
 
 
 def faces(boards: Sequence[Board]) -> Any:
     """Return the ``kernels.Boards``: where the faces are, and each different picture once."""
     module = kernels()
     different = list(dict.fromkeys(board.face for board in boards))
-    pictures = [texture.pyramid(*picture_of(face)) for face in different]
+    pictures = [ground.pyramid(*picture_of(face)) for face in different]
     most = max((len(one.start) for one in pictures), default=1)
     begins = np.cumsum([0, *(one.texels.size for one in pictures)])
     start = np.zeros((len(pictures), most), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""The folder where is kept what takes long to make: compiled code and scenes, and the kernels of tools/vm.
+"""What takes long to make and is kept: compiled code, scenes, kernels of tools/vm; numba is loaded here.
 
 ``$XDG_CACHE_HOME/mastctl``, by default ``~/.cache/mastctl``. All of it can be made again: it may be deleted
 at any time, carried to another machine, or be there for reading only. It does not grow beyond `MOST_BYTES`.
@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib
 import os
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
+from types import ModuleType
+
+from drivers.errors import BadOptions
 
 MOST_BYTES = {"compiled": 20_000_000, "scenes": 400_000_000, "vm": 150_000_000}
 """What is kept of each kind, in bytes; the thing that was made last stays also if it is larger by itself."""
@@ -65,3 +69,36 @@ def _size_bytes(folder: Path) -> int:
             with contextlib.suppress(OSError):
                 size += (Path(place) / name).lstat().st_size
     return size
+
+
+def kernels() -> ModuleType:
+    """Return the module of compiled functions.
+
+    Raises
+    ------
+    BadOptions
+        If numba is not installed.
+    """
+    try:
+        return importlib.import_module("drivers.sim.kernels")
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.split(".")[0] not in ("numba", "llvmlite"):
+            raise
+        raise BadOptions("the simulated rover needs numba: pip install 'mastctl[sim]'") from error
+
+
+def is_compiled() -> bool:
+    """Return whether the renderer starts at once: compiled in this process, or on disk and up to date.
+
+    When it does not, the first scene takes some ten to twenty seconds of compiling.
+
+    Raises
+    ------
+    BadOptions
+        If numba is not installed.
+    """
+    for function in kernels().ENTRIES:
+        folder = Path(function.stats.cache_path)
+        if not function.signatures and not any(folder.glob(f"*.{function.__name__}-*.nbi")):
+            return False
+    return True

@@ -1,25 +1,34 @@
-"""The simulated pan/tilt head in memory: what it is made of, and its calls; ``drivers.sim.axis`` moves it."""
+"""The simulated heads: one in memory, and one behind bytes: its simulator, a line in memory, the real driver.
+
+The simulated rover uses the second where a configuration says ``simulation.wire``. The cameras look from the
+axes of the simulator, so what they show followed from the bytes.
+"""
 
 from __future__ import annotations
 
 import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, TypeVar
 
-from calib.geometry.rig import JointErrors
 from drivers.clock import Clock
 from drivers.errors import BadOptions, BadReply, DriverError, NoReply
-from drivers.faults import PAN_TILT, Fault, FaultPanel, nearest
-from drivers.interfaces import AxisMotion, Reading
+from drivers.faults import PAN_TILT, Fault, FaultPanel
+from drivers.interfaces import AxisMotion, PanTilt, Reading
+from drivers.serial_line import OpenLine
 from drivers.sim.axis import AxisSettings
-from drivers.sim.head_options import axis_changes, check_together
+from drivers.sim.heads import PRESETS, HeadSettings
 from drivers.sim.wire.axis import WireAxis
+from drivers.sim.wire.carrier import WireDevice
+from drivers.sim.wire.dynamixel_bus import DynamixelBus
+from drivers.sim.wire.dynamixel_registers import BAUD_RATES
+from drivers.sim.wire.dynamixel_servo import SimulatedServo
+from drivers.sim.wire.memory_line import MemoryLine
+from drivers.sim.wire.ptu import SimulatedPtu
 
 _T = TypeVar("_T")
-
-ARCSEC = math.radians(1 / 3600)
 
 REPLY_TIMEOUT_S = 0.1
 """How long a caller waits for a head that does not answer, seconds."""
@@ -30,114 +39,49 @@ LOWEST_SUPPLY = 0.8
 HOTTEST_C = 80.0
 """Temperature over which the head complains, degrees Celsius: a Dynamixel X's default."""
 
+_MARGIN_RAD = math.radians(0.5)
+"""How far inside the simulator's own range the driver's limits are."""
+
+_WATCHDOG_S, _BRAKING_S = 0.38, 0.095
+"""On the machine's clock renderer, simulator and driver share one process, which on a busy machine is silent
+for 0.3 s now and then. So the servos wait longer than usual, and brake harder, since they must stand 0.5 s
+after the last packet."""
+
 
 @dataclass(frozen=True)
-class HeadSettings:
-    """A head: its name and two axes."""
+class _Wire:
+    """What stands behind a head of a name: which simulator's model, and which the driver is told."""
 
-    name: str
-    pan: AxisSettings
-    tilt: AxisSettings
+    wire: str
+    simulated: str
+    driver_model: str = ""
 
 
-_SAG_RAD = 5e-5  # the issue's 0.05 mrad, which the mast file does not know
-
-# FLIR PTU-D46-70 in eighth steps of 11.57 arcsec, a quarter of its 46.29 arcsec half step (derived from the
-# manuals of its sisters; the vendor markets 0.003°). Backlash 0.01° is the demo's choice. Ranges (±159°;
-# -80°..+31°), 60°/s and 60°/s² are assumed.
-_PTU = AxisSettings(
-    count_rad=11.57 * ARCSEC,
-    backlash_rad=math.radians(0.01),
-    low_rad=math.radians(-159),
-    high_rad=math.radians(159),
-    speed_rad_per_s=math.radians(60),
-    acceleration_rad_per_s2=math.radians(60),
-    approach_rad=math.radians(0.1),
-)
-# Dynamixel X: 4096 counts a turn (0.0879°), 15' = 0.25° backlash (vendor's figure for XM/XH430 and 540).
-# Speed and acceleration are assumed: well under the no-load speed, profile set by the driver.
-_X = AxisSettings(
-    count_rad=math.tau / 4096,
-    backlash_rad=math.radians(0.25),
-    low_rad=-math.pi,
-    high_rad=math.pi,
-    speed_rad_per_s=1.5,
-    acceleration_rad_per_s2=4.0,
+_HEADS: Mapping[str, _Wire] = MappingProxyType(
+    {
+        "dynamixel_x": _Wire("dynamixel", "xm430_w350", "XM430-W350"),
+        "ph42": _Wire("dynamixel", "ph42_020_s300", "PH42-020-S300"),
+        "ptu_d46_70": _Wire("flir_ptu", "d46_70"),
+    }
 )
 
-_PH42 = replace(
-    _X, count_rad=math.tau / 607500, backlash_rad=math.radians(0.1), approach_rad=math.radians(0.3)
-)
-
-PRESETS: Mapping[str, HeadSettings] = {
-    "ptu_d46_70": HeadSettings(
-        "ptu_d46_70",
-        _PTU,
-        replace(_PTU, low_rad=math.radians(-80), high_rad=math.radians(31), sag_rad=_SAG_RAD),
-    ),
-    # The shortest way, not one-sided: the table shows what counts and backlash allow untreated.
-    "dynamixel_x": HeadSettings(
-        "dynamixel_x", _X, replace(_X, low_rad=-math.pi / 2, high_rad=math.pi / 2, sag_rad=_SAG_RAD)
-    ),
-    # Dynamixel PH42: counts on the motor's side (607500 a turn of the output), so the backlash (6', vendor)
-    # is what matters, and it is taken up. Speed and acceleration are assumed, as for the X.
-    "ph42": HeadSettings(
-        "ph42", _PH42, replace(_PH42, low_rad=-math.pi / 2, high_rad=math.pi / 2, sag_rad=_SAG_RAD)
-    ),
-}
+DEFAULT_HEADS: Mapping[str, str] = MappingProxyType({"dynamixel": "dynamixel_x", "flir_ptu": "ptu_d46_70"})
+"""The wires there are, and the head behind each where a configuration names none."""
 
 
-def head_settings(value: Any) -> HeadSettings:
-    """Return the head that a configuration names.
-
-    Parameters
-    ----------
-    value
-        A preset's name, or a mapping with ``preset`` and any of ``count_rad``, ``backlash_rad``,
-        ``approach_rad``, ``speed_rad_per_s``, ``acceleration_rad_per_s2``, ``ring_hz``, ``ring_damping``,
-        ``ring_gain``, ``settle_s`` (both axes), ``sag_rad``, ``gravity_turnover_rad``, ``gravity_friction``
-        (tilt), ``pan_harmonics_rad`` and ``tilt_harmonics_rad``.
-
-    Raises
-    ------
-    BadOptions
-        For an unknown preset or key, a value that is not a number of the right sign or within its bounds, or
-        values that do not go together.
-    """
-    changes = dict(value) if isinstance(value, Mapping) else {"preset": value}
-    preset = changes.pop("preset", "ptu_d46_70")
-    if not isinstance(preset, str) or preset not in PRESETS:
-        raise BadOptions(f"simulation.head: there is no head {preset!r}{nearest(preset, PRESETS)}")
-    pan, tilt = axis_changes(changes)
-    head = PRESETS[preset]
-    head = replace(head, pan=replace(head.pan, **pan), tilt=replace(head.tilt, **tilt))
-    for axis in (head.pan, head.tilt):
-        check_together(axis)
-    return head
-
-
-def with_joints(head: HeadSettings, joints: JointErrors) -> HeadSettings:
-    """Return a head whose encoders and gears err as a true rig's ``joints`` say; the same if they read true.
-
-    Raises
-    ------
-    BadOptions
-        If the head has errors of its encoders already, or comes to its goals over less than the play.
-    """
-    if joints.reads_true:
-        return head
-    if head.pan.harmonics_rad or head.tilt.harmonics_rad:
+def check_head(wire: str, head: HeadSettings) -> None:
+    """Pass a head that can stand behind a wire. Raises BadOptions, naming those that can."""
+    fitting = [name for name, one in _HEADS.items() if one.wire == wire]
+    if head.name not in fitting:
         raise BadOptions(
-            "simulation.head has harmonics, and the true rig's joints say what encoders are wrong by too; "
-            "expected one of them"
+            f"simulation.head is {head.name!r}, which is not behind simulation.wire {wire!r}; "
+            f"expected {' or '.join(fitting)}"
         )
-    pan, tilt = (
-        replace(axis, harmonics_rad=joint.harmonics_rad, backlash_rad=joint.backlash_rad)
-        for axis, joint in ((head.pan, joints.pan), (head.tilt, joints.tilt))
-    )
-    for axis in (pan, tilt):
-        check_together(axis)
-    return replace(head, pan=pan, tilt=tilt)
+    preset = PRESETS[head.name]
+    if head.pan.count_rad != preset.pan.count_rad or head.tilt.count_rad != preset.tilt.count_rad:
+        raise BadOptions(
+            f"simulation.head.count_rad cannot be changed behind simulation.wire {wire!r}: the device has it"
+        )
 
 
 class SimulatedPanTilt:
@@ -312,3 +256,117 @@ class SimulatedPanTilt:
         if damaged:
             raise BadReply(f"the answer was damaged ({damaged.word})", device=name)
         return result
+
+
+class WiredHead:
+    """Axes, the simulator that turns them, the line to it, and the real driver at its other end.
+
+    Parameters
+    ----------
+    wire
+        A key of ``DEFAULT_HEADS``.
+    head
+        What it is made of; its approach is done by the driver.
+    clock
+        What simulator, line and driver live on: the machine's own or the simulation's, none turned by hand.
+    faults
+        Those of ``pan_tilt`` act on the axes and on the line.
+
+    Attributes
+    ----------
+    pan_tilt
+        The real driver.
+    line
+        What it talks over.
+
+    Raises
+    ------
+    BadOptions
+        For a head or clock that this cannot be done with.
+    DriverError
+        As the driver when it is opened.
+    """
+
+    def __init__(self, wire: str, head: HeadSettings, clock: Clock, faults: FaultPanel) -> None:
+        check_head(wire, head)
+        if not clock.runs:
+            raise BadOptions(f"simulation.wire {wire!r} needs a clock that goes on by itself")
+        now_s = clock.now_s()
+        self._axes = (
+            WireAxis(head.pan, faults, number=0, time_s=now_s),
+            WireAxis(head.tilt, faults, number=1, time_s=now_s),
+        )
+        make = _dynamixel if wire == "dynamixel" else _flir_ptu
+        device, open_head, options = make(_HEADS[head.name], head, self._axes, now_s)
+        if head.pan.settle_s > 0:
+            options["settle_s"] = head.pan.settle_s
+        self.line = MemoryLine(device, clock, faults)
+        try:
+            self.pan_tilt: PanTilt = open_head({**options, "port": self.line.path}, clock, self.line.open)
+        except BaseException:
+            self.line.close()
+            raise
+
+    def true_joints(self, time_s: float) -> tuple[float, float]:
+        """Return the mechanical pan and tilt at a moment of the last minute, radians. Never fails."""
+        pan, tilt = self._axes
+        return pan.mechanical_rad(time_s), tilt.mechanical_rad(time_s)
+
+    def close(self) -> None:
+        """Close the driver, then its line."""
+        self.pan_tilt.close()
+        self.line.close()
+
+
+_Made = tuple[WireDevice, Callable[[Mapping[str, Any], Clock, OpenLine], PanTilt], dict[str, Any]]
+
+
+def _dynamixel(kind: _Wire, head: HeadSettings, axes: tuple[WireAxis, WireAxis], time_s: float) -> _Made:
+    """Two servos at 1 Mbaud, ids 1 and 2."""
+    from drivers.dynamixel.head import open_head
+
+    baud = 1_000_000
+    servos = [
+        SimulatedServo(
+            kind.simulated,
+            servo_id,
+            axis,
+            settings={"baud_rate": BAUD_RATES.index(baud), "return_delay_time": 0},
+            time_s=time_s,
+        )
+        for servo_id, axis in enumerate(axes, 1)
+    ]
+    speed_rad_per_s = head.pan.speed_rad_per_s
+    options: dict[str, Any] = {
+        "baud": baud,
+        "reply_timeout_s": 0.25,  # as long as the process may be silent
+        "speed_rad_per_s": speed_rad_per_s,
+        "acceleration_rad_per_s2": max(head.pan.acceleration_rad_per_s2, speed_rad_per_s / _BRAKING_S),
+        "watchdog_s": _WATCHDOG_S,
+    }
+    for servo_id, (name, axis) in enumerate((("pan", head.pan), ("tilt", head.tilt)), 1):
+        # Rebooted by itself, so that a fault that was taken back leaves nothing behind; nothing falls here.
+        options[name] = {"id": servo_id, "model": kind.driver_model, "on_hardware_error": "reboot"}
+        options[name] |= _reach(axis)
+    return DynamixelBus(servos), open_head, options
+
+
+def _flir_ptu(kind: _Wire, head: HeadSettings, axes: tuple[WireAxis, WireAxis], time_s: float) -> _Made:
+    """A unit in eighth steps, which counts pan to the left."""
+    from drivers.flir_ptu.head import open_head
+
+    unit = SimulatedPtu(kind.simulated, *axes, step_mode="E", baud=38400)
+    pan, tilt = {**_reach(head.pan), "sign": -1}, {**_reach(head.tilt), "sign": 1}
+    # The acceleration stays the unit's own: to set it takes the unit seconds.
+    speed = {"speed_rad_per_s": head.pan.speed_rad_per_s}
+    return unit, open_head, {"baud": unit.baud, "pan": pan, "tilt": tilt, **speed}
+
+
+def _reach(axis: AxisSettings) -> dict[str, Any]:
+    """Limits and approach of an axis as the driver's options have them."""
+    reach: dict[str, Any] = {"limits_rad": [axis.low_rad + _MARGIN_RAD, axis.high_rad - _MARGIN_RAD]}
+    if axis.approach_rad > 0:
+        hangs = axis.gravity_friction < 1
+        reach |= {"approach": "gravity" if hangs else "positive", "approach_rad": axis.approach_rad}
+        reach |= {"gravity_turnover_rad": axis.gravity_turnover_rad} if hangs else {}
+    return reach

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from calib.geometry.rig import Rig
 from drivers.errors import BadOptions
 from drivers.faults import nearest
-from drivers.sim.section import check_bounds, filled
+from drivers.options import check_bounds, filled
 
 Float64 = NDArray[np.float64]
 

@@ -30,20 +30,18 @@ from drivers.errors import BadOptions, NoFreshFrame
 from drivers.faults import FaultPanel, nearest
 from drivers.interfaces import PanTilt
 from drivers.sim.bench_boards import BenchBoard, BenchBoards, checked, facing
-from drivers.sim.camera_clock import ClockSettings
-from drivers.sim.camera_settings import check_cameras
+from drivers.sim.camera_settings import ClockSettings, check_cameras
 from drivers.sim.cameras import SelfExposedCamera, SimulatedCamera
-from drivers.sim.compile_beside import drawing_compiled_beside
-from drivers.sim.kept_scenes import kept_scene
+from drivers.sim.heads import with_joints
 from drivers.sim.optics.lens import Lens
 from drivers.sim.optics.shutter import Shutter
 from drivers.sim.outside_scene import OutsideRenderer, outside_scene
-from drivers.sim.pan_tilt import SimulatedPanTilt, with_joints
+from drivers.sim.pan_tilt import SimulatedPanTilt, WiredHead
 from drivers.sim.placed import REACH_M, check_clear_of
+from drivers.sim.quick_start import drawing_compiled_beside, kept_scene
 from drivers.sim.render import Renderer, Stills, compile_renderer
 from drivers.sim.scene import Scene, SceneSettings
 from drivers.sim.settings import SimulationSettings
-from drivers.sim.wired_head import WiredHead
 
 TRUTH_FRAMES = 512
 """How many frames of each camera ``frame_truth`` remembers."""

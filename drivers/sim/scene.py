@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.geometry.rigid import Rigid, rot_x, rot_y, rot_z
 from drivers.errors import BadOptions
-from drivers.sim import boards, bricks, rocks, terrain, texture
+from drivers.sim import boards, ground, rocks
 from drivers.sim.boards import Board
-from drivers.sim.bricks import Brick
-from drivers.sim.compiled import kernels
+from drivers.sim.ground import OwnTerrain
+from drivers.sim.kept import kernels
 from drivers.sim.placed import (
     Placed,
     PlacedBoard,
@@ -32,7 +32,7 @@ from drivers.sim.placed import (
     named,
     radius_m,
 )
-from drivers.sim.terrain import OwnTerrain
+from drivers.sim.rocks import Brick
 
 Float64 = NDArray[np.float64]
 
@@ -185,17 +185,17 @@ def build_scene(settings: SceneSettings | None = None) -> Scene:
     stones, laid = laid_out(settings, rock_rng, brick_rng, placed_rng, partial(ground_z_m, inner))
     stood = [boards.standing(board, partial(ground_z_m, inner)) for board in settings.boards]
     if laid:
-        stones = rocks.together(stones, bricks.meshes(laid))
+        stones = rocks.together(stones, rocks.meshes(laid))
     if stood:
         stones = rocks.together(stones, boards.meshes(stood))
     tones = ground_tones(inner, sun, tone_rng, settings.terrain) * shadows(inner, stones, sun)
     if settings.terrain is None or settings.terrain.gravel:
-        gravel = texture.gravel(gravel_rng, sun, texture.DETAIL_TEXELS)
+        gravel = ground.gravel(gravel_rng, sun, ground.DETAIL_TEXELS)
     else:
-        gravel = np.ones((texture.DETAIL_TEXELS,) * 2, dtype=np.float32)
-    detail = texture.pyramid(gravel, texture.DETAIL_TEXEL_M)
-    stone = texture.pyramid(texture.stone(stone_rng, texture.STONE_TEXELS), texture.STONE_TEXEL_M)
-    broad = texture.pyramid(tones, INNER_CELL_M)
+        gravel = np.ones((ground.DETAIL_TEXELS,) * 2, dtype=np.float32)
+    detail = ground.pyramid(gravel, ground.DETAIL_TEXEL_M)
+    stone = ground.pyramid(ground.stone(stone_rng, ground.STONE_TEXELS), ground.STONE_TEXEL_M)
+    broad = ground.pyramid(tones, INNER_CELL_M)
     world = kernels().World(inner, outer, stones, detail, broad, stone, boards.faces(stood), sun)
     return Scene(settings, world, laid)
 
@@ -205,16 +205,16 @@ def laid_out(
     rock_rng: np.random.Generator,
     brick_rng: np.random.Generator,
     placed_rng: np.random.Generator,
-    ground: Callable[[float, float], float],
+    ground_m: Callable[[float, float], float],
 ) -> tuple[Any, tuple[Brick, ...]]:
     """Return ``kernels.Rocks`` of the stones, and the bricks; scattered ones keep away from placed things."""
     placed = settings.placed.values()
     taken_m = np.array([[*middle_m(thing), 0.0, radius_m(thing)] for thing in placed]).reshape(-1, 4)
     if isinstance(settings.rocks, tuple):
         where = np.array([[rock.x_m, rock.y_m, rock.diameter_m] for rock in settings.rocks]).reshape(-1, 3)
-        stones = rocks.stones_at(where, placed_rng, ground, [rock.heading_rad for rock in settings.rocks])
+        stones = rocks.stones_at(where, placed_rng, ground_m, [rock.heading_rad for rock in settings.rocks])
     else:
-        stones = rocks.make_rocks(settings.rocks, rock_rng, ground)
+        stones = rocks.make_rocks(settings.rocks, rock_rng, ground_m)
         apart = stones.spheres_m[:, None] - taken_m[None]
         free = (np.hypot(apart[..., 0], apart[..., 1]) > stones.spheres_m[:, None, 3] + taken_m[:, 3]).all(
             axis=1
@@ -222,13 +222,13 @@ def laid_out(
         stones = type(stones)(*(np.ascontiguousarray(part[free]) for part in stones))
     if isinstance(settings.bricks, tuple):
         return stones, tuple(
-            bricks.make_brick(
-                one.x_m, one.y_m, one.heading_rad, ground, (one.length_m, one.width_m, one.height_m)
+            rocks.make_brick(
+                one.x_m, one.y_m, one.heading_rad, ground_m, (one.length_m, one.width_m, one.height_m)
             )
             for one in settings.bricks
         )
     taken_m = np.concatenate([stones.spheres_m, taken_m])
-    return stones, bricks.scattered(settings.bricks, brick_rng, taken_m, ground)
+    return stones, rocks.scattered(settings.bricks, brick_rng, taken_m, ground_m)
 
 
 def tiny_scene(lit: bool = True) -> Scene:
@@ -242,9 +242,9 @@ def tiny_scene(lit: bool = True) -> Scene:
     inner = make_grid(np.zeros((9, 9), dtype=np.float32), INNER_CELLS * INNER_CELL_M / 8)
     stones = rocks.make_rocks(1, rng, partial(ground_z_m, inner))
     even = np.ones((8, 8), dtype=np.float32)
-    broad = texture.pyramid(shadows(inner, stones, sun) if lit else even, inner.cell_m)
-    detail = texture.pyramid(texture.gravel(rng, sun, 128) if lit else even, texture.DETAIL_TEXEL_M)
-    stone = texture.pyramid(texture.stone(rng, 128), texture.STONE_TEXEL_M)
+    broad = ground.pyramid(shadows(inner, stones, sun) if lit else even, inner.cell_m)
+    detail = ground.pyramid(ground.gravel(rng, sun, 128) if lit else even, ground.DETAIL_TEXEL_M)
+    stone = ground.pyramid(ground.stone(rng, 128), ground.STONE_TEXEL_M)
     world = kernels().World(inner, inner, stones, detail, broad, stone, boards.faces([]), sun)
     return Scene(settings, world)
 
@@ -263,10 +263,10 @@ def inner_relief_m(settings: SceneSettings, rng: np.random.Generator) -> NDArray
     rim = np.maximum(np.abs(axis)[:, None], np.abs(axis)[None, :])
     level_at_rim = 1.0 - smooth_step(rim, 28.0, 31.8)
     if settings.terrain is not None:
-        own: Any = terrain.elevation_m(settings.terrain, axis[None, :], axis[:, None])
+        own: Any = ground.elevation_m(settings.terrain, axis[None, :], axis[:, None])
         return np.asarray(own * level_at_rim, dtype=np.float32)
-    swells = texture.fractal(n, rng, 1.9, 0.8 / INNER_CELL_M, 12.0 / INNER_CELL_M)
-    bumps = texture.fractal(n, rng, 1.7, 2.0, 0.8 / INNER_CELL_M)
+    swells = ground.fractal(n, rng, 1.9, 0.8 / INNER_CELL_M, 12.0 / INNER_CELL_M)
+    bumps = ground.fractal(n, rng, 1.7, 2.0, 0.8 / INNER_CELL_M)
     # a peak of three standard deviations comes to relief_m
     relief = settings.relief_m * (0.33 * swells + 0.035 * bumps)
     elevation = np.zeros((n + 1, n + 1), dtype=np.float64)
@@ -284,7 +284,7 @@ def outer_relief_m(settings: SceneSettings, rng: np.random.Generator) -> NDArray
     elevation = np.zeros((n + 1, n + 1), dtype=np.float64)
     if settings.relief_m == 0:
         return elevation.astype(np.float32)
-    hills = texture.fractal(n, rng, 1.6, 4.0, 120.0)
+    hills = ground.fractal(n, rng, 1.6, 4.0, 120.0)
     axis = (np.arange(n + 1) - n / 2) * OUTER_CELL_M
     distance = np.hypot(axis[:, None], axis[None, :])
     elevation[:n, :n] = np.maximum(hills + 0.5, -0.5)
@@ -346,11 +346,11 @@ def ground_tones(
     cosine = np.maximum(-sx * sun[0] - sy * sun[1] - sun[2], 0.0) / np.sqrt(1.0 + sx * sx + sy * sy)
     light = module.AMBIENT + (1.0 - module.AMBIENT) * cosine
     level = module.AMBIENT - (1.0 - module.AMBIENT) * sun[2]
-    soil = texture.fractal(grid.cells, rng, 0.75, 2.0, 10.0 / grid.cell_m)
+    soil = ground.fractal(grid.cells, rng, 0.75, 2.0, 10.0 / grid.cell_m)
     soil = np.exp(0.13 * soil)
     if own is not None:
         middles = grid.x0_m + (np.arange(grid.cells) + 0.5) * grid.cell_m
-        soil = terrain.soil(own, middles[None, :], middles[:, None], grid.cell_m, soil)
+        soil = ground.soil(own, middles[None, :], middles[:, None], grid.cell_m, soil)
     return np.asarray(soil * light / level, dtype=np.float32)
 
 

@@ -9,16 +9,20 @@ from typing import Any
 
 from drivers.errors import BadOptions
 from drivers.faults import nearest, read_script
-from drivers.options import OptionReader
-from drivers.sim.camera_clock import ClockSettings, clock_settings
-from drivers.sim.camera_settings import CameraSettings, check_cameras
-from drivers.sim.pan_tilt import HeadSettings, head_settings
+from drivers.options import OptionReader, filled
+from drivers.sim.camera_settings import (
+    CameraSettings,
+    ClockSettings,
+    TemperatureSettings,
+    check_cameras,
+    clock_settings,
+    temperature_settings,
+)
+from drivers.sim.ground import read_terrain
+from drivers.sim.heads import HeadSettings, head_settings
+from drivers.sim.pan_tilt import DEFAULT_HEADS, check_head
 from drivers.sim.placed import read_list
 from drivers.sim.scene import SceneSettings
-from drivers.sim.section import filled
-from drivers.sim.terrain import read_terrain
-from drivers.sim.warmth import TemperatureSettings, temperature_settings
-from drivers.sim.wired_head import DEFAULT_HEADS, check_head
 from drivers.simulation_clock import simulation_speed
 
 
@@ -76,7 +80,7 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
     ----------
     section
         Keys ``rover`` (a mast file, relative to ``folder``), ``head`` (a preset, see
-        ``drivers.sim.pan_tilt.head_settings``), ``seed`` (of scene and noise), ``samples``, ``scene``
+        ``drivers.sim.heads.head_settings``), ``seed`` (of scene and noise), ``samples``, ``scene``
         (fields of ``SceneSettings``), ``cameras`` (fields of ``CameraSettings``), ``temperature`` (fields of
         ``TemperatureSettings``), ``clocks`` (fields of ``ClockSettings`` by camera), ``faults`` (a list, or a
         script's name), ``wire``, ``speed`` (`drivers.simulation_clock.simulation_speed`). Only ``rover`` is

@@ -14,7 +14,7 @@ import pytest
 from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.rig import Rig, RigCamera
 from drivers.sim import rover
-from drivers.sim.kept_scenes import kept_scene
+from drivers.sim.quick_start import kept_scene
 from drivers.sim.scene import Scene, SceneSettings
 
 SHRINK = 4

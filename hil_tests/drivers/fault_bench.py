@@ -7,7 +7,8 @@ import numpy as np
 from drivers.clock import ManualClock
 from drivers.faults import FaultPanel
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
-from drivers.sim.pan_tilt import PRESETS, SimulatedPanTilt
+from drivers.sim.heads import PRESETS
+from drivers.sim.pan_tilt import SimulatedPanTilt
 
 START = 100.0
 SIZE = (64, 48)

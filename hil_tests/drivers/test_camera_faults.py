@@ -16,7 +16,7 @@ from drivers.errors import DriverError, NoFreshFrame, NoReply
 from drivers.faults import CAMERA_WORDS, FaultPanel
 from drivers.hardware import close_devices
 from drivers.interfaces import Camera, HoldsExposure, KnowsSize, Paced
-from drivers.sim.hanging import HangingCamera
+from drivers.sim.cameras import HangingCamera
 from drivers.simulation_clock import SimulationClock
 from hil_tests.drivers.fault_bench import PATIENCE_S, SIZE, START, Bench
 

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.errors import BadOptions
 from drivers.faults import CAMERA_WORDS, HEAD_WORDS, LOG_WORDS, PAN_TILT, WHEN, FaultPanel, read_script
-from drivers.sim.hanging import HangingCamera
+from drivers.sim.cameras import HangingCamera
 from hil_tests.drivers.fault_bench import SIZE, START, Bench
 from tools.campaigns.servo_rigs import dynamixel, in_memory, ptu
 

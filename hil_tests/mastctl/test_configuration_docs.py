@@ -22,10 +22,10 @@ from drivers.flir_ptu import options as flir_ptu
 from drivers.known import CAMERAS, HEADS, OURS
 from drivers.replay import OPTIONS as REPLAY_OPTIONS
 from drivers.sim import settings as simulation
+from drivers.sim.camera_settings import TemperatureSettings
 from drivers.sim.cameras import CameraSettings
-from drivers.sim.head_options import HEAD_KEYS
+from drivers.sim.heads import HEAD_KEYS
 from drivers.sim.scene import SceneSettings
-from drivers.sim.warmth import TemperatureSettings
 from drivers.v4l2 import options as v4l2
 from mastctl import config
 from mastctl.motion.settings import PointingSettings

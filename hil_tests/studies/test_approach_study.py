@@ -16,7 +16,7 @@ import pytest
 from calib.files.mast_file import load_rig
 from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
-from drivers.sim import bricks, rocks
+from drivers.sim import rocks
 from drivers.sim.scene import Scene, SceneSettings, make_grid, tiny_scene
 from mastctl.experiment.tasks import Kept
 from tools.studies import approach_run as approach
@@ -166,8 +166,8 @@ def test_without_a_rock_at_the_range_nothing_turns_and_the_run_says_so(
     standing: Callable[..., ApproachWorld], rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A brick 8.2 m away, which some rays meet that would reach the ground 8.5 m away."""
-    brick = bricks.make_brick(rig.mast.translation_m[0] + 8.1, 0.0, math.pi / 2, lambda x, y: 0.0)
-    world = standing(rocks=bricks.meshes([brick]))
+    brick = rocks.make_brick(rig.mast.translation_m[0] + 8.1, 0.0, math.pi / 2, lambda x, y: 0.0)
+    world = standing(rocks=rocks.meshes([brick]))
     before = world.site_from_rover
     assert world.turn_to_rock(START_M, ROCK_M) is None
     assert world.turn_to_rock(8.0, 0.18) is None, "it stands 17 cm out of the ground"
@@ -177,7 +177,7 @@ def test_without_a_rock_at_the_range_nothing_turns_and_the_run_says_so(
 
     def build(settings: SceneSettings) -> Scene:
         asked.append(settings)
-        return Scene(settings, tiny_scene().world._replace(rocks=bricks.meshes([brick])))
+        return Scene(settings, tiny_scene().world._replace(rocks=rocks.meshes([brick])))
 
     monkeypatch.setattr(approach, "build_scene", build)
     assert approach.run_approach(rig, rig, 3).error == "no rock stands at the start range"
@@ -203,9 +203,9 @@ def test_height_is_above_the_ground_under_a_point(standing: Callable[..., Approa
 
 def test_a_target_is_on_a_rock_and_not_at_its_boundary(standing: Callable[..., ApproachWorld]) -> None:
     """The front of a brick 10 m ahead, 39 cm across and 17 cm out of the ground."""
-    brick = bricks.make_brick(START_M, 0.0, math.pi / 2, lambda x, y: 0.0)
-    world = standing(rocks=bricks.meshes([brick]))
-    front = START_M - bricks.SIZE_M[1] / 2
+    brick = rocks.make_brick(START_M, 0.0, math.pi / 2, lambda x, y: 0.0)
+    world = standing(rocks=rocks.meshes([brick]))
+    front = START_M - rocks.SIZE_M[1] / 2
     camera = "pancam_left"
     angles = solve(
         world.true.mast,

@@ -18,7 +18,7 @@ from calib.geometry.handoff import Joints, PredictedPixel
 from calib.geometry.rigid import Rigid
 from calib.matching.handed_over import Landed, MatchedHandoff
 from calib.matching.handoff import RefinedPixel, RefinedVerdict
-from drivers.sim import bricks
+from drivers.sim import rocks
 from drivers.sim.rover import SimulatedRover
 from drivers.sim.scene import Scene, tiny_scene
 from mastctl.cli.output import WrongUse
@@ -130,8 +130,8 @@ def test_a_views_picture_marks_every_target_where_it_is() -> None:
 def test_bricks_points_are_seen_only_where_nothing_hides_them(repository: Path) -> None:
     """A brick ahead of the Hazcam shows the front of its top and hides the ground and its own far side."""
     scene = tiny_scene()
-    brick = bricks.make_brick(1.7, 0.0, 0.3, lambda x, y: 0.0)
-    world = scene.world._replace(rocks=bricks.meshes([brick]))
+    brick = rocks.make_brick(1.7, 0.0, 0.3, lambda x, y: 0.0)
+    world = scene.world._replace(rocks=rocks.meshes([brick]))
     camera = load_rig(repository / "configs/sim/rocky8.yaml").rig.cameras["hazcam_left"].model
     truth = SimpleNamespace(camera_in_rover=camera, site_from_rover=Rigid.identity())
     rover: Any = SimpleNamespace(

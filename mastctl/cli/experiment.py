@@ -135,7 +135,7 @@ def _run_simulated(args: argparse.Namespace) -> int:
 
 def run_demo(args: argparse.Namespace) -> int:
     """Start a simulated rover behind a daemon on a free port, and run the experiment on it."""
-    from drivers.sim.compile_beside import drawing_compiled_beside
+    from drivers.sim.quick_start import drawing_compiled_beside
     from mastctl.config import load_config
     from mastctl.experiment.pointing import head_pair
     from mastctl.experiment.simulated import SimulationTruth, demo_config, head_note, own_config

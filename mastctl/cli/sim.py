@@ -152,7 +152,7 @@ def _panel() -> tuple[FaultPanel, Clock]:
 
 def _axis_settings(preset: str, place: int) -> AxisSettings:
     """Backlash and sag of pan (even places) or tilt."""
-    from drivers.sim.pan_tilt import PRESETS
+    from drivers.sim.heads import PRESETS
 
     return PRESETS[preset].tilt if place % 2 else PRESETS[preset].pan
 

@@ -70,8 +70,8 @@ def run(args: argparse.Namespace) -> int:
 
     from drivers.hardware import DeviceSettings, HardwareSettings
     from drivers.known import clock_for
-    from drivers.sim.pan_tilt import head_settings
-    from drivers.sim.wired_head import DEFAULT_HEADS, check_head
+    from drivers.sim.heads import head_settings
+    from drivers.sim.pan_tilt import DEFAULT_HEADS, check_head
     from mastctl.new_rig.folder import boards_about, check_empty, write_built, write_twin
     from mastctl.new_rig.numbers import built_rig
 

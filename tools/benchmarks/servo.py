@@ -44,7 +44,7 @@ class Failed(Exception):
 def simulate(pipe: Connection, delay_s: float) -> None:
     """Two simulated servos behind a pseudo terminal, until the pipe says so."""
     from drivers.clock import SystemClock
-    from drivers.sim.pan_tilt import PRESETS
+    from drivers.sim.heads import PRESETS
     from drivers.sim.wire.axis import WireAxis
     from drivers.sim.wire.dynamixel_bus import DynamixelBus
     from drivers.sim.wire.dynamixel_servo import SimulatedServo

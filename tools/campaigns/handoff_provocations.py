@@ -20,10 +20,9 @@ from calib.geometry.covariance import RigCovariance, moved_rig
 from calib.geometry.rig import Rig
 from calib.geometry.solutions import choose
 from calib.matching.handoff import Eye
-from drivers.sim import texture
-from drivers.sim.bricks import Brick, make_brick, meshes
-from drivers.sim.compiled import kernels
-from drivers.sim.rocks import together
+from drivers.sim import ground
+from drivers.sim.kept import kernels
+from drivers.sim.rocks import Brick, make_brick, meshes, together
 from drivers.sim.scene import Scene, SceneSettings, build_scene, sun_direction
 from mastctl.experiment.targets import BORDER_PX, texture_mask
 from tools.studies.approach_world import ApproachWorld, WorldErrors
@@ -284,7 +283,7 @@ class Stage:
             count, natural = int(rng.choice(PERIODS_PER_SIDE)), float(rng.choice([0.0, 0.1, 0.2]))
             scene = repeated(self._scene(usual), count, natural, rng)
             sigma = float(rng.choice([CLICK_PX, 1.0]))
-            side_mm = texture.DETAIL_TEXELS * texture.DETAIL_TEXEL_M * 1e3
+            side_mm = ground.DETAIL_TEXELS * ground.DETAIL_TEXEL_M * 1e3
             note = f"period {side_mm / count:.0f} mm, natural {natural:g}, clicks {sigma:g} px"
             return View(scene, scene, note, sigma_px=sigma)
         if kind == "shadow":
@@ -363,10 +362,10 @@ def faded(scene: Scene, contrast: float, broad: bool = True) -> Scene:
 
 def repeated(scene: Scene, count: int, natural: float, rng: np.random.Generator) -> Scene:
     """Return the scene with ground that repeats ``count`` times a texture's side, and some natural gravel."""
-    side = texture.DETAIL_TEXELS
-    tile = 1.0 + 0.25 * texture.fractal(side // count, rng, 0.8, 3.0, side / count)
-    gravel = texture.gravel(rng, sun_direction(scene.settings), side) if natural else np.ones((side, side))
+    side = ground.DETAIL_TEXELS
+    tile = 1.0 + 0.25 * ground.fractal(side // count, rng, 0.8, 3.0, side / count)
+    gravel = ground.gravel(rng, sun_direction(scene.settings), side) if natural else np.ones((side, side))
     tones = np.clip(np.tile(tile, (count, count)) * (1.0 + natural * (gravel - 1.0)), 0.1, 1.9)
-    detail = texture.pyramid(tones.astype(np.float32), texture.DETAIL_TEXEL_M)
+    detail = ground.pyramid(tones.astype(np.float32), ground.DETAIL_TEXEL_M)
     plain = faded(scene, 0.1)
     return Scene(scene.settings, plain.world._replace(detail=detail), scene.bricks)

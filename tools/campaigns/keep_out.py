@@ -19,7 +19,8 @@ from dataclasses import dataclass, replace
 from drivers.clock import ManualClock
 from drivers.interfaces import Reading
 from drivers.sim.axis import AxisSettings
-from drivers.sim.pan_tilt import PRESETS, HeadSettings, SimulatedPanTilt
+from drivers.sim.heads import PRESETS, HeadSettings
+from drivers.sim.pan_tilt import SimulatedPanTilt
 from mastctl.devices.door import REST_S, Door
 from mastctl.devices.keep_out import Box, KeptOut, NoWay, Pair, Span
 from mastctl.devices.limits import Limits

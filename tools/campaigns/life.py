@@ -37,10 +37,10 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from drivers.clock import ManualClock
 from drivers.errors import DriverError
-from drivers.sim.camera_clock import CameraClock, ClockSettings
-from drivers.sim.pan_tilt import PRESETS, HeadSettings, SimulatedPanTilt
+from drivers.sim.camera_settings import CameraClock, ClockSettings, TemperatureSettings
+from drivers.sim.heads import PRESETS, HeadSettings
+from drivers.sim.pan_tilt import SimulatedPanTilt
 from drivers.sim.settings import SimulationSettings, simulation_settings
-from drivers.sim.warmth import TemperatureSettings
 from mastctl.cli.output import at_least
 from mastctl.config import load_config
 from mastctl.motion.settings import PointingSettings

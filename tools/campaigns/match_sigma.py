@@ -18,6 +18,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from drivers.sim.sensor import Noise
 
 from calib.files.mast_file import load_rig
 from calib.geometry.cahvor import CameraModel
@@ -30,7 +31,6 @@ from drivers.sim.optics.exposure import Shot
 from drivers.sim.optics.readout import Readout
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
-from drivers.sim.sensor import Noise
 from mastctl.cli.output import at_least, not_negative
 from mastctl.devices.frames import StampedFrame
 from mastctl.experiment.targets import texture_mask

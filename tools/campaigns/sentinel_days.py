@@ -21,8 +21,8 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.matching.warp import Grey
-from drivers.sim import boards, bricks, rocks, scene, texture
-from drivers.sim.compiled import kernels
+from drivers.sim import boards, ground, rocks, scene
+from drivers.sim.kept import kernels
 from drivers.sim.render import Renderer
 from drivers.sim.scene import INNER_CELL_M, Scene, SceneSettings
 from mastctl.sentinel.folder import Picture
@@ -161,7 +161,7 @@ class Surroundings:
         self.inner = scene.make_grid(scene.inner_relief_m(settings, rng), INNER_CELL_M)
         self.outer = scene.make_grid(scene.outer_relief_m(settings, rng), scene.OUTER_CELL_M)
         self.ground = partial(scene.ground_z_m, self.inner)
-        self.stone = texture.pyramid(texture.stone(rng, texture.STONE_TEXELS), texture.STONE_TEXEL_M)
+        self.stone = ground.pyramid(ground.stone(rng, ground.STONE_TEXELS), ground.STONE_TEXEL_M)
         away = NEAREST_M * (FARTHEST_M / NEAREST_M) ** (rng.random(STONES) ** 0.75)
         towards = rng.uniform(-math.pi, math.pi, STONES)
         wide = np.minimum(0.05 * 12.0 ** (rng.random(STONES) ** 1.1), 0.09 * away)
@@ -185,15 +185,15 @@ class Surroundings:
         parts = [stone for number, stone in enumerate(self._at_home) if number not in day.stones]
         parts += [self._stone(number, off) for number, off in day.stones.items() if off is not None]
         if day.strangers:
-            boxes = [bricks.make_brick(x, y, turn, self.ground, size) for x, y, turn, size in day.strangers]
-            parts.append(bricks.meshes(boxes))
+            boxes = [rocks.make_brick(x, y, turn, self.ground, size) for x, y, turn, size in day.strangers]
+            parts.append(rocks.meshes(boxes))
         things = rocks.together(*parts)
         tones = scene.ground_tones(self.inner, sun, np.random.default_rng([self.seed, 3]))
         tones *= scene.shadows(self.inner, things, sun)
-        gravel = texture.gravel(np.random.default_rng([self.seed, 4]), sun, GRAVEL_TEXELS)
+        gravel = ground.gravel(np.random.default_rng([self.seed, 4]), sun, GRAVEL_TEXELS)
         world = kernels().World(
-            self.inner, self.outer, things, texture.pyramid(gravel, texture.DETAIL_TEXEL_M),
-            texture.pyramid(tones, INNER_CELL_M), self.stone, boards.faces([]), sun,
+            self.inner, self.outer, things, ground.pyramid(gravel, ground.DETAIL_TEXEL_M),
+            ground.pyramid(tones, INNER_CELL_M), self.stone, boards.faces([]), sun,
         )  # fmt: skip
         return Scene(settings, world)
 

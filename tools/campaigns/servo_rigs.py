@@ -23,7 +23,8 @@ from drivers.faults import FaultPanel
 from drivers.flir_ptu.head import open_head as open_flir_ptu
 from drivers.interfaces import PanTilt
 from drivers.serial_line import OpenLine, SerialLine
-from drivers.sim.pan_tilt import AxisSettings, HeadSettings, SimulatedPanTilt
+from drivers.sim.heads import AxisSettings, HeadSettings
+from drivers.sim.pan_tilt import SimulatedPanTilt
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import SimulatedServo

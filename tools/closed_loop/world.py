@@ -19,7 +19,7 @@ from calib.geometry.rigid import FloatArray
 from drivers.clock import SystemClock
 from drivers.faults import FaultPanel
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
-from drivers.sim.pan_tilt import PRESETS
+from drivers.sim.heads import PRESETS
 from drivers.sim.render import Renderer, compile_renderer
 from drivers.sim.scene import SceneSettings, build_scene
 from drivers.sim.wire.axis import WireAxis

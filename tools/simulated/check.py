@@ -16,7 +16,8 @@ from calib.geometry.rigid import Rigid
 from calib.geometry.solutions import choose
 from calib.geometry.stereo import triangulate
 from drivers.clock import ManualClock
-from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt
+from drivers.sim.heads import HeadSettings
+from drivers.sim.pan_tilt import SimulatedPanTilt
 
 PAN_LIMITS_RAD, TILT_LIMITS_RAD = (-2.6, 2.6), (-1.2, 0.5)
 JOINTS_RAD = ((0.0, -0.2), (0.8, -0.5), (-0.8, -0.8))

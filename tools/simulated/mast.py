@@ -24,7 +24,7 @@ from calib.geometry.rig import Rig
 from calib.survey.reader import read_survey
 from calib.survey.records import Sigma
 from calib.survey.writer import write_survey
-from drivers.sim.pan_tilt import PRESETS
+from drivers.sim.heads import PRESETS
 from mastctl.calibration.run import Calibrated, calibrate, checked_survey
 from mastctl.cli.output import at_least
 from tools.arguments import end

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drivers.sim.optics.mesh import Float32
+from drivers.sim.optics.lens import Float32
 
 FRAMES_KEPT = 64
 """So many frames are metered at most to catch up with the present."""

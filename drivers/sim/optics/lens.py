@@ -3,6 +3,8 @@
 Thin lens of focal length f at f-number N, focused at s_f: a point at s makes a disc of diameter
 f² / N * |s - s_f| / (s (s_f - f)) on the sensor. Dust on the sensor's window, a gap before the pixels,
 throws the shadow of a disc in light that comes from all of the lens, a cone of 1 in N.
+
+Smooth functions of the pixel are known at the nodes of a mesh and bilinear between them.
 """
 
 from __future__ import annotations
@@ -15,10 +17,13 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
-from drivers.sim.optics.mesh import Float32, Float64, between, nodes, pixels_of
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 MESH_PX = 8
 """Between pixels whose range is asked for defocus, and whose angle is for falloff."""
@@ -28,6 +33,22 @@ LEVEL_PX = 0.5
 
 MOST_DISC_PX = 12.0
 FAR_M = 1e6
+
+
+def nodes(count: int, step_px: int) -> Float64:
+    """Return places of nodes along a side of ``count`` pixels, from its first to its last, evenly spread."""
+    return np.linspace(0.0, count - 1.0, max(2, -(-(count - 1) // step_px) + 1))
+
+
+def between(places: Float64, first: int, last: int) -> Float32:
+    """Return (last - first, nodes): what the nodes weigh at pixels [first, last), linear between nodes."""
+    away = np.abs(np.arange(first, last)[:, None] - places) / (places[1] - places[0])
+    return np.asarray(np.clip(1.0 - away, 0.0, None), dtype=np.float32)
+
+
+def pixels_of(x_px: Float64, y_px: Float64) -> Float64:
+    """Return (rows, columns, 2) pixels of a mesh."""
+    return np.stack(np.meshgrid(x_px, y_px), axis=-1)
 
 
 @dataclass(frozen=True)

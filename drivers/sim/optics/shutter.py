@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
-from drivers.sim.optics.mesh import Float32, Float64, between, nodes, pixels_of
+from drivers.sim.optics.lens import Float32, Float64, between, nodes, pixels_of
 
 VIEW_STEP_PX = 0.7
 """Views that make up a smear are no farther apart."""

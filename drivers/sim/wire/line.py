@@ -24,8 +24,8 @@ from drivers.clock import Clock
 from drivers.errors import BadOptions
 from drivers.faults import FaultPanel
 from drivers.sim.wire.carrier import Line, Observer
+from drivers.sim.wire.carrier import Reply as Reply
 from drivers.sim.wire.carrier import WireDevice as WireDevice
-from drivers.sim.wire.line_faults import Reply as Reply
 
 _TCGETS2 = 0x802C542A  # asm-generic/ioctls.h; struct termios2: 4 flags, line, 19 characters, 2 speeds
 

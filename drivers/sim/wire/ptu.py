@@ -1,21 +1,34 @@
 """A simulated FLIR / Directed Perception pan/tilt unit on a line: its ASCII protocol, byte by byte.
 
-What a command means is known in `drivers.sim.wire.ptu_commands`, what the unit does then in
-`drivers.sim.wire.ptu_unit`.
+What the unit does is known in `drivers.sim.wire.ptu_unit`. Wording follows the manuals and what drivers of
+real units parse; where no source gives any (C, user limits, step modes) it is like its neighbours'.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from drivers.errors import BadOptions
 from drivers.faults import nearest
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.line import Reply
-from drivers.sim.wire.ptu_axis import PtuAxis
-from drivers.sim.wire.ptu_commands import BAUD_RATES, answer
-from drivers.sim.wire.ptu_models import MODELS, STEPS
-from drivers.sim.wire.ptu_unit import PtuUnit
+from drivers.sim.wire.ptu_axis import MODELS, STEPS, PtuAxis
+from drivers.sim.wire.ptu_unit import PtuUnit, Refused
+
+BAUD_RATES = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
+_WORDS = re.compile(r"([A-Z]+)([+-]?\d+)?")
+_STEP_NAMES = {"F": "FULL", "H": "HALF", "Q": "QUARTER", "E": "EIGHTH", "A": "AUTO"}
+_POWER_NAMES = {"R": "REGULAR", "L": "LOW", "H": "HIGH", "O": "OFF"}
+_LIMIT_MODES = {
+    "E": "Limit bounds are ENABLED (soft limits enabled)",
+    "D": "Limit bounds are DISABLED (hard limits only: use care)",
+    "U": "Limit bounds are USER DEFINED (user limits enabled)",
+}
+
+_Plain = Callable[[PtuUnit, float], str | None]
 
 ANSWER_S = 0.001
 """From the end of a command to its answer (assumed)."""
@@ -26,13 +39,211 @@ BANNER = b"\r\n### FLIR Motion Control Systems pan-tilt unit\r\n"
 _LONGEST = 100  # bytes of one command; the controller's buffer (D46 manual 7.3.2)
 
 
+def answer(unit: PtuUnit, words: bytes, time_s: float) -> str:
+    """Carry out one command and return its answer, ``*`` or ``!`` and text."""
+    text = words.decode("ascii", "replace").upper()
+    try:
+        told = _carry_out(unit, text, time_s)
+    except Refused as refusal:
+        return f"! {refusal}"
+    return "*" if told is None else f"* {told}"
+
+
+def _carry_out(unit: PtuUnit, text: str, time_s: float) -> str | None:
+    """One command's text behind the ``*``, if it has any. Raises Refused."""
+    if text.startswith("@"):
+        _set_host(unit, text, time_s)
+        return None
+    if unit.model.e_series and re.fullmatch(r"B[+-]?\d+(,[+-]?\d+){3}", text):
+        values = [int(word) for word in text[1:].split(",")]
+        unit.go_both(values[:2], values[2:], time_s)
+        return None
+    found = _WORDS.fullmatch(text)
+    if found is None:
+        raise _illegal()
+    name, number = found[1], None if found[2] is None else int(found[2])
+    if name in _PLAIN and number is None:
+        return _PLAIN[name](unit, time_s)
+    if name[0] in unit.axes and name[1:] in _QUANTITIES:
+        return _QUANTITIES[name[1:]].carry_out(unit, unit.axes[name[0]], number, time_s)
+    if name[0] in unit.axes and name[1:] == "R":
+        resolution = _E_SERIES_RESOLUTION if unit.model.e_series else _RESOLUTION
+        return resolution.carry_out(unit, unit.axes[name[0]], number, time_s)
+    if name in ("RPS", "RTS"):
+        return _RESET_SPEED.carry_out(unit, unit.axes[name[1]], number, time_s)
+    if name[0] in unit.axes and name[1:2] in ("H", "M") and number is None:
+        return _power(unit, unit.axes[name[0]], name[1], name[2:])
+    if name[0] == "W" and name[1:2] in unit.axes and number is None:
+        return _step(unit, unit.axes[name[1]], name[2:])
+    raise _illegal()
+
+
+def _illegal() -> Refused:
+    return Refused("Illegal Command Entered")
+
+
+def _told(unit: PtuUnit, words: str, axis: PtuAxis, value: object) -> str:
+    """A query's answer: words with the value in them, or the value alone."""
+    return words.format(axis=axis.name, value=value) if unit.verbose else str(value)
+
+
+@dataclass(frozen=True)
+class _Quantity:
+    """What an axis has: told without a number, set with one, unless it can only be told."""
+
+    words: str
+    value: Callable[[PtuAxis, float], object]
+    put: Callable[[PtuUnit, PtuAxis, int, float], None] | None = None
+
+    def carry_out(self, unit: PtuUnit, axis: PtuAxis, number: int | None, time_s: float) -> str | None:
+        """Tell or set it."""
+        if number is None:
+            return _told(unit, self.words, axis, self.value(axis, time_s))
+        if self.put is None:
+            raise _illegal()
+        self.put(unit, axis, number, time_s)
+        return None
+
+
+_RESET_SPEED = _Quantity(
+    "{axis} reset speed is {value} positions/sec", lambda a, t: a.now.reset_speed, PtuUnit.set_reset_speed
+)
+
+_E_SERIES_RESOLUTION = _Quantity("{value} seconds arc per position", lambda a, t: f"{a.told_arcsec:.6f}")
+
+_RESOLUTION = _Quantity(  # 185.142857 is told as 185.1428
+    "{value} seconds arc per {axis} position", lambda a, t: f"{math.floor(a.told_arcsec * 1e4) / 1e4:.4f}"
+)
+
+
+# What follows P or T.
+_QUANTITIES: Mapping[str, _Quantity] = {
+    "P": _Quantity("Current {axis} position is {value}", lambda a, t: a.told_position(t), PtuUnit.go),
+    "O": _Quantity("Target {axis} position is {value}", lambda a, t: a.target, PtuUnit.go_by),
+    "S": _Quantity(
+        "Target {axis} speed is {value} positions/sec", lambda a, t: a.now.speed, PtuUnit.set_speed
+    ),
+    "D": _Quantity(
+        "Current {axis} speed is {value} positions/sec", lambda a, t: a.speed(t), PtuUnit.change_speed
+    ),
+    "U": _Quantity(
+        "Maximum {axis} speed is {value} positions/sec", lambda a, t: a.now.fastest, PtuUnit.set_fastest
+    ),
+    "L": _Quantity(
+        "Minimum {axis} speed is {value} positions/sec", lambda a, t: a.now.slowest, PtuUnit.set_slowest
+    ),
+    "B": _Quantity(
+        "Current {axis} base speed is {value} positions/sec",
+        lambda a, t: a.now.base_speed,
+        PtuUnit.set_base_speed,
+    ),
+    "A": _Quantity(
+        "{axis} acceleration is {value} positions/sec^2",
+        lambda a, t: a.now.acceleration,
+        PtuUnit.set_acceleration,
+    ),
+    "N": _Quantity("Minimum {axis} position is {value}", lambda a, t: a.limits()[0]),
+    "X": _Quantity("Maximum {axis} position is {value}", lambda a, t: a.limits()[1]),
+    "NU": _Quantity(
+        "Minimum user {axis} position is {value}",
+        lambda a, t: a.user_low,
+        lambda u, a, n, t: u.set_user_limit(a, 0, n),
+    ),
+    "XU": _Quantity(
+        "Maximum user {axis} position is {value}",
+        lambda a, t: a.user_high,
+        lambda u, a, n, t: u.set_user_limit(a, 1, n),
+    ),
+}
+
+
+def _switch(attribute: str, value: object, *, e_series: bool = False) -> _Plain:
+    """The command that switches a mode, one that maybe only E series units have."""
+
+    def carry_out(unit: PtuUnit, time_s: float) -> None:
+        if e_series and not unit.model.e_series:
+            raise _illegal()
+        setattr(unit, attribute, value)
+
+    return carry_out
+
+
+# Commands that are whole words.
+_PLAIN: Mapping[str, _Plain] = {
+    "A": lambda u, t: u.wait(t),
+    "S": _switch("slaved", True),
+    "I": lambda u, t: u.immediate(t),
+    "H": lambda u, t: u.halt((u.pan, u.tilt), t),
+    "HP": lambda u, t: u.halt((u.pan,), t),
+    "HT": lambda u, t: u.halt((u.tilt,), t),
+    "R": lambda u, t: u.reset((u.tilt, u.pan), t),
+    "RP": lambda u, t: u.reset((u.pan,), t),
+    "RT": lambda u, t: u.reset((u.tilt,), t),
+    "RE": _switch("at_power_up", "E"),
+    "RD": _switch("at_power_up", "D"),
+    "C": lambda u, t: f"PTU is in {'pure velocity' if u.velocity else 'independent'} control mode",
+    "CI": lambda u, t: u.control(False, t),
+    "CV": lambda u, t: u.control(True, t),
+    "CEC": _switch("encoder", True, e_series=True),
+    "CED": _switch("encoder", False, e_series=True),
+    "PCE": _switch("continuous", True, e_series=True),
+    "PCD": _switch("continuous", False, e_series=True),
+    "L": lambda u, t: _LIMIT_MODES[u.limit_mode],
+    "LE": _switch("limit_mode", "E"),
+    "LD": _switch("limit_mode", "D"),
+    "LU": _switch("limit_mode", "U"),
+    "V": lambda u, t: u.model.version,
+    "O": lambda u, t: f"Input {u.supply_v(t):.0f} VDC @ {u.temperature_c(t) * 1.8 + 32:.0f} degF",
+    "E": lambda u, t: f"Echoing {'ON' if u.echo else 'OFF'}",
+    "EE": _switch("echo", True),
+    "ED": _switch("echo", False),
+    "F": lambda u, t: f"ASCII {'verbose' if u.verbose else 'terse'} mode",
+    "FV": _switch("verbose", True),
+    "FT": _switch("verbose", False),
+    "DS": lambda u, t: u.keep("S"),
+    "DR": lambda u, t: u.keep("R"),
+    "DF": lambda u, t: u.keep("F"),
+    "U": lambda u, t: "Unit ID is 0" if u.verbose else "0",
+}
+
+
+def _power(unit: PtuUnit, axis: PtuAxis, kind: str, level: str) -> str | None:
+    """Tell or set hold (``kind`` H) or move (M) power."""
+    held = kind == "H"
+    if level == "":
+        name = _POWER_NAMES[axis.now.hold if held else axis.now.move]
+        return _told(unit, f"{{axis}} in {{value}} {'hold' if held else 'move'} power mode", axis, name)
+    if level not in (("R", "L", "O") if held else ("R", "L", "H", "O")):
+        raise _illegal()
+    axis.now = replace(axis.now, hold=level) if held else replace(axis.now, move=level)
+    return None
+
+
+def _step(unit: PtuUnit, axis: PtuAxis, mode: str) -> str | None:
+    """Tell or set the step mode, which comes into force when the axis has been reset."""
+    if mode == "":
+        return _told(unit, "{axis} in {value} step mode", axis, _STEP_NAMES[axis.now.step_mode])
+    if mode not in STEPS:
+        raise _illegal()
+    axis.now = replace(axis.now, step_mode=mode)
+    return None
+
+
+def _set_host(unit: PtuUnit, text: str, time_s: float) -> None:
+    """Set the serial line's rate."""
+    found = re.fullmatch(r"@\((\d+),(\d+),([TF])\)", text)
+    if found is None or int(found[1]) not in BAUD_RATES:
+        raise _illegal()
+    unit.set_baud(int(found[1]), time_s)
+
+
 class SimulatedPtu:
     """A unit on a line (``drivers.sim.wire.line.WireDevice``).
 
     Parameters
     ----------
     model
-        A name of ``drivers.sim.wire.ptu_models.MODELS``.
+        A name of ``drivers.sim.wire.ptu_axis.MODELS``.
     pan, tilt
         What it turns.
     step_mode

@@ -13,8 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from drivers.sim.wire.axis import WireAxis
-from drivers.sim.wire.ptu_axis import AxisDefaults, PtuAxis
-from drivers.sim.wire.ptu_models import STEPS, PtuModel
+from drivers.sim.wire.ptu_axis import STEPS, AxisDefaults, PtuAxis, PtuModel
 
 RECOMPUTE_S = 1.5
 """How long a change of acceleration, base speed or upper speed takes: "several seconds" (assumed)."""

@@ -17,7 +17,7 @@ from drivers.dynamixel.head import DynamixelHead, open_head
 from drivers.errors import DriverError
 from drivers.faults import FaultPanel
 from drivers.interfaces import Reading
-from drivers.sim.pan_tilt import AxisSettings
+from drivers.sim.heads import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_packets import unstuffed

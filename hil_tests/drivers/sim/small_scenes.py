@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.sim import texture
+from drivers.sim import ground
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 
 TEXELS = 128
@@ -13,6 +13,6 @@ TEXELS = 128
 def build_small_scene(settings: SceneSettings) -> Scene:
     """As `build_scene`, but gravel and stone are 128 texels across, not 4,096 and 1,024: most of the time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(texture, "DETAIL_TEXELS", TEXELS)
-        patch.setattr(texture, "STONE_TEXELS", TEXELS)
+        patch.setattr(ground, "DETAIL_TEXELS", TEXELS)
+        patch.setattr(ground, "STONE_TEXELS", TEXELS)
         return build_scene(settings)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import BadOptions
-from drivers.sim import bricks, rocks
+from drivers.sim import rocks
 from drivers.sim.scene import Scene, SceneSettings
 
 EYE_M = np.array([0.4, -0.1, -1.5])
@@ -15,8 +15,8 @@ EYE_M = np.array([0.4, -0.1, -1.5])
 @pytest.fixture(scope="module")
 def bricked(scene: Scene) -> Scene:
     """The common scene with bricks put in; its shadows are left as they are."""
-    laid = bricks.scattered(6, np.random.default_rng(5), scene.world.rocks.spheres_m, scene.ground_z_m)
-    together = rocks.together(scene.world.rocks, bricks.meshes(laid))
+    laid = rocks.scattered(6, np.random.default_rng(5), scene.world.rocks.spheres_m, scene.ground_z_m)
+    together = rocks.together(scene.world.rocks, rocks.meshes(laid))
     return Scene(scene.settings, scene.world._replace(rocks=together), laid)
 
 
@@ -36,7 +36,7 @@ def test_bricks_are_boxes_of_their_size_on_the_ground(bricked: Scene) -> None:
     assert len(bricked.bricks) == 6
     for brick in bricked.bricks:
         edges = brick.corners_m[[1, 3, 4]] - brick.corners_m[0]
-        assert sorted(np.linalg.norm(edges, axis=1)) == pytest.approx(sorted(bricks.SIZE_M))
+        assert sorted(np.linalg.norm(edges, axis=1)) == pytest.approx(sorted(rocks.SIZE_M))
         np.testing.assert_allclose(edges @ edges.T, np.diag(np.diag(edges @ edges.T)), atol=1e-12)
         assert (brick.corners_m[:4, 2] < brick.corners_m[4:, 2]).all(), "the first four are the upper ones"
         for x, y, z in brick.corners_m[4:]:
@@ -46,7 +46,7 @@ def test_bricks_are_boxes_of_their_size_on_the_ground(bricked: Scene) -> None:
 
 
 def test_a_brick_is_a_closed_mesh_with_outward_normals(bricked: Scene) -> None:
-    mesh = bricks.meshes(bricked.bricks)
+    mesh = rocks.meshes(bricked.bricks)
     for corners, normals in zip(mesh.corners_m, mesh.normals, strict=True):
         keys = np.unique(np.rint(corners.reshape(-1, 3) * 1e7), axis=0, return_inverse=True)[1].reshape(-1, 3)
         edges = np.concatenate([keys[:, [0, 1]], keys[:, [1, 2]], keys[:, [2, 0]]])

@@ -13,9 +13,9 @@ import pytest
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid, rot_z
-from drivers.sim import compile_beside
-from drivers.sim.compile_beside import drawing_compiled_beside
-from drivers.sim.compiled import kernels
+from drivers.sim import quick_start
+from drivers.sim.kept import kernels
+from drivers.sim.quick_start import drawing_compiled_beside
 from drivers.sim.render import Renderer, compile_drawing, compile_renderer
 from drivers.sim.scene import tiny_scene
 
@@ -32,9 +32,9 @@ def begun(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
         made.append(popen(*words, **more))
         return made[-1]
 
-    monkeypatch.setattr(compile_beside, "is_compiled", lambda: False)
-    monkeypatch.setattr(compile_beside.os, "sched_getaffinity", lambda pid: {0, 1})
-    monkeypatch.setattr(compile_beside.subprocess, "Popen", kept)
+    monkeypatch.setattr(quick_start, "is_compiled", lambda: False)
+    monkeypatch.setattr(quick_start.os, "sched_getaffinity", lambda pid: {0, 1})
+    monkeypatch.setattr(quick_start.subprocess, "Popen", kept)
     return made
 
 
@@ -77,7 +77,7 @@ def test_the_other_process_is_not_left_behind(begun: list[subprocess.Popen[bytes
 def test_the_other_process_ends_when_the_one_that_waits_is_killed(tmp_path: Path) -> None:
     """In an empty folder, where it would compile for many seconds."""
     with subprocess.Popen(
-        [sys.executable, "-m", "drivers.sim.compile_beside"],
+        [sys.executable, "-m", "drivers.sim.quick_start"],
         stdin=subprocess.PIPE,
         env={**os.environ, "XDG_CACHE_HOME": str(tmp_path)},
     ) as process:
@@ -89,13 +89,13 @@ def test_the_other_process_ends_when_the_one_that_waits_is_killed(tmp_path: Path
 def test_where_it_cannot_be_begun_or_kept_the_block_goes_on(
     begun: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compile_beside.sys, "executable", "/nowhere/python")
+    monkeypatch.setattr(quick_start.sys, "executable", "/nowhere/python")
     with drawing_compiled_beside():
         pass
     monkeypatch.undo()
     assert begun == []
-    monkeypatch.setattr(compile_beside, "is_compiled", lambda: False)
-    monkeypatch.setattr(compile_beside.os, "access", lambda folder, mode: False)
+    monkeypatch.setattr(quick_start, "is_compiled", lambda: False)
+    monkeypatch.setattr(quick_start.os, "access", lambda folder, mode: False)
     with drawing_compiled_beside():
         pass
     assert begun == []

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.sim import kept, kept_scenes
+from drivers.sim import kept, quick_start
 from drivers.sim.kept import digest_of, keep_newest, kept_folder
-from drivers.sim.kept_scenes import FACTS, folder_of, kept_scene
+from drivers.sim.quick_start import FACTS, folder_of, kept_scene
 from drivers.sim.scene import Scene, SceneSettings
 from hil_tests.drivers.sim.small_scenes import build_small_scene
 
@@ -30,12 +30,12 @@ def home(tmp_path: Path, built: Scene, monkeypatch: pytest.MonkeyPatch) -> list[
     """A cache of its own; what was built is listed, and is the one scene in truth."""
     asked: list[SceneSettings] = []
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(kept_scenes, "build_scene", lambda settings: asked.append(settings) or built)
+    monkeypatch.setattr(quick_start, "build_scene", lambda settings: asked.append(settings) or built)
     return asked
 
 
 def same(one: Scene, other: Scene) -> bool:
-    pairs = zip(kept_scenes.parts(one.world, ""), kept_scenes.parts(other.world, ""), strict=True)
+    pairs = zip(quick_start.parts(one.world, ""), quick_start.parts(other.world, ""), strict=True)
     return all(a[0] == b[0] and np.array_equal(a[1], b[1]) for a, b in pairs)
 
 
@@ -59,7 +59,7 @@ def test_changed_sources_are_another_scene(
     home: list[SceneSettings], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = folder_of(SETTINGS)
-    monkeypatch.setattr(kept_scenes.kernels(), "SOURCES", "changed")
+    monkeypatch.setattr(quick_start.kernels(), "SOURCES", "changed")
     assert folder_of(SETTINGS) != before
 
 

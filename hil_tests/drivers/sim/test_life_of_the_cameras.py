@@ -16,12 +16,11 @@ from drivers.camera_offset import corrected
 from drivers.clock import ManualClock
 from drivers.errors import BadFrame, BadOptions, NoFreshFrame
 from drivers.pairing import Pairing, learned
-from drivers.sim.camera_clock import CameraClock, ClockSettings
+from drivers.sim.camera_settings import STEP_K, CameraClock, ClockSettings, TemperatureSettings
 from drivers.sim.render import Renderer
 from drivers.sim.rover import SimulatedRover
 from drivers.sim.scene import Scene
 from drivers.sim.settings import simulation_settings
-from drivers.sim.warmth import STEP_K, TemperatureSettings
 from mastctl.devices.frames import checked
 
 pytestmark = pytest.mark.usefixtures("one_scene")

@@ -15,8 +15,9 @@ from drivers.clock import ManualClock
 from drivers.errors import BadOptions
 from drivers.faults import FaultPanel
 from drivers.sim.axis import AxisSettings
+from drivers.sim.heads import PRESETS, HeadSettings, head_settings
 from drivers.sim.motion import Motion
-from drivers.sim.pan_tilt import PRESETS, HeadSettings, SimulatedPanTilt, head_settings
+from drivers.sim.pan_tilt import SimulatedPanTilt
 from drivers.sim.wire.axis import WireAxis
 from mastctl.devices.rest import RestWatch
 from mastctl.motion.settings import PointingSettings

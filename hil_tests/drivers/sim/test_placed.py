@@ -15,8 +15,8 @@ from calib.files.mast_file import load_rig
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions
-from drivers.sim.kept_scenes import read, write
 from drivers.sim.placed import check_clear_of
+from drivers.sim.quick_start import read, write
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, build_scene
 from drivers.sim.settings import scene_settings

@@ -12,12 +12,11 @@ import pytest
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions
-from drivers.sim import rays as ray_tables
-from drivers.sim import render, texture
-from drivers.sim.compiled import is_compiled
-from drivers.sim.kernels.texture import stretched_brightness
-from drivers.sim.rays import ray_table
-from drivers.sim.render import Renderer, Stills, compile_renderer
+from drivers.sim import ground, render
+from drivers.sim import render as ray_tables
+from drivers.sim.kept import is_compiled
+from drivers.sim.kernels.light import stretched_brightness
+from drivers.sim.render import Renderer, Stills, compile_renderer, ray_table
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 from tools.campaigns import render_bias as bias
 
@@ -87,7 +86,7 @@ def test_no_level_of_a_texture_is_shifted_against_another(axis: int) -> None:
     size, texel_m = 512, 0.01
     slope = np.linspace(0.2, 1.8, size, endpoint=False) + 0.8 / size  # mean value of each texel
     tones = np.broadcast_to(slope if axis == 0 else slope[:, None], (size, size)).astype(np.float32)
-    picture = texture.pyramid(tones, texel_m)
+    picture = ground.pyramid(tones, texel_m)
     look = numba.njit(stretched_brightness.py_func)  # Python cannot call what compiled code calls
     rng = np.random.default_rng(13)
     for width in (0.3, 1.0, 1.3, 1.7, 2.0, 3.1, 5.5, 9.0, 16.0):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import BadOptions
-from drivers.sim import compiled, rocks
+from drivers.sim import kept, rocks
 from drivers.sim.scene import Scene, SceneSettings, build_scene, inner_relief_m, make_grid
 from hil_tests.drivers.sim.small_scenes import build_small_scene
 
@@ -230,6 +230,6 @@ def test_without_numba_one_sentence_says_what_to_install(monkeypatch: pytest.Mon
     monkeypatch.setitem(sys.modules, "numba", None)
     for name in [name for name in sys.modules if name.startswith("drivers.sim.kernels")]:
         monkeypatch.delitem(sys.modules, name)
-    for call in (build_scene, compiled.is_compiled):
+    for call in (build_scene, kept.is_compiled):
         with pytest.raises(BadOptions, match=r"needs numba: pip install 'mastctl\[sim\]'"):
             call()

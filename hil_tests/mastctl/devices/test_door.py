@@ -12,7 +12,8 @@ import pytest
 from drivers.clock import ManualClock, SystemClock
 from drivers.errors import BadOptions, BadReply
 from drivers.interfaces import AxisMotion, Reading
-from drivers.sim.pan_tilt import PRESETS, SimulatedPanTilt
+from drivers.sim.heads import PRESETS
+from drivers.sim.pan_tilt import SimulatedPanTilt
 from hil_tests.mastctl.service_fakes import FakeHardware, FakeHead, rig
 from mastctl.devices.devices import HEAD, Devices
 from mastctl.devices.door import TRAVEL_S, Door

@@ -13,7 +13,8 @@ from calib.geometry.rig import AxisJoint, JointErrors
 from drivers.clock import ManualClock
 from drivers.errors import BadOptions
 from drivers.interfaces import AxisMotion, Reading
-from drivers.sim.pan_tilt import SimulatedPanTilt, head_settings, with_joints
+from drivers.sim.heads import head_settings, with_joints
+from drivers.sim.pan_tilt import SimulatedPanTilt
 from mastctl.devices import door as door_module
 from mastctl.devices.devices import Devices
 from mastctl.devices.door import Door

@@ -19,7 +19,7 @@ from distributed import LocalCluster
 
 from calib.files.mast_file import load_rig
 from calib.survey.records import Sigma
-from drivers.sim.pan_tilt import PRESETS
+from drivers.sim.heads import PRESETS
 from hil_tests.mastctl.calibration.survey_world import RIG_FILE
 from mastctl.experiment.simulated import PointingTask, Rover, one_pointing
 from mastctl.experiment.tasks import Work, open_executor

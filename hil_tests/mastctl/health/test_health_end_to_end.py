@@ -10,7 +10,7 @@ import pytest
 
 from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.rigid import Rigid, rot_z
-from drivers.sim.pan_tilt import PRESETS
+from drivers.sim.heads import PRESETS
 from mastctl.client import Client
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon

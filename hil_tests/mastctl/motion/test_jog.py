@@ -13,7 +13,8 @@ import pytest
 
 from drivers.faults import FaultPanel
 from drivers.interfaces import Reading
-from drivers.sim.pan_tilt import PRESETS, SimulatedPanTilt
+from drivers.sim.heads import PRESETS
+from drivers.sim.pan_tilt import SimulatedPanTilt
 from drivers.simulation_clock import SimulationClock
 from mastctl.devices.devices import Devices
 from mastctl.devices.keep_out import Box

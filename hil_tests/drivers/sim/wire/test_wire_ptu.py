@@ -14,7 +14,7 @@ from drivers.faults import PAN_TILT, FaultPanel
 from drivers.sim.axis import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.ptu import SimulatedPtu
-from drivers.sim.wire.ptu_models import MODELS
+from drivers.sim.wire.ptu_axis import MODELS
 
 AXIS = AxisSettings(
     count_rad=1e-5,
