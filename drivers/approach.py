@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 Approach = Literal["none", "positive", "negative", "gravity"]
@@ -27,6 +28,38 @@ def last_turn(approach: Approach, goal_rad: float, gravity_turnover_rad: float) 
     if approach == "gravity":
         return 1 if goal_rad < gravity_turnover_rad else -1
     return {"none": 0, "positive": 1, "negative": -1}[approach]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ApproachedAxis:
+    """What options say of an axis, whatever turns it. Angles are the mast's: pan to the right, tilt up.
+
+    Attributes
+    ----------
+    limits_rad
+        What may be commanded; the device is told it too, if it can be.
+    sign
+        1 if the device counts up where the axis turns positive, else -1.
+    approach
+        From which side a goal is approached, to take the backlash up: ``none``, ``positive`` (the last
+        stretch turns positive), ``negative``, or ``gravity``: against the weight, so that gear and weight
+        press on the same flank.
+    approach_rad
+        How long the last stretch is; more than the backlash.
+    gravity_turnover_rad
+        The angle at which the weight changes sides, for ``gravity``: below it the weight pulls the axis
+        down (the last stretch turns positive), above it up.
+    """
+
+    limits_rad: tuple[float, float]
+    sign: int = 1
+    approach: Approach = "none"
+    approach_rad: float = 0.0
+    gravity_turnover_rad: float = math.pi / 2
+
+    def approach_sign(self, goal_rad: float) -> int:
+        """Return the direction of the last stretch in counts: 1, -1, or 0 for none."""
+        return self.sign * last_turn(self.approach, goal_rad, self.gravity_turnover_rad)
 
 
 def rising_below_rad(approach: Approach, gravity_turnover_rad: float) -> float | None:

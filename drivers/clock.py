@@ -129,7 +129,7 @@ class _MachineTime:
         return nullcontext()
 
 
-class Turn:
+class ClockLock:
     """A lock for who waits on a clock inside it; whoever has it may take it again. A context manager."""
 
     def __init__(self, clock: Clock) -> None:

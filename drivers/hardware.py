@@ -1,24 +1,47 @@
-"""The devices of a configuration: how they are named there, and what they are together once they are open."""
+"""The devices of a configuration: which drivers there are, how devices are named, what they are when open."""
 
 from __future__ import annotations
 
+import json
 import logging
 import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Literal
 
-from drivers.absent_camera import AbsentCamera
-from drivers.faults import PAN_TILT
+from drivers.absent import AbsentCamera
+from drivers.clock import Clock, SystemClock
+from drivers.errors import BadOptions
+from drivers.faults import PAN_TILT, nearest
 from drivers.interfaces import Camera, PanTilt
+from drivers.serial_line import stable_name
+from drivers.simulation_clock import SimulationClock, simulation_speed
 
 if TYPE_CHECKING:
     from drivers.sim.rover import SimulatedRover
 
+
 log = logging.getLogger(__name__)
+
+HEADS = {"dynamixel": "drivers.dynamixel.head", "flir_ptu": "drivers.flir_ptu.head"}
+"""Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them, and whose
+``halt(options)`` stops a head that no daemon drives any more."""
+
+CAMERAS = {"v4l2": "drivers.v4l2.camera"}
+"""Camera drivers of this repository: the module whose ``open_camera(options, clock, name)`` opens one."""
+
+OURS = ("sim", "replay")
+"""No device behind them: they neither fail for a moment nor block, and live on any clock."""
+
+BUILT_IN = (*HEADS, *CAMERAS, *OURS)
+
+Kind = Literal["head", "camera"]
+GROUPS: Mapping[Kind, str] = {"head": "mastctl.heads", "camera": "mastctl.cameras"}
+"""The groups of entry points by which an installed package names its factories."""
 
 HardwareKind = Literal["real", "simulated", "replayed", "mixed"]
 
@@ -27,6 +50,111 @@ CLOSING_PATIENCE_S = 0.5
 
 CLOSING_S = 10.0
 """Devices that are not closed by then are left behind, so that a driver that hangs holds no command's end."""
+
+
+def clock_for(settings: HardwareSettings) -> Clock:
+    """Return the clock that these devices live on: the simulation's, if it is not to go as life does.
+
+    Raises
+    ------
+    BadOptions
+        If a speed is asked for that is none, or that a device cannot follow: real ones and those from outside
+        live in real time.
+    """
+    speed = simulation_speed(settings.simulation.get("speed", 1.0))
+    if speed == 1.0:
+        return SystemClock()
+    told = f"simulation.speed is {settings.simulation['speed']}, expected 1:"
+    for name, device in {PAN_TILT: settings.pan_tilt, **settings.cameras}.items():
+        if device.driver not in OURS:
+            raise BadOptions(f"{told} driver {device.driver!r} lives in real time", device=name)
+    return SimulationClock(speed)
+
+
+@dataclass(frozen=True)
+class InstalledDriver:
+    """A driver that an installed package offers.
+
+    Attributes
+    ----------
+    kind, name
+        What it drives, and what a configuration calls it.
+    factory
+        ``package.module:factory``.
+    package
+        The distribution's name and version.
+    """
+
+    kind: Kind
+    name: str
+    factory: str
+    package: str
+
+
+def installed_drivers() -> list[InstalledDriver]:
+    """Return the drivers that installed packages offer, heads first, by name; imports none of them."""
+    found = []
+    for kind, group in GROUPS.items():
+        for entry in sorted(entry_points(group=group), key=lambda entry: (entry.name, entry.value)):
+            package = "" if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"
+            found.append(InstalledDriver(kind, entry.name, entry.value, package))
+    return found
+
+
+def factory_of(kind: Kind, driver: str, device: str) -> str:
+    """Return the factory, ``package.module:factory``, of a driver that is not in this repository.
+
+    Parameters
+    ----------
+    kind
+        What it is to drive.
+    driver
+        The factory itself, or the name by which an installed package offers one.
+    device
+        Put before a message.
+
+    Raises
+    ------
+    BadOptions
+        If no package offers it for this kind, or several do.
+    """
+    if ":" in driver:
+        return driver
+    installed = installed_drivers()
+    named = [one for one in installed if one.name == driver]
+    factories = {one.factory: one.package for one in named if one.kind == kind}
+    if len(factories) == 1:
+        return next(iter(factories))
+    if factories:
+        packages = " and ".join(factories.values())
+        raise BadOptions(f"{packages} both offer a driver {driver!r}; uninstall one of them", device=device)
+    if named:
+        words = f"driver {driver!r} of {named[0].package} is for a {named[0].kind}, not for a {kind}"
+        raise BadOptions(words, device=device)
+    known = (*BUILT_IN, *(one.name for one in installed if one.kind == kind))
+    raise BadOptions(
+        f"there is no driver {driver!r}{nearest(driver, known)}; a driver from outside is named "
+        f"package.module:factory, or as its package names it in the group {GROUPS[kind]}",
+        device=device,
+    )
+
+
+def head_name(settings: HardwareSettings) -> str | None:
+    """Return which head the settings drive, whoever wrote them: None for one in this program's memory.
+
+    A head is its line (`drivers.serial_line.stable_name` of the option ``port``); one from outside without
+    such an option is its factory with all options.
+    """
+    device = settings.pan_tilt
+    outside = device.driver not in BUILT_IN
+    if device.driver not in HEADS and not outside:
+        return None
+    port = device.options.get("port")
+    if isinstance(port, str) and port:
+        return stable_name(port)
+    if outside:
+        return f"{device.driver} {json.dumps(dict(device.options), sort_keys=True, default=str)}"
+    return None
 
 
 @dataclass(frozen=True)

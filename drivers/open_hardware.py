@@ -1,7 +1,8 @@
 """The one door to hardware: from a configuration's driver names to open devices.
 
 Nothing else knows real and simulated drivers both. A name is ``dynamixel``, ``flir_ptu``, ``v4l2``, ``sim``,
-``replay``, or ``package.module:factory`` for a driver from outside this repository (docs/how-to/drivers.md).
+``replay``, or for a driver from outside this repository ``package.module:factory`` or the name that an
+installed package gives it (`drivers.hardware.factory_of`).
 """
 
 from __future__ import annotations
@@ -14,14 +15,23 @@ from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from drivers.absent_camera import AbsentCamera, Opening, begin_opening, let_go
-from drivers.camera_offset import corrected
+from drivers.absent import AbsentCamera, Opening, begin_opening, let_go
 from drivers.clock import Clock, SystemClock
 from drivers.errors import BadOptions, DriverError, NoReply
 from drivers.faults import PAN_TILT, nearest
-from drivers.hardware import DeviceSettings, Hardware, HardwareKind, HardwareSettings, close_devices
+from drivers.frame_times import corrected
+from drivers.hardware import (
+    CAMERAS,
+    HEADS,
+    OURS,
+    DeviceSettings,
+    Hardware,
+    HardwareKind,
+    HardwareSettings,
+    close_devices,
+    factory_of,
+)
 from drivers.interfaces import Camera, PanTilt
-from drivers.known import BUILT_IN, CAMERAS, HEADS, OURS
 from drivers.outside import device_from_outside
 
 if TYPE_CHECKING:
@@ -47,7 +57,7 @@ def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Har
     settings
         Drivers and their options.
     clock
-        Time for simulated and replayed devices, as a rule that of `drivers.known.clock_for`; the machine's
+        Time for simulated and replayed devices, as a rule that of `drivers.hardware.clock_for`; the machine's
         monotonic clock when left out.
 
     Raises
@@ -182,9 +192,6 @@ class _Opener:
 
     def _open(self, name: str, device: DeviceSettings, protocol: type) -> Any:
         """Open one device and check that it does what the protocol asks."""
-        if ":" in device.driver:
-            self.kinds[name] = None
-            return device_from_outside(name, device, protocol)
         if device.driver == "sim":
             self.kinds[name] = "simulated"
             return self._simulated(name, device)
@@ -203,11 +210,9 @@ class _Opener:
             self.kinds[name] = "real"
             module = importlib.import_module(CAMERAS[device.driver])
             return module.open_camera(device.options, self._clock, name)
-        raise BadOptions(
-            f"there is no driver {device.driver!r}{nearest(device.driver, BUILT_IN)}; "
-            "a driver from outside is named package.module:factory",
-            device=name,
-        )
+        factory = factory_of("head" if protocol is PanTilt else "camera", device.driver, name)
+        self.kinds[name] = None
+        return device_from_outside(name, factory, device.options, protocol)
 
     def _head(self, name: str, device: DeviceSettings) -> Any:
         """A real head; what it raises is told with the device's name in front."""
@@ -244,7 +249,7 @@ class _Opener:
 
     def _replayed(self, name: str, device: DeviceSettings) -> Any:
         """The head or a camera of a recording; devices with the same options share one."""
-        from drivers.replay import open_replay
+        from drivers.recordings.replay import open_replay
 
         key = repr(sorted(device.options.items()))
         if key not in self._replays:

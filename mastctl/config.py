@@ -17,7 +17,7 @@ from calib.errors import BadFile
 from calib.files import read_bytes
 from calib.files.yaml_text import Section, nearest, parse_mapping
 from calib.geometry.rig import Rig
-from drivers.camera_offset import MOST_OFFSET_S
+from drivers.frame_times import MOST_OFFSET_S
 from drivers.hardware import DeviceSettings, HardwareSettings
 from mastctl.devices.keep_out import Box
 from mastctl.devices.limits import Limits

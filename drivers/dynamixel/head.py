@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any, TypeVar
 
-from drivers.absence import Absence
+from drivers.absent import Absence
 from drivers.approach import rising_below_rad
 from drivers.clock import Clock, SystemClock, deadlines_on
 from drivers.dynamixel.bus import Bus
@@ -26,7 +26,7 @@ from drivers.dynamixel.link import Link
 from drivers.dynamixel.models import WATCHDOG_TRIPPED
 from drivers.dynamixel.pair import ServoAxis, ready_pair
 from drivers.dynamixel.servo import Reboots
-from drivers.dynamixel.session import Session
+from drivers.dynamixel.session import ServoSession
 from drivers.dynamixel.settings import DynamixelSettings, dynamixel_settings
 from drivers.dynamixel.watch import GivenUp
 from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
@@ -40,9 +40,9 @@ CALL_TIMEOUT_S = 0.8  # the service waits 1 s
 CLOSE_TIMEOUT_S = 2.0
 AXES = ("pan", "tilt")
 
-TRIES = 5
-AT_REST_S = 2.0
-SLOW = 1  # counts of speed that a holding servo may show
+HALT_TRIES = 5
+HALT_REST_S = 2.0
+HALT_SLOW = 1  # counts of speed that a holding servo may show
 
 
 def open_head(
@@ -90,7 +90,7 @@ class DynamixelHead(Reporting):
         self._closed = False
         self._state = threading.Lock()
         self._bus = Bus(settings.port, self._round, self._clock)
-        self._session: Session | None = self._connect()
+        self._session: ServoSession | None = self._connect()
         self._motions = [axis.motion for axis in self._session.pair.axes]
         self._bus.start()
 
@@ -104,7 +104,7 @@ class DynamixelHead(Reporting):
         LineLost, NoReply, BadReply, WrongDevice, HardwareFault
             If they cannot be read, at once while the line is known to be lost.
         """
-        return self._call("read", Session.read)
+        return self._call("read", ServoSession.read)
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         """Start both axes together towards the angles, rounded to the nearest count, and return.
@@ -154,7 +154,7 @@ class DynamixelHead(Reporting):
             would feed the watchdog of one that did not hear it. With ``watchdog_s: 0`` nothing can be fed:
             a stop tries a line that is away at once.
         """
-        self._call("stop", Session.stop, first=True, tries=not self.settings.watchdog_counts)
+        self._call("stop", ServoSession.stop, first=True, tries=not self.settings.watchdog_counts)
 
     def close(self) -> None:
         """Stop, leave each servo as its ``at_close`` says, and let go of the line; never raises."""
@@ -187,7 +187,7 @@ class DynamixelHead(Reporting):
     def _call(
         self,
         what: str,
-        function: Callable[[Session], T],
+        function: Callable[[ServoSession], T],
         *,
         first: bool = False,
         moves: bool = False,
@@ -203,7 +203,7 @@ class DynamixelHead(Reporting):
             what, lambda: self._within(function, tries), CALL_TIMEOUT_S, first=first, moves=moves
         )
 
-    def _within(self, function: Callable[[Session], T], tries: bool = False) -> T:
+    def _within(self, function: Callable[[ServoSession], T], tries: bool = False) -> T:
         """Do something with the servos, which may end in giving the line up."""
         if tries and self._session is None:
             self._come_back()
@@ -223,14 +223,14 @@ class DynamixelHead(Reporting):
             if now_s >= self._absence.again_s:
                 self._come_back()
         elif now_s >= self._session.poll_due_s:
-            self._within(Session.look)
+            self._within(ServoSession.look)
         return self._absence.again_s if self._session is None else self._session.poll_due_s
 
-    def _connect(self) -> Session:
+    def _connect(self) -> ServoSession:
         """Open the line, make both servos ready without moving them, and read them once."""
         head = self.settings
         pair = ready_pair(head, self._reboots, self._bus.urgent, clock=self._clock, open_line=self._open_line)
-        session = Session(pair, head, self._stamps, self._reboots)
+        session = ServoSession(pair, head, self._stamps, self._reboots)
         try:
             session.poll_once()
         except BaseException as error:  # whatever it was goes on to the caller; the line is not left open
@@ -252,7 +252,7 @@ class DynamixelHead(Reporting):
         self._session, self._motions = session, [axis.motion for axis in session.pair.axes]
         self._absence.end()
 
-    def _give_up(self, session: Session, error: DriverError) -> None:
+    def _give_up(self, session: ServoSession, error: DriverError) -> None:
         """Have both axes brake, close the line, and try again when the watchdogs must have stopped them."""
         with suppress(LineLost):
             session.pair.brake()
@@ -290,7 +290,7 @@ def halt(
         axes = (ServoAxis(link, "pan", head.pan, head), ServoAxis(link, "tilt", head.tilt, head))
         told: dict[str, str] = {}
         failed: dict[str, DriverError] = {}
-        for _ in range(TRIES):  # each once before any of them again
+        for _ in range(HALT_TRIES):  # each once before any of them again
             for axis in axes:
                 if axis.servo.name not in told:
                     try:
@@ -322,7 +322,7 @@ def _stood(axis: ServoAxis) -> str:
 
 def _see_rest(axis: ServoAxis, clock: Clock) -> None:
     """Wait until an axis stands. Raises NoReply."""
-    until_s = clock.now_s() + AT_REST_S
-    while abs(axis.servo.look().values["present_velocity"]) > SLOW:
+    until_s = clock.now_s() + HALT_REST_S
+    while abs(axis.servo.look().values["present_velocity"]) > HALT_SLOW:
         if clock.now_s() > until_s:
             raise NoReply(f"{axis.servo.name} was told to stand, but still moves")

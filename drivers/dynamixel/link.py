@@ -26,7 +26,7 @@ from drivers.dynamixel.packets import (
     GroupAnswer,
     GroupQuestion,
     Part,
-    Status,
+    StatusPacket,
     fast_blocks,
     group_question,
     group_write_packet,
@@ -304,14 +304,14 @@ class Link:
 
     def _replies(
         self, question: GroupQuestion, sent_s: float
-    ) -> tuple[dict[int, Status], dict[int, DriverError]]:
+    ) -> tuple[dict[int, StatusPacket], dict[int, DriverError]]:
         """The replies to a group read until all have come or the deadline passes.
 
         They come in the order of the list; where they do not, or a servo says two things, none is certain.
         """
         parts = question.parts
         waited = list(parts)
-        taken: dict[int, Status] = {}
+        taken: dict[int, StatusPacket] = {}
         wrong: dict[int, DriverError] = {}
         while waited and (status := self._port.receive()) is not None:
             servo_id = status.servo_id
@@ -333,10 +333,10 @@ class Link:
 
     def _fast_replies(
         self, question: GroupQuestion, sent_s: float
-    ) -> tuple[dict[int, Status], dict[int, DriverError]]:
+    ) -> tuple[dict[int, StatusPacket], dict[int, DriverError]]:
         """The replies in the common reply to a fast group read."""
         parts = list(question.parts.values())
-        taken: dict[int, Status] = {}
+        taken: dict[int, StatusPacket] = {}
         wrong: dict[int, DriverError] = {}
         while (status := self._port.receive(fast=True)) is not None:
             blocks = fast_blocks(status, parts)
@@ -356,7 +356,7 @@ class Link:
         return taken, wrong
 
 
-def _pinged(status: Status) -> Pinged:
+def _pinged(status: StatusPacket) -> Pinged:
     """What the data of a ping's reply say."""
     model = int.from_bytes(status.data[:2], "little")
     return Pinged(status.servo_id, model, status.data[2], status.alert)

@@ -60,11 +60,11 @@ OPERATING_MODES = MappingProxyType(
     }
 )
 
-Words = Callable[["Model", int], str]
+Words = Callable[["ServoModel", int], str]
 
 
 @dataclass(frozen=True)
-class Model:
+class ServoModel:
     """One kind of servo.
 
     Attributes
@@ -112,19 +112,19 @@ class Model:
 
 def _x(
     name: str, number: int, current_unit_A: float | None, most_current_counts: int, backlash_deg: float | None
-) -> Model:
+) -> ServoModel:
     """A servo of the X or MX series: 12-bit encoder on the output shaft."""
     table = vendor_table(number, first_ram_address=64)
     backlash = None if backlash_deg is None else math.radians(backlash_deg)
     units = 0.229 * RPM_RAD_PER_S, 214.577 * REV_PER_MIN2_RAD_PER_S2
-    return Model(name, number, *table, 4096, *units, current_unit_A, most_current_counts, backlash, 38)
+    return ServoModel(name, number, *table, 4096, *units, current_unit_A, most_current_counts, backlash, 38)
 
 
-def _p(name: str, number: int, most_current_counts: int) -> Model:
+def _p(name: str, number: int, most_current_counts: int) -> ServoModel:
     """A servo of the P series: counts on the motor's side of the gear."""
     table = vendor_table(number, first_ram_address=512)
     turn, units = table.high_count - table.low_count, (0.01 * RPM_RAD_PER_S, 1.0 * REV_PER_MIN2_RAD_PER_S2)
-    return Model(name, number, *table, turn, *units, 0.001, most_current_counts, math.radians(0.1), 0)
+    return ServoModel(name, number, *table, turn, *units, 0.001, most_current_counts, math.radians(0.1), 0)
 
 
 # Current units and limits, backlash: e-manual, and the makers' data sheets where they state backlash
@@ -152,12 +152,12 @@ _MODELS = (
     _p("PH54-200-S500", 2020, 22740),
 )
 
-MODELS: Mapping[str, Model] = MappingProxyType({model.name: model for model in _MODELS})
-MODELS_BY_NUMBER: Mapping[int, Model] = MappingProxyType({model.number: model for model in _MODELS})
+MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for model in _MODELS})
+MODELS_BY_NUMBER: Mapping[int, ServoModel] = MappingProxyType({model.number: model for model in _MODELS})
 TICK_ADDRESSES = tuple(sorted({model.registers["realtime_tick"].address for model in _MODELS}))
 
 
-def model_named(name: str) -> Model:
+def model_named(name: str) -> ServoModel:
     """Return the model that a configuration names; the letter after the gear may be left out.
 
     Raises
@@ -179,37 +179,37 @@ def hardware_error_words(value: int) -> list[str]:
     return words + ([f"unknown hardware error bits 0x{unknown:02x}"] if unknown else [])
 
 
-def register_words(model: Model, name: str, value: int) -> str:
+def register_words(model: ServoModel, name: str, value: int) -> str:
     """Return what a register's number means; empty where the number says it."""
     words = _WORDS.get(name)
     return "" if words is None else words(model, value)
 
 
-def _angle(model: Model, value: int) -> str:
+def _angle(model: ServoModel, value: int) -> str:
     return f"{math.degrees((value - model.centre_count) * model.count_rad):.3f} deg from its middle"
 
 
-def _velocity(model: Model, value: int) -> str:
+def _velocity(model: ServoModel, value: int) -> str:
     return f"{value * model.velocity_unit_rad_per_s:.4f} rad/s"
 
 
-def _acceleration(model: Model, value: int) -> str:
+def _acceleration(model: ServoModel, value: int) -> str:
     return f"{value * model.acceleration_unit_rad_per_s2:.4f} rad/s2" if value else "as hard as it can"
 
 
-def _current(model: Model, value: int) -> str:
+def _current(model: ServoModel, value: int) -> str:
     return "" if model.current_unit_A is None else f"{value * model.current_unit_A:.3f} A"
 
 
-def _load(model: Model, value: int) -> str:
+def _load(model: ServoModel, value: int) -> str:
     return f"{value / 10:.1f} % load" if model.current_unit_A is None else _current(model, value)
 
 
-def _volts(model: Model, value: int) -> str:
+def _volts(model: ServoModel, value: int) -> str:
     return f"{value / 10:.1f} V"
 
 
-def _errors(model: Model, value: int) -> str:
+def _errors(model: ServoModel, value: int) -> str:
     return ", ".join(hardware_error_words(value)) or "none"
 
 

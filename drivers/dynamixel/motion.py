@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drivers.approach import legs_to
-from drivers.dynamixel.registers import Block
+from drivers.dynamixel.registers import RegisterBlock
 from drivers.dynamixel.settings import ServoAxisSettings
 from drivers.errors import BadReply
 from drivers.interfaces import AxisReport, Side
@@ -19,17 +19,17 @@ STUCK_S = 1.0
 IN_POSITION_BIT, PROFILE_BIT = 0x01, 0x02
 
 
-def motion_blocks(settings: ServoAxisSettings) -> tuple[Block, ...]:
+def motion_blocks(settings: ServoAxisSettings) -> tuple[RegisterBlock, ...]:
     """Return what is read of a servo all the time, by turns: from its goals to its temperature.
 
     They differ in length, so that a reply to one of the last questions is none to the next.
     """
     names = ("goal_velocity", "profile_acceleration", "profile_velocity")
-    return tuple(Block(settings.model.registers, name, "present_temperature") for name in names)
+    return tuple(RegisterBlock(settings.model.registers, name, "present_temperature") for name in names)
 
 
 @dataclass(frozen=True)
-class Sample:
+class ServoSample:
     """What one servo said about itself in one transaction, in its own units.
 
     ``sent_s`` and ``received_s`` are seconds of CLOCK_MONOTONIC; it was measured between them.
@@ -55,13 +55,13 @@ class Truth:
     def __init__(self, name: str, settings: ServoAxisSettings) -> None:
         self._name = name
         self._settings = settings
-        self._last: Sample | None = None
+        self._last: ServoSample | None = None
 
     def forget(self) -> None:
         """Take the next sample whatever it says: the servo restarted."""
         self._last = None
 
-    def check(self, sample: Sample) -> None:
+    def check(self, sample: ServoSample) -> None:
         """Take a sample as true.
 
         Raises
@@ -81,7 +81,7 @@ class Truth:
         self._last = sample
 
 
-class AxisMotion:
+class AxisCourse:
     """One axis' goals and whether it has come to rest.
 
     Parameters
@@ -102,7 +102,7 @@ class AxisMotion:
         self._commanded_rad: float | None = None
         self._side: Side = "unknown"
         self._rest: tuple[int, float] | None = None  # counts and since when
-        self._sample: Sample | None = None
+        self._sample: ServoSample | None = None
         self._sampled = False  # since the goal was sent
         self._speed_rad_per_s = 0.0  # of the profile
         self.goal = 0
@@ -110,7 +110,7 @@ class AxisMotion:
         self.holds = True
 
     @property
-    def sample(self) -> Sample | None:
+    def sample(self) -> ServoSample | None:
         """The last true sample."""
         return self._sample
 
@@ -218,7 +218,7 @@ class AxisMotion:
         off = abs(goal - self.braking_counts(-math.inf, acceleration_rad_per_s2))
         return off * self.settings.model.count_rad <= self.settings.settle_rad
 
-    def take(self, sample: Sample) -> None:
+    def take(self, sample: ServoSample) -> None:
         """Take a true sample."""
         noise = max(1, round(STILL_RAD / self.settings.model.count_rad))
         still = self._speed(sample) <= 1
@@ -290,14 +290,14 @@ class AxisMotion:
             count_rad=settings.model.count_rad,
         )
 
-    def _arrived(self, sample: Sample) -> bool:
+    def _arrived(self, sample: ServoSample) -> bool:
         """In position: the servo says so or it is near enough, and no profile is under way."""
         status = sample.values["moving_status"]
         near = abs(sample.counts - self.goal) * self.settings.model.count_rad <= self.settings.settle_rad
         close = abs(sample.counts - self.goal) * self.settings.model.count_rad <= 4 * self.settings.settle_rad
         return (near or (close and bool(status & IN_POSITION_BIT))) and not status & PROFILE_BIT
 
-    def _speed(self, sample: Sample) -> int:
+    def _speed(self, sample: ServoSample) -> int:
         return abs(sample.values["present_velocity"])
 
     def _note_side(self, way_counts: int) -> None:

@@ -66,7 +66,7 @@ def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"")
 
 
 @dataclass(frozen=True)
-class Status:
+class StatusPacket:
     """A servo's reply: who sent it, its error byte (bit 7 is the hardware alert), its data, unstuffed."""
 
     servo_id: int
@@ -84,7 +84,7 @@ class Status:
         return bool(self.error & ALERT)
 
 
-def take_status(buffer: bytearray, *, at_end: bool = False, fast: bool = False) -> Status | None:
+def take_status(buffer: bytearray, *, at_end: bool = False, fast: bool = False) -> StatusPacket | None:
     """Take the first whole status packet out of a buffer; None when there is none yet.
 
     What comes before it (noise, echoes of instructions, packets whose checksum does not fit) is dropped.
@@ -121,7 +121,7 @@ def take_status(buffer: bytearray, *, at_end: bool = False, fast: bool = False) 
                         body = packet[8 : length - 2]
                         if not fast:
                             body = body.replace(STUFFED, START)
-                        return Status(packet[4], body[0], body[1:])
+                        return StatusPacket(packet[4], body[0], body[1:])
                     continue  # an instruction: the adapter's echo
             elif not at_end and (fast or buffer.find(HEADER, 1) < 0):
                 return None  # a second header inside means that this one is noise
@@ -150,7 +150,7 @@ class GroupAnswer:
     The servos measured after ``sent_s`` and before ``received_s``, seconds of CLOCK_MONOTONIC.
     """
 
-    statuses: Mapping[int, Status]
+    statuses: Mapping[int, StatusPacket]
     missing: Mapping[int, DriverError]
     sent_s: float
     received_s: float
@@ -202,7 +202,7 @@ def group_write_packet(parts: Sequence[Part]) -> bytes:
     return instruction_packet(BROADCAST_ID, BULK_WRITE, body)
 
 
-def fast_blocks(status: Status, parts: Sequence[Part]) -> list[Status] | None:
+def fast_blocks(status: StatusPacket, parts: Sequence[Part]) -> list[StatusPacket] | None:
     """Return the replies in the common reply to a fast group read, those before the first broken block.
 
     Blocks are error, id, data and the checksum of all bytes so far; the last checksum is the packet's, which
@@ -221,7 +221,7 @@ def fast_blocks(status: Status, parts: Sequence[Part]) -> list[Status] | None:
         if block[1] != part.servo_id or (stated and stated != crc.to_bytes(2, "little")):
             break
         crc = crc16(stated, crc)
-        blocks.append(Status(part.servo_id, block[0], block[2:]))
+        blocks.append(StatusPacket(part.servo_id, block[0], block[2:]))
     return blocks
 
 

@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 
 from drivers.clock import Clock
 from drivers.dynamixel.link import Link
-from drivers.dynamixel.motion import AxisMotion, Sample, motion_blocks
+from drivers.dynamixel.motion import AxisCourse, ServoSample, motion_blocks
 from drivers.dynamixel.packets import GroupAnswer, Part
-from drivers.dynamixel.registers import Block
+from drivers.dynamixel.registers import RegisterBlock
 from drivers.dynamixel.servo import Reboots, Servo
 from drivers.dynamixel.settings import DynamixelSettings, ServoAxisSettings
 from drivers.errors import DriverError, LineLost
@@ -52,7 +52,7 @@ class ServoAxis:
         self.settings = settings
         self._clock = link.clock
         self.servo = Servo(link, name, settings, head)
-        self.motion = AxisMotion(self.servo.name, settings, head.settle_s)
+        self.motion = AxisCourse(self.servo.name, settings, head.settle_s)
         self.hardware_error = ""
         counts = settings.acceleration_counts(head.acceleration_rad_per_s2)
         self.acceleration_rad_per_s2 = counts * settings.model.acceleration_unit_rad_per_s2
@@ -116,11 +116,11 @@ class Pair:
         turns = zip(*(motion_blocks(axis.settings) for axis in self.axes), strict=True)
         self._turns = itertools.cycle([(blocks, self._parts(blocks)) for blocks in turns])
 
-    def _parts(self, blocks: Sequence[Block]) -> tuple[Part, ...]:
+    def _parts(self, blocks: Sequence[RegisterBlock]) -> tuple[Part, ...]:
         """A block of each servo."""
         return tuple(Part(i, b.address, b.length) for i, b in zip(self._ids, blocks, strict=True))
 
-    def samples(self) -> list[Sample]:
+    def samples(self) -> list[ServoSample]:
         """Return what both servos say about their motion now, pan first, in one transaction.
 
         Raises
@@ -137,12 +137,12 @@ class Pair:
         for axis, block in zip(self.axes, blocks, strict=True):
             status = answer.statuses[axis.settings.servo_id]
             values = block.decode(status.data)
-            samples.append(Sample(values, status.alert, answer.sent_s, answer.received_s))
+            samples.append(ServoSample(values, status.alert, answer.sent_s, answer.received_s))
         for axis, sample in zip(self.axes, samples, strict=True):
             axis.servo.truth.check(sample)
         return samples
 
-    def sample(self, axis: ServoAxis) -> Sample:
+    def sample(self, axis: ServoAxis) -> ServoSample:
         """Return what one servo says about its motion now, asking it alone; raises as `samples`."""
         return axis.servo.look_once()
 
@@ -159,7 +159,7 @@ class Pair:
         if parts:
             self.link.shout(parts, BRAKE_COPIES)
 
-    def _ask_both(self, fast: bool) -> tuple[GroupAnswer, tuple[Block, ...]]:
+    def _ask_both(self, fast: bool) -> tuple[GroupAnswer, tuple[RegisterBlock, ...]]:
         """Ask both servos for the next of the blocks that hold their motion."""
         blocks, parts = next(self._turns)
         return self.link.group_read(parts, fast=fast), blocks

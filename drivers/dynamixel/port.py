@@ -18,7 +18,7 @@ from drivers.dynamixel.packets import (
     READ,
     REBOOT,
     WRITE,
-    Status,
+    StatusPacket,
     instruction_packet,
     take_status,
 )
@@ -161,7 +161,7 @@ class Port:
         """Send bytes whatever else wants the line or is under way on it. Raises LineLost."""
         self._line.write(data)
 
-    def receive(self, *, fast: bool = False) -> Status | None:
+    def receive(self, *, fast: bool = False) -> StatusPacket | None:
         """Return the next status packet, or None when the deadline passes first.
 
         After a None the port counts as suspect: the reply may still come. Raises LineLost.
@@ -231,7 +231,7 @@ class Exchange:
 
     def ask(
         self, servo_id: int, instruction: int, parameters: bytes, length: int, register: str = ""
-    ) -> Status:
+    ) -> StatusPacket:
         """Send an instruction to one servo and return its reply of ``length`` bytes.
 
         ``register`` is for messages. Raises NoReply, BadReply, Refused, LineLost.
@@ -260,7 +260,7 @@ class Exchange:
         """Drop what comes until nothing has come for ``quiet_s``: late replies. Raises LineLost, BadReply."""
         self.port.drain(quiet_s, 1.0)
 
-    def stray(self, status: Status) -> None:
+    def stray(self, status: StatusPacket) -> None:
         """Note a reply to another question; the line is listened to until quiet before the next one."""
         self.port.suspect = True
         log.debug("%s: dropped a reply of id %d that nobody waits for", self.port.name, status.servo_id)
@@ -274,7 +274,7 @@ class Exchange:
             detail=self.where(servo_id, word, register),
         )
 
-    def refusal(self, status: Status, word: str, register: str) -> Refused:
+    def refusal(self, status: StatusPacket, word: str, register: str) -> Refused:
         """Return the error of a servo that refused."""
         reason = ERROR_WORDS.get(status.refused, f"unknown error {status.refused}")
         alert = ", and it reports a hardware error" if status.alert else ""

@@ -153,7 +153,7 @@ def _registers(rows: Sequence[Sequence[str]], first_ram_address: int) -> Mapping
     return MappingProxyType(registers)
 
 
-class Block:
+class RegisterBlock:
     """Neighbouring registers that are read in one go, and their decoding.
 
     Parameters

@@ -18,7 +18,7 @@ from drivers.dynamixel.models import (
     POSITION_MODE,
     hardware_error_words,
 )
-from drivers.dynamixel.motion import Sample, Truth, motion_blocks
+from drivers.dynamixel.motion import ServoSample, Truth, motion_blocks
 from drivers.dynamixel.packets import Part
 from drivers.dynamixel.servo_table import ServoTable, again, identified
 from drivers.dynamixel.settings import DynamixelSettings, ServoAxisSettings
@@ -182,7 +182,7 @@ class Servo(ServoTable):
                 if self._link.clock.now_s() > until_s:
                     raise
 
-    def look(self) -> Sample:
+    def look(self) -> ServoSample:
         """Return what the servo says about its motion now; what was lost is asked for again.
 
         Raises
@@ -192,12 +192,12 @@ class Servo(ServoTable):
         """
         return again(self._link, self.look_once)
 
-    def look_once(self) -> Sample:
+    def look_once(self) -> ServoSample:
         """Return what the servo says about its motion now, asked one time; raises as `look`."""
         block = next(self._blocks)
         answer = self.block(block)
         status = answer.statuses[self._servo_id]
-        sample = Sample(block.decode(status.data), status.alert, answer.sent_s, answer.received_s)
+        sample = ServoSample(block.decode(status.data), status.alert, answer.sent_s, answer.received_s)
         self.truth.check(sample)
         return sample
 

@@ -8,7 +8,7 @@ from typing import TypeVar
 from drivers.dynamixel.link import Link, Pinged
 from drivers.dynamixel.packets import GroupAnswer, Part
 from drivers.dynamixel.port import QUIET_S
-from drivers.dynamixel.registers import Block, Register
+from drivers.dynamixel.registers import Register, RegisterBlock
 from drivers.errors import BadReply, NoReply, Refused, WrongDevice
 
 T = TypeVar("T")
@@ -117,6 +117,6 @@ class ServoTable:
         entry = self._registers[register]
         return Part(self._servo_id, entry.address, entry.size, entry.encode(value))
 
-    def block(self, block: Block) -> GroupAnswer:
+    def block(self, block: RegisterBlock) -> GroupAnswer:
         """Return neighbouring registers, asked one time; raises as `Link.block`."""
         return self._link.block(Part(self._servo_id, block.address, block.length))

@@ -27,7 +27,7 @@ FAILED_POLLS = 2  # in a row, before the servos are set up anew
 STOP_PATIENCE_S = 0.2  # how long a stop asks for a confirmation that does not come
 
 
-class Session:
+class ServoSession:
     """One line's life; for the one thread that owns it.
 
     Parameters

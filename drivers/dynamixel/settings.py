@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from drivers.approach import APPROACHES, Approach, last_turn
-from drivers.dynamixel.models import Model, model_named
+from drivers.approach import APPROACHES, ApproachedAxis
+from drivers.dynamixel.models import ServoModel, model_named
 from drivers.dynamixel.port import QUIET_S
 from drivers.errors import BadOptions
 from drivers.options import OptionReader
@@ -26,9 +26,9 @@ SILENCE_SPARE_S = 0.05  # the servo's oscillator against ours
 POLL_BYTES = 20 + 2 * (11 + 43)  # the longer of the two instructions, and two replies of 43 bytes of data
 
 
-@dataclass(frozen=True)
-class ServoAxisSettings:
-    """One axis of the head. Angles are the mast's: pan positive to the right, tilt positive up.
+@dataclass(frozen=True, kw_only=True)
+class ServoAxisSettings(ApproachedAxis):
+    """One axis of the head, as of `ApproachedAxis`; its limits are also the servo's position limits.
 
     Attributes
     ----------
@@ -36,19 +36,6 @@ class ServoAxisSettings:
         Which servo.
     zero_counts
         The servo's position where the axis is at zero.
-    sign
-        1 if the servo counts up where the axis turns positive, else -1.
-    limits_rad
-        What may be commanded; also written to the servo as its position limits.
-    approach
-        From which side a goal is approached, to take the backlash up: ``none``, ``positive`` (the last
-        stretch turns positive), ``negative``, or ``gravity``: against the weight, so that gear and weight
-        press on the same flank.
-    approach_rad
-        How long the last stretch is; more than the backlash.
-    gravity_turnover_rad
-        The angle at which the weight changes sides, for ``gravity``: below it the weight pulls the axis
-        down (the last stretch turns positive), above it up.
     at_stop, at_close
         Whether the servo then holds, or its torque is switched off (a tilt axis may fall).
     on_hardware_error
@@ -60,13 +47,8 @@ class ServoAxisSettings:
     """
 
     servo_id: int
-    model: Model
+    model: ServoModel
     zero_counts: int
-    limits_rad: tuple[float, float]
-    sign: int = 1
-    approach: Approach = "none"
-    approach_rad: float = 0.0
-    gravity_turnover_rad: float = math.pi / 2
     at_stop: Rest = "hold"
     at_close: Rest = "hold"
     on_hardware_error: OnHardwareError = "report"
@@ -99,10 +81,6 @@ class ServoAxisSettings:
     def velocity_counts(self, speed_rad_per_s: float) -> int:
         """Return a profile velocity, not above the speed; never 0, which would mean as fast as it can."""
         return max(1, math.floor(speed_rad_per_s / self.model.velocity_unit_rad_per_s + 1e-9))
-
-    def approach_sign(self, goal_rad: float) -> int:
-        """Return the direction of the last stretch in counts: 1, -1, or 0 for none."""
-        return self.sign * last_turn(self.approach, goal_rad, self.gravity_turnover_rad)
 
 
 @dataclass(frozen=True)

@@ -19,22 +19,22 @@ from drivers.dynamixel.models import (
     OPERATING_MODES,
     POSITION_MODE,
     WATCHDOG_TRIPPED,
-    Model,
+    ServoModel,
     hardware_error_words,
     register_words,
 )
-from drivers.dynamixel.registers import Block
+from drivers.dynamixel.registers import RegisterBlock
 from drivers.dynamixel.servo_table import ServoTable, again, identified
 from drivers.errors import BadOptions, DriverError, HardwareFault, NoReply, OutOfRange, Refused, WrongDevice
 from drivers.serial_line import OpenLine, SerialLine
 
 HIGHEST_ID = 252
 
-SPEED_RAD_PER_S = 0.2
-ACCELERATION_RAD_PER_S2 = 1.0
-WATCHDOG = 15  # times 20 ms
-POLL_S = 0.02
-WARM_MARGIN_C = 10  # below the servo's own limit
+TRIAL_SPEED_RAD_PER_S = 0.2
+TRIAL_ACCELERATION_RAD_PER_S2 = 1.0
+TRIAL_WATCHDOG = 15  # times 20 ms
+TRIAL_POLL_S = 0.02
+TRIAL_WARM_MARGIN_C = 10  # below the servo's own limit
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def facts(link: Link, servo_id: int) -> ServoFacts:
     return ServoFacts(servo_id, model.name, firmware, values, {n: w for n, w in words.items() if w})
 
 
-def identify(link: Link, servo_id: int) -> tuple[Model, int]:
+def identify(link: Link, servo_id: int) -> tuple[ServoModel, int]:
     """Return a servo's model and firmware. Raises as `facts`."""
     pinged = identified(link, servo_id, f"servo {servo_id}")
     model = MODELS_BY_NUMBER.get(pinged.model_number)
@@ -137,7 +137,7 @@ def identify(link: Link, servo_id: int) -> tuple[Model, int]:
     return model, pinged.firmware
 
 
-def table_of(link: Link, servo_id: int, model: Model) -> ServoTable:
+def table_of(link: Link, servo_id: int, model: ServoModel) -> ServoTable:
     """Return a servo's control table."""
     return ServoTable(link, servo_id, model.registers, f"servo {servo_id}")
 
@@ -192,7 +192,7 @@ def set_id(link: Link, old: int, new: int, new_baud: int | None = None, *, torqu
         _confirm(link, new, model, f"servo {new} does not answer at {new_baud} baud")
 
 
-def _change(link: Link, servo_id: int, model: Model, register: str, value: int) -> None:
+def _change(link: Link, servo_id: int, model: ServoModel, register: str, value: int) -> None:
     """Write an id or a rate; the answer may come under the new one and so be missed."""
     try:
         link.write(servo_id, model.registers[register], value)
@@ -200,7 +200,7 @@ def _change(link: Link, servo_id: int, model: Model, register: str, value: int) 
         link.quiet(0.05)
 
 
-def _confirm(link: Link, servo_id: int, model: Model, otherwise: str) -> None:
+def _confirm(link: Link, servo_id: int, model: ServoModel, otherwise: str) -> None:
     try:
         found = again(link, lambda: link.ping(servo_id))
     except NoReply:
@@ -275,7 +275,7 @@ def try_out(link: Link, servo_id: int, amplitude_rad: float, torque_percent: flo
         _make_weak_and_slow(table, model, values, torque_percent)
         table.set("torque_enable", 1)
         if firmware >= model.watchdog_firmware:
-            table.set("bus_watchdog", WATCHDOG)
+            table.set("bus_watchdog", TRIAL_WATCHDOG)
         try:
             for goal in (start + reach, start - reach, start):
                 table.write("goal_position", goal)
@@ -288,19 +288,19 @@ def try_out(link: Link, servo_id: int, amplitude_rad: float, torque_percent: flo
 
 
 def _make_weak_and_slow(
-    table: ServoTable, model: Model, values: Mapping[str, int], torque_percent: float
+    table: ServoTable, model: ServoModel, values: Mapping[str, int], torque_percent: float
 ) -> None:
     """Make where the servo stands its goal, and bound its drive, speed and acceleration."""
     if values["bus_watchdog"]:  # it refuses goals
         table.clear_watchdog(values["present_position"])
     table.set("goal_position", values["present_position"])
-    acceleration = max(1, round(ACCELERATION_RAD_PER_S2 / model.acceleration_unit_rad_per_s2))
+    acceleration = max(1, round(TRIAL_ACCELERATION_RAD_PER_S2 / model.acceleration_unit_rad_per_s2))
     table.set("profile_acceleration", acceleration)
-    table.set("profile_velocity", max(1, round(SPEED_RAD_PER_S / model.velocity_unit_rad_per_s)))
+    table.set("profile_velocity", max(1, round(TRIAL_SPEED_RAD_PER_S / model.velocity_unit_rad_per_s)))
     table.set("goal_pwm", round(values["pwm_limit"] * torque_percent / 100))
 
 
-def _check_fit(servo_id: int, model: Model, values: Mapping[str, int], reach: int) -> None:
+def _check_fit(servo_id: int, model: ServoModel, values: Mapping[str, int], reach: int) -> None:
     """Refuse what a trial would make worse."""
     if values["operating_mode"] != POSITION_MODE:
         mode = OPERATING_MODES.get(values["operating_mode"], "an unknown")
@@ -308,7 +308,7 @@ def _check_fit(servo_id: int, model: Model, values: Mapping[str, int], reach: in
     if values["hardware_error"]:
         words = ", ".join(hardware_error_words(values["hardware_error"]))
         raise HardwareFault(f"servo {servo_id} reports {words}; find the cause, then switch it off and on")
-    if values["present_temperature"] > values["temperature_limit"] - WARM_MARGIN_C:
+    if values["present_temperature"] > values["temperature_limit"] - TRIAL_WARM_MARGIN_C:
         raise HardwareFault(
             f"servo {servo_id} is at {values['present_temperature']} C, near its limit of "
             f"{values['temperature_limit']} C; let it cool"
@@ -364,9 +364,9 @@ def _restored(table: ServoTable, values: Mapping[str, int]) -> Iterator[None]:
         raise wrong
 
 
-def _step(link: Link, table: ServoTable, model: Model, goal: int, fence: tuple[int, int]) -> TrialStep:
+def _step(link: Link, table: ServoTable, model: ServoModel, goal: int, fence: tuple[int, int]) -> TrialStep:
     """Watch one short move to its end."""
-    block = Block(model.registers, "goal_velocity", "present_temperature")
+    block = RegisterBlock(model.registers, "goal_velocity", "present_temperature")
     began_s = link.clock.now_s()
     most = 0
     still = 0
@@ -386,7 +386,7 @@ def _step(link: Link, table: ServoTable, model: Model, goal: int, fence: tuple[i
         elapsed_s = link.clock.now_s() - began_s
         if (still >= 5 and elapsed_s > 0.2) or elapsed_s > 10.0:
             break
-        link.clock.sleep(POLL_S)
+        link.clock.sleep(TRIAL_POLL_S)
     left = abs(values["present_position"] - goal)
     if left > max(abs(fence[1] - fence[0]) / 16, 4):
         raise HardwareFault(

@@ -42,7 +42,7 @@ JUMPED = (
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenPosition:
     """A position and when it was measured, seconds."""
 
     position: int
@@ -103,8 +103,8 @@ class StepAxis:
         self.speed: int | None = None
         self.target: int | None = None
         self.next_target: int | None = None
-        self.seen: Seen | None = None
-        self._still = Seen(0, -math.inf)
+        self.seen: SeenPosition | None = None
+        self._still = SeenPosition(0, -math.inf)
         self._dwell_s = 0.0
 
     def rad_from_position(self, position: float) -> float:
@@ -169,7 +169,7 @@ class StepAxis:
         self.target = self.next_target = None
         self._begin_again(time_s)
 
-    def take(self, seen: Seen) -> None:
+    def take(self, seen: SeenPosition) -> None:
         """Remember a position that is taken for true."""
         if self.seen is None or abs(seen.position - self._still.position) > IN_POSITION:
             self._still = seen
@@ -182,13 +182,13 @@ class StepAxis:
         """Count the time of standing still from now."""
         self._dwell_s = 0.0
         if self.seen is not None:
-            self._still = Seen(self.seen.position, time_s)
+            self._still = SeenPosition(self.seen.position, time_s)
 
-    def rests_at(self, seen: Seen) -> bool:
+    def rests_at(self, seen: SeenPosition) -> bool:
         """Return whether a position is the one where the axis has come to rest."""
         return self.rests and self.seen is not None and seen.position == self.seen.position
 
-    def confirms(self, first: Seen, middle: Seen, last: Seen) -> bool:
+    def confirms(self, first: SeenPosition, middle: SeenPosition, last: SeenPosition) -> bool:
         """Return whether the middle of three positions can be taken: see `drivers.flir_ptu.unit`."""
         low, high = sorted((first.position, last.position))
         furthest = self.fastest * (last.time_s - first.time_s) + 1

@@ -26,8 +26,8 @@ from drivers.clock import Clock
 from drivers.errors import BadReply, DriverError, NoReply, Refused
 from drivers.flir_ptu.protocol import (
     RESOLUTION,
-    Answer,
     LineSplitter,
+    PtuAnswer,
     Query,
     answer_of,
     hits_of,
@@ -49,7 +49,7 @@ AGREEING_TRIES = 5
 ORDER_S = 0.01  # how long a shout waits for another thread's write
 
 
-class Interrupted(DriverError):
+class StopCameFirst(DriverError):
     """Something was shouted meanwhile; the command was not sent, and its caller gives way."""
 
     code = "interrupted"
@@ -200,7 +200,8 @@ class Conversation:
     def shout(self, command: str) -> None:
         """Send a command beside a call under way, from any thread.
 
-        That call gets its answer, and `Interrupted` with its next question; then `shouted` takes this one's.
+        That call gets its answer, and `StopCameFirst` with its next question; then `shouted` takes this
+        one's.
 
         Raises
         ------
@@ -298,7 +299,7 @@ class Conversation:
         """Raise Interrupted if something was shouted; who makes a unit ready goes through with it."""
         if self._shouts and self.gives_way and self._tries == 1:
             self._in_step = True
-            raise Interrupted(f"a stop came before {command} was sent", device=self._device)
+            raise StopCameFirst(f"a stop came before {command} was sent", device=self._device)
 
     def _speaks_twice(self, line: bytes) -> bool:
         """Whether a line that nobody asked for puts the last answer in doubt: it may be the true one."""
@@ -361,7 +362,7 @@ class Conversation:
             if not answer.good:
                 refusal = answer.text
 
-    def _next_answer(self, command: str, until_s: float, skip: bool) -> Answer:
+    def _next_answer(self, command: str, until_s: float, skip: bool) -> PtuAnswer:
         """The next answer; a line that is none is an error unless such lines are to be skipped."""
         echo = exact = False
         last, self._answered = self._answered, b""

@@ -18,13 +18,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from drivers.absence import Absence
+from drivers.absent import Absence
 from drivers.approach import rising_below_rad
-from drivers.clock import Clock, SystemClock, Turn, deadlines_on
+from drivers.clock import Clock, ClockLock, SystemClock, deadlines_on
 from drivers.errors import BadReply, DriverError, HardwareFault, LineLost, NoReply, OutOfRange
 from drivers.flir_ptu import protocol as ask
 from drivers.flir_ptu.axis import StepAxis, StepCount
-from drivers.flir_ptu.conversation import Conversation, Interrupted
+from drivers.flir_ptu.conversation import Conversation, StopCameFirst
 from drivers.flir_ptu.options import DEVICE, Options, options_from
 from drivers.flir_ptu.unit import SupplyWatch, checked_version, measure, ready_axes
 from drivers.interfaces import AxisMotion, Reading
@@ -82,7 +82,7 @@ class FlirPtu:
         self._clock = clock
         self._time = deadlines_on(clock)
         self._open_line = open_line
-        self._turn = Turn(self._time)
+        self._turn = ClockLock(self._time)
         self._stop_over = self._time.signal()
         self._stop_asked = False
         self._count = StepCount()
@@ -112,7 +112,7 @@ class FlirPtu:
         while True:
             try:
                 return self._read()
-            except Interrupted:  # several stops may come into one reading
+            except StopCameFirst:  # several stops may come into one reading
                 if self._time.now_s() > until_s:
                     raise
             with self._stop_over:

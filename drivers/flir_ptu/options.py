@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.approach import APPROACHES, Approach, last_turn
+from drivers.approach import APPROACHES, ApproachedAxis
 from drivers.options import OptionReader
 
 DEVICE = "flir_ptu"
@@ -15,42 +15,21 @@ BAUDS = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 PORTS = "a serial device such as /dev/ttyUSB0, socket://HOST:4000 or rfc2217://HOST:PORT"
 
 
-@dataclass(frozen=True)
-class AxisOptions:
-    """One axis. Angles are the mast's: pan positive to the right, tilt positive up.
+@dataclass(frozen=True, kw_only=True)
+class AxisOptions(ApproachedAxis):
+    """One axis, as of `ApproachedAxis`; its limits are also the unit's user limits, if it has any.
 
     Attributes
     ----------
-    limits_rad
-        What may be commanded; also given to the unit, if it has user limits.
-    sign
-        -1 where the unit counts up while the axis turns negative.
     zero_rad
         The axis's angle where the unit stands at position 0.
-    approach
-        From which side a goal is approached, to take the backlash up: ``none``, ``positive`` (the last
-        stretch turns positive), ``negative``, or ``gravity``: against the weight.
-    approach_rad
-        How long the last stretch is; more than the backlash.
     resolution_arcsec
         What a position has to be, seconds of arc; None takes what the unit says. An E46 needs it, since it
         says something wrong before its first reset.
-    gravity_turnover_rad
-        The angle at which the weight changes sides, for ``gravity``: below it the last stretch turns
-        positive, above it negative.
     """
 
-    limits_rad: tuple[float, float]
-    sign: int = 1
     zero_rad: float = 0.0
-    approach: Approach = "none"
-    approach_rad: float = 0.0
-    gravity_turnover_rad: float = math.pi / 2
     resolution_arcsec: float | None = None
-
-    def approach_sign(self, goal_rad: float) -> int:
-        """Return the direction of the last stretch in positions: 1, -1, or 0 for none."""
-        return self.sign * last_turn(self.approach, goal_rad, self.gravity_turnover_rad)
 
 
 @dataclass(frozen=True)

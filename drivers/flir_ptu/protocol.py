@@ -47,7 +47,7 @@ ACCELERATION = _axis_query("A", "AXIS", "acceleration")
 
 
 @dataclass(frozen=True)
-class Answer:
+class PtuAnswer:
     """One answer of the unit.
 
     Attributes
@@ -92,7 +92,7 @@ def hits_of(line: bytes) -> tuple[str, ...]:
     return tuple("pan" if letter in b"Pp" else "tilt" for letter in found)
 
 
-def answer_of(line: bytes, command: str) -> Answer | None:
+def answer_of(line: bytes, command: str) -> PtuAnswer | None:
     """Return a line's answer to a command; None if it is not one.
 
     Parameters
@@ -110,9 +110,9 @@ def answer_of(line: bytes, command: str) -> Answer | None:
         exact = rest.startswith(sent)
         rest, echo = without_hits(rest[len(sent) :]), True
     if rest.strip() == b"*":
-        return Answer(True, "", echo, exact)
+        return PtuAnswer(True, "", echo, exact)
     if rest.startswith((b"* ", b"! ")):
-        return Answer(rest.startswith(b"*"), rest[2:].decode("ascii").strip(), echo, exact)
+        return PtuAnswer(rest.startswith(b"*"), rest[2:].decode("ascii").strip(), echo, exact)
     return None
 
 

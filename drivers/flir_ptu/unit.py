@@ -22,7 +22,7 @@ from itertools import pairwise
 from drivers.clock import Clock
 from drivers.errors import BadReply, Refused, WrongDevice
 from drivers.flir_ptu import protocol as ask
-from drivers.flir_ptu.axis import Seen, StepAxis
+from drivers.flir_ptu.axis import SeenPosition, StepAxis
 from drivers.flir_ptu.conversation import Conversation
 from drivers.flir_ptu.options import DEVICE, Options
 
@@ -34,9 +34,9 @@ MOST_BEND_RAD = 0.01
 
 RECOMPUTE_S = 10.0  # PA and TA take seconds, the manual says
 
-EVERY_S = 5.0
+SUPPLY_EVERY_S = 5.0
 """How often a resting unit is asked."""
-DIP = 0.8
+SUPPLY_DIP = 0.8
 """Below this part of what it was at the start a supply counts as fallen, where no bounds are configured."""
 
 _VOLTS = re.compile(r"(\d+(?:\.\d+)?) ?V")
@@ -53,9 +53,9 @@ def measure(talk: Conversation, pan: StepAxis, tilt: StepAxis, clock: Clock) -> 
     NoReply, Refused, LineLost
         As `Conversation.ask`.
     """
-    asked: dict[StepAxis, list[Seen]] = {tilt: [], pan: []}
-    at_rest: dict[StepAxis, Seen] = {}
-    found: tuple[Seen, Seen] | None = None
+    asked: dict[StepAxis, list[SeenPosition]] = {tilt: [], pan: []}
+    at_rest: dict[StepAxis, SeenPosition] = {}
+    found: tuple[SeenPosition, SeenPosition] | None = None
     while found is None:
         for axis, answers in asked.items():
             if axis not in at_rest and found is None:
@@ -74,28 +74,32 @@ def measure(talk: Conversation, pan: StepAxis, tilt: StepAxis, clock: Clock) -> 
     return found[0].time_s
 
 
-def _asked(talk: Conversation, axis: StepAxis, clock: Clock) -> Seen:
+def _asked(talk: Conversation, axis: StepAxis, clock: Clock) -> SeenPosition:
     """One answer, and when it was measured."""
     before_s = clock.now_s()
     number = talk.ask(ask.POSITION[axis.name])
     # The unit looks when the question is there; its answer takes ten times as long on the wire.
     took_s = min((clock.now_s() - before_s) / 2, 4 * talk.byte_s)
-    return Seen(round(number), before_s + took_s)
+    return SeenPosition(round(number), before_s + took_s)
 
 
 def _found(
-    pan: StepAxis, tilt: StepAxis, pans: Sequence[Seen], tilts: Sequence[Seen], at_rest: dict[StepAxis, Seen]
-) -> tuple[Seen, Seen] | None:
+    pan: StepAxis,
+    tilt: StepAxis,
+    pans: Sequence[SeenPosition],
+    tilts: Sequence[SeenPosition],
+    at_rest: dict[StepAxis, SeenPosition],
+) -> tuple[SeenPosition, SeenPosition] | None:
     """Pan and tilt at one moment, as far as the answers tell; None if they do not yet."""
     if pan in at_rest and tilt in at_rest:
         time_s = (at_rest[pan].time_s + at_rest[tilt].time_s) / 2
-        return Seen(at_rest[pan].position, time_s), Seen(at_rest[tilt].position, time_s)
+        return SeenPosition(at_rest[pan].position, time_s), SeenPosition(at_rest[tilt].position, time_s)
     if tilt in at_rest:
         seen = _middle(pan, pans)
-        return None if seen is None else (seen, Seen(at_rest[tilt].position, seen.time_s))
+        return None if seen is None else (seen, SeenPosition(at_rest[tilt].position, seen.time_s))
     if pan in at_rest:
         seen = _middle(tilt, tilts)
-        return None if seen is None else (Seen(at_rest[pan].position, seen.time_s), seen)
+        return None if seen is None else (SeenPosition(at_rest[pan].position, seen.time_s), seen)
     if len(tilts) < 4 or len(tilts) == len(pans) or _middle(tilt, tilts[:-1]) is None:
         return None
     seen, other = _middle(pan, pans), _middle(tilt, tilts)
@@ -103,17 +107,17 @@ def _found(
         return None
     before = tilts[-3]
     part = (seen.time_s - before.time_s) / max(other.time_s - before.time_s, 1e-6)
-    return seen, Seen(round(before.position + part * (other.position - before.position)), seen.time_s)
+    return seen, SeenPosition(round(before.position + part * (other.position - before.position)), seen.time_s)
 
 
-def _middle(axis: StepAxis, answers: Sequence[Seen]) -> Seen | None:
+def _middle(axis: StepAxis, answers: Sequence[SeenPosition]) -> SeenPosition | None:
     """The last answer but one, if those around it confirm it."""
     if len(answers) < 3 or not axis.confirms(*answers[-3:]):
         return None
     return answers[-2]
 
 
-def _bend_rad(axis: StepAxis, four: Sequence[Seen]) -> float:
+def _bend_rad(axis: StepAxis, four: Sequence[SeenPosition]) -> float:
     """How far from the straight line between the middle two of four answers the axis may have been.
 
     No further than these two are apart, and than its change of speed around them carries it.
@@ -253,7 +257,7 @@ def supply_of(text: str) -> Supply | None:
 def supply_words(now: Supply, at_start: Supply, options: Options) -> tuple[str, ...]:
     """Say what is wrong with the supply or the temperature; empty if nothing is."""
     words = []
-    low, high = options.supply_V or (DIP * at_start.volts, float("inf"))
+    low, high = options.supply_V or (SUPPLY_DIP * at_start.volts, float("inf"))
     if not low <= now.volts <= high:
         expected = f"{low:.1f} to {high:.1f} V" if options.supply_V else f"{low:.1f} V or more"
         words.append(f"the supply is {now.volts:.1f} V, expected {expected}")
@@ -299,7 +303,7 @@ class SupplyWatch:
             words = supply_words(supply, self._at_start, self._options)
             if not words:
                 break
-        self.words, self._due_s = words, self._clock.now_s() + EVERY_S
+        self.words, self._due_s = words, self._clock.now_s() + SUPPLY_EVERY_S
 
 
 def _supply(talk: Conversation) -> Supply | None:

@@ -20,10 +20,10 @@ from drivers.sim.placed import (
     BOARD_M,
     DICTIONARIES,
     MOST_TEXELS,
-    Charuco,
-    Dots,
-    Picture,
     PlacedBoard,
+    PlacedCharuco,
+    PlacedDots,
+    PlacedPicture,
     read_picture,
 )
 from drivers.sim.rocks import Brick
@@ -40,7 +40,7 @@ WHITE, BLACK = 1.6, 0.12
 
 
 @dataclass(frozen=True, eq=False)
-class Board:
+class SceneBoard:
     """A board where it stands.
 
     Attributes
@@ -55,10 +55,10 @@ class Board:
 
     site_from_board: Rigid
     size_m: tuple[float, float]
-    face: Dots | Charuco | Picture
+    face: PlacedDots | PlacedCharuco | PlacedPicture
 
 
-def standing(placed: PlacedBoard, ground_z_m: Callable[[float, float], float]) -> Board:
+def standing(placed: PlacedBoard, ground_z_m: Callable[[float, float], float]) -> SceneBoard:
     """Return the board on the ground."""
     heading, lean = placed.heading_rad, placed.lean_rad
     looks = np.array(
@@ -69,10 +69,10 @@ def standing(placed: PlacedBoard, ground_z_m: Callable[[float, float], float]) -
     height_m = placed.face.size_m[1]
     foot = np.array([placed.x_m, placed.y_m, ground_z_m(placed.x_m, placed.y_m) - placed.raised_m])
     rotation = np.column_stack([right, down, -looks])
-    return Board(Rigid(rotation, foot - 0.5 * height_m * down), placed.face.size_m, placed.face)
+    return SceneBoard(Rigid(rotation, foot - 0.5 * height_m * down), placed.face.size_m, placed.face)
 
 
-def meshes(boards: Sequence[Board]) -> Any:
+def meshes(boards: Sequence[SceneBoard]) -> Any:
     """Return the ``kernels.Rocks`` of boards: boxes whose upper side is the face."""
     boxes = []
     for board in boards:
@@ -84,7 +84,7 @@ def meshes(boards: Sequence[Board]) -> Any:
     return rocks.meshes(boxes)._replace(boards=np.arange(len(boards)))
 
 
-def faces(boards: Sequence[Board]) -> Any:
+def faces(boards: Sequence[SceneBoard]) -> Any:
     """Return the ``kernels.Boards``: where the faces are, and each different picture once."""
     module = kernels()
     different = list(dict.fromkeys(board.face for board in boards))
@@ -110,11 +110,11 @@ def faces(boards: Sequence[Board]) -> Any:
     )
 
 
-def picture_of(face: Dots | Charuco | Picture) -> tuple[Float32, float]:
+def picture_of(face: PlacedDots | PlacedCharuco | PlacedPicture) -> tuple[Float32, float]:
     """Return tones (n, n), n a power of two, from the board's corner on, and how wide a texel is, metres."""
-    if isinstance(face, Dots):
+    if isinstance(face, PlacedDots):
         grey, texel_m = _dots(face)
-    elif isinstance(face, Charuco):
+    elif isinstance(face, PlacedCharuco):
         grey, texel_m = _charuco(face)
     else:
         image, digest, path = read_picture(face.picture, "simulation.scene.boards.picture", Path())
@@ -131,7 +131,7 @@ def _texel_m(feature_m: float, size_m: tuple[float, float]) -> float:
     return max(min(FINEST_M, feature_m / TEXELS_A_FEATURE), max(size_m) / MOST_TEXELS)
 
 
-def _dots(face: Dots) -> tuple[Float32, float]:
+def _dots(face: PlacedDots) -> tuple[Float32, float]:
     """Black dots, each texel by how far the edge is from its middle, so that no dot is off its place."""
     texel_m = _texel_m(face.dot_diameter_m, face.size_m)
     shape = [math.ceil(side_m / texel_m) for side_m in reversed(face.size_m)]
@@ -142,7 +142,7 @@ def _dots(face: Dots) -> tuple[Float32, float]:
     return np.clip(0.5 + outside_m / texel_m, 0.0, 1.0).astype(np.float32), texel_m
 
 
-def _charuco(face: Charuco) -> tuple[Float32, float]:
+def _charuco(face: PlacedCharuco) -> tuple[Float32, float]:
     """OpenCV's own drawing, a whole number of texels a square."""
     count = math.ceil(face.square_m / _texel_m(face.marker_m / 2, face.size_m))
     count = min(count, int(MOST_TEXELS * face.square_m / max(face.size_m)))

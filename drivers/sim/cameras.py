@@ -23,7 +23,7 @@ from drivers.errors import NoFreshFrame, NoReply
 from drivers.faults import Fault, FaultPanel
 from drivers.interfaces import Frame, FrameTime, HoldsExposure, Image
 from drivers.sim.camera_settings import CameraClock, CameraSettings, ClockSettings
-from drivers.sim.optics.exposure import AutoExposure, FixedExposure, Shot
+from drivers.sim.optics.exposure import AutoExposure, FixedExposure, FrameExposure
 from drivers.sim.optics.readout import Noise, Readout
 
 RING_FRAMES = 4
@@ -225,11 +225,11 @@ class SimulatedCamera:
                 self._taken(sequence, begin_s + all_rows_s / 2)
             return self._last
 
-    def _shot(self, sequence: int, epoch: _Epoch) -> Shot:
+    def _shot(self, sequence: int, epoch: _Epoch) -> FrameExposure:
         """Exposure time and gain of a frame."""
         return self._exposure.shot(sequence, epoch.begin_s(sequence), epoch.period_s)
 
-    def _picture(self, sequence: int, epoch: _Epoch, shot: Shot) -> Image:
+    def _picture(self, sequence: int, epoch: _Epoch, shot: FrameExposure) -> Image:
         """The picture of an exposure, as a fault leaves it."""
         begin_s = epoch.begin_s(sequence)
         if fault := self._faults.find(self.name, "frozen", begin_s):
@@ -250,7 +250,7 @@ class SimulatedCamera:
             return np.asarray(shifted, dtype=np.uint8)
         return image
 
-    def _healthy(self, sequence: int, epoch: _Epoch, shot: Shot) -> Image:
+    def _healthy(self, sequence: int, epoch: _Epoch, shot: FrameExposure) -> Image:
         """The picture without faults."""
         light = self._expose(epoch.begin_s(sequence), shot.exposure_s)
         return self._readout.picture(light, sequence, shot)

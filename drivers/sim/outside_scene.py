@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions, DriverError
-from drivers.factory import named_factory, one_line
+from drivers.outside import named_factory, one_line
 from drivers.sim.render import MAX_SAMPLES, Float32, Renderer
 from drivers.sim.scene import Scene, SceneSettings
 

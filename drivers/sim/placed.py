@@ -57,7 +57,7 @@ class PlacedBrick:
 
 
 @dataclass(frozen=True)
-class Dots:
+class PlacedDots:
     """Round dots in rows and columns, as of a survey's board; the margin is from the outer dots' centres."""
 
     rows: int = 10
@@ -74,7 +74,7 @@ class Dots:
 
 
 @dataclass(frozen=True)
-class Charuco:
+class PlacedCharuco:
     """A ChArUco board of OpenCV: squares in rows and columns, markers of a dictionary in the white ones."""
 
     rows: int = 7
@@ -92,7 +92,7 @@ class Charuco:
 
 
 @dataclass(frozen=True)
-class Picture:
+class PlacedPicture:
     """A picture from a file, so wide; pixels are square."""
 
     picture: str = ""
@@ -106,7 +106,7 @@ class Picture:
         return self.width_m, self.width_m * self.size_px[1] / self.size_px[0]
 
 
-FACES: Mapping[str, Any] = {"dots": Dots(), "charuco": Charuco(), "picture": Picture()}
+FACES: Mapping[str, Any] = {"dots": PlacedDots(), "charuco": PlacedCharuco(), "picture": PlacedPicture()}
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class PlacedBoard:
     heading_rad: float = math.nan
     lean_rad: float = 0.0
     raised_m: float = 0.0
-    face: Dots | Charuco | Picture = Dots()
+    face: PlacedDots | PlacedCharuco | PlacedPicture = PlacedDots()
 
 
 Placed = PlacedRock | PlacedBrick | PlacedBoard
@@ -132,15 +132,15 @@ _BOUNDS: Mapping[type, Mapping[str, tuple[float, float]]] = {
     PlacedRock: {**_PLACE, "diameter_m": (0.03, 3.0)},
     PlacedBrick: {**_PLACE, "length_m": (0.02, 3.0), "width_m": (0.02, 3.0), "height_m": (0.02, 3.0)},
     PlacedBoard: {**_PLACE, "lean_rad": (-1.0, 1.0), "raised_m": (0.0, 3.0)},
-    Dots: {
+    PlacedDots: {
         "rows": (2, 50), "columns": (2, 50), "spacing_m": (0.005, 1.0), "dot_diameter_m": (0.002, 1.0),
         "margin_m": (0.0, 1.0),
     },
-    Charuco: {
+    PlacedCharuco: {
         "rows": (2, 50), "columns": (2, 50), "square_m": (0.005, 1.0), "marker_m": (0.002, 1.0),
         "margin_m": (0.0, 1.0),
     },
-    Picture: {"width_m": (0.05, 4.0)},
+    PlacedPicture: {"width_m": (0.05, 4.0)},
 }  # fmt: skip
 
 
@@ -184,7 +184,7 @@ def _board(value: dict[str, Any], key: str, folder: Path) -> PlacedBoard:
     face = filled(FACES[kind], {k: v for k, v in value.items() if k in known}, key)
     check_bounds(face, _BOUNDS[type(face)], key)
     _check_face(face, key)
-    if isinstance(face, Picture):
+    if isinstance(face, PlacedPicture):
         face = _with_digest(face, key, folder)
     board: PlacedBoard = filled(PlacedBoard(), {k: v for k, v in value.items() if k in own}, key)
     if math.isnan(board.heading_rad) and "heading_rad" not in value:
@@ -195,18 +195,18 @@ def _board(value: dict[str, Any], key: str, folder: Path) -> PlacedBoard:
     return replace(board, face=face)
 
 
-def _check_face(face: Dots | Charuco | Picture, key: str) -> None:
+def _check_face(face: PlacedDots | PlacedCharuco | PlacedPicture, key: str) -> None:
     """What two values of a face must be to each other."""
-    if isinstance(face, Dots) and not face.dot_diameter_m < face.spacing_m:
+    if isinstance(face, PlacedDots) and not face.dot_diameter_m < face.spacing_m:
         raise BadOptions(
             f"{key}.dot_diameter_m is {face.dot_diameter_m!r}, expected less than spacing_m, "
             f"{face.spacing_m!r}"
         )
-    if isinstance(face, Dots) and not face.margin_m >= face.dot_diameter_m / 2:
+    if isinstance(face, PlacedDots) and not face.margin_m >= face.dot_diameter_m / 2:
         raise BadOptions(
             f"{key}.margin_m is {face.margin_m!r}, expected half a dot at least, {face.dot_diameter_m / 2:g}"
         )
-    if isinstance(face, Charuco):
+    if isinstance(face, PlacedCharuco):
         if not face.marker_m < face.square_m:
             raise BadOptions(
                 f"{key}.marker_m is {face.marker_m!r}, expected less than square_m, {face.square_m!r}"
@@ -223,7 +223,7 @@ def _check_face(face: Dots | Charuco | Picture, key: str) -> None:
             )
 
 
-def _with_digest(face: Picture, key: str, folder: Path) -> Picture:
+def _with_digest(face: PlacedPicture, key: str, folder: Path) -> PlacedPicture:
     """The picture's whole path, size, and a digest of its bytes, so that a changed file is another scene."""
     if not face.picture:
         raise BadOptions(f"{key} has no picture; the name of a PNG or JPEG file is expected")

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions
-from drivers.sim.kept import is_compiled, kernels
+from drivers.sim.kept import kernels
 from drivers.sim.optics.readout import Noise
 from drivers.sim.scene import Scene, tiny_scene
 
@@ -35,8 +35,6 @@ BLOCK_PX = 4  # ...and then more closely
 NODES = 24
 CHECKS = 41
 MOST_APART = 1e-9  # a thousandth of float32's rounding of a direction
-
-__all__ = ["Renderer", "Stills", "compile_drawing", "compile_renderer", "is_compiled"]
 
 TABLES_KEPT = 24  # of six cameras: their own, one for motion and one for metering
 STILLS_KEPT = 12
@@ -327,7 +325,8 @@ def compile_drawing() -> None:
 def compile_renderer() -> None:
     """Compile what building a scene and drawing it need, or load it from the disk cache.
 
-    Say before calling this what is being waited for, if ``is_compiled()`` is false: some twenty seconds.
+    Say before calling this what is being waited for, if `drivers.sim.kept.is_compiled` is false: some twenty
+    seconds.
 
     Raises
     ------

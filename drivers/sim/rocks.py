@@ -25,11 +25,14 @@ CUTS = 13
 FACES = """0 11 5  0 5 1  0 1 7  0 7 10  0 10 11  1 5 9  5 11 4  11 10 2  10 7 6  7 1 8
     3 9 4  3 4 2  3 2 6  3 6 8  3 8 9  4 9 5  2 4 11  6 2 10  8 6 7  9 8 1"""  # corners of the icosahedron
 
-SIZE_M = (0.39, 0.19, 0.19)  # a common building block
-SUNK_M = 0.02
-RINGS_M = ((1.55, 2.0, 0.75), (5.8, 6.4, 0.9))  # nearest, farthest, azimuth to either side; bricks take turns
-APART_M = 0.05
-TONE = 1.15
+BRICK_SIZE_M = (0.39, 0.19, 0.19)  # a common building block
+BRICK_SUNK_M = 0.02
+BRICK_RINGS_M = (
+    (1.55, 2.0, 0.75),
+    (5.8, 6.4, 0.9),
+)  # nearest, farthest, azimuth to either side; bricks take turns
+BRICKS_APART_M = 0.05
+BRICK_TONE = 1.15
 # Corners 0 to 3 go round the top, 4 to 7 lie under them; each face in the sense of outward normals.
 _SIDES = ((0, 4, 5, 1), (1, 5, 6, 2), (2, 6, 7, 3), (3, 7, 4, 0))
 _TOP, _BOTTOM = (0, 1, 2, 3), (4, 7, 6, 5)
@@ -183,14 +186,14 @@ def make_brick(
     y_m: float,
     turn_rad: float,
     ground_z_m: Callable[[float, float], float],
-    size_m: tuple[float, float, float] = SIZE_M,
+    size_m: tuple[float, float, float] = BRICK_SIZE_M,
 ) -> Brick:
     """Return a brick (length, width, height) about (x, y), its length turned from north to east."""
     length, width, height = size_m
     flat = 0.5 * np.array([[length, width], [length, -width], [-length, -width], [-length, width]])
     cos, sin = np.cos(turn_rad), np.sin(turn_rad)
     around = flat @ np.array([[cos, sin], [-sin, cos]]) + [x_m, y_m]
-    bottom = max(float(ground_z_m(x, y)) for x, y in around) + SUNK_M
+    bottom = max(float(ground_z_m(x, y)) for x, y in around) + BRICK_SUNK_M
     top = np.column_stack([around, np.full(4, bottom - height)])
     return Brick(np.concatenate([top, top + np.array([0.0, 0.0, height])]))
 
@@ -202,15 +205,15 @@ def scattered(
 
     ``taken_m`` (n, 4) are balls (centre, radius) that keep their place.
     """
-    reach = 0.5 * float(np.hypot(*SIZE_M[:2]))
+    reach = 0.5 * float(np.hypot(*BRICK_SIZE_M[:2]))
     taken = [(float(x), float(y), float(r)) for x, y, _, r in taken_m]
     found: list[Brick] = []
     for index in range(count):
-        nearest, farthest, azimuth = RINGS_M[index % len(RINGS_M)]
+        nearest, farthest, azimuth = BRICK_RINGS_M[index % len(BRICK_RINGS_M)]
         for _ in range(300):
             distance, bearing = rng.uniform(nearest, farthest), rng.uniform(-azimuth, azimuth)
             x, y = distance * np.cos(bearing), distance * np.sin(bearing)
-            if all(np.hypot(x - a, y - b) > reach + r + APART_M for a, b, r in taken):
+            if all(np.hypot(x - a, y - b) > reach + r + BRICKS_APART_M for a, b, r in taken):
                 found.append(make_brick(x, y, rng.uniform(0.0, np.pi), ground_z_m))
                 taken.append((x, y, reach))
                 break
@@ -224,7 +227,7 @@ def meshes(bricks: Sequence[Brick]) -> Any:
     across = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
     across /= np.linalg.norm(across, axis=-1, keepdims=True)
     normals = np.repeat(across[:, :, None], 3, axis=2).astype(np.float32)
-    tones = np.full(len(bricks), TONE, dtype=np.float32)
+    tones = np.full(len(bricks), BRICK_TONE, dtype=np.float32)
     return kernels().Rocks(
         spheres(corners), *(boxes(corners, 4**level) for level in (3, 2, 1)), corners, normals, tones,
         np.full(len(bricks), kernels().NOTHING),

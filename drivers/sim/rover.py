@@ -33,7 +33,7 @@ from drivers.sim.bench_boards import BenchBoard, BenchBoards, checked, facing
 from drivers.sim.camera_settings import ClockSettings, check_cameras
 from drivers.sim.cameras import SelfExposedCamera, SimulatedCamera
 from drivers.sim.heads import with_joints
-from drivers.sim.optics.lens import Lens
+from drivers.sim.optics.lens import SimulatedLens
 from drivers.sim.optics.shutter import Shutter
 from drivers.sim.outside_scene import OutsideRenderer, outside_scene
 from drivers.sim.pan_tilt import SimulatedPanTilt, WiredHead
@@ -149,7 +149,7 @@ class SimulatedRover:
         start_s = self._start_s = clock.now_s()
         self._right_eyes = {right for _, right in self.rig.stereo.values()}
         self._lenses = {
-            name: Lens(settings.camera.lens, camera.model, name, settings.camera.seed, self._cast)
+            name: SimulatedLens(settings.camera.lens, camera.model, name, settings.camera.seed, self._cast)
             for name, camera in self.rig.cameras.items()
         }
         self._through_lens: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}

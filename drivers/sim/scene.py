@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from calib.geometry.rigid import Rigid, rot_x, rot_y, rot_z
 from drivers.errors import BadOptions
 from drivers.sim import boards, ground, rocks
-from drivers.sim.boards import Board
+from drivers.sim.boards import SceneBoard
 from drivers.sim.ground import OwnTerrain
 from drivers.sim.kept import kernels
 from drivers.sim.placed import (
@@ -112,7 +112,7 @@ class Scene:
         self.settings = settings
         self.world = world
         self.bricks = bricks
-        self.boards: tuple[Board, ...] = tuple(
+        self.boards: tuple[SceneBoard, ...] = tuple(
             boards.standing(board, self.ground_z_m) for board in settings.boards
         )
 

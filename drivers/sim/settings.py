@@ -52,7 +52,7 @@ class SimulationSettings:
     clocks
         By camera's name: when it exposes and what its stamps are worth; those of no entry are one and true.
     speed
-        Of the clock that the rover is told to live on (`drivers.known.clock_for`); infinite: ``max``.
+        Of the clock that the rover is told to live on (`drivers.hardware.clock_for`); infinite: ``max``.
     """
 
     rover: Path

@@ -38,7 +38,7 @@ _TYPE_WORDS = {
 
 
 @dataclass(frozen=True)
-class Control:
+class CameraControl:
     """One control as the driver describes it.
 
     Attributes
@@ -68,16 +68,16 @@ class Control:
 
 
 @dataclass(frozen=True)
-class Problem:
+class ControlProblem:
     """A control that is not as it was asked for, in one plain sentence."""
 
     control: str
     message: str
 
 
-def list_controls(node: Node) -> list[Control]:
+def list_controls(node: Node) -> list[CameraControl]:
     """Return all controls of a camera; unknown types and compound ones are listed too, not tripped over."""
-    found: list[Control] = []
+    found: list[CameraControl] = []
     last_id = 0
     for _ in range(_MOST_CONTROLS):
         query = abi.QueryExtCtrl(id=last_id | abi.CTRL_FLAG_NEXT_CTRL)
@@ -93,7 +93,7 @@ def list_controls(node: Node) -> list[Control]:
     return found
 
 
-def get_value(node: Node, control: Control) -> int | None:
+def get_value(node: Node, control: CameraControl) -> int | None:
     """Return a control's value now, None if it has none that can be read."""
     if control.kind in ("button", "string") or control.kind.startswith("type "):
         return None
@@ -105,27 +105,31 @@ def get_value(node: Node, control: Control) -> int | None:
     return int(entry.u.value) & 0xFFFFFFFF if control.kind == "bitmask" else int(entry.u.value)
 
 
-def set_value(node: Node, control: Control, value: Value) -> Problem | None:
+def set_value(node: Node, control: CameraControl, value: Value) -> ControlProblem | None:
     """Set a control and read it back; return what did not go as asked."""
     number = _number(control, value)
     if isinstance(number, str):
-        return Problem(control.name, number)
+        return ControlProblem(control.name, number)
     if not control.settable:
-        return Problem(control.name, f"{control.name} cannot be set: it is a {control.kind} to read only")
+        return ControlProblem(
+            control.name, f"{control.name} cannot be set: it is a {control.kind} to read only"
+        )
     entry = abi.ExtControl(id=control.id)
     if control.kind == "integer64":
         entry.u.value64 = number
     else:
         entry.u.value = ctypes.c_int32(number).value
     if refused := _exchange(node, abi.VIDIOC_S_EXT_CTRLS, entry):
-        return Problem(control.name, f"{control.name} does not take {value!r}: {refused}")
+        return ControlProblem(control.name, f"{control.name} does not take {value!r}: {refused}")
     became = get_value(node, control)
     if became is not None and became != number:
-        return Problem(control.name, f"{control.name} is {became} where {number} was set{_range(control)}")
+        return ControlProblem(
+            control.name, f"{control.name} is {became} where {number} was set{_range(control)}"
+        )
     return None
 
 
-def set_by_name(node: Node, wanted: Mapping[str, Value]) -> list[Problem]:
+def set_by_name(node: Node, wanted: Mapping[str, Value]) -> list[ControlProblem]:
     """Set controls by name, in the order given; return a problem for each that is missing or refuses."""
     known = {control.name: control for control in list_controls(node)}
     problems = []
@@ -134,13 +138,13 @@ def set_by_name(node: Node, wanted: Mapping[str, Value]) -> list[Problem]:
         if control is None:
             near = difflib.get_close_matches(plain_name(name), known, n=1)
             hint = f"did you mean {near[0]!r}?" if near else "mastctl camera check lists what it has"
-            problems.append(Problem(name, f"the camera has no control {name!r}; {hint}"))
+            problems.append(ControlProblem(name, f"the camera has no control {name!r}; {hint}"))
         elif problem := set_value(node, control, value):
             problems.append(problem)
     return problems
 
 
-def first_of(controls: Sequence[Control], ids: Sequence[int]) -> Control | None:
+def first_of(controls: Sequence[CameraControl], ids: Sequence[int]) -> CameraControl | None:
     """Return the first control that the camera has of several ids that mean the same."""
     by_id = {control.id: control for control in controls}
     return next((by_id[i] for i in ids if i in by_id), None)
@@ -151,7 +155,7 @@ def plain_name(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
 
 
-def _control(node: Node, query: abi.QueryExtCtrl) -> Control:
+def _control(node: Node, query: abi.QueryExtCtrl) -> CameraControl:
     kind = _TYPE_WORDS.get(query.type, f"type {query.type}")
     if query.flags & abi.CTRL_FLAG_HAS_PAYLOAD and kind != "string":
         kind = f"type {query.type}"
@@ -161,7 +165,7 @@ def _control(node: Node, query: abi.QueryExtCtrl) -> Control:
     )
     name = plain_name(query.name.decode(errors="replace"))
     bounds = (query.minimum, query.maximum, query.step, query.default_value)
-    return Control(query.id, name, kind, *bounds, settable, menu)
+    return CameraControl(query.id, name, kind, *bounds, settable, menu)
 
 
 def _menu(node: Node, query: abi.QueryExtCtrl) -> dict[int, str]:
@@ -178,7 +182,7 @@ def _menu(node: Node, query: abi.QueryExtCtrl) -> dict[int, str]:
     return entries
 
 
-def _number(control: Control, value: Value) -> int | str:
+def _number(control: CameraControl, value: Value) -> int | str:
     """The number for a value as people write it, or a sentence on why there is none."""
     if isinstance(value, str):
         for index, word in control.menu.items():
@@ -192,7 +196,7 @@ def _number(control: Control, value: Value) -> int | str:
     return number
 
 
-def _range(control: Control) -> str:
+def _range(control: CameraControl) -> str:
     return f" ({control.minimum} to {control.maximum}, step {control.step})"
 
 

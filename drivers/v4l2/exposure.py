@@ -21,7 +21,7 @@ MOST_STEP = 4.0  # no change by more than this factor at once: levels far from t
 
 
 @dataclass(frozen=True)
-class ExposureSettings:
+class AutoExposureSettings:
     """What the automatic exposure aims at.
 
     Attributes
@@ -59,7 +59,7 @@ class ExposureControl:
         The exposure time to begin with, seconds.
     """
 
-    def __init__(self, settings: ExposureSettings, exposure_s: float) -> None:
+    def __init__(self, settings: AutoExposureSettings, exposure_s: float) -> None:
         self._settings = settings
         self._exposure_s = exposure_s
         self._members: set[str] = set()
@@ -138,7 +138,7 @@ class _Group:
     """The control that cameras share, and what it was made with by the first of them."""
 
     control: ExposureControl
-    settings: ExposureSettings
+    settings: AutoExposureSettings
     exposure_s: float
     maker: str
     users: int = 0
@@ -151,7 +151,7 @@ class _Groups:
         self._known: dict[str, _Group] = {}
         self._lock = threading.Lock()
 
-    def join(self, camera: str, settings: ExposureSettings, exposure_s: float) -> ExposureControl:
+    def join(self, camera: str, settings: AutoExposureSettings, exposure_s: float) -> ExposureControl:
         """Return the control of a group, made by its first camera; a camera without group has its own.
 
         Raises
@@ -172,7 +172,7 @@ class _Groups:
             group.control.join(camera)
             return group.control
 
-    def leave(self, camera: str, settings: ExposureSettings) -> None:
+    def leave(self, camera: str, settings: AutoExposureSettings) -> None:
         """Let go of a group; the last one out forgets it."""
         with self._lock:
             if (group := self._known.get(settings.group)) is not None:
@@ -182,9 +182,9 @@ class _Groups:
                     del self._known[settings.group]
 
 
-def _check_same(camera: str, group: _Group, settings: ExposureSettings, exposure_s: float) -> None:
+def _check_same(camera: str, group: _Group, settings: AutoExposureSettings, exposure_s: float) -> None:
     """Refuse settings that differ from a group's. Raises BadOptions."""
-    options = [(f"auto_exposure.{f.name}", f.name) for f in fields(ExposureSettings) if f.name != "group"]
+    options = [(f"auto_exposure.{f.name}", f.name) for f in fields(AutoExposureSettings) if f.name != "group"]
     here = {option: getattr(settings, name) for option, name in options} | {"exposure_s": exposure_s}
     there = {option: getattr(group.settings, name) for option, name in options}
     for option, value in (there | {"exposure_s": group.exposure_s}).items():

@@ -48,7 +48,7 @@ class Address:
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundCamera:
     """One connected camera: its node now, its names, and its stable links."""
 
     node: Path
@@ -97,7 +97,7 @@ def open_node(address: Address, name: str) -> Node:
     raise NoCamera(f"no camera matches {address}; connected are {_connected()}", device=name)
 
 
-def list_cameras() -> list[Found]:
+def list_cameras() -> list[FoundCamera]:
     """Return the cameras that are connected and may be opened, in the kernel's order."""
     found = []
     for path in capture_nodes():
@@ -106,7 +106,7 @@ def list_cameras() -> list[Found]:
                 who = node.identity
         except DriverError:
             continue  # an output, a metadata node, or one of somebody else's
-        found.append(Found(path, who.driver, who.card, who.bus, tuple(stable_links(path))))
+        found.append(FoundCamera(path, who.driver, who.card, who.bus, tuple(stable_links(path))))
     return found
 
 

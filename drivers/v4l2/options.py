@@ -10,7 +10,7 @@ from typing import Any
 from drivers.faults import nearest
 from drivers.options import OptionReader, is_whole
 from drivers.v4l2.controls import Value
-from drivers.v4l2.exposure import ExposureSettings
+from drivers.v4l2.exposure import AutoExposureSettings
 from drivers.v4l2.find import Address, check_address
 from drivers.v4l2.pixels import FORMATS
 
@@ -58,7 +58,7 @@ class CameraOptions:
     gain: int | None = None
     white_balance_k: int | None = None
     focus: int | None = None
-    auto_exposure: ExposureSettings | None = None
+    auto_exposure: AutoExposureSettings | None = None
     margin_s: float = 0.002
     trigger: str = ""
     buffers: int = 16
@@ -118,18 +118,18 @@ def _check_in_frame(read: OptionReader, key: str, exposure_s: float | None, rate
         )
 
 
-def _auto_exposure(options: OptionReader, rate_hz: float | None) -> ExposureSettings | None:
+def _auto_exposure(options: OptionReader, rate_hz: float | None) -> AutoExposureSettings | None:
     """The section ``auto_exposure``: true, or its settings."""
     value = options.values.get("auto_exposure", False)
     if value is False:
         return None
-    default = ExposureSettings()
+    default = AutoExposureSettings()
     if rate_hz is not None:
         default = replace(default, longest_s=min(default.longest_s, 1 / rate_hz))
     if value is True:
         return default
     read = options.section("auto_exposure", "true, false or its settings", AUTO_EXPOSURE_OPTIONS)
-    settings = ExposureSettings(
+    settings = AutoExposureSettings(
         group=read.text("group", "a text", default.group),
         percentile=read.number("percentile", default.percentile, 1.0, 99.9),
         target=read.number("target", default.target, 10.0, 245.0),

@@ -7,7 +7,15 @@ from collections.abc import Sequence
 
 from drivers.clock import Clock
 from drivers.v4l2 import abi, find
-from drivers.v4l2.controls import Control, Problem, first_of, get_value, list_controls, set_by_name, set_value
+from drivers.v4l2.controls import (
+    CameraControl,
+    ControlProblem,
+    first_of,
+    get_value,
+    list_controls,
+    set_by_name,
+    set_value,
+)
 from drivers.v4l2.node import Node, PictureFormat, UnsupportedFormat
 from drivers.v4l2.options import CameraOptions
 from drivers.v4l2.pixels import FORMATS
@@ -59,9 +67,9 @@ class Stream:
         self._clock = clock
         self.exposure_s: float | None = None
         self.asked_exposure_s: float | None = None
-        self.problems: list[Problem] = []
+        self.problems: list[ControlProblem] = []
         self.exposures = ExposuresSet(None)
-        self._exposure: Control | None = None
+        self._exposure: CameraControl | None = None
         self._automatic_stays = False
         self.node = find.open_node(options.address, name)
         try:
@@ -139,7 +147,7 @@ class Stream:
         for problem in self.problems:
             log.warning("%s: %s", self._name, problem.message)
 
-    def _turn_off(self, controls: Sequence[Control], which: int, value: int) -> bool:
+    def _turn_off(self, controls: Sequence[CameraControl], which: int, value: int) -> bool:
         """Turn an automatic off, where the camera has one; return whether none stays on."""
         if (control := first_of(controls, (which,))) and (problem := set_value(self.node, control, value)):
             self.problems.append(problem)
@@ -147,7 +155,9 @@ class Stream:
         return True
 
     def _missing(self, word: str, option: str) -> None:
-        self.problems.append(Problem(option, f"the camera has no control for {word}; it stays as it is"))
+        self.problems.append(
+            ControlProblem(option, f"the camera has no control for {word}; it stays as it is")
+        )
 
 
 def set_format(node: Node, code: str, size_px: tuple[int, int], name: str) -> PictureFormat:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from drivers.absence import Absence
+from drivers.absent import Absence
 from drivers.dynamixel.servo import Reboots
 from drivers.errors import BadOptions, LineLost
 from drivers.options import OptionReader

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.known import HEADS
+from drivers.hardware import HEADS
 from mastctl.cli.main import main
 from mastctl.conform.devices import COUNTS
 from tools.campaigns.servo_rigs import LIMITS_RAD, RIGS

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from drivers.camera_offset import corrected
+from drivers.frame_times import corrected
 from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.interfaces import Camera, Frame, FrameTime, HoldsExposure, KnowsSize, Paced, Reading
 from drivers.open_hardware import open_hardware

@@ -18,11 +18,12 @@ from calib.files.mast_file import load_rig
 from calib.geometry.pointing import solve
 from drivers.clock import SystemClock
 from drivers.errors import BadOptions, NoFreshFrame, NoReply
-from drivers.hardware import DeviceSettings, Hardware, HardwareSettings
+from drivers.hardware import DeviceSettings, Hardware, HardwareSettings, installed_drivers
 from drivers.interfaces import Camera, Frame, PanTilt
 from drivers.open_hardware import open_hardware
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
+from mastctl.doctor.host import examine_drivers
 from mastctl.motion.loop import AnglesTarget, PixelTarget, PointingError, PointingLoop, PointRequest, Step
 
 TOO_NEW_S = 1.5
@@ -38,7 +39,7 @@ def mast_file(repository: Path) -> Path:
 
 @pytest.fixture
 def hardware(installed: Path, mast_file: Path) -> Iterator[Hardware]:
-    camera = "bench_rig.camera:open_camera"
+    camera = "bench_rig"  # as the package names it
     cameras = {
         name: DeviceSettings(camera, {"mast_file": str(mast_file), "name": name})
         for name in ("navcam_left", "navcam_right")
@@ -214,6 +215,35 @@ def test_options_it_refuses_are_told_in_its_own_words(installed: Path) -> None:
     head = DeviceSettings("bench_rig.head:open_head", {"speed_rad_per_s": -1})
     with pytest.raises(BadOptions, match="bench head: speed_rad_per_s is -1, expected above 0"):
         open_hardware(HardwareSettings(head, {}))
+
+
+def test_drivers_of_installed_packages_are_found_by_their_names(installed: Path) -> None:
+    with open_hardware(HardwareSettings(DeviceSettings("bench_rig"), {})) as hardware:
+        assert Path(str(sys.modules[type(hardware.pan_tilt).__module__].__file__)).is_relative_to(installed)
+    with pytest.raises(BadOptions, match=r"no driver 'bench_rib'; did you mean 'bench_rig'"):
+        open_hardware(HardwareSettings(DeviceSettings("bench_rib"), {}))
+
+
+def test_a_name_that_packages_quarrel_about_is_refused_and_told_by_the_doctor(
+    installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info = tmp_path / "other_rig-2.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-rig\nVersion: 2.0\n")
+    (info / "entry_points.txt").write_text(
+        "[mastctl.heads]\nbench_rig = other:head\ndynamixel = other:head\n"
+        "[mastctl.cameras]\neye = other:eye\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(BadOptions, match=r"bench-rig 1\.0 and other-rig 2\.0 both offer"):
+        open_hardware(HardwareSettings(DeviceSettings("bench_rig"), {}))
+    with pytest.raises(BadOptions, match=r"driver 'eye' of other-rig 2\.0 is for a camera, not for a head"):
+        open_hardware(HardwareSettings(DeviceSettings("eye"), {}))
+    listed = [(one.what, one.level, one.sentence) for one in examine_drivers(installed_drivers())]
+    assert ("driver eye", "good", "for a camera: other:eye of other-rig 2.0") in listed
+    assert [level for what, level, words in listed if what == "driver bench_rig"] == ["unsure"] * 2 + ["good"]
+    (own,) = (words for what, level, words in listed if what == "driver dynamixel" and level == "unsure")
+    assert own.endswith("mastctl's own driver of this name is used instead")
 
 
 def test_the_head_of_the_page_comes_to_rest_at_every_goal(installed: Path) -> None:

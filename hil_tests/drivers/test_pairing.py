@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from drivers.frame_times import Offset, Pairing, learned, learned_from
 from drivers.interfaces import FrameTime, Paced
-from drivers.pairing import Offset, Pairing, learned, learned_from
 
 PERIOD_S = 0.040
 

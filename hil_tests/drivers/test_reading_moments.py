@@ -9,8 +9,8 @@ from typing import Any, cast
 import pytest
 
 from drivers.dynamixel import session
-from drivers.dynamixel.motion import Sample
-from drivers.flir_ptu.axis import Seen, StepAxis
+from drivers.dynamixel.motion import ServoSample
+from drivers.flir_ptu.axis import SeenPosition, StepAxis
 from drivers.flir_ptu.conversation import Conversation
 from drivers.flir_ptu.unit import measure
 
@@ -28,9 +28,9 @@ class TurnedClock:
 class Motion:
     """Keeps a sample; has long arrived."""
 
-    sample: Sample | None = None
+    sample: ServoSample | None = None
 
-    def take(self, sample: Sample) -> None:
+    def take(self, sample: ServoSample) -> None:
         self.sample = sample
 
     def settled(self, now_s: float) -> bool:
@@ -42,8 +42,8 @@ def test_servos_are_read_in_the_middle_of_their_exchange_whatever_was_done_since
 ) -> None:
     """Asked from 99.90 to 99.96 s, so measured at 99.93 s; told at 100 s, or 5000 s of the stamps."""
     samples = [
-        Sample({"present_position": 10}, False, 99.90, 99.94),
-        Sample({"present_position": 20}, False, 99.92, 99.96),
+        ServoSample({"present_position": 10}, False, 99.90, 99.94),
+        ServoSample({"present_position": 20}, False, 99.92, 99.96),
     ]
     axes = [
         SimpleNamespace(
@@ -59,7 +59,7 @@ def test_servos_are_read_in_the_middle_of_their_exchange_whatever_was_done_since
     line = SimpleNamespace(clock=TurnedClock(100.0))
     pair: Any = SimpleNamespace(axes=axes, samples=lambda: samples, link=line)
     head: Any = SimpleNamespace(poll_hz=10.0, resting_poll_s=0.1, watchdog_counts=0)
-    it = session.Session(pair, head, TurnedClock(5000.0), cast(Any, None))
+    it = session.ServoSession(pair, head, TurnedClock(5000.0), cast(Any, None))
     reading = it.read()
     assert (reading.pan_rad, reading.tilt_rad) == (0.1, 0.2)
     assert reading.time_s == pytest.approx(5000.0 - 0.07)
@@ -71,14 +71,14 @@ class RestingAxis:
     """Rests wherever it is seen."""
 
     name: str
-    taken: list[Seen] = field(default_factory=list)
+    taken: list[SeenPosition] = field(default_factory=list)
 
     __hash__ = object.__hash__
 
-    def rests_at(self, seen: Seen) -> bool:
+    def rests_at(self, seen: SeenPosition) -> bool:
         return True
 
-    def take(self, seen: Seen) -> None:
+    def take(self, seen: SeenPosition) -> None:
         self.taken.append(seen)
 
 

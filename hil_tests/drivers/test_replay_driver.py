@@ -12,7 +12,7 @@ import pytest
 from drivers.clock import ManualClock
 from drivers.errors import BadFrame, BadOptions, NoFreshFrame
 from drivers.interfaces import Camera, PanTilt
-from drivers.replay import NoRecording, Replay, open_replay
+from drivers.recordings.replay import NoRecording, Replay, open_replay
 
 ANGLES = [(0.1, -0.2), (0.5, -0.2), (1.0, 0.1)]
 

@@ -14,10 +14,9 @@ from dataclasses import replace
 import pytest
 
 from drivers import simulation_clock
-from drivers.clock import SystemClock, Turn
+from drivers.clock import ClockLock, SystemClock
 from drivers.errors import BadOptions
-from drivers.hardware import DeviceSettings, HardwareSettings
-from drivers.known import clock_for
+from drivers.hardware import DeviceSettings, HardwareSettings, clock_for
 from drivers.simulation_clock import SimulationClock
 
 LONG_S = 20.0
@@ -301,7 +300,7 @@ def test_a_simulated_wire_follows_it() -> None:
 
 def test_a_turn_is_kept_while_its_thread_waits_on_the_clock_and_may_be_taken_twice() -> None:
     clock = SimulationClock()
-    turn, order = Turn(clock), []
+    turn, order = ClockLock(clock), []
 
     def works(name: str) -> None:
         with turn, turn:

@@ -15,7 +15,7 @@ from calib.matching.warp import Plane, grey
 from drivers.clock import ManualClock
 from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.open_hardware import open_hardware
-from drivers.replay import NoRecording
+from drivers.recordings.replay import NoRecording
 
 FOUND_PX = 3.0
 SOLVED_RAD = 5e-6

@@ -19,8 +19,8 @@ from drivers import options as driver_options
 from drivers.dynamixel import settings as dynamixel
 from drivers.errors import BadOptions
 from drivers.flir_ptu import options as flir_ptu
-from drivers.known import CAMERAS, HEADS, OURS
-from drivers.replay import OPTIONS as REPLAY_OPTIONS
+from drivers.hardware import CAMERAS, HEADS, OURS
+from drivers.recordings.replay import OPTIONS as REPLAY_OPTIONS
 from drivers.sim import settings as simulation
 from drivers.sim.camera_settings import TemperatureSettings
 from drivers.sim.cameras import CameraSettings

@@ -15,8 +15,8 @@ import pytest
 from drivers import interfaces
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
+from drivers.hardware import BUILT_IN
 from drivers.interfaces import Frame, Reading
-from drivers.known import BUILT_IN
 from hil_tests.mastctl.service_fakes import FakeHardware, Hang, rig
 from hil_tests.waiting import until
 from mastctl.devices import devices as devices_module

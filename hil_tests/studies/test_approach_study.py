@@ -205,7 +205,7 @@ def test_a_target_is_on_a_rock_and_not_at_its_boundary(standing: Callable[..., A
     """The front of a brick 10 m ahead, 39 cm across and 17 cm out of the ground."""
     brick = rocks.make_brick(START_M, 0.0, math.pi / 2, lambda x, y: 0.0)
     world = standing(rocks=rocks.meshes([brick]))
-    front = START_M - rocks.SIZE_M[1] / 2
+    front = START_M - rocks.BRICK_SIZE_M[1] / 2
     camera = "pancam_left"
     angles = solve(
         world.true.mast,

@@ -26,8 +26,14 @@ from calib.geometry.rig import UNKNOWN, Approach, Rig
 from calib.geometry.rigid import FloatArray, tangents
 from calib.matching.warp import grey
 from drivers.errors import BadOptions
-from drivers.recorded_frames import SUFFIX, McapFrame, read_recording
-from drivers.recording import Pointing, read_folder, read_products
+from drivers.recordings.frames import (
+    SUFFIX,
+    McapFrame,
+    RecordedPointing,
+    read_folder,
+    read_products,
+    read_recording,
+)
 from mastctl.calibration.mast_file import rounded_matrix
 from mastctl.calibration.run import save_new
 
@@ -94,7 +100,7 @@ def scene_views(rig: Rig, record: Path, camera: str | None = None) -> list[Scene
     return views
 
 
-def _other_mast(mast: StoredRig, pointings: Sequence[Pointing]) -> int:
+def _other_mast(mast: StoredRig, pointings: Sequence[RecordedPointing]) -> int:
     """How many pictures were taken while another mast file was in use, where the record says."""
     frames = [frame for pointing in pointings for frame in pointing.frames.values()]
     told = [frame.facts.get("mast_digest") for frame in frames if isinstance(frame, McapFrame)]
@@ -108,7 +114,7 @@ def _approach(frame: object) -> Approach:
     return pan, tilt
 
 
-def _pointings(rig: Rig, record: Path, camera: str | None) -> Sequence[Pointing]:
+def _pointings(rig: Rig, record: Path, camera: str | None) -> Sequence[RecordedPointing]:
     """Where the head rested, and what its cameras took there."""
     if record.is_dir():
         if (record / CSV_NAME).is_file():

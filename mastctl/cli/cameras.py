@@ -149,7 +149,7 @@ def camera_focus(args: argparse.Namespace) -> int:
 
 def _configured_frame(args: argparse.Namespace) -> StampedFrame:
     """One fresh frame of a configured camera (of any driver) with the joint angles of its moment."""
-    from drivers.absent_camera import AbsentCamera
+    from drivers.absent import AbsentCamera
     from drivers.clock import SystemClock
     from mastctl.devices.opening import devices_beside
     from mastctl.service.mast_in_use import bounds_of

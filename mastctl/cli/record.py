@@ -125,7 +125,7 @@ def _state(recording: Recording) -> str:
 
 
 def _repair(args: argparse.Namespace) -> int:
-    from drivers.recorded_frames import recording_files
+    from drivers.recordings.frames import recording_files
     from mastctl.recorder.repair import repair
 
     out = args.out or args.file.with_name(f"{args.file.stem}.repaired.mcap")

@@ -68,8 +68,7 @@ def run(args: argparse.Namespace) -> int:
     """Write the folder and tell what is in it."""
     import numpy as np
 
-    from drivers.hardware import DeviceSettings, HardwareSettings
-    from drivers.known import clock_for
+    from drivers.hardware import DeviceSettings, HardwareSettings, clock_for
     from drivers.sim.heads import head_settings
     from drivers.sim.pan_tilt import DEFAULT_HEADS, check_head
     from mastctl.new_rig.folder import boards_about, check_empty, write_built, write_twin

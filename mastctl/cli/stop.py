@@ -137,7 +137,7 @@ def _sockets(args: argparse.Namespace) -> Iterator[list[Path]]:
         else:
             yield sockets_of(None, config, loaded.listen.url)
             yield sockets_of(usual_folder(config, loaded.listen.url), None, None)
-    from drivers.known import head_name  # only where nobody answered yet: a stop is quick
+    from drivers.hardware import head_name  # only where nobody answered yet: a stop is quick
     from mastctl.safety.heads import head_folders
 
     with contextlib.suppress(BadFile):  # whoever drives this head, by whatever configuration

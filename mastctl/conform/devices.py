@@ -13,10 +13,10 @@ from typing import Any
 from drivers.clock import SystemClock
 from drivers.errors import BadOptions, DriverError
 from drivers.faults import PAN_TILT
+from drivers.hardware import CAMERAS as CAMERA_DRIVERS
+from drivers.hardware import HEADS as HEAD_DRIVERS
 from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.interfaces import Camera
-from drivers.known import CAMERAS as CAMERA_DRIVERS
-from drivers.known import HEADS as HEAD_DRIVERS
 from mastctl.conform.camera_checks import CAMERAS, CameraTrial
 from mastctl.conform.checks import (
     Check,

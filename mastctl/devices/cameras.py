@@ -18,11 +18,11 @@ from functools import partial
 import numpy as np
 
 from calib.geometry.rig import Rig
-from drivers.absent_camera import AbsentCamera
+from drivers.absent import AbsentCamera
 from drivers.clock import Clock, SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame
+from drivers.frame_times import Offset, Pairing, learned
 from drivers.interfaces import Camera, Frame, FrameTime, KnowsSize, Paced, Reading
-from drivers.pairing import Offset, Pairing, learned
 from mastctl.devices import frames as frame_checks
 from mastctl.devices.exposure_hold import ExposureHold
 from mastctl.devices.faults import FaultWords
@@ -114,8 +114,8 @@ class Cameras:
     ) -> dict[str, StampedFrame]:
         """Return one frame of each camera, asked for in parallel, with its facts; before any `glance`.
 
-        Frames of several cameras belong together (`drivers.pairing`): exposed at one trigger, or nearest in
-        time. Each serves one such set. All are ``moving`` if the head moved at any time from the first
+        Frames of several cameras belong together (`drivers.frame_times`): exposed at one trigger, or nearest
+        in time. Each serves one such set. All are ``moving`` if the head moved at any time from the first
         exposure to the end of the last.
 
         Parameters
@@ -505,7 +505,7 @@ class Cameras:
 
 @dataclass(frozen=True)
 class _Times:
-    """A camera's times as it told them: what `drivers.pairing.learned` asks for."""
+    """A camera's times as it told them: what `drivers.frame_times.learned` asks for."""
 
     period_s: float
     trigger: str

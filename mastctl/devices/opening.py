@@ -17,9 +17,8 @@ from types import SimpleNamespace
 
 from calib.files.mast_file import StoredRig
 from drivers.clock import Clock
-from drivers.hardware import Hardware, HardwareSettings, says_simulated
+from drivers.hardware import Hardware, HardwareSettings, head_name, says_simulated
 from drivers.interfaces import Camera, PanTilt, Reading
-from drivers.known import head_name
 from drivers.open_hardware import open_hardware
 from drivers.open_hardware import open_one_camera as open_one_camera
 from drivers.serial_line import stable_name

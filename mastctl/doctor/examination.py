@@ -9,11 +9,17 @@ from typing import Any
 
 from calib.errors import BadFile
 from drivers.errors import BadOptions
-from drivers.known import CAMERAS, HEADS, clock_for
+from drivers.hardware import CAMERAS, HEADS, OURS, clock_for, installed_drivers
 from mastctl.config import Config, load_config
 from mastctl.doctor.cameras import examine_camera
 from mastctl.doctor.findings import Finding, Level, Machine
-from mastctl.doctor.host import examine_clock, examine_descriptors, examine_folder, examine_kept
+from mastctl.doctor.host import (
+    examine_clock,
+    examine_descriptors,
+    examine_drivers,
+    examine_folder,
+    examine_kept,
+)
 from mastctl.doctor.mast_file import examine_mast_file
 from mastctl.doctor.serial_lines import examine_port
 from mastctl.safety.state_folder import usual_folder
@@ -51,6 +57,7 @@ def examine(path: str | None, asked: Asked, machine: Machine | None = None) -> I
     status = asked(config.listen.url)
     yield from _daemon(config, status)
     yield from _head(config, machine)
+    yield from examine_drivers(installed_drivers())
     for name, camera in config.hardware.cameras.items():
         if camera.driver in CAMERAS:
             yield examine_camera(name, camera.options, in_use=status is not None)
@@ -115,7 +122,7 @@ def _head(config: Config, machine: Machine) -> Iterator[Finding]:
     elif head.driver in HEADS:
         words = f"driver {head.driver} has no 'port' in its options"
         yield Finding("port", "bad", words, "name the serial device; docs/reference/configuration.md")
-    elif ":" in head.driver:
+    elif head.driver not in OURS:
         yield Finding("head", "unsure", f"{head.driver} is from outside; it is not looked at", "")
 
 

@@ -7,10 +7,11 @@ import os
 import resource
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
+from drivers.hardware import BUILT_IN, InstalledDriver
 from drivers.sim.kept import MOST_BYTES, kept_bytes, kept_home
 from mastctl.doctor.findings import Finding
 
@@ -71,6 +72,21 @@ def examine_folder(what: str, folder: Path) -> Iterator[Finding]:
         yield Finding(what, "unsure", told, "make room: what happened before a fault may not be recorded")
     else:
         yield Finding(what, "good", told)
+
+
+def examine_drivers(installed: Sequence[InstalledDriver]) -> Iterator[Finding]:
+    """List the drivers that installed packages offer, and those that cannot be meant by their name."""
+    names = [(one.kind, one.name) for one in installed]
+    for one in installed:
+        what, told = f"driver {one.name}", f"for a {one.kind}: {one.factory} of {one.package}"
+        if one.name in BUILT_IN:
+            words = f"{told}; mastctl's own driver of this name is used instead"
+            yield Finding(what, "unsure", words, f"name it {one.factory} in the configuration")
+        elif names.count((one.kind, one.name)) > 1:
+            words = f"{told}; another package offers one of this name"
+            yield Finding(what, "unsure", words, "uninstall one of them, or name the factory itself")
+        else:
+            yield Finding(what, "good", told)
 
 
 def examine_kept() -> Finding:

@@ -27,7 +27,7 @@ from calib.files.yaml_text import Section, kind_of
 from calib.geometry.handoff import Joints
 from calib.matching.handed_over import HandoffBias, Landed, MatchedHandoff
 from calib.matching.handoff import RefinedVerdict
-from drivers.mcap_file import BadRecording, is_mcap, read_messages
+from drivers.recordings.mcap_file import BadRecording, is_mcap, read_messages
 from mastctl.as_json import picked
 
 SCHEMA = "mastctl/handoff/1"

@@ -14,8 +14,8 @@ from mcap.records import Attachment, Metadata
 from calib.errors import BadFile
 from calib.files.mast_file import StoredRig, parse_rig
 from calib.files.yaml_text import parse_mapping
-from drivers.mcap_file import BadRecording, Entry, Found, read_items
-from drivers.recorded_frames import McapFrame, read_frames, recording_files
+from drivers.recordings.frames import McapFrame, read_frames, recording_files
+from drivers.recordings.mcap_file import BadRecording, McapContents, McapEntry, read_items
 from mastctl.recorder.writer import Attached
 
 log = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ class Recording:
 
     path: Path
     files: tuple[Path, ...]
-    found: tuple[Found, ...]
+    found: tuple[McapContents, ...]
     facts: Mapping[str, str]
     masts: Mapping[str, tuple[Attached, StoredRig]]
     config: Attached | None
@@ -117,7 +117,7 @@ class _Reader:
     """Gathers what the files hold."""
 
     def __init__(self) -> None:
-        self.found: list[Found] = []
+        self.found: list[McapContents] = []
         self.facts: dict[str, str] = {}
         self.masts: dict[str, tuple[Attached, StoredRig]] = {}
         self.config: Attached | None = None
@@ -125,14 +125,14 @@ class _Reader:
         self.handoffs: list[Mapping[str, Any]] = []
 
     def read(self, file: Path) -> None:
-        found = Found()
+        found = McapContents()
         self.found.append(found)
         for item in read_items(file, found):
             if isinstance(item, Metadata):
                 self.facts |= item.metadata
             elif isinstance(item, Attachment):
                 self._attached(file, Attached(item.name, bytes(item.data), item.media_type))
-            elif isinstance(item, Entry) and item.channel.topic in ("/operation", "/handoff"):
+            elif isinstance(item, McapEntry) and item.channel.topic in ("/operation", "/handoff"):
                 self._told(item)
 
     def _attached(self, file: Path, one: Attached) -> None:
@@ -148,7 +148,7 @@ class _Reader:
         except BadFile as error:
             log.warning("%s: an attached file cannot be used: %s", file, error)
 
-    def _told(self, item: Entry) -> None:
+    def _told(self, item: McapEntry) -> None:
         try:
             told = json.loads(item.message.data)
         except ValueError:

@@ -10,7 +10,7 @@ from pathlib import Path
 from mcap.records import Attachment, Header, Metadata
 from mcap.writer import CompressionType, Writer
 
-from drivers.mcap_file import BadRecording, Entry, Found, read_items
+from drivers.recordings.mcap_file import BadRecording, McapContents, McapEntry, read_items
 from mastctl.recorder.writer import CHUNK_BYTES
 
 
@@ -72,16 +72,16 @@ class _Copy:
         self._channels: dict[tuple[str, str, str], int] = {}
         self._schemas: dict[tuple[str, bytes], int] = {}
 
-    def add(self, source: Path) -> Found:
+    def add(self, source: Path) -> McapContents:
         """Copy one file's records, and return what was found in it."""
-        found = Found()
+        found = McapContents()
         for item in read_items(source, found):
             self._start(item)
             if isinstance(item, Metadata):
                 self._writer.add_metadata(item.name, item.metadata)
             elif isinstance(item, Attachment):
                 self._attach(item)
-            elif isinstance(item, Entry):
+            elif isinstance(item, McapEntry):
                 one = item.message
                 channel = self._channel(item)
                 self._writer.add_message(channel, one.log_time, one.data, one.publish_time, one.sequence)
@@ -98,7 +98,7 @@ class _Copy:
             self._attached.add((one.name, one.data))
             self._writer.add_attachment(one.create_time, one.log_time, one.name, one.media_type, one.data)
 
-    def _channel(self, item: Entry) -> int:
+    def _channel(self, item: McapEntry) -> int:
         """Return an entry's channel in the copy."""
         channel, schema = item.channel, item.schema
         name = "" if schema is None else schema.name

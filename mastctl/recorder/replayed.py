@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.files.yaml_text import dump_mapping, parse_mapping
-from drivers.mcap_file import BadRecording
+from drivers.recordings.mcap_file import BadRecording
 from mastctl.recorder.recorded import Recording
 
 SPEED_RAD_PER_S = 1.0

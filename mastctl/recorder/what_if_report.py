@@ -13,7 +13,7 @@ import numpy as np
 from calib.files.mast_file import StoredRig
 from calib.geometry.rigid import FloatArray
 from drivers.errors import BadFrame
-from drivers.recorded_frames import McapFrame
+from drivers.recordings.frames import McapFrame
 from mastctl.recorder.recorded import Recording
 from mastctl.recorder.what_if import HandedAgain, WouldBe, rms
 from mastctl.report import pages, pictures, plots

@@ -2,7 +2,7 @@
 
 The library's writer buffers, does not sync, and writes its index at the end. Here the file is unbuffered,
 mast file and configuration stand at its start with their digests, and every chunk is written whole at once
-and then synced by a thread that alone waits for the disk (`drivers.mcap_file` reads what is left).
+and then synced by a thread that alone waits for the disk (`drivers.recordings.mcap_file` reads what is left).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The place where the latch of a head lies: by what the head is, not by who drives it and from where.
 
-A head has a name (`drivers.known.head_name`), and its place is a folder of that name in
+A head has a name (`drivers.hardware.head_name`), and its place is a folder of that name in
 ``/var/lib/mastctl/heads``, where ``/var/lib/mastctl`` is there (the systemd unit makes it) and this user may
 write; else in ``.local/state/mastctl/heads`` of the user's home as the password database has it. No variable
 of the environment moves it. Only a simulator's line (a pseudo terminal, loopback) and a driver from outside
@@ -19,8 +19,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from drivers.hardware import HardwareSettings
-from drivers.known import head_name
+from drivers.hardware import HardwareSettings, head_name
 from mastctl.safety.state_folder import StateFolder
 
 log = logging.getLogger(__name__)

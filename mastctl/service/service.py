@@ -16,8 +16,7 @@ from typing import cast
 from calib.files.mast_file import StoredRig
 from calib.matching.handed_over import MatchedHandoff
 from drivers.clock import Clock, SystemClock
-from drivers.hardware import Hardware
-from drivers.known import clock_for, head_name
+from drivers.hardware import Hardware, clock_for, head_name
 from mastctl.answers import CalibrationTold, SelfCheck, SentinelTold, TrackTold
 from mastctl.commands.audit import STRANGERS, STRANGERS_FILES, AuditLog
 from mastctl.commands.entry import Entry

@@ -38,7 +38,7 @@ from mcap.records import Attachment
 from calib.errors import BadFile
 from calib.files.mast_file import parse_rig
 from drivers.clock import SystemClock
-from drivers.mcap_file import Entry, Found, read_items
+from drivers.recordings.mcap_file import McapContents, McapEntry, read_items
 from mastctl.cli.output import at_least
 from mastctl.config import load_config
 from mastctl.devices.frames import StampedFrame
@@ -111,11 +111,11 @@ def judged(folder: Path, mast: MastTold, told: mmap.mmap) -> Killed:
     numbers: list[tuple[int, float]] = []
     wrong, left_over = "", 0
     for path in sorted(folder.rglob("*.mcap")):
-        found, digests, mine = Found(), [], []
+        found, digests, mine = McapContents(), [], []
         for item in read_items(path, found):
             if isinstance(item, Attachment):
                 digests.append(hashlib.sha256(item.data).hexdigest())
-            elif isinstance(item, Entry) and item.channel.topic == "/command":
+            elif isinstance(item, McapEntry) and item.channel.topic == "/command":
                 told_there = json.loads(item.message.data)
                 mine.append((told_there["number"], told_there["told_s"]))
         left_over += found.left_over_bytes

@@ -18,7 +18,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from drivers.sim.sensor import Noise
 
 from calib.files.mast_file import load_rig
 from calib.geometry.cahvor import CameraModel
@@ -27,8 +26,8 @@ from calib.geometry.rigid import FloatArray
 from calib.matching.track import SIZES
 from calib.matching.verdict import PatchMatch
 from calib.matching.warp import grey
-from drivers.sim.optics.exposure import Shot
-from drivers.sim.optics.readout import Readout
+from drivers.sim.optics.exposure import FrameExposure
+from drivers.sim.optics.readout import Noise, Readout
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 from mastctl.cli.output import at_least, not_negative
@@ -99,7 +98,7 @@ class Taken:
             picture = drawing.image(look.rig.cameras[name].model, site_from_head)
             if look.colour:
                 noise = Noise(READ_DN, SHOT_DN, int(rng.integers(2**31)), name)
-                image = Readout(noise, colour=True, jpeg_quality=JPEG).picture(picture, 0, Shot(0.0))
+                image = Readout(noise, colour=True, jpeg_quality=JPEG).picture(picture, 0, FrameExposure(0.0))
             else:
                 image = photograph(picture, BLUR_PX, NOISE_DN, rng)
             facts = (f"{name}-{number}", name, number, 0.0, 0.0, pan_rad, tilt_rad, False, "")

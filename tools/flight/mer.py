@@ -35,7 +35,7 @@ from calib.matching.patch import match_patch
 from calib.matching.verdict import MatchSettings, rivalled
 from calib.matching.warp import Grey, Plane, grey
 from drivers.clock import ManualClock
-from drivers.replay import Replay, open_replay
+from drivers.recordings.replay import Replay, open_replay
 from tools.flight.poses import PoseFit, fit_poses
 
 PRODUCTS = "1N4910*.IMG"

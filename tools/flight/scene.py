@@ -25,7 +25,7 @@ from calib.errors import NoCorrection
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.matching.warp import grey
-from drivers.recording import read_products
+from drivers.recordings.frames import read_products
 from tools.arguments import end
 from tools.flight import mer
 

@@ -28,7 +28,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 SOURCES = digest_of(Path(__file__).parent.glob("*.py"))
 
 
-class Place:
+class CodePlace:
     """What numba asks for the folder of a function's compiled code."""
 
     def __init__(self, function: Any) -> None:
@@ -36,7 +36,7 @@ class Place:
         self.folder = kept_folder("compiled", SOURCES)
 
     @classmethod
-    def from_function(cls, function: Any, _file: str) -> Place:
+    def from_function(cls, function: Any, _file: str) -> CodePlace:
         """Return the place of a function; there is one for every function."""
         return cls(function)
 
@@ -58,10 +58,10 @@ class Place:
 
 
 class _Implementation(caching.CompileResultCacheImpl):  # type: ignore[misc]
-    _locator_classes = (Place,)
+    _locator_classes = (CodePlace,)
 
 
-class Kept(caching.FunctionCache):  # type: ignore[misc]
+class KeptCode(caching.FunctionCache):  # type: ignore[misc]
     """Compiled code on disk; a folder that cannot be written is read, and nothing is added to it."""
 
     _impl_class = _Implementation
@@ -103,7 +103,7 @@ _INSIDE = {**_ALL, "no_cpython_wrapper": True}  # packing and unpacking a world 
 def entry(function: Function) -> Function:
     """Compile what Python calls, without the interpreter lock; kept on disk."""
     made: Any = numba.njit(**_ALL)(function)
-    made._cache = Kept(function)
+    made._cache = KeptCode(function)
     return cast(Function, made)
 
 

@@ -115,7 +115,7 @@ def hold_rays(rays: Float32, starts: Float32, samples: int, size: int, beams: Fl
             beams[row, column, 5] = math.sqrt(pitch) / samples
 
 
-class View(NamedTuple):
+class RayView(NamedTuple):
     """A camera's rays, and where it stands: see `render_tiles`."""
 
     rays: Float32
@@ -124,7 +124,7 @@ class View(NamedTuple):
     centre_m: Float64
 
 
-class Block(NamedTuple):
+class PixelBlock(NamedTuple):
     """What holds for all rays of a block of pixels.
 
     No ray meets the inner ground before ``clear_m``, but where the sweep has found it, the outer one before
@@ -163,7 +163,7 @@ def borrowed_world(world: World) -> World:
 
 
 @inlined
-def take_rays(view: View, bundle: Float64, y0: int, y1: int, x0: int, x1: int) -> int:
+def take_rays(view: RayView, bundle: Float64, y0: int, y1: int, x0: int, x1: int) -> int:
     """Fill the bundle with the rays of the pixels [y0, y1) x [x0, x1), in the site frame; return how many."""
     rays, r = view.rays, view.rotation
     n = 0
@@ -181,8 +181,8 @@ def take_rays(view: View, bundle: Float64, y0: int, y1: int, x0: int, x1: int) -
 @inlined
 def pixel_light(
     world: World,
-    view: View,
-    block: Block,
+    view: RayView,
+    block: PixelBlock,
     bundle: Float64,
     first: int,
     near: Int64,
@@ -276,7 +276,7 @@ def render_tiles(
     scratch (5, block * block * q) is written over.
     """
     world = borrowed_world(world)
-    view = View(borrowed(rays), borrowed(starts), borrowed(rotation), borrowed(centre_m))
+    view = RayView(borrowed(rays), borrowed(starts), borrowed(rotation), borrowed(centre_m))
     height, width, q = rays.shape[0], rays.shape[1], rays.shape[2]
     inner, balls = world.inner, world.rocks.spheres_m
     in_tile, in_block = np.empty(balls.shape[0], np.int64), np.empty(balls.shape[0], np.int64)
@@ -322,7 +322,7 @@ def render_tiles(
             count = take_rays(view, bundle, j * block, y1, i * block, x1)
             if starts.shape[0] == 0 and clear < FAR:
                 clear = sweep(inner, bundle, count, mx, my, -mz, clear, abs(bx) > abs(by))
-            place = Block(clear, beyond, n_block, pitch)
+            place = PixelBlock(clear, beyond, n_block, pitch)
             y0, x0 = j * block, i * block
             for y in range(y0, y1):
                 for x in range(x0, x1):

@@ -72,7 +72,7 @@ class ExposureSettings:
 
 
 @dataclass(frozen=True)
-class Shot:
+class FrameExposure:
     """Exposure time and gain of a frame; ``factor``: grey levels over the scene's own brightness."""
 
     exposure_s: float
@@ -91,10 +91,10 @@ class FixedExposure:
         self._gain = settings.gain if on else 1.0
         self._factor = exposure_s * settings.gain / settings.reference_s if on else 1.0
 
-    def shot(self, _sequence: int, begin_s: float, _period_s: float) -> Shot:
+    def shot(self, _sequence: int, begin_s: float, _period_s: float) -> FrameExposure:
         """Return time and gain of the frame whose exposure begins at a moment."""
         daylight = self._settings.daylight(begin_s - self._start_s)
-        return Shot(self.longest_s, self._gain, self._factor * daylight)
+        return FrameExposure(self.longest_s, self._gain, self._factor * daylight)
 
 
 @dataclass
@@ -157,7 +157,7 @@ class AutoExposure:
                 if self._held == 0:
                     self._holds = [*self._holds[-50:], (self._held_since_s, self._now_s())]
 
-    def shot(self, sequence: int, begin_s: float, period_s: float) -> Shot:
+    def shot(self, sequence: int, begin_s: float, period_s: float) -> FrameExposure:
         """Return time and gain of a frame; those before it are metered first, where they were not yet."""
         with self._lock:
             done = self._decided
@@ -179,7 +179,7 @@ class AutoExposure:
         exposure_s = min(max(amount_s, s.shortest_s), s.longest_s)
         gain = min(max(1.0, amount_s / exposure_s), s.most_gain)
         daylight = s.daylight(begin_s - self._start_s)
-        return Shot(exposure_s, gain, exposure_s * gain / s.reference_s * daylight)
+        return FrameExposure(exposure_s, gain, exposure_s * gain / s.reference_s * daylight)
 
     def _amount_s(self, frame: int, begin_s: float, period_s: float) -> float:
         """Time times gain of a frame."""

@@ -83,7 +83,7 @@ class LensSettings:
 
 
 @dataclass(frozen=True)
-class Lens:
+class SimulatedLens:
     """One camera's lens.
 
     Attributes

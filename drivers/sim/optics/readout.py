@@ -12,7 +12,7 @@ from scipy.special import ndtri
 
 from drivers.interfaces import Image
 from drivers.sim.kept import kernels
-from drivers.sim.optics.exposure import Shot
+from drivers.sim.optics.exposure import FrameExposure
 from drivers.sim.optics.lens import Float32
 
 SEEN = np.array([0.55, 1.0, 0.6], dtype=np.float32)
@@ -85,9 +85,9 @@ class Readout:
     noise: Noise
     colour: bool = False
     jpeg_quality: int = 0
-    _kept: list[tuple[Float32, Shot, Float32, Float32]] = field(default_factory=list, repr=False)
+    _kept: list[tuple[Float32, FrameExposure, Float32, Float32]] = field(default_factory=list, repr=False)
 
-    def picture(self, light: Float32, sequence: int, shot: Shot) -> Image:
+    def picture(self, light: Float32, sequence: int, shot: FrameExposure) -> Image:
         """Return frame ``sequence``, uint8 (h, w) or (h, w, 3) BGR, of the light (h, w) on the sensor."""
         levels, sigma_dn = self._levels(light, shot)
         raw = self.noise.levels(levels, sigma_dn, sequence)
@@ -98,7 +98,7 @@ class Readout:
         how = cv2.IMREAD_COLOR if self.colour else cv2.IMREAD_GRAYSCALE
         return np.asarray(cv2.imdecode(data, how), dtype=np.uint8)
 
-    def _levels(self, light: Float32, shot: Shot) -> tuple[Float32, Float32]:
+    def _levels(self, light: Float32, shot: FrameExposure) -> tuple[Float32, Float32]:
         """Grey levels without noise, and the noise's deviation; kept for light that comes again."""
         for one, with_shot, levels, sigma_dn in self._kept:
             if one is light and with_shot == shot:

@@ -37,7 +37,7 @@ SKY_M = 1e5
 Draw = Callable[[CameraModel, Rigid, int, tuple[int, int]], Float32]
 
 
-class Key(NamedTuple):
+class KeyView(NamedTuple):
     """A view that was drawn: where the camera stood, rows [first, last) of the widened picture."""
 
     pose: Rigid
@@ -136,7 +136,7 @@ class Shutter:
         ranges_m = self.ranges(pose.points(rays.origins_m), pose.vectors(rays.directions))
         return np.where(np.isfinite(ranges_m), ranges_m, SKY_M)
 
-    def _seen_by(self, key: Key, pixels: Float64, ranges_m: Float64, poses: list[Rigid]) -> Float64:
+    def _seen_by(self, key: KeyView, pixels: Float64, ranges_m: Float64, poses: list[Rigid]) -> Float64:
         """Where the key's picture shows what pixels (rows, columns, 2) see, a pose a row."""
         rays = self.camera.ray(pixels)
         points_m = rays.origins_m + ranges_m[..., None] * rays.directions
@@ -166,14 +166,14 @@ class _Keys:
         self._steps = max(1, int(np.ceil(way_px[-1] / KEY_STEP_PX)))
         self._samples = samples
         self._camera = widened(shutter.camera)
-        self._drawn: dict[int, Key] = {}
+        self._drawn: dict[int, KeyView] = {}
 
     def owners(self, times_s: Float64) -> NDArray[np.int64]:
         """Return the number of the nearest key for moments."""
         parts = np.interp(times_s, self._times_s, self._way_px) / self._way_px[-1]
         return np.asarray(np.rint(parts * self._steps).astype(np.int64))
 
-    def __getitem__(self, number: int) -> Key:
+    def __getitem__(self, number: int) -> KeyView:
         if number not in self._drawn:
             along = number / self._steps * self._way_px[-1]
             pose = self._shutter.pose(float(np.interp(along, self._way_px, self._times_s)))
@@ -181,7 +181,7 @@ class _Keys:
             rows = np.flatnonzero((ends[0] <= number) & (number <= ends[1]))
             first, last = int(rows[0]), int(rows[-1]) + 1 + 2 * MARGIN_PX
             image = self._shutter.draw(self._camera, pose, self._samples, (first, last))
-            self._drawn[number] = Key(pose, first, np.ascontiguousarray(image[first:last]))
+            self._drawn[number] = KeyView(pose, first, np.ascontiguousarray(image[first:last]))
         return self._drawn[number]
 
 

@@ -9,7 +9,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from drivers.sim.wire import dynamixel_packets as packets
 from drivers.sim.wire.dynamixel_packets import BROADCAST, Instruction, InstructionParser
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
-from drivers.sim.wire.dynamixel_table import ACCESS, CRC_ERROR, DATA_LENGTH, INSTRUCTION_ERROR, Refused
+from drivers.sim.wire.dynamixel_table import (
+    ACCESS,
+    CRC_ERROR,
+    DATA_LENGTH,
+    INSTRUCTION_ERROR,
+    InstructionRefused,
+)
 from drivers.sim.wire.line import Reply
 
 PING, READ, WRITE, REG_WRITE, ACTION, FACTORY_RESET, REBOOT, CLEAR, BACKUP = 1, 2, 3, 4, 5, 6, 8, 0x10, 0x20
@@ -122,7 +128,7 @@ class DynamixelBus:
             level = servo.answers("ping" if code == PING else "read" if code == READ else "write")
             try:
                 data = _do(servo, instruction, time_s, broadcast=broadcast, group=group)
-            except Refused as refused:
+            except InstructionRefused as refused:
                 error = refused.error
             if level and (own or (broadcast and code == PING)):
                 # In a broadcast ping each waits for the one with the next lower id.
@@ -152,7 +158,7 @@ class DynamixelBus:
                 error, data = 0, b""
                 try:
                     data = servo.read(address, length, time_s)
-                except Refused as refused:
+                except InstructionRefused as refused:
                     # A fast answer has fixed places, so the block is there, with an error and zeros.
                     error, data = refused.error, bytes(length) if fast else b""
                 answers.append((error | servo.alert(), servo_id, data))
@@ -177,12 +183,12 @@ def _do(
         return servo.ping()
     if code == READ:
         if len(parameters) != 4:
-            raise Refused(DATA_LENGTH)
+            raise InstructionRefused(DATA_LENGTH)
         address, length = _word(parameters, 0), _word(parameters, 2)
         return b"" if broadcast else servo.read(address, length, time_s)
     if code in (WRITE, REG_WRITE):
         if len(parameters) < 3:
-            raise Refused(DATA_LENGTH)
+            raise InstructionRefused(DATA_LENGTH)
         if code == WRITE:
             servo.write(_word(parameters, 0), parameters[2:], time_s, by_group=group)
         else:
@@ -192,7 +198,7 @@ def _do(
     elif code == REBOOT:
         servo.reboot(time_s)
     elif group:
-        raise Refused(ACCESS)  # a group can write to the RAM area, no more
+        raise InstructionRefused(ACCESS)  # a group can write to the RAM area, no more
     elif code == FACTORY_RESET:
         servo.factory_reset(parameters, time_s, broadcast=broadcast)
     elif code == CLEAR:
@@ -200,7 +206,7 @@ def _do(
     elif code == BACKUP:
         servo.backup(parameters, time_s)
     else:
-        raise Refused(INSTRUCTION_ERROR)
+        raise InstructionRefused(INSTRUCTION_ERROR)
     return b""
 
 
@@ -240,7 +246,7 @@ def _group_write(code: int, parameters: bytes, here: list[SimulatedServo], time_
             if servo.servo_id == servo_id:
                 try:
                     servo.write(address, data, time_s)
-                except Refused:
+                except InstructionRefused:
                     continue
 
 

@@ -12,7 +12,7 @@ import math
 
 from drivers.sim.motion import Motion
 from drivers.sim.wire.axis import WireAxis
-from drivers.sim.wire.dynamixel_models import Model
+from drivers.sim.wire.dynamixel_models import SimulatedModel
 from drivers.sim.wire.dynamixel_table import ControlTable
 
 POSITION_MODES = frozenset({3, 4, 5})
@@ -44,7 +44,13 @@ class Drive:
     """
 
     def __init__(
-        self, model: Model, table: ControlTable, axis: WireAxis, zero_counts: int, sign: int, time_s: float
+        self,
+        model: SimulatedModel,
+        table: ControlTable,
+        axis: WireAxis,
+        zero_counts: int,
+        sign: int,
+        time_s: float,
     ) -> None:
         self.axis = axis
         self._model = model

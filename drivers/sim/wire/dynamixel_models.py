@@ -20,7 +20,7 @@ from drivers.sim.wire.dynamixel_registers import (
     X540_MORE,
     X_EEPROM,
     X_RAM,
-    Register,
+    TableRegister,
     rows,
 )
 
@@ -35,7 +35,7 @@ class IndirectBlock:
 
 
 @dataclass(frozen=True)
-class Model:
+class SimulatedModel:
     """One model of servo.
 
     Attributes
@@ -65,7 +65,7 @@ class Model:
     name: str
     number: int
     firmware: int
-    registers: tuple[Register, ...]
+    registers: tuple[TableRegister, ...]
     indirect: tuple[IndirectBlock, ...]
     indirect_low: int
     indirect_high: int
@@ -86,12 +86,12 @@ class Model:
         return math.tau / self.counts_per_turn
 
     @cached_property
-    def by_name(self) -> Mapping[str, Register]:
+    def by_name(self) -> Mapping[str, TableRegister]:
         """Registers by name."""
         return {register.name: register for register in self.registers}
 
     @cached_property
-    def by_byte(self) -> Mapping[int, tuple[Register, int]]:
+    def by_byte(self) -> Mapping[int, tuple[TableRegister, int]]:
         """Register and offset within it for every defined byte, indirect blocks aside."""
         return {r.address + i: (r, i) for r in self.registers for i in range(r.size)}
 
@@ -114,11 +114,13 @@ _X_MODES = frozenset({0, 1, 3, 4, 5, 16})
 _X_INDIRECT = (IndirectBlock(168, 224, 28), IndirectBlock(578, 634, 28))
 
 
-def _changed(table: Sequence[Register], changes: Mapping[str, tuple[int, int, int]]) -> tuple[Register, ...]:
+def _changed(
+    table: Sequence[TableRegister], changes: Mapping[str, tuple[int, int, int]]
+) -> tuple[TableRegister, ...]:
     """Rows with other ``(initial, low, high)`` for some names."""
     assert changes.keys() <= {row.name for row in table}
     return tuple(
-        Register(r.address, r.size, r.name, r.writable, *changes[r.name]) if r.name in changes else r
+        TableRegister(r.address, r.size, r.name, r.writable, *changes[r.name]) if r.name in changes else r
         for r in sorted(table, key=lambda row: row.address)
     )
 
@@ -137,9 +139,9 @@ def _x(
     drive_bits: int = 0b1101,
     fast: bool = True,
     voltage_v: float = 12.0,
-) -> Model:
+) -> SimulatedModel:
     table = [r for r in rows(X_EEPROM + X_RAM + more) if r.name not in without]
-    return Model(
+    return SimulatedModel(
         name=name,
         number=number,
         firmware=firmware,
@@ -162,7 +164,7 @@ def _x(
 
 def _x330(
     name: str, number: int, changes: Mapping[str, tuple[int, int, int]], voltage_v: float, **initial: int
-) -> Model:
+) -> SimulatedModel:
     gains = {key: (value, 0, 16383) for key, value in initial.items()}
     return _x(
         name,
@@ -204,12 +206,12 @@ def _velocity(initial: int, high: int = 1023) -> dict[str, tuple[int, int, int]]
 
 def _p(
     name: str, number: int, half_turn: int, limit: int, changes: Mapping[str, tuple[int, int, int]]
-) -> Model:
+) -> SimulatedModel:
     positions = {
         "max_position_limit": (limit, -half_turn, half_turn),
         "min_position_limit": (-limit, -half_turn, half_turn),
     }
-    return Model(
+    return SimulatedModel(
         name=name,
         number=number,
         firmware=14,
@@ -361,11 +363,11 @@ _ALL = (
     ),
 )
 
-MODELS: Mapping[str, Model] = {model.name: model for model in _ALL}
+MODELS: Mapping[str, SimulatedModel] = {model.name: model for model in _ALL}
 """Every model that can be simulated, by name."""
 
 
-def model_named(name: str) -> Model:
+def model_named(name: str) -> SimulatedModel:
     """Return a model by its name in any common spelling: ``XM430-W350-T``, ``xm430_w350``.
 
     Raises

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Register:
+class TableRegister:
     """One item of a control table; ``low`` below zero makes it signed."""
 
     address: int
@@ -175,14 +175,14 @@ P_RAM = """
 """
 
 
-def rows(text: str) -> tuple[Register, ...]:
+def rows(text: str) -> tuple[TableRegister, ...]:
     """Return the registers of one of the tables above."""
     found = []
     for line in filter(str.strip, text.splitlines()):
         address, size, name, access, initial, *bounds = line.split()
         low, high = (int(b) for b in bounds) if bounds else (0, 256 ** int(size) - 1)
         first = 0 if initial == "-" else int(initial)
-        found.append(Register(int(address), int(size), name, access == "w", first, low, high))
+        found.append(TableRegister(int(address), int(size), name, access == "w", first, low, high))
     return tuple(found)
 
 

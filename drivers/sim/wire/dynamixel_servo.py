@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from drivers.errors import BadOptions
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_drive import Drive
-from drivers.sim.wire.dynamixel_models import Model, model_named
+from drivers.sim.wire.dynamixel_models import SimulatedModel, model_named
 from drivers.sim.wire.dynamixel_registers import BAUD_RATES
 from drivers.sim.wire.dynamixel_table import (
     DATA_LENGTH,
@@ -15,9 +15,9 @@ from drivers.sim.wire.dynamixel_table import (
     INSTRUCTION_ERROR,
     RESULT_FAIL,
     WATCHDOG_EXPIRED,
-    Change,
     ControlTable,
-    Refused,
+    InstructionRefused,
+    RegisterChange,
 )
 
 ALERT = 0x80
@@ -73,7 +73,7 @@ class SimulatedServo:
         settings: Mapping[str, int] | None = None,
         time_s: float = 0.0,
     ) -> None:
-        self.model: Model = model_named(model)
+        self.model: SimulatedModel = model_named(model)
         self.powered = True
         self.table = ControlTable(self.model, self._live())
         for name, value in {"id": servo_id, **(settings or {})}.items():
@@ -92,7 +92,7 @@ class SimulatedServo:
         self._axis = axis
         self._backup: dict[str, int] = {}
         self._backup_pointers: list[int] = []
-        self._registered: list[Change] = []
+        self._registered: list[RegisterChange] = []
         self._raised = 0
         self._since_s: float | None = None
         self._started_s = self._fed_s = self._retune_s = time_s
@@ -188,7 +188,7 @@ class SimulatedServo:
     def action(self, time_s: float) -> None:
         """Carry out what `reg_write` kept; raise Refused when there is nothing."""
         if not self._registered:
-            raise Refused(INSTRUCTION_ERROR)
+            raise InstructionRefused(INSTRUCTION_ERROR)
         changes, self._registered = self._registered, []
         self.table["registered_instruction"] = 0
         self._apply(changes, time_s)
@@ -202,10 +202,10 @@ class SimulatedServo:
     def factory_reset(self, parameters: bytes, time_s: float, *, broadcast: bool) -> None:
         """Reset the table: 0xFF all, 0x01 all but the id, 0x02 all but id and baud rate; then start anew."""
         if len(parameters) != 1:
-            raise Refused(DATA_LENGTH)
+            raise InstructionRefused(DATA_LENGTH)
         kept = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate")}.get(parameters[0])
         if kept is None or (broadcast and parameters[0] == 0xFF):
-            raise Refused(RESULT_FAIL)
+            raise InstructionRefused(RESULT_FAIL)
         values = {name: self.table[name] for name in (*kept, "model_number", "firmware_version")}
         self.table.values.update({r.name: r.initial for r in self.model.registers} | values)
         self.table.reset_pointers()
@@ -214,7 +214,7 @@ class SimulatedServo:
     def clear(self, parameters: bytes, time_s: float) -> None:
         """Bring the position back to one turn; refused while it moves."""
         if parameters != _CLEAR_KEY or self.drive.moving(time_s):
-            raise Refused(RESULT_FAIL)
+            raise InstructionRefused(RESULT_FAIL)
         before = self.drive.position(time_s)
         self.drive.into_one_turn(time_s)
         self.table["goal_position"] += self.drive.position(time_s) - before
@@ -222,16 +222,16 @@ class SimulatedServo:
     def backup(self, parameters: bytes, time_s: float) -> None:
         """Store the EEPROM area and the settings of the control loop (1), or restore and start anew (2)."""
         if self.table["torque_enable"] or parameters[1:] != _BACKUP_KEY or parameters[0] not in (1, 2):
-            raise Refused(RESULT_FAIL)
+            raise InstructionRefused(RESULT_FAIL)
         if "backup_ready" not in self.table.values:
-            raise Refused(INSTRUCTION_ERROR)
+            raise InstructionRefused(INSTRUCTION_ERROR)
         if parameters[0] == 1:
             names = [r.name for r in self.model.registers if r.writable and self._is_kept(r.name)]
             self._backup = {name: self.table[name] for name in names}
             self._backup_pointers = list(self.table.pointers)
             self.table["backup_ready"] = 1
         elif not self._backup:
-            raise Refused(RESULT_FAIL)
+            raise InstructionRefused(RESULT_FAIL)
         else:
             eeprom = {n: v for n, v in self._backup.items() if self._is_eeprom(n)}
             self.table.values.update(eeprom)
@@ -248,11 +248,11 @@ class SimulatedServo:
     def _expired(self) -> bool:
         return self.table["bus_watchdog"] == WATCHDOG_EXPIRED
 
-    def _changes(self, address: int, data: bytes, by_group: bool) -> list[Change]:
+    def _changes(self, address: int, data: bytes, by_group: bool) -> list[RegisterChange]:
         locked = by_group or self.table["torque_enable"] == 1
         return self.table.changes(address, data, locked=locked, expired=self._expired())
 
-    def _apply(self, changes: list[Change], time_s: float) -> None:
+    def _apply(self, changes: list[RegisterChange], time_s: float) -> None:
         """Store accepted changes and act on them, goals last and once each."""
         goals = []
         for change in changes:

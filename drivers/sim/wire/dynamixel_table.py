@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from drivers.sim.wire.dynamixel_models import Model
-from drivers.sim.wire.dynamixel_registers import Register
+from drivers.sim.wire.dynamixel_models import SimulatedModel
+from drivers.sim.wire.dynamixel_registers import TableRegister
 
 RESULT_FAIL = 0x01
 INSTRUCTION_ERROR = 0x02
@@ -20,7 +20,7 @@ GOALS = frozenset({"goal_pwm", "goal_current", "goal_velocity", "goal_position"}
 WATCHDOG_EXPIRED = 255
 
 
-class Refused(Exception):
+class InstructionRefused(Exception):
     """An instruction that the servo answers with an error number."""
 
     def __init__(self, error: int) -> None:
@@ -29,11 +29,11 @@ class Refused(Exception):
 
 
 @dataclass(frozen=True)
-class Change:
+class RegisterChange:
     """One accepted write: to a register, to an indirect pointer, or to a free indirect data byte."""
 
     value: int
-    register: Register | None = None
+    register: TableRegister | None = None
     pointer: int = -1
     scratch: int = -1
 
@@ -49,7 +49,7 @@ class ControlTable:
         Computes the registers that the servo measures (present position and so on): name to value.
     """
 
-    def __init__(self, model: Model, live: Mapping[str, Callable[[float], int]]) -> None:
+    def __init__(self, model: SimulatedModel, live: Mapping[str, Callable[[float], int]]) -> None:
         self.model = model
         self.values = {r.name: r.initial for r in model.registers}
         count = sum(block.count for block in model.indirect)
@@ -57,7 +57,7 @@ class ControlTable:
         self.scratch = bytearray(count)
         self.reset_pointers()
         self._live = live
-        self._spans: dict[tuple[int, int], tuple[Register, ...] | None] = {}
+        self._spans: dict[tuple[int, int], tuple[TableRegister, ...] | None] = {}
 
     def __getitem__(self, name: str) -> int:
         return self.values[name]
@@ -73,7 +73,7 @@ class ControlTable:
         """Let every indirect address point to its own data byte, as from the factory."""
         self.pointers = [block.data + i for block in self.model.indirect for i in range(block.count)]
 
-    def now(self, register: Register, time_s: float) -> int:
+    def now(self, register: TableRegister, time_s: float) -> int:
         """Return the value of a register at a moment."""
         live = self._live.get(register.name)
         return self.values[register.name] if live is None else live(time_s)
@@ -87,7 +87,7 @@ class ControlTable:
             ACCESS where a byte of the range is not defined, DATA_LENGTH for no bytes.
         """
         if length == 0:
-            raise Refused(DATA_LENGTH)
+            raise InstructionRefused(DATA_LENGTH)
         span = self._span(address, length)
         if span is not None:
             return b"".join(r.to_bytes(self.now(r, time_s)) for r in span)
@@ -105,11 +105,11 @@ class ControlTable:
                 out.append(self.scratch[number])
         return bytes(out)
 
-    def _span(self, address: int, length: int) -> tuple[Register, ...] | None:
+    def _span(self, address: int, length: int) -> tuple[TableRegister, ...] | None:
         """The registers that fill a range exactly, the usual case; None otherwise."""
         key = (address, length)
         if key not in self._spans:
-            found: list[Register] = []
+            found: list[TableRegister] = []
             at = address
             while at < address + length:
                 entry = self.model.by_byte.get(at)
@@ -122,14 +122,14 @@ class ControlTable:
             self._spans[key] = tuple(found) if at == address + length else None
         return self._spans[key]
 
-    def _resolve(self, at: int) -> tuple[Register | None, int, str, int]:
+    def _resolve(self, at: int) -> tuple[TableRegister | None, int, str, int]:
         """What stands at an address, through at most one indirection."""
         entry = self.model.by_byte.get(at)
         if entry is not None:
             return entry[0], entry[1], "", 0
         indirect = self.model.indirect_bytes.get(at)
         if indirect is None:
-            raise Refused(ACCESS)
+            raise InstructionRefused(ACCESS)
         kind, number = indirect
         if kind == "data":
             target = self.model.by_byte.get(self.pointers[number])
@@ -137,11 +137,11 @@ class ControlTable:
                 return target[0], target[1], "", 0
             other = self.model.indirect_bytes.get(self.pointers[number])
             if other is None or other[0] != "data":
-                raise Refused(ACCESS)
+                raise InstructionRefused(ACCESS)
             return None, 0, "data", other[1]
         return None, 0, kind, number
 
-    def changes(self, address: int, data: bytes, *, locked: bool, expired: bool) -> list[Change]:
+    def changes(self, address: int, data: bytes, *, locked: bool, expired: bool) -> list[RegisterChange]:
         """Return what a write would change; nothing is changed yet.
 
         Parameters
@@ -159,64 +159,64 @@ class ControlTable:
             With the error number that the servo answers.
         """
         if not data:
-            raise Refused(DATA_LENGTH)
-        changes: list[Change] = []
+            raise InstructionRefused(DATA_LENGTH)
+        changes: list[RegisterChange] = []
         at, left = address, data
         while left:
             register, offset, kind, number = self._resolve(at)
             if register is None and kind == "data":
-                changes.append(Change(left[0], scratch=number))
+                changes.append(RegisterChange(left[0], scratch=number))
                 at, left = at + 1, left[1:]
                 continue
             size = 2 if register is None else register.size
             if register is not None and not register.writable:
-                raise Refused(ACCESS)
+                raise InstructionRefused(ACCESS)
             if offset != 0 or (kind == "address" and number % 2) or len(left) < size:
-                raise Refused(DATA_LENGTH)
+                raise InstructionRefused(DATA_LENGTH)
             if at < self.model.ram_from and locked:
-                raise Refused(ACCESS)
+                raise InstructionRefused(ACCESS)
             if register is None:
                 value = int.from_bytes(left[:2], "little")
                 if not self.model.indirect_low <= value <= self.model.indirect_high:
-                    raise Refused(DATA_RANGE)
-                changes.append(Change(value, pointer=number // 2))
+                    raise InstructionRefused(DATA_RANGE)
+                changes.append(RegisterChange(value, pointer=number // 2))
             else:
                 for step in range(1, size):  # all bytes of it, in their order, also through indirection
                     if self._resolve(at + step)[:2] != (register, step):
-                        raise Refused(DATA_LENGTH)
+                        raise InstructionRefused(DATA_LENGTH)
                 value = register.from_bytes(left[:size])
                 self._check(register, value, expired)
-                changes.append(Change(value, register=register))
+                changes.append(RegisterChange(value, register=register))
             at, left = at + size, left[size:]
         return changes
 
-    def _check(self, register: Register, value: int, expired: bool) -> None:
+    def _check(self, register: TableRegister, value: int, expired: bool) -> None:
         """Refuse a value outside the register's range, or outside the limits set in the table."""
         name, values = register.name, self.values
         if not register.low <= value <= register.high:
-            raise Refused(DATA_RANGE)
+            raise InstructionRefused(DATA_RANGE)
         if (name == "operating_mode" and value not in self.model.modes) or (
             name == "drive_mode" and value & ~self.model.drive_bits
         ):
-            raise Refused(DATA_RANGE)
+            raise InstructionRefused(DATA_RANGE)
         if expired and (name in GOALS or (name == "bus_watchdog" and value != 0)):
-            raise Refused(DATA_RANGE)
+            raise InstructionRefused(DATA_RANGE)
         if name == "goal_position":
             # The position limits hold in position control only.
             low, high = values["min_position_limit"], values["max_position_limit"]
             if values["operating_mode"] == 3 and not low <= value <= high:
-                raise Refused(DATA_LIMIT)
+                raise InstructionRefused(DATA_LIMIT)
         elif name in GOALS:
             if abs(value) > values[name.replace("goal_", "") + "_limit"]:
-                raise Refused(DATA_LIMIT)
+                raise InstructionRefused(DATA_LIMIT)
         elif (
             self.model.ram_from == 512
             and name in ("profile_velocity", "profile_acceleration")
             and value > values[name.replace("profile_", "") + "_limit"]
         ):
-            raise Refused(DATA_LIMIT)
+            raise InstructionRefused(DATA_LIMIT)
 
-    def apply(self, change: Change) -> None:
+    def apply(self, change: RegisterChange) -> None:
         """Store an accepted change."""
         if change.register is not None:
             self.values[change.register.name] = change.value

@@ -16,7 +16,7 @@ from drivers.faults import nearest
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.line import Reply
 from drivers.sim.wire.ptu_axis import MODELS, STEPS, PtuAxis
-from drivers.sim.wire.ptu_unit import PtuUnit, Refused
+from drivers.sim.wire.ptu_unit import CommandRefused, PtuUnit
 
 BAUD_RATES = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 _WORDS = re.compile(r"([A-Z]+)([+-]?\d+)?")
@@ -44,7 +44,7 @@ def answer(unit: PtuUnit, words: bytes, time_s: float) -> str:
     text = words.decode("ascii", "replace").upper()
     try:
         told = _carry_out(unit, text, time_s)
-    except Refused as refusal:
+    except CommandRefused as refusal:
         return f"! {refusal}"
     return "*" if told is None else f"* {told}"
 
@@ -78,8 +78,8 @@ def _carry_out(unit: PtuUnit, text: str, time_s: float) -> str | None:
     raise _illegal()
 
 
-def _illegal() -> Refused:
-    return Refused("Illegal Command Entered")
+def _illegal() -> CommandRefused:
+    return CommandRefused("Illegal Command Entered")
 
 
 def _told(unit: PtuUnit, words: str, axis: PtuAxis, value: object) -> str:

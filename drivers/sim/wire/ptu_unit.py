@@ -22,7 +22,7 @@ NOMINAL_V = 24.0
 _BAUD_S = 0.02  # a new baud rate comes into force when the answer is through
 
 
-class Refused(Exception):
+class CommandRefused(Exception):
     """What the unit does not do, in the words that it answers behind the ``!``."""
 
 
@@ -113,7 +113,7 @@ class PtuUnit:
     def go(self, axis: PtuAxis, position: int, time_s: float) -> None:
         """Start towards a position, or keep it until slaved mode ends. Raises Refused."""
         if self.velocity:
-            raise Refused("Illegal Command in pure velocity mode")
+            raise CommandRefused("Illegal Command in pure velocity mode")
         _check_position(axis, position, self.allowed(axis))
         if self.slaved:
             axis.slaved = position
@@ -143,7 +143,7 @@ class PtuUnit:
         user = (position, axis.user_high) if end == 0 else (axis.user_low, position)
         if user[0] > user[1]:
             word = ("Minimum", "Maximum")[end]
-            raise Refused(f"{word} user {axis.name} position is beyond the other one")
+            raise CommandRefused(f"{word} user {axis.name} position is beyond the other one")
         axis.user_low, axis.user_high = user
 
     # Speeds
@@ -185,7 +185,7 @@ class PtuUnit:
     def set_slowest(self, axis: PtuAxis, speed: int, time_s: float) -> None:
         """Set the lower bound of speeds. Raises Refused."""
         if speed < self.model.slowest:
-            raise Refused(f"Motor speed cannot be less than {self.model.slowest} pos/sec")
+            raise CommandRefused(f"Motor speed cannot be less than {self.model.slowest} pos/sec")
         if speed > axis.now.fastest:
             raise _too_fast(axis)
         axis.now = replace(axis.now, slowest=speed)
@@ -200,7 +200,7 @@ class PtuUnit:
     def set_acceleration(self, axis: PtuAxis, acceleration: int, time_s: float) -> None:
         """Set the acceleration. Raises Refused."""
         if acceleration < 1:
-            raise Refused("Illegal Command Entered")
+            raise CommandRefused("Illegal Command Entered")
         axis.now = replace(axis.now, acceleration=acceleration)
         self._recompute(axis, time_s)
 
@@ -286,14 +286,14 @@ class PtuUnit:
 def _check_position(axis: PtuAxis, position: int, limits: tuple[float, float]) -> None:
     low, high = limits
     if position > high:
-        raise Refused(f"Maximum allowable {axis.name} position is {high}")
+        raise CommandRefused(f"Maximum allowable {axis.name} position is {high}")
     if position < low:
-        raise Refused(f"Minimum allowable {axis.name} position is {low}")
+        raise CommandRefused(f"Minimum allowable {axis.name} position is {low}")
 
 
-def _too_fast(axis: PtuAxis) -> Refused:
-    return Refused(f"{axis.name} speed cannot exceed {axis.now.fastest} positions/sec")
+def _too_fast(axis: PtuAxis) -> CommandRefused:
+    return CommandRefused(f"{axis.name} speed cannot exceed {axis.now.fastest} positions/sec")
 
 
-def _too_slow(axis: PtuAxis) -> Refused:
-    return Refused(f"{axis.name} speed cannot be less than {axis.now.slowest} positions/sec")
+def _too_slow(axis: PtuAxis) -> CommandRefused:
+    return CommandRefused(f"{axis.name} speed cannot be less than {axis.now.slowest} positions/sec")

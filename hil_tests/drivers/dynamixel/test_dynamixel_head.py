@@ -517,7 +517,7 @@ def test_a_hardware_error_is_rebooted_away_where_the_configuration_says_so() -> 
 def test_a_supply_that_stays_low_reboots_a_servo_three_times_and_no_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("drivers.absence.LONGEST_WAIT_S", 0.1)
+    monkeypatch.setattr("drivers.absent.LONGEST_WAIT_S", 0.1)
     monkeypatch.setattr("drivers.sim.wire.dynamixel_servo.BOOT_S", 0.02)
     with rig() as it:
         for axis in ("pan", "tilt"):

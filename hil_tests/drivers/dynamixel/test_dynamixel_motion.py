@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from drivers.dynamixel.models import MODELS
-from drivers.dynamixel.motion import AxisMotion, Sample, Truth
+from drivers.dynamixel.motion import AxisCourse, ServoSample, Truth
 from drivers.dynamixel.settings import dynamixel_settings
 from drivers.errors import BadOptions, BadReply
 
@@ -30,20 +30,20 @@ class Bench:
 
     def __init__(self, start: int = 2048, **pan: Any) -> None:
         self.settings = dynamixel_settings(options(**pan)).pan
-        self.motion = AxisMotion("pan", self.settings, settle_s=0.1)
+        self.motion = AxisCourse("pan", self.settings, settle_s=0.1)
         self.truth = Truth("pan", self.settings)
         self.now_s = 100.0
         self.motion.begin(start)
         self.be(start)
 
-    def sample(self, counts: int, velocity: int = 0, status: int = 1, tick: int | None = None) -> Sample:
+    def sample(self, counts: int, velocity: int = 0, status: int = 1, tick: int | None = None) -> ServoSample:
         values = {
             "present_position": counts, "present_velocity": velocity, "moving_status": status,
             "realtime_tick": int(1000 * self.now_s) % 32768 if tick is None else tick,
             "goal_position": self.motion.goal, "present_current": 10, "present_temperature": 40,
             "present_voltage": 121,
         }  # fmt: skip
-        return Sample(values, False, self.now_s, self.now_s + 0.002)
+        return ServoSample(values, False, self.now_s, self.now_s + 0.002)
 
     def be(self, counts: int, velocity: int = 0, status: int = 1, for_s: float = PERIOD_S) -> None:
         """Be seen there for a while."""

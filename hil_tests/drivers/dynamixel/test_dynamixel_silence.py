@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from drivers.clock import ManualClock
-from drivers.dynamixel.session import Session
+from drivers.dynamixel.session import ServoSession
 from drivers.errors import NoReply
 
 WATCHDOG_S, REPLY_S = 0.4, 0.1
@@ -33,7 +33,7 @@ def test_an_attempt_that_failed_within_a_look_is_a_part_of_the_silence() -> None
     clock = ManualClock(10.0)
     pair = SilentPair(clock)
     head = SimpleNamespace(poll_hz=50.0, watchdog_counts=20, watchdog_s=WATCHDOG_S, resting_poll_s=0.1)
-    session = Session(pair, head, clock, SimpleNamespace())  # type: ignore[arg-type]
+    session = ServoSession(pair, head, clock, SimpleNamespace())  # type: ignore[arg-type]
     looked: list[float] = []
     session._watch.look_soon = lambda: looked.append(clock.now_s())  # type: ignore[method-assign]
     session._watch.look = lambda: None  # type: ignore[method-assign]

@@ -36,7 +36,7 @@ def test_bricks_are_boxes_of_their_size_on_the_ground(bricked: Scene) -> None:
     assert len(bricked.bricks) == 6
     for brick in bricked.bricks:
         edges = brick.corners_m[[1, 3, 4]] - brick.corners_m[0]
-        assert sorted(np.linalg.norm(edges, axis=1)) == pytest.approx(sorted(rocks.SIZE_M))
+        assert sorted(np.linalg.norm(edges, axis=1)) == pytest.approx(sorted(rocks.BRICK_SIZE_M))
         np.testing.assert_allclose(edges @ edges.T, np.diag(np.diag(edges @ edges.T)), atol=1e-12)
         assert (brick.corners_m[:4, 2] < brick.corners_m[4:, 2]).all(), "the first four are the upper ones"
         for x, y, z in brick.corners_m[4:]:

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from calib.geometry.rigid import Rigid
-from drivers.camera_offset import corrected
 from drivers.clock import ManualClock
 from drivers.errors import BadFrame, BadOptions, NoFreshFrame
-from drivers.pairing import Pairing, learned
+from drivers.frame_times import Pairing, corrected, learned
 from drivers.sim.camera_settings import STEP_K, CameraClock, ClockSettings, TemperatureSettings
 from drivers.sim.render import Renderer
 from drivers.sim.rover import SimulatedRover

@@ -11,16 +11,16 @@ import pytest
 
 from calib.files.mast_file import load_rig
 from calib.geometry.rigid import Rigid
-from drivers.sim.optics.lens import Lens, LensSettings, disc_kernel, shadow
+from drivers.sim.optics.lens import LensSettings, SimulatedLens, disc_kernel, shadow
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene
 
 EYE = "pancam_left"
 
 
-def lens(rig: Path, scene: Scene, **settings: float) -> Lens:
+def lens(rig: Path, scene: Scene, **settings: float) -> SimulatedLens:
     model = load_rig(rig).rig.cameras[EYE].model
-    return Lens(LensSettings(**settings), model, EYE, 5, scene.cast)
+    return SimulatedLens(LensSettings(**settings), model, EYE, 5, scene.cast)
 
 
 def looking_down(rig: Path) -> Rigid:
@@ -39,7 +39,7 @@ def test_light_falls_off_with_the_fourth_power_of_the_cosine_of_a_rays_angle(
     for name, least in (("navcam_left", 0.75), ("hazcam_left", 0.5)):
         model = rig.cameras[name].model
         width, height = model.size_px
-        flat = Lens(LensSettings(falloff=4), model, name, 5, scene.cast).transmission
+        flat = SimulatedLens(LensSettings(falloff=4), model, name, 5, scene.cast).transmission
         for x, y in ((0, 0), (width - 1, height - 1), (width // 2, 3)):
             ray = model.ray(np.array([[float(x), float(y)]])).directions[0]
             assert flat[y, x] == pytest.approx((ray @ model.A) ** 4, abs=2e-3)
@@ -83,7 +83,7 @@ def test_the_disc_of_a_pancam_is_what_its_data_sheet_and_the_thin_lens_give(
 ) -> None:
     """f/20 and 12 um (Bell et al. 2003); 40.95 mm, 3 m: at 10 m 40.95²/20 * 7 / (10 * 2.959) = 19.83 um."""
     model = load_rig(repository / "configs" / "sim" / "rocky8.yaml").rig.cameras[EYE].model
-    far = Lens(
+    far = SimulatedLens(
         LensSettings(f_number=20, focus_m=3), model, EYE, 5, lambda o, d: 10.0 / (d @ model.A)
     ).discs_px(Rigid.identity())
     assert far.mean() == pytest.approx(19.83 / 12, rel=0.01)
@@ -96,7 +96,7 @@ def test_dust_lies_where_it_lies_and_is_soft(small_rig: Path, scene: Scene) -> N
     np.testing.assert_array_equal(
         share, lens(small_rig, scene, dust=12, f_number=20, pitch_um=48, dust_um=150).transmission
     )
-    other = Lens(dusty.settings, dusty.camera, "pancam_right", 5, scene.cast).transmission
+    other = SimulatedLens(dusty.settings, dusty.camera, "pancam_right", 5, scene.cast).transmission
     assert (other != share).any()
 
 

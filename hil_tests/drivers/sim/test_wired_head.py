@@ -14,9 +14,8 @@ import pytest
 from drivers.clock import Clock, ManualClock
 from drivers.errors import BadOptions, DriverError
 from drivers.faults import PAN_TILT
-from drivers.hardware import DeviceSettings, HardwareSettings
+from drivers.hardware import DeviceSettings, HardwareSettings, clock_for
 from drivers.interfaces import Reading
-from drivers.known import clock_for
 from drivers.open_hardware import open_hardware
 from drivers.sim.render import Renderer
 from drivers.sim.rover import SimulatedRover

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from drivers.errors import BadOptions
-from drivers.v4l2.exposure import GROUPS, ExposureControl, ExposureSettings
+from drivers.v4l2.exposure import GROUPS, AutoExposureSettings, ExposureControl
 
-SETTINGS = ExposureSettings(percentile=95, target=180, tolerance=25, shortest_s=1e-4, longest_s=0.03)
+SETTINGS = AutoExposureSettings(percentile=95, target=180, tolerance=25, shortest_s=1e-4, longest_s=0.03)
 
 
 def picture(light: float, exposure_s: float) -> np.ndarray:
@@ -58,7 +58,7 @@ def test_nothing_changes_during_a_measurement() -> None:
 
 
 def test_cameras_of_a_group_have_one_exposure_by_the_brightest() -> None:
-    settings = ExposureSettings(group="navcam")
+    settings = AutoExposureSettings(group="navcam")
     left, right = GROUPS.join("left", settings, 0.005), GROUPS.join("right", settings, 0.005)
     try:
         assert left is right
@@ -79,23 +79,23 @@ def test_cameras_of_a_group_have_one_exposure_by_the_brightest() -> None:
     ("settings", "exposure_s", "message"),
     [
         (
-            ExposureSettings(group="navcam", target=120),
+            AutoExposureSettings(group="navcam", target=120),
             0.005,
             "right: 'auto_exposure.target' is 120, but 180 for left of the same group 'navcam'; "
             "cameras of a group share one exposure, so the same is expected",
         ),
         (
-            ExposureSettings(group="navcam", longest_s=0.02),
+            AutoExposureSettings(group="navcam", longest_s=0.02),
             0.005,
             "'auto_exposure.longest_s' is 0.02, but 0.03",
         ),
-        (ExposureSettings(group="navcam"), 0.02, "'exposure_s' is 0.02, but 0.005 for left"),
+        (AutoExposureSettings(group="navcam"), 0.02, "'exposure_s' is 0.02, but 0.005 for left"),
     ],
 )
 def test_a_camera_of_a_group_with_settings_of_its_own_is_refused(
-    settings: ExposureSettings, exposure_s: float, message: str
+    settings: AutoExposureSettings, exposure_s: float, message: str
 ) -> None:
-    first = ExposureSettings(group="navcam")
+    first = AutoExposureSettings(group="navcam")
     control = GROUPS.join("left", first, 0.005)
     try:
         with pytest.raises(BadOptions, match=re.escape(message)):
@@ -115,7 +115,7 @@ def test_a_picture_taken_with_another_exposure_is_not_judged() -> None:
 
 
 def test_a_camera_that_gives_no_pictures_does_not_hold_the_others_up() -> None:
-    settings = ExposureSettings(group="hazcam")
+    settings = AutoExposureSettings(group="hazcam")
     control = GROUPS.join("left", settings, 0.005)
     GROUPS.join("right", settings, 0.005)
     try:

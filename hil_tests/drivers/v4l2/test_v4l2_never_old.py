@@ -19,7 +19,7 @@ from drivers.errors import BadOptions, NoFreshFrame
 from drivers.v4l2 import camera as camera_module
 from drivers.v4l2 import exposure, stream
 from drivers.v4l2.camera import V4l2Camera
-from drivers.v4l2.controls import Control
+from drivers.v4l2.controls import CameraControl
 from drivers.v4l2.node import StreamFailed, UnsupportedFormat
 from drivers.v4l2.options import parse_options
 from hil_tests.drivers.v4l2.v4l2_sensor import AUTO, EXPOSURE, Sensor, SensorNode, Shot, use
@@ -103,7 +103,7 @@ def bench(
     monkeypatch: pytest.MonkeyPatch,
     kind: str,
     told_hz: float | None = 25.0,
-    controls: tuple[Control, ...] = (),
+    controls: tuple[CameraControl, ...] = (),
     **options: object,
 ) -> Iterator[Bench]:
     node = SensorNode(kind, told_hz, controls)

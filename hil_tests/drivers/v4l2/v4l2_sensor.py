@@ -16,12 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from drivers.v4l2 import abi, find, stream
-from drivers.v4l2.controls import Control, Problem
+from drivers.v4l2.controls import CameraControl, ControlProblem
 from drivers.v4l2.node import Dequeued, Identity, PictureFormat
 
 SIZE_PX = (16, 8)
-EXPOSURE = Control(abi.CID_EXPOSURE_ABSOLUTE, "exposure", "integer", 1, 10000, 1, 100, True, {})
-AUTO = Control(abi.CID_EXPOSURE_AUTO, "auto_exposure", "menu", 0, 3, 1, 3, True, {1: "Manual", 3: "Auto"})
+EXPOSURE = CameraControl(abi.CID_EXPOSURE_ABSOLUTE, "exposure", "integer", 1, 10000, 1, 100, True, {})
+AUTO = CameraControl(
+    abi.CID_EXPOSURE_AUTO, "auto_exposure", "menu", 0, 3, 1, 3, True, {1: "Manual", 3: "Auto"}
+)
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,9 @@ class SensorNode:
     path = Path("/dev/video7")
     refused: tuple[int, ...] = ()  # controls that take no value
 
-    def __init__(self, kind: str, rate_hz: float | None = 25.0, controls: tuple[Control, ...] = ()) -> None:
+    def __init__(
+        self, kind: str, rate_hz: float | None = 25.0, controls: tuple[CameraControl, ...] = ()
+    ) -> None:
         self.identity = Identity("uvcvideo" if kind == "uvc" else "made_up", "Made up", "nowhere", 0)
         self.kind = kind
         self.rate_hz = rate_hz
@@ -124,9 +128,9 @@ class SensorNode:
 def use(monkeypatch: object, node: SensorNode) -> None:
     """Have the driver open this node and speak with its controls."""
 
-    def set_value(opened: SensorNode, control: Control, value: int) -> Problem | None:
+    def set_value(opened: SensorNode, control: CameraControl, value: int) -> ControlProblem | None:
         if control.id in opened.refused:
-            return Problem(control.name, f"{control.name} does not take {value}: Permission denied")
+            return ControlProblem(control.name, f"{control.name} does not take {value}: Permission denied")
         opened.sets.append((control.id, value))
         opened.values[control.id] = value
         return None

@@ -22,7 +22,7 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import Rigid
 from calib.matching.warp import grey
-from drivers.recorded_frames import read_recording
+from drivers.recordings.frames import read_recording
 from mastctl.cli.main import main
 from mastctl.client import Client
 from mastctl.config import Listen, load_config

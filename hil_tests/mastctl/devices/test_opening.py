@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import save_rig
-from drivers.hardware import DeviceSettings, HardwareSettings
-from drivers.known import head_name
+from drivers.hardware import DeviceSettings, HardwareSettings, head_name
 from hil_tests.mastctl.outside_daemon import daemon_process, line
 from hil_tests.mastctl.safety.test_deaths import Bench, made
 from hil_tests.mastctl.service_fakes import rig

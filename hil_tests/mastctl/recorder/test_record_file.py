@@ -16,7 +16,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 
-from drivers.mcap_file import BadRecording, Entry, Found, read_items
+from drivers.recordings.mcap_file import BadRecording, McapContents, McapEntry, read_items
 from hil_tests.mastctl.recorder.recorder_world import (
     CONFIG,
     files,
@@ -58,9 +58,9 @@ def small(path: Path) -> None:
     file.finish()
 
 
-def numbers(path: Path, found: Found | None = None) -> list[int]:
+def numbers(path: Path, found: McapContents | None = None) -> list[int]:
     items = read_items(path, found)
-    return [json.loads(item.message.data)["number"] for item in items if isinstance(item, Entry)]
+    return [json.loads(item.message.data)["number"] for item in items if isinstance(item, McapEntry)]
 
 
 def test_mast_file_and_configuration_stand_at_the_start_with_their_digests(recorded: Path) -> None:
@@ -151,7 +151,7 @@ def test_cut_off_at_any_byte_it_holds_every_chunk_before_and_repair_makes_it_who
     for length in sorted({0, 5, 9, *chance.integers(9, len(data), 40).tolist(), len(data) - 1}):
         cut = tmp_path / f"{length}.mcap"
         cut.write_bytes(data[:length] + b"\0" * int(chance.integers(0, 3) if length > 8 else 0))
-        found = Found()
+        found = McapContents()
         there = numbers(cut, found)
         assert there == list(range(len(there))) and len(there) % 10 == 0, f"seed {seed}, {length} bytes"
         assert not found.complete and not found.damaged
@@ -169,7 +169,7 @@ def test_a_chunk_that_was_damaged_is_passed_over_and_told(tmp_path: Path) -> Non
     second = [i for i in range(len(data)) if data[i : i + 4] == b"zstd"][1]
     data[second + 20] ^= 0xFF
     path.write_bytes(data)
-    found = Found()
+    found = McapContents()
     assert numbers(path, found) == [*range(10), *range(20, 30)]
     assert found.damaged == 1
     repaired = repair([path], tmp_path / "out.mcap")
@@ -185,7 +185,7 @@ def test_random_damage_never_ends_in_anything_but_a_shorter_reading(tmp_path: Pa
         for place in chance.integers(8, len(data), chance.integers(1, 4)):
             changed[place] = chance.integers(0, 256)
         path.write_bytes(changed)
-        found = Found()
+        found = McapContents()
         there = numbers(path, found)
         assert sorted(set(there)) == there and set(there) <= set(range(30)), changed
         assert len(there) == 30 or found.damaged or not found.complete, changed

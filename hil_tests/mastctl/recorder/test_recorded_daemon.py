@@ -10,7 +10,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from drivers.mcap_file import Entry, read_items
+from drivers.recordings.mcap_file import McapEntry, read_items
 from hil_tests.mastctl.recorder.recorder_world import files, told, until
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
@@ -112,7 +112,7 @@ def _state_of(path: Path, operation: str) -> str:
     states = [
         json.loads(item.message.data)
         for item in read_items(path)
-        if isinstance(item, Entry) and item.channel.topic == "/operation"
+        if isinstance(item, McapEntry) and item.channel.topic == "/operation"
     ]
     return next((one["state"] for one in reversed(states) if one["id"] == operation), "")
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from drivers.clock import ManualClock
-from drivers.mcap_file import Entry, Found, read_items
+from drivers.recordings.mcap_file import McapContents, McapEntry, read_items
 from hil_tests.mastctl.recorder.recorder_world import (
     files,
     frame,
@@ -280,7 +280,7 @@ def test_the_room_of_others_is_left_free_the_ring_giving_way_first(
     one.tell("command", "2", {"number": 2})
     until(lambda: not one.faults(), "it goes on")
     one.close()
-    assert all(Found is not None and list(read_items(path)) for path in files(tmp_path))
+    assert all(McapContents is not None and list(read_items(path)) for path in files(tmp_path))
 
 
 def test_a_run_ends_at_its_size_and_says_so(tmp_path: Path) -> None:
@@ -494,5 +494,5 @@ def test_a_value_that_cannot_be_told_spoils_nothing_else(tmp_path: Path) -> None
     one.tell("command", "1", {"number": 1})
     one.close()
     (path,) = files(tmp_path)
-    assert sum(isinstance(item, Entry) for item in read_items(path)) == sum(1 for _ in messages(path))
+    assert sum(isinstance(item, McapEntry) for item in read_items(path)) == sum(1 for _ in messages(path))
     assert told(path, "/command") == [{"number": 1}]

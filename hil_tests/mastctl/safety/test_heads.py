@@ -14,8 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.hardware import DeviceSettings, HardwareSettings
-from drivers.known import head_name
+from drivers.hardware import DeviceSettings, HardwareSettings, head_name
 from drivers.serial_line import stable_name
 from hil_tests import forks
 from hil_tests.mastctl.outside_daemon import OUTSIDE, free_port, line, write_config

@@ -21,7 +21,7 @@ import pytest
 
 from calib.files.mast_file import save_rig
 from drivers import open_hardware as door
-from drivers.absence import FIRST_WAIT_S, LONGEST_WAIT_S
+from drivers.absent import FIRST_WAIT_S, LONGEST_WAIT_S
 from drivers.errors import BadFrame, BadOptions, DriverError, LineLost, NoReply
 from drivers.interfaces import Frame
 from hil_tests import forks

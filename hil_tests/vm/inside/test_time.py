@@ -13,8 +13,8 @@ import pytest
 
 from drivers.clock import SystemClock
 from drivers.errors import NoFreshFrame
+from drivers.frame_times import learned
 from drivers.interfaces import Reading
-from drivers.pairing import learned
 from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.options import CameraOptions
 from mastctl.devices.devices import Devices

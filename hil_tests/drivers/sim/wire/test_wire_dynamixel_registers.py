@@ -10,7 +10,7 @@ from pathlib import Path
 import dynamixel_easy_sdk
 import pytest
 
-from drivers.sim.wire.dynamixel_models import MODELS, Model
+from drivers.sim.wire.dynamixel_models import MODELS, SimulatedModel
 
 FOLDER = Path(dynamixel_easy_sdk.__file__).parent / "control_table"
 FILES = {name: f"{name}.model" for name in MODELS} | {
@@ -90,7 +90,7 @@ def test_units() -> None:
         assert model.velocity_unit_rad_per_s == pytest.approx(units["Present Velocity"], rel=2e-3), name
 
 
-def signed_names(model: Model) -> set[str]:
+def signed_names(model: SimulatedModel) -> set[str]:
     return {r.name for r in model.registers if r.low < 0}
 
 

@@ -25,8 +25,7 @@ from drivers.errors import BadOptions, DriverError, NoFreshFrame
 from drivers.faults import PAN_TILT
 from drivers.interfaces import Camera, Frame, FrameTime, Image, PanTilt, Reading
 from drivers.options import OptionReader
-from drivers.recorded_frames import read_recording
-from drivers.recording import Pointing, read_folder, read_products
+from drivers.recordings.frames import RecordedPointing, read_folder, read_products, read_recording
 
 TOLERANCE_RAD = 0.002
 """How far from a recorded pointing a move may ask, unless the options say otherwise: two Navcam pixels."""
@@ -60,7 +59,7 @@ class Replay:
 
     pan_tilt: PanTilt
     cameras: Mapping[str, Camera]
-    pointings: Sequence[Pointing]
+    pointings: Sequence[RecordedPointing]
 
 
 def open_replay(options: Mapping[str, Any], folder: Path, clock: Clock) -> Replay:
@@ -71,8 +70,8 @@ def open_replay(options: Mapping[str, Any], folder: Path, clock: Clock) -> Repla
     options
         One of ``recording`` (an MCAP file that mastctl recorded, or a folder of them), ``products`` (a list
         of PDS3 files, or a pattern like ``opportunity/1N*.IMG``, sorted by name) with ``camera`` (the name
-        that its frames go by), and ``frames`` (a CSV, see `drivers.recording`). ``tolerance_rad``: how far
-        from a recorded pointing a move may ask.
+        that its frames go by), and ``frames`` (a CSV, see `drivers.recordings.frames`).
+        ``tolerance_rad``: how far from a recorded pointing a move may ask.
         ``grey_range_dn``: [low, high], what becomes black and white in frames of more than 8 bits.
     folder
         Where relative paths start.
@@ -120,12 +119,12 @@ def open_replay(options: Mapping[str, Any], folder: Path, clock: Clock) -> Repla
 class ReplayedHead:
     """A head that stands at recorded pointings only; safe from any thread."""
 
-    def __init__(self, pointings: Sequence[Pointing], tolerance_rad: float, clock: Clock) -> None:
+    def __init__(self, pointings: Sequence[RecordedPointing], tolerance_rad: float, clock: Clock) -> None:
         self._pointings = pointings
         self._tolerance_rad = tolerance_rad
         self._clock = clock
         self._lock = threading.Lock()
-        self._stood: deque[tuple[float, Pointing]] = deque([(-math.inf, pointings[0])], maxlen=1000)
+        self._stood: deque[tuple[float, RecordedPointing]] = deque([(-math.inf, pointings[0])], maxlen=1000)
 
     def read(self) -> Reading:
         """Return the measured angles that were recorded where the head stands."""
@@ -160,7 +159,7 @@ class ReplayedHead:
     def close(self) -> None:
         """Nothing is held."""
 
-    def at(self, time_s: float) -> Pointing:
+    def at(self, time_s: float) -> RecordedPointing:
         """Return where the head stood at a moment, seconds of the clock."""
         with self._lock:
             for since_s, pointing in reversed(self._stood):
@@ -183,7 +182,7 @@ class ReplayedCamera:
         self._start_s = clock.now_s()
         self._closed = threading.Event()
         self._lock = threading.Lock()
-        self._shown: tuple[Pointing, Image] | None = None
+        self._shown: tuple[RecordedPointing, Image] | None = None
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
         """Return the newest frame, or wait for the first whose exposure begins after ``exposed_after_s``.

@@ -38,7 +38,7 @@ class BadRecording(DriverError):
 
 
 @dataclass
-class Found:
+class McapContents:
     """What was met while a file was read; it grows as the reading goes on.
 
     Attributes
@@ -65,7 +65,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Entry:
+class McapEntry:
     """One message with its channel, and its schema (None where the channel names none).
 
     ``at`` is where in the file the record begins that holds it: what `read_at` wants.
@@ -77,7 +77,7 @@ class Entry:
     at: int
 
 
-Item = Header | Attachment | Metadata | Entry
+Item = Header | Attachment | Metadata | McapEntry
 
 
 def is_mcap(path: Path) -> bool:
@@ -89,7 +89,7 @@ def is_mcap(path: Path) -> bool:
         return False
 
 
-def read_items(path: Path, found: Found | None = None) -> Iterator[Item]:
+def read_items(path: Path, found: McapContents | None = None) -> Iterator[Item]:
     """Yield what a file holds, in its order: header, attachments, metadata, messages.
 
     Parameters
@@ -105,7 +105,7 @@ def read_items(path: Path, found: Found | None = None) -> Iterator[Item]:
         If it cannot be read, or does not begin like an MCAP file; an empty one is a recording of nothing.
         What is wrong further on is passed over.
     """
-    told = found if found is not None else Found()
+    told = found if found is not None else McapContents()
     try:
         with path.open("rb") as file:
             size = file.seek(0, io.SEEK_END)
@@ -121,14 +121,14 @@ def read_items(path: Path, found: Found | None = None) -> Iterator[Item]:
         raise BadRecording(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
-def read_messages(path: Path, topics: Sequence[str] | None = None) -> Iterator[Entry]:
+def read_messages(path: Path, topics: Sequence[str] | None = None) -> Iterator[McapEntry]:
     """Yield the messages of a file, of all topics or of these. Raises BadRecording."""
     for item in read_items(path):
-        if isinstance(item, Entry) and (topics is None or item.channel.topic in topics):
+        if isinstance(item, McapEntry) and (topics is None or item.channel.topic in topics):
             yield item
 
 
-def read_at(path: Path, entry: Entry) -> bytes:
+def read_at(path: Path, entry: McapEntry) -> bytes:
     """Return a message's content again, without reading what stands before it.
 
     ``entry`` may have lost its own content since it was read. Raises BadRecording.
@@ -139,9 +139,9 @@ def read_at(path: Path, entry: Entry) -> bytes:
             opcode, length = _FRAME.unpack(file.read(_FRAME.size))
             if length > LARGEST_RECORD:
                 raise ValueError("it has changed")
-            told = Found(channels={entry.channel.id: entry.channel})
+            told = McapContents(channels={entry.channel.id: entry.channel})
             for one in _record(opcode, file.read(length), told, entry.at):
-                if isinstance(one, Entry) and _same(one.message, entry.message):
+                if isinstance(one, McapEntry) and _same(one.message, entry.message):
                     return one.message.data
     except (OSError, ValueError, struct.error) as error:
         raise BadRecording(f"{path}: cannot be read again: {error}") from None
@@ -153,7 +153,7 @@ def _same(one: Message, other: Message) -> bool:
     return (one.channel_id, one.sequence, one.log_time) == (other.channel_id, other.sequence, other.log_time)
 
 
-def _items(file: BinaryIO, size: int, told: Found) -> Iterator[Item]:
+def _items(file: BinaryIO, size: int, told: McapContents) -> Iterator[Item]:
     """Walk over the records after the magic."""
     told.whole_bytes = file.tell()
     while True:
@@ -180,7 +180,7 @@ def _ends_whole(file: BinaryIO, size: int) -> bool:
     return file.read(len(MAGIC)) == MAGIC
 
 
-def _record(opcode: int, content: bytes, told: Found, at: int) -> Iterator[Item]:
+def _record(opcode: int, content: bytes, told: McapContents, at: int) -> Iterator[Item]:
     """What one record holds; a damaged one holds nothing."""
     if opcode == Opcode.CHUNK:
         try:
@@ -205,7 +205,7 @@ def _record(opcode: int, content: bytes, told: Found, at: int) -> Iterator[Item]
     yield from _known(one, told, at)
 
 
-def _known(one: object, told: Found, at: int) -> Iterator[Item]:
+def _known(one: object, told: McapContents, at: int) -> Iterator[Item]:
     """Keep schemas and channels, hand on the rest, each message with its channel."""
     if isinstance(one, Schema):
         told.schemas[one.id] = one
@@ -219,7 +219,7 @@ def _known(one: object, told: Found, at: int) -> Iterator[Item]:
         told.messages += 1
         told.first_ns = one.log_time if told.first_ns is None else min(told.first_ns, one.log_time)
         told.last_ns = one.log_time if told.last_ns is None else max(told.last_ns, one.log_time)
-        yield Entry(told.schemas.get(channel.schema_id), channel, one, at)
+        yield McapEntry(told.schemas.get(channel.schema_id), channel, one, at)
     elif isinstance(one, Header | Attachment | Metadata):
         yield one
 

@@ -1,29 +1,34 @@
-"""A recording: frames with the joint angles measured when they were taken.
+"""Recorded frames with the joint angles measured when they were taken.
 
 Other people's pictures are read in two forms: PDS3 products of one camera (image, and the label's measured
-mast angles), and a CSV beside ordinary image files with the columns ``camera,pan_rad,tilt_rad,file``; what
-mastctl itself recorded is `drivers.recorded_frames`'s. Pixels of more than 8 bits
-become 8 by one linear scale for all frames of a camera, never one for each: grey levels stay comparable.
+mast angles), and a CSV beside ordinary image files with the columns ``camera,pan_rad,tilt_rad,file``. Pixels
+of more than 8 bits become 8 by one linear scale for all frames of a camera, never one for each: grey levels
+stay comparable. Of what mastctl itself recorded (MCAP) the facts are there at once, a picture when asked for.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.files import pds3, read_bytes
 from drivers.errors import BadFrame, BadOptions
 from drivers.interfaces import Image
+from drivers.recordings.mcap_file import BadRecording, McapEntry, read_at, read_items
 
 SAME_RAD = 1e-7
 """Frames whose angles differ by less were taken at one pointing; labels print no finer."""
@@ -38,6 +43,10 @@ CSV_COLUMNS = ("camera", "pan_rad", "tilt_rad", "file")
 MAX_CSV_BYTES = 1 << 24
 HOW = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 MAX_IMAGE_BYTES = 1 << 30
+
+SUFFIX = ".mcap"
+ONE_PLACE_RAD = 2e-5
+"""Frames whose angles differ by less were taken at one pointing: a fortieth of a Navcam pixel."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +98,7 @@ class HasPicture(Protocol):
 
 
 @dataclass(frozen=True)
-class Pointing:
+class RecordedPointing:
     """A place where the head stood, and what its cameras took there."""
 
     pan_rad: float
@@ -99,7 +108,7 @@ class Pointing:
 
 def read_products(
     paths: Sequence[Path], camera: str, grey_range_dn: tuple[float, float] | None = None
-) -> list[Pointing]:
+) -> list[RecordedPointing]:
     """Return the pointings of PDS3 products taken by one camera, in the order of the paths.
 
     Raises
@@ -132,7 +141,7 @@ def read_products(
     return _pointings([RecordedFrame(camera, pan, tilt, path, scale) for pan, tilt, path in found])
 
 
-def read_folder(path: Path, grey_range_dn: tuple[float, float] | None = None) -> list[Pointing]:
+def read_folder(path: Path, grey_range_dn: tuple[float, float] | None = None) -> list[RecordedPointing]:
     """Return the pointings of a CSV ``camera,pan_rad,tilt_rad,file`` with image files beside it.
 
     Raises
@@ -173,7 +182,7 @@ def _scale(
     return GreyScale(float(low), float(max(high, low + 1.0)))
 
 
-def _pointings(frames: Sequence[RecordedFrame]) -> list[Pointing]:
+def _pointings(frames: Sequence[RecordedFrame]) -> list[RecordedPointing]:
     """Frames grouped by where the head stood, in their order."""
     groups: list[tuple[RecordedFrame, dict[str, RecordedFrame]]] = []
     for frame in frames:
@@ -188,7 +197,7 @@ def _pointings(frames: Sequence[RecordedFrame]) -> list[Pointing]:
                 device="replay",
             )
         together[frame.camera] = frame
-    return [Pointing(first.pan_rad, first.tilt_rad, together) for first, together in groups]
+    return [RecordedPointing(first.pan_rad, first.tilt_rad, together) for first, together in groups]
 
 
 def _same_place(one: RecordedFrame, other: RecordedFrame) -> bool:
@@ -271,3 +280,121 @@ def _angle(word: str, place: str) -> float:
 def _shown(this: tuple[str, tuple[int, int]]) -> str:
     """An instrument with its image size."""
     return f"{this[0] or 'an unnamed instrument'} with {this[1][0]} x {this[1][1]} pixels"
+
+
+@dataclass(frozen=True)
+class McapFrame:
+    """A frame in a recording.
+
+    Attributes
+    ----------
+    facts
+        What stands beside the picture (topic ``/camera/NAME/frame``).
+    path, entry
+        Where its picture is.
+    """
+
+    facts: Mapping[str, Any]
+    path: Path
+    entry: McapEntry
+
+    def image(self) -> Image:
+        """Return the picture, uint8 (h, w) or (h, w, 3) BGR, read-only. Raises BadFrame."""
+        camera = str(self.facts["camera"])
+        try:
+            data = read_at(self.path, self.entry)
+            schema = self.entry.schema
+            name = "" if schema is None else schema.name
+            image = _recorded_image(name, data, bool(self.facts.get("colour")))
+        except (BadRecording, DecodeError, ValueError) as error:
+            raise BadFrame(str(error), device=camera) from None
+        image.setflags(write=False)
+        return image
+
+
+def recording_files(path: Path) -> list[Path]:
+    """Return the files of a recording: itself, or those in a folder, in the order in which they were made.
+
+    Raises
+    ------
+    BadRecording
+        If there is nothing.
+    """
+    files = sorted(one for one in path.iterdir() if one.suffix == SUFFIX) if path.is_dir() else [path]
+    if not files or not files[0].is_file():
+        raise BadRecording(f"{path}: there is no recording; an MCAP file or a folder of them is expected")
+    return files
+
+
+def read_frames(path: Path) -> Iterator[McapFrame]:
+    """Yield the frames of a recording in their order; their pictures are not kept. Raises BadRecording."""
+    for file in recording_files(path):
+        facts: dict[tuple[str, int], dict[str, Any]] = {}
+        for item in read_items(file):
+            if not isinstance(item, McapEntry) or not item.channel.topic.startswith("/camera/"):
+                continue
+            camera, _, what = item.channel.topic.removeprefix("/camera/").rpartition("/")
+            place = camera, item.message.log_time
+            if what == "frame":
+                told = _facts(item.message.data)
+                if told is not None and told["camera"] == camera:
+                    facts[place] = told
+            elif what == "image" and place in facts:
+                there = replace(item, message=replace(item.message, data=b""))
+                yield McapFrame(facts.pop(place), file, there)
+
+
+def read_recording(path: Path) -> list[RecordedPointing]:
+    """Return where the head rested in a recording, and the last frame of each camera there.
+
+    Raises
+    ------
+    BadOptions
+        If there is no recording, it cannot be read, or no frame in it was taken by a head at rest.
+    """
+    places: dict[tuple[int, int], RecordedPointing] = {}
+    try:
+        for frame in read_frames(path):
+            if frame.facts["moving"]:
+                continue
+            pan_rad, tilt_rad = float(frame.facts["pan_rad"]), float(frame.facts["tilt_rad"])
+            cell = round(pan_rad / ONE_PLACE_RAD), round(tilt_rad / ONE_PLACE_RAD)
+            around = ((cell[0] + i, cell[1] + j) for i in (0, -1, 1) for j in (0, -1, 1))
+            here = next((near for near in around if near in places), cell)
+            before = places.get(here) or RecordedPointing(pan_rad, tilt_rad, {})
+            places[here] = replace(before, frames={**before.frames, str(frame.facts["camera"]): frame})
+    except BadRecording as error:
+        raise BadOptions(str(error), device="replay") from None
+    if not places:
+        raise BadOptions(f"{path}: holds no picture that a head at rest took", device="replay")
+    return list(places.values())
+
+
+def _facts(data: bytes) -> dict[str, Any] | None:
+    """A frame's facts, None if they are none: another program may have written the topic."""
+    try:
+        told = json.loads(data)
+        numbers = [float(told[name]) for name in ("pan_rad", "tilt_rad", "mid_exposure_s")]
+        whole = isinstance(told["camera"], str) and isinstance(told["frame_id"], str) and "moving" in told
+    except (ValueError, KeyError, TypeError):
+        return None
+    return told if whole and np.isfinite(numbers).all() else None
+
+
+def _recorded_image(schema: str, data: bytes, colour: bool) -> Image:
+    """A picture's pixels. Raises ValueError, DecodeError."""
+    if schema == "foxglove.CompressedImage":
+        flags = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
+        content = np.frombuffer(CompressedImage.FromString(data).data, np.uint8)
+        image = cv2.imdecode(content, flags | cv2.IMREAD_IGNORE_ORIENTATION) if content.size else None
+        if image is None:
+            raise ValueError("the recorded picture cannot be decoded")
+        return np.asarray(image, dtype=np.uint8)
+    if schema != "foxglove.RawImage":
+        raise ValueError(f"the recorded picture is of the schema {schema or 'none'}")
+    raw = RawImage.FromString(data)
+    channels = {"mono8": 1, "bgr8": 3}.get(raw.encoding)
+    if channels is None or raw.step != raw.width * channels or len(raw.data) != raw.step * raw.height:
+        raise ValueError(f"the recorded picture is {raw.encoding} of {len(raw.data)} bytes")
+    shape = (raw.height, raw.width) if channels == 1 else (raw.height, raw.width, channels)
+    return np.frombuffer(raw.data, np.uint8).reshape(shape).copy()

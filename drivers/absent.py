@@ -1,4 +1,4 @@
-"""A camera that could not be opened at the start: a place that it joins as soon as it can.
+"""Devices that are away: why, when they are worth another try, and a camera that joins when it can be opened.
 
 A factory may fail, which is tried again with a growing wait, or block for as long as it likes, which nobody
 can end from outside. So each opening has a thread of its own, and whoever asks is told at once how it stands.
@@ -6,17 +6,52 @@ can end from outside. So each opening has a thread of its own, and whoever asks 
 
 from __future__ import annotations
 
+import copy
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
 
-from drivers.absence import LONGEST_WAIT_S, Absence
 from drivers.errors import DriverError
 from drivers.interfaces import Camera, Frame
 
+FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 2.0
+
 Opening = Future[Any]
+
+
+class Absence:
+    """Whether a device is away. Each failed try doubles the wait before the next one, up to a bound.
+
+    Attributes
+    ----------
+    error
+        Why it is away; None while it is here.
+    again_s
+        When to try again, on the clock of the caller, seconds.
+    """
+
+    def __init__(self) -> None:
+        self.error: DriverError | None = None
+        self.again_s = 0.0
+        self._wait_s = FIRST_WAIT_S
+
+    def note(self, error: DriverError, now_s: float, silent_s: float = 0.0) -> None:
+        """Note that it is away, or still away after a try; it is left alone for ``silent_s`` at least."""
+        self.again_s = now_s + max(self._wait_s, silent_s)
+        self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
+        self.error = error
+
+    def end(self) -> None:
+        """Note that it is here."""
+        self.error, self._wait_s = None, FIRST_WAIT_S
+
+    def check(self) -> None:
+        """Raise why it is away, if it is; each time a new error, since one grows with every raise."""
+        error = self.error
+        if error is not None:
+            raise copy.copy(error)
 
 
 def begin_opening(name: str, make: Callable[[], Any]) -> Opening:
