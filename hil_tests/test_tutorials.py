@@ -85,8 +85,8 @@ class Walk:
         self.environ |= {
             "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
             "MASTCTL_URL": f"http://{self.address}",
-            "XDG_STATE_HOME": str(folder / "state-home"),
-            "MASTCTL_HEADS": str(folder / "heads"),
+            "XDG_STATE_HOME": f"{temporary}/state",  # short, for its sockets
+            "MASTCTL_HEADS": f"{temporary}/heads",
             "TMPDIR": temporary,
         }
 
