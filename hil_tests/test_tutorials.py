@@ -28,7 +28,7 @@ from hil_tests.waiting import until
 from mastctl.cli.main import Parser, build_parser
 
 BLOCK = re.compile(r"(?:`((?!/)[\w./-]+)`:\n\n)?```(\w+)\n(.*?)```", re.DOTALL)
-NUMBER = re.compile(r"(?:(?<!\w)[-+])?\d[\d.:]*")
+NUMBER = re.compile(r"(?:(?<!\w)[-+])?\d(?:[\d.:]*\d)?")
 SIGNED = re.compile(r"(?<!\w)[-+]\d+\.\d+")
 NEAR = 0.3
 LONGEST_S = 1800.0

@@ -262,7 +262,7 @@ class CameraModel(ReadOnlyArrays):
 
     @property
     def focal_px(self) -> tuple[float, float]:
-        """Focal lengths across and down, pixels: |A x H| and |A x V|."""
+        """Focal lengths across and down, pixels: ``|A x H|`` and ``|A x V|``."""
         across, down = (float(np.linalg.norm(np.cross(self.A, letter))) for letter in (self.H, self.V))
         return across, down
 
