@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import entry_points
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Literal
@@ -93,6 +92,8 @@ class InstalledDriver:
 
 def installed_drivers() -> list[InstalledDriver]:
     """Return the drivers that installed packages offer, heads first, by name; imports none of them."""
+    from importlib.metadata import entry_points  # loads 50 modules, and most rigs have no such driver
+
     found = []
     for kind, group in GROUPS.items():
         for entry in sorted(entry_points(group=group), key=lambda entry: (entry.name, entry.value)):
