@@ -83,12 +83,16 @@ class Crowd:
         self._go.set()
         time.sleep(duration_s)
 
-    def warm_up(self, least_s: float) -> None:
-        """Let everybody do their worst for at least so long, and until all of it was done once."""
+    def warm_up(self, least_s: float, operations: int = 0) -> None:
+        """Let everybody do their worst for so long, so many operations, and until all of it was done once."""
         until_s = time.monotonic() + WARM_S
         self.work(least_s)
-        while (lacking := self._ledger.lacking()) and time.monotonic() < until_s:
+        while time.monotonic() < until_s:
+            lacking = self._ledger.lacking()
+            if not lacking and self._ledger.operated >= operations:
+                break
             time.sleep(0.2)
+        lacking = self._ledger.lacking()
         self._ledger.check(not lacking, f"not warm after {WARM_S:g} s: {sorted(lacking)}")
 
     def rest(self, settle_s: float) -> None:

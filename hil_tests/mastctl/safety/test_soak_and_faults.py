@@ -24,7 +24,7 @@ def test_a_daemon_among_faults_and_bad_clients_does_as_wanted(
 ) -> None:
     """So short a run has no warm-up: whether the daemon grows is the long one's question."""
     monkeypatch.setattr(campaign, "WEIGH_S", 0.0)
-    monkeypatch.setattr(campaign.Crowd, "warm_up", lambda crowd, least_s: crowd.work(1.0))
+    monkeypatch.setattr(campaign.Crowd, "warm_up", lambda crowd, least_s, operations: crowd.work(1.0))
     monkeypatch.setattr(campaign, "judge", lambda first, last, ledger: None)
     assert campaign.soak(tmp_path, "memory", 3.0, seed=3, settle_s=0.5, rests=1) == []
 
@@ -34,10 +34,10 @@ def test_a_daemon_among_faults_and_bad_clients_stays_the_same(tmp_path: Path) ->
     assert campaign.soak(tmp_path, "memory", 60.0, seed=3, rests=1) == []
 
 
-def test_the_warm_up_ends_when_everything_was_done_once() -> None:
+def test_the_warm_up_ends_when_everything_was_done_once_and_enough_operations_have_ended() -> None:
     ledger = Ledger()
     *others, last = sorted(EVERYTHING)
-    warming = threading.Thread(target=campaign.Crowd(0, 1, ledger).warm_up, args=(0.0,), daemon=True)
+    warming = threading.Thread(target=campaign.Crowd(0, 1, ledger).warm_up, args=(0.0, 1), daemon=True)
     warming.start()
     for what in others:
         ledger.act(what)
@@ -45,6 +45,9 @@ def test_the_warm_up_ends_when_everything_was_done_once() -> None:
     warming.join(1.0)
     assert warming.is_alive()
     ledger.act(last)
+    warming.join(1.0)
+    assert warming.is_alive(), "no operation has ended"
+    ledger.operation_ended("angles", {"state": "done", "created_s": 0.0, "ended_s": 1.0}, 5.0)
     joined(warming)
     assert ledger.wrong == []
 
