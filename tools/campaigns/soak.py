@@ -39,7 +39,7 @@ GIVES_BACK = {
 }
 """The C library keeps 150 to 200 MB of freed pictures otherwise, 40 MB more or less from rest to rest."""
 WARM_OPERATIONS = 60
-"""After fewer, on a busy machine, a daemon still takes memory that stays (485 MB after 24, 513 to 521 later)."""
+"""After fewer, on a busy machine, it still takes memory that stays: 485 MB after 24, 513 to 521 later."""
 RESTS = 4  # after the warm-up
 SETTLE_S = 14.0  # idle threads of the web's pool end after 10 s
 WEIGH_S = 4.0
