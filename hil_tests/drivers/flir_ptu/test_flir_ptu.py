@@ -449,7 +449,7 @@ def test_a_limit_hit_of_a_resting_head_that_has_moved_meanwhile_stays(opened: Be
 def test_supply_and_temperature_are_watched_while_the_head_rests(
     opened: Bench, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], answer: str, words: str
 ) -> None:
-    monkeypatch.setattr("drivers.flir_ptu.unit.EVERY_S", 0.0)
+    monkeypatch.setattr("drivers.flir_ptu.unit.SUPPLY_EVERY_S", 0.0)
     unit = ScriptedPtu()
     unit.answers["O"] = b"* Input 30 VDC @ 86 degF"
     head, _ = opened(unit, **options)

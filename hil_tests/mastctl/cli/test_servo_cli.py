@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from drivers.dynamixel import models, workshop
+from drivers.dynamixel import registers, workshop
 from drivers.dynamixel.link import Link
 from drivers.errors import HardwareFault, OutOfRange, WrongDevice
 from drivers.sim.heads import AxisSettings
@@ -345,13 +345,13 @@ def test_test_begins_only_when_it_is_certain_to_be_slow_and_weak(
 def test_test_stops_at_its_fence(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     # A servo that does not stand where it was sent: here one whose place is misread by 100 counts.
     link = Link(bench.line.path, int(BAUD))
-    true_decode = models.Block.decode
+    true_decode = registers.RegisterBlock.decode
 
-    def misread(block: models.Block, data: bytes) -> dict[str, int]:
+    def misread(block: registers.RegisterBlock, data: bytes) -> dict[str, int]:
         values = true_decode(block, data)
         return {**values, "present_position": values["present_position"] + 100}
 
-    monkeypatch.setattr(models.Block, "decode", misread)
+    monkeypatch.setattr(registers.RegisterBlock, "decode", misread)
     with pytest.raises(OutOfRange, match="left the fence"):
         workshop.try_out(link, 1, math.radians(3), 30.0)
     link.close()
