@@ -86,12 +86,12 @@ def _order(trial: CameraTrial) -> str:
     return f"{trial.kept('order')['missed']} passed over"
 
 
-@CAMERAS.check("camera.refusal", "what cannot come in time is refused in time, with NoFreshFrame")
+@CAMERAS.check("camera.refusal", "a frame that cannot come in time is refused in time, with NoFreshFrame")
 def _refusal(trial: CameraTrial) -> None:
     trial.kept("refusal")
 
 
-@CAMERAS.check("camera.told", "size and pace, where it tells them, are those of its frames")
+@CAMERAS.check("camera.told", "size and pace, where it states them, are those of its frames")
 def _told(trial: CameraTrial) -> str:
     return ", ".join(trial.kept("told")["abilities"]) or "it tells nothing"
 

@@ -66,7 +66,7 @@ def _move(trial: HeadTrial) -> str:
 
 @HEADS.check(
     "head.under_way",
-    "under way it tells what is measured, says that it moves, and its stamps grow",
+    "under way it reports measured angles and motion, and its stamps grow",
     moves=True,
 )
 def _under_way(trial: HeadTrial) -> str:
