@@ -79,7 +79,8 @@ class Walk:
     def __init__(self, folder: Path, temporary: str, stack: ExitStack) -> None:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
-            self.address = f"127.0.0.1:{free.getsockname()[1]}"
+            self.port = free.getsockname()[1]
+        self.address = f"127.0.0.1:{self.port}"
         self.folder, self.stack = folder, stack
         self.environ = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST")}
         self.environ |= {
@@ -102,6 +103,8 @@ class Walk:
             ["bash", "-c", self.here(command)], cwd=self.folder, env=self.environ, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, timeout=LONGEST_S,
         )  # fmt: skip
+        for config in self.folder.glob("*/config.yaml"):  # of `sim new`
+            config.write_text(config.read_text().replace("port: 8420", f"port: {self.port}"))
         assert agrees(shown, done.stdout), f"$ {command}\n{done.stdout}\nwhere the page shows\n{shown}"
 
     def begin(self, command: str, shown: str) -> None:
@@ -170,7 +173,7 @@ def parses(line: str, parser: Parser) -> bool:
         asked = [word for word in shlex.split(line.split(" > ")[0].split(" | ")[0]) if word.startswith("--")]
     except ValueError:
         return True  # words of a sentence
-    return all(option.split("=")[0] in parser.format_help() for option in asked)
+    return all(option.split("=")[0] in parser._option_string_actions for option in asked)
 
 
 def test_every_option_of_a_command_on_a_page_is_one(repository: Path) -> None:
