@@ -147,7 +147,9 @@ def head_name(settings: HardwareSettings) -> str | None:
     such an option is its factory with all options.
     """
     device = settings.pan_tilt
-    outside = device.driver not in BUILT_IN
+    outside = ":" in device.driver
+    if not outside and device.driver not in BUILT_IN:
+        outside = any(one.name == device.driver for one in installed_drivers())
     if device.driver not in HEADS and not outside:
         return None
     port = device.options.get("port")
