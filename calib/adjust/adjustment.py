@@ -377,8 +377,7 @@ class Adjustment:
             rates["board", image.board] = rigid_rates(in_rover, points, board.translation_m)
         sigma = image.sigma_px[keep]
         residual = (seen.pixels_px - image.pixels_px[keep]) / sigma[:, None]
-        flat = {key: (one / sigma[:, None, None]).reshape(residual.size, -1) for key, one in rates.items()}
-        return ResidualBlock.of(self.unknowns, residual.ravel(), flat, width=2)
+        return ResidualBlock.of(self.unknowns, residual.ravel(), rates, 2, sigma[:, None, None])
 
     def station_residual(self, state: Estimate, point: StationTerm) -> FloatArray:
         """Measured less expected place of a prism or tape, in the rover frame and in sigmas, (3,)."""
@@ -394,14 +393,14 @@ class Adjustment:
         setup = state.rover_from_station[point.setup]
         eye = np.eye(3)
         measured = rigid_rates(eye[None], setup.points(point.position_m)[None], setup.translation_m)[0]
-        rates: dict[Key, FloatArray] = {("setup", point.setup): measured / point.sigma_m}
+        rates: dict[Key, FloatArray] = {("setup", point.setup): measured}
         if point.board is not None:
             board = state.rover_from_board[point.board]
             expected = rigid_rates(eye[None], board.points(point.in_board_m)[None], board.translation_m)[0]
-            rates["board", point.board] = -expected / point.sigma_m
+            rates["board", point.board] = -expected
         elif self.prism_cad_m > 0:
-            rates["prism", point.point] = -eye / point.sigma_m
-        return ResidualBlock.of(self.unknowns, self.station_residual(state, point), rates, width=3)
+            rates["prism", point.point] = -eye
+        return ResidualBlock.of(self.unknowns, self.station_residual(state, point), rates, 3, point.sigma_m)
 
     def known(self, state: Estimate) -> Iterator[tuple[Known, ResidualBlock]]:
         """What is known beforehand: usual lenses, joints and boards, prisms from CAD, joint readings."""
@@ -416,8 +415,10 @@ class Adjustment:
                 if kind == "attitude" and not self.joint_rad:
                     continue
                 residual = (self.numbers(state, key) - unknown.prior) / unknown.sigma
-                rates = np.diag(1.0 / unknown.sigma)
-                yield Known(key, unknown.kind), ResidualBlock.of(self.unknowns, residual, {key: rates}, 1)
+                block = ResidualBlock(
+                    residual, unknown.rates, self.at(key), 1, {key: slice(0, len(residual))}
+                )
+                yield Known(key, unknown.kind), block
 
     def numbers(self, state: Estimate, key: Key) -> FloatArray:
         """Return an unknown's numbers in a state; 0 for a camera's A and O, which count from its own.

@@ -51,6 +51,12 @@ class Unknown:
     kind: str | None = None
     usual: np.ndarray | None = None
 
+    @cached_property
+    def rates(self) -> FloatArray:
+        """(k, k) how residuals against the prior, in its sigmas, change with the numbers."""
+        assert self.sigma is not None
+        return np.diag(1.0 / self.sigma)
+
 
 class Unknowns(Mapping[Key, Unknown]):
     """The unknowns of a fit by key, and where the numbers of each stand among all of them."""
@@ -62,6 +68,7 @@ class Unknowns(Mapping[Key, Unknown]):
         self._parts = {
             key: slice(end - len(one.names), end) for (key, one), end in zip(self.items(), ends, strict=True)
         }
+        self._places = {key: np.arange(part.start, part.stop) for key, part in self._parts.items()}
 
     def __getitem__(self, key: Key) -> Unknown:
         return self._by_key[key]
@@ -96,7 +103,7 @@ class Unknowns(Mapping[Key, Unknown]):
 
     def at(self, key: Key) -> np.ndarray:
         """Return the indices of an unknown's numbers."""
-        return np.arange(self._parts[key].start, self._parts[key].stop)
+        return self._places[key]
 
     def of_kinds(self, *kinds: str) -> np.ndarray:
         """Return the indices of all unknowns of some kinds, the kinds in the order that is asked for."""
@@ -163,15 +170,21 @@ class ResidualBlock:
 
     @classmethod
     def of(
-        cls, unknowns: Unknowns, residual: FloatArray, rates: Mapping[Key, FloatArray], width: int
+        cls,
+        unknowns: Unknowns,
+        residual: FloatArray,
+        rates: Mapping[Key, FloatArray],
+        width: int,
+        sigma: float | FloatArray = 1.0,
     ) -> ResidualBlock:
-        """Return the block of residuals (m,) that change with some unknowns at ``rates`` (m, k)."""
+        """Return the block of residuals (m,) that change at ``rates`` over ``sigma``, (..., k) by unknown."""
         parts, first = {}, 0
         for key, one in rates.items():
-            parts[key] = slice(first, first + one.shape[1])
-            first += one.shape[1]
+            parts[key] = slice(first, first + one.shape[-1])
+            first += one.shape[-1]
         columns = np.concatenate([unknowns.at(key) for key in rates])
-        return cls(residual, np.concatenate(list(rates.values()), axis=1), columns, width, parts)
+        jacobian = np.concatenate(list(rates.values()), axis=-1) / sigma
+        return cls(residual, jacobian.reshape(len(residual), first), columns, width, parts)
 
     def rates(self, key: Key) -> FloatArray:
         """Return how the residuals change with one unknown, (m, k)."""

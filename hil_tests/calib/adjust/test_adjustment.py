@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -169,9 +170,9 @@ def test_no_meaning_hangs_on_the_order_in_which_unknowns_are_declared(
     made = ResidualBlock.of
 
     def turned_round(
-        unknowns: Unknowns, residual: FloatArray, rates: Mapping[Key, FloatArray], width: int
+        unknowns: Unknowns, residual: FloatArray, rates: Mapping[Key, FloatArray], *others: Any, **more: Any
     ) -> ResidualBlock:
-        return made(unknowns, residual, dict(reversed(rates.items())), width)
+        return made(unknowns, residual, dict(reversed(rates.items())), *others, **more)
 
     monkeypatch.setattr(ResidualBlock, "of", turned_round)
     other = fit_joint(survey)
