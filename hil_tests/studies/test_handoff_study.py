@@ -23,7 +23,7 @@ from drivers.sim.rover import SimulatedRover
 from drivers.sim.scene import Scene, tiny_scene
 from mastctl.cli.output import WrongUse
 from mastctl.client import Client, ClientError
-from mastctl.handoff.log import read_log
+from mastctl.watch.handoffs import read_log
 from tools.studies import handoff as study
 from tools.studies.handoff_record import (
     BrickPoints,

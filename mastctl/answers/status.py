@@ -143,7 +143,8 @@ class SentinelTold(TypedDict):
 
 
 class CalibrationTold(TypedDict):
-    """Whether residuals are as the mast file predicts; ``since`` (ISO 8601, UTC) where they are not."""
+    """Whether the mast file still holds, by residuals, reference pictures and hand-offs; ``since`` (ISO 8601,
+    UTC) where it does not."""
 
     verdict: Literal["good", "drifts", "few", "unknown"]
     sentence: str

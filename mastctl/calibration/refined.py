@@ -22,7 +22,7 @@ from calib.geometry.rig import Rig
 from calib.matching.handed_over import HandoffBias, MatchedHandoff, handoff_bias
 from mastctl.calibration.mast_file import rounded_matrix
 from mastctl.calibration.run import save_new
-from mastctl.handoff.log import ReadLog
+from mastctl.watch.handoffs import ReadLog
 
 SHIFT_FIRST = (3, 4, 5, 0, 1, 2)
 """In files and on the terminal a correction is its shift, then its turn."""

@@ -20,7 +20,7 @@ def run(args: argparse.Namespace) -> int:
     """Propose a correction as a new mast file; 1, and no file, if the hand-offs tell none."""
     from calib.files.mast_file import load_rig
     from mastctl.calibration.refined import propose, save_refined
-    from mastctl.handoff.log import read_log
+    from mastctl.watch.handoffs import read_log
 
     unused = {"--report": args.report, "--in-use": args.in_use, "--method": args.method, "--mast": args.mast}
     if given := [option for option, value in unused.items() if value is not None]:
@@ -58,7 +58,7 @@ def _check_out(out: Path, read: list[Path]) -> None:
 
 def _document(proposal: Proposal, saved: StoredRig | None, previous: Path | None) -> dict[str, Any]:
     from mastctl.calibration.refined import pose_told
-    from mastctl.handoff.log import bias_told
+    from mastctl.watch.handoffs import bias_told
 
     return {
         "mast_file": None

@@ -181,9 +181,9 @@ def _listen(words: str | None) -> dict[str, Any]:
 def _what_if(args: argparse.Namespace, recording: Recording) -> int:
     """Work a recording's pointings and hand-offs out again."""
     from calib.files.mast_file import load_rig
-    from mastctl.handoff.log import handoff_of
     from mastctl.recorder.what_if import handoffs_with, pointings_with, seen_in
     from mastctl.recorder.what_if_report import WhatIf, write_what_if
+    from mastctl.watch.handoffs import handoff_of
 
     mast = load_rig(args.mast)
     frames = {name: frame.facts for name, frame in recording.frames.items()}

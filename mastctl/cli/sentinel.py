@@ -83,9 +83,8 @@ def _steering(args: argparse.Namespace, client: Client) -> Iterator[None]:
 
 
 def _reference(args: argparse.Namespace) -> int:
-    from mastctl.sentinel.folder import save_reference
-    from mastctl.sentinel.look import head_cameras, take_pictures, usual_rests
-    from mastctl.sentinel.watch import now_utc
+    from mastctl.watch.looks import head_cameras, now_utc, take_pictures, usual_rests
+    from mastctl.watch.reference import save_reference
 
     with client_of(args) as client, _steering(args, client):
         rests = args.rest or usual_rests(client)
@@ -110,9 +109,8 @@ def _reference(args: argparse.Namespace) -> int:
 
 
 def _look(args: argparse.Namespace) -> int:
-    from mastctl.sentinel.folder import add_look, read_reference
-    from mastctl.sentinel.look import look_again
-    from mastctl.sentinel.watch import now_utc
+    from mastctl.watch.looks import look_again, now_utc
+    from mastctl.watch.reference import add_look, read_reference
 
     reference = read_reference(args.folder)
     with (
@@ -125,9 +123,9 @@ def _look(args: argparse.Namespace) -> int:
 
 
 def _tell(args: argparse.Namespace, look: dict[str, Any] | None) -> int:
-    from mastctl.sentinel.folder import read_looks, read_reference
-    from mastctl.sentinel.standing import standing
-    from mastctl.sentinel.watch import now_utc
+    from mastctl.watch.looks import now_utc
+    from mastctl.watch.reference import read_looks, read_reference
+    from mastctl.watch.sentinel import standing
 
     reference = read_reference(args.folder)
     now = standing(reference, read_looks(args.folder, reference), now_utc())
@@ -145,7 +143,7 @@ def _tell(args: argparse.Namespace, look: dict[str, Any] | None) -> int:
 
 
 def _watch(args: argparse.Namespace) -> int:
-    from mastctl.sentinel.watch import watch
+    from mastctl.watch.looks import watch
 
     watch(
         args.folder,

@@ -23,8 +23,8 @@ from mastctl.doctor.host import (
 from mastctl.doctor.mast_file import examine_mast_file
 from mastctl.doctor.serial_lines import examine_port
 from mastctl.safety.state_folder import usual_folder
-from mastctl.sentinel.folder import SENTINEL_FOLDER
-from mastctl.sentinel.standing import read_folder, standing
+from mastctl.watch.reference import SENTINEL_FOLDER
+from mastctl.watch.sentinel import read_folder, standing
 
 Asked = Callable[[str], Mapping[str, Any] | None]
 """Returns the status of the daemon at an address, None if nobody answers there."""

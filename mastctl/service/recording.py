@@ -11,13 +11,13 @@ from drivers.clock import Clock
 from mastctl.answers import Recordings
 from mastctl.config import Config
 from mastctl.devices.frames import StampedFrame
-from mastctl.handoff.log import line_of
 from mastctl.recorder.feed import Feed
 from mastctl.recorder.recorder import MastTold, Recorder
 from mastctl.recorder.writer import Attached
 from mastctl.service.mast_in_use import MastInUse
 from mastctl.state.faults import StandingFault
 from mastctl.state.publisher import Publisher
+from mastctl.watch.handoffs import line_of
 
 FOLDER = "records"
 

@@ -29,15 +29,11 @@ from mastctl.devices.opening import open_rig
 from mastctl.errors import MastctlError
 from mastctl.guided.guide import Guide
 from mastctl.guided.reports import Reports
-from mastctl.handoff.check import HandoffCheck
-from mastctl.handoff.in_picture import in_picture
-from mastctl.health.health import CalibrationHealth
 from mastctl.live.pictures import WatchedCameras
 from mastctl.live.settings import LiveSettings
 from mastctl.live.view import LiveView, check_installed
-from mastctl.metrics.history import History
-from mastctl.metrics.metrics import Metrics
 from mastctl.motion.jog import Jogs
+from mastctl.motion.pairs import in_picture
 from mastctl.motion.requests import wrong_camera
 from mastctl.motion.track import ACTIVE, TrackStatus
 from mastctl.motion.tracker import Tracker
@@ -48,8 +44,6 @@ from mastctl.safety.latch import Latch
 from mastctl.safety.state_folder import StateFolder
 from mastctl.safety.stop_socket import StopSocket
 from mastctl.safety.stop_threads import StopThreads
-from mastctl.sentinel.folder import SENTINEL_FOLDER
-from mastctl.sentinel.in_service import SentinelFindings
 from mastctl.service.mast_in_use import MastInUse, configured, read_mast
 from mastctl.service.masts import Masts
 from mastctl.service.opening import bounded, run_names
@@ -62,6 +56,13 @@ from mastctl.service.stopping import Stopping, state_faults
 from mastctl.service_manager import ServiceManager
 from mastctl.state.faults import StandingFault
 from mastctl.state.machine import Machine
+from mastctl.watch.handoffs import HandoffCheck
+from mastctl.watch.history import History
+from mastctl.watch.metrics import Metrics
+from mastctl.watch.reference import SENTINEL_FOLDER
+from mastctl.watch.residuals import CalibrationHealth
+from mastctl.watch.sentinel import SentinelFindings
+from mastctl.watch.verdict import mast_verdict
 
 log = logging.getLogger(__name__)
 
@@ -312,10 +313,14 @@ class Service:
             track=self.tracker.status,
             faults=faults,
             control=self.leases.told(),
-            calibration=cast(CalibrationTold, self.health.verdict.told()),
+            calibration=self.mast_verdict(),
             sentinel=cast(SentinelTold | None, self.sentinel.told()),
             stop_socket=None if self.stop_socket is None else str(self.stop_socket.path),
         )
+
+    def mast_verdict(self) -> CalibrationTold:
+        """Return whether the mast file still holds, by all three kinds of evidence."""
+        return mast_verdict(self.health.verdict, self.sentinel.told(), self.handoffs.told())
 
     def track_told(self, status: TrackStatus | None = None) -> TrackTold:
         """Return the track, as it is or was, and the self-check of now as ``GET /track`` tells them."""

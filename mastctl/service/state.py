@@ -54,9 +54,9 @@ class State:
     stop_socket
         Path of the Unix socket for stops alone.
     calibration
-        What pointings say of the mast file (`mastctl.health.verdict.Verdict.told`).
+        Whether the mast file still holds (`mastctl.watch.verdict.mast_verdict`).
     sentinel
-        What its looks say (`mastctl.sentinel.standing.findings`); None where they were not read yet.
+        What its looks say (`mastctl.watch.sentinel.findings`); None where they were not read yet.
     control
         Who steers, as `mastctl.commands.lease.Control.told` tells it; None for nobody.
     """

@@ -15,7 +15,6 @@ from drivers.clock import Clock
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import check_known
 from mastctl.errors import NotNow
-from mastctl.health.health import CalibrationHealth
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import (
     AnglesTarget,
@@ -33,6 +32,7 @@ from mastctl.motion.tracker import Tracker
 from mastctl.operations.operations import Operations
 from mastctl.operations.records import Operation
 from mastctl.service.masts import Masts
+from mastctl.watch.residuals import CalibrationHealth
 
 CLICK_AGE_S = 300.0  # a person may look at a picture for minutes before clicking; the sun moves meanwhile
 

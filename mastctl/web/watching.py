@@ -9,9 +9,9 @@ from fastapi import FastAPI, Request, Response
 
 from mastctl.answers import CalibrationHealthTold, LiveTold, ReadyTold, SentinelTold, Word
 from mastctl.errors import Unable
-from mastctl.metrics.metrics import CONTENT_TYPE
-from mastctl.sentinel.folder import SENTINEL_FOLDER
-from mastctl.sentinel.standing import findings
+from mastctl.watch.metrics import CONTENT_TYPE
+from mastctl.watch.reference import SENTINEL_FOLDER
+from mastctl.watch.sentinel import findings
 from mastctl.web import PREFIX
 from mastctl.web.packed import passing_answer
 from mastctl.web.parts import Here
@@ -54,11 +54,12 @@ def add_watching(app: FastAPI) -> None:
 
     @app.get(
         f"{PREFIX}/calibration/health",
-        summary="Whether residuals of the last days are as the mast file predicts",
+        summary="Whether the mast file still holds, with the figures of the last days' residuals",
     )
     async def calibration(here: Here) -> CalibrationHealthTold:
         service = here.service
-        return cast(CalibrationHealthTold, {**service.health.told(), "sentinel": service.sentinel.told()})
+        told = {**service.health.told(), **service.mast_verdict(), "sentinel": service.sentinel.told()}
+        return cast(CalibrationHealthTold, told)
 
     @app.get(f"{PREFIX}/sentinel", summary="What the drift sentinel's looks say, and how old the last one is")
     async def sentinel(here: Here) -> SentinelTold:

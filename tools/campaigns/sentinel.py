@@ -27,8 +27,8 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Mast, Rig, RigCamera
 from calib.geometry.rigid import FloatArray
 from mastctl.cli.output import at_least
-from mastctl.sentinel.folder import Reference, look_line
-from mastctl.sentinel.standing import slow_course, standing
+from mastctl.watch.reference import Reference, look_line
+from mastctl.watch.sentinel import slow_course, standing
 from tools.arguments import end
 from tools.campaign import options
 from tools.campaigns.sentinel_days import RESTS, Truth, about, alarm

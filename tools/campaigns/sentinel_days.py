@@ -25,7 +25,7 @@ from drivers.sim import boards, ground, rocks, scene
 from drivers.sim.kept import kernels
 from drivers.sim.render import Renderer
 from drivers.sim.scene import INNER_CELL_M, Scene, SceneSettings
-from mastctl.sentinel.folder import Picture
+from mastctl.watch.reference import ReferencePicture
 
 LATITUDE_RAD, TURN_OF_AXIS_RAD = math.radians(35.0), math.radians(23.4)
 LOWEST_SUN_RAD = 0.22
@@ -225,7 +225,7 @@ class DaysLook:
 
     stood_rad: FloatArray
     scene: Scene
-    pictures: list[Picture]
+    pictures: list[ReferencePicture]
 
 
 class Days:
@@ -255,7 +255,7 @@ class Days:
         stood: FloatArray,
         truth: Truth,
         drawn: dict[object, Grey],
-    ) -> list[Picture]:
+    ) -> list[ReferencePicture]:
         """One truth's pictures; light that another truth had as well is not drawn again."""
         assert self._renderer is not None
         found = []
@@ -270,7 +270,7 @@ class Days:
                     model = changed(self.rig.cameras[eye].model, eye, truth)
                     drawn[key] = self._renderer.image(model, site_from_head, 2)
                 picture = developed(rng, drawn[key], day, eye)
-                found.append(Picture(eye, pose, *rest, DIGEST, picture))
+                found.append(ReferencePicture(eye, pose, *rest, DIGEST, picture))
         return found
 
     def truly_moved(self, then: DaysLook, now: DaysLook, shift: ViewShift) -> FloatArray:

@@ -17,8 +17,8 @@ from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from mastctl.packaged import config_folder
-from mastctl.sentinel.folder import Reference, save_reference
-from mastctl.sentinel.look import view_shifts
+from mastctl.watch.looks import view_shifts
+from mastctl.watch.reference import Reference, save_reference
 from tools.campaigns.sentinel_days import (
     RESTS,
     Days,

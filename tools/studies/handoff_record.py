@@ -15,7 +15,7 @@ from calib.matching.handoff import RefinedPixel
 from drivers.interfaces import Image
 from drivers.sim.rover import SimulatedRover
 from mastctl.devices.frames import camera_and_sequence
-from mastctl.handoff.log import bias_told
+from mastctl.watch.handoffs import bias_told
 
 PAPER_WORST_PX: Mapping[str, float] = {"pancam to navcam": 2.5, "navcam to hazcam": 4.0}
 """The paper's worst geometric hand-off, Pancam to Navcam at 6 m and Navcam to Hazcam at 2 m."""

@@ -9,11 +9,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mastctl.handoff.log import HandoffLog
 from mastctl.report import pages, pictures, plots
 from mastctl.report.figures import Figure
 from mastctl.report.records import write_csv, write_json
 from mastctl.report.tables import Table, number, x_y
+from mastctl.watch.handoffs import HandoffLog
 from tools.studies.handoff_record import (
     PAPER_WORST_PX,
     Handed,
@@ -36,7 +36,7 @@ TRUTH_BGR = (80, 200, 80)
 def write_handoff_report(experiment: HandoffExperiment, folder: Path) -> Path:
     """Write report.html, the tables and the record into ``folder`` (made if need be); return the page.
 
-    ``handoffs.jsonl`` is what `mastctl calibrate --refine` reads (`mastctl.handoff.log`).
+    ``handoffs.jsonl`` is what `mastctl calibrate --refine` reads (`mastctl.watch.handoffs`).
 
     Raises
     ------

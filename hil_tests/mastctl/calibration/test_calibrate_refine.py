@@ -28,7 +28,7 @@ from hil_tests.calib.matching.handed_over import (
 )
 from mastctl.calibration.refined import pose_told
 from mastctl.cli.main import main
-from mastctl.handoff.log import HandoffLog
+from mastctl.watch.handoffs import HandoffLog
 
 TURN_RAD = (0.0, 0.004, 0.003)
 SHIFT_M = (0.002, 0.0, -0.002)

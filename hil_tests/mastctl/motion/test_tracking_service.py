@@ -35,9 +35,9 @@ from hil_tests.waiting import NET_S, until
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
-from mastctl.handoff.log import read_log
 from mastctl.motion import tracker as tracker_module
 from mastctl.motion.target_look import EyePixel, NotTrackable, TrackSighting
+from mastctl.watch.handoffs import read_log
 
 TARGET_M = (5.0, 0.5, 0.0)
 SIGMA = (0.01, 0.005)

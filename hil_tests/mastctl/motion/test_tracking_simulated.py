@@ -20,7 +20,7 @@ from mastctl.client import Client, ClientError
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.targets import texture_mask
-from mastctl.handoff.log import read_log
+from mastctl.watch.handoffs import read_log
 
 CROPPED_PX = (400, 300)
 STEP_M = 0.45

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.mastctl.sentinel.small_rover import small_rover
+from hil_tests.mastctl.watch.small_rover import small_rover
 from hil_tests.waiting import until
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon

@@ -1,4 +1,4 @@
-"""One pointing's residual as it is kept, and what an operation's record says of it.
+"""One pointing's residual as it is kept, and the file of those of the last days.
 
 What is judged is not the whole residual but what is left of it beside the joints: where the picture shows the
 target, less where position, mast file and *measured* joint angles put it. A servo that stops a count short is
@@ -7,14 +7,20 @@ a matter of the servo, not of the calibration.
 
 from __future__ import annotations
 
+import json
+import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 from typing import Any
 
+from calib.errors import BadFile
+from calib.files.atomic import replace_bytes
 from calib.files.mast_file import StoredRig
 from drivers.interfaces import COARSE_COUNT_RAD
 from mastctl.operations.records import Operation
+from mastctl.watch.json_lines import append_line, read_lines
 
 DISAGREE = "eyes_disagree"
 
@@ -139,3 +145,65 @@ def _numbers(values: object, key: str, size: int) -> tuple[float, ...]:
     if not all(type(value) in (int, float) and math.isfinite(value) for value in values):
         raise ValueError(f"{key} is not {size} finite numbers")
     return tuple(float(value) for value in values)
+
+
+log = logging.getLogger(__name__)
+
+FILE = "pointings.jsonl"
+MOST_BYTES = 4 << 20
+"""At which the file is written anew with what still counts; some 6000 pointings."""
+
+
+class Journal:
+    """A file of pointings; used by one thread.
+
+    Parameters
+    ----------
+    path
+        The file; its folder must be there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def read(self) -> list[Measured]:
+        """Return what the file holds, in its order; lines that are none are passed over, and told.
+
+        Raises
+        ------
+        BadFile
+            If the file system refuses.
+        """
+        try:
+            lines = read_lines(self.path, 2 * MOST_BYTES)
+        except OSError as error:
+            raise BadFile(self.path, "", f"cannot be read: {error.strerror or error}") from None
+        found, strange = [], 0
+        for line in lines:
+            try:
+                found.append(measured_of(json.loads(line)))
+            except (ValueError, TypeError, RecursionError):
+                strange += 1
+        if strange:
+            log.warning(
+                "%s: %d of %d lines are no pointings and do not count", self.path, strange, len(lines)
+            )
+        return found
+
+    def add(self, one: Measured, counting: Sequence[Measured]) -> None:
+        """Append a pointing; where the file is full it is written anew with ``counting``, which has it too.
+
+        Raises
+        ------
+        BadFile
+            If the file system refuses; what was there is still there.
+        """
+        try:
+            if not append_line(self.path, _line(one), MOST_BYTES):
+                replace_bytes(self.path, b"".join(map(_line, counting)))
+        except OSError as error:
+            raise BadFile(self.path, "", f"cannot be written: {error.strerror or error}") from None
+
+
+def _line(one: Measured) -> bytes:
+    return (json.dumps(one.told(), allow_nan=False) + "\n").encode()

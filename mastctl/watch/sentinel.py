@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import logging
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,7 +14,7 @@ import numpy as np
 
 from calib.errors import BadFile
 from calib.geometry.rigid import FloatArray
-from mastctl.sentinel.folder import REFERENCE, Reference, read_looks, read_reference
+from mastctl.watch.reference import LOOKS, REFERENCE, Reference, read_looks, read_reference
 
 CONFIRMED = 2
 """So many looks one after the other must name the same change before it is told."""
@@ -28,7 +30,7 @@ SLOW_LOOKS, SLOW_GAIN = 5, 9.0
 
 
 @dataclass(frozen=True)
-class Standing:
+class SentinelStanding:
     """What the looks say together.
 
     level
@@ -47,7 +49,7 @@ class Standing:
     since: str | None
 
 
-def standing(reference: Reference, looks: Sequence[Mapping[str, Any]], now: datetime) -> Standing:
+def standing(reference: Reference, looks: Sequence[Mapping[str, Any]], now: datetime) -> SentinelStanding:
     """Return what the looks at a reference say together; ``now`` for how long ago."""
     telling = [look for look in looks if look["views"]]
     if not telling:
@@ -57,14 +59,14 @@ def standing(reference: Reference, looks: Sequence[Mapping[str, Any]], now: date
             else f"{_looks(len(looks))} saw nothing they knew: night, fog, other light, another place? "
             f"The last {ago(looks[-1]['time'], now)}"
         )
-        return Standing("unsure", words, len(looks), None)
+        return SentinelStanding("unsure", words, len(looks), None)
     last = telling[-1]
     silent = len(looks) - 1 - max(at for at, look in enumerate(looks) if look["views"])
     blind = f"; {_looks(silent)} since then saw nothing they knew" if silent else ""
     seen = f"last looked {ago(last['time'], now)}"
     if not last["named"]:
         words = f"nothing has changed, {_looks(len(telling))}, {seen}{blind}"
-        return Standing("good" if silent < SILENT else "unsure", words, len(looks), None)
+        return SentinelStanding("good" if silent < SILENT else "unsure", words, len(looks), None)
     alike = 0
     for look in reversed(telling):
         if look["named"] != last["named"]:
@@ -73,7 +75,7 @@ def standing(reference: Reference, looks: Sequence[Mapping[str, Any]], now: date
     first = telling[-alike]["time"]
     if alike < CONFIRMED:
         words = f"{last['sentence']}, seen once {ago(first, now)}: look again{blind}"
-        return Standing("unsure", words, len(looks), first)
+        return SentinelStanding("unsure", words, len(looks), first)
     course = slow_course(reference.time, telling, last["named"])
     if course is not None:
         per_day, first = course
@@ -83,7 +85,7 @@ def standing(reference: Reference, looks: Sequence[Mapping[str, Any]], now: date
         words = f"since {for_long(first, now)}"
     old = (age := age_s(last["time"], now)) is not None and age > 86400.0 * OLD_DAYS
     words = f"{last['sentence']}, {words}{f' ({seen})' if old else ''}{blind}"
-    return Standing("bad", words, len(looks), first)
+    return SentinelStanding("bad", words, len(looks), first)
 
 
 def findings(folder: Path, mast_digest: str) -> dict[str, Any]:
@@ -148,9 +150,9 @@ def slow_course(begin: str, looks: Sequence[Mapping[str, Any]], what: str) -> tu
     days, sizes, sigmas = _history(begin, looks, what)
     if len(days) < SLOW_LOOKS or not (np.diff(days) >= 0.0).all():
         return None
-    steps = [_left((days >= onset).astype(np.float64), sizes, sigmas)[0] for onset in days]
+    steps = [_left_chi2((days >= onset).astype(np.float64), sizes, sigmas)[0] for onset in days]
     onsets = np.concatenate([[0.0], days[:-2]])
-    slopes = [_left(np.maximum(days - onset, 0.0), sizes, sigmas) for onset in onsets]
+    slopes = [_left_chi2(np.maximum(days - onset, 0.0), sizes, sigmas) for onset in onsets]
     best = int(np.argmin([left for left, _ in slopes]))
     left, per_day = slopes[best]
     if left > min(steps) - SLOW_GAIN:
@@ -161,7 +163,7 @@ def slow_course(begin: str, looks: Sequence[Mapping[str, Any]], what: str) -> tu
     return per_day, since
 
 
-def _left(shape: FloatArray, sizes: FloatArray, sigmas: FloatArray) -> tuple[float, float]:
+def _left_chi2(shape: FloatArray, sizes: FloatArray, sigmas: FloatArray) -> tuple[float, float]:
     """Chi-square that a course of this shape leaves, and its factor."""
     weights = 1.0 / sigmas**2
     factor = float(np.sum(weights * shape * sizes) / max(np.sum(weights * shape**2), 1e-300))
@@ -225,3 +227,81 @@ def ago(time: str, now: datetime) -> str:
     age = age_s(time, now)
     words = for_long(time, now)
     return f"at {words}" if age is None or age <= -90.0 else f"{words} ago"
+
+
+log = logging.getLogger(__name__)
+
+POLL_S = 2.0
+ANEW_S = 60.0
+"""Sentences hold how long ago something was, and are made anew so often."""
+
+CLOSE_S = 2.0
+
+
+class SentinelFindings:
+    """What the looks in a folder say, as of a few seconds ago; reading it waits for nothing.
+
+    Parameters
+    ----------
+    folder
+        Where a sentinel keeps its reference and looks; need not be there.
+    mast_digest
+        Returns that of the mast file in use.
+    """
+
+    def __init__(self, folder: Path, mast_digest: Callable[[], str]) -> None:
+        self._folder = folder
+        self._mast_digest = mast_digest
+        self._found: dict[str, Any] | None = None
+        self._level = "none"
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="sentinel findings", daemon=True)
+        self._thread.start()
+
+    def told(self) -> dict[str, Any] | None:
+        """Return what ``GET /sentinel`` tells, None before it was read for the first time."""
+        found = self._found
+        if found is None or found["last_look"] is None:
+            return found
+        age = age_s(found["last_look"], datetime.now(UTC))
+        return {**found, "age_s": None if age is None else max(age, 0.0)}
+
+    def close(self) -> None:
+        """Read no more; bounded."""
+        self._ended.set()
+        self._thread.join(CLOSE_S)
+
+    # In the thread
+
+    def _work(self) -> None:
+        known: object = None
+        while True:
+            mark = self._mark(), self._mast_digest(), datetime.now(UTC).timestamp() // ANEW_S
+            if mark != known:
+                known = mark
+                try:
+                    self._say(findings(self._folder, mark[1]))
+                except Exception:  # a file that nobody foresaw must not end the watch
+                    log.exception("the sentinel's findings in %s met a defect of the program", self._folder)
+            if self._ended.wait(POLL_S):
+                return
+
+    def _mark(self) -> tuple[tuple[int, int] | None, ...]:
+        """What changes whenever one of the files does."""
+        marks: list[tuple[int, int] | None] = []
+        for name in (REFERENCE, LOOKS):
+            try:
+                about = (self._folder / name).stat()
+            except OSError:
+                marks.append(None)
+            else:
+                marks.append((about.st_mtime_ns, about.st_size))
+        return tuple(marks)
+
+    def _say(self, found: dict[str, Any]) -> None:
+        """Let findings be known; a change that comes or goes is logged."""
+        before, self._level, self._found = self._level, found["level"], found
+        if self._level == "bad" and before != "bad":
+            log.warning("drift sentinel: %s", found["sentence"])
+        elif before == "bad" and self._level != "bad":
+            log.info("drift sentinel: %s", found["sentence"])

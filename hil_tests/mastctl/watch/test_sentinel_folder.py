@@ -13,19 +13,19 @@ import pytest
 
 from calib.calibrate.scene.drift import SceneChange, SceneDrift
 from calib.errors import BadFile
-from mastctl.sentinel import folder as folder_module
-from mastctl.sentinel.folder import (
+from mastctl.watch import reference as folder_module
+from mastctl.watch.looks import is_due
+from mastctl.watch.reference import (
     LOOKS,
     REFERENCE,
-    Picture,
     Reference,
+    ReferencePicture,
     add_look,
     read_looks,
     read_reference,
     save_reference,
 )
-from mastctl.sentinel.standing import findings, standing
-from mastctl.sentinel.watch import is_due
+from mastctl.watch.sentinel import findings, standing
 
 NOW = datetime(2026, 5, 4, 12, 0, tzinfo=UTC)
 RESTS = [(0.0, -0.2), (0.5, -0.2)]
@@ -34,10 +34,10 @@ RESTS = [(0.0, -0.2), (0.5, -0.2)]
 REFERENCE_OF_A_WEEK = Reference((NOW - timedelta(days=7)).isoformat(), "d" * 64, (), (), Path())
 
 
-def pictures() -> list[Picture]:
+def pictures() -> list[ReferencePicture]:
     rng = np.random.default_rng(1)
     return [
-        Picture("eye", pose, *rest, "d" * 64, rng.integers(0, 256, (48, 64)).astype(np.float32))
+        ReferencePicture("eye", pose, *rest, "d" * 64, rng.integers(0, 256, (48, 64)).astype(np.float32))
         for pose, rest in enumerate(RESTS)
     ]
 

@@ -25,7 +25,7 @@ QUIET = frozenset({"lease.renew", "jog"})
 """Commands that come again and again and tell nothing new where they are carried out."""
 
 
-class Sample(NamedTuple):
+class PastSample(NamedTuple):
     """The head at a moment, seconds of the daemon's clock; degrees Celsius where the driver knows them."""
 
     time_s: float
@@ -34,7 +34,7 @@ class Sample(NamedTuple):
     temperatures_c: Mapping[str, float]
 
 
-class Event(NamedTuple):
+class PastEvent(NamedTuple):
     """Something that happened: ``state``, ``fault`` or ``command``, in words, and whether it is well."""
 
     time_s: float
@@ -61,8 +61,8 @@ class History:
     ) -> None:
         self._temperatures_c = temperatures_c
         self._clock = clock
-        self._samples: deque[Sample] = deque(maxlen=SAMPLES)
-        self._events: deque[Event] = deque(maxlen=EVENTS)
+        self._samples: deque[PastSample] = deque(maxlen=SAMPLES)
+        self._events: deque[PastEvent] = deque(maxlen=EVENTS)
         self._before: HeadReading | None = None
         self._word = ""
         self._standing: dict[str, frozenset[str]] = {}
@@ -125,42 +125,42 @@ class History:
     def _keep(self, reading: HeadReading) -> None:
         self._samples.append(self._sample(reading))
 
-    def _sample(self, reading: HeadReading) -> Sample:
-        return Sample(reading.time_s, reading.pan_rad, reading.tilt_rad, self._temperatures_c())
+    def _sample(self, reading: HeadReading) -> PastSample:
+        return PastSample(reading.time_s, reading.pan_rad, reading.tilt_rad, self._temperatures_c())
 
-    def _told_of(self, one: Published) -> Iterator[Event]:
+    def _told_of(self, one: Published) -> Iterator[PastEvent]:
         """What happened by a value that was published, if anything did."""
         now_s, value = self._clock.now_s(), one.value
         if one.topic == "state" and value.word != self._word:
             self._word = value.word
             well = value.word not in ("fault", "stopped")
-            yield Event(now_s, "state", _joined(value.word, value.reason), well)
+            yield PastEvent(now_s, "state", _joined(value.word, value.reason), well)
         elif one.topic == "fault":
             before = self._standing.get(one.key, frozenset())
             self._standing[one.key] = frozenset(fault.code for fault in value)
             for fault in value:
                 if fault.code not in before:
-                    yield Event(now_s, "fault", _joined(one.key, fault.message), False)
+                    yield PastEvent(now_s, "fault", _joined(one.key, fault.message), False)
             if before and not value:
-                yield Event(now_s, "fault", f"{one.key}: nothing is wrong any more", True)
+                yield PastEvent(now_s, "fault", f"{one.key}: nothing is wrong any more", True)
         elif one.topic == "command":
             yield from _command(now_s, value)
 
 
-def _moved(one: HeadReading, last: Sample) -> bool:
+def _moved(one: HeadReading, last: PastSample) -> bool:
     return max(abs(one.pan_rad - last.pan_rad), abs(one.tilt_rad - last.tilt_rad)) > MOVED_RAD
 
 
-def _command(now_s: float, record: Mapping[str, Any]) -> Iterator[Event]:
+def _command(now_s: float, record: Mapping[str, Any]) -> Iterator[PastEvent]:
     """What a command's record, or that of its operation's end, tells."""
     if "result" in record:
         well = record["result"] == "ok"
         if not (well and record["command"] in QUIET):
             words = f"{record['who']}: {record['command']}"
-            yield Event(now_s, "command", words if well else _joined(words, record.get("message")), well)
+            yield PastEvent(now_s, "command", words if well else _joined(words, record.get("message")), well)
     elif "ended" in record:
         words = f"{record['ended']}: {record['state']}"
-        yield Event(now_s, "command", _joined(words, record.get("message")), record["state"] == "done")
+        yield PastEvent(now_s, "command", _joined(words, record.get("message")), record["state"] == "done")
 
 
 def _joined(words: str, more: str | None) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -22,6 +21,7 @@ from calib.files import read_bytes
 from calib.files.atomic import replace_bytes
 from calib.files.yaml_text import Section
 from calib.matching.warp import Grey, grey
+from mastctl.watch.json_lines import append_line, read_lines
 
 SCHEMA = "mastctl/sentinel/1"
 SENTINEL_FOLDER = "sentinel"
@@ -35,7 +35,7 @@ MOST_LOOKS_BYTES = 16_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class ReferencePicture:
     """A camera's picture at a rest: true joint angles, and the mast file that they follow from."""
 
     camera: str
@@ -66,7 +66,7 @@ class Reference:
         for one in self.pictures:
             self.picture(one["camera"], one["pose"])
 
-    def picture(self, camera: str, pose: int) -> Picture | None:
+    def picture(self, camera: str, pose: int) -> ReferencePicture | None:
         """Return a picture, None if the reference has none of this camera there. Raises BadFile."""
         for told in self.pictures:
             if told["camera"] == camera and told["pose"] == pose:
@@ -76,12 +76,14 @@ class Reference:
                 image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if whole else None
                 if image is None:
                     raise BadFile(path, "", "is not the picture that was taken; take the reference again")
-                return Picture(camera, pose, told["pan_rad"], told["tilt_rad"], self.mast_digest, grey(image))
+                return ReferencePicture(
+                    camera, pose, told["pan_rad"], told["tilt_rad"], self.mast_digest, grey(image)
+                )
         return None
 
 
 def save_reference(
-    folder: Path, time: str, rests: Sequence[tuple[float, float]], pictures: Sequence[Picture]
+    folder: Path, time: str, rests: Sequence[tuple[float, float]], pictures: Sequence[ReferencePicture]
 ) -> Reference:
     """Save reference pictures in place of any before, and forget the looks at those.
 
@@ -113,7 +115,7 @@ def save_reference(
     return read_reference(folder)
 
 
-def _saved(folder: Path, inner: Path, one: Picture) -> dict[str, Any]:
+def _saved(folder: Path, inner: Path, one: ReferencePicture) -> dict[str, Any]:
     """Write a picture; what the reference says of it. Raises OSError."""
     done, png = cv2.imencode(".png", np.clip(np.rint(one.image), 0, 255).astype(np.uint8))
     if not done:
@@ -175,12 +177,7 @@ def add_look(folder: Path, reference: Reference, time: str, drift: SceneDrift) -
     line = look_line(reference, time, drift)
     path = folder / LOOKS
     try:
-        with path.open("a+b") as file:
-            file.seek(max(file.seek(0, os.SEEK_END) - 1, 0))
-            torn = file.read(1) not in (b"", b"\n")  # a line that was cut costs only itself
-            file.write(b"\n" * torn + json.dumps(line).encode() + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
+        append_line(path, json.dumps(line).encode() + b"\n")
     except OSError as error:
         raise BadFile(
             path, "", f"cannot be written: {error.strerror or error}; the look is not kept"
@@ -221,11 +218,7 @@ def read_looks(folder: Path, reference: Reference) -> list[dict[str, Any]]:
     """
     path = folder / LOOKS
     try:
-        with path.open("rb") as file:
-            file.seek(max(file.seek(0, os.SEEK_END) - MOST_LOOKS_BYTES, 0))
-            rows = file.read().splitlines()
-    except FileNotFoundError:
-        return []
+        rows = read_lines(path, MOST_LOOKS_BYTES)
     except OSError as error:
         raise BadFile(path, "", f"cannot be read: {error.strerror or error}") from None
     return [look for row in rows if (look := _look(row)) and look.get("reference") == reference.time]

@@ -54,7 +54,7 @@ class Metrics:
 
     def __init__(self, status: Status, errors: Errors, publisher: Publisher) -> None:
         self._registry = CollectorRegistry()
-        self._registry.register(_Now(status, errors))
+        self._registry.register(_NowMetrics(status, errors))
         ProcessCollector(registry=self._registry)
         self._operations = self._counter("operations", "Operations that have ended.", "state", "code")
         self._commands = self._counter("commands", "Commands, by what came of them.", "command", "result")
@@ -142,7 +142,7 @@ class Metrics:
             self._missed.labels(camera).inc(facts.sequence - before - 1)
 
 
-class _Now:
+class _NowMetrics:
     """What is true at the moment, read when somebody asks."""
 
     def __init__(self, status: Status, errors: Errors) -> None:
@@ -193,7 +193,7 @@ class _Now:
         yield failed
         yield from _steering(status.get("control"))
         yield from _calibration(status.get("calibration"))
-        yield from _sentinel(status.get("sentinel"))
+        yield from _drift(status.get("sentinel"))
 
 
 def _steering(control: Mapping[str, Any] | None) -> Iterable[Metric]:
@@ -208,7 +208,7 @@ def _steering(control: Mapping[str, Any] | None) -> Iterable[Metric]:
     yield left
 
 
-def _sentinel(told: Mapping[str, Any] | None) -> Iterable[Metric]:
+def _drift(told: Mapping[str, Any] | None) -> Iterable[Metric]:
     """What the drift sentinel's looks say; nothing without a reference."""
     if told is not None and told["reference"] is not None:
         bad = float(told["level"] == "bad")
@@ -220,10 +220,12 @@ def _sentinel(told: Mapping[str, Any] | None) -> Iterable[Metric]:
 
 
 def _calibration(told: Mapping[str, Any] | None) -> Iterable[Metric]:
-    """Whether residuals are as the mast file predicts."""
+    """Whether the mast file still holds."""
     if told is not None:
         drifts = float(told["verdict"] == "drifts")
-        yield GaugeMetricFamily("mastctl_calibration_drifts", "1 if residuals are not as predicted.", drifts)
+        yield GaugeMetricFamily(
+            "mastctl_calibration_drifts", "1 if anything says that the mast file does not hold.", drifts
+        )
         yield GaugeMetricFamily(
             "mastctl_calibration_pointings", "Of the last days, that are judged.", float(told["pointings"])
         )

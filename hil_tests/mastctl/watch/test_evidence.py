@@ -8,11 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hil_tests.mastctl.health.histories import DAY_S, NOON_S, bumped, honest, pointing, stored_rig
-from mastctl.health.evidence import Judge, Sums, sums_of
-from mastctl.health.expected import Expected
-from mastctl.health.verdict import verdict_of
-from mastctl.health.windows import LOG_THRESHOLD, Windows
+from hil_tests.mastctl.watch.histories import DAY_S, NOON_S, bumped, honest, pointing, stored_rig
+from mastctl.watch.evidence import Expected, Judge, Sums, sums_of
+from mastctl.watch.residuals import LOG_THRESHOLD, Windows, verdict_of
 
 CAMERAS = ("pancam_left", "navcam_left", "navcam_right")
 BUMP_RAD = 2e-3

@@ -13,13 +13,13 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from calib.geometry.rig import Rig
-from hil_tests.mastctl.sentinel.small_rover import RESTS, bumped, refocused, slipped, small_rover, truly
+from hil_tests.mastctl.watch.small_rover import RESTS, bumped, refocused, slipped, small_rover, truly
 from hil_tests.waiting import until
 from mastctl.cli.main import main
 from mastctl.client import Client
 from mastctl.daemon import RunningDaemon
-from mastctl.sentinel.folder import LOOKS, read_looks, read_reference
-from mastctl.sentinel.watch import watch
+from mastctl.watch.looks import watch
+from mastctl.watch.reference import LOOKS, read_looks, read_reference
 
 Run = Callable[..., tuple[int, str, str]]
 THERE = (0.4, -0.2)
@@ -107,6 +107,11 @@ def test_a_change_of_the_truth_is_named_by_two_looks_and_told_everywhere(
     until(in_status, "the finding in the status")
     assert client.status()["faults"] == [] and client.status()["state"] == "ready"
     health = client.calibration_health()
+    assert (health["verdict"], health["since"]) == ("drifts", told["since"])
+    assert health["sentence"].startswith(f"reference pictures: {what}")
+    assert client.status()["calibration"] == {
+        key: health[key] for key in client.status()["calibration"] or ()
+    }
     assert health["sentinel"] is not None and health["sentinel"]["sentence"].startswith(what)
     text = daemon.service.metrics.text().decode()
     found = {one.name: one for one in text_string_to_metric_families(text)}
@@ -206,7 +211,7 @@ def test_one_camera_less_than_the_reference_is_said(folder: Path, tmp_path: Path
 def test_pictures_of_another_size_are_refused_in_a_sentence(folder: Path, tmp_path: Path, run: Run) -> None:
     import cv2
 
-    from mastctl.sentinel.folder import Picture, save_reference
+    from mastctl.watch.reference import ReferencePicture, save_reference
 
     reference = read_reference(folder)
     smaller = []
@@ -215,7 +220,7 @@ def test_pictures_of_another_size_are_refused_in_a_sentence(folder: Path, tmp_pa
         assert picture is not None
         image = cv2.resize(picture.image, (256, 192))
         smaller.append(
-            Picture(
+            ReferencePicture(
                 picture.camera, picture.pose, picture.pan_rad, picture.tilt_rad, reference.mast_digest, image
             )
         )

@@ -1,21 +1,24 @@
-"""The record of hand-offs: a text file, one JSON object a line, appended to by whoever hands over.
+"""The mast's self-check in service: the record of hand-offs, and what they say together.
 
-Keys of a line: ``schema`` (``mastctl/handoff/1``), ``time`` (ISO 8601, UTC), ``mast_digest``, ``source``
-(left and right camera), ``pan_rad``, ``tilt_rad``, ``joint_sigma_rad``, ``left_px``, ``right_px``,
+Keys of a line of the record: ``schema`` (``mastctl/handoff/1``), ``time`` (ISO 8601, UTC), ``mast_digest``,
+``source`` (left and right camera), ``pan_rad``, ``tilt_rad``, ``joint_sigma_rad``, ``left_px``, ``right_px``,
 ``sigma_px`` (of each coordinate of those), ``to_pan_rad``, ``to_tilt_rad``, and ``destinations``, by camera:
 ``geometric_px``, ``geometric_covariance_px2`` (of the clicks), ``verdict``, ``reason``, ``found_px`` and
 ``found_covariance_px2``, the last two null unless the verdict is ``accepted``. Angles are true ones, by the
-joints of the mast file that ``mast_digest`` names.
+joints of the mast file that ``mast_digest`` names. The file may hang or be full: a thread of its own reads
+and writes it, and nobody waits for that.
 """
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
+import logging
+import threading
+from collections import deque
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, cast, get_args
 
 import numpy as np
@@ -25,17 +28,18 @@ from calib.files import digest_of, read_bytes
 from calib.files.mast_file import CAMERA_NAME, CAMERA_NAME_WORDS
 from calib.files.yaml_text import Section, kind_of
 from calib.geometry.handoff import Joints
-from calib.matching.handed_over import HandoffBias, Landed, MatchedHandoff
+from calib.matching.handed_over import HandoffBias, Landed, MatchedHandoff, handoff_bias
 from calib.matching.handoff import RefinedVerdict
 from drivers.recordings.mcap_file import BadRecording, is_mcap, read_messages
 from mastctl.as_json import picked
+from mastctl.state.faults import StandingFault
+from mastctl.watch.json_lines import OtherFile, append_line
 
 SCHEMA = "mastctl/handoff/1"
 TOPIC = "/handoff"
 """Of a recording."""
 
 MAX_BYTES = 1 << 28
-LONGEST_LINE = 1 << 16
 _BEGIN = f'{{"schema": "{SCHEMA}"'.encode()
 LARGEST_PX = 1e6
 _KEYS = (
@@ -83,31 +87,12 @@ class HandoffLog:
         line = (json.dumps(line_of(handoff), allow_nan=False) + "\n").encode()
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            with self.path.open("a+b") as file:
-                fcntl.flock(file, fcntl.LOCK_EX)  # released when the file is closed
-                file.write(self._mended(file.fileno()) + line)
-                file.flush()
-                os.fsync(file.fileno())
+            append_line(self.path, line, begins=_BEGIN)
+        except OtherFile:
+            words = "is no record of hand-offs; a new or another file is expected"
+            raise BadFile(self.path, "", words) from None
         except OSError as error:
             raise BadFile(self.path, "", f"cannot be appended to: {error.strerror or error}") from None
-
-    def _mended(self, descriptor: int) -> bytes:
-        """Take a torn last line away; return the line end that a whole one lacks."""
-        end = os.fstat(descriptor).st_size
-        start = max(0, end - LONGEST_LINE)
-        tail = os.pread(descriptor, end - start, start)
-        last = tail[tail.rfind(b"\n") + 1 :]
-        head = os.pread(descriptor, len(_BEGIN), 0)
-        if not _BEGIN.startswith(head) or len(last) == LONGEST_LINE:
-            raise BadFile(self.path, "", "is no record of hand-offs; a new or another file is expected")
-        if not last:
-            return b""
-        try:
-            json.loads(last)
-        except ValueError:
-            os.ftruncate(descriptor, end - len(last))
-            return b""
-        return b"\n"
 
 
 def line_of(handoff: MatchedHandoff) -> dict[str, Any]:
@@ -236,3 +221,171 @@ def _landed(line: Section) -> dict[str, Landed]:
             one.covariance("found_covariance_px2", 2) if good else None,
         )
     return landed
+
+
+log = logging.getLogger(__name__)
+
+NAME = "handoff_log"
+KEPT = 2000
+"""Newest hand-offs that count, and that wait for a file that cannot be written."""
+SLOW_S = 5.0  # a file that takes longer than this is a fault
+CLOSE_S = 2.0
+
+
+class HandoffCheck:
+    """What hand-offs say of the mast file in use; safe to use from any thread, never waits for a file.
+
+    Parameters
+    ----------
+    path
+        The record, read at the start and appended to; None: only what comes is known.
+    digest
+        Of the mast file in use.
+    clock
+        Dates the faults.
+    file_time
+        What the file's slowness is measured by; the machine's own clock by default: a file is real, also
+        beside a simulation whose time goes by faster.
+    """
+
+    def __init__(self, path: Path | None, digest: str, clock: Clock, file_time: Clock | None = None) -> None:
+        self._path = path
+        self._clock = clock
+        self._file_time = file_time or SystemClock()
+        self._lock = threading.Lock()
+        self._handoffs: deque[MatchedHandoff] = deque(maxlen=KEPT)
+        self._digest = digest
+        self._judged: tuple[int, tuple[HandoffBias, ...]] = (0, ())  # how many count, what stands out
+        self._unread: StandingFault | None = None
+        self._unwritten: StandingFault | None = None
+        # Since when the file has not answered: by the clock, and by the file's time.
+        self._asked_s: tuple[float, float] | None = None
+        self._queue: SimpleQueue[MatchedHandoff | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._work, name=NAME, daemon=True)
+        if path is not None:
+            self._thread.start()
+
+    def add(self, handoff: MatchedHandoff) -> None:
+        """Count a hand-off, and have it written down."""
+        with self._lock:
+            self._handoffs.append(handoff)
+            news = self._judge()
+        _log_news(news)
+        if self._path is not None:
+            self._queue.put(handoff)
+
+    def use_mast(self, digest: str) -> None:
+        """Count only the hand-offs of this mast file from now on."""
+        with self._lock:
+            self._digest = digest
+            news = self._judge()
+        _log_news(news)
+
+    def told(self) -> dict[str, Any]:
+        """Return how many hand-offs of the mast file count, and the offsets that stand out, as JSON."""
+        counted, offsets = self._judged
+        return {"handoffs": counted, "offsets": [bias_told(one) for one in offsets]}
+
+    def faults(self) -> tuple[StandingFault, ...]:
+        """Return what is wrong with the record's file."""
+        faults = [one for one in (self._unread, self._unwritten) if one is not None]
+        asked_s = self._asked_s
+        if asked_s is not None and self._file_time.now_s() - asked_s[1] > SLOW_S:
+            faults.append(
+                StandingFault(
+                    NAME,
+                    "slow",
+                    f"{self._path} does not answer; hand-offs wait for it",
+                    asked_s[0],
+                    "the file answers",
+                )
+            )
+        return tuple(faults)
+
+    def close(self) -> None:
+        """Write down what waits; bounded."""
+        if self._path is None:
+            return
+        self._queue.put(None)
+        self._thread.join(CLOSE_S)
+        if self._thread.is_alive():
+            log.error("%s does not answer; the newest hand-offs are not written down", self._path)
+
+    def _judge(self) -> list[HandoffBias]:
+        """Sum up anew and return what stands out newly; the lock is held, so nothing is logged here."""
+        those = [one for one in self._handoffs if one.mast_digest == self._digest]
+        known = {(one.source, one.camera) for one in self._judged[1]}
+        offsets = tuple(one for one in handoff_bias(those) if one.significant)
+        self._judged = sum(bool(one.found) for one in those), offsets
+        return [one for one in offsets if (one.source, one.camera) not in known]
+
+    # In the file's thread
+
+    def _work(self) -> None:
+        assert self._path is not None
+        self._read(self._path)
+        writer = HandoffLog(self._path)
+        waiting: deque[MatchedHandoff] = deque(maxlen=KEPT)
+        while True:
+            handoff = self._queue.get()
+            if handoff is not None:
+                waiting.append(handoff)
+            self._write(writer, waiting)
+            if handoff is None:
+                return
+
+    def _read(self, path: Path) -> None:
+        self._ask()
+        try:
+            before = read_log(path).handoffs if path.is_file() else ()
+        except (BadFile, OSError) as error:
+            words = f"{' '.join(str(error).split())}; what was written down before does not count"
+            with self._lock:
+                self._unread = StandingFault(
+                    NAME, "unreadable", words, self._clock.now_s(), "the file is right at the next start"
+                )
+            log.error("%s", words)
+            before = ()
+        with self._lock:
+            self._handoffs = deque((*before, *self._handoffs), maxlen=KEPT)
+            news = self._judge()
+        _log_news(news)
+        self._answered()
+
+    def _write(self, writer: HandoffLog, waiting: deque[MatchedHandoff]) -> None:
+        """Write down what waits, oldest first, as far as it goes."""
+        words = ""
+        self._ask()
+        while waiting and not words:
+            try:
+                writer.append(waiting[0])
+                waiting.popleft()
+            except BadFile as error:
+                words = f"{' '.join(str(error).split())}; hand-offs count, and wait to be written down"
+            except ValueError as error:
+                log.error("a hand-off cannot be written down: %s", error)
+                waiting.popleft()
+        self._answered()
+        with self._lock:
+            before = self._unwritten
+            since_s = self._clock.now_s() if before is None else before.since_s
+            self._unwritten = (
+                StandingFault(NAME, "unwritable", words, since_s, "a hand-off is written down")
+                if words
+                else None
+            )
+        if words and before is None:
+            log.error("%s", words)
+
+    def _ask(self) -> None:
+        with self._lock:
+            self._asked_s = self._clock.now_s(), self._file_time.now_s()
+
+    def _answered(self) -> None:
+        with self._lock:
+            self._asked_s = None
+
+
+def _log_news(news: list[HandoffBias]) -> None:
+    for one in news:
+        log.warning("hand-offs tell an offset: %s", one.sentence)

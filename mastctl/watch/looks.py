@@ -1,22 +1,27 @@
-"""Going to the rests of a reference and taking the pictures again, through a running daemon."""
+"""Going to the rests of a reference and taking the pictures again, once, or whenever the head is idle."""
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calib.calibrate.scene.drift import JOINT_SIGMA_RAD, SceneDrift, ViewShift, find_drift
 from calib.calibrate.scene.features import seen_again
+from calib.errors import BadFile
 from calib.files.mast_file import parse_rig
 from calib.geometry.rig import Rig
 from calib.matching.warp import grey
 from mastctl.client import Client, ClientError
 from mastctl.errors import MastctlError
-from mastctl.sentinel.folder import Picture, Reference
+from mastctl.watch.reference import Reference, ReferencePicture, add_look, read_looks, read_reference
 
 TURN_TIMEOUT_S = 90.0
 EDGE_RAD = 0.05
@@ -36,7 +41,7 @@ class LookEnded(MastctlError):
 class Taken:
     """Pictures of a look; ``missing``: why a camera, or one at a rest, gave none."""
 
-    pictures: list[Picture] = field(default_factory=list)
+    pictures: list[ReferencePicture] = field(default_factory=list)
     missing: dict[str, str] = field(default_factory=dict)
 
 
@@ -100,7 +105,7 @@ def take_pictures(
                 if shot.moving:
                     raise LookEnded(f"the head moved while {camera} took its picture; nothing was kept")
                 taken.pictures.append(
-                    Picture(camera, pose, *shot.true_rad, shot.mast_digest, grey(shot.image))
+                    ReferencePicture(camera, pose, *shot.true_rad, shot.mast_digest, grey(shot.image))
                 )
             if progress is not None:
                 progress(pose + 1, len(rests))
@@ -163,13 +168,16 @@ def look_again(
 
 
 def compared(
-    rig: Rig, reference: Reference, pictures: Sequence[Picture], joint_sigma_rad: float = JOINT_SIGMA_RAD
+    rig: Rig,
+    reference: Reference,
+    pictures: Sequence[ReferencePicture],
+    joint_sigma_rad: float = JOINT_SIGMA_RAD,
 ) -> SceneDrift:
     """Return what has changed between a reference and new pictures. Raises as `view_shifts`."""
     return find_drift(rig, view_shifts(rig, reference, pictures), joint_sigma_rad)
 
 
-def view_shifts(rig: Rig, reference: Reference, pictures: Sequence[Picture]) -> list[ViewShift]:
+def view_shifts(rig: Rig, reference: Reference, pictures: Sequence[ReferencePicture]) -> list[ViewShift]:
     """Return how far the features of a reference have moved in new pictures.
 
     Raises
@@ -200,10 +208,105 @@ def view_shifts(rig: Rig, reference: Reference, pictures: Sequence[Picture]) -> 
     return shifts
 
 
-def _told_px(rig: Rig, then: Picture, now: Picture, pixels: np.ndarray) -> np.ndarray:
+def _told_px(rig: Rig, then: ReferencePicture, now: ReferencePicture, pixels: np.ndarray) -> np.ndarray:
     """How far pixels (n, 2) move by what the joints read now and read then."""
     before = rig.camera_in_rover(then.camera, then.pan_rad, then.tilt_rad)
     after = rig.camera_in_rover(then.camera, now.pan_rad, now.tilt_rad)
     rays = before.ray(pixels)
     seen, valid = after.project(rays.origins_m + 5.0 * rays.directions)
     return np.asarray(np.where(valid[:, None], seen - pixels, 0.0))
+
+
+LEASE_S = 30.0
+RETRY_S = 60.0
+"""After so long it is tried again, where a look is due and somebody needs the head, or had it given up."""
+
+NAME = "sentinel"
+
+
+def now_utc() -> datetime:
+    """Return the time of day."""
+    return datetime.now(UTC)
+
+
+def is_due(reference: Reference, last_look: str | None, every_s: float, now: datetime) -> bool:
+    """Return whether a look is due: at the reference's time of day, and each ``every_s`` from it on.
+
+    What a clock that was set back makes of it is a look too many, not none for as long.
+    """
+
+    def turn(moment: datetime) -> int:
+        passed = moment - datetime.fromisoformat(reference.time).astimezone(UTC)
+        return math.floor(passed.total_seconds() / every_s)
+
+    last = reference.time if last_look is None else last_look
+    return turn(now) != turn(datetime.fromisoformat(last).astimezone(UTC))
+
+
+def look_idle(client: Client, reference: Reference) -> SceneDrift:
+    """Look under a lease that gives way to everybody.
+
+    Raises
+    ------
+    LookEnded
+        If somebody wanted to steer or stopped the head; as `look_again` else.
+    """
+    with client.lease(NAME, for_s=LEASE_S, gives_way=True):
+        try:
+            return look_again(client, reference)
+        except ClientError as error:
+            if error.code in ("lease_over", "leased"):
+                how = str(error).removeprefix("the lease has ended: ").removesuffix("; acquire another")
+                raise LookEnded(f"{how}; nothing was kept") from None
+            raise
+
+
+def watch(
+    folder: Path,
+    connect: Callable[[], AbstractContextManager[Client]],
+    tell: Callable[[str], None],
+    looked: Callable[[dict[str, Any]], None],
+    every_s: float,
+    idle_s: float,
+    sleep: Callable[[float], None] = time.sleep,
+    now: Callable[[], datetime] = now_utc,
+) -> None:
+    """Look whenever it is due and the head is idle, until interrupted.
+
+    Parameters
+    ----------
+    folder
+        With a reference.
+    connect
+        To the daemon.
+    tell, looked
+        Get why there is no look though one is due, each reason once; and each look.
+    every_s
+        From look to look, seconds, counted from the reference's time on.
+    idle_s
+        So long nobody must have used the head.
+
+    Raises
+    ------
+    BadFile
+        If there is no reference at the start. What fails later is told, and tried again.
+    """
+    read_reference(folder)
+    said = ""
+    while True:
+        why = ""
+        try:
+            reference = read_reference(folder)
+            looks = read_looks(folder, reference)
+            if is_due(reference, looks[-1]["time"] if looks else None, every_s, now()):
+                with connect() as client:
+                    why = is_idle(client, idle_s)
+                    if not why:
+                        drift = look_idle(client, reference)
+                        looked(add_look(folder, reference, now().isoformat(timespec="seconds"), drift))
+        except (ClientError, MastctlError, BadFile) as error:
+            why = str(error)
+        if why and why != said:
+            tell(f"no look now: {why}")
+        said = why
+        sleep(min(RETRY_S, every_s / 4.0))

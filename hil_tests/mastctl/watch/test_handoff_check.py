@@ -26,9 +26,8 @@ from hil_tests.calib.matching.handed_over import (
 )
 from hil_tests.mastctl.service_fakes import Hang
 from hil_tests.waiting import until
-from mastctl.handoff import check as module
-from mastctl.handoff.check import NAME, HandoffCheck
-from mastctl.handoff.log import HandoffLog, read_log
+from mastctl.watch import handoffs as module
+from mastctl.watch.handoffs import NAME, HandoffCheck, HandoffLog, read_log
 
 DIGEST, OTHER = "d" * 64, "e" * 64
 

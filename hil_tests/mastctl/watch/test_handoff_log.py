@@ -15,7 +15,7 @@ import pytest
 from calib.errors import BadFile
 from calib.geometry.handoff import Joints
 from calib.matching.handed_over import Landed, MatchedHandoff
-from mastctl.handoff.log import HandoffLog, line_of, read_log
+from mastctl.watch.handoffs import HandoffLog, line_of, read_log
 
 
 def one(index: int = 0) -> MatchedHandoff:

@@ -12,17 +12,15 @@ import pytest
 from calib.errors import BadFile
 from calib.geometry.rig import Rig
 from drivers.interfaces import COARSE_COUNT_RAD
-from hil_tests.mastctl.health.histories import DAY_S, NOON_S, bumped, pointing, stored_rig
 from hil_tests.mastctl.service_fakes import Hang
+from hil_tests.mastctl.watch.histories import DAY_S, NOON_S, bumped, pointing, stored_rig
 from hil_tests.waiting import NET_S, until
-from mastctl.health import health as health_module
-from mastctl.health import journal as journal_module
-from mastctl.health.health import CalibrationHealth
-from mastctl.health.journal import FILE, Journal
-from mastctl.health.measured import Measured, measured_by, measured_of
-from mastctl.health.windows import Windows
 from mastctl.motion.results import Step
 from mastctl.operations.records import Operation
+from mastctl.watch import pointings as journal_module
+from mastctl.watch import residuals as health_module
+from mastctl.watch.pointings import FILE, Journal, Measured, measured_by, measured_of
+from mastctl.watch.residuals import CalibrationHealth, Windows
 
 STORED = stored_rig()
 

@@ -13,9 +13,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from drivers.interfaces import Reading
 from hil_tests.mastctl.service_fakes import FakePointing, FakeResult
 from hil_tests.waiting import until
-from mastctl.metrics.metrics import Metrics
 from mastctl.operations.records import Operation
 from mastctl.state.publisher import Publisher
+from mastctl.watch.metrics import Metrics
 
 STATUS: dict[str, Any] = {
     "state": "ready",

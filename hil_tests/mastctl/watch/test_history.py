@@ -7,10 +7,10 @@ import pytest
 from drivers.clock import SystemClock
 from hil_tests.waiting import until
 from mastctl.devices.joint_history import HeadReading
-from mastctl.metrics import history as history_module
-from mastctl.metrics.history import History
 from mastctl.state.faults import StandingFault
 from mastctl.state.publisher import Publisher
+from mastctl.watch import history as history_module
+from mastctl.watch.history import History
 
 
 def reading(time_s: float, pan_rad: float) -> HeadReading:

@@ -1,1 +1,0 @@
-"""The mast's self-check in service: hand-offs written down and weighed."""

@@ -1,1 +1,0 @@
-"""Whether pointings still come out as the mast file predicts."""

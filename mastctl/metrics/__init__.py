@@ -1,1 +1,0 @@
-"""Figures of a running daemon as Prometheus reads them."""

@@ -1,0 +1,373 @@
+"""What the residuals of the last days say of the mast file, judged in a thread that nobody waits for.
+
+Windows begin every six hours and last until now; each is judged by itself, so that what began on Tuesday is
+not watered down by Monday. A window's evidence exceeds 4000 by chance in one of 4000 at most, however many
+pointings come and whenever it is looked at; with four windows a day that is one false alarm in a thousand
+days. The pointing that is farthest off does not count in a window: one false match is no drift.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import reduce
+from operator import add, sub
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any, Literal
+
+import numpy as np
+
+from calib.errors import BadFile, CalibError
+from calib.files.mast_file import StoredRig
+from calib.geometry.covariance import stored_covariance
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
+from mastctl.operations.records import Operation
+from mastctl.watch.evidence import Evidence, Expected, Judge, Sums, expected, sums_of
+from mastctl.watch.pointings import FILE, Journal, Measured, measured_by
+
+DAYS = 7
+DAY_S = 86400.0
+SPAN_S = 6 * 3600.0
+FALSE_ALARMS_PER_DAY = 1e-3
+LOG_THRESHOLD = math.log(DAY_S / SPAN_S / FALSE_ALARMS_PER_DAY)
+FEWEST = 3
+"""Pointings that a judgement needs."""
+KEPT = 2000
+"""Newest pointings that count."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A pointing, what it depends on, and how far off it is by itself.
+
+    ``sigma_px``: one sigma of each coordinate, of everything together; ``square``: of both, over that.
+    """
+
+    measured: Measured
+    expected: Expected
+    sigma_px: tuple[float, float]
+    square: float
+
+
+class Windows:
+    """The pointings with one mast file; used by one thread.
+
+    Parameters
+    ----------
+    rig, mast_digest
+        The mast file.
+
+    Raises
+    ------
+    CalibError
+        If it has no covariance, or one that is none: then nothing can be expected of it.
+    """
+
+    def __init__(self, rig: Rig, mast_digest: str) -> None:
+        covariance = stored_covariance(rig)
+        if covariance is None:
+            raise CalibError("the mast file does not say how sure it is (fit.covariance)")
+        self._rig = rig
+        self._digest = mast_digest
+        self._parameters = covariance.names
+        self._covariance: FloatArray = covariance.covariance
+        self._cameras = tuple(rig.cameras)
+        self._judge = Judge(covariance.covariance, self._cameras)
+        self._spans: dict[int, list[Judged]] = {}
+        self._sums: dict[int, Sums] = {}
+
+    @property
+    def pointings(self) -> Sequence[Judged]:
+        """Those that count, oldest first."""
+        return [one for span in sorted(self._spans) for one in self._spans[span]]
+
+    def add(self, one: Measured) -> Judged | None:
+        """Count a pointing; None if it is of another mast file, or cannot be judged by this one."""
+        if one.mast_digest != self._digest:
+            return None
+        try:
+            depends = expected(self._rig, self._parameters, self._cameras, one)
+        except CalibError:
+            return None
+        total = depends.noise_px2 + depends.rates @ self._covariance @ depends.rates.T
+        off = np.array(one.off_px)
+        sigma = np.sqrt(np.diag(total)).tolist()
+        square = float(off @ np.linalg.solve(total, off))
+        judged = Judged(one, depends, (sigma[0], sigma[1]), square)
+        span = math.floor(one.time_s / SPAN_S)
+        sums = _sums(judged)
+        self._sums[span] = self._sums[span] + sums if span in self._sums else sums
+        self._spans.setdefault(span, []).append(judged)
+        return judged
+
+    def forget(self, now_s: float) -> None:
+        """Let go of what is older than the days that count, and of what is too many."""
+        oldest = math.floor((now_s - DAYS * DAY_S) / SPAN_S)
+        for span in sorted(self._spans):
+            too_many = sum(map(len, self._spans.values())) > KEPT and len(self._spans) > 1
+            if span < oldest or too_many:
+                del self._spans[span], self._sums[span]
+
+    def evidence(self) -> Evidence | None:
+        """Return that of the window which speaks loudest; None with too few pointings."""
+        found: Evidence | None = None
+        spans = sorted(self._spans, reverse=True)
+        for number in range(1, len(spans) + 1):
+            window = spans[:number]
+            sums = reduce(add, (self._sums[span] for span in window))
+            if sums.count < FEWEST:
+                continue
+            worst = max((one for span in window for one in self._spans[span]), key=lambda one: one.square)
+            doubtful = [one for span in window for one in self._spans[span] if not one.measured.confirmed]
+            kept = sums - _sums(worst)
+            without = (_sums(one) for one in doubtful if one is not worst)
+            now = self._judge.weigh(kept, reduce(sub, without, kept))
+            if found is None or now.log_evidence > found.log_evidence:
+                found = now
+        return found
+
+
+def _sums(one: Judged) -> Sums:
+    return sums_of(one.expected, one.measured.off_px, one.measured.time_s)
+
+
+VerdictWord = Literal["good", "drifts", "few", "unknown"]
+
+AS_LIKELY = math.log(20.0)
+"""Cameras whose evidence is nearer than this to the strongest one's cannot be told from it."""
+
+
+@dataclass(frozen=True)
+class ResidualVerdict:
+    """Whether pointings come out as the mast file predicts.
+
+    Attributes
+    ----------
+    word
+        ``good``; ``drifts``; ``few`` pointings yet; ``unknown``: the mast file does not say how sure it is.
+    sentence
+        What that means.
+    pointings
+        How many count.
+    since
+        When the first of those was that speak against it (ISO 8601, UTC); None unless it drifts.
+    times
+        As how many times as large as expected residuals are, rms, all that is common taken out.
+    turned
+        By camera: how far it seems turned about each axis of the frame that it is mounted on, with one
+        sigma, and the decimal logarithm of the evidence for that.
+    """
+
+    word: VerdictWord
+    sentence: str
+    pointings: int = 0
+    since: str | None = None
+    times: float | None = None
+    log10_evidence: float | None = None
+    turned: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def told(self) -> dict[str, Any]:
+        """Return the short form, of ``GET /status``."""
+        return {
+            "verdict": self.word,
+            "sentence": self.sentence,
+            "pointings": self.pointings,
+            "since": self.since,
+        }
+
+    def told_whole(self) -> dict[str, Any]:
+        """Return all of it."""
+        return self.told() | {
+            "times_expected": self.times,
+            "log10_evidence": self.log10_evidence,
+            "log10_threshold": LOG_THRESHOLD / math.log(10),
+            "false_alarms_per_day": FALSE_ALARMS_PER_DAY,
+            "cameras": self.turned,
+        }
+
+
+NOTHING_YET = ResidualVerdict("few", f"fewer than {FEWEST} pointings with this mast file have a residual")
+
+
+def verdict_of(evidence: Evidence | None, pointings: int) -> ResidualVerdict:
+    """Return what is to be said of the evidence of the loudest window."""
+    if evidence is None:
+        return ResidualVerdict("few", NOTHING_YET.sentence, pointings)
+    since = datetime.fromtimestamp(evidence.since_s, UTC).isoformat(timespec="seconds")
+    drifts = evidence.log_evidence >= LOG_THRESHOLD
+    return ResidualVerdict(
+        "drifts" if drifts else "good",
+        _what_drifts(evidence, since) if drifts else "residuals are as the mast file predicts",
+        pointings,
+        since if drifts else None,
+        evidence.times,
+        evidence.log_evidence / math.log(10),
+        {
+            name: {
+                "turn_rad": list(one.turn_rad),
+                "sigma_rad": list(one.sigma_rad),
+                "log10_evidence": one.log_evidence / math.log(10),
+            }
+            for name, one in evidence.turned.items()
+        },
+    )
+
+
+def _what_drifts(evidence: Evidence, since: str) -> str:
+    """What drifts, by how much, since when, and what to do."""
+    which = f"{evidence.count + 1} pointings since {since}"
+    strongest = max(evidence.turned.values(), key=lambda one: one.log_evidence, default=None)
+    if strongest is None or evidence.log_wider >= strongest.log_evidence:
+        return (
+            f"residuals are {evidence.times:.1f} times as large as the mast file, counts and matches explain "
+            f"({which}), and no one camera accounts for it: look at the head's mount and gears, or calibrate "
+            "again"
+        )
+    likely = {
+        name: one
+        for name, one in sorted(evidence.turned.items(), key=lambda item: -item[1].log_evidence)
+        if one.log_evidence > strongest.log_evidence - AS_LIKELY
+    }
+    cameras = " or ".join(likely)
+    size = f"{1e3 * strongest.size_rad:.1f} ± {1e3 * strongest.size_sigma_rad:.1f} mrad"
+    return (
+        f"{cameras} looks {size} beside where the mast file has it ({which}): look at its mount, then "
+        "calibrate again"
+    )
+
+
+log = logging.getLogger(__name__)
+
+TOLD = 50
+"""Newest pointings that are told one by one."""
+CLOSE_S = 2.0
+
+
+class CalibrationHealth:
+    """What pointings say of the mast file in use; safe to use from any thread, never waits for a file.
+
+    Parameters
+    ----------
+    folder
+        Where the pointings of the last days are kept.
+    mast
+        The mast file in use.
+    wall_s
+        The time of day, seconds since 1970: pointings of a week ago may be from before a restart.
+    """
+
+    def __init__(self, folder: Path, mast: StoredRig, wall_s: Callable[[], float] = time.time) -> None:
+        self._journal = Journal(folder / FILE)
+        self._wall_s = wall_s
+        self._mast = mast
+        self._known: deque[Measured] = deque(maxlen=KEPT)
+        self._windows: Windows | None = None
+        self._judges_by = mast  # in the thread: it comes to the one in use by and by
+        self._newest: tuple[Judged, ...] = ()
+        self._not_kept = ""
+        self.verdict = NOTHING_YET
+        self._queue: SimpleQueue[Measured | StoredRig | None] = SimpleQueue()
+        self._queue.put(self._mast)
+        self._thread = threading.Thread(target=self._work, name="calibration health", daemon=True)
+        self._thread.start()
+
+    def ended(self, mast: StoredRig, operation: Operation) -> None:
+        """Keep what a pointing measured, if it did; ``mast`` was in use when it began."""
+        one = measured_by(operation, mast, self._wall_s())
+        if one is not None:
+            self._queue.put(one)
+
+    def use_mast(self, mast: StoredRig) -> None:
+        """Judge by this mast file from now on."""
+        self._mast = mast
+        self.verdict, self._newest = NOTHING_YET, ()
+        self._queue.put(self._mast)
+
+    def told(self) -> dict[str, Any]:
+        """Return all that is known, as ``GET /calibration/health`` tells it."""
+        return self.verdict.told_whole() | {
+            "not_kept": self._not_kept or None,
+            "newest": [
+                {
+                    **one.measured.told(),
+                    "sigma_px": list(one.sigma_px),
+                    "square": one.square,
+                }
+                for one in reversed(self._newest)
+            ],
+        }
+
+    def close(self) -> None:
+        """Write down what waits; bounded."""
+        self._queue.put(None)
+        self._thread.join(CLOSE_S)
+        if self._thread.is_alive():
+            log.error("%s does not answer; the newest pointings are not kept", self._journal.path)
+
+    # In the thread
+
+    def _work(self) -> None:
+        try:
+            self._known.extend(self._journal.read())
+        except BadFile as error:
+            log.error("%s; pointings from before do not count", error)
+        while (news := self._queue.get()) is not None:
+            try:
+                self._take(news)
+            except Exception:  # a pointing that nobody foresaw must not end the watch
+                log.exception("the calibration's health met a defect of the program")
+
+    def _take(self, news: Measured | StoredRig) -> None:
+        now_s = self._wall_s()
+        if isinstance(news, Measured):
+            self._known.append(news)
+            self._keep(news, now_s)
+            if self._windows is not None:
+                self._windows.add(news)
+        else:
+            self._judges_by = news
+            try:
+                self._windows = Windows(news.rig, news.digest)
+            except CalibError as error:
+                self._windows = None
+                self._say(
+                    ResidualVerdict("unknown", f"residuals are kept, and judged by nothing: {error}"), ()
+                )
+            else:
+                for one in self._known:
+                    self._windows.add(one)
+        windows = self._windows
+        if windows is not None:
+            windows.forget(now_s)
+            pointings = windows.pointings
+            self._say(verdict_of(windows.evidence(), len(pointings)), tuple(pointings[-TOLD:]))
+
+    def _say(self, verdict: ResidualVerdict, newest: tuple[Judged, ...]) -> None:
+        """Let a verdict be known, unless another mast file is in use by now."""
+        if self._judges_by is not self._mast:
+            return
+        before, self.verdict, self._newest = self.verdict, verdict, newest
+        if verdict.word == "drifts" and before.word != "drifts":
+            log.warning("the calibration drifts: %s", verdict.sentence)
+        elif before.word == "drifts" and verdict.word != "drifts":
+            log.info("the calibration does not drift any more: %s", verdict.sentence)
+
+    def _keep(self, one: Measured, now_s: float) -> None:
+        """Write a pointing down; what cannot be written is said once."""
+        counting = [kept for kept in self._known if kept.time_s > now_s - DAYS * DAY_S]
+        try:
+            self._journal.add(one, counting)
+        except BadFile as error:
+            if not self._not_kept:
+                log.error("%s; pointings count, and are not kept over a restart", error)
+            self._not_kept = str(error)
+        else:
+            self._not_kept = ""
