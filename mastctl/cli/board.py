@@ -71,8 +71,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
 def _make(args: argparse.Namespace) -> int:
     from calib.files.atomic import save_bytes
     from calib.targets.board_file import save_board
-    from mastctl.board_print.files import pdf_of, svg_of
-    from mastctl.board_print.sheet import sheet_of
+    from mastctl.setup.board_sheet import pdf_of, sheet_of, svg_of
 
     out = Path(args.out)
     if out.suffix not in (".pdf", ".svg"):
@@ -142,7 +141,7 @@ def _find(args: argparse.Namespace) -> int:
 
 
 def _paper_mm(args: argparse.Namespace) -> tuple[float, float]:
-    from mastctl.board_print.sheet import PAPERS_MM
+    from mastctl.setup.board_sheet import PAPERS_MM
 
     known = {name.lower(): size for name, size in PAPERS_MM.items()}
     size = known.get(args.paper.lower())
@@ -164,7 +163,7 @@ def _board(args: argparse.Namespace, paper_mm: tuple[float, float]) -> AnyBoard:
     """The board that the options and the paper ask for, read as its file will be."""
     from calib.errors import BadFile
     from calib.targets.board_file import board_of, dictionary_size
-    from mastctl.board_print.sheet import room_mm
+    from mastctl.setup.board_sheet import room_mm
 
     wide_mm, high_mm = room_mm(paper_mm)
     usual_mm = USUAL_MM * min(wide_mm, high_mm) / 174.0
@@ -253,7 +252,7 @@ def _check_free(yaml: Path, measured: bool) -> None:
 
 def _tell(args: argparse.Namespace, yaml: Path, files: list[Path], bar_m: tuple[float, float]) -> None:
     from calib.targets.board_file import document_of, load_board
-    from mastctl.board_print.sheet import drawn
+    from mastctl.setup.board_sheet import drawn
 
     board = load_board(yaml)
     if args.json:

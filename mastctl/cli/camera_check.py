@@ -37,7 +37,7 @@ def add_action(actions: Any) -> None:
 
 def camera_check(args: argparse.Namespace) -> int:
     """Measure what a camera delivers, and show what it can do."""
-    from mastctl.cameras.quality import quality_of
+    from mastctl.setup.camera_check import quality_of
 
     if args.config is not None and (config := config_of(args)).hardware.cameras[args.camera].driver != "v4l2":
         return _check_any(args, config)
@@ -70,9 +70,9 @@ def camera_check(args: argparse.Namespace) -> int:
 def _check_any(args: argparse.Namespace, config: Config) -> int:
     """Hold a configured camera of any driver against what a driver promises."""
     from drivers.clock import SystemClock
-    from mastctl.cameras.check import CameraCheck
     from mastctl.devices.opening import devices_beside, open_one_camera
     from mastctl.service.mast_in_use import bounds_of
+    from mastctl.setup.camera_check import CameraCheck
 
     bounds = bounds_of(config)
     assert bounds.stored is not None

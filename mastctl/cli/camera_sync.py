@@ -16,8 +16,8 @@ from mastctl.cli.output import positive_number
 
 if TYPE_CHECKING:
     from calib.geometry.rig import Rig
-    from mastctl.cameras.sync_sweep import Sweep
     from mastctl.config import Config
+    from mastctl.setup.sync_sweep import Sweep
 
 SIGNIFICANT_SIGMAS = 3.0
 LEAST_TOLD_S = 0.0005  # what nobody needs to correct
@@ -49,10 +49,10 @@ def add_action(actions: Any) -> None:
 def camera_sync(args: argparse.Namespace) -> int:
     """Measure, and tell each camera's offset_s; 1 if no camera's could be told."""
     from drivers.clock import SystemClock
-    from mastctl.cameras.sync_sweep import Sweep, plan_sweep
     from mastctl.config import load_config
     from mastctl.devices.opening import devices_beside
     from mastctl.service.mast_in_use import bounds_of
+    from mastctl.setup.sync_sweep import Sweep, plan_sweep
 
     config = load_config(args.config)
     bounds = bounds_of(config)
@@ -110,7 +110,7 @@ def _ending_signals() -> Iterator[threading.Event]:
 
 def _found(sweep: Sweep, name: str, in_use_s: float) -> dict[str, Any]:
     """One camera's result, as JSON."""
-    from mastctl.cameras.sync_motion import CannotTell
+    from mastctl.setup.sync_motion import CannotTell
 
     seen = sweep.seen[name]
     told: dict[str, Any] = {

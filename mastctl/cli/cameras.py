@@ -125,7 +125,7 @@ def camera_grab(args: argparse.Namespace) -> int:
 
 def camera_focus(args: argparse.Namespace) -> int:
     """Show the sharpness twice a second, and the best so far."""
-    from mastctl.cameras.quality import sharpness
+    from mastctl.setup.camera_check import sharpness
 
     best, seen = 0.0, []
     with opened_camera(args) as camera:

@@ -26,7 +26,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 
 def _doctor(args: argparse.Namespace) -> int:
-    from mastctl.doctor.examination import examine
+    from mastctl.setup.doctor import examine
 
     found = []
     for finding in examine(args.config, _asked):

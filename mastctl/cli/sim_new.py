@@ -115,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
             f"{made.believed.name}: what the mast file is off by", ("camera", "at most, px at 5 m"), rows
         )
     if made.twin.by != "fit.covariance":
-        from mastctl.new_rig.twin import STATED
+        from mastctl.setup.new_rig import STATED
 
         where = "" if args.mast_file is None else ", the mast file has no covariance"
         sys.stdout.write(f"drawn by stated sigmas{where}: {STATED}\n")
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _numbers(args: argparse.Namespace) -> Any:
     """The numbers of the command line, where given."""
-    from mastctl.new_rig.numbers import RigNumbers, focal_of
+    from mastctl.setup.new_rig import RigNumbers, focal_of
 
     given = {key: getattr(args, key) for key in ("focal_px", "name") if getattr(args, key) is not None}
     for key, option in (("height_m", "height"), ("baseline_m", "baseline"), ("size_px", "size")):

@@ -11,10 +11,10 @@ from typing import Any
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.interfaces import Camera
-from mastctl.cameras.check import FRAME_TIMEOUT_S, GRACE_S, CameraCheck
 from mastctl.conform.checks import NotTried, PromiseBroken, Suite, expect
 from mastctl.conform.worker import beside, ended
 from mastctl.devices import frames as frame_checks
+from mastctl.setup.camera_check import FRAME_TIMEOUT_S, GRACE_S, CameraCheck
 
 CAMERAS: Suite[CameraTrial] = Suite()
 

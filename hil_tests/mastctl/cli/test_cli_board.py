@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from calib.targets.board_file import load_board
 from calib.targets.boards import Charuco
-from mastctl.board_print.sheet import PAPERS_MM, sheet_of
 from mastctl.cli.main import main
+from mastctl.setup.board_sheet import PAPERS_MM, sheet_of
 
 DPI = 200
 PX_PER_MM = DPI / 25.4

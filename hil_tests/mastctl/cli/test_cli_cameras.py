@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
-from mastctl.cameras.quality import quality_of, sharpness
 from mastctl.cli.main import main
 from mastctl.report.png_text import read_text, with_text
+from mastctl.setup.camera_check import quality_of, sharpness
 
 PICTURE = np.random.default_rng(2).integers(0, 256, (48, 64), dtype=np.uint8)
 PNG = bytes(cv2.imencode(".png", PICTURE)[1])

@@ -20,7 +20,7 @@ from drivers.sim.pan_tilt import DEFAULT_HEADS
 from mastctl.calibration.mast_file import rounded_matrix
 from mastctl.config import CONFIG_SCHEMA, check_cameras, load_config
 from mastctl.errors import MastctlError
-from mastctl.new_rig.twin import STATED, Twin, true_twin, usual_covariance
+from mastctl.setup.new_rig import STATED, Twin, true_twin, usual_covariance
 
 CONFIG, MAST, TRUE_RIG = "config.yaml", "mast.yaml", "true_rig.yaml"
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.geometry.rigid import FloatArray
-from mastctl.cameras.sync_motion import LEAST_FRAMES, CannotTell, JointMotion
+from mastctl.setup.sync_motion import LEAST_FRAMES, CannotTell, JointMotion
 
 REACH_S = 0.6
 """How far off a camera's stamps are looked for, seconds either way."""

@@ -12,8 +12,8 @@ import pytest
 
 from drivers.errors import NoFreshFrame
 from drivers.interfaces import Frame
-from mastctl.cameras.check import CameraCheck
 from mastctl.cli.main import main
+from mastctl.setup.camera_check import CameraCheck
 
 IMAGE = np.random.default_rng(1).integers(0, 256, (48, 64), dtype=np.uint8)
 PERIOD_S, EXPOSURE_S = 0.02, 0.005

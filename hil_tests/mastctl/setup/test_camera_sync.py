@@ -263,7 +263,7 @@ def test_stamps_of_another_clock_are_told_as_that(
 @pytest.fixture
 def soon(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A camera's driver that does not come back is given up soon."""
-    from mastctl.cameras import sync_sweep as sweep
+    from mastctl.setup import sync_sweep as sweep
 
     monkeypatch.setattr(sweep, "FRAME_TIMEOUT_S", 0.5)
     monkeypatch.setattr(sweep, "GRACE_S", 0.5)
@@ -297,7 +297,7 @@ def test_nothing_moves_where_no_camera_gives_a_picture(
 def test_a_signal_ends_it_while_a_cameras_driver_hangs(
     package: Path, repository: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from mastctl.cameras import sync_sweep as sweep
+    from mastctl.setup import sync_sweep as sweep
 
     monkeypatch.setattr(sweep, "FRAME_TIMEOUT_S", 300.0)
     monkeypatch.setattr(sweep, "END_S", 0.5)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mastctl.cameras.sync_fit import OffsetFit, fit_offset
-from mastctl.cameras.sync_motion import CannotTell, JointMotion
+from mastctl.setup.sync_fit import OffsetFit, fit_offset
+from mastctl.setup.sync_motion import CannotTell, JointMotion
 
 
 @dataclass(frozen=True)

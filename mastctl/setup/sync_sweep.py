@@ -19,12 +19,11 @@ from calib.geometry.rigid import FloatArray
 from drivers.clock import Clock
 from drivers.errors import DriverError, NoReply
 from drivers.interfaces import Camera, Frame, Reading
-from mastctl.cameras.sync_fit import REACH_S, OffsetFit, fit_offset
-from mastctl.cameras.sync_motion import CannotTell, JointMotion
-from mastctl.cameras.sync_patches import Patches, choose_patches
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
 from mastctl.errors import MastctlError, Stopped
+from mastctl.setup.sync_fit import REACH_S, OffsetFit, fit_offset
+from mastctl.setup.sync_motion import CannotTell, JointMotion, Patches, choose_patches
 
 SPEEDS = (
     1.0,

@@ -1,1 +1,0 @@
-"""Boards on paper: the sheet, and its files."""

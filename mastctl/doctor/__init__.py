@@ -1,1 +1,0 @@
-"""What a machine lacks for a configuration: permissions, adapters, cameras, clock, disk, mast file."""

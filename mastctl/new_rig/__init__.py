@@ -1,1 +1,0 @@
-"""New simulated rigs: from a few numbers, or the twin of a calibrated one."""

@@ -1,0 +1,242 @@
+"""What a machine and a mast file lack for a configuration, in findings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from calib.errors import BadFile
+from calib.files.mast_file import load_rig
+from drivers.errors import BadOptions, DriverError
+from drivers.hardware import CAMERAS, HEADS, OURS, clock_for, installed_drivers
+from drivers.v4l2 import find
+from drivers.v4l2.node import CameraBusy, NoCamera, NoPermission
+from drivers.v4l2.options import parse_options
+from mastctl.config import Config, check_cameras, load_config
+from mastctl.safety.state_folder import usual_folder
+from mastctl.setup.machine import (
+    DoctorFinding,
+    ExaminedMachine,
+    Level,
+    examine_clock,
+    examine_descriptors,
+    examine_drivers,
+    examine_folder,
+    examine_kept,
+    examine_port,
+)
+from mastctl.watch.reference import SENTINEL_FOLDER
+from mastctl.watch.sentinel import read_folder, standing
+
+Asked = Callable[[str], Mapping[str, Any] | None]
+"""Returns the status of the daemon at an address, None if nobody answers there."""
+
+
+def examine(
+    path: str | None, asked: Asked, machine: ExaminedMachine | None = None
+) -> Iterator[DoctorFinding]:
+    """Look at everything that a configuration needs; nothing is opened that could move.
+
+    Parameters
+    ----------
+    path
+        The configuration; None for the packaged one.
+    asked
+        Asks a daemon that may run already.
+    machine
+        Where devices and their descriptions lie; this machine by default.
+    """
+    machine = machine or ExaminedMachine()
+    try:
+        config = load_config(path)
+    except BadFile as error:
+        yield DoctorFinding(
+            "configuration", "bad", str(error), "correct it; docs/reference/configuration.md has every key"
+        )
+        yield examine_clock()
+        yield examine_descriptors()
+        return
+    yield DoctorFinding("configuration", "good", str(config.path))
+    yield from examine_mast_file(config)
+    status = asked(config.listen.url)
+    yield from _daemon(config, status)
+    yield from _head_line(config, machine)
+    yield from examine_drivers(installed_drivers())
+    for name, camera in config.hardware.cameras.items():
+        if camera.driver in CAMERAS:
+            yield examine_camera(name, camera.options, in_use=status is not None)
+    yield from _simulation(config)
+    yield from examine_folder(
+        "state folder", config.state_folder or usual_folder(config.path, config.listen.url)
+    )
+    state_folder = config.state_folder or usual_folder(config.path, config.listen.url)
+    yield from _sentinel(state_folder / SENTINEL_FOLDER)
+    yield examine_kept()
+    yield examine_clock()
+    yield examine_descriptors()
+
+
+def _sentinel(folder: Path) -> Iterator[DoctorFinding]:
+    """What the drift sentinel's looks say, where it keeps them in the state folder."""
+    reference, looks, wrong = read_folder(folder)
+    if wrong:
+        yield DoctorFinding("drift", "unsure", wrong, "take a new reference: mastctl sentinel reference")
+    if reference is None:
+        return
+    now = standing(reference, looks, datetime.now(UTC))
+    advice = "" if now.level == "good" else "look again: mastctl sentinel look; if it stays, calibrate again"
+    level: Level = "unsure" if now.level != "good" else "good"  # the daemon works all the same
+    yield DoctorFinding("drift", level, now.sentence, advice)
+
+
+def _daemon(config: Config, status: Mapping[str, Any] | None) -> Iterator[DoctorFinding]:
+    """What a daemon that runs already says is wrong."""
+    if status is None:
+        yield DoctorFinding("daemon", "good", f"none runs at {config.listen.url}")
+        return
+    yield DoctorFinding("daemon", "good", f"one runs at {config.listen.url}, state {status.get('state')}")
+    for fault in status.get("faults", []):
+        yield DoctorFinding(
+            f"fault of {fault['device']}", "bad", fault["message"], f"it lasts until {fault['until']}"
+        )
+    yield from _calibration(status.get("calibration"))
+
+
+def _calibration(told: Mapping[str, Any] | None) -> Iterator[DoctorFinding]:
+    """Whether the mast file still holds."""
+    if told is None:
+        return
+    what, sentence = "calibration", f"{told['sentence']} ({told['pointings']} pointings)"
+    if told["verdict"] == "drifts":
+        yield DoctorFinding(
+            what, "unsure", told["sentence"], "calibrate again; docs/how-to/drift.md says where to look"
+        )
+    elif told["verdict"] == "unknown":
+        yield DoctorFinding(what, "unsure", sentence, "calibrate again: mastctl calibrate writes it")
+    else:
+        yield DoctorFinding(what, "good", sentence)
+
+
+def _head_line(config: Config, machine: ExaminedMachine) -> Iterator[DoctorFinding]:
+    """The head's line, if it has one."""
+    head = config.hardware.pan_tilt
+    port = head.options.get("port")
+    if head.driver in HEADS and isinstance(port, str):
+        yield from examine_port(port, machine)
+    elif head.driver in HEADS:
+        words = f"driver {head.driver} has no 'port' in its options"
+        yield DoctorFinding("port", "bad", words, "name the serial device; docs/reference/configuration.md")
+    elif head.driver not in OURS:
+        yield DoctorFinding("head", "unsure", f"{head.driver} is from outside; it is not looked at", "")
+
+
+def _simulation(config: Config) -> Iterator[DoctorFinding]:
+    """Whether what simulates can be had."""
+    drivers = [config.hardware.pan_tilt.driver, *(one.driver for one in config.hardware.cameras.values())]
+    if "sim" not in drivers:
+        return
+    try:
+        clock_for(config.hardware)
+        import numba
+    except BadOptions as error:
+        yield DoctorFinding("simulation", "bad", str(error), "correct the configuration")
+    except ImportError:
+        words = "numba is not installed, which renders what simulated cameras see"
+        yield DoctorFinding("simulation", "bad", words, "pip install 'mastctl[sim]'")
+    else:
+        yield DoctorFinding("simulation", "good", f"a simulated rover, rendered by numba {numba.__version__}")
+
+
+def examine_camera(name: str, options: Mapping[str, Any], *, in_use: bool) -> DoctorFinding:
+    """Look at one V4L2 camera; no stream is begun.
+
+    Parameters
+    ----------
+    name
+        As the configuration calls it.
+    options
+        Of the driver ``v4l2``.
+    in_use
+        Whether a daemon that runs may have it.
+    """
+    what = f"camera {name}"
+    try:
+        asked = parse_options(options, name)
+        with find.open_node(asked.address, name) as node:
+            offered = node.formats()
+            who = node.identity
+    except BadOptions as error:
+        return DoctorFinding(what, "bad", str(error), "correct the configuration")
+    except NoCamera as error:
+        return DoctorFinding(
+            what, "bad", str(error), "plug it in; mastctl camera list shows what is connected"
+        )
+    except NoPermission as error:
+        return DoctorFinding(what, "bad", str(error), 'sudo usermod -aG video "$USER", then log in again')
+    except CameraBusy as error:
+        if in_use:
+            return DoctorFinding(what, "good", str(error))
+        return DoctorFinding(what, "bad", str(error), "end the program that has it")
+    except DriverError as error:
+        return DoctorFinding(what, "bad", str(error), "mastctl camera check says more")
+    if asked.format not in offered:
+        words = f"{who.card} at {who.bus} offers {', '.join(offered)} where {asked.format} is configured"
+        return DoctorFinding(what, "bad", words, "configure one of these")
+    return DoctorFinding(what, "good", f"{who.card} at {who.bus}, {asked.format}")
+
+
+OLD_DAYS = 180
+
+
+def examine_mast_file(
+    config: Config, now: Callable[[], datetime] = lambda: datetime.now(UTC)
+) -> Iterator[DoctorFinding]:
+    """Look at the mast file of a configuration."""
+    try:
+        stored = load_rig(config.mast_file)
+        check_cameras(config, stored.rig)
+    except BadFile as error:
+        yield DoctorFinding("mast file", "bad", str(error), "name another, or calibrate: mastctl calibrate")
+        return
+    about = f"{config.mast_file.name} ({stored.digest[:8]}...), {len(stored.rig.cameras)} cameras"
+    yield DoctorFinding("mast file", "good", about)
+    for note in stored.notes:
+        yield DoctorFinding("mast file", "unsure", note, "see docs/reference/configuration.md")
+    yield _age(stored.rig.provenance, now())
+    yield _verdict(stored.rig.fit)
+
+
+def _age(provenance: Mapping[str, Any], now: datetime) -> DoctorFinding:
+    what, advice = "mast file's age", "calibrate again: mastctl calibrate"
+    try:
+        made = datetime.fromisoformat(str(provenance.get("date", "")))
+        made = made if made.tzinfo else made.replace(tzinfo=UTC)
+    except ValueError:
+        return DoctorFinding(what, "unsure", "it does not say when it was made", advice)
+    days = (now - made).days
+    if days < 0:
+        return DoctorFinding(
+            what,
+            "unsure",
+            f"it was made on {made:%Y-%m-%d}, in the future",
+            "look at this machine's clock, or at the one that made it",
+        )
+    told = f"made on {made:%Y-%m-%d}, {days} days ago"
+    if days > OLD_DAYS:
+        return DoctorFinding(what, "unsure", told, f"look whether residuals have grown, or {advice}")
+    return DoctorFinding(what, "good", told)
+
+
+def _verdict(fit: Mapping[str, Any]) -> DoctorFinding:
+    what = "calibration's verdict"
+    verdict = fit.get("verdict")
+    words = verdict.get("words") if isinstance(verdict, Mapping) else None
+    if not isinstance(words, str):
+        return DoctorFinding(
+            what, "unsure", "it does not say how well it fits", "calibrate with mastctl calibrate"
+        )
+    levels: dict[object, Level] = {"good": "good", "bad": "bad"}
+    level = levels.get(verdict.get("grade") if isinstance(verdict, Mapping) else None, "unsure")
+    return DoctorFinding(what, level, words, "" if level == "good" else "the calibration's report says why")

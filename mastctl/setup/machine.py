@@ -1,0 +1,285 @@
+"""What this machine has for a rig: clock, folders, descriptors, serial lines; and how a finding reads."""
+
+from __future__ import annotations
+
+import ctypes
+import grp
+import os
+import re
+import resource
+import shutil
+import stat
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+from drivers.hardware import BUILT_IN, InstalledDriver
+from drivers.sim.kept import MOST_BYTES, kept_bytes, kept_home
+
+Level = Literal["good", "unsure", "bad"]
+
+
+@dataclass(frozen=True)
+class DoctorFinding:
+    """One thing that was looked at.
+
+    Attributes
+    ----------
+    what
+        What it is about, in two or three words.
+    level
+        ``good``; ``unsure``: works, but not as well or not for sure; ``bad``: the daemon will not work.
+    sentence
+        What was found.
+    advice
+        What a person does about it; empty where it is good.
+    """
+
+    what: str
+    level: Level
+    sentence: str
+    advice: str = ""
+
+
+@dataclass(frozen=True)
+class ExaminedMachine:
+    """The machine that is examined; tests give it a folder of their own in place of ``/``."""
+
+    root: Path = field(default_factory=lambda: Path("/"))
+
+    def at(self, path: str | Path) -> Path:
+        """Return where an absolute path lies."""
+        return self.root / str(path).lstrip("/")
+
+    def text(self, path: str | Path) -> str | None:
+        """Return a small file's words, None if it cannot be read."""
+        try:
+            return self.at(path).read_text().strip()
+        except (OSError, ValueError):
+            return None
+
+
+LEAST_FREE_BYTES = 1_000_000_000  # the recorder's ring of some minutes of two cameras
+LEAST_DESCRIPTORS = 256
+BUILT = datetime(2025, 1, 1, tzinfo=UTC)  # no clock that is right says less
+_NOT_SYNCHRONISED = 0x40  # STA_UNSYNC of adjtimex(2)
+
+
+class _Timex(ctypes.Structure):
+    """The beginning of struct timex, and room for the rest; only ``status`` is read."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+        ("esterror", ctypes.c_long),
+        ("status", ctypes.c_int),
+        ("rest", ctypes.c_long * 64),
+    )
+
+
+def clock_status() -> int | None:
+    """Return the kernel's status bits of the wall clock, None if it does not tell."""
+    told = _Timex()
+    return None if ctypes.CDLL(None).adjtimex(ctypes.byref(told)) < 0 else told.status
+
+
+def examine_clock(
+    now_s: Callable[[], float] = time.time, status: Callable[[], int | None] = clock_status
+) -> DoctorFinding:
+    """Look at the wall clock, which dates records, logs and mast files; motion does not depend on it."""
+    now = datetime.fromtimestamp(now_s(), UTC)
+    if now < BUILT:
+        words = f"the clock says {now:%Y-%m-%d}, which is past"
+        return DoctorFinding("clock", "bad", words, "set it: records and mast files are dated by it")
+    bits = status()
+    if bits is None or bits & _NOT_SYNCHRONISED:
+        words = f"the clock says {now:%Y-%m-%d %H:%M} UTC and follows no time server"
+        return DoctorFinding("clock", "unsure", words, "install chrony or switch systemd-timesyncd on")
+    return DoctorFinding("clock", "good", f"{now:%Y-%m-%d %H:%M} UTC, kept by a time server")
+
+
+def examine_folder(what: str, folder: Path) -> Iterator[DoctorFinding]:
+    """Look whether a folder, or the one that it would be made in, may be written and has room."""
+    there = next(one for one in (folder, *folder.parents) if one.exists())
+    if not there.is_dir():
+        yield DoctorFinding(what, "bad", f"{there} is no folder", "name another, or move it away")
+        return
+    if not os.access(there, os.W_OK | os.X_OK):
+        words = f"{there} may not be written by this user"
+        yield DoctorFinding(what, "bad", words, f'sudo chown "$USER" {there}, or name another folder')
+        return
+    free = shutil.disk_usage(there).free
+    told = f"{folder}: {free / 1e9:.1f} GB free"
+    if free < LEAST_FREE_BYTES:
+        yield DoctorFinding(
+            what, "unsure", told, "make room: what happened before a fault may not be recorded"
+        )
+    else:
+        yield DoctorFinding(what, "good", told)
+
+
+def examine_drivers(installed: Sequence[InstalledDriver]) -> Iterator[DoctorFinding]:
+    """List the drivers that installed packages offer, and those that cannot be meant by their name."""
+    names = [(one.kind, one.name) for one in installed]
+    for one in installed:
+        what, told = f"driver {one.name}", f"for a {one.kind}: {one.factory} of {one.package}"
+        if one.name in BUILT_IN:
+            words = f"{told}; mastctl's own driver of this name is used instead"
+            yield DoctorFinding(what, "unsure", words, f"name it {one.factory} in the configuration")
+        elif names.count((one.kind, one.name)) > 1:
+            words = f"{told}; another package offers one of this name"
+            yield DoctorFinding(what, "unsure", words, "uninstall one of them, or name the factory itself")
+        else:
+            yield DoctorFinding(what, "good", told)
+
+
+def examine_kept() -> DoctorFinding:
+    """Look how much is kept of what takes long to make, and how much that can become."""
+    sizes = {kind: kept_bytes(kind) for kind in MOST_BYTES}
+    kinds = ", ".join(f"{kind} {size / 1e6:.0f}" for kind, size in sizes.items())
+    most = sum(MOST_BYTES.values())
+    told = f"{kept_home()}: {sum(sizes.values()) / 1e6:.0f} MB ({kinds}) of at most {most / 1e6:.0f} MB"
+    return DoctorFinding("kept", "good", told)
+
+
+def examine_descriptors() -> DoctorFinding:
+    """Look how many files, sockets and devices a process of this user may have open."""
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    told = f"{most} files and connections at once"
+    if most != resource.RLIM_INFINITY and most < LEAST_DESCRIPTORS:
+        return DoctorFinding(
+            "descriptors", "unsure", told, f"ulimit -n {LEAST_DESCRIPTORS} or more, LimitNOFILE= of the unit"
+        )
+    return DoctorFinding(
+        "descriptors", "good", told if most != resource.RLIM_INFINITY else "as many as there are"
+    )
+
+
+SLOWEST_MS = 2  # of an adapter's latency timer: at 50 readings a second 16 ms are most of the time there is
+_NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
+_ADAPTERS = {
+    "0403": "FTDI",
+    "fff1": "ROBOTIS",
+    "2f5d": "ROBOTIS",
+    "10c4": "Silicon Labs",
+    "1a86": "WCH",
+    "067b": "Prolific",
+}
+
+
+def examine_port(port: str, machine: ExaminedMachine) -> Iterator[DoctorFinding]:
+    """Look at the port of a head without opening it: whoever opens a line may move what hangs on it."""
+    if "://" in port:
+        yield DoctorFinding(
+            "port", "unsure", f"{port} is on the network; it is not asked here", "try mastctl run"
+        )
+        return
+    path = machine.at(port)
+    if not path.exists():
+        there = _connected(machine)
+        yield DoctorFinding(
+            "port",
+            "bad",
+            f"{port} does not exist; {there}",
+            "plug the adapter in, or name the port as it is called here",
+        )
+        return
+    yield from _permission(port, path)
+    yield from _holder(port, path, machine)
+    yield from _name(port, machine)
+    yield from _latency(port, path, machine)
+
+
+def _permission(port: str, path: Path) -> Iterator[DoctorFinding]:
+    if os.access(path, os.R_OK | os.W_OK):
+        yield DoctorFinding("port permission", "good", f"{port} may be read and written")
+        return
+    about = path.stat()
+    group = _group(about.st_gid)
+    words = f"{port} may not be opened by this user; it is of group {group}, {stat.filemode(about.st_mode)}"
+    yield DoctorFinding(
+        "port permission", "bad", words, f'sudo usermod -aG {group} "$USER", then log in again'
+    )
+
+
+def _holder(port: str, path: Path, machine: ExaminedMachine) -> Iterator[DoctorFinding]:
+    """Another program that has the device open: two on one bus garble each other's bytes."""
+    real = path.resolve()
+    for process in sorted(machine.at("/proc").glob("[0-9]*"), key=lambda entry: int(entry.name)):
+        if process.name == str(os.getpid()):
+            continue
+        try:
+            held = any(Path(os.path.realpath(one)) == real for one in (process / "fd").iterdir())
+        except OSError:  # of another user, or gone
+            continue
+        if held:
+            name = machine.text(f"/proc/{process.name}/comm") or "a program"
+            yield DoctorFinding(
+                "port in use",
+                "unsure",
+                f"{port} is open in {name} (process {process.name})",
+                "fine if that is the daemon; else end it (ModemManager: see configs/udev/60-mastctl.rules)",
+            )
+
+
+def _name(port: str, machine: ExaminedMachine) -> Iterator[DoctorFinding]:
+    if not _NUMBERED.fullmatch(port):
+        return
+    links = [
+        link
+        for link in sorted(machine.at("/dev/serial/by-id").glob("*"))
+        if link.resolve() == machine.at(port).resolve()
+    ]
+    stable = f"/dev/serial/by-id/{links[0].name}" if links else "a name made by configs/udev/60-mastctl.rules"
+    yield DoctorFinding(
+        "port name", "unsure", f"{port} changes with the order of plugging", f"configure {stable}"
+    )
+
+
+def _latency(port: str, path: Path, machine: ExaminedMachine) -> Iterator[DoctorFinding]:
+    timer = machine.text(f"/sys/bus/usb-serial/devices/{path.resolve().name}/latency_timer")
+    if timer is None or not timer.isdecimal():
+        return
+    if int(timer) <= SLOWEST_MS:
+        yield DoctorFinding("latency timer", "good", f"{port} holds bytes back for {timer} ms at most")
+        return
+    yield DoctorFinding(
+        "latency timer",
+        "unsure",
+        f"{port} holds bytes back for up to {timer} ms; the Dynamixel driver asks for less when it opens it",
+        "install configs/udev/60-mastctl.rules, or: "
+        f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{path.resolve().name}/latency_timer",
+    )
+
+
+def _connected(machine: ExaminedMachine) -> str:
+    """The serial devices that are there, with the makers of their adapters."""
+    found = []
+    for device in sorted([*machine.at("/dev").glob("ttyUSB*"), *machine.at("/dev").glob("ttyACM*")]):
+        vendor = _vendor(device, machine)
+        found.append(f"/dev/{device.name}{f' ({vendor})' if vendor else ''}")
+    return f"there are {', '.join(found)}" if found else "no USB serial adapter is connected"
+
+
+def _vendor(device: Path, machine: ExaminedMachine) -> str:
+    """The maker of a USB serial device, by the numbers that its parents in sysfs tell."""
+    place = machine.at(f"/sys/class/tty/{device.name}/device").resolve()
+    for folder in (place, *place.parents):
+        number = folder / "idVendor"
+        if number.is_file():
+            return _ADAPTERS.get(number.read_text().strip(), "")
+        if folder == machine.root:
+            break
+    return ""
+
+
+def _group(number: int) -> str:
+    try:
+        return grp.getgrgid(number).gr_name
+    except KeyError:
+        return str(number)
