@@ -20,8 +20,15 @@ from calib.geometry.rig import Rig
 from drivers.frame_times import MOST_OFFSET_S
 from drivers.hardware import DeviceSettings, HardwareSettings
 from mastctl.devices.keep_out import Box
-from mastctl.devices.limits import Limits
-from mastctl.devices.sun import LEAST_CONE_RAD, SUN, WIDEST_CONE_RAD, Frame, Sun, direction_of
+from mastctl.devices.limits import (
+    LEAST_CONE_RAD,
+    SUN,
+    WIDEST_CONE_RAD,
+    Frame,
+    Limits,
+    SunDirection,
+    direction_of,
+)
 from mastctl.live.settings import LiveSettings
 from mastctl.motion.settings import HandoffRules, PairBounds, TrackingSettings
 from mastctl.packaged import default_config
@@ -102,7 +109,7 @@ class Config:
     listen: Listen
     hardware: HardwareSettings
     limits: Limits
-    sun: Sun | None = None
+    sun: SunDirection | None = None
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     repeat_after_s: float | None = None
     record: RecordSettings = field(default_factory=RecordSettings)
@@ -315,7 +322,7 @@ def _box(limits: Section, name: str) -> Box:
     return Box(name, pan_rad, tilt_rad)
 
 
-def _sun(top: Section) -> Sun | None:
+def _sun(top: Section) -> SunDirection | None:
     """Read the direction that no head camera looks into, in the rover or the site frame."""
     limits = _limits_section(top)
     if "sun" not in limits:
@@ -327,7 +334,7 @@ def _sun(top: Section) -> Sun | None:
     frame: Frame = "site"
     if "frame" in section and section.choice("frame", ("site", "rover")) == "rover":
         frame = "rover"
-    return Sun(direction_of(azimuth_rad, elevation_rad), frame, half_angle_rad)
+    return SunDirection(direction_of(azimuth_rad, elevation_rad), frame, half_angle_rad)
 
 
 def _above_zero(section: Section, key: str, most: float) -> float:

@@ -39,7 +39,7 @@ from mastctl.access.tokens import TokenList
 from mastctl.config import Config, Listen
 from mastctl.errors import MastctlError
 from mastctl.guided.guide import Door
-from mastctl.queued_output import stall_while
+from mastctl.logs import stall_while
 from mastctl.safety.state_folder import StateFolder
 from mastctl.safety.stop_threads import StopsHang
 from mastctl.service.service import Service

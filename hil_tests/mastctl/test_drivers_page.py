@@ -20,7 +20,7 @@ from drivers.interfaces import Frame, Reading
 from hil_tests.mastctl.service_fakes import FakeHardware, Hang, rig
 from hil_tests.waiting import until
 from mastctl.devices import devices as devices_module
-from mastctl.devices import frames, joint_history, rest, stops
+from mastctl.devices import frames, joint_history, stops
 from mastctl.devices.cameras import CAMERA_GRACE_S
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
@@ -64,8 +64,9 @@ def test_deadlines_and_periods_are_the_programs_own(page: str) -> None:
         f"| `close()` | {service_module.HARDWARE_CLOSE_S:g} s for all devices",
         f"{1 / m.MOVING_PERIOD_S:g} times a second while the head moves, {1 / m.RESTING_PERIOD_S:g} times",
         f"rests within {s.arrival_tolerance_rad:g} rad of the angles sent",
-        f"({rest.SAME_RAD:g} rad) for {s.dwell_s:g} s",
-        f"for {rest.DITHER_S:g} s its readings lie within {s.rest_tolerance_rad:g} rad of each other",
+        f"({joint_history.SAME_RAD:g} rad) for {s.dwell_s:g} s",
+        f"for {joint_history.DITHER_S:g} s its readings lie within "
+        f"{s.rest_tolerance_rad:g} rad of each other",
         f"the way over the speed, and {allowed_s:g} s",
         f"more than {joint_history.CLOCK_TOLERANCE_S:g} s in the future, "
         f"more than {joint_history.OLDEST_READING_S:g} s back",

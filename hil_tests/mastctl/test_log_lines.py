@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from hil_tests.mastctl.outside_daemon import Pipe
-from mastctl.log_lines import JsonLines, formatter, to_journal
-from mastctl.queued_output import QueuedHandler, QueuedWriter
+from mastctl.logs import JsonLines, QueuedHandler, QueuedWriter, formatter, to_journal
 
 
 def record(level: int, words: str, *args: object) -> logging.LogRecord:

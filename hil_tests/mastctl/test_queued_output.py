@@ -21,7 +21,7 @@ from hil_tests.mastctl.outside_daemon import (
 from hil_tests.mastctl.service_fakes import Hang
 from hil_tests.waiting import NET_S, until
 from mastctl.client import Client
-from mastctl.queued_output import QueuedHandler, QueuedText, QueuedWriter, stall_while
+from mastctl.logs import QueuedHandler, QueuedText, QueuedWriter, stall_while
 
 
 @pytest.mark.parametrize("full", ["stderr", "stdout", "both"])

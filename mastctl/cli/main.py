@@ -26,8 +26,7 @@ from typing import Any, NoReturn
 from mastctl import signals
 from mastctl.cli import output
 from mastctl.cli.examples import EXAMPLES
-from mastctl.log_lines import TEXT
-from mastctl.queued_output import QueuedHandler, writer_to
+from mastctl.logs import TEXT, QueuedHandler, writer_to
 
 log = logging.getLogger(__name__)
 

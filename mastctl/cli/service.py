@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from mastctl.cli import output
 from mastctl.cli.output import CommandError, WrongUse, finite_number, positive_number
 from mastctl.cli.target import add_target_options, check_done, check_target, option_number, target_of
-from mastctl.queued_output import QueuedHandler
+from mastctl.logs import QueuedHandler
 
 if TYPE_CHECKING:
     from mastctl.client import Client
@@ -112,7 +112,7 @@ def _run(args: argparse.Namespace) -> int:
 
 def queue_output() -> None:
     """Let nothing that the daemon says wait for who reads it, on stderr as on stdout."""
-    from mastctl.queued_output import QueuedText, writer_to
+    from mastctl.logs import QueuedText, writer_to
 
     for name in ("stdout", "stderr"):
         try:
@@ -127,7 +127,7 @@ def queue_output() -> None:
 
 def _set_log(args: argparse.Namespace) -> None:
     """Set what is logged, and how its lines look."""
-    from mastctl.log_lines import formatter
+    from mastctl.logs import formatter
 
     for handler in logging.getLogger().handlers:
         if isinstance(handler, QueuedHandler):

@@ -25,10 +25,10 @@ from drivers.frame_times import Offset, Pairing, learned
 from drivers.interfaces import Camera, Frame, FrameTime, KnowsSize, Paced, Reading
 from mastctl.devices import frames as frame_checks
 from mastctl.devices.exposure_hold import ExposureHold
-from mastctl.devices.faults import FaultWords
+from mastctl.devices.fault_watch import FaultWords
 from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import JointHistory
-from mastctl.devices.thread import Asked, DeviceThread
+from mastctl.devices.thread import DeviceThread, ThreadCall
 from mastctl.errors import NoLonger
 from mastctl.state.faults import StandingFault
 
@@ -263,7 +263,7 @@ class Cameras:
     def _offsets(self, names: Sequence[str], deadline_s: float) -> dict[str, Offset]:
         """What is known of each camera's times beside the first one's."""
         first = names[0]
-        asked: dict[str, Asked[_Times | None]] = {}
+        asked: dict[str, ThreadCall[_Times | None]] = {}
         for name in names:
             tell = partial(self._times_of, name)
             left_s = max(0.0, deadline_s - self._time.now_s())
@@ -282,7 +282,7 @@ class Cameras:
 
     def _fetched(self, after_s: Mapping[str, float], deadline_s: float) -> dict[str, Frame | StampedFrame]:
         """One frame of each named camera, exposed after its moment."""
-        asked: dict[str, Asked[Frame | StampedFrame]] = {}
+        asked: dict[str, ThreadCall[Frame | StampedFrame]] = {}
         for camera, exposed_after_s in after_s.items():
             take = self._taker(camera, exposed_after_s, deadline_s)
             left_s = max(0.0, deadline_s - self._time.now_s())

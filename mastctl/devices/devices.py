@@ -21,15 +21,13 @@ from drivers.errors import BadReply, DriverError, LineLost, NoReply
 from drivers.interfaces import COARSE_COUNT_RAD, AxisReport, Camera, PanTilt, Reporting, StopsBeside
 from mastctl.devices import joint_history
 from mastctl.devices.cameras import Cameras
-from mastctl.devices.door import REST_S, Door
-from mastctl.devices.fault_watch import FaultWatch
-from mastctl.devices.faults import FaultWords
+from mastctl.devices.fault_watch import FaultWatch, FaultWords
 from mastctl.devices.frames import ASKED, KEPT_FRAMES, FrameStore, StampedFrame
 from mastctl.devices.joint_history import HeadReading, JointHistory
+from mastctl.devices.judge import REST_S, KeepOutJudge
 from mastctl.devices.keep_out import Pair
-from mastctl.devices.limits import Limits
-from mastctl.devices.stops import AT_ONCE_S, PATIENCE_S, Stops
-from mastctl.devices.sun import Sun
+from mastctl.devices.limits import Limits, SunDirection
+from mastctl.devices.stops import AT_ONCE_S, PATIENCE_S, StopRequests
 from mastctl.devices.thread import DeviceThread
 from mastctl.devices.ways import Way
 from mastctl.errors import MastctlError, Stopped
@@ -109,14 +107,14 @@ class Devices:
         rig: Rig | None = None,
         camera_grace_s: float | None = None,
         new_run: Callable[[], str] | None = None,
-        sun: Sun | None = None,
+        sun: SunDirection | None = None,
         machine: Machine | None = None,
     ) -> None:
         self._machine = machine or Machine(clock)
         self._publisher = self._machine.publisher
         self.on_turn: Callable[[], None] = lambda: None
         self._pan_tilt = hardware.pan_tilt
-        self.door = Door(limits, hardware.pan_tilt, clock, HEAD, rig, sun)
+        self.door = KeepOutJudge(limits, hardware.pan_tilt, clock, HEAD, rig, sun)
         self._clock = clock
         self._time = deadlines_on(clock)
         self._joints = JointErrors() if rig is None else rig.joints
@@ -146,7 +144,7 @@ class Devices:
             HEAD, between=self._poll, between_timeout_s=READ_TIMEOUT_S, words=WORDS, clock=self._time
         )
         patience_s = AT_ONCE_S if _stops_beside(self._pan_tilt) else PATIENCE_S
-        self._stops = Stops(self._head, HEAD, lambda: self._pan_tilt.stop(), self._time, patience_s)
+        self._stops = StopRequests(self._head, HEAD, lambda: self._pan_tilt.stop(), self._time, patience_s)
         self.fault_watch.begin()
 
     # The head
@@ -267,7 +265,7 @@ class Devices:
         self._head.call("move", send, MOVE_TIMEOUT_S)
 
     def way(self, here: Pair, goal: Pair) -> Way:
-        """Return the moves that lead to a goal (`mastctl.devices.door.Door.way`)."""
+        """Return the moves that lead to a goal (`mastctl.devices.judge.Door.way`)."""
         return self.door.way(here, goal)
 
     def stop(self) -> None:

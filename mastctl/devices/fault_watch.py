@@ -1,14 +1,32 @@
-"""What is wrong with the devices and the daemon's own files, told when it changes: also when nothing happens
-but that time passes."""
+"""What is wrong with the devices: how a failed call becomes a fault, and each change of it told once."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 from drivers.clock import Clock
 from mastctl.state.faults import StandingFault, same_faults
 from mastctl.state.in_turn import InTurn
 from mastctl.state.machine import Machine
+
+
+@dataclass(frozen=True)
+class FaultWords:
+    """What belongs to the faults of one kind of call.
+
+    Attributes
+    ----------
+    until
+        What takes such a fault back, in plain words that follow "until".
+    late_is_fault
+        Whether an answer that came too late is a fault itself, because the call moves something; any other
+        answer, however late, shows that the device works again.
+    """
+
+    until: str
+    late_is_fault: bool = False
+
 
 ENDS_S = 1.0
 LOOK_S = 0.1  # a call is overdue by the clock alone; so late it may be told

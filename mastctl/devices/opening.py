@@ -1,7 +1,7 @@
 """The one way to open a head: nothing else in this program does (held by the import contracts).
 
 Whoever opens one holds its place (`mastctl.safety.heads`), so that no other program drives it; knows its
-latch; and moves it within limits, around keep-outs and off the sun, as `mastctl.devices.door` judges.
+latch; and moves it within limits, around keep-outs and off the sun, as `mastctl.devices.judge` judges.
 """
 
 from __future__ import annotations
@@ -23,9 +23,8 @@ from drivers.open_hardware import open_hardware
 from drivers.open_hardware import open_one_camera as open_one_camera
 from drivers.serial_line import stable_name
 from mastctl.devices.devices import HEAD, Devices
-from mastctl.devices.door import Door
-from mastctl.devices.limits import Limits
-from mastctl.devices.sun import Sun
+from mastctl.devices.judge import KeepOutJudge
+from mastctl.devices.limits import Limits, SunDirection
 from mastctl.errors import Stopped
 from mastctl.safety import heads
 from mastctl.safety.latch import Estopped, latched_at
@@ -53,7 +52,7 @@ class Bounds:
 
     limits: Limits
     stored: StoredRig | None = None
-    sun: Sun | None = None
+    sun: SunDirection | None = None
     state: Path | None = None
 
 
@@ -135,7 +134,7 @@ def head_beside(
         def opened() -> GuardedHead:
             head = stack.enter_context(open_hardware(replace(settings, cameras={}), clock)).pan_tilt
             rig = None if bounds.stored is None else bounds.stored.rig
-            return GuardedHead(head, Door(bounds.limits, head, clock, HEAD, rig, bounds.sun), moves)
+            return GuardedHead(head, KeepOutJudge(bounds.limits, head, clock, HEAD, rig, bounds.sun), moves)
 
         yield opened
 
@@ -159,7 +158,7 @@ class GuardedHead:
         What judges.
     """
 
-    def __init__(self, head: PanTilt, door: Door, moves: bool) -> None:
+    def __init__(self, head: PanTilt, door: KeepOutJudge, moves: bool) -> None:
         self._head = head
         self.door = door
         self._moves = moves

@@ -31,7 +31,7 @@ class _Inside:
     began_s: float
 
 
-class Stops:
+class StopRequests:
     """Sends the stops of one head and knows which of them are still on their way; safe from any thread.
 
     A stop goes before everything that waits in the head's own thread. If that hangs in an earlier call, the

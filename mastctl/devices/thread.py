@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, LineLost, NoReply
-from mastctl.devices.faults import FaultWords
+from mastctl.devices.fault_watch import FaultWords
 from mastctl.errors import MastctlError, one_line
 from mastctl.state.faults import StandingFault
 
@@ -30,7 +30,7 @@ LONGEST_WORDS, LONGEST_CODE = 400, 60  # of what a driver says went wrong
 
 
 @dataclass(eq=False)
-class Asked(Generic[T]):
+class ThreadCall(Generic[T]):
     """A call on its way: what `DeviceThread.submit` gives and `DeviceThread.wait` takes.
 
     Attributes
@@ -52,7 +52,7 @@ class Asked(Generic[T]):
 
 
 @dataclass(frozen=True)
-class _Now:
+class _CallNow:
     """The call under way."""
 
     what: str
@@ -96,9 +96,9 @@ class DeviceThread:
         self._between_after_error_s = between_after_error_s
         self._words = dict(words or {})
         self._wake = self._clock.signal()
-        self._jobs: deque[Asked[Any]] = deque()
+        self._jobs: deque[ThreadCall[Any]] = deque()
         self._closing = False
-        self._now: _Now | None = None
+        self._now: _CallNow | None = None
         self._errors: Counter[tuple[str, str]] = Counter()
         self._faults: Mapping[str, StandingFault] = {}  # replaced, never edited: read without a lock
         self._thread = self._clock.thread(self._serve, f"device {device}")
@@ -113,7 +113,7 @@ class DeviceThread:
         first: bool = False,
         anyway: bool = False,
         told: bool = True,
-    ) -> Asked[T]:
+    ) -> ThreadCall[T]:
         """Queue a call and return at once.
 
         Parameters
@@ -133,7 +133,7 @@ class DeviceThread:
         NoReply
             At once, if the device is already overdue with an earlier call, or closed.
         """
-        asked = Asked(what, function, timeout_s, first, told, self._clock.now_s(), Future[T]())
+        asked = ThreadCall(what, function, timeout_s, first, told, self._clock.now_s(), Future[T]())
         with self._wake:
             if self._closing:
                 raise NoReply(f"{what} was asked after the device was closed", device=self._device)
@@ -144,7 +144,7 @@ class DeviceThread:
             self._wake.notify_all()
         return asked
 
-    def wait(self, asked: Asked[T], deadline_s: float) -> T:
+    def wait(self, asked: ThreadCall[T], deadline_s: float) -> T:
         """Return a call's result, waiting until ``deadline_s`` (of the clock) at most.
 
         Raises
@@ -242,7 +242,7 @@ class DeviceThread:
             device=self._device,
         )
 
-    def _overdue(self, now: _Now | None) -> str:
+    def _overdue(self, now: _CallNow | None) -> str:
         """Say in plain words how late the call under way is; empty when it is not."""
         now_s = self._clock.now_s()
         if now is None or now_s < now.until_s:
@@ -259,7 +259,7 @@ class DeviceThread:
     def _serve(self) -> None:
         next_between_s = self._clock.now_s()
         while True:
-            asked: Asked[Any] | None = None
+            asked: ThreadCall[Any] | None = None
             with self._wake:
                 while not self._jobs and not self._closing:
                     wait_s = None if self._between is None else next_between_s - self._clock.now_s()
@@ -275,7 +275,7 @@ class DeviceThread:
                     self._answer(asked)
             elif self._between is not None:
                 pause_s, error = self._run(
-                    Asked(
+                    ThreadCall(
                         self._between_name, self._between, self._between_timeout_s, False, True,
                         self._clock.now_s(), Future(),
                     )
@@ -287,7 +287,7 @@ class DeviceThread:
                     float(pause_s) if error is None else self._between_after_error_s
                 )
 
-    def _answer(self, asked: Asked[Any]) -> None:
+    def _answer(self, asked: ThreadCall[Any]) -> None:
         """Make a call that somebody asked for."""
         result, error = self._run(asked)
         with self._wake:
@@ -297,11 +297,11 @@ class DeviceThread:
                 asked.future.set_exception(error)
             self._wake.notify_all()
 
-    def _run(self, asked: Asked[Any]) -> tuple[Any, Exception | None]:
+    def _run(self, asked: ThreadCall[Any]) -> tuple[Any, Exception | None]:
         """Make one call; whatever happens comes back as a result or a typed error."""
         began_s = self._clock.now_s()
         with self._wake:
-            self._now = _Now(asked.what, asked.first, began_s, began_s + asked.timeout_s)
+            self._now = _CallNow(asked.what, asked.first, began_s, began_s + asked.timeout_s)
         result: Any = None
         error: Exception | None = None
         try:

@@ -72,7 +72,7 @@ def plan(keep_outs: KeepOuts, here: Pair, goal: Pair, speed_rad_per_s: float) ->
         start = out
     way = None
     for more_rad in (OFF_RAD, 0.0):
-        way = way or _fastest(_Grid(keep_outs, start, goal, more_rad), speed_rad_per_s)
+        way = way or _fastest(_WayGrid(keep_outs, start, goal, more_rad), speed_rad_per_s)
     if way is None:
         names = ", ".join(sorted({box.name for box in keep_outs.boxes}))
         raise NoWay(
@@ -92,7 +92,7 @@ def duration_s(here: Pair, goals: tuple[Pair, ...], speed_rad_per_s: float) -> f
     return far / speed_rad_per_s + CORNER_S * (len(goals) - 1)
 
 
-class _Grid:
+class _WayGrid:
     """The plane cut along every edge: lines at even, the cells between them at odd numbers."""
 
     def __init__(self, keep_outs: KeepOuts, start: Pair, goal: Pair, more_rad: float) -> None:
@@ -155,7 +155,7 @@ class _Grid:
         return taken
 
 
-def _fastest(grid: _Grid, speed_rad_per_s: float) -> tuple[Pair, ...] | None:
+def _fastest(grid: _WayGrid, speed_rad_per_s: float) -> tuple[Pair, ...] | None:
     """Dijkstra's way over the corners; None if the goal is not reached."""
     shape = len(grid.pans), len(grid.tilts)
     cost = np.full(shape, math.inf)

@@ -10,10 +10,9 @@ from typing import Protocol, TypeVar
 
 from calib.geometry.solutions import Solution, order, ordered
 from drivers.clock import Clock
-from mastctl.devices.joint_history import HeadReading
+from mastctl.devices.joint_history import HeadReading, RestWatch
 from mastctl.devices.keep_out import KeptOut, NoWay, Pair
 from mastctl.devices.limits import Limits
-from mastctl.devices.rest import RestWatch
 from mastctl.devices.ways import Way
 from mastctl.motion.results import PointingError
 from mastctl.motion.settings import PointingSettings
@@ -41,7 +40,7 @@ class SteeredHead:
 
     A reading must be finite, of now, not before the last one, and free of faults; it must be reachable from
     the last one at twice the speed cap, or lie on the way to the commanded angles (a replayed head is there
-    at once). The head has settled when it rests (`mastctl.devices.rest`); it has arrived when it rests where
+    at once). The head has settled when it rests (`RestWatch`); it has arrived when it rests where
     it was sent.
     """
 

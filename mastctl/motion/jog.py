@@ -22,7 +22,7 @@ from typing import Any, Protocol
 from drivers.clock import Clock, SystemClock
 from drivers.interfaces import Reading
 from mastctl.answers import JogTold
-from mastctl.devices.door import Door
+from mastctl.devices.judge import KeepOutJudge
 from mastctl.devices.keep_out import KeptOut, Pair
 from mastctl.errors import MastctlError, NotNow
 from mastctl.motion.results import PointingError
@@ -42,7 +42,7 @@ class JogDevices(Protocol):
     """What of `mastctl.devices.devices.Devices` a jog needs."""
 
     @property
-    def door(self) -> Door: ...
+    def door(self) -> KeepOutJudge: ...
     def read(self) -> Reading: ...
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None: ...
     def stop(self) -> None: ...

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from calib.matching.shown_view import ViewLimits
 from calib.matching.verdict import MatchSettings
-from mastctl.devices.rest import DITHER_RAD
+from mastctl.devices.joint_history import DITHER_RAD
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class PointingSettings:
     dwell_s
         How long the reading must stay the same: three exposures, and longer than a mast's ringing after the
         axis reports its position reached. A reading that dithers is watched for a second
-        (`mastctl.devices.rest`).
+        (`mastctl.devices.joint_history`).
     rest_tolerance_rad
         How far the readings of a head at rest may lie from each other: three counts of a 12-bit servo.
     arrival_tolerance_rad

@@ -29,7 +29,7 @@ def main() -> None:
         with Path(os.devnull).open("rb") as nothing:
             os.dup2(nothing.fileno(), 0)
         os.dup2(2, 1)
-        from mastctl.queued_output import QueuedHandler, QueuedText, writer_to
+        from mastctl.logs import QueuedHandler, QueuedText, writer_to
 
         sys.stdout = sys.stderr = QueuedText(writer_to(2))  # as `mastctl run` says things
         handler = QueuedHandler(writer_to(2))

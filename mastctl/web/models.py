@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_vali
 from calib.geometry.rigid import Rigid, rotation_of
 from mastctl.commands.entry import LONGEST_DEADLINE_S
 from mastctl.commands.lease import LONGEST_S, SHORTEST_S, USUAL_S
-from mastctl.devices.sun import LEAST_CONE_RAD, WIDEST_CONE_RAD, Sun, direction_of
+from mastctl.devices.limits import LEAST_CONE_RAD, WIDEST_CONE_RAD, SunDirection, direction_of
 from mastctl.guided.guide import Wanted
 from mastctl.motion.jog import Beat
 from mastctl.motion.requests import (
@@ -295,7 +295,7 @@ class SunBody(_Strict):
             raise ValueError("direction is no direction: its length is 0")
         return self
 
-    def sun(self, now_s: float) -> Sun:
+    def sun(self, now_s: float) -> SunDirection:
         """Return it as the door takes it."""
         if self.direction is None:
             assert self.azimuth_rad is not None and self.elevation_rad is not None
@@ -303,7 +303,7 @@ class SunBody(_Strict):
         else:
             x, y, z = (part / math.hypot(*self.direction) for part in self.direction)
         until_s = None if self.valid_s is None else now_s + self.valid_s
-        return Sun((x, y, z), self.frame, self.half_angle_rad, until_s)
+        return SunDirection((x, y, z), self.frame, self.half_angle_rad, until_s)
 
 
 class StandBody(_Strict):

@@ -73,7 +73,7 @@ class _Drive:
         boxes = _boxes(rng)
         speed = rng.uniform(0.2, 1.6)
         self._limits = Limits(PAN, TILT, speed, _margin_rad(head), keep_out=boxes)
-        self._door = Door(self._limits, self._head, self._clock, "pan_tilt", None, None)
+        self._door = KeepOutJudge(self._limits, self._head, self._clock, "pan_tilt", None, None)
         self._boxes = [copy for box in boxes for copy in box.within(PAN)]
         self._found = Driven(Counter())
 

@@ -19,7 +19,7 @@ from drivers.sim.heads import PRESETS, HeadSettings, head_settings
 from drivers.sim.motion import Motion
 from drivers.sim.pan_tilt import SimulatedPanTilt
 from drivers.sim.wire.axis import WireAxis
-from mastctl.devices.rest import RestWatch
+from mastctl.devices.joint_history import RestWatch
 from mastctl.motion.settings import PointingSettings
 
 AXIS = AxisSettings(1e-5, 0.0, -1.5, 1.5, 1.0, 2.0)

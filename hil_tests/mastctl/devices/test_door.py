@@ -16,10 +16,9 @@ from drivers.sim.heads import PRESETS
 from drivers.sim.pan_tilt import SimulatedPanTilt
 from hil_tests.mastctl.service_fakes import FakeHardware, FakeHead, rig
 from mastctl.devices.devices import HEAD, Devices
-from mastctl.devices.door import TRAVEL_S, Door
+from mastctl.devices.judge import TRAVEL_S, KeepOutJudge
 from mastctl.devices.keep_out import Box, KeptOut, Pair
-from mastctl.devices.limits import Limits
-from mastctl.devices.sun import Sun, direction_of
+from mastctl.devices.limits import Limits, SunDirection, direction_of
 
 DECK = Box("deck", (-1.0, 1.0), (-1.2, -0.8))
 LIMITS = Limits((-2.5, 2.5), (-1.2, 0.6), 0.5, margin_rad=0.02, keep_out=(DECK,))
@@ -36,15 +35,17 @@ class StatedHead(FakeHead):
         return dict.fromkeys(("pan", "tilt"), AxisMotion(ACCELERATION, self.beyond_rad))
 
 
-def door_of(limits: Limits = LIMITS, head: FakeHead | None = None, sun: Sun | None = None) -> Door:
-    return Door(limits, head or StatedHead(), ManualClock(100.0), HEAD, rig(), sun)
+def door_of(
+    limits: Limits = LIMITS, head: FakeHead | None = None, sun: SunDirection | None = None
+) -> KeepOutJudge:
+    return KeepOutJudge(limits, head or StatedHead(), ManualClock(100.0), HEAD, rig(), sun)
 
 
 def at(pan_rad: float, tilt_rad: float, moving: bool = False) -> Reading:
     return Reading(pan_rad, tilt_rad, moving, 100.0)
 
 
-def lets(door: Door, reading: Reading, goal: Pair) -> bool:
+def lets(door: KeepOutJudge, reading: Reading, goal: Pair) -> bool:
     try:
         door.check_move(goal, lambda: reading)
     except KeptOut:
@@ -171,7 +172,7 @@ def test_the_simulated_head_says_how_it_moves() -> None:
 
 def test_the_sun_is_kept_out_until_its_moment_and_then_missed_aloud() -> None:
     door = door_of(replace(LIMITS, keep_out=()))
-    door.use_sun(Sun(direction_of(0.5, 0.0), "rover", 0.1, 110.0))
+    door.use_sun(SunDirection(direction_of(0.5, 0.0), "rover", 0.1, 110.0))
     with pytest.raises(KeptOut, match="keep-out sun"):
         door.check_goal(0.5, 0.0)
     assert [fault.code for fault in door.faults(at(0.5, 0.02))] == ["sun_in_view"]
@@ -189,15 +190,15 @@ def test_the_sun_is_kept_out_until_its_moment_and_then_missed_aloud() -> None:
 
 def test_a_sun_that_is_told_in_the_way_of_a_head_is_found_there_but_not_behind_it() -> None:
     door = door_of(replace(LIMITS, keep_out=()))
-    door.use_sun(Sun(direction_of(2.4, 0.5), "rover", 0.1))  # somewhere else
+    door.use_sun(SunDirection(direction_of(2.4, 0.5), "rover", 0.1))  # somewhere else
     start = door.check_move((1.0, 0.0), lambda: at(-1.0, 0.0))
     door.sent(start, (1.0, 0.0), 0.5)
     assert door.in_the_way(at(-0.8, 0.0, moving=True)) is None
-    door.use_sun(Sun(direction_of(0.0, 0.0), "rover", 0.1))
+    door.use_sun(SunDirection(direction_of(0.0, 0.0), "rover", 0.1))
     assert door.in_the_way(at(-0.8, 0.0, moving=True)) == "sun"
     assert door.in_the_way(at(0.0, 0.0, moving=True)) is None  # it looks there and goes out
     assert door.in_the_way(at(0.8, 0.0, moving=True)) is None  # it has passed
-    door.use_sun(Sun(direction_of(1.0, 0.0), "rover", 0.1))
+    door.use_sun(SunDirection(direction_of(1.0, 0.0), "rover", 0.1))
     assert door.in_the_way(at(0.95, 0.0, moving=True)) == "sun"  # it would come to rest there
     clock = door._clock
     assert isinstance(clock, ManualClock)
@@ -207,7 +208,7 @@ def test_a_sun_that_is_told_in_the_way_of_a_head_is_found_there_but_not_behind_i
 
 
 def test_a_sun_of_the_site_turns_with_the_rover() -> None:
-    sun = Sun(direction_of(0.5, 0.0), "site", 0.1)
+    sun = SunDirection(direction_of(0.5, 0.0), "site", 0.1)
     door = door_of(replace(LIMITS, keep_out=()), sun=sun)
     with pytest.raises(KeptOut):
         door.check_goal(0.5, 0.0)

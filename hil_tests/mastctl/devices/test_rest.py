@@ -14,9 +14,8 @@ from hil_tests.mastctl.devices.turned import Turned
 from hil_tests.mastctl.motion.pointing_world import World, click, run
 from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from mastctl.devices.devices import Devices
-from mastctl.devices.joint_history import JointHistory
+from mastctl.devices.joint_history import DITHER_RAD, JointHistory, RestWatch, dithers
 from mastctl.devices.limits import Limits
-from mastctl.devices.rest import DITHER_RAD, RestWatch, dithers
 from mastctl.motion.loop import AnglesTarget, PointingError, PointRequest
 
 XM430_RAD = 2 * math.pi / 4096

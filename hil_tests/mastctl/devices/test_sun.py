@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Mast, Rig, RigCamera
 from mastctl.devices.keep_out import TOUCH_RAD
-from mastctl.devices.sun import ROWS, Sun, direction_of, sun_boxes
+from mastctl.devices.limits import ROWS, SunDirection, direction_of, sun_boxes
 
 TILTS = (-1.2, 1.2)
 
@@ -89,6 +89,6 @@ def test_azimuth_goes_from_forward_to_the_right_and_elevation_up() -> None:
 
 
 def test_a_direction_holds_until_its_moment() -> None:
-    sun = Sun((1.0, 0.0, 0.0), "rover", 0.1, 10.0)
+    sun = SunDirection((1.0, 0.0, 0.0), "rover", 0.1, 10.0)
     assert sun.holds(10.0) and not sun.holds(10.001)
     assert replace(sun, until_s=None).holds(1e12)

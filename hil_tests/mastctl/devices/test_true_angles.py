@@ -17,8 +17,8 @@ from drivers.sim.heads import head_settings, with_joints
 from drivers.sim.pan_tilt import SimulatedPanTilt
 from mastctl.devices import door as door_module
 from mastctl.devices.devices import Devices
-from mastctl.devices.door import Door
 from mastctl.devices.joint_history import USUAL_PLAY_RAD, HeadReading, JointHistory
+from mastctl.devices.judge import KeepOutJudge
 from mastctl.devices.limits import Limits
 
 HARMONICS = ((0.006, -0.002), (0.0015, 0.001))
@@ -53,7 +53,7 @@ class Bench:
         self.history = JointHistory(self.joints)
         self.devices = object.__new__(Devices)  # of it only `goal` is asked: no thread, no camera
         self.devices._joints = self.joints
-        self.devices.door = Door(LIMITS, self.head, self.clock, "head", None, None)
+        self.devices.door = KeepOutJudge(LIMITS, self.head, self.clock, "head", None, None)
         self.here = self.history.add(self.head.read())
 
     def go(self, pan_rad: float, tilt_rad: float) -> HeadReading:

@@ -19,8 +19,7 @@ from drivers.hardware import DeviceSettings
 from hil_tests.waiting import until
 from mastctl.config import load_config
 from mastctl.packaged import config_folder
-from mastctl.testing.daemons import config_for_a_test
-from mastctl.testing.pictures import resized, with_width
+from mastctl.testing.daemons import config_for_a_test, resized, with_width
 
 HOLDER = """
 import os, sys, threading, time

@@ -21,8 +21,7 @@ from drivers.errors import BadOptions
 from drivers.interfaces import AxisMotion, PanTilt, Reading, StatesMotion
 from mastctl.answers import SunTold
 from mastctl.devices.keep_out import Box, KeepOuts, KeptOut, Pair, Span
-from mastctl.devices.limits import Limits
-from mastctl.devices.sun import SUN, Sun, sun_boxes
+from mastctl.devices.limits import SUN, Limits, SunDirection, sun_boxes
 from mastctl.devices.ways import Way, duration_s, plan
 from mastctl.state.faults import StandingFault
 
@@ -36,7 +35,7 @@ ROUNDED = 1.01  # a servo rounds its acceleration up to its own unit
 
 
 @dataclass(frozen=True)
-class _Sent:
+class _SentMove:
     """The move that was let through last."""
 
     within: Span | None  # None: nobody knew where it began
@@ -45,7 +44,7 @@ class _Sent:
     at_s: float
 
 
-class Door:
+class KeepOutJudge:
     """Limits, keep-outs and the sun; safe from any thread.
 
     Parameters
@@ -70,7 +69,13 @@ class Door:
     """
 
     def __init__(
-        self, limits: Limits, head: PanTilt, clock: Clock, device: str, rig: Rig | None, sun: Sun | None
+        self,
+        limits: Limits,
+        head: PanTilt,
+        clock: Clock,
+        device: str,
+        rig: Rig | None,
+        sun: SunDirection | None,
     ) -> None:
         self.limits = limits
         self._clock = clock
@@ -85,7 +90,7 @@ class Door:
         self._rover_from_site = np.eye(3)
         self._sun_boxes: tuple[Box, ...] = ()
         self._boxes: tuple[KeepOuts | None, KeepOuts | None] = (None, None)  # without the sun, and with it
-        self._sent: _Sent | None = None
+        self._sent: _SentMove | None = None
         self._inside_s: Mapping[str, float] = {}  # where the head stands and should not, and since when
         self.use_limits(limits)
 
@@ -108,7 +113,7 @@ class Door:
         return self._stated
 
     @property
-    def sun(self) -> Sun | None:
+    def sun(self) -> SunDirection | None:
         """The direction that is kept out; also one that holds no longer."""
         return self._sun
 
@@ -139,7 +144,7 @@ class Door:
             self._rig = rig
             self._renew()
 
-    def use_sun(self, sun: Sun | None) -> None:
+    def use_sun(self, sun: SunDirection | None) -> None:
         """Keep another direction out, or none."""
         with self._lock:
             self._sun = sun
@@ -212,7 +217,7 @@ class Door:
         if before is not None and start is not None and start.corners[0] != start.corners[1]:
             speed_rad_per_s = max(speed_rad_per_s, before.speed_rad_per_s)  # it may still be that fast
         within = None if start is None else Span.around(*start.corners, *self._round(goal).corners)
-        self._sent = _Sent(within, goal, speed_rad_per_s, self._clock.now_s())
+        self._sent = _SentMove(within, goal, speed_rad_per_s, self._clock.now_s())
 
     def nearest(self, reading: Reading, goal: Pair, stay: Pair | None = None) -> Pair:
         """Return how far towards a goal a head under way may be sent: each axis goes as far as it may.
