@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.output import positive_number
-from mastctl.cli.places import check_file, check_folder, unusable
+from mastctl.cli.output import check_file, check_folder, positive_number, unusable
 
 if TYPE_CHECKING:
     from calib.files.mast_file import StoredRig
@@ -89,9 +88,9 @@ def run(args: argparse.Namespace) -> int:
 
         return calibrate_refine.run(args)
     if args.refine_scene is not None:
-        from mastctl.cli import calibrate_scene
+        from mastctl.cli import calibrate_refine
 
-        return calibrate_scene.run(args)
+        return calibrate_refine.run_scene(args)
     if args.camera is not None or args.joint_sigma_rad is not None:
         raise output.WrongUse("--camera and --joint-sigma-rad belong to --refine-scene")
     args.method, args.mast = args.method or "joint", args.mast or 6

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.output import CommandError, WrongUse
-from mastctl.cli.places import check_file, check_folder
+from mastctl.cli.output import CommandError, WrongUse, check_file, check_folder
 
 if TYPE_CHECKING:
     from mastctl.bench.frame import Frame

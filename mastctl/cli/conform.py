@@ -143,7 +143,7 @@ def _device(
             else args.camera or "camera"
         )
         return device_settings(args.driver, _options(args.options), kind, name), name, None, size_px
-    from mastctl.cli.camera_choice import with_cameras
+    from mastctl.cli.camera_sync import with_cameras
     from mastctl.config import load_config
     from mastctl.service.mast_in_use import bounds_of
 

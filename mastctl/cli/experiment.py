@@ -8,15 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.experiment_common import (
+from mastctl.cli.output import check_folder
+from mastctl.cli.tasks import (
     add_run_options,
+    add_task_options,
     at_least_one,
+    refuse_task_options,
+    results_of,
     run_bar,
     simulated_daemon,
     tell_report,
 )
-from mastctl.cli.places import check_folder
-from mastctl.cli.tasks import add_task_options, refuse_task_options, results_of
 
 if TYPE_CHECKING:
     from mastctl.client import Client

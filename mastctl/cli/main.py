@@ -19,13 +19,12 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, NoReturn
 
 from mastctl import signals
 from mastctl.cli import output
-from mastctl.cli.examples import EXAMPLES
 from mastctl.logs import TEXT, QueuedHandler, writer_to
 
 log = logging.getLogger(__name__)
@@ -34,28 +33,20 @@ log = logging.getLogger(__name__)
 MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.service": ("run", "status", "point", "snapshot"),
     "mastctl.cli.stop": ("stop", "estop", "reset", "halt"),
-    "mastctl.cli.lease": ("lease",),
-    "mastctl.cli.reload": ("reload",),
-    "mastctl.cli.token": ("token",),
-    "mastctl.cli.track": ("track",),
-    "mastctl.cli.jog": ("jog",),
-    "mastctl.cli.operations": ("operations", "events"),
-    "mastctl.cli.mast": ("mast", "fault"),
+    "mastctl.cli.steering": ("lease", "track", "jog"),
+    "mastctl.cli.operations": ("reload", "operations", "events", "mast", "fault"),
+    "mastctl.cli.setup": ("token", "completion", "doctor"),
     "mastctl.cli.camera_files": ("camera",),
-    "mastctl.cli.geometry": ("solve", "triangulate", "budget"),
-    "mastctl.cli.handoff": ("handoff",),
+    "mastctl.cli.geometry": ("solve", "triangulate", "budget", "handoff"),
     "mastctl.cli.board": ("board",),
     "mastctl.cli.calibrate": ("calibrate",),
     "mastctl.cli.calibrate_bench": ("calibrate bench",),
     "mastctl.cli.experiment": ("experiment", "demo"),
-    "mastctl.cli.completion": ("completion",),
     "mastctl.cli.conform": ("conform",),
-    "mastctl.cli.doctor": ("doctor",),
     "mastctl.cli.record": ("record", "replay"),
     "mastctl.cli.sim": ("sim",),
     "mastctl.cli.sentinel": ("sentinel",),
-    "mastctl.cli.servo": ("servo",),
-    "mastctl.cli.ptu": ("ptu",),
+    "mastctl.cli.servos": ("servo", "ptu"),
 }
 
 # argparse's own pattern knows -1 and -1.5 but takes -1e-3 for an option; "not finite" words get our message.
@@ -246,3 +237,100 @@ def _check_command(words: Sequence[str]) -> None:
 
 if __name__ == "__main__":
     process()
+
+
+_ALL = """
+run --config rover.yaml
+status --json
+point --camera navcam_left --at 300 420
+snapshot navcam_left --out left.png
+stop
+estop --name Ana --reason "sparks at the mast"
+reset --name Ana --reason "cable mended"
+halt --config rover.yaml
+lease show
+lease take --for 60
+lease renew --lease 0f3c --for 60
+lease release --lease 0f3c
+token new --name wall --role view
+token list
+token revoke wall
+track start --camera navcam_left --at 300 420
+track status
+track watch --count 10
+track pose --position 4.1 0.2 0 --sigma 0.02 0.009
+track look
+track stop
+jog --rates 0.2 0 --seconds 2
+operations list
+operations show 000012-9f3a
+operations watch 000012-9f3a
+mast show --out now.yaml
+mast use rocky8-refined.yaml
+mast back
+reload
+fault list
+fault set navcam_left noise sigma=8
+fault clear navcam_left
+events state fault --count 5
+camera project mast.yaml --camera navcam_left --pan 0.3 --tilt -0.2 --points points.csv
+camera ray mast.yaml --camera navcam_left --pan 0.3 --tilt -0.2 --pixels pixels.csv
+camera convert camera.yaml camera.cahvor
+camera maps mast.yaml --pair navcam --out maps.npz
+camera list
+camera sync navcam_left navcam_right --config rover.yaml
+camera check /dev/video0 --rate 30
+camera grab /dev/video0 --out picture.png
+camera focus /dev/video0 --seconds 30
+solve mast.yaml --camera navcam_left --target 6 1 0
+triangulate mast.yaml --pair navcam --pan 0.3 --tilt -0.2 --left 300 420 --right 271 420
+budget
+handoff mast.yaml --from navcam --to hazcam --pan 0.3 --tilt -0.2 --left 300 420 --right 271 420
+board make --kind charuco --paper A4 --out board.pdf
+board measured board.yaml --across-mm 149.6 --down-mm 149.8
+board find board.yaml picture.png
+calibrate survey --out mast.yaml --report report
+calibrate bench --config rig.yaml --board board.yaml --out mast.yaml --report report
+experiment pointing --targets 20 --out pointing
+demo --out demo
+completion bash
+conform http://127.0.0.1:8420
+doctor --config rover.yaml
+sentinel reference --folder sentinel --rest 0,-0.3
+sentinel look --folder sentinel
+sentinel watch --folder sentinel --every-s 86400
+sentinel status --folder sentinel
+record start afternoon
+record stop
+record list
+record show afternoon.mcap
+record repair broken.mcap --out whole.mcap
+replay afternoon.mcap --mast other.yaml
+sim new twin --height 1.9 --baseline 0.42
+sim dynamixel --servo xl330_m288:1 --servo xl330_m288:2 --pty
+sim ptu --pty
+servo scan /dev/ttyUSB0
+servo info /dev/ttyUSB0 1
+servo set-id /dev/ttyUSB0 1 2
+servo test /dev/ttyUSB0 1 --degrees 5
+ptu info /dev/ttyUSB0
+ptu home /dev/ttyUSB0
+"""
+_GROUPS = frozenset(
+    (
+        *("lease", "token", "track", "operations", "mast", "fault", "camera", "experiment", "record"),
+        *("sim", "servo", "ptu", "board", "sentinel"),
+    )
+)
+
+
+def _command_of(line: str) -> str:
+    words = line.split()
+    two = words[0] in _GROUPS or words[:2] == ["calibrate", "bench"]
+    return " ".join(words[:2] if two else words[:1])
+
+
+EXAMPLES: Mapping[str, str] = {
+    f"mastctl {_command_of(line)}": f"mastctl {line}" for line in _ALL.strip().splitlines()
+}
+"""Of a command, ``mastctl lease take``, a line that a shell would take."""

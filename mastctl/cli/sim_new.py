@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mastctl.cli import output
-from mastctl.cli.output import WrongUse
-from mastctl.cli.places import check_folder
+from mastctl.cli.output import WrongUse, check_folder
 
 MOST_BOARDS = 12
 HEADS = ("ptu_d46_70", "dynamixel_x", "ph42")

@@ -22,7 +22,7 @@ from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import target_approach_budget
 from drivers.interfaces import Image
 from mastctl.cli import output
-from mastctl.cli.places import check_folder
+from mastctl.cli.output import check_folder
 from mastctl.packaged import config_folder
 from mastctl.report import pictures, plots
 from mastctl.report.records import write_csv, write_json

@@ -18,9 +18,8 @@ import numpy as np
 
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
-from mastctl.cli.experiment_common import tell_report
-from mastctl.cli.output import WrongUse, at_least, print_table
-from mastctl.cli.places import check_folder
+from mastctl.cli.output import WrongUse, at_least, check_folder, print_table
+from mastctl.cli.tasks import tell_report
 from mastctl.packaged import config_folder
 from mastctl.report import pages, plots
 from mastctl.report.figures import Figure

@@ -17,10 +17,9 @@ from pathlib import Path
 
 from calib.files.mast_file import load_rig
 from mastctl.cli import output
-from mastctl.cli.experiment_common import run_bar, tell_report
-from mastctl.cli.places import check_folder
+from mastctl.cli.output import check_folder
 from mastctl.cli.service import add_daemon_options, client_of, refuse_daemon_options
-from mastctl.cli.tasks import refuse_task_options
+from mastctl.cli.tasks import refuse_task_options, run_bar, tell_report
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.experiment.simulated import Rover, SimulationTruth, running_rover

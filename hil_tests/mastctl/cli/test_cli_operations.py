@@ -13,8 +13,7 @@ import pytest
 
 from calib.files.mast_file import save_rig
 from hil_tests.mastctl.service_fakes import FakeHardware, rig
-from mastctl.cli.examples import EXAMPLES
-from mastctl.cli.main import _as_one_word, build_parser, main
+from mastctl.cli.main import EXAMPLES, _as_one_word, build_parser, main
 from mastctl.client import Client
 from mastctl.daemon import RunningDaemon
 

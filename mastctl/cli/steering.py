@@ -1,14 +1,16 @@
-"""Following a target with a running daemon: ``mastctl track start|status|watch|pose|look|stop``."""
+"""Commands that steer: ``lease``, ``jog`` and ``track``."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import sys
+import time
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli.output import CommandError, at_least, finite_number, one_line, positive_number
-from mastctl.cli.service import add_daemon_options, client_of, followed, tell_result
+from mastctl.cli.output import CommandError, WrongUse, at_least, finite_number, one_line, positive_number
+from mastctl.cli.service import add_daemon_options, client_of, followed, steers, tell_result
 from mastctl.cli.target import add_target_options, check_done, check_target, target_of
 
 if TYPE_CHECKING:
@@ -17,6 +19,108 @@ if TYPE_CHECKING:
 
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add lease, jog and track."""
+    for add in (_add_lease, _add_jog, _add_track):
+        add(subparsers)
+
+
+def _add_lease(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add lease."""
+    lease = subparsers.add_parser("lease", help="who steers the rover, and the right to")
+    acts = lease.add_subparsers(dest="act", required=True, metavar="ACT")
+    show = acts.add_parser("show", help="show who steers")
+    show.set_defaults(run=_show_lease)
+    take = acts.add_parser(
+        "take", help="acquire the lease and print its id, for --lease; with --reason from whoever has it"
+    )
+    take.add_argument("--name", help="the holder's name (default: user@host)")
+    take.add_argument("--reason", metavar="WHY", help="take over from whoever steers, and tell them why")
+    take.set_defaults(run=_take)
+    renew = acts.add_parser("renew", help="have a lease run on from now")
+    renew.set_defaults(run=_renew)
+    for one, default_s in ((take, 30.0), (renew, None)):
+        words = "30 s" if default_s else "as long as at first"
+        one.add_argument(
+            "--for", dest="for_s", type=positive_number, default=default_s, metavar="S",
+            help=f"how long, seconds up to 3600 (default: {words})",
+        )  # fmt: skip
+    release = acts.add_parser("release", help="let others steer")
+    release.set_defaults(run=_release)
+    for one in (show, take, renew, release):
+        add_daemon_options(one)
+
+
+def _show_lease(args: argparse.Namespace) -> int:
+    with client_of(args) as client:
+        control = client.control()
+    tell_result(args, {"control": control}, steers(control))
+    return 0
+
+
+def _take(args: argparse.Namespace) -> int:
+    with client_of(args) as client:
+        granted = client.acquire_lease(args.name, args.for_s, args.reason)
+    tell_result(args, granted, granted["lease_id"])
+    return 0
+
+
+def _renew(args: argparse.Namespace) -> int:
+    _check_named(args)
+    with client_of(args) as client:
+        granted = client.renew_lease(args.for_s)
+    tell_result(args, granted, steers(granted))
+    return 0
+
+
+def _release(args: argparse.Namespace) -> int:
+    _check_named(args)
+    with client_of(args) as client:
+        client.release_lease()
+    tell_result(args, {"released": True}, "released")
+    return 0
+
+
+def _check_named(args: argparse.Namespace) -> None:
+    if args.lease is None:
+        raise WrongUse("--lease is missing; the id that 'mastctl lease take' printed is expected")
+
+
+LOOK_S = 0.05  # how often it is seen whether the daemon still takes the heartbeats
+
+
+def _add_jog(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add jog."""
+    jog = subparsers.add_parser("jog", help="turn the head at a rate, until Ctrl-C or for some seconds")
+    jog.add_argument(
+        "--rates", nargs=2, type=finite_number, required=True, metavar=("PAN", "TILT"), help="rad/s"
+    )
+    jog.add_argument(
+        "--seconds", type=positive_number, metavar="S", help="for how long (default: until Ctrl-C)"
+    )
+    jog.set_defaults(run=_jog)
+    add_daemon_options(jog)
+
+
+def _jog(args: argparse.Namespace) -> int:
+    held: dict[str, str] = {}
+    with client_of(args) as client:
+        until_s = None if args.seconds is None else time.monotonic() + args.seconds
+        with suppress(KeyboardInterrupt), client.jog() as jog:
+            jog.rates(*args.rates)
+            while until_s is None or time.monotonic() < until_s:
+                time.sleep(LOOK_S)
+                jog.check()
+                held = jog.held
+        joints = client.status()["joints"]
+    where = {name: None if joints is None else joints[name] for name in ("pan_rad", "tilt_rad")}
+    words = (
+        f"let go at pan {where['pan_rad']:+.4f}, tilt {where['tilt_rad']:+.4f} rad" if joints else "let go"
+    )
+    tell_result(args, {**where, "held": held}, "; ".join([words, *held.values()]))
+    return 0
+
+
+def _add_track(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add track with its commands."""
     track = subparsers.add_parser("track", help="follow a target while the rover moves")
     commands = track.add_subparsers(dest="track_command", metavar="WHAT", required=True)
@@ -74,13 +178,13 @@ def _start(args: argparse.Namespace) -> int:
     with client_of(args) as client:
         operation_id = client.start_track(**target_of(args, client))
         check_done(followed(client, operation_id, args))
-        return _show(args, client.wait_track(operation_id, args.timeout))
+        return _show_track(args, client.wait_track(operation_id, args.timeout))
 
 
 def _status(args: argparse.Namespace) -> int:
     with client_of(args) as client:
         track = client.track()
-        _show(args, track)
+        _show_track(args, track)
         if not args.json:
             for one in track["self_check"]["offsets"]:
                 sys.stdout.write(one_line(one["sentence"]) + "\n")
@@ -90,7 +194,7 @@ def _status(args: argparse.Namespace) -> int:
 def _watch(args: argparse.Namespace) -> int:
     with client_of(args) as client:
         for number, track in enumerate(client.watch_track(), 1):
-            _show(args, track)
+            _show_track(args, track)
             sys.stdout.flush()
             if number == args.count:
                 return 0
@@ -115,17 +219,17 @@ def _look(args: argparse.Namespace) -> int:
 
 def _stop(args: argparse.Namespace) -> int:
     with client_of(args) as client:
-        return _show(args, client.stop_track())
+        return _show_track(args, client.stop_track())
 
 
 def _after_look(args: argparse.Namespace, client: Client, operation_id: str | None) -> int:
     """Wait for a look, if there is one, and show the track."""
     if operation_id is not None:
         followed(client, operation_id, args)
-    return _show(args, client.wait_track(operation_id, args.timeout))
+    return _show_track(args, client.wait_track(operation_id, args.timeout))
 
 
-def _show(args: argparse.Namespace, track: TrackTold) -> int:
+def _show_track(args: argparse.Namespace, track: TrackTold) -> int:
     tell_result(args, track, track_line(track))
     return 0
 

@@ -1,4 +1,4 @@
-"""Commands of the tokens by which others than this machine's users reach a daemon."""
+"""Setting up: ``doctor``, ``token``, ``completion``."""
 
 from __future__ import annotations
 
@@ -9,12 +9,67 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
+from mastctl.cli.output import CommandError
 
 if TYPE_CHECKING:
     from mastctl.access.tokens import TokenList
+    from mastctl.client.answers import Status
+
+
+MARKS = {"good": "✓", "unsure": "?", "bad": "✗"}
 
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add doctor, token and completion."""
+    for add in (_add_doctor, _add_token, _add_completion):
+        add(subparsers)
+
+
+def _add_doctor(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add doctor."""
+    doctor = subparsers.add_parser(
+        "doctor", help="look for what this machine lacks for a configuration; opens and moves nothing"
+    )
+    doctor.add_argument(
+        "--config", metavar="FILE", help="configuration (default: the packaged simulated rover)"
+    )
+    doctor.set_defaults(run=_doctor)
+
+
+def _doctor(args: argparse.Namespace) -> int:
+    from mastctl.setup.doctor import examine
+
+    found = []
+    for finding in examine(args.config, _asked):
+        found.append(finding)
+        if args.json:
+            continue
+        told = f"{MARKS[finding.level]} {finding.what}: {finding.sentence}"
+        sys.stdout.write(output.one_line(told) + "\n")
+        if finding.advice:
+            sys.stdout.write(f"    {output.one_line(finding.advice)}\n")
+    bad = sum(finding.level == "bad" for finding in found)
+    unsure = sum(finding.level == "unsure" for finding in found)
+    if args.json:
+        output.print_json({"bad": bad, "unsure": unsure, "findings": [vars(finding) for finding in found]})
+    else:
+        words = "nothing stands in the way" if not bad else f"{bad} to be mended before the daemon can work"
+        sys.stdout.write(f"{words}{f'; {unsure} to think about' if unsure else ''}\n")
+    return 1 if bad else 0
+
+
+def _asked(url: str) -> Status | None:
+    """The status of a daemon, if one answers."""
+    from mastctl.client import Client, ClientError
+
+    try:
+        with Client(url) as client:
+            return client.status()
+    except ClientError:
+        return None
+
+
+def _add_token(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add token new, token list and token revoke."""
     token = subparsers.add_parser("token", help="tokens of a daemon that is reached from other machines")
     verbs = token.add_subparsers(dest="verb", metavar="VERB", required=True)
@@ -79,3 +134,27 @@ def _folder(args: argparse.Namespace) -> Path:
         return Path(args.state)
     config = load_config(args.config)
     return config.state_folder or usual_folder(config.path, config.listen.url)
+
+
+SHELLS = ("bash", "zsh", "tcsh")
+
+
+def _add_completion(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add completion."""
+    completion = subparsers.add_parser(
+        "completion", help="print what makes a shell complete commands and options"
+    )
+    completion.add_argument("shell", choices=SHELLS)
+    completion.set_defaults(run=_completion)
+
+
+def _completion(args: argparse.Namespace) -> int:
+    from mastctl.cli.main import build_parser
+
+    try:
+        import shtab
+    except ImportError:
+        words = "shtab is not installed, which writes completions: pip install 'mastctl[completion]'"
+        raise CommandError("no_shtab", words) from None
+    sys.stdout.write(shtab.complete(build_parser([]), shell=args.shell))
+    return 0
