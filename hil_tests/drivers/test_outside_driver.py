@@ -23,8 +23,8 @@ from drivers.interfaces import Camera, Frame, PanTilt
 from drivers.open_hardware import open_hardware
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
-from mastctl.doctor.host import examine_drivers
 from mastctl.motion.loop import AnglesTarget, PixelTarget, PointingError, PointingLoop, PointRequest, Step
+from mastctl.setup.machine import examine_drivers
 
 TOO_NEW_S = 1.5
 """0.3 s were seen on a rig; more, so that a busy machine does not make late pictures of them."""

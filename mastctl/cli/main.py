@@ -270,7 +270,7 @@ mast use rocky8-refined.yaml
 mast back
 reload
 fault list
-fault set navcam_left noise sigma=8
+fault set navcam_left dark for_s=5
 fault clear navcam_left
 events state fault --count 5
 camera project mast.yaml --camera navcam_left --pan 0.3 --tilt -0.2 --points points.csv

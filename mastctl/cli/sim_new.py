@@ -70,8 +70,8 @@ def run(args: argparse.Namespace) -> int:
     from drivers.hardware import DeviceSettings, HardwareSettings, clock_for
     from drivers.sim.heads import head_settings
     from drivers.sim.pan_tilt import DEFAULT_HEADS, check_head
-    from mastctl.new_rig.folder import boards_about, check_empty, write_built, write_twin
-    from mastctl.new_rig.numbers import built_rig
+    from mastctl.setup.new_rig import built_rig
+    from mastctl.setup.rig_folder import boards_about, check_empty, write_built, write_twin
 
     if args.mast_file is not None:
         for option in _OF_NUMBERS:

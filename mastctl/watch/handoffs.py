@@ -30,6 +30,7 @@ from calib.files.yaml_text import Section, kind_of
 from calib.geometry.handoff import Joints
 from calib.matching.handed_over import HandoffBias, Landed, MatchedHandoff, handoff_bias
 from calib.matching.handoff import RefinedVerdict
+from drivers.clock import Clock, SystemClock
 from drivers.recordings.mcap_file import BadRecording, is_mcap, read_messages
 from mastctl.as_json import picked
 from mastctl.state.faults import StandingFault

@@ -21,7 +21,7 @@ from drivers.interfaces import Reading
 from drivers.sim.axis import AxisSettings
 from drivers.sim.heads import PRESETS, HeadSettings
 from drivers.sim.pan_tilt import SimulatedPanTilt
-from mastctl.devices.door import REST_S, Door
+from mastctl.devices.judge import REST_S, KeepOutJudge
 from mastctl.devices.keep_out import Box, KeptOut, NoWay, Pair, Span
 from mastctl.devices.limits import Limits
 from mastctl.motion.jog import AHEAD_S, TICK_S

@@ -159,7 +159,6 @@ WORDS = {
     "camera sync": ["--seconds", "3"],
     "conform": ["--head", "--motion", "--reach", "0.2"],
     "experiment pointing": ["--targets", "1", "--out", "out"],
-    "experiment handoff": ["--targets", "1", "--out", "out"],
     "demo": ["--targets", "1", "--out", "out"],
     "sentinel reference": ["--folder", "sentinel"],
     "sentinel look": ["--folder", "sentinel"],

@@ -15,7 +15,7 @@ from drivers.errors import BadOptions
 from drivers.interfaces import AxisMotion, Reading
 from drivers.sim.heads import head_settings, with_joints
 from drivers.sim.pan_tilt import SimulatedPanTilt
-from mastctl.devices import door as door_module
+from mastctl.devices import judge
 from mastctl.devices.devices import Devices
 from mastctl.devices.joint_history import USUAL_PLAY_RAD, HeadReading, JointHistory
 from mastctl.devices.judge import KeepOutJudge
@@ -182,6 +182,6 @@ def test_a_head_says_from_which_side_it_comes_by_itself() -> None:
 
 def test_the_sun_is_kept_out_where_the_head_reads_it() -> None:
     joint = AxisJoint(((0.02, 0.0),), 0.01)
-    low, high = door_module._as_read(joint, (0.1, 0.3))
+    low, high = judge._as_read(joint, (0.1, 0.3))
     assert max(joint.true_rad(low, side) for side in (-1, 0, 1)) == pytest.approx(0.1, abs=1e-12)
     assert min(joint.true_rad(high, side) for side in (-1, 0, 1)) == pytest.approx(0.3, abs=1e-12)
