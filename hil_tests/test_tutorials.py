@@ -31,8 +31,8 @@ BLOCK = re.compile(r"(?:`((?!/)[\w./-]+)`:\n\n)?```(\w+)\n(.*?)```", re.DOTALL)
 NUMBER = re.compile(r"(?:(?<!\w)[-+])?\d(?:[\d.:]*\d)?")
 SIGNED = re.compile(r"(?<!\w)[-+]\d+\.\d+")
 NEAR = 0.3
-LATE = "the bus watchdog tripped while the head stood at its goal"
-"""What a real-time servo line adds where the machine has much else to do."""
+LOGGED = re.compile(r"^WARNING (?:drivers|mastctl)\.[\w.]+: .*\n", re.MULTILINE)
+"""Logged by a real-time servo line on a machine with much else to do; results are compared all the same."""
 LONGEST_S = 1800.0
 """A net for one command, on a machine with much else to do."""
 PAGES = ("first-pointing", "servos-to-verdict", "first-ci-test", "recalibrate")
@@ -107,8 +107,9 @@ class Walk:
         )  # fmt: skip
         for config in self.folder.glob("*/config.yaml"):  # of `sim new`
             config.write_text(config.read_text().replace("port: 8420", f"port: {self.port}"))
-        printed = "".join(line for line in done.stdout.splitlines(keepends=True) if LATE not in line)
-        assert agrees(shown, printed), f"$ {command}\n{done.stdout}\nwhere the page shows\n{shown}"
+        assert agrees(shown, LOGGED.sub("", done.stdout)), (
+            f"$ {command}\n{done.stdout}\nwhere the page shows\n{shown}"
+        )
 
     def begin(self, command: str, shown: str) -> None:
         log = self.folder / f"log-{len(list(self.folder.glob('log-*')))}"
