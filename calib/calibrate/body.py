@@ -146,7 +146,7 @@ def _enough(sights: BodySights) -> None:
         raise NoCorrection(
             "one_sided",
             f"the targets found in {name} lie within {span:.0f} px of its {width}; hand-offs over at least "
-            f"{SPREAD * width:.0f} px are needed to tell a turn from a shift",
+            f"{SPREAD * width:.0f} px are needed to separate a turn from a shift",
         )
 
 

@@ -325,4 +325,4 @@ def _see_rest(axis: ServoAxis, clock: Clock) -> None:
     until_s = clock.now_s() + HALT_REST_S
     while abs(axis.servo.look().values["present_velocity"]) > HALT_SLOW:
         if clock.now_s() > until_s:
-            raise NoReply(f"{axis.servo.name} was told to stand, but still moves")
+            raise NoReply(f"{axis.servo.name} got the command to stand, but still moves")

@@ -275,7 +275,7 @@ class Conversation:
         for line in self._splitter.feed(self._line.read(0.0)):
             self._note_hits(line)
             if self._speaks_twice(line):
-                raise BadReply(f"said {_shown(line)}, which nobody asked for", device=self._device)
+                raise BadReply(f"said {_shown(line)}, which was not requested", device=self._device)
         begun = self._splitter.clear()
         self._note_hits(begun)
         if without_hits(begun):

@@ -229,7 +229,7 @@ def facing(eye_m: ArrayLike, position_m: ArrayLike, turned_rad: ArrayLike = (0.0
     right = np.cross([0.0, 0.0, 1.0], away)
     if float(np.linalg.norm(right)) < 1e-3:
         place = ", ".join(f"{value:.3f}" for value in np.asarray(position_m, dtype=np.float64))
-        raise BadOptions(f"a board at ({place}) m is right over or under the eye, expected one beside it")
+        raise BadOptions(f"a board at ({place}) m is right over or under the camera, expected one beside it")
     x, z = right / np.linalg.norm(right), away / np.linalg.norm(away)
     about_x, about_y, about_z = (float(angle) for angle in np.asarray(turned_rad, dtype=np.float64))
     square = np.column_stack([x, np.cross(z, x), z])

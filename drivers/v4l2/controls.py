@@ -86,7 +86,7 @@ def list_controls(node: Node) -> list[CameraControl]:
         except OSError as error:
             if error.errno in (errno.EINVAL, errno.ENOTTY):
                 break
-            raise node.failure(error, "tell its controls") from None
+            raise node.failure(error, "list its controls") from None
         last_id = query.id
         if query.type != abi.CTRL_TYPE_CTRL_CLASS and not query.flags & abi.CTRL_FLAG_DISABLED:
             found.append(_control(node, query))

@@ -302,7 +302,7 @@ class Node:
         except OSError as error:
             if error.errno in (errno.EINVAL, errno.ENOTTY, errno.ENODATA):
                 return False
-            raise self.failure(error, "tell what it offers") from None
+            raise self.failure(error, "list its formats") from None
         return True
 
     def _identify(self) -> Identity:
@@ -312,7 +312,7 @@ class Node:
         except OSError as error:
             if error.errno in (errno.ENOTTY, errno.EINVAL):
                 raise NotACamera(f"{self.path} is no video device", device=self.name) from None
-            raise self.failure(error, "tell what it is") from None
+            raise self.failure(error, "identify itself") from None
         flags = found.capabilities
         flags = found.device_caps if flags & abi.CAP_DEVICE_CAPS else flags
         driver, card, bus = (f.decode(errors="replace") for f in (found.driver, found.card, found.bus_info))

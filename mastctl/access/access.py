@@ -87,7 +87,7 @@ class Access:
             raise TooMany("too_many_guesses", words, max(1.0, wait_s))
         if self._guesses.wrong(address, digest, now_s):
             log.warning("a wrong token came from %s", address[:60])
-        raise NotLetIn("wrong_token", "the token is nobody's; perhaps it was revoked")
+        raise NotLetIn("wrong_token", "the token is unknown; perhaps it was revoked")
 
     def lend(self, name: str) -> tuple[str, Callable[[], None]]:
         """Return a new token of the role operate for a program of this daemon's own, and what takes it back.

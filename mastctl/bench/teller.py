@@ -199,4 +199,4 @@ class Terminal:
         sys.stderr.write("It need not be exact. Enter when it stands still (Ctrl-C: later). ")
         sys.stderr.flush()
         if not sys.stdin.readline():
-            raise NobodyThere("nobody is there to place the board: standard input has ended")
+            raise NobodyThere("no one can place the board: standard input has ended")

@@ -70,7 +70,7 @@ class Proposal:
         for group, pose in self.poses.items():
             codes.append("not_significant")
             sentences.append(
-                f"{group}: {len(pose.used.handoffs)} hand-offs tell no correction: {pose.sigmas:.1f} sigma "
+                f"{group}: {len(pose.used.handoffs)} hand-offs show no correction: {pose.sigmas:.1f} sigma "
                 "where 3 are asked for"
             )
         if self.other_mast:

@@ -27,8 +27,8 @@ def add_commands(subparsers: Any) -> None:
         description="Reads a survey folder (docs/how-to/survey-calibration.md), checks it, finds dots where "
         "there are none, fits cameras and mast, and writes the mast file with its uncertainty. Every former "
         "version is kept: the last as NAME.previous.yaml, those before as NAME.previous-1.yaml and so on. "
-        "With --refine it corrects the body cameras of a mast file by hand-offs instead, as a new mast file, "
-        "and ends with 1 and writes nothing if they tell no significant correction.",
+        "With --refine it corrects the body cameras of a mast file by hand-offs instead, as a new mast file. "
+        "If they show no significant correction, it writes nothing and exits with 1.",
     )
     parser.add_argument(
         "survey",

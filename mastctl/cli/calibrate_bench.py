@@ -37,9 +37,9 @@ def add_commands(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         COMMAND,
         help="fit cameras, axes and joints to pictures of a board that stands anywhere; drives the head",
-        description="Turns the head to look for a board, chooses each next pose by what it would tell, asks "
-        "for two to four placements of the board, and ends by itself when the wanted pointing error is met "
-        "(docs/how-to/bench-calibration.md). Everything seen is kept in a folder: a run that ended goes on "
+        description="Turns the head to look for a board, chooses each next pose by its expected information, "
+        "and asks for two to four placements of the board. It ends by itself when the wanted pointing error is "
+        "met (docs/how-to/bench-calibration.md). Everything seen is kept in a folder: a run that ended goes on "
         "with the same command. With FOLDER such a folder is fitted again, and nothing moves.",
     )
     parser.add_argument(
@@ -64,7 +64,7 @@ def add_commands(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--wanted-px", type=output.positive_number, default=0.2, metavar="PX",
-        help="what the calibration may leave of a first pointing, rms an axis (default 0.2)",
+        help="wanted error of a first pointing from the calibration, rms an axis (default 0.2)",
     )  # fmt: skip
     parser.add_argument(
         "--cameras", nargs="+", metavar="NAME", help="which cameras (default: all that the daemon has)"

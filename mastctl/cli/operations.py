@@ -33,7 +33,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def _add_operations(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add operations and events."""
-    operations = subparsers.add_parser("operations", help="what a daemon does, and has done since its start")
+    operations = subparsers.add_parser("operations", help="the operations of a daemon since its start")
     acts = operations.add_subparsers(dest="act", required=True, metavar="ACT")
     every = acts.add_parser("list", help="show the newest operations, newest first")
     every.set_defaults(run=_list)

@@ -44,7 +44,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     )
     replay.add_argument("file", metavar="FILE", type=Path, help="an MCAP file, or a folder of segments")
     replay.add_argument(
-        "--mast", metavar="OTHER.yaml", type=Path, help="what if: this mast file had been used"
+        "--mast", metavar="OTHER.yaml", type=Path, help="evaluate as if this mast file had been used"
     )
     replay.add_argument("--report", metavar="DIR", type=Path, help="where the what-if's page goes")
     replay.add_argument(

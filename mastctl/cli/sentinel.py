@@ -32,11 +32,9 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
         "--rest", action="append", type=_rest, metavar="PAN,TILT", help="a rest, radians (default: six)"
     )
     reference.set_defaults(run=_reference)
-    look = acts.add_parser("look", help="take them again and tell what has changed; 1 if something has")
+    look = acts.add_parser("look", help="take them again and report changes; 1 if there is one")
     look.set_defaults(run=_look)
-    watch = acts.add_parser(
-        "watch", help="look again and again, whenever nobody needs the head, until Ctrl-C"
-    )
+    watch = acts.add_parser("watch", help="look again and again, whenever the head is idle, until Ctrl-C")
     watch.add_argument(
         "--every-s",
         type=positive_number,
@@ -49,10 +47,10 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
         type=positive_number,
         default=300.0,
         metavar="S",
-        help="how long nobody must have used the head (default 300 s)",
+        help="how long the head must have been idle (default 300 s)",
     )
     watch.set_defaults(run=_watch)
-    status = acts.add_parser("status", help="what the looks so far say; 1 if something has changed")
+    status = acts.add_parser("status", help="the result of the looks so far; 1 if something has changed")
     status.set_defaults(run=_status)
     for one in (reference, look, watch, status):
         one.add_argument(

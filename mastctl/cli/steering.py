@@ -129,7 +129,7 @@ def _add_track(subparsers: argparse._SubParsersAction[Any]) -> None:
     add_target_options(start, "what is seen at a point, metres")
     start.set_defaults(run=_start)
 
-    status = commands.add_parser("status", help="show the track, and offsets that hand-offs tell")
+    status = commands.add_parser("status", help="show the track, and offsets found by hand-offs")
     status.set_defaults(run=_status)
 
     watch = commands.add_parser(

@@ -33,7 +33,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     estop = subparsers.add_parser(
         "estop", help="stop the mast at once, and let nothing move it until 'mastctl reset'"
     )
-    estop.add_argument("--reason", metavar="WORDS", help="why, for who comes to reset it")
+    estop.add_argument("--reason", metavar="WORDS", help="the reason, for the person who resets it")
     estop.add_argument("--name", metavar="WHO", help="who stops it")
     estop.set_defaults(run=_estop)
 

@@ -249,7 +249,7 @@ def fastest_seen(trial: HeadTrial, asked_rad_per_s: float) -> tuple[float, float
     moments_s = np.linspace(stamps_s[0], stamps_s[-1], 13)
     step_s = float(moments_s[1] - moments_s[0])
     if step_s < 0.004:
-        raise NotTried("the way was too short to tell a speed; a larger --reach helps")
+        raise NotTried("the way was too short to measure a speed; a larger --reach helps")
     fastest = 0.0
     for axis in (0, 1):
         if trial.true_rad is not None:

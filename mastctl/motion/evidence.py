@@ -182,7 +182,7 @@ def check_one_moment(
     except PointingError as error:
         raise PointingError(
             "target_moving",
-            f"the eyes were exposed {1e3 * spread_s:.1f} ms apart, and {1e3 * between_s:.1f} ms later "
+            f"the cameras were exposed {1e3 * spread_s:.1f} ms apart, and {1e3 * between_s:.1f} ms later "
             f"{camera} does not see the target where it was: {error}",
         ) from None
     speed = float(np.linalg.norm(seen.pixel_px - pixel_px)) / between_s

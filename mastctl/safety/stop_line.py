@@ -71,7 +71,7 @@ def ask(path: Path, line: str) -> dict[str, Any]:
     except ValueError:
         told = None
     if not isinstance(told, dict) or verb != line.split()[0]:
-        raise NoAnswer(f"what listens at {path} does not answer as a daemon does")
+        raise NoAnswer(f"the program that listens at {path} does not answer as a daemon does")
     return told
 
 
@@ -95,7 +95,7 @@ def _asked(path: Path, line: str) -> str:
         except (ConnectionResetError, BrokenPipeError):
             return ""
         except OSError as error:
-            raise NoAnswer(f"nobody listens at {path}: {error.strerror or error}") from None
+            raise NoAnswer(f"no daemon listens at {path}: {error.strerror or error}") from None
     return answer.decode("utf-8", "replace").strip()
 
 

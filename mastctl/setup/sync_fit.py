@@ -212,7 +212,7 @@ class _Equations:
         part = self.normal[np.ix_(self.free, self.free)]
         scale = np.sqrt(np.diag(part))
         if not (scale > 0).all() or np.linalg.cond(part / np.outer(scale, scale)) > 1e8:
-            raise CannotTell("the head's motion does not tell a time offset from the play of its gears")
+            raise CannotTell("the head's motion cannot separate a time offset from the play of its gears")
         found[np.ix_(self.free, self.free)] = np.linalg.inv(part)
         return found
 

@@ -143,8 +143,8 @@ def config_for_a_test(
     for name, device in {PAN_TILT: config.hardware.pan_tilt, **config.hardware.cameras}.items():
         if device.driver != "sim":
             raise BadOptions(
-                f"{config.path}: {name} has driver {device.driver!r}, expected 'sim': tests in parallel that "
-                "nobody watches move no real head"
+                f"{config.path}: {name} has driver {device.driver!r}, expected 'sim': tests in parallel "
+                "without an observer move no real head"
             )
     section = dict(config.hardware.simulation)
     if path is None:

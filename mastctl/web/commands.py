@@ -33,9 +33,7 @@ NOTHING: Mapping[str, Any] = {}
 async def _asked(
     request: Request,
     here: Here,
-    mastctl_client: Annotated[
-        str | None, Header(description="What the program that asks calls itself")
-    ] = None,
+    mastctl_client: Annotated[str | None, Header(description="The client's name")] = None,
     mastctl_lease: Annotated[str | None, Header(description="The id of the lease that it holds")] = None,
     idempotency_key: Annotated[
         str | None, Header(description="The same for each try of one command, which is carried out once")

@@ -32,7 +32,7 @@ def add_sessions(app: FastAPI) -> None:
     async def login(body: LoginBody, request: Request, response: Response, here: Here) -> SessionTold:
         access = here.entrance.access
         if access is None:
-            raise NotNow("no_login", "nobody needs a token here: the daemon serves this machine only")
+            raise NotNow("no_login", "no token is needed here: the daemon serves this machine only")
         secret, token, _ = access.log_in(body.token, address_of(request.scope))
         response.set_cookie(
             cookie_name(request.scope),

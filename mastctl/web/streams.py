@@ -39,7 +39,7 @@ class Streams:
             ``too_many`` listen already, ``closing``.
         """
         if self._ended:
-            raise Unable("closing", "the daemon ends; nothing more will be told")
+            raise Unable("closing", "the daemon ends; no more events follow")
         if len(self._open) >= self._most:
             words = f"{self._most} listen to events already, and no more may; ask again later"
             raise Unable("too_many", words, FULL_S)

@@ -65,7 +65,7 @@ class Waiting:
         try:
             return asked.result()
         except CancelledError:
-            raise Unable("closing", "the daemon ends; what was asked for will not come") from None
+            raise Unable("closing", "the daemon ends; the request will not be served") from None
 
     async def run(self, function: Callable[[], T]) -> T:
         """Return what ``function()`` returns, run in a worker thread.
@@ -123,7 +123,7 @@ class Waiting:
             await asyncio.wait({call, ending}, return_when=asyncio.FIRST_COMPLETED)
             if call.done():
                 return call.result()
-            raise Unable("closing", "the daemon ends; what was asked for will not come")
+            raise Unable("closing", "the daemon ends; the request will not be served")
         finally:
             for one in (call, ending):
                 one.cancel()

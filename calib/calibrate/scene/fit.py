@@ -183,7 +183,7 @@ def fit_scene(
         most = max(gains.values(), default=0.0)
         raise NoCorrection(
             "not_significant",
-            f"{len(problem.features)} features tell no correction: {most:.1f} sigma where 3 are asked for",
+            f"{len(problem.features)} features show no correction: {most:.1f} sigma where 3 are asked for",
         )
     errs = errs_by_reading(problem, state)
     if errs is not None:
@@ -192,7 +192,7 @@ def fit_scene(
             f"at its {errs.readings} readings {errs.joint} is off by {1e3 * errs.size_rad:.1f} mrad rms "
             f"({errs.sigmas:.0f} sigma beyond what rests scatter by), which no term explains: a correction "
             f"would look surer than it is. Take pictures at {LEAST_RESTS_TWICE} or more {errs.joint} angles "
-            f"over {LEAST_SPAN_TWICE_RAD:g} rad; if the joint repeats no better, tell --joint-sigma-rad",
+            f"over {LEAST_SPAN_TWICE_RAD:g} rad; if the joint repeats no better, give --joint-sigma-rad",
         )
     predicted = predicted_px(problem, state, taken, fitted.joint_sigma_rad)
     return _told(problem, state, taken, gains, fitted, outliers, predicted)

@@ -227,7 +227,7 @@ def test_a_feature_behind_a_camera_is_named_and_never_a_number() -> None:
 
 def test_a_rig_that_is_as_believed_is_left_as_it_is() -> None:
     views, features = scene(4)
-    with pytest.raises(NoCorrection, match="tell no correction") as refused:
+    with pytest.raises(NoCorrection, match="show no correction") as refused:
         fit_scene(believed(), views, features)
     assert refused.value.code == "not_significant"
 

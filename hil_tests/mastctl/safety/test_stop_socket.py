@@ -229,7 +229,7 @@ def test_a_socket_that_a_dead_daemon_left_is_replaced(tmp_path: Path, stops: Sto
     assert said(path, b"stop\n").startswith("stop {")
     door.close()
     until(lambda: not path.exists(), "the end")
-    with pytest.raises(NoAnswer, match="nobody listens"):
+    with pytest.raises(NoAnswer, match="no daemon listens"):
         ask(path, "stop")
 
 
