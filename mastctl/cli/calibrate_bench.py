@@ -38,9 +38,9 @@ def add_commands(subparsers: Any) -> None:
         COMMAND,
         help="fit cameras, axes and joints to pictures of a board that stands anywhere; drives the head",
         description="Turns the head to look for a board, chooses each next pose by its expected information, "
-        "and asks for two to four placements of the board. It ends by itself when the wanted pointing error is "
-        "met (docs/how-to/bench-calibration.md). Everything seen is kept in a folder: a run that ended goes on "
-        "with the same command. With FOLDER such a folder is fitted again, and nothing moves.",
+        "and asks for two to four placements of the board. It ends by itself when the wanted pointing error "
+        "is met (docs/how-to/bench-calibration.md). Everything seen is kept in a folder: a run that ended "
+        "goes on with the same command. With FOLDER such a folder is fitted again, and nothing moves.",
     )
     parser.add_argument(
         "folder", nargs="?", type=Path, metavar="FOLDER", help="a bench's folder to fit again"
