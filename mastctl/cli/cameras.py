@@ -175,7 +175,7 @@ def _utc(monotonic_s: float) -> str:
 
 def _add_check(actions: Any) -> None:
     """Add check to the actions of ``camera``."""
-    check = actions.add_parser("check", help="what a camera can do, and what it really delivers")
+    check = actions.add_parser("check", help="check a camera's properties and what it really delivers")
     add_camera_options(check)
     check.add_argument(
         "--seconds", type=positive_number, default=5.0, metavar="S", help="how long (default 5)"

@@ -189,7 +189,7 @@ def _add_mast(subparsers: argparse._SubParsersAction[Any]) -> None:
     every.set_defaults(run=_faults)
     begin = switches.add_parser("set", help="switch one on")
     begin.add_argument("device", metavar="DEVICE", help="pan_tilt, a camera, ... (docs/how-to/simulation.md)")
-    begin.add_argument("word", metavar="WORD", help="what goes wrong: off, stuck, dark, ...")
+    begin.add_argument("word", metavar="WORD", help="the fault word: off, stuck, dark, ...")
     begin.add_argument("parameters", nargs="*", metavar="NAME=VALUE", help="how much of it")
     begin.set_defaults(run=_set)
     clear = switches.add_parser("clear", help="switch those of a device off, or all")

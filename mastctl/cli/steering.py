@@ -26,15 +26,15 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def _add_lease(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add lease."""
-    lease = subparsers.add_parser("lease", help="who steers the rover, and the right to")
+    lease = subparsers.add_parser("lease", help="the lease: the right to steer the rover, and its holder")
     acts = lease.add_subparsers(dest="act", required=True, metavar="ACT")
     show = acts.add_parser("show", help="show who steers")
     show.set_defaults(run=_show_lease)
     take = acts.add_parser(
-        "take", help="acquire the lease and print its id, for --lease; with --reason from whoever has it"
+        "take", help="acquire the lease and print its id, for --lease; with --reason from its holder"
     )
     take.add_argument("--name", help="the holder's name (default: user@host)")
-    take.add_argument("--reason", metavar="WHY", help="take over from whoever steers, and tell them why")
+    take.add_argument("--reason", metavar="WHY", help="take the lease from its holder, who gets the reason")
     take.set_defaults(run=_take)
     renew = acts.add_parser("renew", help="have a lease run on from now")
     renew.set_defaults(run=_renew)
