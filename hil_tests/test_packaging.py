@@ -126,7 +126,7 @@ def test_the_installed_command_points_a_small_rover_and_checks_it(
         (6.0, 1, 0)
     ]
     assert_report(tmp_path / "pointed" / "report.html")
-    assert told["conforms"] and told["passed"] > 30 and told["failed"] == 0
+    assert told["conforms"] and told["passed"] > 10 and told["failed"] == 0
     assert (tmp_path / "report.xml").stat().st_size > 1000
 
 
