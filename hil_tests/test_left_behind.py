@@ -127,7 +127,7 @@ def test_what_is_left_behind_fails_the_run(repository: Path, tmp_path: Path, wha
 
 TOOL = """
 import subprocess, tempfile, time
-from tools.arguments import end
+from tools.command import end
 def main():
     with tempfile.TemporaryDirectory() as folder, subprocess.Popen(["sleep", "600"], cwd=folder) as process:
         try:

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.mutants.nearest import imports, nearest
-from tools.mutants.sites import sites
+from tools.mutants.sites import imports, nearest, sites
 from tools.mutants.trial import run, run_change
 
 MODULE = '''"""Words."""

@@ -38,7 +38,7 @@ from mastctl.access.access import Access
 from mastctl.access.tokens import TokenList
 from mastctl.config import Config, Listen
 from mastctl.errors import MastctlError
-from mastctl.guided.guide import Door
+from mastctl.guided.guide import WayIn
 from mastctl.logs import stall_while
 from mastctl.safety.state_folder import StateFolder
 from mastctl.safety.stop_threads import StopsHang
@@ -373,13 +373,13 @@ def _entrance(service: Service, url: str) -> Iterator[Entrance]:
     listen = service.config.listen
     names = Names(frozenset(listen.hosts), any_address=listen.needs_token, secure=listen.tls is not None)
     certificate = None if listen.tls is None else listen.tls.certificate
-    service.guide.door = Door(url, None, certificate)
+    service.guide.door = WayIn(url, None, certificate)
     if not listen.needs_token:
         yield Entrance(names, None, "loopback" if listen.socket is None else "unix")
         return
     tokens = TokenList(service.folder.path)
     access = Access(tokens)
-    service.guide.door = Door(url, access.lend, certificate)
+    service.guide.door = WayIn(url, access.lend, certificate)
     service.leases.stands = access.stands
     try:
         log.warning("%s asks everybody for a token, but for a stop; tokens lie in %s", url, tokens.folder)

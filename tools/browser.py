@@ -9,7 +9,7 @@ import argparse
 import shutil
 import sys
 
-from tools.arguments import end
+from tools.command import end
 from tools.virtual_machine.apt import Busy, apt_get
 
 NAMES = ("chromium", "chromium-browser")

@@ -13,7 +13,7 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-from tools.arguments import end
+from tools.command import end
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 BEGIN, END = "<!-- long tests: begin -->", "<!-- long tests: end -->"

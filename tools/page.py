@@ -14,7 +14,7 @@ import sys
 import webbrowser
 
 from mastctl.client import Client
-from tools.arguments import end
+from tools.command import end
 
 PAN_RAD, TILT_RAD = 0.03, -0.17
 

@@ -17,8 +17,8 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from mastctl.client import Client
 from mastctl.packaged import config_folder
-from tools.arguments import end
 from tools.browser import chromium
+from tools.command import end
 from tools.living_daemon import simulated, started, written
 
 CAMERAS = ("pancam_left", "pancam_right", "navcam_left", "navcam_right", "hazcam_left", "hazcam_right")

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import escape
 
-from tools.arguments import end, new_file
+from tools.command import end, new_file
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGES = ("mastctl", "drivers", "calib")

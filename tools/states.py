@@ -16,7 +16,7 @@ from pathlib import Path
 from xml.sax.saxutils import escape
 
 from mastctl.state.table import CHOICES, EVENTS, HAPPENS, MEANINGS, TABLE, WORDS, Event, Word, leads_to
-from tools.arguments import end
+from tools.command import end
 
 BEGIN, END = "<!-- states: begin -->", "<!-- states: end -->"
 PLACES: dict[Word, tuple[int, int]] = {  # px, middle of the box

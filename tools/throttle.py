@@ -12,13 +12,13 @@ import socket
 import threading
 from collections.abc import Iterator
 
-from tools.arguments import end
+from tools.command import end
 
 PIECE = 1460  # bytes, as in a packet
 QUEUE = 1 << 22  # bytes that wait for the link in each direction, as in a modem that drops nothing
 
 
-class Way:
+class ThrottledWay:
     """One direction of a link: bytes of all connections go one after the other."""
 
     def __init__(self, bytes_per_s: float, delay_s: float) -> None:
@@ -59,7 +59,7 @@ class Way:
 
 async def serve(line: socket.socket, port: int, bytes_per_s: float, delay_s: float) -> None:
     """Carry what comes to a listening socket to a port of this machine and back, until cancelled."""
-    out, back = Way(bytes_per_s, delay_s), Way(bytes_per_s, delay_s)
+    out, back = ThrottledWay(bytes_per_s, delay_s), ThrottledWay(bytes_per_s, delay_s)
 
     async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from tools.arguments import end
+from tools.command import end
 
 REPOSITORY = Path(__file__).parents[1]
 BUDGET = Path("tools/words_budget.csv")

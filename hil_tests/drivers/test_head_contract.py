@@ -28,7 +28,7 @@ from mastctl.conform.head_trial import HeadTrial
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.pointing import run_pointing_experiment
 from mastctl.experiment.simulated import SimulationTruth, demo_config
-from tools.campaigns.servo_rigs import LIMITS_RAD, RIGS, TURNED, Rig
+from tools.campaigns.servo_rigs import LIMITS_RAD, RIGS, TURNED, HeadRig
 
 REAL = [name for name in RIGS if name != "in_memory"]
 KERNEL = pytest.mark.long(
@@ -41,18 +41,18 @@ T = TypeVar("T")
 
 
 @pytest.fixture(params=[*TURNED, *LONG])
-def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+def rig(request: pytest.FixtureRequest) -> Iterator[HeadRig]:
     with MADE[request.param]() as made:
         yield made
 
 
 @pytest.fixture(params=[*WIRES, *LONG])
-def wired(request: pytest.FixtureRequest) -> Iterator[Rig]:
+def wired(request: pytest.FixtureRequest) -> Iterator[HeadRig]:
     with MADE[request.param]() as made:
         yield made
 
 
-def trial_of(rig: Rig) -> HeadTrial:
+def trial_of(rig: HeadRig) -> HeadTrial:
     """The rig as the checks of heads take one."""
     return HeadTrial(
         rig.head, LIMITS_RAD, 1.0, limits_rad=LIMITS_RAD, own_limits=True,
@@ -60,7 +60,7 @@ def trial_of(rig: Rig) -> HeadTrial:
     )  # fmt: skip
 
 
-def settled(rig: Rig) -> Reading:
+def settled(rig: HeadRig) -> Reading:
     """Read until the head has settled."""
     readings: list[Reading] = []
 
@@ -72,7 +72,7 @@ def settled(rig: Rig) -> Reading:
     return readings[-1]
 
 
-def works_again(rig: Rig) -> Reading:
+def works_again(rig: HeadRig) -> Reading:
     """Read until the head answers again."""
     readings: list[Reading] = []
 
@@ -95,7 +95,7 @@ def attempt(call: Callable[[], T]) -> T | None:
         return None
 
 
-def brought(rig: Rig, *goal: float) -> None:
+def brought(rig: HeadRig, *goal: float) -> None:
     """Send the head to a goal and see it settle there."""
 
     def there() -> bool:
@@ -109,7 +109,7 @@ def brought(rig: Rig, *goal: float) -> None:
     until(there, f"rest at {goal}", clock=rig.clock)
 
 
-def true_enough(rig: Rig, reading: Reading, began_s: float, ended_s: float) -> bool:
+def true_enough(rig: HeadRig, reading: Reading, began_s: float, ended_s: float) -> bool:
     """Whether the motors were where a reading has them, at some moment of the call."""
     steps = [began_s + (ended_s - began_s) * i / 20 for i in range(21)]
     truths = [rig.true_rad(step) for step in steps]
@@ -120,7 +120,7 @@ def true_enough(rig: Rig, reading: Reading, began_s: float, ended_s: float) -> b
     return True
 
 
-def true_reading(rig: Rig) -> Reading:
+def true_reading(rig: HeadRig) -> Reading:
     """Read, and see that it is true."""
     began_s = rig.clock.now_s()
     reading = rig.head.read()
@@ -131,7 +131,7 @@ def true_reading(rig: Rig) -> Reading:
 
 
 @pytest.mark.parametrize("check", HEADS.checks, ids=lambda check: str(check.name))
-def test_every_head_keeps_every_promise(rig: Rig, check: Check[HeadTrial]) -> None:
+def test_every_head_keeps_every_promise(rig: HeadRig, check: Check[HeadTrial]) -> None:
     check.ask(trial_of(rig))
 
 
@@ -150,7 +150,7 @@ def test_over_a_real_line_it_moves_and_comes_back_after_a_pulled_plug(name: str)
 
 
 @pytest.mark.parametrize("asked", [0.3, 50.0])
-def test_no_axis_goes_faster_than_asked_or_than_its_own_bound(rig: Rig, asked: float) -> None:
+def test_no_axis_goes_faster_than_asked_or_than_its_own_bound(rig: HeadRig, asked: float) -> None:
     assert rig.fastest_rad_per_s is not None
     bound = min(asked, rig.fastest_rad_per_s)
     fastest, unsure = fastest_seen(trial_of(rig), asked)
@@ -158,13 +158,13 @@ def test_no_axis_goes_faster_than_asked_or_than_its_own_bound(rig: Rig, asked: f
     assert fastest >= min(bound, 1.0) * 0.3, "nor much slower"
 
 
-def test_goals_halfway_between_counts_go_to_either_never_further(rig: Rig) -> None:
+def test_goals_halfway_between_counts_go_to_either_never_further(rig: HeadRig) -> None:
     for counts in (10.4, 10.6, -10.4, -10.6):
         rig.head.move(counts * rig.count_rad, 0.0)
         assert settled(rig).pan_rad == pytest.approx(round(counts) * rig.count_rad, abs=rig.settle_rad)
 
 
-def test_what_is_measured_is_told_not_what_was_commanded(rig: Rig) -> None:
+def test_what_is_measured_is_told_not_what_was_commanded(rig: HeadRig) -> None:
     rig.head.move(0.2, 0.1)
     at = settled(rig)
     rig.panel.set("pan_tilt", "stuck")
@@ -175,7 +175,7 @@ def test_what_is_measured_is_told_not_what_was_commanded(rig: Rig) -> None:
     assert (reading.pan_rad, reading.tilt_rad) == pytest.approx((at.pan_rad, at.tilt_rad), abs=1e-9)
 
 
-def test_an_axis_that_does_not_follow_is_told_in_words(wired: Rig) -> None:
+def test_an_axis_that_does_not_follow_is_told_in_words(wired: HeadRig) -> None:
     settled(wired)
     wired.panel.set("pan_tilt", "stuck")
     wired.head.move(0.5, -0.3)
@@ -193,7 +193,7 @@ def test_an_axis_that_does_not_follow_is_told_in_words(wired: Rig) -> None:
     assert any("pan" in word or "tilt" in word for word in words), words
 
 
-def test_a_silent_device_is_an_error_and_comes_back_without_moving(rig: Rig) -> None:
+def test_a_silent_device_is_an_error_and_comes_back_without_moving(rig: HeadRig) -> None:
     rig.head.move(0.2, 0.1)
     settled(rig)
     held = rig.true_rad(rig.clock.now_s())
@@ -219,7 +219,7 @@ def test_a_silent_device_is_an_error_and_comes_back_without_moving(rig: Rig) -> 
     assert settled(rig).pan_rad == pytest.approx(0.0, abs=rig.count_rad + rig.settle_rad)
 
 
-def test_a_pulled_plug_is_an_error_and_the_head_comes_back_by_itself(wired: Rig) -> None:
+def test_a_pulled_plug_is_an_error_and_the_head_comes_back_by_itself(wired: HeadRig) -> None:
     assert wired.line is not None
     wired.head.move(0.2, 0.1)
     settled(wired)
@@ -242,7 +242,7 @@ def test_a_pulled_plug_is_an_error_and_the_head_comes_back_by_itself(wired: Rig)
     assert wired.true_rad(wired.clock.now_s()) == pytest.approx(held, abs=wired.count_rad)
 
 
-def test_a_late_reply_is_never_taken_for_the_next(wired: Rig) -> None:
+def test_a_late_reply_is_never_taken_for_the_next(wired: HeadRig) -> None:
     settled(wired)
     wired.panel.set("pan_tilt", "delayed", delay_s=0.4)
     for goal in (0.5, -0.5):
@@ -265,7 +265,7 @@ def test_a_late_reply_is_never_taken_for_the_next(wired: Rig) -> None:
         assert true_enough(wired, reading, began_s, wired.clock.now_s())
 
 
-def test_replies_lost_now_and_then_cost_errors_but_no_wrong_angle(rig: Rig) -> None:
+def test_replies_lost_now_and_then_cost_errors_but_no_wrong_angle(rig: HeadRig) -> None:
     rig.panel.set("pan_tilt", "intermittent", probability=0.1, seed=5)
     good = 0
     for index in range(24):
@@ -301,14 +301,14 @@ def test_close_stops_the_head_and_leaves_no_thread_and_no_descriptor(name: str) 
     assert len(list(Path("/proc/self/fd").iterdir())) == descriptors
 
 
-def test_close_of_a_head_that_is_gone_does_not_raise(wired: Rig) -> None:
+def test_close_of_a_head_that_is_gone_does_not_raise(wired: HeadRig) -> None:
     assert wired.line is not None
     wired.line.hang_up()
     wired.head.close()
     wired.head.close()
 
 
-def _stands(rig: Rig) -> bool:
+def _stands(rig: HeadRig) -> bool:
     now_s = rig.clock.now_s()
     return rig.true_rad(now_s) == rig.true_rad(now_s - 0.05)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tools.campaigns.servo import WORDS, Judge, ServoRow, run_word
+from tools.campaigns.servo import WORDS, ReadingJudge, ServoRow, run_word
 from tools.campaigns.servo_rigs import in_memory
 
 REAL = pytest.mark.long(
@@ -26,7 +26,7 @@ def test_no_fault_makes_a_driver_tell_a_wrong_angle_or_leave_anything_behind(dri
 def test_the_judge_finds_a_wrong_reading_and_a_passed_limit() -> None:
     row = ServoRow("in_memory", "corrupt", 1)
     with in_memory(turned=True) as rig:
-        judge = Judge(rig, row, lying=False)
+        judge = ReadingJudge(rig, row, lying=False)
         reading = rig.head.read()
         judge.reading(reading, reading.time_s, reading.time_s)
         judge.limits()

@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 
 from tools.flight import real_handoff
-from tools.flight.mer import View
-from tools.flight.real_handoff import Carried, carried, level_plane, targets, told
+from tools.flight.mer import FlightView
+from tools.flight.real_handoff import CarriedTarget, carried, level_plane, targets, told
 
 
 @pytest.fixture(scope="module")
-def frames(mer_folder: Path) -> list[View]:
+def frames(mer_folder: Path) -> list[FlightView]:
     return real_handoff.views(mer_folder)
 
 
 @pytest.fixture(scope="module")
-def some(frames: list[View]) -> list[Carried]:
+def some(frames: list[FlightView]) -> list[CarriedTarget]:
     first, second = frames[2], frames[3]
     pixels = targets(first, second)[::6]
     return [carried(first, second, pixel, level_plane(first.camera), 0.2, 7) for pixel in pixels]
 
 
-def test_nearly_all_targets_are_found_near_their_epipolar_lines(some: list[Carried]) -> None:
+def test_nearly_all_targets_are_found_near_their_epipolar_lines(some: list[CarriedTarget]) -> None:
     found = told(some)
     assert found["targets"] >= 20
     assert found["found"] >= 0.9 * found["targets"]
@@ -33,13 +33,13 @@ def test_nearly_all_targets_are_found_near_their_epipolar_lines(some: list[Carri
     assert found["worst_px"] < 6.0
 
 
-def test_ecc_finds_the_same_places(some: list[Carried]) -> None:
+def test_ecc_finds_the_same_places(some: list[CarriedTarget]) -> None:
     found = told(some)
     assert found["ecc_agrees"] >= 0.85 * found["found"]
     assert found["ecc_apart_median_px"] < 0.2
 
 
-def test_a_target_of_another_place_is_not_found(frames: list[View]) -> None:
+def test_a_target_of_another_place_is_not_found(frames: list[FlightView]) -> None:
     """The third frame's targets in the first, taken for the fourth: other ground altogether."""
     first = frames[2]
     wrong = replace(frames[3], image=frames[0].image)
@@ -56,8 +56,8 @@ def test_a_folder_without_the_frames_is_refused(tmp_path: Path) -> None:
 def test_residuals_are_summed_by_hand() -> None:
     here, nowhere = np.zeros(2), np.full(2, np.nan)
 
-    def one(verdict: str, x: float, y: float, ecc: np.ndarray) -> Carried:
-        return Carried(here, here, np.eye(2), verdict, "", np.array([x, y]), y, ecc)
+    def one(verdict: str, x: float, y: float, ecc: np.ndarray) -> CarriedTarget:
+        return CarriedTarget(here, here, np.eye(2), verdict, "", np.array([x, y]), y, ecc)
 
     found = told(
         [

@@ -10,7 +10,7 @@ import pytest
 
 from calib.files.mast_file import load_rig
 from calib.geometry.covariance import stored_covariance
-from tools.simulated.check import projection_error_px, turned_rover_frame
+from tools.simulated.mast import projection_error_px, turned_rover_frame
 
 SAME_PX = 1e-3
 """Another processor's arithmetic may end the fit this far away."""

@@ -18,7 +18,7 @@ from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
 from drivers.sim import rocks
 from drivers.sim.scene import Scene, SceneSettings, make_grid, tiny_scene
-from mastctl.experiment.tasks import Kept
+from mastctl.experiment.tasks import KeptResults
 from tools.studies import approach_run as approach
 from tools.studies.approach import (
     approach_table,
@@ -240,7 +240,7 @@ def test_the_command_says_what_targets_lie_on(
     for row in json.loads(capsys.readouterr().out)["tasks"]:
         assert row["task"].startswith(f"on {on}, seed ")
         run = ApproachRun(int(row["task"].split()[-1]), (stop(1.05, (0.001, 0.0, 0.0)),))
-        Kept(tmp_path).write(row["id"], row["task"], run)
+        KeptResults(tmp_path).write(row["id"], row["task"], run)
     assert main([*command, "--out", str(tmp_path / "out")]) == 0
     assert f"targets on {on}" in capsys.readouterr().out
     record = json.loads((tmp_path / "out" / "record.json").read_text())

@@ -95,5 +95,5 @@ def test_walks_are_added_up() -> None:
 
 
 def test_blocks_of_cases_have_draws_of_their_own() -> None:
-    first, second = (pointing.run_block(pointing.Block(1, start, 1))[0].case for start in (0, 1000))
+    first, second = (pointing.run_block(pointing.MastBlock(1, start, 1))[0].case for start in (0, 1000))
     assert not np.allclose(first.pixel_px, second.pixel_px)

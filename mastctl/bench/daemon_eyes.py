@@ -16,7 +16,7 @@ from calib.files.mast_file import parse_rig
 from calib.geometry.rig import Rig
 from calib.targets.boards import AnyBoard
 from calib.targets.corners import CornersNotFound, find_corners
-from mastctl.bench.eyes import Head, Interrupted, Look, NoLight, NotThere, Seen
+from mastctl.bench.eyes import BenchHead, BenchInterrupted, BenchLook, NoLight, NotThere, SeenBoard
 from mastctl.client import Client, ClientError, Snapshot
 
 TURN_TIMEOUT_S = 90.0
@@ -49,7 +49,7 @@ LASTING = frozenset(
 
 
 class DaemonEyes:
-    """Looks through a daemon; see `mastctl.bench.eyes.Eyes`.
+    """Looks through a daemon; see `mastctl.bench.eyes.BenchEyes`.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class DaemonEyes:
         rig = served_rig(parse_rig(client.mast_file(), "the daemon's mast file").rig, cameras)
         axes = status["axes"]
         limits = status["limits"]
-        self._head = Head(
+        self._head = BenchHead(
             rig,
             (float(limits["pan_rad"][0]), float(limits["pan_rad"][1])),
             (float(limits["tilt_rad"][0]), float(limits["tilt_rad"][1])),
@@ -77,7 +77,7 @@ class DaemonEyes:
         )
 
     @property
-    def head(self) -> Head:
+    def head(self) -> BenchHead:
         """What is known of it."""
         return self._head
 
@@ -87,8 +87,8 @@ class DaemonEyes:
         tilt_rad: float,
         approach: tuple[int, int] = (0, 0),
         cameras: Collection[str] | None = None,
-    ) -> Look:
-        """See `mastctl.bench.eyes.Eyes`.
+    ) -> BenchLook:
+        """See `mastctl.bench.eyes.BenchEyes`.
 
         Raises
         ------
@@ -111,7 +111,7 @@ class DaemonEyes:
                 if _unlit(error) and waited_s > min(ADJUSTING_S, PATIENCE_S):
                     raise NoLight(_sentence(error)) from None
                 if error.code in LASTING or waited_s > PATIENCE_S:
-                    raise Interrupted(f"{_sentence(error)}") from None
+                    raise BenchInterrupted(f"{_sentence(error)}") from None
                 time.sleep(AGAIN_S)
 
     def seconds_each(self) -> dict[str, float]:
@@ -129,13 +129,13 @@ class DaemonEyes:
 
     def _look(
         self, pan_rad: float, tilt_rad: float, approach: tuple[int, int], cameras: Collection[str] | None
-    ) -> Look:
+    ) -> BenchLook:
         names = [name for name in self._cameras if cameras is None or name in cameras]
         begun_s = self._now_s()
         self._turn(pan_rad, tilt_rad, approach)
         shots: dict[str, Snapshot] = {}
         failed: dict[str, ClientError] = {}
-        found: dict[str, Future[Seen]] = {}
+        found: dict[str, Future[SeenBoard]] = {}
         for name in names:
             try:
                 shots[name] = self._client.snapshot(name)
@@ -154,10 +154,10 @@ class DaemonEyes:
         seen = [
             found[name].result()
             if name in found
-            else Seen(name, one.pan_rad, one.tilt_rad, None, _without_picture(name, failed[name]))
+            else SeenBoard(name, one.pan_rad, one.tilt_rad, None, _without_picture(name, failed[name]))
             for name in names
         ]
-        return Look(tuple(seen), _side(one, "pan_approach"), _side(one, "tilt_approach"), seconds)
+        return BenchLook(tuple(seen), _side(one, "pan_approach"), _side(one, "tilt_approach"), seconds)
 
     def _turn(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int]) -> None:
         """Go to readings, by way of ones beside them where an axis would come from the other side.
@@ -192,7 +192,7 @@ class DaemonEyes:
         told: Mapping[str, Any] = operation.get("error") or {}
         why = str(told.get("message", "the move failed"))
         if operation["state"] == "stopped":
-            raise Interrupted(self._stopped(why))
+            raise BenchInterrupted(self._stopped(why))
         if operation["state"] != "done":
             raise ClientError(str(told.get("code", "failed")), why)
 
@@ -207,15 +207,17 @@ class DaemonEyes:
             return "somebody pressed stop in the middle of a move, and the head stands still"
         return f"the head was stopped in the middle of a move: {why}"
 
-    def _seen(self, shot: Snapshot) -> Seen:
+    def _seen(self, shot: Snapshot) -> SeenBoard:
         pan_rad, tilt_rad = shot.pan_rad, shot.tilt_rad
         corners = find_corners(self._board, shot.image)
         if isinstance(corners, CornersNotFound):
-            return Seen(shot.camera, pan_rad, tilt_rad, None, _why(shot.image, corners.reason), shot.data)
+            return SeenBoard(
+                shot.camera, pan_rad, tilt_rad, None, _why(shot.image, corners.reason), shot.data
+            )
         if len(corners) < FEWEST_CORNERS:
             few = f"{len(corners)} corners of the board where {FEWEST_CORNERS} at least are expected"
-            return Seen(shot.camera, pan_rad, tilt_rad, None, few, shot.data)
-        return Seen(shot.camera, pan_rad, tilt_rad, corners, "", shot.data)
+            return SeenBoard(shot.camera, pan_rad, tilt_rad, None, few, shot.data)
+        return SeenBoard(shot.camera, pan_rad, tilt_rad, corners, "", shot.data)
 
     def _now_s(self) -> float:
         return float(self._client.status()["now_s"])

@@ -15,14 +15,11 @@ from calib.geometry.rigid import FloatArray, rigid_rates
 from calib.plan.knowledge import ExpectedPointing
 from calib.survey.records import Survey
 from mastctl.bench.differences import Difference
+from mastctl.calibration.drawn import arrow_scale, dots_of, draw_arrows, over_picture, told
 from mastctl.report import plots
 
 CELLS = (16, 12)
 """Of a picture in which corners are counted."""
-
-MANY = 2500
-ARROW_PART = 0.025
-"""The typical residual is drawn this part of the picture's width long."""
 
 RANGES_M = (2.0, 10.0)
 SIDES = ((1, plots.BLUE, "came from smaller angles"), (-1, plots.RUST, "came from larger angles"),
@@ -35,7 +32,7 @@ def coverage(calibration: BenchCalibration, cameras: Sequence[str]) -> Any:
     axes = np.atleast_1d(figure.subplots(1, len(cameras)))
     for axis, name in zip(axes, cameras, strict=True):
         width, height = calibration.rig.cameras[name].model.size_px
-        places = _places(calibration, name)
+        places, _ = dots_of(_mine(calibration, name), told)
         counts, xs, ys = np.histogram2d(
             places[:, 0], places[:, 1], bins=CELLS, range=((-0.5, width - 0.5), (-0.5, height - 0.5))
         )
@@ -54,22 +51,14 @@ def residuals(calibration: BenchCalibration, cameras: Sequence[str]) -> Any:
     figure = plots.new(5.6 * len(cameras), 4.4)
     axes = np.atleast_1d(figure.subplots(1, len(cameras)))
     for axis, name in zip(axes, cameras, strict=True):
-        width, height = calibration.rig.cameras[name].model.size_px
-        axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
-        fitted = _arrows(calibration, name, check=False)
-        typical = max(
-            float(np.sqrt(np.mean(np.sum(fitted[1] ** 2, axis=1)))) if len(fitted[1]) else 0.0, 1e-9
-        )
-        scale = typical / (ARROW_PART * width)
+        size_px = calibration.rig.cameras[name].model.size_px
+        over_picture(axis, size_px)
+        scale = arrow_scale(dots_of(_mine(calibration, name), told)[1], size_px[0])
         for check, colour, label in ((False, plots.BLUE, "fitted"), (True, plots.RUST, "not fitted")):
-            places, arrows = _arrows(calibration, name, check)
-            step = -(-len(places) // MANY) or 1
+            places, arrows = dots_of(_mine(calibration, name, check), told)
             if len(places):
-                axis.quiver(
-                    *places[::step].T, *arrows[::step].T, color=colour, angles="xy", scale_units="xy",
-                    scale=scale, width=0.0018, headwidth=4, headlength=5, alpha=0.8, label=label,
-                )  # fmt: skip
-        out = _left_out(calibration, name)
+                draw_arrows(axis, places, arrows, colour, scale, label)
+        out, _ = dots_of(_mine(calibration, name), lambda image: ~image.used)
         if len(out):
             axis.scatter(*out.T, marker="x", s=14, color=plots.GREY, label="left out")
         rms = calibration.rms_px.get(name, (float("nan"),) * 2)
@@ -89,9 +78,7 @@ def against_joints(calibration: BenchCalibration, cameras: Sequence[str]) -> Any
             axis = axes[row, column]
             for index, name in enumerate(cameras):
                 for check in (False, True):
-                    mine = [
-                        i for i in calibration.images if i.camera == name and (i.purpose == "check") == check
-                    ]
+                    mine = _mine(calibration, name, check)
                     points = [(_read(image, joint), *_mean(image, part)) for image in mine]
                     values = np.array([one for one in points if one[0] is not None], dtype=float)
                     if len(values):
@@ -195,15 +182,14 @@ def differences(found: Sequence[Difference]) -> Any:
     figure = plots.new(5.6 * len(found), 4.4)
     axes = np.atleast_1d(figure.subplots(1, len(found)))
     for axis, one in zip(axes, found, strict=True):
-        width, height = one.size_px
         arrows = one.lens_px
         typical = max(float(np.nanmax(np.linalg.norm(arrows, axis=1))), 1e-9)
-        scale = typical / (0.05 * width)
+        scale = typical / (0.05 * one.size_px[0])
         axis.quiver(
             *one.pixels_px.T, *arrows.T, color=plots.BLUE, angles="xy", scale_units="xy", scale=scale,
             width=0.003, headwidth=4, headlength=5,
         )  # fmt: skip
-        axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+        over_picture(axis, one.size_px)
         axis.set_title(
             f"{one.camera}: lens apart by {typical:.2f} px at most, {one.rms_px:.2f} px rms", fontsize=10
         )
@@ -296,27 +282,11 @@ def _read(image: ImageResiduals, joint: str) -> float | None:
 
 def _mean(image: ImageResiduals, part: int) -> tuple[float, float]:
     """Mean residual of a picture and its sigma, were its corners independent."""
-    which = np.ones(len(image.used), dtype=bool) if image.purpose == "check" else image.used
-    values = image.residuals_px[which, part]
+    values = image.residuals_px[told(image), part]
     if not len(values):
         return 0.0, 0.0
     return float(values.mean()), float(values.std() / np.sqrt(len(values)))
 
 
-def _places(calibration: BenchCalibration, camera: str) -> FloatArray:
-    mine = [i.pixels_px[i.used] for i in calibration.images if i.camera == camera and i.purpose != "check"]
-    return np.concatenate(mine) if mine else np.empty((0, 2))
-
-
-def _arrows(calibration: BenchCalibration, camera: str, check: bool) -> tuple[FloatArray, FloatArray]:
-    mine = [i for i in calibration.images if i.camera == camera and (i.purpose == "check") == check]
-    kept = [np.ones(len(i.used), dtype=bool) if check else i.used for i in mine]
-    if not mine:
-        return np.empty((0, 2)), np.empty((0, 2))
-    places = np.concatenate([i.pixels_px[k] for i, k in zip(mine, kept, strict=True)])
-    return places, np.concatenate([i.residuals_px[k] for i, k in zip(mine, kept, strict=True)])
-
-
-def _left_out(calibration: BenchCalibration, camera: str) -> FloatArray:
-    mine = [i for i in calibration.images if i.camera == camera and i.purpose != "check"]
-    return np.concatenate([i.pixels_px[~i.used] for i in mine]) if mine else np.empty((0, 2))
+def _mine(calibration: BenchCalibration, camera: str, check: bool = False) -> list[ImageResiduals]:
+    return [i for i in calibration.images if i.camera == camera and (i.purpose == "check") == check]

@@ -17,20 +17,20 @@ class NotThere(MastctlError):
     code = "not_there"
 
 
-class Interrupted(MastctlError):
+class BenchInterrupted(MastctlError):
     """The bench cannot go on just now; nothing is lost."""
 
     code = "interrupted"
 
 
-class NoLight(Interrupted):
+class NoLight(BenchInterrupted):
     """Every camera's picture at an attitude is too dark, or too bright, to be used; elsewhere it may do."""
 
     code = "interrupted"
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SeenBoard:
     """One camera's picture of a look.
 
     Attributes
@@ -56,11 +56,11 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class BenchLook:
     """Cameras' pictures at one attitude, from which side each joint came (1, -1, 0 unknown), and how long
     it took, seconds of the rover's clock."""
 
-    seen: tuple[Seen, ...]
+    seen: tuple[SeenBoard, ...]
     pan_approach: int
     tilt_approach: int
     seconds: float
@@ -81,13 +81,13 @@ class Look:
         return tuple(one.camera for one in self.seen)
 
     @property
-    def found(self) -> tuple[Seen, ...]:
+    def found(self) -> tuple[SeenBoard, ...]:
         """The pictures that show the board."""
         return tuple(one for one in self.seen if one.corners is not None)
 
 
 @dataclass(frozen=True, eq=False)
-class Head:
+class BenchHead:
     """What is known of a head before it is calibrated.
 
     Attributes
@@ -109,11 +109,11 @@ class Head:
     count_rad: float = 0.0
 
 
-class Eyes(Protocol):
+class BenchEyes(Protocol):
     """A head with cameras in front of a board."""
 
     @property
-    def head(self) -> Head:
+    def head(self) -> BenchHead:
         """What is known of it."""
         ...
 
@@ -123,7 +123,7 @@ class Eyes(Protocol):
         tilt_rad: float,
         approach: tuple[int, int] = (0, 0),
         cameras: Collection[str] | None = None,
-    ) -> Look:
+    ) -> BenchLook:
         """Turn to joint readings, radians, from the sides asked for (0: any), and take some cameras at rest,
         all of them by default.
 

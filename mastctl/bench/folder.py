@@ -18,8 +18,8 @@ from calib.plan.placements import Placement
 from calib.survey.records import Approach, Sigma, Survey, SurveyCamera, SurveyImage
 from calib.survey.writer import BenchFolder, NotWritten
 from calib.targets.boards import AnyBoard
-from mastctl.bench.eyes import Look, Seen
-from mastctl.bench.frame import Frame, frame_of
+from mastctl.bench.eyes import BenchLook, SeenBoard
+from mastctl.bench.frame import RoverFrame, frame_of
 
 JOURNAL = "bench.jsonl"
 
@@ -27,7 +27,7 @@ FORMER = "former_mast.yaml"
 """The mast file that was in use when the run began."""
 
 
-class Kept:
+class RunFolder:
     """The folder of one run; whatever it was told is on the disk when a call returns.
 
     Parameters
@@ -71,7 +71,7 @@ class Kept:
             number = _number_of(image, path)
             self._numbers[image.placement] = max(number, self._numbers.get(image.placement, 0))
 
-    def begin(self, former: bytes, frame: Frame) -> None:
+    def begin(self, former: bytes, frame: RoverFrame) -> None:
         """Keep the mast file in use, unless one is kept already, and what the rover frame hangs on."""
         path = self.path / FORMER
         try:
@@ -100,7 +100,7 @@ class Kept:
             raise NotWritten(self._journal, "", f"cannot be written: {error.strerror or error}") from None
         self.notes.append(told)
 
-    def add(self, placement: str, board: str, look: Look, check: bool) -> None:
+    def add(self, placement: str, board: str, look: BenchLook, check: bool) -> None:
         """Keep the pictures of a look that show the board."""
         number = self._numbers.get(placement, 0) + 1
         for one in look.found:
@@ -178,11 +178,11 @@ def moved_placements(notes: Iterable[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def kept_moved(folder: Path) -> dict[str, float]:
-    """Return the placements of a folder's run that moved (see `Kept.moved`). Raises BadFile."""
+    """Return the placements of a folder's run that moved (see `RunFolder.moved`). Raises BadFile."""
     return moved_placements(_read_notes(folder / JOURNAL))
 
 
-def kept_frame(folder: Path) -> Frame:
+def kept_frame(folder: Path) -> RoverFrame:
     """Return what the rover frame of a folder's run hangs on. Raises BadFile."""
     return frame_of(_read_notes(folder / JOURNAL))
 
@@ -200,20 +200,22 @@ def survey_cameras(rig: Rig, names: Mapping[str, tuple[int, int]]) -> dict[str, 
     return cameras
 
 
-def looks_of(survey: Survey) -> Iterator[tuple[str, bool, Look]]:
+def looks_of(survey: Survey) -> Iterator[tuple[str, bool, BenchLook]]:
     """Yield what a folder shows, look by look: placement, whether it is a check's, the look."""
     groups: dict[str, list[SurveyImage]] = {}
     for image in survey.images:
         groups.setdefault(_of_look(image), []).append(image)
     for images in groups.values():
         seen = tuple(
-            Seen(i.camera, i.pan_rad or 0.0, i.tilt_rad or 0.0, survey.corners.get(i.name), "no corners kept")
+            SeenBoard(
+                i.camera, i.pan_rad or 0.0, i.tilt_rad or 0.0, survey.corners.get(i.name), "no corners kept"
+            )
             for i in images
             if i.name in survey.corners
         )
         if seen:
             head = next((i for i in images if i.pan_rad is not None), images[0])
-            look = Look(seen, head.pan_approach, head.tilt_approach, 0.0)
+            look = BenchLook(seen, head.pan_approach, head.tilt_approach, 0.0)
             yield images[0].placement, images[0].purpose == "check", look
 
 

@@ -1,8 +1,8 @@
-"""Where the rover frame of a bench is: no board of unknown place can tell, so it is stated."""
+"""Where the rover frame of a bench is, and the fit in it: no board of unknown place tells it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,7 +32,7 @@ class NoSuchFrame(MastctlError):
 
 
 @dataclass(frozen=True)
-class Frame:
+class RoverFrame:
     """What the rover frame hangs on: one of these, or where the former mast file has the mast.
 
     Attributes
@@ -64,21 +64,21 @@ class Frame:
         return self.mast_at is not None or self.board_at is not None or self.body
 
 
-def frame_of(notes: Sequence[Mapping[str, Any]]) -> Frame:
+def frame_of(notes: Sequence[Mapping[str, Any]]) -> RoverFrame:
     """Return what a run's journal says the frame hangs on."""
     told: Mapping[str, Any] = next((note for note in reversed(notes) if note.get("event") == "frame"), {})
-    return Frame(told.get("mast_at"), told.get("board_at"), bool(told.get("body")))
+    return RoverFrame(told.get("mast_at"), told.get("board_at"), bool(told.get("body")))
 
 
 def rover_from_board(board_at: Sequence[float]) -> Rigid:
-    """Return the pose of a board that was told in metres and degrees (see `Frame`)."""
+    """Return the pose of a board that was told in metres and degrees (see `RoverFrame`)."""
     turn = Rotation.from_euler("ZYX", board_at[3:], degrees=True).as_matrix()
     return Rigid(turn @ UPRIGHT, np.array(board_at[:3]))
 
 
 def fit_in_frame(
     survey: Survey,
-    frame: Frame,
+    frame: RoverFrame,
     former: Rig | None,
     options: BenchOptions | None = None,
     moved: Mapping[str, float] | None = None,
@@ -127,7 +127,7 @@ def fit_in_frame(
 
 
 def _fit_in_frame(
-    survey: Survey, frame: Frame, former: Rig | None, options: BenchOptions
+    survey: Survey, frame: RoverFrame, former: Rig | None, options: BenchOptions
 ) -> BenchCalibration:
     """The fit of what a survey shows."""
     survey, notes = without_lonely(survey)
@@ -210,3 +210,52 @@ def without_lonely(survey: Survey) -> tuple[Survey, tuple[str, ...]]:
         ),
         tuple(notes),
     )
+
+
+LEAST_PX, LEAST_SCALE = 0.01, 0.1
+"""No corner is surer than this, and none so much surer than its finder says; few pictures agree by chance."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedBench:
+    """A survey's fit.
+
+    Attributes
+    ----------
+    rig
+        Cameras, mast and joints.
+    boards
+        Placement to rover_from_board; of a board that moved meanwhile, where it stood last.
+    corner_rms_px
+        Rms per axis of the fitted corners.
+    sigma_scale
+        How large residuals are against the sigmas that corners came with.
+    calibration
+        All of what the fit tells; None of a stand-in.
+    """
+
+    rig: Rig
+    boards: Mapping[str, Rigid]
+    corner_rms_px: float
+    sigma_scale: float
+    calibration: BenchCalibration | None
+
+
+FitSurvey = Callable[[Survey], FittedBench]
+
+
+def fit_in_rover(frame: RoverFrame, former: Rig, moved: Callable[[], Mapping[str, float]]) -> FitSurvey:
+    """Return the fit of a bench in a rover frame that was stated; ``moved`` as of `fit_in_frame`."""
+
+    def fit(survey: Survey) -> FittedBench:
+        done = fit_in_frame(survey, frame, former, moved=moved())
+        # Of a board that moved, "p1 from IMAGE on" comes after "p1": where it stands now.
+        boards = {placement.split(" ")[0]: pose for (_, placement), pose in done.rover_from_board.items()}
+        rms = float(np.sqrt(np.mean(np.square(list(done.rms_px.values())))))
+        # Corners were fitted with what print and lens add; those that a run plans with come without it.
+        fitted_px = np.median(np.concatenate([image.sigma_px for image in done.images]))
+        own_px = np.median(np.concatenate([one.sigma_px for one in survey.corners.values()]))
+        scale = float(np.sqrt(done.chi2 / max(done.degrees_of_freedom, 1.0)) * fitted_px / own_px)
+        return FittedBench(done.rig, boards, max(rms, LEAST_PX), max(scale, LEAST_SCALE), done)
+
+    return fit

@@ -21,10 +21,10 @@ from calib.plan.knowledge import BenchShot, BoardView, ExpectedPointing, Knowled
 from calib.plan.placements import FEWEST, body_cameras
 from calib.plan.poses import Sought, expected_px, readings, rover_from_board, shown, with_board
 from calib.targets.boards import AnyBoard
-from mastctl.bench.eyes import Head, Look
-from mastctl.bench.fitting import FitSurvey, Fitted
-from mastctl.bench.folder import Kept, looks_of
-from mastctl.bench.teller import CELLS
+from mastctl.bench.events import CELLS
+from mastctl.bench.eyes import BenchHead, BenchLook
+from mastctl.bench.folder import RunFolder, looks_of
+from mastctl.bench.frame import FitSurvey, FittedBench
 from mastctl.errors import MastctlError
 
 USUAL_PAN_RAD, USUAL_TILT_RAD = (-1.2, 1.2), (-0.9, 0.3)
@@ -41,7 +41,7 @@ BESIDE, BESIDE_AT_FIRST = 0.1, 0.5
 """So far outside a picture, in parts of its width, corners may be in it after all: after, before a fit."""
 
 
-class Known:
+class BenchKnowledge:
     """What was seen, what follows from it, and the fit of it that is under way.
 
     Parameters
@@ -79,8 +79,8 @@ class Known:
 
     def __init__(
         self,
-        head: Head,
-        kept: Kept,
+        head: BenchHead,
+        kept: RunFolder,
         board_name: str,
         board: AnyBoard,
         fit: FitSurvey,
@@ -102,13 +102,13 @@ class Known:
         # A count is rounded both when the head is sent and when it is read.
         self.now = Knowledge(head.rig, {}, head.count_rad / math.sqrt(12.0))
         self.aim: ExpectedPointing = pointing(self.now, self.workspace)
-        self.looks: list[tuple[str, bool, Look]] = list(looks_of(kept.survey()))
+        self.looks: list[tuple[str, bool, BenchLook]] = list(looks_of(kept.survey()))
         self.shots: list[BenchShot] = []
-        self.fitted: Fitted | None = None
+        self.fitted: FittedBench | None = None
         self.fitted_looks = 0
         self._scale = 1.0
         self._pool = ThreadPoolExecutor(1, "bench-fit")
-        self._pending: tuple[int, Future[Fitted]] | None = None
+        self._pending: tuple[int, Future[FittedBench]] | None = None
 
     def end(self) -> None:
         """Fit no more."""
@@ -129,7 +129,7 @@ class Known:
         """Return the names of the placements, in turn."""
         return list(dict.fromkeys(placement for placement, _, _ in self.looks))
 
-    def of(self, name: str, check: bool | None = None) -> list[Look]:
+    def of(self, name: str, check: bool | None = None) -> list[BenchLook]:
         """Return the looks of a placement: all, or those that are a check's or are not."""
         return [one for at, is_check, one in self.looks if at == name and check in (None, is_check)]
 
@@ -204,7 +204,7 @@ class Known:
             if len({name for name, cameras in seen if body in cameras} & by_head) < FEWEST
         ]
 
-    def promised_px(self, looks: Sequence[Look], name: str) -> dict[str, float]:
+    def promised_px(self, looks: Sequence[BenchLook], name: str) -> dict[str, float]:
         """Return what corners of looks that were not fitted should be off by, rms per axis, by camera."""
         told: dict[str, list[float]] = {}
         covariance = covariance_of(with_board(self.now, self.shots, name))
@@ -225,7 +225,7 @@ class Known:
 
     # -- what is learned -------------------------------------------------------------------------------
 
-    def take(self, name: str, look: Look, check: bool = False) -> None:
+    def take(self, name: str, look: BenchLook, check: bool = False) -> None:
         """Keep a look at a placement, add it to what is known, and fit beside what comes next if it is
         worth it."""
         self.kept.add(name, self._board_name, look, check)
@@ -250,7 +250,7 @@ class Known:
         except CalibError as reason:
             self._say(f"no fit yet: {reason}")
 
-    def fit(self) -> Fitted:
+    def fit(self) -> FittedBench:
         """Return the fit of everything that was seen. Raises CalibError if it cannot be fitted."""
         self.collect(wait=True)
         if self.fitted is None or self.fitted_looks < len(self.looks):
@@ -270,7 +270,7 @@ class Known:
             self._shot(name, look) for name, check, look in self.looks if not check and name not in spoiled
         ]
 
-    def _use(self, fitted: Fitted, looks: int) -> None:
+    def _use(self, fitted: FittedBench, looks: int) -> None:
         """Let a fit of so many looks be the present estimate; boards that it does not know stay where they
         were seen."""
         self.fitted, self.fitted_looks = fitted, looks
@@ -282,7 +282,7 @@ class Known:
         self.aim = pointing(self.now, self.workspace)
         self.believe_boards()
 
-    def _shot(self, name: str, look: Look) -> BenchShot:
+    def _shot(self, name: str, look: BenchLook) -> BenchShot:
         views = tuple(
             BoardView(one.camera, self.board.in_board_m(one.corners.ids), self._scale * one.corners.sigma_px)
             for one in look.found
@@ -290,7 +290,7 @@ class Known:
         )
         return BenchShot(name, look.pan_rad, look.tilt_rad, views, look.pan_approach, look.tilt_approach)
 
-    def _board_from(self, look: Look) -> Rigid:
+    def _board_from(self, look: BenchLook) -> Rigid:
         """Where the board is, by the picture that shows most of it."""
         one = max(look.found, key=lambda seen: 0 if seen.corners is None else len(seen.corners))
         assert one.corners is not None

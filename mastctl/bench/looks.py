@@ -1,21 +1,86 @@
-"""Looks at a board at one placement: find it, take what tells most, and see that it stayed where it was."""
+"""What a bench is to reach, and its looks at a board at one placement.
+
+The board is found, what tells most is taken of it, and it is seen that it stayed where it was.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from calib.plan.knowledge import BenchShot
 from calib.plan.placements import Placement
 from calib.plan.poses import AttitudeChoice, next_shot
-from mastctl.bench.eyes import Eyes, Look, NotThere
-from mastctl.bench.known import Known
-from mastctl.bench.search import Search
-from mastctl.bench.teller import Progress, Teller
-from mastctl.bench.wanted import FEWEST_LOOKS, Wanted
+from mastctl.bench.events import BenchProgress
+from mastctl.bench.eyes import BenchEyes, BenchLook, NotThere
+from mastctl.bench.known import BenchKnowledge
+from mastctl.bench.search import BoardSearch
+from mastctl.bench.teller import Teller
 from mastctl.errors import MastctlError
+
+FEWEST_LOOKS = 8
+"""Of a placement: fewer leave the board's own place, and so what it tells, to chance."""
+
+TURN_S = 1.5
+"""Between two looks, for the head to get there."""
+
+
+@dataclass(frozen=True)
+class BenchGoal:
+    """What a run is to reach, and when it stops trying.
+
+    Attributes
+    ----------
+    pointing_px
+        Rms per axis of a first pointing that the calibration may leave, on paper.
+    pictures
+        Of a camera, at most; the check's are among them.
+    placements
+        Fewest and most.
+    checks
+        Looks that are not fitted.
+    """
+
+    pointing_px: float = 0.2
+    pictures: int = 60
+    placements: tuple[int, int] = (2, 4)
+    checks: int = 5
+
+    def at_least_px(self, floor_px: float) -> float:
+        """Return what the calibration may leave: as asked, or what counts leave anyway."""
+        return max(self.pointing_px, floor_px)
+
+    def will_take(self, picture_s: Mapping[str, float], pointing: Collection[str], choice_s: float) -> str:
+        """Return in words how long a run takes.
+
+        Parameters
+        ----------
+        picture_s
+            Of each camera, how long a picture and finding its corners take, seconds.
+        pointing
+            The cameras of which each look takes a picture; of the others only where they may see the board.
+        choice_s
+            How long it takes to choose where to look next, seconds.
+        """
+        fewest = self.placements[0] * FEWEST_LOOKS + self.checks
+        least_s = choice_s + TURN_S + sum(picture_s[name] for name in pointing)
+        most_s = choice_s + TURN_S + sum(picture_s.values())
+        slowest = max(picture_s, key=picture_s.__getitem__)
+        return (
+            f"{fewest} to {self.pictures} looks will take {_minutes(fewest * least_s)} to "
+            f"{_minutes(self.pictures * most_s)} minutes here: one of all {len(picture_s)} cameras "
+            f"{most_s:.1f} s ({slowest} {picture_s[slowest]:.1f} s, the choice of the next "
+            f"{choice_s:.1f} s), "
+            f"of {', '.join(pointing)} alone {least_s:.1f} s; --cameras leaves others out"
+        )
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds / 60.0:.2g}" if seconds < 600.0 else f"{seconds / 60.0:.0f}"
+
 
 LITTLE_GAIN, LAST_GAIN = 0.12, 0.01
 """A look that promises less than this part of the predicted error is not worth its time at a placement, or at
@@ -49,7 +114,7 @@ class Looks:
         What to reach.
     """
 
-    def __init__(self, eyes: Eyes, known: Known, teller: Teller, wanted: Wanted) -> None:
+    def __init__(self, eyes: BenchEyes, known: BenchKnowledge, teller: Teller, wanted: BenchGoal) -> None:
         self._eyes, self._known, self._teller, self._wanted = eyes, known, teller, wanted
         self.here = ""
         """The placement that was worked at, and whose board so stands there."""
@@ -63,7 +128,7 @@ class Looks:
             With what the pictures showed instead.
         """
         self._teller.step("search")
-        search = Search(self._eyes, self._known.now, self._known.sought, self._teller)
+        search = BoardSearch(self._eyes, self._known.now, self._known.sought, self._teller)
         self._known.take(name, search.find(placement))
 
     def work_at(self, name: str, most: int) -> None:
@@ -109,7 +174,7 @@ class Looks:
                     known.take(name, look)
         self._end(name)
 
-    def look_at(self, shot: BenchShot, check: bool = False) -> Look | None:
+    def look_at(self, shot: BenchShot, check: bool = False) -> BenchLook | None:
         """Take a shot; None where the head must not go."""
         try:
             return self._look(shot, self._known.cameras_for(shot, check))
@@ -123,11 +188,11 @@ class Looks:
         apart_px = corners_apart_px(then, self._again(then))
         return apart_px is not None and apart_px <= MOVED_PX
 
-    def _again(self, then: Look) -> Look:
+    def _again(self, then: BenchLook) -> BenchLook:
         """A look taken again, by the cameras that showed the board and those that point."""
         return self._look(then, {*self._known.workspace.cameras, *(one.camera for one in then.found)})
 
-    def _look(self, where: BenchShot | Look, cameras: Collection[str]) -> Look:
+    def _look(self, where: BenchShot | BenchLook, cameras: Collection[str]) -> BenchLook:
         at = where.pan_rad, where.tilt_rad, (where.pan_approach, where.tilt_approach)
         every = len(cameras) == len(self._known.head.rig.cameras)
         return self._eyes.look(*at) if every else self._eyes.look(*at, cameras)
@@ -167,7 +232,7 @@ class Looks:
     def _tell(self, name: str, choice: AttitudeChoice) -> None:
         known = self._known
         self._teller.progress(
-            Progress(
+            BenchProgress(
                 name,
                 known.pictures(),
                 self._wanted.pictures,
@@ -181,7 +246,7 @@ class Looks:
         )
 
 
-def corners_apart_px(then: Look, now: Look) -> float | None:
+def corners_apart_px(then: BenchLook, now: BenchLook) -> float | None:
     """Return how far corners lie apart in two looks from one attitude, median; None if none is common."""
     apart: list[float] = []
     before = {one.camera: one.corners for one in then.found}
@@ -199,6 +264,6 @@ def deg(angle_rad: float) -> str:
     return f"{math.degrees(angle_rad):+.0f} degrees"
 
 
-def _whys(look: Look) -> str:
+def _whys(look: BenchLook) -> str:
     """Why a look does not show the board, camera by camera."""
     return "; ".join(dict.fromkeys(one.why for one in look.seen if one.why)) or "no corners found"

@@ -17,8 +17,8 @@ from calib.plan.knowledge import ExpectedPointing
 from calib.survey.records import Survey
 from mastctl.bench import drawn
 from mastctl.bench.differences import rig_differences
-from mastctl.bench.final import Checked
-from mastctl.calibration.verdict import Verdict
+from mastctl.bench.run import Checked
+from mastctl.calibration.verdict import CalibrationVerdict
 from mastctl.report import pages, plots
 from mastctl.report.tables import Table, x_y
 
@@ -26,7 +26,7 @@ PAGE = "bench.html"
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class BenchPage:
     """All that the page is made of.
 
     ``aim`` and ``covariance`` are the pointing over the workspace and what is unsure of its unknowns;
@@ -35,7 +35,7 @@ class Told:
 
     survey: Survey
     calibration: BenchCalibration
-    verdict: Verdict
+    verdict: CalibrationVerdict
     saved: StoredRig
     checked: Checked | None
     aim: ExpectedPointing
@@ -44,7 +44,7 @@ class Told:
     former: Rig | None
 
 
-def write_bench_report(told: Told, folder: Path) -> Path:
+def write_bench_report(told: BenchPage, folder: Path) -> Path:
     """Write bench.html into ``folder`` (made if need be) in one step and return it.
 
     Raises
@@ -59,7 +59,7 @@ def write_bench_report(told: Told, folder: Path) -> Path:
     return path
 
 
-def _page(told: Told) -> str:
+def _page(told: BenchPage) -> str:
     fit = told.calibration
     differences = [] if told.former is None else list(rig_differences(fit.rig, told.former))
     return pages.page(
@@ -150,7 +150,7 @@ def _terms(fit: BenchCalibration) -> Table:
     return Table(("term", "", "size", "moves pixels by, rms px", "chi-square gained"), rows)
 
 
-def _plots(told: Told, differences: list[Any]) -> dict[str, Any]:
+def _plots(told: BenchPage, differences: list[Any]) -> dict[str, Any]:
     """Every plot, by the name that the template has for it."""
     fit = told.calibration
     cameras = [name for name in fit.rig.cameras if any(i.camera == name for i in fit.images)]

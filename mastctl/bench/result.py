@@ -5,12 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, replace
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from calib.adjust.result import BenchCalibration, TermGain
 from calib.calibrate.bench.problem import BenchOptions
@@ -21,17 +17,17 @@ from calib.geometry.covariance import RigCovariance
 from calib.geometry.rig import Rig
 from calib.plan.knowledge import Knowledge, Workspace, pointing
 from calib.survey.records import Survey
-from mastctl.bench.final import Checked
-from mastctl.bench.frame import Frame, fit_in_frame
+from mastctl.bench.events import px
+from mastctl.bench.frame import RoverFrame, fit_in_frame
 from mastctl.bench.known import first_cameras
-from mastctl.bench.report import Told, write_bench_report
-from mastctl.bench.run import BenchRun
-from mastctl.bench.teller import Teller, px
+from mastctl.bench.report import BenchPage, write_bench_report
+from mastctl.bench.run import BenchRun, Checked
+from mastctl.bench.teller import Teller
 from mastctl.calibration.bench_verdict import judge_bench, predicted_pointing_px
-from mastctl.calibration.mast_file import as_lists, mast_keys, rounded_matrix
+from mastctl.calibration.mast_file import as_lists, mast_keys, with_fit
 from mastctl.calibration.run import checked_survey, save_new
-from mastctl.calibration.stated import components_told
-from mastctl.calibration.verdict import Verdict
+from mastctl.calibration.tested import components_told, finite
+from mastctl.calibration.verdict import CalibrationVerdict
 from mastctl.errors import MastctlError
 
 
@@ -66,7 +62,7 @@ class BenchDone:
 
     survey: Survey
     calibration: BenchCalibration
-    verdict: Verdict
+    verdict: CalibrationVerdict
     saved: StoredRig
     checked: Checked | None = None
     _: KW_ONLY
@@ -88,8 +84,8 @@ class BenchDone:
             "sigma": {**plain(fit.sigma)["mast"], **plain(fit.sigma)},
             "seconds": fit.seconds,
             "joints": joint_keys(fit.rig.joints),
-            "chi2": _finite(fit.chi2),
-            "degrees_of_freedom": _finite(fit.degrees_of_freedom),
+            "chi2": finite(fit.chi2),
+            "degrees_of_freedom": finite(fit.degrees_of_freedom),
             "sigmas_found": components_told(self.survey, fit),
             "terms": [term_told(term) for term in fit.terms],
             "bows_m": {board: bow.tolist() for board, bow in fit.bows_m.items()},
@@ -215,7 +211,7 @@ def save_bench(
     out: Path,
     report: Path | None,
     options: BenchOptions,
-    frame: Frame,
+    frame: RoverFrame,
     former: Rig | None,
     moved: Mapping[str, float],
 ) -> BenchDone:
@@ -287,7 +283,7 @@ def _reported(done: BenchDone, folder: Path | None, former: Rig | None, where: W
     done = replace(done, calibrated_px=aim.rms_px(covariance))
     if folder is None:
         return done
-    told = Told(
+    told = BenchPage(
         done.survey, fit, done.verdict, done.saved, done.checked, aim, covariance, tuple(done.worth()), former
     )
     try:
@@ -307,38 +303,19 @@ def term_told(term: TermGain) -> dict[str, Any]:
         "sigma": dict(zip(term.parameters, term.sigma.tolist(), strict=True)),
         "chi2": float(term.chi2),
         "chance": float(term.chance),
-        "moves_px": _finite(term.moves_px),
+        "moves_px": finite(term.moves_px),
         "sentence": term.sentence,
     }
 
 
-def with_bench_fit(calibration: BenchCalibration, survey: Survey, verdict: Verdict) -> Rig:
-    """Return the calibrated rig with ``fit`` and ``provenance`` filled in."""
-    fit = {
-        "method": "bench",
-        "rms_px": as_lists(calibration.rms_px),
-        "check_rms_px": as_lists(calibration.check_rms_px),
-        "sigma": plain(calibration.sigma),
-        "chi2": _finite(calibration.chi2),
-        "degrees_of_freedom": _finite(calibration.degrees_of_freedom),
-        "sigmas_found": components_told(survey, calibration),
+def with_bench_fit(calibration: BenchCalibration, survey: Survey, verdict: CalibrationVerdict) -> Rig:
+    """Return `with_fit` of a bench's calibration."""
+    own = {
         "terms": [term_told(term) for term in calibration.terms],
         "bows_m": {board: bow.tolist() for board, bow in calibration.bows_m.items()},
         "degenerate": [direction.sentence for direction in calibration.degenerate],
         "verdict": verdict.told(),
         "gauges": list(calibration.gauges),
         "outliers": [outlier.name for outlier in calibration.outliers],
-        "parameters": list(calibration.parameter_names),
-        "covariance": rounded_matrix(calibration.covariance).tolist(),
     }
-    provenance = {
-        "survey": survey.folder.resolve().name,
-        "survey_digest": survey.digest,
-        "program": f"mastctl {version('mastctl')}",
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
-    return replace(calibration.rig, fit=fit, provenance=provenance)
-
-
-def _finite(number: float) -> float | None:
-    return float(number) if np.isfinite(number) else None
+    return with_fit(calibration, survey, {"method": "bench"}, own, {})

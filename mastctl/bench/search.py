@@ -12,7 +12,7 @@ from calib.errors import CalibError, Unreachable
 from calib.plan.knowledge import Knowledge
 from calib.plan.placements import Placement
 from calib.plan.poses import Sought, readings
-from mastctl.bench.eyes import Eyes, Look, NoLight, NotThere
+from mastctl.bench.eyes import BenchEyes, BenchLook, NoLight, NotThere
 from mastctl.bench.teller import Teller
 from mastctl.errors import MastctlError
 
@@ -40,14 +40,14 @@ class BoardNotFound(MastctlError):
     code = "board_not_found"
 
 
-class Search:
+class BoardSearch:
     """Looks for the board within the head's limits."""
 
-    def __init__(self, eyes: Eyes, known: Knowledge, sought: Sought, teller: Teller) -> None:
+    def __init__(self, eyes: BenchEyes, known: Knowledge, sought: Sought, teller: Teller) -> None:
         self._eyes, self._known, self._sought, self._teller = eyes, known, sought, teller
         self._on_head = {name for name, camera in known.rig.cameras.items() if camera.on == "head"}
 
-    def find(self, placement: Placement) -> Look:
+    def find(self, placement: Placement) -> BenchLook:
         """Return the first look that shows the board.
 
         Views without light or with nothing in them end nothing: the board may stand beside them.

@@ -16,8 +16,9 @@ from calib.geometry.rig import Rig
 from calib.plan.placements import Placement
 from calib.targets.board_file import document_of
 from calib.targets.boards import AnyBoard
-from mastctl.bench.eyes import Head
-from mastctl.bench.teller import NobodyThere, Progress, Step, Teller
+from mastctl.bench.events import BenchProgress, Step
+from mastctl.bench.eyes import BenchHead
+from mastctl.bench.teller import NobodyThere, Teller
 from mastctl.client import Client
 
 BOARD = "bench"
@@ -70,11 +71,11 @@ class SimulatedPerson:
         """Pass it on."""
         self._told.step(step)
 
-    def progress(self, now: Progress) -> None:
+    def progress(self, now: BenchProgress) -> None:
         """Pass it on."""
         self._told.progress(now)
 
-    def place(self, name: str, placement: Placement, head: Head) -> None:
+    def place(self, name: str, placement: Placement, head: BenchHead) -> None:
         """Put the board there, or where the file has it.
 
         Raises
@@ -90,7 +91,7 @@ class SimulatedPerson:
             self._told.say(f"placement {name}: the board {placement.words()}{said}")
         self.stand(placement)
 
-    def stands(self, name: str, placement: Placement | None, head: Head) -> None:
+    def stands(self, name: str, placement: Placement | None, head: BenchHead) -> None:
         """Put a board back that the simulation has forgotten with a daemon that ended."""
         if placement is not None and BOARD not in self._client.boards():
             self.stand(self._where(name, placement))

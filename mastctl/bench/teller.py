@@ -2,78 +2,41 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
+import queue
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal, Protocol
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Any, Protocol, TextIO
 
 from calib.plan.placements import Placement
-from mastctl.bench.eyes import Head
+from mastctl.as_json import as_json
+from mastctl.bench.events import (
+    LINES,
+    BenchAsks,
+    BenchBegins,
+    BenchFails,
+    BenchLine,
+    BenchProgress,
+    BenchSays,
+    BenchStands,
+    BenchSteps,
+    Step,
+)
+from mastctl.bench.eyes import BenchHead
 from mastctl.errors import MastctlError
 
 COLUMNS, ROWS = 33, 11
 """Of each half of a sketch, signs."""
 
 
-Step = Literal["search", "pictures", "fit", "check"]
-"""What a run does beside asking for placements."""
-
-CELLS = (8, 6)
-"""Columns and rows into which a picture is divided to tell where corners were seen."""
-
-
 class NobodyThere(MastctlError):
     """Nobody answers at the terminal."""
 
     code = "nobody_there"
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far a run is.
-
-    Attributes
-    ----------
-    placement
-        Where it works.
-    pictures, most
-        Taken of the camera with most of them, and how many there may be.
-    predicted_px, target_px, floor_px
-        Rms per axis of a first pointing: what the calibration leaves, may leave, and what counts alone leave.
-    next_rad
-        The next attitude, pan and tilt.
-    expected_px
-        What is predicted after it.
-    cells
-        Of each camera how many corners were seen in each of its picture's `CELLS`, row by row.
-    """
-
-    placement: str
-    pictures: int
-    most: int
-    predicted_px: float
-    target_px: float
-    floor_px: float
-    next_rad: tuple[float, float]
-    expected_px: float
-    cells: Mapping[str, tuple[int, ...]]
-
-    @property
-    def coverage(self) -> Mapping[str, float]:
-        """Part of each camera's picture in which corners were seen, 0 to 1."""
-        return {name: sum(map(bool, counts)) / len(counts) for name, counts in self.cells.items()}
-
-    def words(self) -> str:
-        """Return it as a line."""
-        seen = ", ".join(f"{name} {100 * part:.0f} %" for name, part in self.coverage.items())
-        pan, tilt = (math.degrees(angle) for angle in self.next_rad)
-        return (
-            f"{self.placement}: {self.pictures} of {self.most} pictures a camera; seen over "
-            f"{seen or 'nothing'}; pointing to {px(self.predicted_px)} "
-            f"(wanted {px(self.target_px)}); most helps pan {pan:+.0f}, "
-            f"tilt {tilt:+.0f} degrees: to {px(self.expected_px)}"
-        )
 
 
 class Teller(Protocol):
@@ -87,24 +50,17 @@ class Teller(Protocol):
         """Tell what is done from now on."""
         ...
 
-    def progress(self, now: Progress) -> None:
+    def progress(self, now: BenchProgress) -> None:
         """Tell how far the run is."""
         ...
 
-    def place(self, name: str, placement: Placement, head: Head) -> None:
+    def place(self, name: str, placement: Placement, head: BenchHead) -> None:
         """Have the board placed, and return when it stands."""
         ...
 
-    def stands(self, name: str, placement: Placement | None, head: Head) -> None:
+    def stands(self, name: str, placement: Placement | None, head: BenchHead) -> None:
         """Know that a run goes on before a board that was placed so."""
         ...
-
-
-def px(value: float) -> str:
-    """Return pixels as a person reads them."""
-    if not math.isfinite(value):
-        return "? px"
-    return f"{value:.2f} px" if value < 10 else f"{value:.0f} px"
 
 
 def sketch(placement: Placement, board_m: float = 0.5) -> str:
@@ -178,14 +134,14 @@ class Terminal:
     def step(self, step: Step) -> None:
         """Say nothing: sentences and progress show it."""
 
-    def progress(self, now: Progress) -> None:
+    def progress(self, now: BenchProgress) -> None:
         """Write a line."""
         self.say(now.words())
 
-    def stands(self, name: str, placement: Placement | None, head: Head) -> None:
+    def stands(self, name: str, placement: Placement | None, head: BenchHead) -> None:
         """A real board stands where it stands."""
 
-    def place(self, name: str, placement: Placement, head: Head) -> None:
+    def place(self, name: str, placement: Placement, head: BenchHead) -> None:
         """Ask for the placement, and wait for Enter.
 
         Raises
@@ -200,3 +156,89 @@ class Terminal:
         sys.stderr.flush()
         if not sys.stdin.readline():
             raise NobodyThere("no one can place the board: standard input has ended")
+
+
+STANDS = "stands"
+LEFT_ALONE = 3
+"""Exit code of a run whose answers have ended."""
+
+
+def leave() -> None:
+    """End the process at once; what was seen is on the disk."""
+    os._exit(LEFT_ALONE)
+
+
+class Lines:
+    """Tells a run to a program, a line of JSON each (`mastctl.bench.events`); see `Teller`.
+
+    The only answer is a line ``stands``. Whoever asks is gone when the answers end, and then the process ends
+    too: nobody would steer with a lease that nobody renews.
+
+    Parameters
+    ----------
+    out, answers
+        Where lines go, and where answers come from.
+    on_end
+        Called, in a thread of its own, when the answers end.
+    """
+
+    def __init__(self, out: TextIO, answers: TextIO, on_end: Callable[[], None] = leave) -> None:
+        self._out, self._waits = out, True
+        self._stands: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        threading.Thread(target=self._hear, args=(answers, on_end), name="answers", daemon=True).start()
+
+    def begun(
+        self, head: BenchHead, board_m: tuple[float, float], folder: str, simulated: bool, waits: bool
+    ) -> None:
+        """Tell what is calibrated with what; ``waits``: whether a placement is waited for, or the board goes
+        by itself where it is asked for."""
+        self._waits = waits
+        cameras = {name: camera.model.size_px for name, camera in head.rig.cameras.items()}
+        self._tell(BenchBegins(board_m, cameras, folder, simulated))
+
+    def say(self, sentence: str) -> None:
+        """Tell a sentence."""
+        self._tell(BenchSays(sentence))
+
+    def step(self, step: Step) -> None:
+        """Tell what is done from now on."""
+        self._tell(BenchSteps(step))
+
+    def progress(self, now: BenchProgress) -> None:
+        """Tell how far the run is."""
+        self._tell(now)
+
+    def place(self, name: str, placement: Placement, head: BenchHead) -> None:
+        """Ask for a placement, and wait until somebody says that it stands."""
+        while self._waits and not self._stands.empty():
+            self._stands.get()  # of a placement before
+        self._tell(BenchAsks(name, **asdict(placement), words=placement.words(), waits=self._waits))
+        if self._waits:
+            self._stands.get()
+        self._tell(BenchStands(name))
+
+    def stands(self, name: str, placement: Placement | None, head: BenchHead) -> None:
+        """A real board stands where it stands."""
+
+    def done(self, result: Mapping[str, Any]) -> None:
+        """Tell what came of it: all that the command tells with ``--json``."""
+        self._write(json.dumps({"event": "done", "result": as_json(result)}, allow_nan=False))
+
+    def failed(self, code: str, message: str) -> None:
+        """Tell why nothing did."""
+        self._tell(BenchFails(code, message))
+
+    def _tell(self, line: BenchLine) -> None:
+        self._write(LINES.dump_json(line).decode())
+
+    def _write(self, line: str) -> None:
+        with self._lock:
+            self._out.write(line + "\n")
+            self._out.flush()
+
+    def _hear(self, answers: TextIO, on_end: Callable[[], None]) -> None:
+        for line in answers:
+            if line.strip() == STANDS:
+                self._stands.put(None)
+        on_end()

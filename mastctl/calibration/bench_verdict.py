@@ -11,14 +11,14 @@ from calib.errors import CalibError
 from calib.geometry.covariance import RigCovariance
 from calib.plan.knowledge import Knowledge, Workspace, pointing
 from calib.survey.records import Survey
-from mastctl.calibration.expected import RARELY
+from mastctl.calibration.checks import RARELY
 from mastctl.calibration.verdict import (
     MANY_LEFT_OUT,
     POINTING_BAD_PX,
     POINTING_GOOD_PX,
+    CalibrationVerdict,
     Grade,
     Reason,
-    Verdict,
     sigma_reasons,
 )
 
@@ -26,7 +26,7 @@ LITTLE = 0.2
 """Corners that are off by less than this part of ``corner_px`` are no reason for doubt."""
 
 
-def judge_bench(survey: Survey, calibration: BenchCalibration) -> Verdict:
+def judge_bench(survey: Survey, calibration: BenchCalibration) -> CalibrationVerdict:
     """Return whether to trust a bench's calibration; the worst of the reasons decides."""
     reasons = [
         *_noise(survey, calibration),
@@ -42,7 +42,7 @@ def judge_bench(survey: Survey, calibration: BenchCalibration) -> Verdict:
     ]
     grades = {reason.grade for reason in reasons}
     grade: Grade = "bad" if "bad" in grades else "care" if "care" in grades else "good"
-    return Verdict(grade, tuple(reasons))
+    return CalibrationVerdict(grade, tuple(reasons))
 
 
 def predicted_pointing_px(calibration: BenchCalibration) -> tuple[float, float] | None:

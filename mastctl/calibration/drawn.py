@@ -11,7 +11,7 @@ from calib.adjust.result import Calibration, ImageResiduals
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid
 from calib.targets.boards import Board
-from mastctl.calibration.maps import PointingMap
+from mastctl.calibration.landing import PointingMap
 from mastctl.report import plots
 
 FITTED, CHECK, LEFT_OUT = plots.BLUE, plots.RUST, "#999999"
@@ -26,9 +26,9 @@ NAME_ROOM_M = 0.5
 def residuals(calibration: Calibration, camera: str) -> Any:
     """Draw the residuals of a camera's dots as arrows over its image: fitted images, and check images."""
     mine = [image for image in calibration.images if image.camera == camera]
-    fitted = _dots(mine, lambda image: image.used)
-    check = _dots(mine, lambda image: np.full(len(image.used), image.purpose == "check"))
-    out = _dots(mine, lambda image: ~image.used & (image.purpose != "check"))
+    fitted = dots_of(mine, lambda image: image.used)
+    check = dots_of(mine, lambda image: np.full(len(image.used), image.purpose == "check"))
+    out = dots_of(mine, lambda image: ~image.used & (image.purpose != "check"))
     shown = [("fitted images", fitted, FITTED)] + ([("check images", check, CHECK)] if len(check[0]) else [])
     figure = plots.new(11.5, 4.3)
     axes = figure.subplots(1, 2, sharey=True)
@@ -46,19 +46,36 @@ def residuals(calibration: Calibration, camera: str) -> Any:
 
 def _arrows(axis: Any, places: np.ndarray, arrows: np.ndarray, colour: str, size_px: tuple[int, int]) -> None:
     """Residuals at their dots, the typical one a fixed part of the image long, and how long that is."""
-    width, height = size_px
-    axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    over_picture(axis, size_px)
     if not len(places):
         axis.set_xlabel("x, px")
         return
-    typical = max(float(np.sqrt(np.mean(np.sum(arrows**2, axis=1)))), 1e-9)
-    length_px = ARROW_PART * width
-    step = -(-len(places) // MANY_DOTS)
+    scale = arrow_scale(arrows, size_px[0])
+    draw_arrows(axis, places, arrows, colour, scale)
+    axis.set_xlabel(f"x, px; arrows drawn {1 / scale:.0f} times as long")
+
+
+def over_picture(axis: Any, size_px: tuple[int, int]) -> None:
+    """Give an axes the extent of a picture, y downwards."""
+    width, height = size_px
+    axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+
+
+def arrow_scale(arrows: np.ndarray, width_px: int) -> float:
+    """Return what a pixel of the drawing is of a residual (n, 2), the typical one `ARROW_PART` long."""
+    typical = float(np.sqrt(np.mean(np.sum(arrows**2, axis=1)))) if len(arrows) else 0.0
+    return max(typical, 1e-9) / (ARROW_PART * width_px)
+
+
+def draw_arrows(
+    axis: Any, places: np.ndarray, arrows: np.ndarray, colour: str, scale: float, label: str | None = None
+) -> None:
+    """Draw residuals (n, 2) at their places (n, 2), at most some `MANY_DOTS` of them."""
+    step = -(-len(places) // MANY_DOTS) or 1
     axis.quiver(
         *places[::step].T, *arrows[::step].T, color=colour, angles="xy", scale_units="xy",
-        scale=typical / length_px, width=0.0018, headwidth=4, headlength=5, alpha=0.8,
+        scale=scale, width=0.0018, headwidth=4, headlength=5, alpha=0.8, label=label,
     )  # fmt: skip
-    axis.set_xlabel(f"x, px; arrows drawn {length_px / typical:.0f} times as long")
 
 
 def boards(calibration: Calibration, board: Board) -> Any:
@@ -188,7 +205,8 @@ def pointing_map(found: PointingMap, calibration: Calibration, what: str) -> Any
     return figure
 
 
-def _dots(images: Sequence[ImageResiduals], which: Any) -> tuple[np.ndarray, np.ndarray]:
+def dots_of(images: Sequence[ImageResiduals], which: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixels (n, 2) and residuals (n, 2) of those dots of images that ``which`` picks, by a mask."""
     places = [image.pixels_px[which(image)] for image in images]
     arrows = [image.residuals_px[which(image)] for image in images]
     if not places:
@@ -197,8 +215,12 @@ def _dots(images: Sequence[ImageResiduals], which: Any) -> tuple[np.ndarray, np.
 
 
 def _image_rms(image: ImageResiduals) -> float:
-    which = np.ones(len(image.used), dtype=bool) if image.purpose == "check" else image.used
-    return float(np.sqrt(np.mean(image.residuals_px[which] ** 2)))
+    return float(np.sqrt(np.mean(image.residuals_px[told(image)] ** 2)))
+
+
+def told(image: ImageResiduals) -> np.ndarray:
+    """Return which of an image's dots count: all of a check image, of others those that were fitted."""
+    return np.ones(len(image.used), dtype=bool) if image.purpose == "check" else image.used
 
 
 def _eyes(rig: Rig, plan: Any, side: Any) -> None:

@@ -1,4 +1,5 @@
-"""Where a target lands when a rig is believed that is not quite the true one.
+"""Where a target lands when a rig is believed that is not quite the true one, and how sure that is over the
+joints.
 
 What the daemon does with a click: two pixels of a stereo pair, triangulated and pointed at by the believed
 rig. What happens then is by the true one. The paper's sections IV and V, without a renderer.
@@ -6,14 +7,18 @@ rig. What happens then is by the true one. The paper's sections IV and V, withou
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calib.adjust.result import Calibration
+from calib.adjust.uncertainty import pixel_covariance, rig_moved_along
 from calib.errors import CalibError
+from calib.geometry.cahvor import CameraModel
 from calib.geometry.pointing import solve
-from calib.geometry.rig import Rig
+from calib.geometry.rig import Mast, Rig
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import triangulate
 
@@ -127,3 +132,153 @@ def handoff_errors_px(
         if valid and true.cameras[name].model.holds(pixel):
             errors[name] = seen(believed, name, pan_rad, tilt_rad, position) - pixel
     return errors
+
+
+PAN_RAD = (-2.6, 2.6)
+TILT_RAD = (-1.2, 0.7)
+STEPS = (27, 15)
+STEP = 0.1
+"""Of a sigma, for numerical derivatives."""
+
+CORNER = (0.2, 0.25)
+"""Where a click is taken to be, as part of the image's width and height: off the middle."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointingMap:
+    """Pixels over pan (n,) and tilt (m,), radians: ``by_click`` and ``by_position`` (m, n).
+
+    ``by_click``: a target clicked in the stereo pair at these joint angles; it is the same at every pan,
+    since all of it happens beyond the pan axis. ``by_position``: a target whose place in the rover frame is
+    given. Not-a-number where there is no answer.
+    """
+
+    pair: str
+    camera: str
+    range_m: float
+    pan_rad: FloatArray
+    tilt_rad: FloatArray
+    by_click: FloatArray
+    by_position: FloatArray
+
+
+def uncertainty_map(calibration: Calibration, pair: str, range_m: float) -> PointingMap:
+    """Return the sigma (rms per axis, px) that the calibration alone gives to pointing, over the joints."""
+    names = calibration.rig.stereo[pair]
+    middle = np.array(calibration.rig.cameras[names[0]].model.image_center_px)
+    clicks = _Clicks(calibration, names, range_m)
+    by_click = clicks.sigma_px
+
+    def by_position(pan: float, tilt: float) -> float:
+        rays = calibration.rig.camera_in_rover(names[0], pan, tilt).ray(middle)
+        target = rays.origins_m + range_m * rays.directions
+        return _rms(pixel_covariance(calibration, names[0], pan, tilt, target[None])[1][0])
+
+    return _map(pair, names[0], range_m, by_click, by_position)
+
+
+def change_map(new: Rig, old: Rig, pair: str, range_m: float) -> PointingMap | None:
+    """Return by how many pixels pointing would change (length of the shift), over the joints.
+
+    The new rig is taken as true. None where the old rig has no such cameras on its head.
+    """
+    names = new.stereo[pair]
+    if any(name not in old.cameras or old.cameras[name].on != "head" for name in names):
+        return None
+    middle = np.array(new.cameras[names[0]].model.image_center_px)
+
+    def by_click(tilt: float) -> float:
+        target, left, right = click(new, names, 0.0, tilt, _corner(new, names[0]), range_m)
+        return float(np.linalg.norm(pointing_error_px(old, new, names, 0.0, tilt, target, left, right)))
+
+    def by_position(pan: float, tilt: float) -> float:
+        rays = new.camera_in_rover(names[0], pan, tilt).ray(middle)
+        target = rays.origins_m + range_m * rays.directions
+        return float(np.linalg.norm(position_error_px(old, new, names[0], pan, tilt, target, target)))
+
+    return _map(pair, names[0], range_m, by_click, by_position)
+
+
+class _Clicks:
+    """A click near a corner, pointed at by rigs that are off by one sigma in one direction each.
+
+    `calib.adjust.uncertainty.pointing_covariance` for many joint angles: a target that keeps its place in the
+    head frame is triangulated once a rig, not once for each pan and tilt. The directions are the columns of a
+    square root of the covariance, so that their squares add up to the variance.
+    """
+
+    def __init__(self, calibration: Calibration, names: tuple[str, str], range_m: float) -> None:
+        rig = calibration.rig
+        self.rig = replace(rig, cameras={name: rig.cameras[name] for name in names}, stereo={})
+        self.camera = names[0]
+        models = [rig.cameras[name].model for name in names]
+        ray = models[0].ray(_corner(rig, names[0]))
+        self.target_in_head_m = ray.origins_m + range_m * ray.directions
+        clicks: list[FloatArray] = []
+        for model, name in zip(models, names, strict=True):
+            pixel, valid = model.project(self.target_in_head_m)
+            if not valid:
+                raise CalibError(f"camera {name} does not see a target at {range_m:g} m")
+            clicks.append(pixel)
+        columns = np.concatenate(
+            [calibration.part("mast."), *(calibration.part(f"cameras.{n}.") for n in names)]
+        )
+        values, vectors = np.linalg.eigh(calibration.covariance[np.ix_(columns, columns)])
+        steps = (vectors * np.sqrt(np.maximum(values, 0.0))).T
+        narrow = replace(calibration, rig=self.rig)
+        self.believed: list[tuple[Mast, CameraModel, FloatArray]] = []
+        for step in (np.zeros(len(columns)), *(STEP * step for step in steps)):
+            moved = rig_moved_along(narrow, columns, step)
+            left, right = (moved.cameras[name].model for name in names)
+            found = triangulate(left, right, clicks[0], clicks[1]).position_m
+            self.believed.append((moved.mast, left, found))
+
+    def sigma_px(self, tilt: float, pan: float = 0.0) -> float:
+        """Rms per axis of where the target lands; CalibError where it cannot be pointed at."""
+        target = self.rig.mast.rover_from_head(pan, tilt).points(self.target_in_head_m)
+        landed = [self._landed(*rig, pan, tilt, target) for rig in self.believed]
+        off = (np.array(landed[1:]) - landed[0]) / STEP
+        return float(np.sqrt(np.sum(off**2) / 2))
+
+    def _landed(
+        self,
+        mast: Mast,
+        left: CameraModel,
+        in_head_m: FloatArray,
+        pan: float,
+        tilt: float,
+        target: FloatArray,
+    ) -> FloatArray:
+        position = mast.rover_from_head(pan, tilt).points(in_head_m)
+        angles = solve(mast, left, position, left.image_center_px, from_pan_rad=pan, from_tilt_rad=tilt)[0]
+        in_head = self.rig.mast.rover_from_head(angles.pan_rad, angles.tilt_rad).inverse.points(target)
+        return np.asarray(self.rig.cameras[self.camera].model.project(in_head)[0])
+
+
+def _map(
+    pair: str,
+    camera: str,
+    range_m: float,
+    by_click: Callable[[float], float],
+    by_position: Callable[[float, float], float],
+) -> PointingMap:
+    pans, tilts = np.linspace(*PAN_RAD, STEPS[0]), np.linspace(*TILT_RAD, STEPS[1])
+    clicked = np.array([_or_nan(by_click, float(tilt)) for tilt in tilts])
+    placed = np.array([[_or_nan(by_position, float(pan), float(tilt)) for pan in pans] for tilt in tilts])
+    return PointingMap(pair, camera, range_m, pans, tilts, np.tile(clicked[:, None], len(pans)), placed)
+
+
+def _or_nan(value: Callable[..., float], *joints_rad: float) -> float:
+    try:
+        return value(*joints_rad)
+    except CalibError:
+        return float("nan")
+
+
+def _corner(rig: Rig, camera: str) -> FloatArray:
+    width, height = rig.cameras[camera].model.size_px
+    return np.array([CORNER[0] * width, CORNER[1] * height])
+
+
+def _rms(covariance: FloatArray) -> float:
+    return float(np.sqrt(np.trace(covariance) / 2))

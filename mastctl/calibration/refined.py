@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
-from importlib.metadata import version
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calib.adjust.uncertainty import sigma_by_key
 from calib.calibrate.body import corrected_covariance, corrected_rig, fit_body_pose
 from calib.calibrate.body_sights import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose, body_groups
 from calib.errors import NoCorrection
 from calib.files.mast_file import StoredRig
-from calib.files.yaml_text import plain
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
 from calib.matching.handed_over import HandoffBias, MatchedHandoff, handoff_bias
-from mastctl.calibration.mast_file import rounded_matrix
+from mastctl.calibration.mast_file import rounded_matrix, with_correction
 from mastctl.calibration.run import save_new
 from mastctl.watch.handoffs import ReadLog
 
@@ -124,8 +120,7 @@ def save_refined(proposal: Proposal, out: Path) -> tuple[StoredRig, Path | None]
 def refined_rig(proposal: Proposal) -> Rig:
     """Return the rig with every significant correction, its covariance and its provenance.
 
-    Mast and head cameras are untouched. ``fit.covariance`` and ``fit.sigma`` are those of the corrected rig;
-    what else the survey left under ``fit`` stays as the survey left it.
+    Mast and head cameras are untouched.
     """
     rig = proposal.mast.rig
     known = stored_covariance(rig)
@@ -133,27 +128,12 @@ def refined_rig(proposal: Proposal) -> Rig:
         known = None if known is None else corrected_covariance(rig, known, pose)
         rig = corrected_rig(rig, pose)
     told = {group: pose_told(pose) for group, pose in proposal.significant.items()}
-    fit = {**rig.fit, "refined": told}
-    if known is not None:
-        fit["covariance"] = rounded_matrix(known.covariance).tolist()
-        fit["sigma"] = plain(sigma_by_key(rig, known.names, known.covariance))
-    before = rig.provenance.get("refined", [])
-    provenance = {
-        **rig.provenance,
-        "refined": [
-            *(before if isinstance(before, list) else [before]),
-            {
-                "former_file": proposal.mast.path.name,
-                "former_digest": proposal.mast.digest,
-                "cameras": [name for pose in proposal.significant.values() for name in pose.cameras],
-                "records": [{"file": log.path.name, "digest": log.digest} for log in proposal.logs],
-                "handoffs": {g: len(p.used.handoffs) for g, p in proposal.significant.items()},
-                "program": f"mastctl {version('mastctl')}",
-                "date": datetime.now(UTC).isoformat(timespec="seconds"),
-            },
-        ],
+    by = {
+        "cameras": [name for pose in proposal.significant.values() for name in pose.cameras],
+        "records": [{"file": log.path.name, "digest": log.digest} for log in proposal.logs],
+        "handoffs": {g: len(p.used.handoffs) for g, p in proposal.significant.items()},
     }
-    return replace(rig, fit=fit, provenance=provenance)
+    return with_correction(proposal.mast, rig, known, {"refined": told}, by)
 
 
 def pose_told(pose: BodyPose) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,47 +11,30 @@ import numpy as np
 from calib.adjust.result import HELD_FIXED, Calibration
 from calib.files.atomic import save_bytes
 from calib.files.mast_file import StoredRig
-from calib.survey.records import Survey
 from mastctl.calibration import drawn
-from mastctl.calibration.maps import change_map, uncertainty_map
-from mastctl.calibration.stated import component_table
-from mastctl.calibration.tested import board_table, wider_table
-from mastctl.calibration.verdict import POINTING_RANGE_M, Verdict
+from mastctl.calibration.landing import change_map, uncertainty_map
+from mastctl.calibration.run import Calibrated
+from mastctl.calibration.tested import board_table, component_table, wider_table
+from mastctl.calibration.verdict import POINTING_RANGE_M
 from mastctl.report import pages, plots
-from mastctl.report.figures import Figure
+from mastctl.report.pictures import Figure
 from mastctl.report.tables import Table, x_y
 
 WORST_IMAGES = 12
 
 
-@dataclass(frozen=True, eq=False)
-class Told:
-    """All that the page is made of.
-
-    ``warnings`` are the check's sentences, ``undetected`` (image, reason) of images without dots, ``in_use``
-    the mast file to compare with, ``saved`` the new one.
-    """
-
-    survey: Survey
-    calibration: Calibration
-    verdict: Verdict
-    warnings: Sequence[str]
-    undetected: Sequence[tuple[str, str]]
-    in_use: StoredRig | None
-    saved: StoredRig
-
-
-def write_calibration_report(told: Told, folder: Path) -> Path:
+def write_calibration_report(told: Calibrated, in_use: StoredRig | None, folder: Path) -> Path:
     """Write calibration.html into ``folder`` (made if need be) in one step and return it.
 
-    A report that was there is kept as calibration.previous.html.
+    It compares with the mast file ``in_use``, if there is one. A report that was there is kept as
+    calibration.previous.html.
 
     Raises
     ------
     OSError, BadFile
         If it cannot be written; then the file is as it was.
     """
-    page = _page(told).encode()
+    page = _page(told, in_use).encode()
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "calibration.html"
     save_bytes(path, page)
@@ -99,7 +81,7 @@ def _spread(sigma: float, unit: str) -> str:
     return f"± {1000 * sigma:.2f} m{unit}"
 
 
-def _page(told: Told) -> str:
+def _page(told: Calibrated, in_use: StoredRig | None) -> str:
     calibration, survey, verdict = told.calibration, told.survey, told.verdict
     return pages.page(
         "calibration.html",
@@ -124,7 +106,7 @@ def _page(told: Told) -> str:
         warnings=told.warnings,
         left_out=[outlier.sentence for outlier in calibration.outliers],
         undetected=[f"{name}: {reason}" for name, reason in told.undetected],
-        plots=_plots(told) if plots.installed() else None,
+        plots=_plots(told, in_use) if plots.installed() else None,
         station=_station_table(calibration),
         worst_images=_worst_images(calibration),
     )
@@ -136,7 +118,7 @@ def _when(saved: StoredRig) -> str:
     return date.replace("T", " ").replace("+00:00", " UTC")
 
 
-def _plots(told: Told) -> dict[str, Any]:
+def _plots(told: Calibrated, in_use: StoredRig | None) -> dict[str, Any]:
     """Every plot, by the name that the template has for it."""
     calibration = told.calibration
     pairs = [p for p, c in calibration.rig.stereo.items() if calibration.rig.cameras[c[0]].on == "head"]
@@ -153,7 +135,7 @@ def _plots(told: Told) -> dict[str, Any]:
         "errors": plots.plot(drawn.errors_by(calibration), "rms of images over range, angle, pan and tilt"),
         "correlations": _correlations(calibration),
         "uncertainties": uncertainties,
-        "change": None if told.in_use is None else _change(calibration, told.in_use, pairs),
+        "change": None if in_use is None else _change(calibration, in_use, pairs),
     }
 
 
@@ -209,7 +191,7 @@ def _typical(values: np.ndarray) -> str:
     return f"{np.nanmedian(values):.2f}, at most {np.nanmax(values):.2f}"
 
 
-def _mean(told: Told, camera: str) -> str:
+def _mean(told: Calibrated, camera: str) -> str:
     fitted = told.calibration.rms_px.get(camera)
     check = told.calibration.check_rms_px.get(camera)
     words = [f"fitted {x_y(fitted, 3)} px rms"] if fitted else []

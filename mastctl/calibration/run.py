@@ -16,8 +16,8 @@ from calib.files.mast_file import StoredRig, save_rig
 from calib.geometry.rig import Rig
 from calib.survey.check import check_survey
 from calib.survey.records import Survey, SurveyFinding
-from mastctl.calibration.mast_file import with_fit
-from mastctl.calibration.verdict import Verdict, judge_calibration
+from mastctl.calibration.mast_file import with_survey_fit
+from mastctl.calibration.verdict import CalibrationVerdict, judge_calibration
 from mastctl.errors import MastctlError
 
 Method = Literal["paper", "joint"]
@@ -45,7 +45,7 @@ class Calibrated:
 
     survey: Survey
     calibration: Calibration
-    verdict: Verdict
+    verdict: CalibrationVerdict
     warnings: tuple[str, ...]
     undetected: tuple[tuple[str, str], ...]
     saved: StoredRig
@@ -98,7 +98,7 @@ def calibrate(
     calibration = FITS[method](survey, mast_parameters)
     jointly = None if method == "joint" else _jointly(survey, mast_parameters)
     verdict = judge_calibration(survey, calibration, warnings, [name for name, _ in undetected], jointly)
-    saved, previous = save_new(with_fit(calibration, survey, verdict.told()), out)
+    saved, previous = save_new(with_survey_fit(calibration, survey, verdict.told()), out)
     sentences = tuple(sentence_of(finding) for finding in warnings)
     return Calibrated(survey, calibration, verdict, sentences, undetected, saved, previous)
 

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
-from importlib.metadata import version
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calib.adjust.uncertainty import sigma_by_key
 from calib.calibrate.scene.features import find_features
 from calib.calibrate.scene.fit import SceneFit, fit_scene
 from calib.calibrate.scene.terms import SceneView, corrected, overlapping
 from calib.errors import NoCorrection
 from calib.files.mast_file import StoredRig
-from calib.files.yaml_text import plain
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import RigCovariance, stored_covariance
 from calib.geometry.parameters import parameter_names
@@ -34,7 +30,7 @@ from drivers.recordings.frames import (
     read_products,
     read_recording,
 )
-from mastctl.calibration.mast_file import rounded_matrix
+from mastctl.calibration.mast_file import rounded_matrix, with_correction
 from mastctl.calibration.run import save_new
 
 CSV_NAME = "frames.csv"
@@ -175,28 +171,15 @@ def save_scene(proposal: SceneProposal, out: Path) -> tuple[StoredRig, Path | No
     """Save the corrected mast file; return it, and where ``out``'s former one is. Raises BadFile."""
     rig, fit = proposal.mast.rig, proposal.fit
     known = stored_covariance(rig)
-    told = {**rig.fit, "refined_scene": scene_told(fit)}
-    if known is not None:
-        known = _widened(rig, known, fit)
-        told["covariance"] = rounded_matrix(known.covariance).tolist()
-        told["sigma"] = plain(sigma_by_key(fit.rig, known.names, known.covariance))
-    before = rig.provenance.get("refined", [])
-    provenance = {
-        **rig.provenance,
-        "refined": [
-            *(before if isinstance(before, list) else [before]),
-            {
-                "former_file": proposal.mast.path.name,
-                "former_digest": proposal.mast.digest,
-                "scene": proposal.record.name,
-                "pictures_digest": proposal.digest,
-                "corrected": list(fit.taken),
-                "program": f"mastctl {version('mastctl')}",
-                "date": datetime.now(UTC).isoformat(timespec="seconds"),
-            },
-        ],
+    known = None if known is None else _widened(rig, known, fit)
+    by = {
+        "scene": proposal.record.name,
+        "pictures_digest": proposal.digest,
+        "corrected": list(fit.taken),
     }
-    return save_new(replace(fit.rig, fit=told, provenance=provenance), out)
+    return save_new(
+        with_correction(proposal.mast, fit.rig, known, {"refined_scene": scene_told(fit)}, by), out
+    )
 
 
 def scene_told(fit: SceneFit) -> dict[str, Any]:

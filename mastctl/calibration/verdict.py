@@ -16,10 +16,8 @@ from calib.adjust.terms import PRISMS, TAPES
 from calib.adjust.uncertainty import pointing_covariance
 from calib.errors import CalibError
 from calib.survey.records import Survey, SurveyFinding
-from mastctl.calibration.exchanged import exchanged_boards
-from mastctl.calibration.expected import RARELY, check_sizes
-from mastctl.calibration.stated import allowed, wrong_sentence
-from mastctl.calibration.tested import cross_validation_px
+from mastctl.calibration.checks import RARELY, check_sizes, exchanged_boards
+from mastctl.calibration.tested import allowed, cross_validation_px, wrong_sentence
 
 Grade = Literal["good", "care", "bad"]
 
@@ -62,7 +60,7 @@ class Reason:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class CalibrationVerdict:
     """The worst of the reasons decides."""
 
     grade: Grade
@@ -85,7 +83,7 @@ def judge_calibration(
     warnings: Sequence[SurveyFinding] = (),
     undetected: Sequence[str] = (),
     jointly: Calibration | CalibError | None = None,
-) -> Verdict:
+) -> CalibrationVerdict:
     """Return whether to trust a calibration.
 
     Parameters
@@ -123,7 +121,7 @@ def judge_calibration(
         reasons.append(Reason("care", f"the check of the survey warned {count} times"))
     grades = {reason.grade for reason in reasons}
     grade: Grade = "bad" if "bad" in grades else "care" if "care" in grades else "good"
-    return Verdict(grade, tuple(reasons))
+    return CalibrationVerdict(grade, tuple(reasons))
 
 
 def _noise(survey: Survey, calibration: Calibration) -> list[Reason]:

@@ -174,14 +174,11 @@ def _report(args: argparse.Namespace, done: Calibrated, in_use: StoredRig | None
     if args.report is None:
         return None
     from calib.errors import BadFile
-    from mastctl.calibration.report import Told, write_calibration_report
+    from mastctl.calibration.report import write_calibration_report
 
     with output.waiting(args.json, "writing the report"):
-        told = Told(
-            done.survey, done.calibration, done.verdict, done.warnings, done.undetected, in_use, done.saved
-        )
         try:
-            return write_calibration_report(told, args.report)
+            return write_calibration_report(done, in_use, args.report)
         except (OSError, BadFile) as error:
             saved = f"the mast file {done.saved.path} is saved, but its report is not"
             raise output.CommandError("report_not_written", f"{saved}: {error}") from None
@@ -193,8 +190,7 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
     from calib.files.yaml_text import plain
     from mastctl.calibration.mast_file import as_lists, mast_keys
     from mastctl.calibration.report import change_summary
-    from mastctl.calibration.stated import components_told
-    from mastctl.calibration.tested import cross_validation_told, wider_told
+    from mastctl.calibration.tested import components_told, cross_validation_told, wider_told
 
     fit = done.calibration
     sigma = plain(fit.sigma)
@@ -249,8 +245,7 @@ def _finite(number: float) -> float | None:
 def _show(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> None:
     """Tables for people."""
     from mastctl.calibration.report import camera_table, change_summary, mast_table
-    from mastctl.calibration.stated import component_table
-    from mastctl.calibration.tested import board_table, wider_table
+    from mastctl.calibration.tested import board_table, component_table, wider_table
 
     fit = done.calibration
     output.print_table(

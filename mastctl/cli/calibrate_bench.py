@@ -16,7 +16,7 @@ from mastctl.cli import output
 from mastctl.cli.output import CommandError, WrongUse, check_file, check_folder
 
 if TYPE_CHECKING:
-    from mastctl.bench.frame import Frame
+    from mastctl.bench.frame import RoverFrame
     from mastctl.bench.run import BenchRun
     from mastctl.bench.teller import Teller
     from mastctl.client import Client
@@ -153,12 +153,12 @@ def _again(args: argparse.Namespace) -> int:
     return 0
 
 
-def _frame(args: argparse.Namespace) -> Frame:
+def _frame(args: argparse.Namespace) -> RoverFrame:
     """What the rover frame hangs on, as far as it was said."""
     import math
 
     from calib.files.mast_file import load_rig
-    from mastctl.bench.frame import Frame
+    from mastctl.bench.frame import RoverFrame
 
     for option in ("mast_at", "board_at"):
         numbers = getattr(args, option)
@@ -168,12 +168,12 @@ def _frame(args: argparse.Namespace) -> Frame:
     if args.like is not None:
         mast = load_rig(args.like).rig.mast
         mast_at = [*mast.translation_m.tolist(), *mast.rotation_rad.tolist()]
-    return Frame(mast_at, args.board_at, args.body_stays)
+    return RoverFrame(mast_at, args.board_at, args.body_stays)
 
 
 def _drive_in_lines(args: argparse.Namespace) -> int:
     """Drive for a program: results and refusals are lines of its stream."""
-    from mastctl.bench.lines import Lines
+    from mastctl.bench.teller import Lines
 
     os.nice(BESIDE)
     args.lines = Lines(sys.stdout, sys.stdin)
@@ -191,7 +191,7 @@ def _drive(args: argparse.Namespace) -> int:
     from calib.calibrate.starts.bench import BenchNotFitted
     from calib.survey.writer import NotWritten
     from calib.targets.board_file import load_board
-    from mastctl.bench.eyes import Interrupted
+    from mastctl.bench.eyes import BenchInterrupted
     from mastctl.bench.looks import BoardLost
     from mastctl.bench.result import finish
     from mastctl.bench.search import BoardNotFound
@@ -205,7 +205,7 @@ def _drive(args: argparse.Namespace) -> int:
             with _bench(args, board, folder) as (bench, teller):
                 done = finish(bench, teller, args.out, args.report)
             break
-        except (Interrupted, BoardNotFound, BoardLost, NobodyThere) as reason:
+        except (BenchInterrupted, BoardNotFound, BoardLost, NobodyThere) as reason:
             if not _go_on(args, reason, folder):
                 raise CommandError(reason.code, f"{reason}; {kept}") from None
         except (BenchNotFitted, NotWritten) as reason:
@@ -240,13 +240,13 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
     """A run on a daemon that runs, or on one that is started for it, under a lease."""
     from calib.survey.records import Sigma
     from mastctl.bench.daemon_eyes import DaemonEyes
-    from mastctl.bench.eyes import Interrupted
-    from mastctl.bench.fitting import fit_in_rover
-    from mastctl.bench.folder import Kept, kept_frame, survey_cameras
+    from mastctl.bench.eyes import BenchInterrupted
+    from mastctl.bench.folder import RunFolder, kept_frame, survey_cameras
+    from mastctl.bench.frame import fit_in_rover
+    from mastctl.bench.looks import BenchGoal
     from mastctl.bench.run import BenchRun
     from mastctl.bench.simulated import SimulatedPerson
     from mastctl.bench.teller import Terminal
-    from mastctl.bench.wanted import Wanted
     from mastctl.client import ClientError
 
     with ExitStack() as stack:
@@ -258,7 +258,7 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
             else:
                 stack.enter_context(client.lease(name="calibrate bench", ends_with_stop=True))
         except ClientError as error:
-            raise Interrupted(f"the head cannot be steered: {error}") from None
+            raise BenchInterrupted(f"the head cannot be steered: {error}") from None
         served = list(client.status()["cameras"])
         cameras = args.cameras or served
         for name in cameras:
@@ -268,7 +268,7 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
         head = eyes.head
         sizes = {name: camera.model.size_px for name, camera in head.rig.cameras.items()}
         sigma = Sigma(0.0, 0.0, joint_rad=head.count_rad / 12**0.5, corner_px=0.1)
-        kept = Kept(folder, {"board": board}, sigma, survey_cameras(head.rig, sizes), head.rig.stereo)
+        kept = RunFolder(folder, {"board": board}, sigma, survey_cameras(head.rig, sizes), head.rig.stereo)
         simulated = client.status()["simulated"]
         teller: Teller = args.lines or Terminal(max(board.size_m))
         if args.lines:
@@ -279,7 +279,7 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
         elif args.placements is not None or args.by_hand:
             option = "--by-hand" if args.placements is None else "--placements"
             raise WrongUse(f"{option} is of a simulated bench, and this one is real")
-        wanted = Wanted(args.wanted_px, args.pictures)
+        wanted = BenchGoal(args.wanted_px, args.pictures)
         kept.begin(client.mast_file(), _frame(args))
         fit = fit_in_rover(kept_frame(folder), head.rig, kept.moved)
         bench = BenchRun(eyes, kept, "board", board, teller, fit, wanted)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mastctl.client import Client
     from mastctl.config import Config
     from mastctl.daemon import RunningDaemon
-    from mastctl.experiment.tasks import Kept, Work
+    from mastctl.experiment.tasks import KeptResults, Work
 
 
 Task = TypeVar("Task")
@@ -96,15 +96,14 @@ def results_of(
         The results in the order of the tasks; None where they were only listed, or some of them run.
     """
     from mastctl.cli.output import check_folder
-    from mastctl.cli.tasks import run_bar
-    from mastctl.experiment.tasks import Kept, Work
+    from mastctl.experiment.tasks import KeptResults, Work
 
     work = Work(function, tasks, label)
     folder: Path | None = args.results or _beside(getattr(args, "out", None))
     if folder is None and args.task:
         raise output.WrongUse("--task needs --results DIR, where its result is kept")
     check_folder(folder, "--results")
-    kept = None if folder is None else Kept(folder)
+    kept = None if folder is None else KeptResults(folder)
     as_json = getattr(args, "json", False)
     if args.list_tasks:
         _list(work, kept, as_json)
@@ -146,7 +145,7 @@ def _opened(args: argparse.Namespace) -> Callable[[], AbstractContextManager[Any
     return partial(open_executor, args.executor, args.workers)
 
 
-def _list(work: Work[Any, Any], kept: Kept | None, as_json: bool) -> None:
+def _list(work: Work[Any, Any], kept: KeptResults | None, as_json: bool) -> None:
     rows = [
         {"id": name, "done": kept is not None and kept.holds(name), "task": work.label(task)}
         for name, task in zip(work.ids, work.tasks, strict=True)

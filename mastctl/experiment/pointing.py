@@ -19,7 +19,7 @@ from calib.files.mast_file import parse_rig
 from calib.geometry.rig import Rig
 from drivers.interfaces import Image
 from mastctl.client import Client, ClientError
-from mastctl.experiment.targets import VIEWS_PER_TARGET, Target, Views, pointed
+from mastctl.experiment.targets import VIEWS_PER_TARGET, Target, TargetViews, pointed
 
 # Rms pixel errors (x, y) of the paper's Table VI: first and second pointing at each distance in metres.
 PAPER_TABLE_VI: Mapping[float, tuple[tuple[float, float], tuple[float, float]]] = {
@@ -257,7 +257,7 @@ def run_pointing_experiment(
     rig = parse_rig(client.mast_file(), "the daemon's mast file").rig
     pair = head_pair(rig, set(status["cameras"]))
     aim_px = rig.cameras[pair[0]].model.image_center_px
-    bench = _Bench(client, rig, pair, status["limits"], seed, truth, clock)
+    bench = _PointingRun(client, rig, pair, status["limits"], seed, truth, clock)
     records: list[TargetRecord] = []
     summaries = []
     for distance_m in distances_m:
@@ -297,7 +297,7 @@ def head_pair(rig: Rig, served: set[str]) -> tuple[str, str]:
     return pairs.get("navcam") or next(iter(pairs.values()))
 
 
-class _Bench:
+class _PointingRun:
     """The running experiment: the daemon, the rig as the daemon believes it, the seed."""
 
     def __init__(
@@ -322,7 +322,7 @@ class _Bench:
         """Find one target at the distance, point at it twice, and return the record of it."""
         begun_s = self._clock.now_s()
         rng = np.random.default_rng([self._seed, round(1000 * distance_m), index])
-        views = Views(self._client, self._rig, self._pair, self._limits, rng, PAN_RANGE_RAD)
+        views = TargetViews(self._client, self._rig, self._pair, self._limits, rng, PAN_RANGE_RAD)
         reason = ""
         for _ in range(VIEWS_PER_TARGET):
             try:

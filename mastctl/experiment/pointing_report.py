@@ -17,8 +17,8 @@ from mastctl.experiment.pointing import (
     TargetRecord,
 )
 from mastctl.report import pages, pictures, plots
-from mastctl.report.figures import Figure
-from mastctl.report.records import write_csv, write_json
+from mastctl.report.pages import write_csv, write_json
+from mastctl.report.pictures import Figure
 from mastctl.report.tables import Table, number, x_y
 
 PICTURES_PER_DISTANCE = 4

@@ -133,7 +133,7 @@ OPERATION_TIMEOUT_S = 60.0
 STOP_TIMEOUT_S = 30.0
 
 
-class Views:
+class TargetViews:
     """Views of one stereo pair on the head, at random azimuths within ``pan_range_rad`` of straight ahead."""
 
     def __init__(

@@ -95,7 +95,7 @@ class Work(Generic[Task, Result]):
     def run(
         self,
         executor: Callable[[], AbstractContextManager[Executor]],
-        kept: Kept | None = None,
+        kept: KeptResults | None = None,
         done: Callable[[Task, Result], None] = lambda task, result: None,
     ) -> list[Result]:
         """Return the results in the order of the tasks.
@@ -135,7 +135,7 @@ class Work(Generic[Task, Result]):
         return [found[name] for name in self.ids]
 
     def _ended(
-        self, executor: Executor, todo: Mapping[str, Task], kept: Kept | None
+        self, executor: Executor, todo: Mapping[str, Task], kept: KeptResults | None
     ) -> Iterator[tuple[str, Result]]:
         """Run tasks; their names and results as they come."""
         futures = {
@@ -166,7 +166,7 @@ class Work(Generic[Task, Result]):
             ) from first
 
 
-class Kept:
+class KeptResults:
     """A folder of results, a file a task, each written whole or not at all; any number of runs may share it.
 
     A result is a pickle, which runs what it holds when it is read: the folder must be as trusted as the

@@ -31,7 +31,7 @@ KEPT_WORDS, LONGEST_WORDS = 20, 400
 ENDS_S = 5.0
 
 
-class Child:
+class GuidedProgram:
     """One process; it is at work from the start on.
 
     Parameters

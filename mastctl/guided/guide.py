@@ -28,9 +28,9 @@ from mastctl.answers import BenchState, BenchTold
 from mastctl.commands.caller import Caller
 from mastctl.commands.lease import Lease, Leases, StopCame
 from mastctl.errors import BadRequest, MastctlError, NotNow, Unable
-from mastctl.guided.child import Child
-from mastctl.guided.runs import Folder, Runs, board_bytes, keep_board, known_boards
-from mastctl.guided.told import Run, ended, heard
+from mastctl.guided.child import GuidedProgram
+from mastctl.guided.runs import GuidedFolder, Runs, board_bytes, keep_board, known_boards
+from mastctl.guided.told import GuidedRun, ended, heard
 from mastctl.state.publisher import Published, Publisher, ThreadSubscription
 
 log = logging.getLogger(__name__)
@@ -53,13 +53,13 @@ FREE_BYTES = 500_000_000
 GOES_ON = "everything seen is kept, and the run can go on"
 
 
-class Stops(Protocol):
+class Stopper(Protocol):
     """What of `mastctl.service.stopping.Stopping` ends what the program has begun."""
 
     def stop(self, reason: str = ...) -> str | None: ...
 
 
-class Running(Protocol):
+class Operating(Protocol):
     """What of `mastctl.operations.operations.Operations` says what runs."""
 
     @property
@@ -67,7 +67,7 @@ class Running(Protocol):
 
 
 @dataclass(frozen=True)
-class Door:
+class WayIn:
     """How a program of this machine comes in.
 
     Attributes
@@ -87,7 +87,7 @@ class Door:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class RunRequest:
     """What is asked for when a run begins or goes on.
 
     Attributes
@@ -114,16 +114,16 @@ class Wanted:
 class _Work:
     """A run that is at work, or was."""
 
-    folder: Folder
+    folder: GuidedFolder
     lease: Lease
     give_back: Callable[[], None]
-    run: Run
-    child: Child | None = None
-    outcome: Run | None = None
+    run: GuidedRun
+    child: GuidedProgram | None = None
+    outcome: GuidedRun | None = None
     over: threading.Event = field(default_factory=threading.Event)
 
 
-def command_of(folder: Folder, asked: dict[str, Any], door: Door, mast_file: Path) -> list[str]:
+def command_of(folder: GuidedFolder, asked: dict[str, Any], door: WayIn, mast_file: Path) -> list[str]:
     """Return the command that carries a run out."""
     words = [sys.executable, "-m", "mastctl", "calibrate", "bench", "--lines", "--url", door.url]
     words += ["--board", str(folder.board), "--out", str(mast_file), "--survey", str(folder.seen)]
@@ -161,14 +161,14 @@ class Guide:
         state: Path,
         masts_folder: Callable[[], Path],
         leases: Leases,
-        stopping: Stops,
-        operations: Running,
+        stopping: Stopper,
+        operations: Operating,
         publisher: Publisher,
         simulated: bool,
-        command: Callable[[Folder, dict[str, Any], Door, Path], Sequence[str]] = command_of,
+        command: Callable[[GuidedFolder, dict[str, Any], WayIn, Path], Sequence[str]] = command_of,
     ) -> None:
         self.runs = Runs(state)
-        self.door: Door | None = None
+        self.door: WayIn | None = None
         self._masts_folder = masts_folder
         self._leases, self._stopping, self._operations = leases, stopping, operations
         self._publisher = publisher
@@ -181,7 +181,7 @@ class Guide:
         self._closed = False
 
     @property
-    def run(self) -> Run | None:
+    def run(self) -> GuidedRun | None:
         """The run that is at work, or the last of this daemon; takes no lock."""
         work = self._work
         return None if work is None else work.run
@@ -203,7 +203,7 @@ class Guide:
             "simulated": self._simulated,
         }
 
-    def start(self, wanted: Wanted, who: str, last_stop: StopCame | None = None) -> Run:
+    def start(self, wanted: RunRequest, who: str, last_stop: StopCame | None = None) -> GuidedRun:
         """Begin a run, or go on with one, and return it.
 
         Parameters
@@ -232,7 +232,7 @@ class Guide:
         finally:
             self._starting.release()
 
-    def stands(self) -> Run:
+    def stands(self) -> GuidedRun:
         """Hand on that the board stands where it was asked for.
 
         Raises
@@ -249,7 +249,7 @@ class Guide:
             raise Unable("no_process", "the calibration program does not take the answer; it may have ended")
         return work.run
 
-    def leave(self, who: str) -> Run:
+    def leave(self, who: str) -> GuidedRun:
         """End the run and what it moves; it can go on later. Raises NotNow ``bench_idle``, DriverError."""
         work = self._working()
         self._finish(work, "interrupted", "left", f"{who} ended the run; {GOES_ON}", and_motion=True)
@@ -289,7 +289,7 @@ class Guide:
 
     # Begin
 
-    def _start(self, wanted: Wanted, who: str, last_stop: StopCame) -> Run:
+    def _start(self, wanted: RunRequest, who: str, last_stop: StopCame) -> GuidedRun:
         now, door = self.run, self.door
         if now is not None and not now.over:
             raise NotNow("bench_runs", f"{now.by} has a bench calibration running since {now.begun}")
@@ -301,7 +301,7 @@ class Guide:
         inside = Caller(HOLDER, "operate", "inside")
         lease = self._leases.take(inside, f"{who} began it", HOLDER, LEASE_S, last_stop)
         text, give_back = (None, lambda: None) if door.lend is None else door.lend(HOLDER)
-        run = Run(
+        run = GuidedRun(
             folder.name,
             asked["begun"],
             who,
@@ -317,7 +317,7 @@ class Guide:
         if door.certificate is not None:
             environment["MASTCTL_CERTIFICATE"] = str(door.certificate)
         try:
-            work.child = Child(
+            work.child = GuidedProgram(
                 self._command(folder, asked, door, masts / asked["mast_file"]),
                 folder.path,
                 environment,
@@ -333,7 +333,7 @@ class Guide:
         self._publish(work)
         return work.run
 
-    def _asked(self, wanted: Wanted, who: str) -> tuple[Folder, dict[str, Any]]:
+    def _asked(self, wanted: RunRequest, who: str) -> tuple[GuidedFolder, dict[str, Any]]:
         """The run's folder with all that it needs, and what is asked of it."""
         if wanted.goes_on is not None:
             folder = self.runs.named(wanted.goes_on)
@@ -463,7 +463,7 @@ class Guide:
             work.child.join()
         self._keep_end(work, ended(outcome or work.run, state, code, sentence))
 
-    def _keep_end(self, work: _Work, run: Run) -> None:
+    def _keep_end(self, work: _Work, run: GuidedRun) -> None:
         """Write down how it ended, and tell it."""
         if run.state == "done":
             try:

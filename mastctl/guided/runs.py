@@ -24,7 +24,7 @@ from calib.targets.board_file import parse_board
 from calib.targets.boards import AnyBoard
 from mastctl.answers import BenchListed
 from mastctl.errors import BadRequest, NotKnown, Unable
-from mastctl.guided.told import Run
+from mastctl.guided.told import GuidedRun
 from mastctl.packaged import config_folder
 from mastctl.safety.state_file import StateFile
 
@@ -35,7 +35,7 @@ MOST_BOARD_BYTES = 100_000
 
 
 @dataclass(frozen=True)
-class Folder:
+class GuidedFolder:
     """The folder of one run."""
 
     path: Path
@@ -80,7 +80,7 @@ class Folder:
         """Write down what is asked for. Raises BadFile."""
         StateFile(self.path / "run.json", SCHEMA).write(told)
 
-    def keep_end(self, run: Run) -> None:
+    def keep_end(self, run: GuidedRun) -> None:
         """Write down how it ended. Raises BadFile."""
         told = {
             "state": run.state,
@@ -118,7 +118,7 @@ class Runs:
     def __init__(self, state: Path) -> None:
         self.folder = state / "bench"
 
-    def new(self) -> Folder:
+    def new(self) -> GuidedFolder:
         """Make a folder for a run that begins now. Raises Unable ``unwritable``."""
         stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
         for name in (stamp, *(f"{stamp}-{k}" for k in range(2, 1000))):
@@ -129,10 +129,10 @@ class Runs:
             except OSError as error:
                 words = f"a run's folder cannot be made in {self.folder}: {error.strerror or error}"
                 raise Unable("unwritable", words) from None
-            return Folder(self.folder / name)
+            return GuidedFolder(self.folder / name)
         raise Unable("unwritable", f"no name is free in {self.folder}")
 
-    def named(self, name: str) -> Folder:
+    def named(self, name: str) -> GuidedFolder:
         """Return a run that is there, by its name. Raises NotKnown ``bench_unknown``."""
         for one in self.all():
             if one.name == name:
@@ -150,14 +150,14 @@ class Runs:
             left = going if going.exists() else folder
             raise Unable("unwritable", f"{left} cannot be removed: {error.strerror or error}") from None
 
-    def all(self) -> list[Folder]:
+    def all(self) -> list[GuidedFolder]:
         """Return all, the newest first. What is no run's folder, or a link, is passed over."""
         try:
             found = [one for one in self.folder.iterdir() if NAME.fullmatch(one.name)]
         except OSError:
             return []
         return [
-            Folder(one)
+            GuidedFolder(one)
             for one in sorted(found, reverse=True)
             if one.is_dir() and not one.is_symlink() and (one / "run.json").is_file()
         ]
@@ -203,7 +203,7 @@ def board_bytes(known: str | None, text: str | None) -> tuple[bytes, AnyBoard]:
         raise BadRequest("bad_board", " ".join(f"{error.place or 'board'}: {error.reason}".split())) from None
 
 
-def keep_board(folder: Folder, data: bytes) -> None:
+def keep_board(folder: GuidedFolder, data: bytes) -> None:
     """Write a board's file into a run's folder. Raises Unable ``unwritable``."""
     try:
         replace_bytes(folder.board, data, 0o644)

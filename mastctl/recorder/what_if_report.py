@@ -17,7 +17,7 @@ from drivers.recordings.frames import McapFrame
 from mastctl.recorder.recorded import Recording
 from mastctl.recorder.what_if import HandedAgain, WouldBe, rms
 from mastctl.report import pages, pictures, plots
-from mastctl.report.figures import Figure
+from mastctl.report.pictures import Figure
 from mastctl.report.tables import Table, number, x_y
 
 CROP_PX, SCALE = 6, 40

@@ -1,17 +1,21 @@
-"""Self-contained HTML pages from the templates beside this module: one look, light, dark and on paper.
+"""What a run leaves: self-contained HTML pages, and for programs tables as CSV and records as JSON.
 
-The templates hold the words and their order, Python the numbers. Everything that is put in is escaped;
-nothing refers to a file or an address outside the page.
+Templates beside this module hold the words and their order, Python the numbers: one look, light, dark and on
+paper. Everything that is put in is escaped; nothing refers to a file or an address outside the page.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import csv
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined
 
 
@@ -58,3 +62,22 @@ def _templates(beside: Path | None) -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a table: numbers in shortest form, cells of what is not a number empty. Raises OSError."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows([_cell(value) for value in row] for row in rows)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, (float, np.floating)):
+        return "" if math.isnan(value) else repr(float(value))
+    return str(value)
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a record, a line a value. Raises OSError."""
+    path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")

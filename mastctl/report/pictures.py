@@ -1,13 +1,35 @@
-"""Pictures: pieces of them enlarged, marked, as the bytes of a file, and inlined in a page."""
+"""Pictures: pieces of them enlarged, marked, as the bytes of a file, and as figures of a page."""
 
 from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from drivers.interfaces import Image
 from mastctl.errors import MastctlError
-from mastctl.report.figures import Figure, data_url
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture with its words.
+
+    ``source`` is what `data_url` returns. ``kind`` is ``photo``; ``lines``, which follow the page into the
+    dark; or ``map``, whose colours mean numbers and stay.
+    """
+
+    source: str
+    alt: str
+    caption: str = ""
+    kind: str = "photo"
+
+
+def data_url(content: bytes, kind: str) -> str:
+    """Return the bytes of a picture (``png`` or ``jpeg``) as an address that holds them."""
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
 
 JPEG_QUALITY = 90
 PAGE_JPEG_QUALITY = 80

@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 from typing import Any
 
-from mastctl.report.figures import Figure, data_url
+from mastctl.report.pictures import Figure, data_url
 
 BLUE, RUST, GREEN, VIOLET, AMBER, GREY = "#1f6f8b", "#c1440e", "#2d7d46", "#7a4b9d", "#b26a00", "#555555"
 COLOURS = (BLUE, RUST, GREEN, VIOLET, AMBER, GREY)

@@ -14,7 +14,7 @@ from calib.geometry.rigid import Rigid, rotation_of
 from mastctl.commands.entry import LONGEST_DEADLINE_S
 from mastctl.commands.lease import LONGEST_S, SHORTEST_S, USUAL_S
 from mastctl.devices.limits import LEAST_CONE_RAD, WIDEST_CONE_RAD, SunDirection, direction_of
-from mastctl.guided.guide import Wanted
+from mastctl.guided.guide import RunRequest
 from mastctl.motion.jog import Beat
 from mastctl.motion.requests import (
     LARGEST_M,
@@ -395,9 +395,9 @@ class BenchBody(_Strict):
             raise ValueError("board, board_file or goes_on is expected, and one of them")
         return self
 
-    def wanted(self) -> Wanted:
+    def wanted(self) -> RunRequest:
         """Return it as the guide takes it."""
-        return Wanted(**self.model_dump())
+        return RunRequest(**self.model_dump())
 
 
 class LoginBody(_Strict):

@@ -32,7 +32,7 @@ from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Corners, DotBoard
 from calib.targets.corners import find_corners
 from calib.targets.markers import corners_on_board_m, detect
 from tools.against_others.calibration import boards_residuals, rms
-from tools.arguments import end
+from tools.command import end
 
 Image = NDArray[np.uint8]
 Found = dict[int, NDArray[np.float64]]

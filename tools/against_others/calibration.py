@@ -59,14 +59,14 @@ from tools.against_others.points import (
     REPOSITORY,
     ROWS,
     SQUARE_M,
+    BoardViews,
     Points,
-    Views,
     opencv_views,
     read_views,
     simulated_survey,
     views_as_points,
 )  # fmt: skip
-from tools.arguments import end
+from tools.command import end
 
 T = TypeVar("T")
 ROUGH_FOCAL = 1.2
@@ -78,7 +78,7 @@ LOST_PX = 1e3
 
 
 @dataclass(frozen=True)
-class Row:
+class FitRow:
     """One fit: rms of its residuals and, where the truth is known, of its predictions; None where refused."""
 
     problem: str
@@ -112,7 +112,7 @@ def centred(size_px: tuple[int, int], focal_px: float) -> CameraModel:
     return CameraModel("CAHVOR", size_px, np.zeros(3), z, focal_px * x + cx * z, focal_px * y + cy * z, z)
 
 
-def boards_problem(views: Views, focal_px: float) -> tuple[Adjustment, Estimate]:
+def boards_problem(views: BoardViews, focal_px: float) -> tuple[Adjustment, Estimate]:
     """Return the project's adjustment of one camera and free boards, and its start."""
     camera = centred(views.size_px, focal_px)
     middle = (np.array(views.size_px) - 1) / 2
@@ -135,7 +135,7 @@ def boards_problem(views: Views, focal_px: float) -> tuple[Adjustment, Estimate]
     return Adjustment(terms, (), start, mast_parameters=0, prisms_cad_m={}), start
 
 
-def from_pictures_alone(views: Views) -> float:
+def from_pictures_alone(views: BoardViews) -> float:
     """Return the rms of the camera that a bench's fit starts with, nothing of its lens being known."""
     centred_m = views.in_board_m - views.in_board_m[[0, -1]].mean(axis=0)
     terms = [
@@ -174,7 +174,7 @@ def boards_residuals(problem: Adjustment, state: Estimate) -> np.ndarray:
     return np.concatenate(found) * NOISE_PX
 
 
-def compare_views(views: Views, rounds: int, mrcal: str | None) -> list[Row]:
+def compare_views(views: BoardViews, rounds: int, mrcal: str | None) -> list[FitRow]:
     """Fit a camera and the boards' poses."""
     name = f"{views.name}: {len(views.pixels_px)} boards, free"
     poses = 6 * len(views.pixels_px)
@@ -184,16 +184,16 @@ def compare_views(views: Views, rounds: int, mrcal: str | None) -> list[Row]:
         ("OpenCV k1 k2 p1 p2 k3", 0, 5),
     ):
         (found, matrix, *_), taken = timed(lambda flags=flags: opencv_views(views, flags), rounds)
-        rows.append(Row(name, label, poses + 4 + lens, float(found), None, taken))
+        rows.append(FitRow(name, label, poses + 4 + lens, float(found), None, taken))
     focal = ROUGH_FOCAL * float(matrix[0, 0])
     problem, start = boards_problem(views, focal)
     fit, taken = timed(lambda: minimise(problem, start, weak=problem.weak), rounds)
     count = len(parameter_names("CAHVOR")) + poses - len(gauges())
-    rows.insert(0, Row(name, "ours CAHVOR", count, rms(boards_residuals(problem, fit.state)), None, taken))
+    rows.insert(0, FitRow(name, "ours CAHVOR", count, rms(boards_residuals(problem, fit.state)), None, taken))
 
     alone, taken = timed(lambda: from_pictures_alone(views), rounds)
     note = "bench: no focal length known"
-    rows.insert(1, Row(name, "ours, from nothing", count, alone, None, taken, note))
+    rows.insert(1, FitRow(name, "ours, from nothing", count, alone, None, taken, note))
 
     moving = np.setdiff1d(np.arange(len(problem.names)), gauges())
 
@@ -210,7 +210,7 @@ def compare_views(views: Views, rounds: int, mrcal: str | None) -> list[Row]:
         plain, taken = timed(
             lambda options=options: least_squares(residual, np.zeros(len(moving)), **options), 1
         )
-        rows.append(Row(name, label, count, rms(plain.fun.reshape(-1, 2)), None, taken, told(plain)))
+        rows.append(FitRow(name, label, count, rms(plain.fun.reshape(-1, 2)), None, taken, told(plain)))
     first = [np.concatenate([Rotation.from_matrix(p.rotation).as_rotvec(), p.translation_m])
              for p in start.rover_from_board.values()]  # fmt: skip
     middle = ((np.array(views.size_px) - 1) / 2).tolist()
@@ -234,25 +234,25 @@ def compare_views(views: Views, rounds: int, mrcal: str | None) -> list[Row]:
 def mrcal_row(
     name: str, label: str, parameters: int, interpreter: str | None, request: dict, pixels_px: np.ndarray,
     truth_px: np.ndarray | None = None,
-) -> Row:  # fmt: skip
+) -> FitRow:  # fmt: skip
     """Let mrcal fit, or say why it did not."""
     if interpreter is None:
-        return Row(name, label, parameters, None, None, None, "no mrcal")
+        return FitRow(name, label, parameters, None, None, None, "no mrcal")
     done = subprocess.run(
         [interpreter, str(Path(__file__).with_name("mrcal_fit.py"))],
         input=json.dumps(request), capture_output=True, text=True, cwd="/",
     )  # fmt: skip
     if done.returncode:
-        return Row(name, label, parameters, None, None, None, f"mrcal ended: {done.stderr.strip()[-80:]}")
+        return FitRow(name, label, parameters, None, None, None, f"mrcal ended: {done.stderr.strip()[-80:]}")
     answer = json.loads(done.stdout.splitlines()[-1])
     if "refused" in answer:
-        return Row(name, label, parameters, None, None, None, f"refused: {answer['refused']}")
+        return FitRow(name, label, parameters, None, None, None, f"refused: {answer['refused']}")
     error = None if truth_px is None else rms(np.array(answer["probe"]) - truth_px)
     found = rms(np.array(answer["pixels"]) - pixels_px)
-    return Row(name, label, parameters, found, error, 1e3 * answer["seconds"])
+    return FitRow(name, label, parameters, found, error, 1e3 * answer["seconds"])
 
 
-def compare_points(points: Points, rounds: int, mrcal: str | None) -> list[Row]:
+def compare_points(points: Points, rounds: int, mrcal: str | None) -> list[FitRow]:
     """Fit a camera to fixed points."""
     focal = ROUGH_FOCAL * points.focal_px
     # SQPnP on every ninth point, as fit_camera would start from.
@@ -262,10 +262,10 @@ def compare_points(points: Points, rounds: int, mrcal: str | None) -> list[Row]:
         raise SystemExit(f"{points.name}: no pinhole camera sees the points; nothing is compared")
     count = len(parameter_names("CAHVOR"))
 
-    def row(label: str, model: CameraModel, taken: float, note: str = "") -> Row:
+    def row(label: str, model: CameraModel, taken: float, note: str = "") -> FitRow:
         error = rms(model.project(points.probe_m)[0] - points.truth_px) if len(points.probe_m) else None
         left = rms(model.project(points.points_m)[0] - points.pixels_px)
-        return Row(points.name, label, count, left, error, taken, note)
+        return FitRow(points.name, label, count, left, error, taken, note)
 
     problem = FixedPoints(points.points_m, points.pixels_px, np.full(len(points.points_m), NOISE_PX))
     weak = np.ones(count)
@@ -309,7 +309,7 @@ def compare_points(points: Points, rounds: int, mrcal: str | None) -> list[Row]:
     return rows
 
 
-def pooled(runs: Sequence[Sequence[Row]]) -> list[Row]:
+def pooled(runs: Sequence[Sequence[FitRow]]) -> list[FitRow]:
     """Return one row a method: rms over runs, median time."""
     rows = []
     for same in zip(*runs, strict=True):
@@ -334,7 +334,7 @@ def find_mrcal() -> str | None:
     return None
 
 
-def print_table(rows: Sequence[Row], mrcal: str | None) -> None:
+def print_table(rows: Sequence[FitRow], mrcal: str | None) -> None:
     """Print rows by problem; ratios are to the first row of a problem, ours."""
     print("mrcal: none found, its rows are empty" if mrcal is None else f"mrcal: of {mrcal}")
     first = rows[0]
@@ -352,7 +352,7 @@ def print_table(rows: Sequence[Row], mrcal: str | None) -> None:
         print(f"{row.method:22} {row.parameters:4d} {numbers}  {row.note}")
 
 
-def verdicts(rows: Sequence[Row]) -> list[dict[str, object]]:
+def verdicts(rows: Sequence[FitRow]) -> list[dict[str, object]]:
     """Return for every problem with OpenCV in it our rms over each of OpenCV's."""
     found: list[dict[str, object]] = []
     for mine in rows:
@@ -381,7 +381,7 @@ def main() -> int:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     mrcal = find_mrcal()
-    rows: list[Row] = []
+    rows: list[FitRow] = []
     try:
         sides = [read_views(arguments.data, side) for side in ("left", "right")]
     except FileNotFoundError as error:

@@ -21,7 +21,7 @@ SETTLED = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 200, 1e-12)
 
 
 @dataclass(frozen=True, eq=False)
-class Views:
+class BoardViews:
     """Corners of a chessboard: (54, 3) on the board, metres, and (n, 54, 2) in n pictures, pixels."""
 
     name: str
@@ -44,7 +44,7 @@ class Points:
     truth_px: np.ndarray
 
 
-def read_views(folder: Path, side: str) -> Views:
+def read_views(folder: Path, side: str) -> BoardViews:
     """Find the corners in every picture of one side.
 
     Raises
@@ -68,10 +68,10 @@ def read_views(folder: Path, side: str) -> Views:
         size = (grey.shape[1], grey.shape[0])
     x, y = np.meshgrid(np.arange(COLUMNS) * SQUARE_M, np.arange(ROWS) * SQUARE_M)
     board = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
-    return Views(side, size, board, np.array(found))
+    return BoardViews(side, size, board, np.array(found))
 
 
-def opencv_views(views: Views, flags: int) -> tuple[float, np.ndarray, np.ndarray, list[Rigid]]:
+def opencv_views(views: BoardViews, flags: int) -> tuple[float, np.ndarray, np.ndarray, list[Rigid]]:
     """Return OpenCV's rms, matrix, distortion and board poses (camera from board)."""
     boards = [views.in_board_m.astype(np.float32)] * len(views.pixels_px)
     pixels = [p.astype(np.float32) for p in views.pixels_px]
@@ -82,7 +82,7 @@ def opencv_views(views: Views, flags: int) -> tuple[float, np.ndarray, np.ndarra
     return found, matrix, lens, poses
 
 
-def views_as_points(views: Views) -> Points:
+def views_as_points(views: BoardViews) -> Points:
     """Return the corners as fixed points in OpenCV's camera frame; nothing is to be predicted."""
     _, matrix, _, poses = opencv_views(views, 0)
     points = np.concatenate([pose.points(views.in_board_m) for pose in poses])

@@ -42,7 +42,7 @@ from calib.geometry.cahvor import CameraModel
 from mastctl.cli.output import at_least
 from tools.against_others.tracker_methods import HALF_PX, METHODS, Tracked
 from tools.against_others.tracker_sequences import SETTINGS, STEPS, WORLDS, Sequence, loaded, rigs, sequences
-from tools.arguments import end
+from tools.command import end
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 WRONG_PX = 5.0
@@ -51,7 +51,7 @@ CONTRIB = "opencv-contrib-python-headless>=4.10,<5"
 
 
 @dataclass(frozen=True)
-class Row:
+class TrackerRow:
     """One method on the sequences of one world and setting; None where nothing was kept or run."""
 
     world: str
@@ -73,7 +73,7 @@ class Row:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class JudgedTracks:
     """Errors (n, 20, 2) px of all runs, not-a-number where said lost; milliseconds (n, 20); metres of a pixel
     at the last target (n,)."""
 
@@ -97,20 +97,24 @@ class Judged:
         return ~self.wrong & ~self.lost
 
 
-def judged(runs: list[Tracked], truth_px: np.ndarray, pixel_m: np.ndarray) -> Judged:
+def judged(runs: list[Tracked], truth_px: np.ndarray, pixel_m: np.ndarray) -> JudgedTracks:
     """Hold the found pixels of all runs against the truth (n, 20, 2, 2)."""
     found = np.array([one[0] for one in runs])
-    return Judged(np.linalg.norm(found - truth_px, axis=-1), np.array([one[1] for one in runs]), pixel_m)
+    return JudgedTracks(
+        np.linalg.norm(found - truth_px, axis=-1), np.array([one[1] for one in runs]), pixel_m
+    )
 
 
-def row(world: str, setting: str, method: str, mine: Judged, ours: Judged, plain: Judged) -> Row:
+def row(
+    world: str, setting: str, method: str, mine: JudgedTracks, ours: JudgedTracks, plain: JudgedTracks
+) -> TrackerRow:
     """Sum up a method's runs."""
     kept, both = mine.kept, mine.kept & ours.kept
     errors = mine.error_px[kept]
     spent, reference = percentile(mine.milliseconds, 50), percentile(plain.milliseconds, 50)
     median = float(np.median(np.where(np.isnan(mine.error_px), np.inf, mine.error_px)))
     last_m = rms(errors[:, -1] * mine.pixel_m[kept, None])
-    return Row(
+    return TrackerRow(
         world, setting, method, len(kept), int(kept.sum()), int(mine.lost.sum()), int(mine.wrong.sum()),
         float(np.isnan(mine.error_px).any(axis=2).mean()),
         median if np.isfinite(median) else None, rms(errors), rms(errors[:, -1]),
@@ -165,7 +169,7 @@ def contrib_tracked(python: Path, kind: str, files: list[Path]) -> list[Tracked]
 
 def compare(
     world: str, setting: str, files: list[Path], configs: Path, contrib: tuple[Path, str] | None
-) -> list[Row]:
+) -> list[TrackerRow]:
     """Run every method on the sequences of one world and setting."""
     believed = rigs(configs)[1]
     found: dict[str, list[Tracked]] = {name: [] for name in METHODS}
@@ -185,7 +189,7 @@ def compare(
     ]
 
 
-def verdicts(rows: list[Row]) -> list[dict[str, object]]:
+def verdicts(rows: list[TrackerRow]) -> list[dict[str, object]]:
     """Hold ours against what is wanted, for every world and setting."""
     answers: list[dict[str, object]] = []
     for mine in (one for one in rows if one.method == "ours"):
@@ -210,7 +214,7 @@ def _answer(where: str, what: str, value: float | None, wanted: float, most: boo
     return {"where": where, "what": what, "value": value, "wanted": wanted, "at_most": most, "met": met}
 
 
-def print_table(rows: list[Row]) -> None:
+def print_table(rows: list[TrackerRow]) -> None:
     """Print rows, a block each world and setting."""
     for number, one in enumerate(rows):
         if number == 0 or (one.world, one.setting) != (rows[number - 1].world, rows[number - 1].setting):
@@ -248,7 +252,7 @@ def main() -> int:
     contrib = (contrib_python(arguments.contrib), arguments.kind) if arguments.contrib else None
     configs = REPOSITORY / "configs"
     seeds = range(arguments.seed, arguments.seed + arguments.targets)
-    rows: list[Row] = []
+    rows: list[TrackerRow] = []
     for world in arguments.worlds:
         for setting in arguments.settings:
             files = [file for _, file in sequences(arguments.work, world, setting, seeds, *rigs(configs))]

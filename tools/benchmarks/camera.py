@@ -39,7 +39,7 @@ from drivers.v4l2.find import open_node, options_for
 from drivers.v4l2.options import CameraOptions, parse_options
 from drivers.v4l2.stream import set_format
 from mastctl.cli.output import at_least, positive_number
-from tools.arguments import end
+from tools.command import end
 
 PARTS = ("gaps", "age", "cpu", "memory", "unplugged", "opens")
 CONSUMERS = ("sleeps", "computes", "is stopped for 2 s")

@@ -16,7 +16,7 @@ import socket
 from collections import Counter
 from collections.abc import Awaitable, Callable
 
-from tools.arguments import end
+from tools.command import end
 from tools.living_daemon import Asker
 
 CAMERA = "navcam_left"

@@ -40,7 +40,7 @@ from calib.geometry.pointing import solve
 from calib.geometry.rig import Mast
 from calib.geometry.rigid import Rigid, rot_x, rot_y, rot_z
 from mastctl.cli.output import at_least
-from tools.arguments import end
+from tools.command import end
 
 COUNTS = (1_000, 100_000, 1_000_000)
 SAME = {"forward": 1e-6, "gradient": 1e-3, "inverse": 1e-7}
@@ -57,7 +57,7 @@ LONGEST_S = 10.0
 
 
 @dataclass(frozen=True)
-class Row:
+class GeometryRow:
     """One line of the table of camera models; rates in million points a second."""
 
     camera: str
@@ -104,7 +104,7 @@ class PointingRow:
 
 
 @dataclass(frozen=True)
-class BenchCamera:
+class TimedCamera:
     """A camera in its own frame, with mrcal's name and numbers for it."""
 
     name: str
@@ -113,7 +113,7 @@ class BenchCamera:
     intrinsics: list[float]
 
 
-def bench_camera(name: str, kind: str, e: tuple[float, float, float]) -> BenchCamera:
+def bench_camera(name: str, kind: str, e: tuple[float, float, float]) -> TimedCamera:
     """Return a Navcam-like camera, O a little off A; ``e`` counts for CAHVORE (type 2)."""
     curved = kind == "CAHVORE"
     size, focal = ((1280, 960), 600.0) if curved else ((1024, 1024), 1226.0)
@@ -134,7 +134,7 @@ def bench_camera(name: str, kind: str, e: tuple[float, float, float]) -> BenchCa
     )
     numbers = [focal, focal, cx, cy, alpha, beta, *r]
     lens = "LENSMODEL_CAHVORE_linearity=0.000" if curved else "LENSMODEL_CAHVOR"
-    return BenchCamera(name, model, lens, numbers + list(e) if curved else numbers)
+    return TimedCamera(name, model, lens, numbers + list(e) if curved else numbers)
 
 
 class Mrcal:
@@ -160,7 +160,7 @@ class Mrcal:
         self._process.stdin.close()
         self._process.wait(timeout=60)
 
-    def time(self, camera: BenchCamera, task: str, values: Path, repeats: int, output: Path | None) -> dict:
+    def time(self, camera: TimedCamera, task: str, values: Path, repeats: int, output: Path | None) -> dict:
         """Return the worker's answer: seconds a call, or why it refused."""
         request = {
             "task": task,
@@ -184,7 +184,7 @@ def time_calls(call: Callable[[], object], repeats: int) -> float:
     return (time.thread_time() - start) / repeats
 
 
-def bench_cameras(mrcal: Mrcal | None, folder: Path, rounds: int) -> list[Row]:
+def bench_cameras(mrcal: Mrcal | None, folder: Path, rounds: int) -> list[GeometryRow]:
     """Time every camera, task and number of points, in turns with mrcal."""
     rng = np.random.default_rng(1)
     cameras = (
@@ -220,7 +220,7 @@ def bench_cameras(mrcal: Mrcal | None, folder: Path, rounds: int) -> list[Row]:
                     def theirs(
                         repeats: int,
                         mrcal: Mrcal = mrcal,
-                        camera: BenchCamera = camera,
+                        camera: TimedCamera = camera,
                         task: str = task,
                         values_file: Path = values_file,
                     ) -> float:
@@ -232,7 +232,7 @@ def bench_cameras(mrcal: Mrcal | None, folder: Path, rounds: int) -> list[Row]:
                 rounds,
             )
             rows.append(
-                Row(
+                GeometryRow(
                     camera.name,
                     task,
                     count,
@@ -338,7 +338,7 @@ def bench_pointing(rounds: int) -> list[PointingRow]:
     return rows
 
 
-def print_tables(rows: list[Row], pointings: list[PointingRow], with_mrcal: bool) -> None:
+def print_tables(rows: list[GeometryRow], pointings: list[PointingRow], with_mrcal: bool) -> None:
     """Print both tables as text."""
     beside = "mrcal (Debian's or this interpreter's)" if with_mrcal else "no mrcal found: ratios are missing"
     print(f"Camera models, million points a second, one thread; {beside}")

@@ -22,7 +22,7 @@ import yaml
 from websockets.sync.client import connect
 
 from mastctl.client import Client
-from tools.arguments import end
+from tools.command import end
 from tools.living_daemon import Asker, simulated, started, vitals, written
 
 PAIR = ("navcam_left", "navcam_right")

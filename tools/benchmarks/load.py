@@ -33,8 +33,8 @@ import yaml
 
 from mastctl.cli.output import at_least, positive_number
 from mastctl.packaged import default_config
-from tools.arguments import end
 from tools.campaigns.servo_rigs import line_alone
+from tools.command import end
 from tools.living_daemon import Asker, simulated, started, vitals, written
 
 CLIENTS, STREAMS = 50, 4

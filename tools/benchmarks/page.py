@@ -16,8 +16,8 @@ import yaml
 from playwright.sync_api import Page, sync_playwright
 
 from mastctl.client import Client
-from tools.arguments import end
 from tools.browser import chromium
+from tools.command import end
 from tools.living_daemon import simulated, started, vitals, written
 from tools.throttle import throttled
 

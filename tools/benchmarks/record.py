@@ -28,7 +28,7 @@ import yaml
 from mastctl.cli.output import at_least, positive_number
 from mastctl.client import Client
 from mastctl.packaged import default_config
-from tools.arguments import end
+from tools.command import end
 
 PLAIN, NO_RING = "plain", {"ring_s": 0.0}
 DAEMONS = {
@@ -53,7 +53,7 @@ class Daemon:
 
 
 @dataclass(frozen=True)
-class Pointing:
+class RecordedPointing:
     """What one pointing took: processor time, duration, and that of its steps by name."""
 
     processor_s: float
@@ -85,7 +85,7 @@ def main() -> int:
     return 0
 
 
-def _tell(done: dict[str, list[Pointing]], rest: dict[str, float], written_mb: float) -> None:
+def _tell(done: dict[str, list[RecordedPointing]], rest: dict[str, float], written_mb: float) -> None:
     print(f"{'median of ' + str(len(done[PLAIN])):<32}" + "".join(f"{name:>18}" for name in done))
     _row("processor, s", done, lambda row: row.processor_s)
     _row("begin to end, s", done, lambda row: row.whole_s)
@@ -97,7 +97,9 @@ def _tell(done: dict[str, list[Pointing]], rest: dict[str, float], written_mb: f
     print(f"the ring has {written_mb:.1f} MB")
 
 
-def _row(words: str, done: dict[str, list[Pointing]], part: Callable[[Pointing], float]) -> None:
+def _row(
+    words: str, done: dict[str, list[RecordedPointing]], part: Callable[[RecordedPointing], float]
+) -> None:
     found = {name: statistics.median(part(row) for row in rows) for name, rows in done.items()}
     plain = found[PLAIN]
     print(
@@ -106,7 +108,7 @@ def _row(words: str, done: dict[str, list[Pointing]], part: Callable[[Pointing],
     )
 
 
-def _point(daemon: Daemon) -> Pointing:
+def _point(daemon: Daemon) -> RecordedPointing:
     """Point at a pixel of a fresh picture."""
     client = daemon.client
     client.wait(client.point(pan_rad=0.0, tilt_rad=-0.1))
@@ -118,7 +120,7 @@ def _point(daemon: Daemon) -> Pointing:
     steps_s: dict[str, float] = {}
     for step in record["steps"]:
         steps_s[step["name"]] = steps_s.get(step["name"], 0.0) + step["duration_s"]
-    return Pointing(daemon.processor_s - began_s, record["ended_s"] - record["created_s"], steps_s)
+    return RecordedPointing(daemon.processor_s - began_s, record["ended_s"] - record["created_s"], steps_s)
 
 
 @contextlib.contextmanager

@@ -133,6 +133,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    from tools.arguments import end
+    from tools.command import end
 
     end(main)

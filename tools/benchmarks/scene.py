@@ -19,8 +19,8 @@ from calib.calibrate.scene.features import find_features
 from calib.calibrate.scene.fit import fit_scene
 from calib.calibrate.scene.terms import corrected
 from mastctl.cli.output import at_least
-from tools.arguments import end
-from tools.still_scene import navcams, pictures, rests
+from tools.campaigns.scene import navcams, pictures, rests
+from tools.command import end
 
 REPEAT_RAD = 1e-4
 TURN = (["cameras.navcam_left.turn.y", "cameras.navcam_left.turn.z"], np.array([1.5e-3, -1.3e-3]))

@@ -29,7 +29,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from mastctl.cli.output import at_least, not_negative
-from tools.arguments import end
+from tools.command import end
 
 BAUD = 1_000_000
 IDS = (1, 2)
@@ -37,7 +37,7 @@ GOAL, POSITION, SIZE = 116, 132, 4  # e-manual, X series
 CALL = Callable[[], None]
 
 
-class Failed(Exception):
+class BusFailed(Exception):
     """A call that brought no answer in the driver's own time."""
 
 
@@ -50,7 +50,7 @@ def simulate(pipe: Connection, delay_s: float) -> None:
     from drivers.sim.wire.dynamixel_servo import SimulatedServo
     from drivers.sim.wire.line import PtyLine
 
-    class Waiting(DynamixelBus):
+    class BusWaiting(DynamixelBus):
         """A bus whose servos take their time."""
 
         def receive(self, data: bytes, time_s: float) -> Sequence[Any]:
@@ -69,7 +69,7 @@ def simulate(pipe: Connection, delay_s: float) -> None:
         )
         for servo_id in IDS
     ]
-    with PtyLine(Waiting(servos), clock, wire_time=False) as line:
+    with PtyLine(BusWaiting(servos), clock, wire_time=False) as line:
         pipe.send(line.path)
         pipe.recv()
 
@@ -106,7 +106,7 @@ def plain_sdk(path: str) -> Iterator[tuple[CALL, CALL]]:
     def read() -> None:
         result = reader.txRxPacket()
         if result != sdk.COMM_SUCCESS:
-            raise Failed(f"the SDK says {result}")
+            raise BusFailed(f"the SDK says {result}")
         for servo_id in IDS:
             reader.getData(servo_id, POSITION, SIZE)
 
@@ -141,7 +141,7 @@ def link(path: str) -> Iterator[tuple[CALL, CALL]]:
     def read() -> None:
         answer = line.group_read(reads)
         if answer.missing:
-            raise Failed("a servo is missing")
+            raise BusFailed("a servo is missing")
         for servo_id in IDS:
             int.from_bytes(answer.statuses[servo_id].data, "little", signed=True)
 
@@ -183,7 +183,7 @@ def lerobot_bus(path: str) -> Iterator[tuple[CALL, CALL]]:
         try:
             motors.sync_read("Present_Position", normalize=False)
         except ConnectionError as error:  # its one try was not answered in time
-            raise Failed(str(error)) from error
+            raise BusFailed(str(error)) from error
 
     def write_read() -> None:
         motors.sync_write("Goal_Position", dict.fromkeys(names, 2048), normalize=False)
@@ -199,7 +199,7 @@ def measure(path: str, driver: Any, which: int, calls: int) -> tuple[list[float]
     with driver(path) as operations:
         call = operations[which]
         for _ in range(20):
-            with suppress(Failed):
+            with suppress(BusFailed):
                 call()
         times = []
         cpu_s = time.process_time()
@@ -207,7 +207,7 @@ def measure(path: str, driver: Any, which: int, calls: int) -> tuple[list[float]
             began_s = time.perf_counter()
             try:
                 call()
-            except Failed:
+            except BusFailed:
                 failed += 1
             times.append(time.perf_counter() - began_s)
         return times, time.process_time() - cpu_s, failed

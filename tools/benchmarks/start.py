@@ -23,7 +23,7 @@ from urllib.request import urlopen
 from mastctl.cli.output import at_least
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
-from tools.arguments import end
+from tools.command import end
 from tools.living_daemon import simulated
 
 Spent = dict[str, list[tuple[float, float]]]

@@ -39,8 +39,8 @@ from mastctl.cli.output import at_least
 from mastctl.config import load_config
 from mastctl.packaged import default_config
 from mastctl.safety.stop_line import ask
-from tools.arguments import end
 from tools.benchmarks.crowd import LOADS
+from tools.command import end
 
 HEADS = {"memory": None, "ptu": "flir_ptu", "dynamixel": "dynamixel"}
 STREAMS = 4

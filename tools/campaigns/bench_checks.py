@@ -28,15 +28,14 @@ from calib.calibrate.bench.fit import fit_bench
 from calib.calibrate.bench.problem import BenchProblem
 from calib.calibrate.bench.told import UNPREDICTED, check_weights
 from mastctl.cli.output import at_least
-from tools.arguments import end
-from tools.campaign import options, run_cases
 from tools.campaigns.bench_coverage import CHANCES, HEADS, plan_of
+from tools.command import end, options, run_cases
 from tools.sim_survey.bench import simulate_bench
 
 GEOMETRIES = 12
 
 
-class Task(NamedTuple):
+class ChecksTask(NamedTuple):
     """Benches of one geometry: head, head positions a placement, fitted and not, how many benches, seed."""
 
     head: str
@@ -46,7 +45,7 @@ class Task(NamedTuple):
     seed: int
 
 
-class Found(NamedTuple):
+class ChecksFound(NamedTuple):
     """Chances of the check pictures (benches, cameras), and the part of their expected squares that is the
     calibration's, by camera."""
 
@@ -54,7 +53,7 @@ class Found(NamedTuple):
     part: np.ndarray
 
 
-def found(task: Task) -> Found:
+def found(task: ChecksTask) -> ChecksFound:
     """Return the chances of the check pictures of some benches."""
     plan = replace(plan_of(task.head, task.attitudes, task.seed, task.checks), gross=0.0)
     survey = simulate_bench(task.seed, replace(plan, noise=0.0))
@@ -74,7 +73,7 @@ def found(task: Task) -> Found:
             weighed, mine, steps, np.random.default_rng([task.seed, 19, *camera.encode()])
         )
         chances.append([chance_of_sum(float(square), weights) for square in squares])
-    return Found(np.array(chances).T, np.array(part))
+    return ChecksFound(np.array(chances).T, np.array(part))
 
 
 def drawn_steps(weighed: Weighed, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -113,7 +112,7 @@ def main(words: Sequence[str] | None = None) -> int:
     args = parser.parse_args(words)
     each = -(-args.cases // GEOMETRIES)
     tasks = [
-        Task(args.head, args.attitudes, args.checks, each, seed)
+        ChecksTask(args.head, args.attitudes, args.checks, each, seed)
         for seed in range(args.seed, args.seed + GEOMETRIES)
     ]
     results = run_cases(args, "checks", found, tasks, lambda task: f"seed {task.seed}")

@@ -46,8 +46,7 @@ from calib.geometry.rig import joint_numbers_of as joint_numbers
 from calib.geometry.rigid import tangents
 from calib.geometry.stereo import triangulate
 from mastctl.cli.output import at_least
-from tools.arguments import end
-from tools.campaign import held_percent, options, rms, run_cases
+from tools.command import end, held_percent, options, rms, run_cases
 from tools.sim_survey.bench import BenchPlan, Placement, simulate_bench
 
 LEVEL, Z = 0.95, 1.959964
@@ -132,7 +131,7 @@ def doubting(task: BenchTask) -> Iterator[None]:
         yield
 
 
-class Score(NamedTuple):
+class BenchScore(NamedTuple):
     """Errors over sigmas, of parameters by name and of pixels; how far pointings land (3 files, ranges,
     targets, 2), px; what entered; chi-square's probability and quotient; pictures that were fitted and how
     many of them were left out; of each camera whether its check pictures are bad, and their chance; seconds.
@@ -150,7 +149,7 @@ class Score(NamedTuple):
     seconds: float
 
 
-def score(task: BenchTask) -> Score | str:
+def score(task: BenchTask) -> BenchScore | str:
     """Return how far one bench's fit is from the truth, or why there is none."""
     survey = simulate_bench(task.seed, task.plan)
     try:
@@ -171,7 +170,7 @@ def score(task: BenchTask) -> Score | str:
         else pointings(true, rig, task.plan.count_rad, task.seed)
         for rig in rigs
     ]
-    return Score(
+    return BenchScore(
         parameter_errors(true, fit),
         np.concatenate([pixel_errors(true, name, fit) for name in true.cameras]),
         np.array(landed),
@@ -309,7 +308,7 @@ def main() -> int:
         for seed in range(args.seed, args.seed + args.cases)
     ]
     found = run_cases(args, "benches", score, tasks, lambda task: f"seed {task.seed}")
-    if scores := [one for one in found if isinstance(one, Score)]:
+    if scores := [one for one in found if isinstance(one, BenchScore)]:
         report(scores)
     refused = [one for one in found if isinstance(one, str)]
     print("\n".join([f"benches refused: {len(refused)}", *refused]))
@@ -318,7 +317,7 @@ def main() -> int:
     return 0
 
 
-def report(scores: Sequence[Score]) -> None:
+def report(scores: Sequence[BenchScore]) -> None:
     """Print the tables."""
     names = list(dict.fromkeys(name for s in scores for name in s.parameters))
     print(f"{100 * LEVEL:g} % intervals hold the truth in, %            rms error in sigmas, benches")

@@ -29,9 +29,8 @@ from calib.plan.knowledge import BenchShot, ExpectedPointing, Knowledge, Workspa
 from calib.plan.placements import Placement
 from calib.plan.poses import Sought, expected_px, next_shot, seen
 from calib.targets.boards import Charuco
-from mastctl.bench.wanted import FEWEST_LOOKS
-from tools.arguments import end
-from tools.campaign import options
+from mastctl.bench.looks import FEWEST_LOOKS
+from tools.command import end, options
 
 A2 = Charuco(10, 7, 0.055, 0.042)
 PAIR = ("navcam_left", "navcam_right")

@@ -36,8 +36,7 @@ from mastctl.client import Client, Snapshot
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.packaged import config_folder
-from tools.arguments import end
-from tools.campaign import heading, line, options
+from tools.command import end, heading, line, options
 
 PRINTED = Charuco(10, 6, 0.055, 0.04125)
 LEFT, RIGHT = "navcam_left", "navcam_right"

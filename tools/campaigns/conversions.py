@@ -29,8 +29,7 @@ from calib.files.twin import twin_error
 from calib.files.yaml_text import parse_mapping
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
-from tools.arguments import end
-from tools.campaign import options
+from tools.command import end, options
 
 FORMATS = {"opencv": "yaml", "ros": "yaml", "kalibr": "yaml", "mrcal": "cameramodel"}
 GRID = (61, 47)

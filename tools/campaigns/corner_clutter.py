@@ -23,8 +23,7 @@ from scipy.spatial.transform import Rotation
 from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Corners
 from calib.targets.corners import find_corners
 from calib.targets.pattern import pattern_of
-from tools.arguments import end
-from tools.campaign import options, run_cases
+from tools.command import end, options, run_cases
 
 FloatArray = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 
 from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, Corners, DotBoard
 from calib.targets.corners import CornersNotFound, find_corners
-from tools.arguments import end
-from tools.campaign import options, run_cases
 from tools.campaigns.board_photos import SIZE_PX, Levels, keep_pictures, light, photographed, placed
+from tools.command import end, options, run_cases
 
 FloatArray = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -42,7 +41,7 @@ OUTLIER_PX = 1.0
 
 
 @dataclass(frozen=True)
-class Case:
+class PictureCase:
     """What a picture suffers; blur and noise are standard deviations, ``hidden`` a part of the corners."""
 
     name: str
@@ -56,55 +55,55 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Scene:
+class BoardScene:
     """Where boards are, and what their pictures suffer."""
 
     name: str
     slant_deg: tuple[float, float]
     range_m: tuple[float, float]
-    cases: tuple[Case, ...]
+    cases: tuple[PictureCase, ...]
 
 
-SHARP = Case("blur 0.7, noise 2")
+SHARP = PictureCase("blur 0.7, noise 2")
 SCENES = (
-    Scene(
+    BoardScene(
         "slant 0 to 40, 0.7 to 1.3 m",
         (0.0, 40.0),
         (0.7, 1.3),
         (
             SHARP,
-            Case("no blur", blur_px=0.0, noise_dn=1.0),
-            Case("blur 0.5", blur_px=0.5, noise_dn=1.0),
-            Case("blur 1.5", blur_px=1.5),
-            Case("blur 2.5", blur_px=2.5),
-            Case("smear 6 px", smear_px=6.0),
-            Case("noise 5", noise_dn=5.0),
-            Case("dark", contrast=0.12),
-            Case("uneven light", gradient=0.7),
-            Case("half hidden", hidden=0.5),
-            Case("16 bits, noise 1", noise_dn=1.0, bits=16),
+            PictureCase("no blur", blur_px=0.0, noise_dn=1.0),
+            PictureCase("blur 0.5", blur_px=0.5, noise_dn=1.0),
+            PictureCase("blur 1.5", blur_px=1.5),
+            PictureCase("blur 2.5", blur_px=2.5),
+            PictureCase("smear 6 px", smear_px=6.0),
+            PictureCase("noise 5", noise_dn=5.0),
+            PictureCase("dark", contrast=0.12),
+            PictureCase("uneven light", gradient=0.7),
+            PictureCase("half hidden", hidden=0.5),
+            PictureCase("16 bits, noise 1", noise_dn=1.0, bits=16),
         ),
     ),
-    Scene("slant 55 to 60", (55.0, 60.0), (0.7, 1.3), (SHARP, Case("blur 1.5", blur_px=1.5))),
-    Scene("1.6 to 2.4 m", (0.0, 40.0), (1.6, 2.4), (SHARP, Case("noise 5", noise_dn=5.0))),
-    Scene("3 to 4.5 m", (0.0, 40.0), (3.0, 4.5), (Case("blur 0.5, noise 2", blur_px=0.5),)),
-    Scene("0.45 to 0.6 m", (0.0, 40.0), (0.45, 0.6), (SHARP,)),
+    BoardScene("slant 55 to 60", (55.0, 60.0), (0.7, 1.3), (SHARP, PictureCase("blur 1.5", blur_px=1.5))),
+    BoardScene("1.6 to 2.4 m", (0.0, 40.0), (1.6, 2.4), (SHARP, PictureCase("noise 5", noise_dn=5.0))),
+    BoardScene("3 to 4.5 m", (0.0, 40.0), (3.0, 4.5), (PictureCase("blur 0.5, noise 2", blur_px=0.5),)),
+    BoardScene("0.45 to 0.6 m", (0.0, 40.0), (0.45, 0.6), (SHARP,)),
 )
 
 
 @dataclass(frozen=True)
-class Task:
+class PoseTask:
     """One board at one pose of a scene, in all its cases."""
 
     kind: str
-    scene: Scene
+    scene: BoardScene
     pose: int
     seed: int
     pictures: bool = False
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CornersOutcome:
     """One picture: errors (n, 2) px, sigmas (n,), corners in view, OpenCV's errors, the reason if none."""
 
     errors_px: FloatArray
@@ -119,7 +118,7 @@ class Outcome:
 class PoseFound:
     """What became of a pose: an outcome a case, and pictures (PNG) by their names."""
 
-    outcomes: dict[str, Outcome]
+    outcomes: dict[str, CornersOutcome]
     pictures: dict[str, bytes] = field(default_factory=dict)
 
 
@@ -149,7 +148,7 @@ def opencvs(board: AnyBoard, image: Image, truth: FloatArray) -> FloatArray:
     return np.asarray(np.reshape(corners, (-1, 2)) - truth[np.ravel(ids)], dtype=np.float64)
 
 
-def run_pose(task: Task) -> PoseFound:
+def run_pose(task: PoseTask) -> PoseFound:
     """Draw a board, photograph it in every case, and find its corners."""
     board, scene = BOARDS[task.kind], task.scene
     rng = np.random.default_rng([task.seed, task.pose, *task.kind.encode(), *scene.name.encode()])
@@ -177,12 +176,14 @@ def run_pose(task: Task) -> PoseFound:
         theirs = opencvs(board, eight, truth)
         if isinstance(found, CornersNotFound):
             none = np.empty((0, 2))
-            told.outcomes[case.name] = Outcome(
+            told.outcomes[case.name] = CornersOutcome(
                 none, np.empty(0), int(seen.sum()), theirs, found.reason, seconds
             )
         else:
             errors = found.pixels_px - truth[found.ids]
-            told.outcomes[case.name] = Outcome(errors, found.sigma_px, int(seen.sum()), theirs, "", seconds)
+            told.outcomes[case.name] = CornersOutcome(
+                errors, found.sigma_px, int(seen.sum()), theirs, "", seconds
+            )
         if task.pictures and (task.pose == 0 or isinstance(found, CornersNotFound)):
             name = f"{task.kind}_{scene.name}_{case.name}_{task.pose}.png".replace(" ", "_")
             told.pictures[name] = cv2.imencode(".png", overlay(eight, found))[1].tobytes()
@@ -204,7 +205,7 @@ def overlay(image: Image, found: Corners | CornersNotFound) -> Image:
     return np.asarray(shown, dtype=np.uint8)
 
 
-def tell(kind: str, name: str, outcomes: list[Outcome]) -> int:
+def tell(kind: str, name: str, outcomes: list[CornersOutcome]) -> int:
     """Print a case's row; return how many ids were wrong."""
     errors = np.concatenate([o.errors_px for o in outcomes])
     sigma = np.concatenate([o.sigma_px for o in outcomes])[:, None]
@@ -249,7 +250,7 @@ def main() -> int:
     parser.add_argument("--pictures", type=Path, help="folder for pictures with what was found")
     args = parser.parse_args()
     tasks = [
-        Task(kind, scene, pose, args.seed, args.pictures is not None)
+        PoseTask(kind, scene, pose, args.seed, args.pictures is not None)
         for kind in BOARDS
         for scene in SCENES
         if args.kind in (None, kind)

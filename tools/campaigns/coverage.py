@@ -38,8 +38,7 @@ from calib.survey.records import Sigma, Survey
 from mastctl.calibration.run import FITS, Method
 from mastctl.cli.output import not_negative
 from mastctl.packaged import config_folder
-from tools.arguments import end
-from tools.campaign import held_percent, options, rms, run_cases
+from tools.command import end, held_percent, options, rms, run_cases
 from tools.sim_survey.blunders import with_fewer_dots, with_moved_tape, with_scattered_dots
 from tools.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
 
@@ -65,7 +64,7 @@ class Gross(NamedTuple):
     clean_px2: float
 
 
-class Score(NamedTuple):
+class SurveyScore(NamedTuple):
     """Errors over their sigmas: of the mast's parameters and of pixels by camera; the mast's squared distance
     from the truth by its whole covariance; what errors would be from prisms alone; chi-square; left out."""
 
@@ -80,7 +79,7 @@ class Score(NamedTuple):
     gross: Gross | None
 
 
-class SurveyTask(NamedTuple):
+class CoverageTask(NamedTuple):
     """One survey of a true rig."""
 
     true: Rig
@@ -91,7 +90,7 @@ class SurveyTask(NamedTuple):
     gross_part: float
 
 
-def score(task: SurveyTask) -> Score | str:
+def score(task: CoverageTask) -> SurveyScore | str:
     """Return how far one survey's fit is from the truth, in its own sigmas, or why there is none."""
     true = task.true
     survey, of_truth = simulate_survey(true, task.seed, task.plan)
@@ -113,7 +112,7 @@ def score(task: SurveyTask) -> Score | str:
     in_sigmas = error / np.sqrt(np.diag(covariance))
     named = {outlier.name for outlier in fit.outliers}
     unnamed, besides = tuple(sorted(gross - named)), len(named - gross)
-    return Score(
+    return SurveyScore(
         {fit.parameter_names[i]: float(e) for i, e in zip(at, in_sigmas, strict=True)},
         float(error @ np.linalg.solve(covariance, error)),
         _prisms_alone(true, survey, of_truth),
@@ -196,11 +195,11 @@ def main() -> int:
     plan = SurveyPlan(sigma=Sigma(0.001, 0.1, args.joint_sigma_rad, args.prism_cad_sigma_m))
     began = time.monotonic()
     tasks = [
-        SurveyTask(true, seed, plan, args.method, args.mast, args.gross)
+        CoverageTask(true, seed, plan, args.method, args.mast, args.gross)
         for seed in range(args.seed, args.seed + args.cases)
     ]
     found = run_cases(args, "surveys", score, tasks, lambda task: f"seed {task.seed}")
-    if scores := [one for one in found if isinstance(one, Score)]:
+    if scores := [one for one in found if isinstance(one, SurveyScore)]:
         report(scores)
     refused = [one for one in found if isinstance(one, str)]
     print("\n".join([f"surveys refused: {len(refused)}", *refused]))
@@ -209,7 +208,7 @@ def main() -> int:
     return 0
 
 
-def report(scores: list[Score]) -> None:
+def report(scores: list[SurveyScore]) -> None:
     """Print the table."""
     mast = np.array([list(s.mast.values()) for s in scores])
     pixels = {n: np.array([s.pixels[n] for s in scores]) for n in scores[0].pixels}

@@ -26,9 +26,8 @@ from calib.targets.dot_order import PredictedBoard
 from calib.targets.dots import DotsFound, find_dots
 from drivers.sim.render import Renderer
 from drivers.sim.scene import SceneSettings, build_scene
-from tools.arguments import end
-from tools.campaign import options, run_cases
 from tools.campaigns.board_photos import keep_pictures
+from tools.command import end, options, run_cases
 from tools.sim_survey.board import BoardLook, draw_board, half_size_m, photograph
 
 BOARD = Board(10, 10, 0.08, 0.04, {})
@@ -73,7 +72,7 @@ class BoardTrial:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class DotsOutcome:
     """How a trial went: errors (n, 2) px and their sigmas, or why it failed."""
 
     errors_px: np.ndarray
@@ -152,19 +151,19 @@ def make_trial(
     return BoardTrial(image, camera, pose, PredictedBoard(rough, predicted))
 
 
-def judge(trial: BoardTrial) -> tuple[Outcome, DotsFound | DetectionFailure]:
+def judge(trial: BoardTrial) -> tuple[DotsOutcome, DotsFound | DetectionFailure]:
     """Find the dots and compare them with the truth."""
     start_s = time.perf_counter()
     found = find_dots(trial.image, BOARD, trial.predicted)
     seconds = time.perf_counter() - start_s
     if isinstance(found, DetectionFailure):
-        return Outcome(np.empty((0, 2)), np.empty(0), found.reason, False, seconds), found
+        return DotsOutcome(np.empty((0, 2)), np.empty(0), found.reason, False, seconds), found
     centres = BOARD.dots_in_board_m(found.rows, found.columns)
     truth, _ = trial.camera.project(trial.camera_from_board.points(centres))
     errors = found.pixels_px - truth
     if np.median(np.linalg.norm(errors, axis=1)) > 2.0:
-        return Outcome(np.empty((0, 2)), np.empty(0), "", True, seconds), found
-    return Outcome(errors, found.sigma_px, "", False, seconds), found
+        return DotsOutcome(np.empty((0, 2)), np.empty(0), "", True, seconds), found
+    return DotsOutcome(errors, found.sigma_px, "", False, seconds), found
 
 
 @dataclass(frozen=True)
@@ -184,7 +183,7 @@ class Cell:
 class CellFound:
     """What became of a cell: an outcome a pose, and pictures (PNG) by their names."""
 
-    outcomes: list[Outcome]
+    outcomes: list[DotsOutcome]
     pictures: dict[str, bytes] = field(default_factory=dict)
 
 
@@ -218,7 +217,7 @@ def overlay(image: np.ndarray, found: DotsFound | DetectionFailure) -> np.ndarra
     return shown
 
 
-def tell(cell: Cell, outcomes: list[Outcome]) -> int:
+def tell(cell: Cell, outcomes: list[DotsOutcome]) -> int:
     """Print a cell's row and why boards were not found; return how many were not, or in a wrong order."""
     errors = np.concatenate([o.errors_px for o in outcomes])
     sigma = np.concatenate([o.sigma_px for o in outcomes])[:, None]

@@ -22,8 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.faults import CAMERA_WORDS, HEAD_WORDS, PAN_TILT
-from tools.arguments import end
-from tools.campaign import heading, line, options
+from tools.command import end, heading, line, options
 from tools.living_daemon import HEADS, Asker, simulated, started
 
 CAMERAS = ("navcam_left", "navcam_right")
@@ -107,14 +106,14 @@ def trials(folder: Path, head: str, during: str, words: Sequence[str] | None = N
     config = simulated(folder, head, CAMERAS)
     while faults:
         with started(config) as (_, port), Asker(port, "faults") as asker:
-            bench, good = _Bench(asker), True
+            bench, good = _FaultClient(asker), True
             while faults and good:  # what does not get well is left behind with its daemon
                 trial = bench.tried(*faults.pop(0), begin, well)
                 good = trial.well_s is not None
                 yield trial
 
 
-class _Bench:
+class _FaultClient:
     """One client that sets faults and looks what follows."""
 
     def __init__(self, asker: Asker) -> None:
@@ -201,7 +200,7 @@ class _Bench:
         return bool(record["state"] == "done")
 
 
-def _point(bench: _Bench) -> str:
+def _point(bench: _FaultClient) -> str:
     """Send the head off to a place, and wait until it is under way."""
     until_s = time.monotonic() + ENDS_S
     if not (bench.done("/point", NEAR_RAD, until_s) and bench.quiet(until_s)):
@@ -214,7 +213,7 @@ def _point(bench: _Bench) -> str:
     return operation
 
 
-def _pointed(bench: _Bench, until_s: float) -> bool:
+def _pointed(bench: _FaultClient, until_s: float) -> bool:
     """Whether a pointing is done again, and nothing is wrong."""
     while time.monotonic() < until_s:
         if bench.done("/point", {"position_m": PLACE_M, "frame": "rover"}, until_s) and bench.quiet(until_s):
@@ -222,7 +221,7 @@ def _pointed(bench: _Bench, until_s: float) -> bool:
     return False
 
 
-def _drive(bench: _Bench) -> str:
+def _drive(bench: _FaultClient) -> str:
     """Have a target followed, and drive a step."""
     if bench.asker.json("GET", "/track")["state"] != "tracking":
         _follow(bench)
@@ -232,7 +231,7 @@ def _drive(bench: _Bench) -> str:
     return operation
 
 
-def _follow(bench: _Bench) -> None:
+def _follow(bench: _FaultClient) -> None:
     """Begin a track where nothing is followed."""
     until_s = time.monotonic() + ENDS_S
     asker = bench.asker
@@ -250,7 +249,7 @@ def _follow(bench: _Bench) -> None:
     raise TimeoutError(f"no track could be begun: {bench.why}")
 
 
-def _posed(bench: _Bench) -> str | None:
+def _posed(bench: _FaultClient) -> str | None:
     """Drive a step and say so; the look that follows, if any."""
     bench.x_m += STEP_M
     asker = bench.asker
@@ -261,7 +260,7 @@ def _posed(bench: _Bench) -> str | None:
     return told["operation"]
 
 
-def _looked(bench: _Bench, until_s: float) -> bool:
+def _looked(bench: _FaultClient, until_s: float) -> bool:
     """Whether the target is found again, and nothing is wrong."""
     while time.monotonic() < until_s:
         if bench.done("/track/look", {}, until_s):

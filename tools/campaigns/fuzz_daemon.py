@@ -44,8 +44,7 @@ from mastctl.commands.lease import LONGEST_S
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.web import PREFIX
-from tools.arguments import end
-from tools.campaign import options
+from tools.command import end, options
 
 LEFT_OUT = ("positive_data_acceptance",)
 UNASKED = f"^{PREFIX}/(events|track/stream|health/ready)$"

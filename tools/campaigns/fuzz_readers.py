@@ -40,8 +40,7 @@ from calib.targets.board_file import parse_board
 from calib.targets.boards import AnyBoard
 from calib.targets.pattern import pattern_of
 from mastctl.cli.main import main as mastctl
-from tools.arguments import end
-from tools.campaign import options
+from tools.command import end, options
 
 HANG_S = 20
 

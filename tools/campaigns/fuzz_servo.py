@@ -31,8 +31,7 @@ from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_packets import InstructionParser
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
 from drivers.sim.wire.ptu import SimulatedPtu
-from tools.arguments import end
-from tools.campaign import options
+from tools.command import end, options
 
 SDK = PacketHandler(2.0)
 MARK = b"\xff\xff\xfd"
@@ -40,7 +39,7 @@ AWKWARD = bytes((0xFF, 0xFF, 0xFF, 0xFD, 0xFD, 0x00, 0x00, 0x01, 0x04, 0x07, 0x5
 LONGEST = 1024
 
 
-class Failed(Exception):
+class ParserFailed(Exception):
     """A parser did what it must not."""
 
 
@@ -145,12 +144,12 @@ def seen(stream: bytes, taken: list[tuple[int, bytes]], sent: tuple[int, bytes],
     allowed = {(packet_id, plain(body)) for _, _, packet_id, body in real}
     for one in taken:
         if one not in allowed:
-            raise Failed(f"{where} took {one} out of {stream.hex()}")
+            raise ParserFailed(f"{where} took {one} out of {stream.hex()}")
     if taken[-1:] != [sent]:
         begin = len(stream) - len(packet(*sent))
         if any(start < begin < end for start, end, _, _ in real):
             return "coincidence"
-        raise Failed(f"{where} did not take the last packet of {stream.hex()}, but {taken}")
+        raise ParserFailed(f"{where} did not take the last packet of {stream.hex()}, but {taken}")
     return "right"
 
 
@@ -188,7 +187,7 @@ def simulator_parser(rng: random.Random) -> str:
 AXIS = AxisSettings(math.tau / 4096, 0.0, -3.0, 3.0, 6.0, 60.0)
 
 
-class Bus:
+class FuzzedBus:
     """Simulated servos that live through many streams, as they are left by each."""
 
     def __init__(self) -> None:
@@ -230,7 +229,7 @@ class Bus:
             found = [p for reply in replies for p in packets_in(reply.data)]
             bodies = [body for _, _, packet_id, body in found if packet_id == servo.servo_id]
             if len(bodies) != 1 or (bodies[0][:1], bodies[0][2:4]) != wanted:
-                raise Failed(f"no answer to a ping of {servo.servo_id} after {stream.hex()}")
+                raise ParserFailed(f"no answer to a ping of {servo.servo_id} after {stream.hex()}")
         self.bus.host_baud = None
         return "right"
 
@@ -244,7 +243,7 @@ class Bus:
                     return  # a servo of a fast read is missing, its piece and those behind it too
                 if len({servo.servo_id for servo in self.servos}) < len(self.servos):
                     return  # two that share an id talk at once
-                raise Failed(f"the bus said {said.hex()} to {stream.hex()}")
+                raise ParserFailed(f"the bus said {said.hex()} to {stream.hex()}")
             at = end
 
 
@@ -288,12 +287,12 @@ def driver_fast_parser(rng: random.Random) -> str:
     allowed = {(packet_id, found) for _, _, packet_id, found in real}
     for one_taken in taken:
         if one_taken not in allowed:
-            raise Failed(f"the driver took {one_taken} out of {stream.hex()}")
+            raise ParserFailed(f"the driver took {one_taken} out of {stream.hex()}")
     if taken[-1:] != [(0xFE, body)]:
         begin = len(stream) - len(last)
         if any(s < begin < e or begin < s for s, e, _, _ in real):
             return "coincidence"
-        raise Failed(f"the driver did not take the last packet of {stream.hex()}, but {taken}")
+        raise ParserFailed(f"the driver did not take the last packet of {stream.hex()}, but {taken}")
     return "right"
 
 
@@ -340,10 +339,10 @@ def ptu_simulator(rng: random.Random) -> str:
         say(b" ")
     last = resolution()
     if first is None or last is None:
-        raise Failed(f"{model} did not tell its resolution ({first}, {last}) after {stream!r}")
+        raise ParserFailed(f"{model} did not tell its resolution ({first}, {last}) after {stream!r}")
     steps = math.log2(last / first)
     if abs(steps - round(steps)) > 1e-3 or abs(steps) > 3.01:
-        raise Failed(f"{model} told {last} instead of {first} after {stream!r}")
+        raise ParserFailed(f"{model} told {last} instead of {first} after {stream!r}")
     return "right"
 
 
@@ -396,7 +395,7 @@ def ptu_driver(rng: random.Random) -> str:
     if taken[-1][1] is None and re.match(rb"(!T)?!P[PT]", taken[-1][0]):
         return "refused: hit right before echo"
     if taken[-1][1] != float(number):
-        raise Failed(f"the answer {words!r} was read as {taken[-1]} at the end of {stream!r}")
+        raise ParserFailed(f"the answer {words!r} was read as {taken[-1]} at the end of {stream!r}")
     outcome = "right"
     same = {float(o[2]) for o in others if o[:2] == (kind, axis)} | {float(number)}
     for got, value in taken:
@@ -404,7 +403,7 @@ def ptu_driver(rng: random.Random) -> str:
             continue
         text = got.decode("latin-1").lower()
         if not all(word in text for word in query.words) or f"{value:g}".lstrip("-")[:1] not in text:
-            raise Failed(f"{got!r} was read as {value} in answer to {query.letters}")
+            raise ParserFailed(f"{got!r} was read as {value} in answer to {query.letters}")
         outcome = "changed digit"
     return outcome
 
@@ -413,7 +412,7 @@ def targets() -> dict[str, Callable[[random.Random], str]]:
     """What is fuzzed, by name."""
     return {
         "simulated servos: parser": simulator_parser,
-        "simulated servos: bus": Bus(),
+        "simulated servos: bus": FuzzedBus(),
         "servo driver: parser": driver_parser,
         "servo driver: fast reads": driver_fast_parser,
         "simulated PTU": ptu_simulator,
@@ -436,7 +435,7 @@ def campaign(cases: int, seed: int) -> tuple[dict[str, Counter[str]], dict[str, 
             except Exception as error:
                 counts[name]["FAILED"] += 1
                 failures.append(f"seed {seed}, {name}, case {case}: {type(error).__name__}: {error}")
-                if isinstance(target, Bus):
+                if isinstance(target, FuzzedBus):
                     target.renew()
         spent_s[name] = time.perf_counter() - begun
     return counts, spent_s, failures

@@ -28,10 +28,9 @@ from calib.matching.warp import Plane, warp_patch
 from drivers.sim.render import compile_renderer
 from mastctl.cli.output import at_least
 from mastctl.packaged import config_folder
-from mastctl.report.records import write_csv
-from tools.arguments import end, new_file
-from tools.campaign import options, run_cases, show
-from tools.campaigns.handoff_provocations import KINDS, Case, Stage
+from mastctl.report.pages import write_csv
+from tools.campaigns.handoff_provocations import KINDS, ProvokedHandoff, Stage
+from tools.command import end, new_file, options, run_cases, show
 
 WRONG_PX = 4.0
 RIGHT_PX = 1.0
@@ -49,7 +48,7 @@ ANYTHING = MatchSettings(
 
 
 @dataclass(frozen=True)
-class Outcome:
+class HandoffOutcome:
     """One case in one destination camera; errors are lengths in px, not-a-number where there is no pixel."""
 
     kind: str
@@ -71,15 +70,15 @@ class Outcome:
         return self.refined_px if self.verdict == "accepted" else self.correlated_px
 
 
-def run_case(case: Case, number: int) -> list[Outcome]:
+def run_case(case: ProvokedHandoff, number: int) -> list[HandoffOutcome]:
     """Hand one target over; nothing where the geometric hand-off refuses by itself."""
     at = Joints(*case.joints_rad, JOINT_SIGMA_RAD)
     believed = case.believed
     pair, to = believed.stereo[case.step[0]], believed.stereo[case.step[1]]
     step = " to ".join(case.step)
 
-    def outcome(camera: str, verdict: str, reason: str, *numbers: float) -> Outcome:
-        return Outcome(case.kind, case.note, number, step, camera, verdict, reason, *numbers)
+    def outcome(camera: str, verdict: str, reason: str, *numbers: float) -> HandoffOutcome:
+        return HandoffOutcome(case.kind, case.note, number, step, camera, verdict, reason, *numbers)
 
     try:
         done = hand_off(
@@ -103,14 +102,14 @@ def run_case(case: Case, number: int) -> list[Outcome]:
     return outcomes
 
 
-def _surface(case: Case, done: Handoff) -> Plane:
+def _surface(case: ProvokedHandoff, done: Handoff) -> Plane:
     """What the source pair sees, without thresholds; level ground at the clicks' point where it sees none."""
     (left, right), clicks = case.source, case.clicks_px
     found = find_partner(left.image, left.camera, clicks[0], right.image, right.camera, settings=ANYTHING)
     return found.plane or Plane(done.seen.position_m, np.array([0.0, 0.0, -1.0]))
 
 
-def correlated(case: Case, eye: Eye, plane: Plane, predicted: PredictedPixel) -> np.ndarray:
+def correlated(case: ProvokedHandoff, eye: Eye, plane: Plane, predicted: PredictedPixel) -> np.ndarray:
     """Return where the warped patch correlates best in the window; the geometric pixel if there is none."""
     settings = RefineSettings()
     reach = settings.sigmas * math.sqrt(float(np.linalg.eigvalsh(predicted.search_px2)[-1]))
@@ -129,12 +128,12 @@ def correlated(case: Case, eye: Eye, plane: Plane, predicted: PredictedPixel) ->
     return np.array([x + u, y + v]) - PAD + HALF_PX + template.target_px - template.centre_px
 
 
-def _off(pixel_px: np.ndarray, case: Case, name: str) -> float:
+def _off(pixel_px: np.ndarray, case: ProvokedHandoff, name: str) -> float:
     return float(np.linalg.norm(pixel_px - case.true_px[name]))
 
 
 @dataclass(frozen=True)
-class Row:
+class HandoffRow:
     """One row of the table, in cases: both eyes together; None where none was accepted."""
 
     kind: str
@@ -148,13 +147,13 @@ class Row:
     refused_right: int
 
 
-def summarise(kind: str, cases: Sequence[Sequence[Outcome]]) -> Row:
+def summarise(kind: str, cases: Sequence[Sequence[HandoffOutcome]]) -> HandoffRow:
     """Count cases: wrong if an eye's answer is, flagged if no such eye is accepted."""
     accepted = [[one for one in eyes if one.verdict == "accepted"] for eyes in cases]
     wrong = [[one for one in eyes if one.answer_px > WRONG_PX] for eyes in cases]
     errors = np.array([one.refined_px for eyes in accepted for one in eyes])
     right = [max(one.correlated_px for one in eyes) <= RIGHT_PX for eyes in cases]
-    return Row(
+    return HandoffRow(
         kind,
         len(cases),
         sum(bool(eyes) for eyes in accepted),
@@ -175,7 +174,7 @@ COLUMNS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class HandoffBlock:
     """Cases of one kind from ``first`` on, up to ``BLOCK``, with a draw of their own."""
 
     true: Rig
@@ -186,7 +185,7 @@ class Block:
     count: int
 
 
-def run_block(block: Block) -> list[list[Outcome]]:
+def run_block(block: HandoffBlock) -> list[list[HandoffOutcome]]:
     """Hand over the cases of a block: outcomes in each eye."""
     compile_renderer()
     calibration = stored_covariance(block.believed) or RigCovariance((), np.zeros((0, 0)))
@@ -212,12 +211,12 @@ def main() -> int:
     if args.kind:
         wanted = {args.kind: args.cases}
     blocks = [
-        Block(true, believed, args.seed, kind, first, min(BLOCK, count - first))
+        HandoffBlock(true, believed, args.seed, kind, first, min(BLOCK, count - first))
         for kind, count in wanted.items()
         for first in range(0, count, BLOCK)
     ]
     label = "{0.kind}, {0.count} from {0.first}".format
-    done: dict[str, list[list[Outcome]]] = {kind: [] for kind in wanted}
+    done: dict[str, list[list[HandoffOutcome]]] = {kind: [] for kind in wanted}
     for block, cases in zip(blocks, run_cases(args, "blocks", run_block, blocks, label), strict=True):
         done[block.kind] += cases
     bad = [cases for kind in KINDS for cases in done.get(kind, [])]

@@ -52,7 +52,7 @@ SECOND_EYE_RAD = (0.002, 0.02)
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ProvokedView:
     """What one look is made of: scenes of the source's and the destination's pictures, and what is wrong."""
 
     source: Scene
@@ -64,7 +64,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class ProvokedHandoff:
     """One target in the pictures of one look.
 
     Attributes
@@ -110,7 +110,7 @@ class Stage:
         self._true, self._believed, self._calibration = true, believed, calibration
         self._scenes: dict[SceneSettings, Scene] = {}
 
-    def cases(self, kind: str, count: int, first: int = 0) -> Iterator[Case]:
+    def cases(self, kind: str, count: int, first: int = 0) -> Iterator[ProvokedHandoff]:
         """Yield ``count`` cases of a kind, by turns of either step; a draw of its own for each ``first``."""
         self.close()
         self._rng = np.random.default_rng([self._scene_seed, *kind.encode(), *([first] if first else [])])
@@ -132,7 +132,7 @@ class Stage:
 
     def _look(
         self, kind: str, off_px: float, source: str, to: str, distance_m: float, azimuth_rad: float
-    ) -> Iterator[Case]:
+    ) -> Iterator[ProvokedHandoff]:
         """One look from a new place: up to ``PER_VIEW`` targets."""
         rng = self._rng
         azimuth = rng.uniform(-azimuth_rad, azimuth_rad)
@@ -173,7 +173,7 @@ class Stage:
             clicks = exact + rng.normal(0.0, view.sigma_px, (2, 2))
             clicks[1, 0] += view.second_click_px * rng.choice([-1.0, 1.0])
             source_eyes = (eyes[pair[0]], eyes[pair[1]])
-            yield Case(
+            yield ProvokedHandoff(
                 kind, f"{view.note}, mast file off by {off_px:g} px", (source, to), (pan, tilt), source_eyes,
                 destinations, believed, calibration, clicks, view.sigma_px, true,
             )  # fmt: skip
@@ -212,7 +212,7 @@ class Stage:
 
     def _candidates(
         self,
-        view: View,
+        view: ProvokedView,
         world: ApproachWorld,
         camera: str,
         joints: tuple[float, float],
@@ -243,7 +243,7 @@ class Stage:
     def _shows(
         self,
         world: ApproachWorld,
-        view: View,
+        view: ProvokedView,
         names: tuple[str, ...],
         joints: tuple[float, float],
         point: Float64,
@@ -263,43 +263,49 @@ class Stage:
 
     # ------------------------------------------------------------- what is wrong
 
-    def _view(self, kind: str, distance_m: float, azimuth: float) -> View:
+    def _view(self, kind: str, distance_m: float, azimuth: float) -> ProvokedView:
         """The scenes of one look of a kind."""
         rng = self._rng
         usual = SceneSettings(seed=self._scene_seed)
         if kind == "good":
             scene = self._scene(usual)
-            return View(scene, scene, "as it is")
+            return ProvokedView(scene, scene, "as it is")
         if kind == "occluded":
             scene = self._scene(usual)
             hidden = with_bricks(scene, self._row(scene, distance_m, azimuth))
             stood = bool(rng.random() < 0.5) and distance_m < 4.0
-            return View(hidden if stood else scene, hidden, "stood there" if stood else "came between")
+            return ProvokedView(
+                hidden if stood else scene, hidden, "stood there" if stood else "came between"
+            )
         if kind == "flat":
             contrast = float(np.exp(rng.uniform(*np.log(CONTRASTS))))
             scene = faded(self._scene(usual), contrast)
-            return View(scene, scene, f"contrast {contrast:.3f}")
+            return ProvokedView(scene, scene, f"contrast {contrast:.3f}")
         if kind == "repeated":
             count, natural = int(rng.choice(PERIODS_PER_SIDE)), float(rng.choice([0.0, 0.1, 0.2]))
             scene = repeated(self._scene(usual), count, natural, rng)
             sigma = float(rng.choice([CLICK_PX, 1.0]))
             side_mm = ground.DETAIL_TEXELS * ground.DETAIL_TEXEL_M * 1e3
             note = f"period {side_mm / count:.0f} mm, natural {natural:g}, clicks {sigma:g} px"
-            return View(scene, scene, note, sigma_px=sigma)
+            return ProvokedView(scene, scene, note, sigma_px=sigma)
         if kind == "shadow":
             low = replace(usual, rocks=300, bricks=12, sun_elevation_rad=0.45)
             by = float(rng.uniform(*SUN_BY_RAD) * rng.choice([-1.0, 1.0]))
             moved = replace(low, sun_azimuth_rad=low.sun_azimuth_rad + by)
             contrast = float(rng.choice([1.0, 0.3, 0.1]))
             scenes = [faded(self._scene(one), contrast, broad=False) for one in (low, moved)]
-            return View(scenes[0], scenes[1], f"sun by {math.degrees(by):.0f} degrees, contrast {contrast:g}")
+            return ProvokedView(
+                scenes[0], scenes[1], f"sun by {math.degrees(by):.0f} degrees, contrast {contrast:g}"
+            )
         assert kind == "range"
         scene = self._scene(usual)
         if rng.random() < 0.5:
             off = float(rng.uniform(*SECOND_CLICK_PX))
-            return View(scene, scene, f"second click off by {off:.1f} px", second_click_px=off)
+            return ProvokedView(scene, scene, f"second click off by {off:.1f} px", second_click_px=off)
         turn = float(rng.uniform(*SECOND_EYE_RAD) * rng.choice([-1.0, 1.0]))
-        return View(scene, scene, f"head turned by {turn * 1e3:.1f} mrad between", second_eye_rad=turn)
+        return ProvokedView(
+            scene, scene, f"head turned by {turn * 1e3:.1f} mrad between", second_eye_rad=turn
+        )
 
     def _scene(self, settings: SceneSettings) -> Scene:
         """Build a scene, or take it from those kept."""

@@ -25,8 +25,7 @@ from mastctl.devices.judge import REST_S, KeepOutJudge
 from mastctl.devices.keep_out import Box, KeptOut, NoWay, Pair, Span
 from mastctl.devices.limits import Limits
 from mastctl.motion.jog import AHEAD_S, TICK_S
-from tools.arguments import end
-from tools.campaign import options, run_cases
+from tools.command import end, options, run_cases
 
 LOOK_S = 0.01
 LATEST_S = 0.08
@@ -49,14 +48,14 @@ def case(seed: str, checked: bool = True, actions: int = ACTIONS) -> Driven:
 
 
 @dataclass(frozen=True)
-class Case:
+class KeepOutCase:
     """One head and its boxes, drawn by the seed, with the door or past it."""
 
     seed: str
     checked: bool
 
 
-def run_case(one: Case) -> Driven:
+def run_case(one: KeepOutCase) -> Driven:
     """Drive one head of the campaign."""
     return case(one.seed, one.checked)
 
@@ -268,7 +267,7 @@ def main() -> int:
     parser = options(__doc__, 200, "heads")
     parser.add_argument("--unchecked", action="store_true", help="send every goal, past the door")
     args = parser.parse_args()
-    cases = [Case(f"{args.seed}/{number}", not args.unchecked) for number in range(args.cases)]
+    cases = [KeepOutCase(f"{args.seed}/{number}", not args.unchecked) for number in range(args.cases)]
     founds = run_cases(args, "heads", run_case, cases, lambda one: f"case {one.seed}")
     counts = sum((found.counts for found in founds), Counter[str]())
     least_rad = min(found.least_rad for found in founds)

@@ -49,8 +49,7 @@ from mastctl.recorder.repair import repair
 from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.writer import Attached
 from mastctl.safety.state_file import StateFile
-from tools.arguments import end
-from tools.campaign import options
+from tools.command import end, options
 
 MOST_LOST_S = 1.0
 STEP_S = 0.005
@@ -141,7 +140,7 @@ def _by_the_library(path: Path) -> int:
 
 
 @dataclass
-class Child:
+class RecordingChild:
     """A child at work, and when it gets its signal."""
 
     pid: int
@@ -150,7 +149,7 @@ class Child:
     kill_s: float
 
 
-def begun(folder: Path, mast: MastTold, seed: int, life_s: float) -> Child:
+def begun(folder: Path, mast: MastTold, seed: int, life_s: float) -> RecordingChild:
     """Start a child."""
     folder.mkdir()
     told = mmap.mmap(-1, PLACE.size)
@@ -161,16 +160,16 @@ def begun(folder: Path, mast: MastTold, seed: int, life_s: float) -> Child:
             record_until_killed(folder, mast, seed, told)
         finally:
             os._exit(1)
-    return Child(pid, folder, told, now_s + life_s)
+    return RecordingChild(pid, folder, told, now_s + life_s)
 
 
-def killed(child: Child) -> int:
+def killed(child: RecordingChild) -> int:
     """Kill a child, wait for its end and return how that was."""
     os.kill(child.pid, signal.SIGKILL)
     return os.waitpid(child.pid, 0)[1]
 
 
-def ended(child: Child, mast: MastTold) -> Killed:
+def ended(child: RecordingChild, mast: MastTold) -> Killed:
     """Kill a child and judge what it left."""
     if not os.WIFSIGNALED(killed(child)):
         return Killed(0, 0, 0.0, 0, "it ended by itself")
@@ -181,7 +180,7 @@ def kills(count: int, at_once: int, seed: int, folder: Path) -> list[Killed]:
     """Kill ``count`` children, ``at_once`` at a time, and return what each left."""
     chance = random.Random(seed)
     mast = mast_of(default_config())
-    running: list[Child] = []
+    running: list[RecordingChild] = []
     results: list[Killed] = []
     begins = iter(range(count))
     try:

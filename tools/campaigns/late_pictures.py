@@ -31,9 +31,8 @@ from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.frames import camera_and_sequence
 from mastctl.experiment.simulated import demo_config
-from mastctl.experiment.targets import Target, Views, pointed
-from tools.arguments import end
-from tools.campaign import numbers, options, run_cases, show
+from mastctl.experiment.targets import Target, TargetViews, pointed
+from tools.command import end, numbers, options, run_cases, show
 
 PAIR = ("navcam_left", "navcam_right")
 PAN_RANGE_RAD = 1.2
@@ -46,7 +45,7 @@ BUFFERED = -1.0
 
 
 @dataclass(frozen=True)
-class Task:
+class LateTask:
     """One target: by number and distance; the speeds, and the lags that are tried at each."""
 
     index: int
@@ -78,7 +77,7 @@ class LateFound:
 Key = tuple[float, float]
 
 
-def lagging(config: Config, task: Task, speed_rad_per_s: float, lag_s: float) -> Config:
+def lagging(config: Config, task: LateTask, speed_rad_per_s: float, lag_s: float) -> Config:
     """The rover with cameras that stamp so late, a cap of speed, and what is asked of a second picture."""
     clocks = {} if lag_s == BUFFERED else {name: {"stamped_late_s": lag_s} for name in PAIR}
     hardware = replace(config.hardware, simulation={**config.hardware.simulation, "clocks": clocks})
@@ -105,13 +104,13 @@ def buffered() -> Iterator[None]:
         SimulatedCamera.next_frame = plain  # type: ignore[method-assign]
 
 
-def point(task: Task) -> dict[Key, LateFound]:
+def point(task: LateTask) -> dict[Key, LateFound]:
     """Find a target with honest cameras, and point at it at every speed with every lag."""
     config = demo_config(load_config(None), head=task.head, seed=task.seed)
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
         rng = np.random.default_rng([task.seed, task.index])
         rig = parse_rig(client.mast_file(), "the mast file").rig
-        views = Views(client, rig, PAIR, client.status()["limits"], rng, PAN_RANGE_RAD)
+        views = TargetViews(client, rig, PAIR, client.status()["limits"], rng, PAN_RANGE_RAD)
         target = next(filter(None, (views.find_target(task.distance_m) for _ in range(TRIES))), None)
     found: dict[Key, LateFound] = {}
     for speed, lag_s in product(task.speeds_rad_per_s, task.lags_s) if target is not None else ():
@@ -205,7 +204,7 @@ def main() -> int:
     args = parser.parse_args()
     lags_s = (0.0, BUFFERED, *args.lags)
     tasks = [
-        Task(index, float(at_m), args.speeds, lags_s, args.repeat_after, args.head, args.seed)
+        LateTask(index, float(at_m), args.speeds, lags_s, args.repeat_after, args.head, args.seed)
         for index, at_m in enumerate(np.geomspace(2.0, 8.0, args.cases))
     ]
     label = "target {0.index} at {0.distance_m:.1f} m".format

@@ -45,8 +45,7 @@ from mastctl.cli.output import at_least
 from mastctl.config import load_config
 from mastctl.motion.settings import PointingSettings
 from mastctl.packaged import config_folder
-from tools.arguments import end
-from tools.campaign import options, run_cases, show
+from tools.command import end, options, run_cases, show
 
 PAIRS = ("navcam", "pancam")
 PERIOD_S, EXPOSURE_S = 0.1, 0.008
@@ -95,7 +94,7 @@ class LifeRow(NamedTuple):
 
 
 @dataclass(frozen=True)
-class CameraTrial:
+class LightTrial:
     """An option, the section ``cameras`` that is it, and the targets."""
 
     option: str
@@ -142,7 +141,7 @@ def main() -> int:
     if args.of == "cameras":
         cameras = config.hardware.simulation.get("cameras", {})
         trials = [
-            CameraTrial(option, only_of(cameras, keys), args.cases or 4, args.seed)
+            LightTrial(option, only_of(cameras, keys), args.cases or 4, args.seed)
             for option, keys in OF_CAMERAS.items()
         ]
         lights = run_cases(args, "options", pointed, trials, lambda trial: trial.option)
@@ -274,7 +273,7 @@ def only_of(cameras: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any]
     return kept
 
 
-def pointed(trial: CameraTrial) -> LightRow:
+def pointed(trial: LightTrial) -> LightRow:
     """The pointing experiment on the packaged rover with such cameras."""
     folder = config_folder()
     config = yaml.safe_load((folder / "default.yaml").read_text())

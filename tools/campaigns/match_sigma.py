@@ -37,8 +37,7 @@ from mastctl.motion.looking import CameraView, Clicked, RigCameras
 from mastctl.motion.results import PointingError
 from mastctl.motion.settings import PointingSettings
 from mastctl.packaged import config_folder
-from tools.arguments import end
-from tools.campaign import options, run_cases, show
+from tools.command import end, options, run_cases, show
 from tools.sim_survey.board import photograph
 
 LEFT, RIGHT = "navcam_left", "navcam_right"
@@ -57,7 +56,7 @@ MATCHES = ("other eye", "after a turn")
 
 
 @dataclass(frozen=True)
-class Look:
+class MatchLook:
     """Pictures of both eyes at a random pose and after a turn, and so many targets in them."""
 
     rig: Rig
@@ -69,7 +68,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Row:
+class MatchRow:
     """Matches of one kind: asked for, and errors and sigmas (n, 2) px of the good ones."""
 
     asked: int
@@ -77,7 +76,7 @@ class Row:
     sigma_px: FloatArray
 
 
-Rows = dict[tuple[str, str], Row]
+Rows = dict[tuple[str, str], MatchRow]
 """By settings and kind of match."""
 
 
@@ -87,10 +86,10 @@ def renderer(relief_m: float, seed: int) -> Renderer:
     return Renderer(build_scene(SceneSettings(seed=seed, relief_m=relief_m)), workers=1)
 
 
-class Taken:
+class TakenPose:
     """Pictures of one pose of the head, and its cameras."""
 
-    def __init__(self, look: Look, pan_rad: float, tilt_rad: float, rng: np.random.Generator) -> None:
+    def __init__(self, look: MatchLook, pan_rad: float, tilt_rad: float, rng: np.random.Generator) -> None:
         drawing = renderer(look.relief_m, look.seed)
         site_from_head = look.rig.mast.rover_from_head(pan_rad, tilt_rad)
         self.views: dict[str, CameraView] = {}
@@ -107,14 +106,14 @@ class Taken:
             self.views[name] = CameraView(frame, grey(image), camera)
 
 
-def run_look(look: Look) -> Rows:
+def run_look(look: MatchLook) -> Rows:
     """Take the pictures and match the targets by each of the settings."""
     rng = np.random.default_rng([look.seed, look.number])
     range_m = np.exp(rng.uniform(np.log(NEAR_M), np.log(FAR_M)))
     pan, tilt = rng.uniform(-0.9, 0.9), -np.arctan2(1.46, range_m)
     turn = rng.uniform(-0.15, 0.15, 2)
-    first = Taken(look, pan, tilt, rng)
-    second = Taken(look, pan + turn[0], tilt + turn[1], rng)
+    first = TakenPose(look, pan, tilt, rng)
+    second = TakenPose(look, pan + turn[0], tilt + turn[1], rng)
     scene = renderer(look.relief_m, look.seed).scene
     found: dict[tuple[str, str], list[FloatArray | None]] = {
         (name, kind): [] for name in SETTINGS for kind in MATCHES
@@ -130,12 +129,12 @@ def run_look(look: Look) -> Rows:
     rows = {}
     for key, matches in found.items():
         good = np.array([one for one in matches if one is not None]).reshape(-1, 2, 2)
-        rows[key] = Row(len(matches), good[:, 0], good[:, 1])
+        rows[key] = MatchRow(len(matches), good[:, 0], good[:, 1])
     return rows
 
 
 def chosen(
-    look: Look, scene: Scene, first: Taken, second: Taken, rng: np.random.Generator
+    look: MatchLook, scene: Scene, first: TakenPose, second: TakenPose, rng: np.random.Generator
 ) -> Iterator[tuple[FloatArray, tuple[FloatArray, FloatArray]]]:
     """Pixels of the left eye with texture, and where the right eye, and the left after the turn, see them."""
     view = first.views[LEFT]
@@ -165,7 +164,7 @@ def shown(scene: Scene, camera: CameraModel, point_m: FloatArray) -> FloatArray 
 
 
 def matched(
-    eyes: RigCameras, pixel: FloatArray, first: Taken, second: Taken
+    eyes: RigCameras, pixel: FloatArray, first: TakenPose, second: TakenPose
 ) -> tuple[PatchMatch | None, PatchMatch | None]:
     """The matches in the other eye and after the turn, None where the loop refuses."""
     view = first.views[LEFT]
@@ -197,7 +196,7 @@ class _NoCameras:
 def together(parts: Sequence[Rows]) -> Rows:
     """Rows of several looks as one."""
     return {
-        key: Row(
+        key: MatchRow(
             sum(part[key].asked for part in parts),
             np.concatenate([part[key].error_px for part in parts]),
             np.concatenate([part[key].sigma_px for part in parts]),
@@ -247,7 +246,7 @@ def main() -> int:
     args = parser.parse_args()
     rig = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig
     looks = [
-        Look(rig, relief_m, seed, number, args.targets, args.colour)
+        MatchLook(rig, relief_m, seed, number, args.targets, args.colour)
         for relief_m in args.relief
         for seed in range(1, args.seeds + 1)
         for number in range(args.cases)

@@ -35,14 +35,13 @@ from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.open_hardware import open_hardware
 from mastctl.cli.output import at_least
 from mastctl.packaged import config_folder
-from tools.arguments import end
-from tools.campaign import options, run_cases, show
+from tools.command import end, options, run_cases, show
 
 PAIRS = {"navcam": ("navcam_left", "navcam_right"), "pancam": ("pancam_left", "pancam_right")}
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class WalkView:
     """Pictures by camera with the joint angles that the head reads, and the true angles (pan, tilt) then."""
 
     pictures: dict[str, Posed]
@@ -60,7 +59,7 @@ class Tally:
     missed: int = 0
 
 
-def taken(moves: int, seed: int, head: str) -> list[View]:
+def taken(moves: int, seed: int, head: str) -> list[WalkView]:
     """Return ``moves`` + 2 views."""
     rng = np.random.default_rng(seed)
     names = [name for pair in PAIRS.values() for name in pair]
@@ -69,7 +68,7 @@ def taken(moves: int, seed: int, head: str) -> list[View]:
     settings = HardwareSettings(
         DeviceSettings("sim"), dict.fromkeys(names, DeviceSettings("sim")), rover, folder
     )
-    views: list[View] = []
+    views: list[WalkView] = []
     with open_hardware(settings, clock) as hardware:
         assert hardware.simulation is not None
         at = np.array([0.0, -0.4])
@@ -88,7 +87,7 @@ def taken(moves: int, seed: int, head: str) -> list[View]:
                 )
                 for name in names
             }
-            views.append(View(pictures, hardware.simulation.true_joints(begun_s)))
+            views.append(WalkView(pictures, hardware.simulation.true_joints(begun_s)))
             way = np.exp(rng.uniform(np.log(1e-3), np.log(0.4))) * rng.choice([-1.0, 1.0], 2)
             at = np.clip(at + way * rng.uniform([0.5, 0.1], [1.0, 0.5]), [-1.2, -0.75], [1.2, -0.15])
     return views
@@ -99,7 +98,7 @@ def fresh(view: Posed, told: Posed | None = None) -> Posed:
     return Posed(view.image, *(told or view).angles_rad)
 
 
-def is_lie(shown: View, told: Posed, allowed_rad: tuple[float, float]) -> bool:
+def is_lie(shown: WalkView, told: Posed, allowed_rad: tuple[float, float]) -> bool:
     """Whether a view is truly another than the told one, by more than is allowed."""
     return bool((np.abs(np.subtract(shown.true_rad, told.angles_rad)) > allowed_rad).any())
 
@@ -141,7 +140,7 @@ def _sum(tallies: list[Tally]) -> Tally:
     return total
 
 
-def judged(rig: Rig, views: list[View]) -> dict[str, dict[str, Tally]]:
+def judged(rig: Rig, views: list[WalkView]) -> dict[str, dict[str, Tally]]:
     """Judge every move by every pair: honest pictures, those of before, those of the next view."""
     tallies = {pair: {kind: Tally() for kind in ("honest", "before", "next")} for pair in PAIRS}
     for before, after, later in zip(views, views[1:], views[2:], strict=False):

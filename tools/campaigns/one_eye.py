@@ -25,9 +25,8 @@ from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.frames import camera_and_sequence
 from mastctl.experiment.simulated import SimulationTruth, demo_config
-from mastctl.experiment.targets import Target, Views, pointed
-from tools.arguments import end
-from tools.campaign import numbers, options, percent, rms, run_cases, show
+from mastctl.experiment.targets import Target, TargetViews, pointed
+from tools.command import end, numbers, options, percent, rms, run_cases, show
 
 PAIR = ("navcam_left", "navcam_right")
 CASES = ("pair", "range told", "plane told", "unknown")
@@ -37,7 +36,7 @@ NORMAL_95, CHI2_95_OF_TWO = 1.96, 5.991
 
 
 @dataclass(frozen=True)
-class Task:
+class OneEyeTask:
     """One target at a distance."""
 
     distance_m: float
@@ -69,13 +68,13 @@ def alone(config: Config) -> Config:
     return replace(config, hardware=replace(config.hardware, cameras=cameras))
 
 
-def point(task: Task) -> dict[str, OneEyeFound]:
+def point(task: OneEyeTask) -> dict[str, OneEyeFound]:
     """Find one target with the pair and point at it in every case."""
     config = demo_config(load_config(None), head=task.head, seed=task.seed)
     with RunningDaemon(config) as two, Client(two.url) as pair:
         rng = np.random.default_rng([task.seed, round(1000 * task.distance_m), task.index])
         rig = parse_rig(pair.mast_file(), "the mast file").rig
-        views = Views(pair, rig, PAIR, pair.status()["limits"], rng, PAN_RANGE_RAD)
+        views = TargetViews(pair, rig, PAIR, pair.status()["limits"], rng, PAN_RANGE_RAD)
         target: Target | None = None
         for _ in range(TRIES):
             target = views.find_target(task.distance_m)
@@ -152,7 +151,9 @@ def main() -> int:
     parser.add_argument("--distances", type=numbers, default="10,6,2", metavar="M,M", help="(default 10,6,2)")
     parser.add_argument("--head", default="ptu_d46_70", metavar="NAME", help="preset (default ptu_d46_70)")
     args = parser.parse_args()
-    tasks = [Task(at, index, args.head, args.seed) for at in args.distances for index in range(args.cases)]
+    tasks = [
+        OneEyeTask(at, index, args.head, args.seed) for at in args.distances for index in range(args.cases)
+    ]
     results = run_cases(args, "targets", point, tasks, "target {0.index} at {0.distance_m:g} m".format)
     rows = []
     for case in CASES:

@@ -21,8 +21,7 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.pointing import solve
 from calib.geometry.rig import Mast
 from calib.geometry.solutions import Solution
-from tools.arguments import end
-from tools.campaign import options, run_cases
+from tools.command import end, options, run_cases
 
 WORST_PX = 1e-7
 BLOCK = 1000
@@ -31,7 +30,7 @@ SAME_RAD = 1e-5
 
 
 @dataclass(frozen=True)
-class Case:
+class MastCase:
     """One random mast, camera and pixel, the joint angles chosen, and the target they put on the pixel."""
 
     mast: Mast
@@ -43,10 +42,10 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SolvedCase:
     """What became of a case: its solutions, or the refusal, and whether the generating one is there."""
 
-    case: Case
+    case: MastCase
     solutions: list[Solution]
     refused: str
     found: bool
@@ -111,7 +110,7 @@ def random_camera(rng: np.random.Generator, kind: str) -> CameraModel:
     )
 
 
-def random_case(rng: np.random.Generator, number: int) -> Case:
+def random_case(rng: np.random.Generator, number: int) -> MastCase:
     """Return case ``number``: every second mast is skew, the three camera models take turns."""
     mast = random_mast(rng, skew=number % 2 == 1)
     while True:
@@ -125,16 +124,16 @@ def random_case(rng: np.random.Generator, number: int) -> Case:
         tilt *= 0.4
     range_m = 10.0 ** rng.uniform(np.log10(0.5), 2.0)
     target = rover_from_head(mast, pan, tilt, rays.origins_m + range_m * rays.directions)
-    return Case(mast, camera, pixel, float(pan), float(tilt), target)
+    return MastCase(mast, camera, pixel, float(pan), float(tilt), target)
 
 
-def run_case(case: Case) -> Outcome:
+def run_case(case: MastCase) -> SolvedCase:
     """Return what the solver makes of one case."""
     began = time.perf_counter()
     try:
         solutions = solve(case.mast, case.camera, case.target_in_rover_m, case.pixel_px)
     except Unreachable as why:
-        return Outcome(case, [], str(why), False, np.inf, time.perf_counter() - began)
+        return SolvedCase(case, [], str(why), False, np.inf, time.perf_counter() - began)
     seconds = time.perf_counter() - began
     wanted = np.array([case.pan_rad, case.tilt_rad])
     joints = np.array([[one.pan_rad, one.tilt_rad] for one in solutions])
@@ -142,11 +141,11 @@ def run_case(case: Case) -> Outcome:
     in_head = [head_from_rover(case.mast, pan, tilt, case.target_in_rover_m) for pan, tilt in joints]
     pixels, valid = case.camera.project(np.array(in_head))
     errors = np.where(valid, np.abs(pixels - case.pixel_px).max(axis=1), np.inf)
-    return Outcome(case, solutions, "", bool(misses.min() <= SAME_RAD), float(errors.max()), seconds)
+    return SolvedCase(case, solutions, "", bool(misses.min() <= SAME_RAD), float(errors.max()), seconds)
 
 
 @dataclass(frozen=True)
-class Block:
+class MastBlock:
     """Cases from ``first`` on, up to ``BLOCK``, with a draw of their own."""
 
     seed: int
@@ -154,7 +153,7 @@ class Block:
     count: int
 
 
-def run_block(block: Block) -> list[Outcome]:
+def run_block(block: MastBlock) -> list[SolvedCase]:
     """Return what becomes of the cases of a block."""
     rng = np.random.default_rng([block.seed, block.first])
     return [run_case(random_case(rng, block.first + number)) for number in range(block.count)]
@@ -164,7 +163,7 @@ def main() -> int:
     """Run the campaign; exit 1 if a solution was lost or one missed its pixel by more than 1e-7."""
     args = options(__doc__, 10_000, "random masts").parse_args()
     blocks = [
-        Block(args.seed, first, min(BLOCK, args.cases - first)) for first in range(0, args.cases, BLOCK)
+        MastBlock(args.seed, first, min(BLOCK, args.cases - first)) for first in range(0, args.cases, BLOCK)
     ]
     found = run_cases(args, "thousands", run_block, blocks, lambda block: f"cases from {block.first}")
     worst: dict[tuple[str, str], float] = {}

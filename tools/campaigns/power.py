@@ -31,12 +31,11 @@ from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.survey.records import Survey
 from mastctl.calibration.bench_verdict import judge_bench
-from mastctl.calibration.expected import RARELY
+from mastctl.calibration.checks import RARELY
 from mastctl.cli.output import at_least
 from mastctl.packaged import config_folder
-from tools.arguments import end
-from tools.campaign import heading, line, options, run_cases
 from tools.campaigns.bench_coverage import plan_of
+from tools.command import end, heading, line, options, run_cases
 from tools.sim_survey.bench import BenchPlan, Mishap, simulate_bench
 from tools.sim_survey.blunders import with_slipped_joint
 from tools.sim_survey.plan import SurveyPlan

@@ -42,14 +42,13 @@ from calib.geometry.rig import MAST_NAMES, Rig, numbers_of
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import triangulate
 from calib.survey.records import Sigma, Survey
-from mastctl.calibration import expected
-from mastctl.calibration.expected import check_sizes
+from mastctl.calibration import checks as expected
+from mastctl.calibration.checks import check_sizes
 from mastctl.calibration.run import SurveyRefused, checked_survey
 from mastctl.calibration.verdict import judge_calibration
 from mastctl.packaged import config_folder
-from tools.arguments import end
-from tools.campaign import options, rms, run_cases
 from tools.campaigns.survey_provocations import PROVOCATIONS, Provoked
+from tools.command import end, options, rms, run_cases
 from tools.sim_survey.plan import SurveyPlan, rover_from_head
 
 DIRECTIONS_RAD = ((-0.8, -0.2), (0.0, -0.4), (0.7, -0.7))
@@ -81,7 +80,7 @@ LEVELS = {
 """At what chance each test warns; check images do for each of four cameras."""
 
 
-class Task(NamedTuple):
+class ProvokedTask(NamedTuple):
     """One survey of a true rig."""
 
     rig: Rig
@@ -89,7 +88,7 @@ class Task(NamedTuple):
     seed: int
 
 
-class Outcome(NamedTuple):
+class ProvokedOutcome(NamedTuple):
     """What came of a survey: what was wrong, the grade or '' if refused, the worst error in sigmas and of
     what, the reasons that were not good, and by test the chance of what it found (`chances_of`)."""
 
@@ -102,7 +101,7 @@ class Outcome(NamedTuple):
     chances: dict[str, float]
 
 
-def judged(task: Task) -> Outcome:
+def judged(task: ProvokedTask) -> ProvokedOutcome:
     """Return what the verdict on one provoked survey is, and how far the truth is."""
     joint_rad = COUNTED_RAD if task.seed % 2 else 0.0
     plan = SurveyPlan(sigma=replace(SIGMA, joint_rad=joint_rad))
@@ -112,13 +111,13 @@ def judged(task: Task) -> Outcome:
         warnings = checked_survey(made.survey)
         fit = fit_joint(made.survey, made.mast_parameters)
     except (SurveyRefused, CalibError) as refused:
-        return Outcome(task.kind, made.words, "", float("nan"), "", (str(refused),), {})
+        return ProvokedOutcome(task.kind, made.words, "", float("nan"), "", (str(refused),), {})
     verdict = judge_calibration(made.survey, fit, warnings)
     errors = errors_in_sigmas(made, fit)
     worst = max(errors, key=errors.__getitem__)
     reasons = tuple(r.sentence for r in verdict.reasons if r.grade != "good")
     reasons += tuple(str(warning) for warning in warnings)
-    return Outcome(
+    return ProvokedOutcome(
         task.kind, made.words, verdict.grade, errors[worst], worst, reasons, chances_of(made.survey, fit)
     )
 
@@ -210,13 +209,13 @@ def _pointing(made: Provoked, fit: Calibration, pair: tuple[str, str]) -> FloatA
     return np.array(errors)
 
 
-def tasks_of(rig: Rig, cases: int, seed: int) -> list[Task]:
+def tasks_of(rig: Rig, cases: int, seed: int) -> list[ProvokedTask]:
     """The cases: one kind after the other, the clean ones a fifth of all."""
     wrong = [kind for kind in PROVOCATIONS if kind != "nothing wrong"]
     kinds = [
         "nothing wrong" if n % CLEAN == 0 else wrong[(n - n // CLEAN - 1) % len(wrong)] for n in range(cases)
     ]
-    return [Task(rig, kind, seed + number) for number, kind in enumerate(kinds)]
+    return [ProvokedTask(rig, kind, seed + number) for number, kind in enumerate(kinds)]
 
 
 def main() -> int:
@@ -248,7 +247,7 @@ def main() -> int:
     return 0
 
 
-def report(outcomes: list[Outcome]) -> None:
+def report(outcomes: list[ProvokedOutcome]) -> None:
     """Print the table, and every case in which the verdict erred."""
     heads = ("cases", "refused", *(f"{far}: {what}" for far in FAR for what in SAID.values()))
     print(f"{'':16s} " + "  ".join(heads))
@@ -285,7 +284,7 @@ def false_alarms(chances: list[dict[str, float]]) -> None:
             )
 
 
-def _cell(one: Outcome) -> str:
+def _cell(one: ProvokedOutcome) -> str:
     """Which column of the table an outcome belongs to."""
     if not one.grade:
         return "refused"

@@ -27,8 +27,7 @@ from calib.matching.handed_over import MatchedHandoff, matched_handoff
 from calib.matching.handoff import RefinedPixel
 from mastctl.calibration.landing import handoff_errors_px
 from mastctl.cli.output import at_least, not_negative, positive_number
-from tools.arguments import end
-from tools.campaign import options, rms, run_cases
+from tools.command import end, options, rms, run_cases
 
 HEAD_HEIGHT_M, ASIDE_RAD = 1.45, 0.35
 HELD_OUT, HELD_OUT_M = 60, (1.5, 4.0)
@@ -42,7 +41,7 @@ ROWS = [
 
 
 @dataclass(frozen=True)
-class Block:
+class RefineBlock:
     """Cases of one row from ``first`` on, up to ``BLOCK``, with a draw of their own."""
 
     true: Rig
@@ -57,7 +56,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Case:
+class RefinedCase:
     """One fit: significant or not, directions told, chi-square of six, held-out errors (n, 2) px."""
 
     significant: bool
@@ -97,7 +96,7 @@ def targets(
 def handed(
     believed: Rig,
     true: Rig,
-    block: Block,
+    block: RefineBlock,
     rng: np.random.Generator,
 ) -> list[MatchedHandoff]:
     """Hand-offs of a case, with the errors of clicks and matches."""
@@ -141,7 +140,7 @@ def moved(true: Rig, step: FloatArray) -> tuple[Rig, FloatArray]:
     return replace(true, cameras={**true.cameras, **cameras}), np.concatenate([step[:3], shift])
 
 
-def run_block(block: Block) -> list[Case]:
+def run_block(block: RefineBlock) -> list[RefinedCase]:
     """Return what the fits of a block come to; the cases of all rows have the same draws."""
     true, rng = block.true, np.random.default_rng([block.seed, block.first])
     cases = []
@@ -154,14 +153,14 @@ def run_block(block: Block) -> list[Case]:
         held_out = rng.integers(1 << 31)
         before, after = (errors_px(rig, true, np.random.default_rng(held_out)) for rig in (believed, taken))
         chi2 = float(off @ np.linalg.solve(fit.covariance, off))
-        cases.append(Case(fit.significant, fit.seen, chi2, before, after))
+        cases.append(RefinedCase(fit.significant, fit.seen, chi2, before, after))
     return cases
 
 
-def blocks_of(true: Rig, options: argparse.Namespace) -> list[Block]:
+def blocks_of(true: Rig, options: argparse.Namespace) -> list[RefineBlock]:
     """The tasks, row by row."""
     return [
-        Block(
+        RefineBlock(
             true, ranges_m, size, first, min(BLOCK, options.cases - first),
             options.handoffs, options.click_px, options.match_px, options.seed,
         )
@@ -203,7 +202,7 @@ def main() -> int:
     return 0
 
 
-def label(block: Block) -> str:
+def label(block: RefineBlock) -> str:
     """A task in words."""
     targets = next(words for words, ranges_m, _ in ROWS if ranges_m == block.ranges_m)
     return f"{targets}, {'moved' if block.size else 'not moved'}, cases from {block.first}"

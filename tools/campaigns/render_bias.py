@@ -24,8 +24,7 @@ from calib.geometry.rigid import FloatArray, Rigid, rot_y, rot_z
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 from mastctl.cli.output import at_least, positive_number
-from tools.arguments import end
-from tools.campaign import options, run_cases
+from tools.command import end, options, run_cases
 
 MAST = Mast(np.array([0.3443, -0.0043, -1.4572]), np.array([-0.0088, -0.0181, 0.0027]))
 Poses = Callable[[CameraModel, float, np.random.Generator], tuple[Rigid, Rigid]]
@@ -42,7 +41,7 @@ UNEVEN = 0.03
 
 
 @dataclass(frozen=True)
-class Errors:
+class BiasErrors:
     """What was measured: error_px (n, 2), found minus true, in x and y, and how many patches were lost."""
 
     error_px: FloatArray
@@ -61,9 +60,9 @@ class Errors:
         )
 
 
-def together(parts: list[Errors]) -> Errors:
+def together(parts: list[BiasErrors]) -> BiasErrors:
     """All errors of several pairs of pictures."""
-    return Errors(np.concatenate([part.error_px for part in parts]), sum(part.lost for part in parts))
+    return BiasErrors(np.concatenate([part.error_px for part in parts]), sum(part.lost for part in parts))
 
 
 def mast_camera(focal_px: float, y_m: float, z_m: float, r2: float) -> CameraModel:
@@ -118,7 +117,7 @@ def measure(
     patches: int,
     rng: np.random.Generator,
     believed: CameraModel | None = None,
-) -> Errors:
+) -> BiasErrors:
     """Return the errors of up to ``patches`` patches carried from the first pose to the second.
 
     ``believed`` is the camera that geometry is reckoned with, ``camera`` by default.
@@ -150,7 +149,7 @@ def measure(
             lost += 1
         else:
             errors.append(found - truth)
-    return Errors(np.array(errors).reshape(-1, 2), lost)
+    return BiasErrors(np.array(errors).reshape(-1, 2), lost)
 
 
 def texture_of(image: np.ndarray) -> FloatArray:
@@ -268,7 +267,7 @@ def scene_renderer(scene: str, seed: int) -> Renderer:
     return Renderer(build_scene(flat if scene == "flat" else SceneSettings(seed=seed)), workers=1)
 
 
-def run_row(row: BiasRow) -> Errors:
+def run_row(row: BiasRow) -> BiasErrors:
     """Draw a row's pictures and measure them."""
     camera, poses = CAMERAS[row.camera]
     rng = np.random.default_rng([row.seed, int(row.range_m * 10), row.samples])

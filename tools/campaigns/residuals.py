@@ -40,8 +40,7 @@ from mastctl.devices.frames import camera_and_sequence
 from mastctl.experiment.simulated import own_config
 from mastctl.experiment.targets import BORDER_PX
 from mastctl.packaged import config_folder
-from tools.arguments import end
-from tools.campaign import options, rms, run_cases, show
+from tools.command import end, options, rms, run_cases, show
 
 DAYS = {"kind": "default.yaml", "worst": "worst_day.yaml"}
 PARTS: Mapping[str, tuple[str, ...]] = {
@@ -79,7 +78,7 @@ VIEWS = 40
 
 
 @dataclass(frozen=True)
-class Task:
+class ClicksTask:
     """So many clicks of one group, in one scene of its own, on a day without some of its `PARTS`."""
 
     day: str
@@ -91,7 +90,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Click:
+class TrueClick:
     """One click: how far away, what was refused, or the error and the sigma (x, y) in px.
 
     Attributes
@@ -127,7 +126,7 @@ def config_of(day: str, scene_seed: int, without: Sequence[str] = ()) -> Config:
     return replace(config, hardware=replace(config.hardware, simulation=simulation, cameras=cameras))
 
 
-def click_all(task: Task) -> list[Click]:
+def click_all(task: ClicksTask) -> list[TrueClick]:
     """Click in random views of a scene of the task's own."""
     scene_seed = int(np.random.default_rng([task.seed, task.number, 1]).integers(1, 2**31))
     rng = np.random.default_rng([task.seed, task.number, GROUPS.index(task.group), 2])
@@ -140,7 +139,7 @@ def click_all(task: Task) -> list[Click]:
         return [click(client, rover, task.group, rng) for _ in range(task.cases)]
 
 
-def click(client: Client, rover: SimulatedRover, group: str, rng: np.random.Generator) -> Click:
+def click(client: Client, rover: SimulatedRover, group: str, rng: np.random.Generator) -> TrueClick:
     """Click a random pixel of the group in a random view, and hold the residual against the truth."""
     shot, pixel = random_click(client, rover, group, rng)
     seen_by = camera_of(rover, shot, pixel[1])
@@ -157,16 +156,16 @@ def click(client: Client, rover: SimulatedRover, group: str, rng: np.random.Gene
     try:
         record = client.wait(client.point(pixel=(LEFT, shot.frame_id, *pixel)), timeout_s=WAITED_S)
     except ClientError as error:
-        return Click(**about, refused=f"{error.code}: {error}")
+        return TrueClick(**about, refused=f"{error.code}: {error}")
     if record["state"] != "done":
         told = record["error"] or {"code": record["state"], "message": ""}
-        return Click(**about, refused=f"{told['code']}: {told['message']}")
+        return TrueClick(**about, refused=f"{told['code']}: {told['message']}")
     (row,) = record["pointings"]
     measured = np.array(row["target_px"])
     landed = client.snapshot(LEFT, frame_id=row["frame_id"])
     true, _ = camera_of(rover, landed, float(measured[1])).project(point)
     error_px, sigma_px = measured - true, row["residual_sigma_px"]
-    return Click(**about, refused="", error_px=tuple(error_px.tolist()), sigma_px=tuple(sigma_px))
+    return TrueClick(**about, refused="", error_px=tuple(error_px.tolist()), sigma_px=tuple(sigma_px))
 
 
 def camera_of(rover: SimulatedRover, shot: Snapshot, row_px: float) -> CameraModel:
@@ -235,7 +234,7 @@ def shown(rover: SimulatedRover, camera: CameraModel, point_m: FloatArray) -> bo
     return ends_m > (1.0 - HIDDEN) * float((point_m - ray.origins_m) @ ray.directions)
 
 
-def told(day: str, group: str, clicks: Sequence[Click]) -> dict[str, Any]:
+def told(day: str, group: str, clicks: Sequence[TrueClick]) -> dict[str, Any]:
     """A row of the table."""
     refused = [one for one in clicks if one.refused]
     good = [one for one in clicks if not one.refused]
@@ -263,7 +262,7 @@ def told(day: str, group: str, clicks: Sequence[Click]) -> dict[str, Any]:
     }
 
 
-def _code(one: Click) -> str:
+def _code(one: TrueClick) -> str:
     return one.refused.split(":")[0]
 
 
@@ -293,7 +292,9 @@ def main() -> int:
     )
     args = parser.parse_args()
     tasks = [
-        Task(day, tuple(args.without), group, args.seed, number, min(A_TASK, args.cases - number * A_TASK))
+        ClicksTask(
+            day, tuple(args.without), group, args.seed, number, min(A_TASK, args.cases - number * A_TASK)
+        )
         for number in range(math.ceil(args.cases / A_TASK))
         for day in args.day
         for group in GROUPS

@@ -8,7 +8,8 @@ A scene, at the level of features: two eyes look all round at two tilts, 22 rest
 ground; the head's rests err by ``--repeat-rad``, while ``--told-rad`` is what the fit is told. One thing is
 wrong with the rig, by turns: an eye turned (2 mrad), an eye refocused (0.2 %), the tilt axis leaning (2
 mrad), a pan encoder off its centre (2 mrad), or two of these. ``--right``: nothing is. ``--pictures``: the
-same with rendered pictures of the packaged Navcams (`tools.still_scene`), 20 of 10 rests.
+same with rendered pictures of the packaged Navcams (nothing of `calib.scene` has a part in them), 20 of 10
+rests.
 
 Told are how often the 95 % interval holds the truth, of the corrected numbers and of pixels: points at 2, 5
 and 15 m, near the middle and a corner of one rest's picture, are predicted for another rest's from where the
@@ -20,6 +21,9 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -28,13 +32,68 @@ from calib.calibrate.scene.features import Feature, find_features
 from calib.calibrate.scene.fit import SceneFit, fit_scene
 from calib.calibrate.scene.terms import SceneView, corrected
 from calib.errors import NoCorrection
+from calib.files.mast_file import load_rig
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Mast, Rig, RigCamera
-from calib.geometry.rigid import FloatArray
+from calib.geometry.rigid import FloatArray, Rigid
+from drivers.sim.optics.readout import Noise
+from drivers.sim.render import Renderer
+from drivers.sim.scene import SceneSettings, build_scene
 from mastctl.cli.output import positive_number
-from tools.arguments import end
-from tools.campaign import options, rms, run_cases
-from tools.still_scene import navcams, pictures, rests
+from tools.command import end, options, rms, run_cases
+
+RIG = Path(__file__).resolve().parents[1] / "configs" / "sim" / "rocky8.yaml"
+NAVCAMS = ("navcam_left", "navcam_right")
+
+Rest = tuple[float, float]
+TrueAngles = Callable[[int, Rest], Rest]
+"""Where the joints truly stand, by the rest's number and what they read."""
+
+
+def navcams() -> Rig:
+    """The packaged rover's mast with its two Navcams alone."""
+    rig = load_rig(RIG).rig
+    cameras = {name: rig.cameras[name] for name in NAVCAMS}
+    return Rig("navcams", rig.mast, cameras, {"navcam": NAVCAMS})
+
+
+def rests(rows: int, columns: int, span_rad: float) -> list[Rest]:
+    """Where the head looks: rows of tilts from -0.15 rad down, pans to either side, there and back again."""
+    tilts = -0.15 - 0.3 * np.arange(rows)
+    pans = np.linspace(-span_rad / 2, span_rad / 2, columns)
+    return [
+        (float(pan), float(tilt))
+        for row, tilt in enumerate(tilts)
+        for pan in (pans if row % 2 == 0 else pans[::-1])
+    ]
+
+
+def pictures(
+    true: Rig,
+    looked: list[Rest],
+    angles: TrueAngles,
+    seed: int,
+    noise_dn: float = 1.5,
+    moved: Callable[[int], Rigid] = lambda _: Rigid.identity(),
+) -> Iterator[SceneView]:
+    """Yield what the head cameras of a true rig see, with the angles that the joints read.
+
+    ``moved`` says where the rover stands at a rest, in its first place's frame.
+    """
+    renderer = _renderer(seed)
+    for pose, rest in enumerate(looked):
+        site_from_head = moved(pose) @ true.mast.rover_from_head(*angles(pose, rest))
+        for name, camera in true.cameras.items():
+            light = renderer.image(camera.model, site_from_head, 2)
+            noise = Noise(noise_dn, noise_dn, seed, name)
+            image: FloatArray = noise.levels(light, noise.sigma_dn(light), pose).astype(np.float32)
+            yield SceneView(f"{name} {pose}", name, image, *rest, pose)
+
+
+@cache
+def _renderer(seed: int) -> Renderer:
+    return Renderer(build_scene(SceneSettings(seed=seed)), workers=1)
+
 
 Z = 1.959964
 SIZE, FOCAL_PX, NOISE_PX = (1024, 768), 1280.0, 0.1
@@ -57,7 +116,7 @@ class SceneTask(NamedTuple):
     drawn: bool
 
 
-class Score(NamedTuple):
+class SceneScore(NamedTuple):
     """What a scene told: terms; errors over sigmas of numbers and of pixels; rms pixels before and after."""
 
     kind: str
@@ -132,7 +191,7 @@ def features_of(
     return views, features
 
 
-def score(task: SceneTask) -> Score | str:
+def score(task: SceneTask) -> SceneScore | str:
     """Return how far one scene's correction is from the truth, or why there is none."""
     rng = np.random.default_rng([task.seed, 3])
     believed = navcams() if task.drawn else eyes()
@@ -163,7 +222,7 @@ def score(task: SceneTask) -> Score | str:
     before, after, spread = foretold(believed, true, fit)
     moved = spread > LEAST_PX  # what goes by an eye that was not corrected is as it was
     pixels = after[moved] / spread[moved]
-    return Score(
+    return SceneScore(
         task.kind, fit.taken, off, pixels, rms(before), rms(after), fit.joint_sigma_rad, fit.scale, seconds
     )
 
@@ -211,7 +270,7 @@ def main() -> int:
         for seed in range(args.seed, args.seed + args.cases)
     ]  # fmt: skip
     found = run_cases(args, "scenes", score, tasks, lambda task: f"seed {task.seed}")
-    scores = [one for one in found if isinstance(one, Score)]
+    scores = [one for one in found if isinstance(one, SceneScore)]
     if scores:
         report(scores)
     refused = [one for one in found if isinstance(one, str)]
@@ -221,7 +280,7 @@ def main() -> int:
     return 0
 
 
-def report(scores: list[Score]) -> None:
+def report(scores: list[SceneScore]) -> None:
     """Print the tables."""
     for kind in sorted({one.kind for one in scores}):
         mine = [one for one in scores if one.kind == kind]

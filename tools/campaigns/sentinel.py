@@ -29,10 +29,9 @@ from calib.geometry.rigid import FloatArray
 from mastctl.cli.output import at_least
 from mastctl.watch.reference import Reference, look_line
 from mastctl.watch.sentinel import slow_course, standing
-from tools.arguments import end
-from tools.campaign import options
-from tools.campaigns.sentinel_days import RESTS, Truth, about, alarm
+from tools.campaigns.sentinel_days import RESTS, ChangedRig, about, alarm
 from tools.campaigns.sentinel_rendered import calm_days, power
+from tools.command import end, options
 
 SIZE = (1024, 768)
 FOCAL_PX = 1280.0
@@ -64,7 +63,7 @@ def rig() -> Rig:
     return Rig("campaign", Mast(MAST_M, np.zeros(3)), cameras)
 
 
-def shown(points: FloatArray, eye: str, pan: float, tilt: float, truth: Truth) -> FloatArray:
+def shown(points: FloatArray, eye: str, pan: float, tilt: float, truth: ChangedRig) -> FloatArray:
     """Pixels (n, 2) of points (n, 3) in the rover's first frame, by a pinhole and turns one after another."""
     r = truth.rover
     seen = points @ (about(2, r[2]) @ about(1, r[1]) @ about(0, r[0]))
@@ -75,7 +74,7 @@ def shown(points: FloatArray, eye: str, pan: float, tilt: float, truth: Truth) -
     return np.stack([f * y / x + (SIZE[0] - 1) / 2, f * z / x + (SIZE[1] - 1) / 2], axis=1)
 
 
-class Site:
+class FeatureSite:
     """A rover's surroundings with its reference look."""
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -94,9 +93,9 @@ class Site:
                 far = rng.uniform(2.0, 25.0, FEATURES)[:, None]
                 points = MAST_M + (place + ahead * far) @ (about(2, pan) @ about(1, tilt)).T
                 self.points[pose, eye] = points
-                self.then[pose, eye] = shown(points, eye, *(np.array([pan, tilt]) + off[pose]), Truth())
+                self.then[pose, eye] = shown(points, eye, *(np.array([pan, tilt]) + off[pose]), ChangedRig())
 
-    def look(self, truth: Truth) -> SceneDrift:
+    def look(self, truth: ChangedRig) -> SceneDrift:
         """One day's look: what the sentinel finds."""
         rng = self.rng
         dust, spoil = rng.uniform(0.2, 1.0), rng.uniform(1.0, 2.0)
@@ -128,30 +127,30 @@ class Site:
         return find_drift(self.rig, shifts)
 
 
-def random_change(rng: np.random.Generator) -> Truth:
+def random_change(rng: np.random.Generator) -> ChangedRig:
     """A bump, a slip, another focus or a rover that sank, from some sigmas up."""
     eye = str(rng.choice(list(EYES_M)))
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
     match rng.integers(5):
         case 0:
-            return Truth(turned={eye: direction * rng.uniform(1.0e-3, 3e-3)}, name=f"{eye} turned")
+            return ChangedRig(turned={eye: direction * rng.uniform(1.0e-3, 3e-3)}, name=f"{eye} turned")
         case 1:
-            return Truth(
+            return ChangedRig(
                 focal={eye: float(rng.choice([-1, 1]) * rng.uniform(1e-3, 5e-3))}, name=f"{eye} refocused"
             )
         case 2:
-            return Truth(
+            return ChangedRig(
                 slip=(float(rng.choice([-1, 1]) * rng.uniform(1.5e-3, 5e-3)), 0.0), name="pan slipped"
             )
         case 3:
-            return Truth(
+            return ChangedRig(
                 slip=(0.0, float(rng.choice([-1, 1]) * rng.uniform(1.5e-3, 5e-3))), name="tilt slipped"
             )
         case _:
             level = np.array([direction[0], direction[1], 0.0])
             level /= np.linalg.norm(level)
-            return Truth(rover=level * rng.uniform(2e-3, 5e-3), name="rover turned")
+            return ChangedRig(rover=level * rng.uniform(2e-3, 5e-3), name="rover turned")
 
 
 def main() -> int:
@@ -169,11 +168,11 @@ def main() -> int:
             power(args.changes, args.seed, args.smaller, args.hour)
         return 1 if false_days else 0
     rng = np.random.default_rng(args.seed)
-    site, before, false, largest = Site(rng), None, [], 0.0
+    site, before, false, largest = FeatureSite(rng), None, [], 0.0
     for day in range(args.days):
         if day and day % RENEWED == 0:
-            site, before = Site(rng), None
-        now = site.look(Truth())
+            site, before = FeatureSite(rng), None
+        now = site.look(ChangedRig())
         largest = max(largest, *(change.sigmas for change in now.changes), 0.0)
         if alarm(before, now):
             false.append(f"day {day}: {now.sentence}")
@@ -186,7 +185,7 @@ def main() -> int:
         print(f"  {sentence}")
     told: Counter[str] = Counter()
     for _ in range(args.changes):
-        truth, site, before = random_change(rng), Site(rng), None
+        truth, site, before = random_change(rng), FeatureSite(rng), None
         kind = truth.name.split()[-1] if truth.name.startswith("navcam") else truth.name
         for look in range(LOOKS):
             now = site.look(truth)
@@ -213,13 +212,13 @@ def _slow(rng: np.random.Generator, masts: int) -> None:
     """Masts that lean by a little each day: are they told, as slow, and how fast?"""
     told, slow, off = 0, 0, []
     for _ in range(masts):
-        site, rate = Site(rng), float(rng.choice([-1, 1])) * rng.uniform(*SLOW_RAD)
+        site, rate = FeatureSite(rng), float(rng.choice([-1, 1])) * rng.uniform(*SLOW_RAD)
         begin = datetime(2026, 1, 1, tzinfo=UTC)
         reference = Reference(begin.isoformat(), "", RESTS, (), Path())
         looks = []
         for day in range(1, SLOW_DAYS + 1):
             now = begin + timedelta(days=day)
-            drift = site.look(Truth(slip=(0.0, rate * day)))
+            drift = site.look(ChangedRig(slip=(0.0, rate * day)))
             looks.append(look_line(reference, now.isoformat(), drift))
         says = standing(reference, looks, now)
         told += says.level == "bad"

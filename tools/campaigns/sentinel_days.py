@@ -40,7 +40,7 @@ RESTS = tuple(
 
 
 @dataclass(frozen=True)
-class Truth:
+class ChangedRig:
     """What is changed: turns of eyes, part of the focal length, slips, a turn of the rover; radians."""
 
     turned: Mapping[str, FloatArray] = field(default_factory=dict)
@@ -198,7 +198,7 @@ class Surroundings:
         return Scene(settings, world)
 
 
-def changed(model: CameraModel, eye: str, truth: Truth) -> CameraModel:
+def changed(model: CameraModel, eye: str, truth: ChangedRig) -> CameraModel:
     """A camera of the head as a change leaves it: turned about its own place, its focal length another."""
     t = truth.turned.get(eye, np.zeros(3))
     turn = about(2, t[2]) @ about(1, t[1]) @ about(0, t[0])
@@ -236,7 +236,7 @@ class Days:
         self._renderer: Renderer | None = None
 
     def look(
-        self, rng: np.random.Generator, day: Weather, truths: Sequence[Truth] = (Truth(),)
+        self, rng: np.random.Generator, day: Weather, truths: Sequence[ChangedRig] = (ChangedRig(),)
     ) -> list[DaysLook]:
         """Return a look for each truth, all on one day and from the same rests."""
         shown = self.place.scene(day)
@@ -253,7 +253,7 @@ class Days:
         rng: np.random.Generator,
         day: Weather,
         stood: FloatArray,
-        truth: Truth,
+        truth: ChangedRig,
         drawn: dict[object, Grey],
     ) -> list[ReferencePicture]:
         """One truth's pictures; light that another truth had as well is not drawn again."""

@@ -21,10 +21,10 @@ from mastctl.watch.looks import view_shifts
 from mastctl.watch.reference import Reference, save_reference
 from tools.campaigns.sentinel_days import (
     RESTS,
+    ChangedRig,
     Days,
     DaysLook,
     Surroundings,
-    Truth,
     Weather,
     alarm,
     moved_stones,
@@ -58,7 +58,7 @@ def eyes_of(name: str, by: int) -> Rig:
 
 
 @dataclass
-class Noise:
+class ViewNoise:
     """What pictures of days without a change were off by, beside what the head truly stood off."""
 
     views: int = 0
@@ -145,7 +145,7 @@ class RenderedSite:
 
 def calm_days(days: int, seed: int, by: int, hour: str) -> int:
     """Look at days without a change; return how many false alarms there were."""
-    noise, false, largest, blind, named = Noise(), [], 0.0, 0, 0
+    noise, false, largest, blind, named = ViewNoise(), [], 0.0, 0, 0
     begun_s = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         site: RenderedSite | None = None
@@ -216,20 +216,22 @@ def power(sites: int, seed: int, by: int, hour: str) -> None:
         print(f"  {case:28s} {quick:9d} {some:6d} {right:8d}")
 
 
-def provoked(rng: np.random.Generator, eyes: list[str]) -> dict[str, Truth]:
+def provoked(rng: np.random.Generator, eyes: list[str]) -> dict[str, ChangedRig]:
     """Return a change of each kind and size, about a random axis, of a random eye or joint."""
-    cases: dict[str, Truth] = {}
+    cases: dict[str, ChangedRig] = {}
     for size in TURNS_RAD:
         eye, axis = str(rng.choice(eyes)), rng.normal(size=3)
         turn = size * axis / np.linalg.norm(axis)
-        cases[f"turned {1e3 * size:g} mrad"] = Truth(turned={eye: turn}, name=f"{eye} turned")
+        cases[f"turned {1e3 * size:g} mrad"] = ChangedRig(turned={eye: turn}, name=f"{eye} turned")
     for part in FOCUS:
         eye, way = str(rng.choice(eyes)), float(rng.choice([-1, 1]))
-        cases[f"refocused {100 * part:g} %"] = Truth(focal={eye: way * part}, name=f"{eye} refocused")
+        cases[f"refocused {100 * part:g} %"] = ChangedRig(focal={eye: way * part}, name=f"{eye} refocused")
     for size in SLIPS_RAD:
         joint, way = int(rng.integers(2)), float(rng.choice([-1, 1]))
         slip = (way * size, 0.0) if joint == 0 else (0.0, way * size)
-        cases[f"slipped {1e3 * size:g} mrad"] = Truth(slip=slip, name=f"{('pan', 'tilt')[joint]} slipped")
+        cases[f"slipped {1e3 * size:g} mrad"] = ChangedRig(
+            slip=slip, name=f"{('pan', 'tilt')[joint]} slipped"
+        )
     return cases
 
 

@@ -40,19 +40,18 @@ from drivers.errors import DriverError, HardwareFault
 from drivers.faults import HEAD_WORDS
 from drivers.interfaces import Reading
 from mastctl.cli.output import at_least, positive_number
-from tools.arguments import end, new_file
-from tools.campaign import heading, line, options
 from tools.campaigns.servo_rigs import (
     LIMITS_RAD,
-    Rig,
+    HeadRig,
     as_opened,
     dynamixel,
     fresh_servos,
     opened_on,
     ptu,
 )
+from tools.command import end, heading, line, new_file, options
 
-DRIVERS: dict[str, Callable[[], AbstractContextManager[Rig]]] = {
+DRIVERS: dict[str, Callable[[], AbstractContextManager[HeadRig]]] = {
     "dynamixel_pty": partial(dynamixel, watchdog_s=0.3, reply_timeout_s=0.05),
     "ptu_pty": ptu,
     "dynamixel": partial(dynamixel, watchdog_s=0.3, reply_timeout_s=0.05, turned=True),
@@ -115,10 +114,10 @@ class ServoRow:
         return not (self.wrong or self.outside or self.lost or self.left_over)
 
 
-class Judge:
+class ReadingJudge:
     """Compares readings with the true angles, and true angles with the limits."""
 
-    def __init__(self, rig: Rig, row: ServoRow, lying: bool) -> None:
+    def __init__(self, rig: HeadRig, row: ServoRow, lying: bool) -> None:
         self._rig, self._row, self.lying = rig, row, lying
         self._seen_s = self._rig.clock.now_s()
 
@@ -176,12 +175,12 @@ class Judge:
             self._row.complaints.append(words)
 
 
-class Run:
+class ServoRun:
     """Episodes of one word on one rig."""
 
-    def __init__(self, rig: Rig, row: ServoRow, rng: np.random.Generator) -> None:
+    def __init__(self, rig: HeadRig, row: ServoRow, rng: np.random.Generator) -> None:
         self._rig, self._row, self._rng = rig, row, rng
-        self._judge = Judge(rig, row, row.word in LYING)
+        self._judge = ReadingJudge(rig, row, row.word in LYING)
 
     def episode(self) -> bool:
         """Healthy, faulty, healthy again; return whether the head came back without being switched off."""
@@ -319,7 +318,7 @@ def run_word(driver: str, word: str, transactions: int, seed: int, until_s: floa
         with ExitStack() as stack:
             rig = _opened(stack, driver)
             stack.enter_context(rig.clock.at_work())
-            run = Run(rig, row, rng)
+            run = ServoRun(rig, row, rng)
             while row.calls < transactions and time.monotonic() < until_s and run.episode():
                 pass
     waited_s = time.monotonic() + 10.0
@@ -329,7 +328,7 @@ def run_word(driver: str, word: str, transactions: int, seed: int, until_s: floa
     return row
 
 
-def _opened(stack: ExitStack, driver: str) -> Rig:
+def _opened(stack: ExitStack, driver: str) -> HeadRig:
     """A new rig; on a machine so busy that even a healthy head comes late it may take some tries."""
     for _ in range(OPENING_TRIES):
         with suppress(DriverError):

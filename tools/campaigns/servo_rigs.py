@@ -42,7 +42,7 @@ D48E_STEP_RAD = math.radians(162 / 7 / 3600)  # eighth step of 23.142857"
 
 
 @dataclass
-class Rig:
+class HeadRig:
     """A head, and what only the tester knows about it.
 
     Attributes
@@ -82,7 +82,7 @@ class Rig:
 
 
 @contextmanager
-def in_memory(turned: bool = False) -> Iterator[Rig]:
+def in_memory(turned: bool = False) -> Iterator[HeadRig]:
     """The simulated head without any bytes."""
     clock = _clock(turned)
     axes = [
@@ -92,7 +92,7 @@ def in_memory(turned: bool = False) -> Iterator[Rig]:
     panel = FaultPanel(clock.now_s, ())
     head = SimulatedPanTilt(HeadSettings("in memory", *axes), clock, panel)
     try:
-        yield Rig("in memory", head, clock, panel, head.true_joints, X_COUNT_RAD)
+        yield HeadRig("in memory", head, clock, panel, head.true_joints, X_COUNT_RAD)
     finally:
         head.close()
 
@@ -100,7 +100,7 @@ def in_memory(turned: bool = False) -> Iterator[Rig]:
 @contextmanager
 def dynamixel(
     watchdog_s: float = 0.0, reply_timeout_s: float = 0.2, *, turned: bool = False
-) -> Iterator[Rig]:
+) -> Iterator[HeadRig]:
     """Two XM430 servos behind a serial line.
 
     By default patient and without a watchdog: on a busy machine simulator and driver both come late.
@@ -124,7 +124,7 @@ def dynamixel(
         }  # fmt: skip
         head = open_dynamixel(options, clock, opens)
         stack.callback(head.close)
-        yield Rig("Dynamixel", head, clock, panel, _truth(axes), X_COUNT_RAD, line, sent)
+        yield HeadRig("Dynamixel", head, clock, panel, _truth(axes), X_COUNT_RAD, line, sent)
 
 
 class CountedServo(SimulatedServo):
@@ -175,7 +175,7 @@ def as_opened(servo: SimulatedServo, head: DynamixelHead) -> bool:
 
 
 @contextmanager
-def ptu(*, turned: bool = False) -> Iterator[Rig]:
+def ptu(*, turned: bool = False) -> Iterator[HeadRig]:
     """A D46-70 behind a serial line."""
     with ExitStack() as stack:
         clock = _clock(turned)
@@ -215,7 +215,7 @@ def line_alone(driver: str) -> Iterator[tuple[dict[str, Any], Callable[[float], 
 
 
 @contextmanager
-def ptu_tcp() -> Iterator[Rig]:
+def ptu_tcp() -> Iterator[HeadRig]:
     """A D48E, whose answers look otherwise, behind a TCP port."""
     with ExitStack() as stack:
         clock = SystemClock()
@@ -238,7 +238,7 @@ def _ptu_rig(
     panel: FaultPanel,
     axes: tuple[WireAxis, WireAxis],
     sent: list[int],
-) -> Rig:
+) -> HeadRig:
     """The driver on a simulated unit; positions of its pan grow to the left."""
     step_rad = D48E_STEP_RAD if name == "PTU, TCP" else D46_STEP_RAD
     acceleration = round(ACCELERATION_RAD_PER_S2 / step_rad)
@@ -253,7 +253,7 @@ def _ptu_rig(
     head = open_flir_ptu(options, clock, opens)
     stack.callback(head.close)
     fastest = unit.pan.now.fastest * step_rad  # its own; the options' speed is for moves that name none
-    return Rig(name, head, clock, panel, _truth(axes), step_rad, line, sent, fastest_rad_per_s=fastest)
+    return HeadRig(name, head, clock, panel, _truth(axes), step_rad, line, sent, fastest_rad_per_s=fastest)
 
 
 def _clock(turned: bool) -> Clock:

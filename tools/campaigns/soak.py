@@ -24,10 +24,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from tools.arguments import end
-from tools.campaign import options
 from tools.campaigns.soak_clients import Crowd
 from tools.campaigns.soak_ledger import SEES, Ledger
+from tools.command import end, options
 from tools.living_daemon import HEADS, Vitals, simulated, started, vitals
 
 MOST_GROWTH_MB = 20.0

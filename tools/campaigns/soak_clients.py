@@ -67,7 +67,7 @@ class Crowd:
         self._go = threading.Event()
         self._ending = threading.Event()
         self._idle: dict[str, threading.Event] = {}
-        clients: dict[str, Callable[[Client], None]] = {
+        clients: dict[str, Callable[[SoakClient], None]] = {
             "looker 1": _look, "looker 2": _look, "watcher": _watch, NAME: _steer, "rival": _rival,
             "faults": _set_fault, "staller": _stall, "vanisher": _vanish, "rubbish": _rubbish,
         }  # fmt: skip
@@ -103,7 +103,7 @@ class Crowd:
             good = idle.wait(max(0.0, until_s - time.monotonic()))
             self._ledger.check(good, f"{name} still waits for the daemon")
         with Asker(self._port, NAME) as asker:
-            told = _quiet(Client(NAME, self._port, asker, random.Random(0), self._ledger, self._go))
+            told = _quiet(SoakClient(NAME, self._port, asker, random.Random(0), self._ledger, self._go))
             good = told["state"] in ("ready", "holding") and not told["faults"]
             words = [fault["message"] for fault in told["faults"]]
             self._ledger.check(
@@ -126,7 +126,7 @@ class Crowd:
         for thread in self._threads:
             thread.join(1.0)
 
-    def _live(self, name: str, act: Callable[[Client], None], draw: random.Random) -> None:
+    def _live(self, name: str, act: Callable[[SoakClient], None], draw: random.Random) -> None:
         while True:
             self._idle[name].set()
             self._go.wait()
@@ -135,7 +135,7 @@ class Crowd:
             self._idle[name].clear()
             try:
                 with Asker(self._port, name) as asker:
-                    client = Client(name, self._port, asker, draw, self._ledger, self._go)
+                    client = SoakClient(name, self._port, asker, draw, self._ledger, self._go)
                     while client.goes_on:
                         act(client)
             except Exception as error:
@@ -144,7 +144,7 @@ class Crowd:
                     self._go.wait(0.2)
 
 
-class Client:
+class SoakClient:
     """What an act is given: somebody to ask, draws, and where to note what came."""
 
     def __init__(
@@ -205,7 +205,7 @@ class Client:
         return {"pan_rad": self.draw.uniform(-1.5, 1.5), "tilt_rad": self.draw.uniform(-0.7, 0.2)}
 
 
-def _quiet(client: Client) -> dict[str, Any]:
+def _quiet(client: SoakClient) -> dict[str, Any]:
     """Take back what was begun and return the status once the daemon is at rest, or is not in its time."""
     client.ask("DELETE", "/simulation/faults")
     client.ledger.faults_taken_back()
@@ -228,14 +228,14 @@ def _quiet(client: Client) -> dict[str, Any]:
 # Who looks
 
 
-def _look(client: Client) -> None:
+def _look(client: SoakClient) -> None:
     camera = client.draw.choice(SEES)
     if client.ask("GET", f"/snapshot/{camera}?fresh=false&format=jpeg")["http"] == 200:
         client.ledger.first(f"looked by {camera}")
     time.sleep(0.2)
 
 
-def _watch(client: Client) -> None:
+def _watch(client: SoakClient) -> None:
     asked_s = time.monotonic()
     client.ledger.status(client.ask("GET", "/status"), asked_s)
     time.sleep(0.2)
@@ -244,7 +244,7 @@ def _watch(client: Client) -> None:
 # Who steers
 
 
-def _steer(client: Client) -> None:
+def _steer(client: SoakClient) -> None:
     """What is not done yet comes first, in this order; then each as often as its weight says."""
     acts = {
         _angles: (4, "angles done"), _pixel: (3, "pixel done"), _place: (2, "place done"),
@@ -256,35 +256,35 @@ def _steer(client: Client) -> None:
     (first or client.draw.choices(list(acts), [weight for weight, _ in acts.values()]))[0](client)
 
 
-def _angles(client: Client) -> None:
+def _angles(client: SoakClient) -> None:
     client.point("angles", client.angles())
 
 
-def _outside(client: Client) -> None:
+def _outside(client: SoakClient) -> None:
     told = client.ask("POST", "/point", {"pan_rad": 2.9, "tilt_rad": 0.0})
     client.ledger.act("outside")
     if told["http"] == 202:
         client.ledger.check(False, "an angle outside the limits was taken")
 
 
-def _pixel(client: Client) -> None:
+def _pixel(client: SoakClient) -> None:
     _settle(client)
     shot = client.ask("GET", "/snapshot/navcam_left?fresh=true&format=jpeg")
     if shot["frame_id"] is not None:
         client.point("pixel", {"pixel": _clicked(client, shot["frame_id"])})
 
 
-def _clicked(client: Client, frame_id: str) -> dict[str, Any]:
+def _clicked(client: SoakClient, frame_id: str) -> dict[str, Any]:
     x_px, y_px = client.draw.uniform(150, 870), client.draw.uniform(250, 700)
     return {"camera": "navcam_left", "frame_id": frame_id, "x_px": x_px, "y_px": y_px}
 
 
-def _place(client: Client) -> None:
+def _place(client: SoakClient) -> None:
     place = [client.draw.uniform(3.0, 9.0), client.draw.uniform(-2.0, 2.0), 0.0]
     client.point("place", {"position_m": place, "frame": "rover"})
 
 
-def _track(client: Client) -> None:
+def _track(client: SoakClient) -> None:
     """Follow what is clicked while the rover drives a few steps."""
     client.point("angles", {"pan_rad": client.draw.uniform(-0.3, 0.3), "tilt_rad": -0.3})
     _settle(client)
@@ -316,14 +316,14 @@ def _track(client: Client) -> None:
     client.ask("POST", "/track/stop")
 
 
-def _settle(client: Client) -> None:
+def _settle(client: SoakClient) -> None:
     """Wait until the head rests, or something is wrong."""
     until_s = time.monotonic() + 5.0
     while time.monotonic() < until_s and client.ask("GET", "/status").get("moving"):
         time.sleep(0.05)
 
 
-def _jog(client: Client) -> None:
+def _jog(client: SoakClient) -> None:
     """Turn under a lease; half of the time the heartbeats just cease, and the head must stop by itself."""
     lease = client.ask("POST", "/lease", {"for_s": 10.0})
     client.ledger.act("jog")
@@ -350,7 +350,7 @@ def _jog(client: Client) -> None:
     client.ask("DELETE", "/lease", None, headers)
 
 
-def _stop(client: Client) -> None:
+def _stop(client: SoakClient) -> None:
     """Stop a move under way."""
     told = client.ask("POST", "/point", {**client.angles(), "deadline_s": DEADLINE_S})
     time.sleep(client.draw.uniform(0.0, 1.0))
@@ -362,7 +362,7 @@ def _stop(client: Client) -> None:
         client.wait("stopped", told["id"])
 
 
-def _estop(client: Client) -> None:
+def _estop(client: SoakClient) -> None:
     """Latch under way, see that nothing moves, and release."""
     told = client.ask("POST", "/point", {**client.angles(), "deadline_s": DEADLINE_S})
     time.sleep(client.draw.uniform(0.0, 1.0))
@@ -382,7 +382,7 @@ def _estop(client: Client) -> None:
         time.sleep(0.2)
 
 
-def _mast(client: Client) -> None:
+def _mast(client: SoakClient) -> None:
     """Use another mast file, point, and go back."""
     _settle(client)
     if client.ask("POST", "/mast", {"file": "other_mast.yaml"})["http"] == 200:
@@ -392,7 +392,7 @@ def _mast(client: Client) -> None:
         client.ask("POST", "/mast", {"file": "mast.yaml"})
 
 
-def _twice(client: Client) -> None:
+def _twice(client: SoakClient) -> None:
     """Ask for one pointing twice under one key; it must be one operation."""
     key = f"{client.draw.getrandbits(64):x}"
     body, headers = {**client.angles(), "deadline_s": DEADLINE_S}, {"Idempotency-Key": key}
@@ -404,7 +404,7 @@ def _twice(client: Client) -> None:
         client.wait("angles", first["id"])
 
 
-def _record(client: Client) -> None:
+def _record(client: SoakClient) -> None:
     """Record a pointing into a file of its own."""
     began = client.ask("POST", "/recordings/start", {})
     client.point("angles", client.angles())
@@ -415,13 +415,13 @@ def _record(client: Client) -> None:
 # Who disturbs
 
 
-def _rival(client: Client) -> None:
+def _rival(client: SoakClient) -> None:
     """Steer without asking who does."""
     client.point("rival", client.angles())
     time.sleep(client.draw.uniform(2.0, 10.0))
 
 
-def _set_fault(client: Client) -> None:
+def _set_fault(client: SoakClient) -> None:
     """Set a word for a while, and some time later another."""
     kind = client.draw.random()
     if kind < 0.45:
@@ -448,7 +448,7 @@ def _seeded(device: str, word: str) -> bool:
     return "seed" in words[word].parameters
 
 
-def _stall(client: Client) -> None:
+def _stall(client: SoakClient) -> None:
     """Ask for many pictures and read none."""
     with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", client.port)) as there:
         there.setblocking(False)
@@ -458,7 +458,7 @@ def _stall(client: Client) -> None:
     client.ledger.act("stalled")
 
 
-def _vanish(client: Client) -> None:
+def _vanish(client: SoakClient) -> None:
     """Start a client and kill it at work."""
     with subprocess.Popen(
         [sys.executable, "-c", VANISHING, str(client.port)], stderr=subprocess.DEVNULL
@@ -469,7 +469,7 @@ def _vanish(client: Client) -> None:
     time.sleep(client.draw.uniform(1.0, 6.0))
 
 
-def _rubbish(client: Client) -> None:
+def _rubbish(client: SoakClient) -> None:
     """Send what is no request, or a stop from nowhere, and go."""
     since_s = time.monotonic()
     with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", client.port), 2.0) as there:

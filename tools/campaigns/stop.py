@@ -20,9 +20,8 @@ from dataclasses import dataclass
 from drivers.errors import DriverError
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import VOLTAGE
-from tools.arguments import end
-from tools.campaign import options, run_cases
-from tools.campaigns.servo_rigs import ACCELERATION_RAD_PER_S2, Rig, dynamixel
+from tools.campaigns.servo_rigs import ACCELERATION_RAD_PER_S2, HeadRig, dynamixel
+from tools.command import end, options, run_cases
 
 AXES = ("pan", "tilt")
 LONGEST_S = 20.0
@@ -30,14 +29,14 @@ LATEST_S = 0.25
 """How long after the failure the stop comes at most."""
 
 
-def _line_fault(word: str, **parameters: float) -> Callable[[Rig, DynamixelBus, int], None]:
-    def begin(rig: Rig, bus: DynamixelBus, axis: int) -> None:
+def _line_fault(word: str, **parameters: float) -> Callable[[HeadRig, DynamixelBus, int], None]:
+    def begin(rig: HeadRig, bus: DynamixelBus, axis: int) -> None:
         rig.panel.set("pan_tilt", word, sender=axis + 1, replies=1e9, **parameters)
 
     return begin
 
 
-FAULTS: dict[str, Callable[[Rig, DynamixelBus, int], None]] = {
+FAULTS: dict[str, Callable[[HeadRig, DynamixelBus, int], None]] = {
     "none": lambda rig, bus, axis: None,
     "unpowered": lambda rig, bus, axis: bus.servos[axis].set_power(False, time.monotonic()),
     "mute": _line_fault("mute"),
@@ -50,7 +49,7 @@ FAULTS: dict[str, Callable[[Rig, DynamixelBus, int], None]] = {
 
 
 @dataclass
-class Stopped:
+class StopResult:
     """One trial: seconds from the call to the brake and for the call, radians beyond a perfect brake."""
 
     brake_s: float
@@ -68,7 +67,7 @@ class StopTrial:
     after_s: float
 
 
-def trial(one: StopTrial) -> Stopped:
+def trial(one: StopTrial) -> StopResult:
     """Stop a moving head of which one servo has failed; tell of the other axis."""
     logging.disable(logging.CRITICAL)  # each trial gives a line up, and says so
     fault, axis, after_s = one.fault, one.axis, one.after_s
@@ -107,7 +106,7 @@ def trial(one: StopTrial) -> Stopped:
         step_s = 0.002
         speed = (rig.true_rad(brake_s)[other] - rig.true_rad(brake_s - step_s)[other]) / step_s
         perfect_rad = speed**2 / (2 * ACCELERATION_RAD_PER_S2)
-        return Stopped(max(0.0, brake_s - called_s), call_s, way_rad - perfect_rad)
+        return StopResult(max(0.0, brake_s - called_s), call_s, way_rad - perfect_rad)
 
 
 def _until(true: Callable[[], bool]) -> None:

@@ -22,8 +22,8 @@ import numpy as np
 
 from drivers.sim.kept import kept_home
 from mastctl.cli.output import at_least, positive_number
-from tools.arguments import end
 from tools.closed_loop.run import RECORD
+from tools.command import end
 from tools.virtual_machine import boot, kernel
 
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -21,8 +21,8 @@ from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.pointing import PointingExperiment, TargetRecord, run_pointing_experiment
 from mastctl.experiment.simulated import SimulationTruth
-from tools.arguments import end
 from tools.closed_loop import files
+from tools.command import end
 
 RECORD = "record.json"
 
@@ -54,10 +54,10 @@ def in_memory(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 def through_devices(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     """Run on capture nodes and a serial line, with the world behind them, and a daemon of its own."""
-    from tools.closed_loop.world import World, WorldTruth
+    from tools.closed_loop.world import LoopWorld, WorldTruth
 
     files.write_rig(folder)
-    with World(folder / "rig.yaml", args.seed) as world:
+    with LoopWorld(folder / "rig.yaml", args.seed) as world:
         config = files.through_devices(folder, world.port, world.head)
         with _daemon(config) as url, Client(url) as client:
             document = _experiment(client, WorldTruth(world, client), args)

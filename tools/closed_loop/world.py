@@ -40,7 +40,7 @@ LOOK_EVERY_S = 0.01
 REFRESH_EVERY_S = 0.5
 
 
-class World:
+class LoopWorld:
     """Servos, scene, screens. A context manager; leaving it switches everything off.
 
     Parameters
@@ -78,10 +78,10 @@ class World:
         ]
         self._line = PtyLine(DynamixelBus(servos), clock, panel)
         self.port = self._line.path
-        self._eyes: list[Eye] = []
+        self._eyes: list[LoopEye] = []
 
-    def __enter__(self) -> World:
-        self._eyes = [Eye(self, index, name) for index, name in enumerate(files.CAMERAS)]
+    def __enter__(self) -> LoopWorld:
+        self._eyes = [LoopEye(self, index, name) for index, name in enumerate(files.CAMERAS)]
         return self
 
     def __exit__(self, *ignored: object) -> None:
@@ -130,7 +130,7 @@ class World:
         }
 
 
-class Eye:
+class LoopEye:
     """One camera's screen, and the thread that keeps it true.
 
     A frame of the capture node must show what was there at its stamp. Drawing takes longer than a frame, so
@@ -150,7 +150,7 @@ class Eye:
         What ended the thread; empty while all is well.
     """
 
-    def __init__(self, world: World, index: int, name: str) -> None:
+    def __init__(self, world: LoopWorld, index: int, name: str) -> None:
         self.pictures = 0
         self.worst_blind_s = 0.0
         self.worst_drawing_s = 0.0
@@ -227,7 +227,7 @@ class Eye:
 class WorldTruth:
     """Where a clicked point really is in a later frame (`mastctl.experiment.pointing.Truth`)."""
 
-    def __init__(self, world: World, client: Client) -> None:
+    def __init__(self, world: LoopWorld, client: Client) -> None:
         self._world = world
         self._client = client
 

@@ -51,7 +51,7 @@ NEIGHBOURS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class FlightView:
     """One replayed frame: grey picture, measured angles, and the camera there in the rover frame."""
 
     image: Grey
@@ -61,7 +61,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class CarriedFeatures:
     """A feature of one view found in another.
 
     ``across_px`` is its signed distance from the epipolar line; ``position_m`` the point that both views see.
@@ -106,7 +106,7 @@ class Rehearsal:
     angles that would put it in the middle of the picture.
     """
 
-    carried: Carried
+    carried: CarriedFeatures
     position_m: FloatArray
     aim_px: FloatArray
     solution: Solution
@@ -151,7 +151,7 @@ def replay(folder: Path, clock: ManualClock) -> Replay:
     return open_replay({"products": PRODUCTS, "camera": CAMERA}, folder, clock)
 
 
-def views(recording: Replay, clock: ManualClock, rover: Rig) -> list[View]:
+def views(recording: Replay, clock: ManualClock, rover: Rig) -> list[FlightView]:
     """Move the replayed head to every pointing in turn and take a picture there."""
     found = []
     for pointing in recording.pointings:
@@ -159,11 +159,11 @@ def views(recording: Replay, clock: ManualClock, rover: Rig) -> list[View]:
         frame = recording.cameras[CAMERA].next_frame(clock.now_s(), 1.0)
         reading = recording.pan_tilt.read()
         camera = rover.camera_in_rover(CAMERA, reading.pan_rad, reading.tilt_rad)
-        found.append(View(grey(frame.image), reading.pan_rad, reading.tilt_rad, camera))
+        found.append(FlightView(grey(frame.image), reading.pan_rad, reading.tilt_rad, camera))
     return found
 
 
-def features(first: View, second: View) -> FloatArray:
+def features(first: FlightView, second: FlightView) -> FloatArray:
     """Return the corners (n, 2) of the first view that the second may see."""
     corners = cv2.goodFeaturesToTrack(first.image, CORNERS, QUALITY, APART_PX, blockSize=BLOCK_PX)[:, 0]
     size = np.array(second.camera.size_px)
@@ -184,7 +184,7 @@ def epipolar_line(
     return inverse[valid], pixels[valid]
 
 
-def carry(first: View, pixel_px: FloatArray, second: View) -> Carried | None:
+def carry(first: FlightView, pixel_px: FloatArray, second: FlightView) -> CarriedFeatures | None:
     """Find a feature of the first view in the second, by the rule above; None if no match counts."""
     settings = MatchSettings()
     ray = first.camera.ray(pixel_px)
@@ -217,7 +217,7 @@ def carry(first: View, pixel_px: FloatArray, second: View) -> Carried | None:
         return None
     position = triangulate(first.camera, second.camera, pixel_px, best.pixel_px).position_m
     across = across_px(first.camera, pixel_px, second.camera, best.pixel_px)
-    return Carried(pixel_px, best.pixel_px, across, best.correlation, position)
+    return CarriedFeatures(pixel_px, best.pixel_px, across, best.correlation, position)
 
 
 def across_px(first: CameraModel, pixel_px: FloatArray, second: CameraModel, found_px: FloatArray) -> float:
@@ -229,14 +229,16 @@ def across_px(first: CameraModel, pixel_px: FloatArray, second: CameraModel, fou
     return float((along[0] * y - along[1] * x) / np.linalg.norm(along))
 
 
-def carried_features(first: View, second: View) -> tuple[int, list[Carried]]:
+def carried_features(first: FlightView, second: FlightView) -> tuple[int, list[CarriedFeatures]]:
     """Return how many features the second view may see, and those whose match counts."""
     corners = features(first, second)
     found = [carry(first, corner, second) for corner in corners]
     return len(corners), [one for one in found if one is not None]
 
 
-def pair_result(first: View, second: View, seen: int, carried: Sequence[Carried]) -> PairResult:
+def pair_result(
+    first: FlightView, second: FlightView, seen: int, carried: Sequence[CarriedFeatures]
+) -> PairResult:
     """Sum up a pair of views."""
     across = np.array([one.across_px for one in carried])
     turn_rad, left = turned(first, second, carried)
@@ -269,7 +271,9 @@ def turned_about_itself(camera: CameraModel, turn_rad: FloatArray) -> CameraMode
     return camera.moved(Rigid(rotation, camera.C - rotation @ camera.C))
 
 
-def turned(first: View, second: View, carried: Sequence[Carried]) -> tuple[FloatArray, FloatArray]:
+def turned(
+    first: FlightView, second: FlightView, carried: Sequence[CarriedFeatures]
+) -> tuple[FloatArray, FloatArray]:
     """Return the turn (3,) of the second camera that leaves the least across the lines, and the rest."""
 
     def across(turn_rad: FloatArray) -> FloatArray:
@@ -280,7 +284,9 @@ def turned(first: View, second: View, carried: Sequence[Carried]) -> tuple[Float
     return best.x, best.fun
 
 
-def rehearse(first: View, second: View, carried: Sequence[Carried], index: int, rover: Rig) -> Rehearsal:
+def rehearse(
+    first: FlightView, second: FlightView, carried: Sequence[CarriedFeatures], index: int, rover: Rig
+) -> Rehearsal:
     """Point at a feature as the service would: range, target, aim, angles; then see where it is.
 
     The range is that of the plane through the nearest other features.

@@ -31,7 +31,7 @@ class Label:
 
 
 @dataclass(frozen=True)
-class Errors:
+class LabelErrors:
     """Predicted against published models.
 
     rms and worst of position (mm), orientation (mrad) and of the shift of a grid of pixels (px of the label's
@@ -109,7 +109,7 @@ def one_lens(labels: Sequence[Label], lens: CameraModel) -> list[Label]:
     return [replace(label, model=model) for label, model in zip(labels, models, strict=True)]
 
 
-def errors(fitted: PoseFit, labels: Sequence[Label]) -> Errors:
+def errors(fitted: PoseFit, labels: Sequence[Label]) -> LabelErrors:
     """Compare what a fit predicts with what labels say."""
     position, orientation, shift = [], [], []
     for label in labels:
@@ -118,7 +118,7 @@ def errors(fitted: PoseFit, labels: Sequence[Label]) -> Errors:
         position.append(np.linalg.norm(found.position_m) * 1e3)
         orientation.append(np.linalg.norm(found.rotation_rad) * 1e3)
         shift.append(np.linalg.norm(found.shift_px, axis=-1))
-    return Errors(
+    return LabelErrors(
         len(labels),
         rms(position),
         float(np.max(position)),

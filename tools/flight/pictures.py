@@ -32,13 +32,13 @@ OVERLAP_PX = (400, 100, 1000)
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class PicturePair:
     """Two views with the features found in both, and the residuals after a free turn of the second."""
 
     name: str
-    first: mer.View
-    second: mer.View
-    carried: Sequence[mer.Carried]
+    first: mer.FlightView
+    second: mer.FlightView
+    carried: Sequence[mer.CarriedFeatures]
     turned_px: FloatArray
 
 
@@ -50,7 +50,7 @@ def stretched(image: np.ndarray) -> np.ndarray:
     return np.asarray(clear)
 
 
-def pointing(first: mer.View, second: mer.View, done: mer.Rehearsal, path: Path) -> None:
+def pointing(first: mer.FlightView, second: mer.FlightView, done: mer.Rehearsal, path: Path) -> None:
     """Draw a feature in one frame, and its line, aim and finding in the other."""
     figure = Figure(figsize=(11.0, 7.6), layout="constrained")
     grid = figure.add_gridspec(2, 4, height_ratios=(2.35, 1))
@@ -72,7 +72,7 @@ def pointing(first: mer.View, second: mer.View, done: mer.Rehearsal, path: Path)
     _save(figure, path)
 
 
-def residuals(pairs: Sequence[Pair], path: Path) -> None:
+def residuals(pairs: Sequence[PicturePair], path: Path) -> None:
     """Draw what is left across the epipolar lines, magnified, and how much of it one turn a pair explains."""
     figure = Figure(figsize=(11.0, 5.6), layout="constrained")
     grid = figure.add_gridspec(1, len(pairs) + 1, width_ratios=(*(1 for _ in pairs), 1.5))
@@ -125,7 +125,7 @@ def prediction(measured_mrad: FloatArray, printed_mrad: FloatArray, path: Path) 
     figure.savefig(path, dpi=110)
 
 
-def _frame(axes: Axes, view: mer.View, title: str) -> None:
+def _frame(axes: Axes, view: mer.FlightView, title: str) -> None:
     """A whole frame with its angles."""
     axes.imshow(stretched(view.image), cmap="gray", vmin=0, vmax=255, interpolation="antialiased")
     angles = f"pan {np.degrees(view.pan_rad):.2f}°, tilt {np.degrees(view.tilt_rad):.2f}°"
@@ -138,7 +138,7 @@ def _mark(axes: Axes, pixel_px: FloatArray, colour: str, half_px: float) -> None
     axes.add_patch(Rectangle(pixel_px - half_px, 2 * half_px, 2 * half_px, fill=False, color=colour, lw=1.6))
 
 
-def _line(axes: Axes, first: mer.View, pixel_px: FloatArray, second: mer.View) -> None:
+def _line(axes: Axes, first: mer.FlightView, pixel_px: FloatArray, second: mer.FlightView) -> None:
     """The epipolar line from 2 m to far away, with a dot at each of some ranges between."""
     _, pixels = mer.epipolar_line(first.camera, pixel_px, second.camera)
     axes.plot(*pixels.T, color=LINE, lw=1.2)
@@ -152,7 +152,7 @@ def _line(axes: Axes, first: mer.View, pixel_px: FloatArray, second: mer.View) -
     axes.text(far[0] + 1, far[1] - 1.5, "far", color=LINE, fontsize=9, va="bottom", ha="center")
 
 
-def _across(first: mer.View, one: mer.Carried, second: mer.View) -> FloatArray:
+def _across(first: mer.FlightView, one: mer.CarriedFeatures, second: mer.FlightView) -> FloatArray:
     """Unit vector across a feature's epipolar line, on the side that counts as positive."""
     _, pixels = mer.epipolar_line(first.camera, one.pixel_px, second.camera)
     at = int(np.clip(np.argmin(np.linalg.norm(pixels - one.found_px, axis=1)), 1, len(pixels) - 2))
@@ -165,7 +165,7 @@ def _arrow(axes: Axes, start: FloatArray, end: FloatArray, colour: str) -> None:
     axes.annotate("", end, start, arrowprops={"arrowstyle": "->", "color": colour, "lw": 1.2})
 
 
-def _zoom(axes: Axes, view: mer.View, pixel_px: FloatArray, title: str) -> None:
+def _zoom(axes: Axes, view: mer.FlightView, pixel_px: FloatArray, title: str) -> None:
     """A small piece of a frame, every pixel seen."""
     axes.imshow(stretched(view.image), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
     x, y = pixel_px
@@ -173,7 +173,7 @@ def _zoom(axes: Axes, view: mer.View, pixel_px: FloatArray, title: str) -> None:
     axes.set_title(f"{title} ({2 * ZOOM_PX} px wide)", fontsize=9)
 
 
-def _told(first: mer.View, done: mer.Rehearsal) -> list[tuple[str, str]]:
+def _told(first: mer.FlightView, done: mer.Rehearsal) -> list[tuple[str, str]]:
     """What the pointing was asked."""
     x, y = done.carried.pixel_px
     range_m = float(np.linalg.norm(done.position_m - first.camera.C))
@@ -187,7 +187,7 @@ def _told(first: mer.View, done: mer.Rehearsal) -> list[tuple[str, str]]:
     ]
 
 
-def _measured(second: mer.View, done: mer.Rehearsal) -> list[tuple[str, str]]:
+def _measured(second: mer.FlightView, done: mer.Rehearsal) -> list[tuple[str, str]]:
     """What came of it."""
     (ax, ay), (fx, fy), (dx, dy) = done.aim_px, done.carried.found_px, done.residual_px
     return [

@@ -46,11 +46,11 @@ from calib.matching.look import TrackLook, seen_by
 from calib.matching.track import KeyPicture, Track, TrackSettings
 from calib.matching.warp import Plane, carry
 from drivers.clock import ManualClock
-from tools.arguments import end, new_file
 from tools.campaigns.render_bias import BLUR_PX, GRID_PX, HALF_PX, MARGIN_PX, best_affine
 from tools.campaigns.render_bias import match as ecc
+from tools.command import end, new_file
 from tools.flight import mer
-from tools.flight.mer import View
+from tools.flight.mer import FlightView
 
 PAIRS = ((0, 1), (1, 0), (2, 3), (3, 2), (3, 4), (4, 3))
 EVERY_PX = 32
@@ -68,7 +68,7 @@ APART_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class CarriedTarget:
     """One target of one pair, and what became of it.
 
     Attributes
@@ -98,7 +98,7 @@ class Carried:
     ecc_px: FloatArray
 
 
-def views(folder: Path) -> list[mer.View]:
+def views(folder: Path) -> list[mer.FlightView]:
     """Return the five frames as the replay driver gives them, with the labels' own camera models.
 
     Raises
@@ -123,7 +123,7 @@ def level_plane(camera: CameraModel) -> Plane:
     return Plane(camera.C - CAMERA_HEIGHT_M * UP, UP)
 
 
-def targets(first: mer.View, second: mer.View) -> FloatArray:
+def targets(first: mer.FlightView, second: mer.FlightView) -> FloatArray:
     """Grid pixels (n, 2) of the first frame that the second sees if the ground is level, or far."""
     width, height = first.camera.size_px
     columns, rows = (
@@ -139,8 +139,13 @@ def targets(first: mer.View, second: mer.View) -> FloatArray:
 
 
 def carried(
-    first: mer.View, second: mer.View, pixel_px: FloatArray, plane: Plane, range_sigma: float, seed: int
-) -> Carried:
+    first: mer.FlightView,
+    second: mer.FlightView,
+    pixel_px: FloatArray,
+    plane: Plane,
+    range_sigma: float,
+    seed: int,
+) -> CarriedTarget:
     """Hand one target over; the plane tells the range, uncertain by ``range_sigma`` of itself."""
     ray = first.camera.ray(pixel_px)
     range_m = float((plane.point_m - ray.origins_m) @ plane.normal / (ray.directions @ plane.normal))
@@ -156,7 +161,7 @@ def carried(
     match = look.found["second"]
     good = match.verdict == "good"
     across = mer.across_px(first.camera, pixel_px, second.camera, match.pixel_px) if good else np.nan
-    return Carried(
+    return CarriedTarget(
         pixel_px, np.asarray(predicted), spread, _verdict(look), look.reason, match.pixel_px, across,
         _by_ecc(first, second, pixel_px, plane, seed) if good else np.full(2, np.nan),
     )  # fmt: skip
@@ -167,7 +172,9 @@ def _verdict(look: TrackLook) -> str:
     return "misfit" if verdict == "good" and look.track.state == "lost" else verdict
 
 
-def _by_ecc(first: mer.View, second: mer.View, pixel_px: FloatArray, plane: Plane, seed: int) -> FloatArray:
+def _by_ecc(
+    first: mer.FlightView, second: mer.FlightView, pixel_px: FloatArray, plane: Plane, seed: int
+) -> FloatArray:
     """Where ECC finds the raw patch."""
     there, valid = carry(pixel_px + GRID_PX, first.camera, plane, second.camera)
     nowhere = np.full(2, np.nan)
@@ -179,7 +186,7 @@ def _by_ecc(first: mer.View, second: mer.View, pixel_px: FloatArray, plane: Plan
     return nowhere if found is None else found
 
 
-def pair(first: mer.View, second: mer.View) -> dict[str, list[Carried]]:
+def pair(first: mer.FlightView, second: mer.FlightView) -> dict[str, list[CarriedTarget]]:
     """Hand all targets of a pair over, by both assumptions of the range."""
     pixels = targets(first, second)
     level = [
@@ -205,7 +212,7 @@ def pair(first: mer.View, second: mer.View) -> dict[str, list[Carried]]:
 
 
 def _plane_near(
-    view: mer.View, pixel_px: FloatArray, points: Sequence[FloatArray], pixels: Sequence[FloatArray]
+    view: mer.FlightView, pixel_px: FloatArray, points: Sequence[FloatArray], pixels: Sequence[FloatArray]
 ) -> Plane | None:
     """The plane through the points whose pixels are nearest; None if they are too few or it is not ground."""
     if len(points) < NEIGHBOURS:
@@ -221,7 +228,7 @@ def _plane_near(
     return Plane(middle, normal) if 1.0 < range_m < 100.0 else None
 
 
-def told(some: Sequence[Carried]) -> dict[str, Any]:
+def told(some: Sequence[CarriedTarget]) -> dict[str, Any]:
     """Sum up: shares of verdicts, residuals of the found, and how far ECC ends from our match."""
     found = [one for one in some if one.verdict in ("good", "misfit")]
     off = np.array([one.found_px - one.predicted_px for one in found]).reshape(-1, 2)
@@ -311,7 +318,9 @@ ZOOM_PX = 26
 EXAMPLES = 3
 
 
-def draw(first: View, second: View, ways: Mapping[str, Sequence[Carried]], path: Path) -> None:
+def draw(
+    first: FlightView, second: FlightView, ways: Mapping[str, Sequence[CarriedTarget]], path: Path
+) -> None:
     """Draw a pair: all targets with their residuals, and some of them large."""
     figure = Figure(figsize=(11.0, 8.6), layout="constrained")
     grid = figure.add_gridspec(2, 2 * EXAMPLES, height_ratios=(2.6, 1))
@@ -349,7 +358,7 @@ def _stretched(image: np.ndarray) -> np.ndarray:
     return np.asarray(clear.apply(np.clip(image * 1.6, 0, 255).astype(np.uint8)))
 
 
-def _frame(axes: Axes, view: View, title: str) -> None:
+def _frame(axes: Axes, view: FlightView, title: str) -> None:
     axes.imshow(_stretched(view.image), cmap="gray", vmin=0, vmax=255, interpolation="antialiased")
     angles = f"pan {np.degrees(view.pan_rad):.2f}°, tilt {np.degrees(view.tilt_rad):.2f}°"
     axes.set_title(f"{title}\n{angles}", fontsize=9)
@@ -357,7 +366,7 @@ def _frame(axes: Axes, view: View, title: str) -> None:
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=(), yticks=())
 
 
-def _zoom(axes: Axes, view: View, middle_px: FloatArray, title: str, cross_px: FloatArray) -> None:
+def _zoom(axes: Axes, view: FlightView, middle_px: FloatArray, title: str, cross_px: FloatArray) -> None:
     axes.imshow(_stretched(view.image), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
     x, y = middle_px
     axes.set(xlim=(x - ZOOM_PX, x + ZOOM_PX), ylim=(y + ZOOM_PX, y - ZOOM_PX), xticks=(), yticks=())
@@ -365,7 +374,7 @@ def _zoom(axes: Axes, view: View, middle_px: FloatArray, title: str, cross_px: F
     axes.set_title(f"{title}\n({2 * ZOOM_PX} px wide)", fontsize=8)
 
 
-def _ellipse(axes: Axes, one: Carried) -> None:
+def _ellipse(axes: Axes, one: CarriedTarget) -> None:
     """The window's ellipse: as many sigmas of the prediction as the tracker searches."""
     values, vectors = np.linalg.eigh(one.spread_px2)
     width, height = 2 * TrackSettings().sigmas * np.sqrt(values[::-1])

@@ -26,7 +26,7 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.matching.warp import grey
 from drivers.recordings.frames import read_products
-from tools.arguments import end
+from tools.command import end
 from tools.flight import mer
 
 TOLD_RAD = (5e-5, 2e-4, 1.3e-3)

@@ -22,7 +22,7 @@ from calib.files.pds3 import PdsProduct
 from calib.geometry.maps import ModelDifference, model_difference
 from drivers.clock import ManualClock
 from drivers.errors import DriverError
-from tools.arguments import end
+from tools.command import end
 from tools.flight import mer, msl
 from tools.flight.poses import PoseFit
 
@@ -194,7 +194,9 @@ def mer_blocks(folder: Path, pictures: bool, mast_file: Path | None) -> dict[str
 
         flight_pictures.pointing(first, second, done, PICTURES / "opportunity_pointing.jpg")
         pairs = [
-            flight_pictures.Pair(f"{name} frame", one, other, features, mer.turned(one, other, features)[1])
+            flight_pictures.PicturePair(
+                f"{name} frame", one, other, features, mer.turned(one, other, features)[1]
+            )
             for name, (one, other, _, features) in found.items()
             if name != "1st to 2nd"
         ]
@@ -264,7 +266,7 @@ def _worst(differences: Sequence[ModelDifference]) -> str:
     return f"{position:.4f} | {turn:.4f} | {shift:.4f}"
 
 
-def _errors_row(name: str, found: msl.Errors) -> str:
+def _errors_row(name: str, found: msl.LabelErrors) -> str:
     return (
         f"{name} | {found.labels} | {found.position_rms_mm:.4f}, {found.position_max_mm:.4f} "
         f"| {found.orientation_rms_mrad:.4f}, {found.orientation_max_mrad:.4f} "

@@ -34,10 +34,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mastctl.cli.output import at_least
-from tools.arguments import end, new_file
-from tools.mutants.nearest import TESTS, imports, nearest
-from tools.mutants.sites import Site, sites
-from tools.mutants.trial import Ended, end_with_tests, run, run_change, warm
+from tools.command import end, new_file
+from tools.mutants.sites import TESTS, MutantSite, imports, nearest, sites
+from tools.mutants.trial import MutantEnded, end_with_tests, run, run_change, warm
 
 REPOSITORY = Path(__file__).resolve().parent.parent.parent
 FOLDERS = ("calib", "drivers", "mastctl", "hil_tests", "configs", "tools", "docs")
@@ -56,7 +55,7 @@ PATIENCE_S = 1200.0  # by the clock on the wall, for a run that waits for what n
 class Tried(NamedTuple):
     """What became of one mutant, by which tests, and who objected."""
 
-    site: Site
+    site: MutantSite
     outcome: str
     test: str
     cpu_s: float
@@ -96,12 +95,12 @@ def _copied(folder: Path, count: int) -> list[Path]:
     return copies
 
 
-def _unchanged(test: str, longest_s: float) -> Ended:
+def _unchanged(test: str, longest_s: float) -> MutantEnded:
     """Run one test file on the code as it is."""
     return run(_Own.copy, {test: longest_s}, PATIENCE_S, watched=True)
 
 
-def _tried(site: Site, allowed_s: dict[str, float]) -> Tried:
+def _tried(site: MutantSite, allowed_s: dict[str, float]) -> Tried:
     """Make one change, run the tests until one objects, and take it back."""
     tests = [*allowed_s]
     if not tests:
@@ -120,9 +119,9 @@ def _modules(place: str) -> list[str]:
     return [str(file.relative_to(REPOSITORY)) for file in files]
 
 
-def _drawn(modules: list[str], count: int, seed: int) -> list[Site]:
+def _drawn(modules: list[str], count: int, seed: int) -> list[MutantSite]:
     """Changes in ``count`` lines, drawn at random from all lines that can be changed."""
-    lines: dict[tuple[str, int], list[Site]] = {}
+    lines: dict[tuple[str, int], list[MutantSite]] = {}
     for module in modules:
         for site in sites(REPOSITORY, module):
             lines.setdefault((module, site.line), []).append(site)
@@ -141,7 +140,7 @@ def _counted(place: str, outcomes: list[str]) -> str:
     return f"{place}: {', '.join([share, *also])}"
 
 
-def _allowed_s(site: Site, near: list[str], alone: dict[str, Ended]) -> dict[str, float]:
+def _allowed_s(site: MutantSite, near: list[str], alone: dict[str, MutantEnded]) -> dict[str, float]:
     """The tests for one change, quickest first, with the processor time that a test of each may take."""
     files = [
         test
@@ -154,7 +153,7 @@ def _allowed_s(site: Site, near: list[str], alone: dict[str, Ended]) -> dict[str
     }
 
 
-def _all_tried(chosen: list[Site], args: argparse.Namespace, copies: list[Path]) -> Iterator[Tried]:
+def _all_tried(chosen: list[MutantSite], args: argparse.Namespace, copies: list[Path]) -> Iterator[Tried]:
     graph = imports(REPOSITORY)
     near = {site.file: nearest(REPOSITORY, graph, site.file, args.tests, args.among) for site in chosen}
     files = sorted({test for tests in near.values() for test in tests})

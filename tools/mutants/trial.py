@@ -22,7 +22,7 @@ from typing import NamedTuple, NoReturn
 
 import pytest
 
-from tools.mutants.nearest import PACKAGES, TESTS
+from tools.mutants.sites import PACKAGES, TESTS
 
 LIBRARIES = ("cv2", "fastapi", "httpx", "hypothesis", "numba", "numpy.testing", "scipy.interpolate")
 LIBRARIES += ("scipy.optimize", "scipy.spatial.transform", "scipy.stats", "uvicorn", "yaml")
@@ -31,7 +31,7 @@ BROKEN = (2, 3, 4)  # pytest's codes for what ended before a test could judge: a
 STARTS_PROCESSES = ("os.exec", "os.fork", "os.posix_spawn", "os.spawn", "subprocess.Popen")
 
 
-class Ended(NamedTuple):
+class MutantEnded(NamedTuple):
     """How a run ended.
 
     ``outcome`` is ``passed``, ``killed`` (a test objected), ``killed by timeout`` or ``broken`` (the tests
@@ -48,7 +48,7 @@ class Ended(NamedTuple):
 
 def run_change(
     file: Path, changed: str, copy: Path, allowed_s: Mapping[str, float], patience_s: float
-) -> Ended:
+) -> MutantEnded:
     """Run test files on a changed file until one test objects, and put the file back.
 
     A test that objects must do so again, and must not without the change: else it failed by chance or by what
@@ -100,7 +100,7 @@ def run(
     *,
     watched: bool = False,
     leave_out: Sequence[str] = (),
-) -> Ended:
+) -> MutantEnded:
     """Run test files, or single tests, until one test objects.
 
     ``allowed_s`` names them in their order with the processor time that a single test of each may take;
@@ -125,7 +125,7 @@ def run(
     return _judged(said, bool(ended), status, used.ru_utime + used.ru_stime)
 
 
-def _judged(said: Path, in_time: bool, status: int, cpu_s: float) -> Ended:
+def _judged(said: Path, in_time: bool, status: int, cpu_s: float) -> MutantEnded:
     lines = [json.loads(line) for line in said.read_text().splitlines()]
     begun = [line["begins"] for line in lines if "begins" in line]
     objected = [line["objects"] for line in lines if "objects" in line]
@@ -134,12 +134,12 @@ def _judged(said: Path, in_time: bool, status: int, cpu_s: float) -> Ended:
     last = (objected or begun or [""])[-1]
     code = os.waitstatus_to_exitcode(status)
     if not in_time or code == -signal.SIGPROF:
-        return Ended("killed by timeout", last, cpu_s, None)
+        return MutantEnded("killed by timeout", last, cpu_s, None)
     if code == NOTHING_TO_RUN:
-        return Ended("passed", "", cpu_s, functions)
+        return MutantEnded("passed", "", cpu_s, functions)
     if code in BROKEN or not begun:
-        return Ended("broken", last, cpu_s, None)
-    return Ended("killed" if code else "passed", last if code else "", cpu_s, functions)
+        return MutantEnded("broken", last, cpu_s, None)
+    return MutantEnded("killed" if code else "passed", last if code else "", cpu_s, functions)
 
 
 def _in_the_fork(

@@ -15,7 +15,7 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.plan.placements import Placement
 from calib.targets.boards import AnyBoard, Corners
-from mastctl.bench.eyes import Head, Look, Seen
+from mastctl.bench.eyes import BenchHead, BenchLook, SeenBoard
 from tools.sim_survey.survey import rover_from_head
 
 EDGE_PX = 3.0
@@ -70,7 +70,7 @@ class CornerBench:
         Where the board stands now; None: nowhere.
     """
 
-    head: Head
+    head: BenchHead
     true_rig: Rig
     board: AnyBoard
     rng: np.random.Generator
@@ -95,8 +95,8 @@ class CornerBench:
         tilt_rad: float,
         approach: tuple[int, int] = (0, 0),
         cameras: Collection[str] | None = None,
-    ) -> Look:
-        """See `mastctl.bench.eyes.Eyes`."""
+    ) -> BenchLook:
+        """See `mastctl.bench.eyes.BenchEyes`."""
         begun = self.pan.read_rad, self.tilt.read_rad
         for axis, wanted, side in ((self.pan, pan_rad, approach[0]), (self.tilt, tilt_rad, approach[1])):
             if side:
@@ -109,16 +109,16 @@ class CornerBench:
         names = [name for name in self.head.rig.cameras if cameras is None or name in cameras]
         self.pictures += len(names)
         seen = [self._seen(name, true_rad) for name in names]
-        return Look(tuple(seen), self._side(self.pan), self._side(self.tilt), seconds)
+        return BenchLook(tuple(seen), self._side(self.pan), self._side(self.tilt), seconds)
 
     def _side(self, axis: TrueAxis) -> int:
         return 0 if axis.one_sided else axis.side
 
-    def _seen(self, camera: str, true_rad: tuple[float, float]) -> Seen:
+    def _seen(self, camera: str, true_rad: tuple[float, float]) -> SeenBoard:
         held = self.true_rig.cameras[camera]
         read = self.pan.read_rad, self.tilt.read_rad
         if self.rover_from_board is None:
-            return Seen(camera, *read, None, "no corners")
+            return SeenBoard(camera, *read, None, "no corners")
         pose = self.rover_from_board
         if held.on == "head":
             pose = rover_from_head(self.true_rig.mast, *true_rad).inverse @ pose
@@ -129,10 +129,10 @@ class CornerBench:
         size = np.array(held.model.size_px)
         inside = valid & facing & ((pixels > EDGE_PX) & (pixels < size - 1 - EDGE_PX)).all(axis=1)
         if inside.sum() < 6:
-            return Seen(camera, *read, None, "no corners")
+            return SeenBoard(camera, *read, None, "no corners")
         noisy: FloatArray = pixels[inside] + self.rng.normal(0.0, self.noise_px, (int(inside.sum()), 2))
         corners = Corners(self.board.ids[inside], noisy, np.full(int(inside.sum()), self.noise_px))
-        return Seen(camera, *read, corners)
+        return SeenBoard(camera, *read, corners)
 
 
 @dataclass
@@ -153,10 +153,10 @@ class SelfPlacing:
         """Keep it."""
         self.told.append(now.words())  # type: ignore[attr-defined]
 
-    def stands(self, name: str, placement: Placement | None, head: Head) -> None:
+    def stands(self, name: str, placement: Placement | None, head: BenchHead) -> None:
         """It stands there still."""
 
-    def place(self, name: str, placement: Placement, head: Head) -> None:
+    def place(self, name: str, placement: Placement, head: BenchHead) -> None:
         """Put the board there."""
         self.told.append(f"{name}: {placement.words()}")
         self.bench.stand(placement)

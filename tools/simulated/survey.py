@@ -23,7 +23,7 @@ from calib.survey.writer import write_survey
 from drivers.sim.render import Renderer
 from drivers.sim.scene import build_scene
 from mastctl.cli.output import at_least, not_negative
-from tools.arguments import end
+from tools.command import end
 from tools.sim_survey.board import draw_board, photograph
 from tools.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
 

@@ -25,10 +25,9 @@ from mastctl.cli import output
 from mastctl.cli.output import check_folder
 from mastctl.packaged import config_folder
 from mastctl.report import pictures, plots
-from mastctl.report.records import write_csv, write_json
+from mastctl.report.pages import write_csv, write_json
 from mastctl.report.tables import Table
-from tools.arguments import end
-from tools.campaign import options, run_cases
+from tools.command import end, options, run_cases
 from tools.studies.approach_run import ApproachRun, ApproachTask, Stop, one_approach
 
 PAPER_CM = {"stereo": 9.7, "untracked": 22.2, "tracked": 1.5}

@@ -22,11 +22,10 @@ from mastctl.cli.output import WrongUse, at_least, check_folder, print_table
 from mastctl.cli.tasks import tell_report
 from mastctl.packaged import config_folder
 from mastctl.report import pages, plots
-from mastctl.report.figures import Figure
-from mastctl.report.records import write_csv, write_json
+from mastctl.report.pages import write_csv, write_json
+from mastctl.report.pictures import Figure
 from mastctl.report.tables import Table, number, x_y
-from tools.arguments import end
-from tools.campaign import options, run_cases
+from tools.command import end, options, run_cases
 from tools.studies.calibration_survey import (
     DISTANCES_M,
     HANDOFFS,

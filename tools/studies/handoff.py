@@ -23,8 +23,7 @@ from mastctl.cli.tasks import refuse_task_options, run_bar, tell_report
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.experiment.simulated import Rover, SimulationTruth, running_rover
-from tools.arguments import end
-from tools.campaign import options, run_cases
+from tools.command import end, options, run_cases
 from tools.studies.handoff_record import BrickPoints, HandoffExperiment, HandoffRecord, summarise_handoffs
 from tools.studies.handoff_report import bias_sentences, handoff_table, write_handoff_report
 from tools.studies.handoff_run import STEPS, run_handoff_experiment

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from mastctl.report import pages, pictures, plots
-from mastctl.report.figures import Figure
-from mastctl.report.records import write_csv, write_json
+from mastctl.report.pages import write_csv, write_json
+from mastctl.report.pictures import Figure
 from mastctl.report.tables import Table, number, x_y
 from mastctl.watch.handoffs import HandoffLog
 from tools.studies.handoff_record import (

@@ -24,7 +24,7 @@ from calib.matching.handoff import Eye, refine_handoff
 from calib.matching.warp import grey
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.experiment.pointing import ClickTruth, RunTime
-from mastctl.experiment.targets import VIEWS_PER_TARGET, Target, Views
+from mastctl.experiment.targets import VIEWS_PER_TARGET, Target, TargetViews
 from mastctl.motion.pairs import JOINT_SIGMA_RAD
 from tools.studies.handoff_record import (
     Handed,
@@ -102,7 +102,7 @@ def run_handoff_experiment(
     calibration = stored_covariance(rig)
     records: list[HandoffRecord] = []
     for source, to, distance_m in steps:
-        bench = _Bench(
+        bench = _HandoffRun(
             client,
             rig,
             (source, to),
@@ -145,7 +145,7 @@ def _reason(error: ClientError | CalibError) -> str:
     return f"{getattr(error, 'code', 'error')}: {error}"
 
 
-class _Bench:
+class _HandoffRun:
     """One step of the running experiment."""
 
     def __init__(
@@ -180,7 +180,7 @@ class _Bench:
     def _draw_for(self, number: int) -> None:
         """Begin the draw of a target, or of a view of known points."""
         self._rng = np.random.default_rng([self._seed, round(1000 * self._distance_m), number])
-        self._views = Views(
+        self._views = TargetViews(
             self._client, self._rig, self._source, self._limits, self._rng, self._pan_range_rad
         )
 

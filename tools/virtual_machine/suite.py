@@ -16,7 +16,7 @@ TAIL = 3000
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SuiteOutcome:
     """How many tests ran, those that did not pass with the reason, and the end of the console."""
 
     tests: int
@@ -24,7 +24,7 @@ class Outcome:
     console: str
 
 
-def run_tests(boot: Callable[..., Result], out: Path, tests: Sequence[str] = (TESTS,)) -> Outcome:
+def run_tests(boot: Callable[..., Result], out: Path, tests: Sequence[str] = (TESTS,)) -> SuiteOutcome:
     """Run tests in the machine.
 
     Parameters
@@ -61,4 +61,4 @@ def run_tests(boot: Callable[..., Result], out: Path, tests: Sequence[str] = (TE
     ]
     if result.status != 0 and not bad:
         raise VmFailed(f"pytest ended with {result.status} in the machine:\n{tail}")
-    return Outcome(len(cases), tuple(bad), tail)
+    return SuiteOutcome(len(cases), tuple(bad), tail)

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from calib.calibrate.scene.drift import ALARM_SIGMAS, VIEW_SIGMA, ViewShift, find_drift, view_change
-from tools.campaigns.sentinel import RESTS, SIZE, Site, Truth, rig, shown
+from tools.campaigns.sentinel import RESTS, SIZE, ChangedRig, FeatureSite, rig, shown
 
 SEED = 11
 
 
-def look_at(truth: Truth, seed: int = SEED):  # type: ignore[no-untyped-def]
-    return Site(np.random.default_rng(seed)).look(truth)
+def look_at(truth: ChangedRig, seed: int = SEED):  # type: ignore[no-untyped-def]
+    return FeatureSite(np.random.default_rng(seed)).look(truth)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_days_of_weather_light_and_moving_rocks_are_no_change(seed: int) -> None:
-    drift = look_at(Truth(), seed)
+    drift = look_at(ChangedRig(), seed)
     assert drift.named is None
     assert drift.sentence == ""
     assert max(change.sigmas for change in drift.changes) < ALARM_SIGMAS - 1.0
@@ -26,15 +26,15 @@ def test_days_of_weather_light_and_moving_rocks_are_no_change(seed: int) -> None
 @pytest.mark.parametrize(
     ("truth", "what", "value"),
     [
-        (Truth(turned={"navcam_left": np.array([0.0, 1.8e-3, 0.0])}), "navcam_left turned", 1.8e-3),
-        (Truth(focal={"navcam_right": 3e-3}), "navcam_right refocused", 3e-3),
-        (Truth(slip=(3e-3, 0.0)), "pan slipped", 3e-3),
-        (Truth(slip=(0.0, -3e-3)), "tilt slipped", -3e-3),
-        (Truth(rover=np.array([4e-3, 0.0, 0.0])), "rover turned", 4e-3),
+        (ChangedRig(turned={"navcam_left": np.array([0.0, 1.8e-3, 0.0])}), "navcam_left turned", 1.8e-3),
+        (ChangedRig(focal={"navcam_right": 3e-3}), "navcam_right refocused", 3e-3),
+        (ChangedRig(slip=(3e-3, 0.0)), "pan slipped", 3e-3),
+        (ChangedRig(slip=(0.0, -3e-3)), "tilt slipped", -3e-3),
+        (ChangedRig(rover=np.array([4e-3, 0.0, 0.0])), "rover turned", 4e-3),
     ],
     ids=["bump", "focus", "pan", "tilt", "rover"],
 )
-def test_a_change_is_named_with_its_size(truth: Truth, what: str, value: float) -> None:
+def test_a_change_is_named_with_its_size(truth: ChangedRig, what: str, value: float) -> None:
     drift = look_at(truth)
     assert drift.named is not None
     assert drift.named.what == what
@@ -44,7 +44,7 @@ def test_a_change_is_named_with_its_size(truth: Truth, what: str, value: float) 
 
 
 def test_the_sentence_says_who_turned_how_far_about_what_and_how_sure_that_is() -> None:
-    drift = look_at(Truth(turned={"navcam_left": np.array([0.0, 1.8e-3, 0.0])}))
+    drift = look_at(ChangedRig(turned={"navcam_left": np.array([0.0, 1.8e-3, 0.0])}))
     words = drift.sentence
     assert words.startswith("navcam_left turned 1.")
     assert " mrad about y, " in words
@@ -103,10 +103,10 @@ def test_another_scene_says_nothing_instead_of_something() -> None:
 
 def test_one_eye_at_one_rest_cannot_tell_a_bump_from_a_slip_and_says_so() -> None:
     rng = np.random.default_rng(SEED)
-    site = Site(rng)
+    site = FeatureSite(rng)
     then = site.then[1, "navcam_left"]
     pan, tilt = RESTS[1]
-    now = shown(site.points[1, "navcam_left"], "navcam_left", pan, tilt, Truth(slip=(0.0, 5e-3)))
+    now = shown(site.points[1, "navcam_left"], "navcam_left", pan, tilt, ChangedRig(slip=(0.0, 5e-3)))
     moved = now - then + 0.05 * rng.normal(size=then.shape)
     drift = find_drift(rig(), [ViewShift("navcam_left", 1, pan, tilt, then, moved, np.full(len(then), 0.05))])
     assert drift.named is not None

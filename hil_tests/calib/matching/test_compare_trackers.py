@@ -12,7 +12,7 @@ import pytest
 from scipy import ndimage
 
 from tools.against_others.tracker_methods import lucas_kanade, lucas_kanade_grid, match_template
-from tools.against_others.trackers import Row, judged, row, verdicts
+from tools.against_others.trackers import TrackerRow, judged, row, verdicts
 
 STEPS = 20
 
@@ -90,8 +90,8 @@ def test_runs_are_counted_by_hand() -> None:
 
 
 def test_ours_is_held_against_the_best_of_those_that_keep_targets() -> None:
-    def one(method: str, kept: int, to_ours: float, milliseconds: float = 9.0) -> Row:
-        return Row(
+    def one(method: str, kept: int, to_ours: float, milliseconds: float = 9.0) -> TrackerRow:
+        return TrackerRow(
             "plane", "B", method, 12, kept, 0, 0, 0.0, 0.1, 0.1, 0.15, 0.3, to_ours, milliseconds, 12.0, 8.0
         )
 

@@ -12,13 +12,12 @@ from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.survey.records import Sigma
 from calib.targets.boards import Charuco
-from mastctl.bench.eyes import Eyes, Head
-from mastctl.bench.fitting import fit_in_rover
-from mastctl.bench.folder import Kept, survey_cameras
-from mastctl.bench.frame import Frame
+from mastctl.bench.eyes import BenchEyes, BenchHead
+from mastctl.bench.folder import RunFolder, survey_cameras
+from mastctl.bench.frame import RoverFrame, fit_in_rover
+from mastctl.bench.looks import BenchGoal
 from mastctl.bench.run import BenchRun
 from mastctl.bench.teller import Teller
-from mastctl.bench.wanted import Wanted
 from tools.simulated.bench import CornerBench, SelfPlacing, TrueAxis
 
 BOARD = Charuco(10, 7, 0.055, 0.042)
@@ -52,7 +51,7 @@ def corner_bench(
 ) -> CornerBench:
     """A PTU's counts; ``axis`` is of both joints."""
     true, believed = of(repository)
-    head = Head(believed, (-2.6, 2.6), (-1.2, 0.5), one_sided, PTU_COUNT_RAD)
+    head = BenchHead(believed, (-2.6, 2.6), (-1.2, 0.5), one_sided, PTU_COUNT_RAD)
     pan, tilt = (
         TrueAxis(PTU_COUNT_RAD, one_sided=one_sided, **axis)
         for _ in range(2)  # type: ignore[arg-type]
@@ -60,24 +59,24 @@ def corner_bench(
     return CornerBench(head, true, BOARD, np.random.default_rng(seed), pan, tilt)
 
 
-def kept_in(folder: Path, bench: CornerBench) -> Kept:
+def kept_in(folder: Path, bench: CornerBench) -> RunFolder:
     """The run's folder."""
     rig = bench.head.rig
     sizes = {name: camera.model.size_px for name, camera in rig.cameras.items()}
     sigma = Sigma(0.0, 0.0, joint_rad=PTU_COUNT_RAD / 12**0.5, corner_px=bench.noise_px)
-    return Kept(folder, {"board": BOARD}, sigma, survey_cameras(rig, sizes), rig.stereo)
+    return RunFolder(folder, {"board": BOARD}, sigma, survey_cameras(rig, sizes), rig.stereo)
 
 
 def run_of(
     bench: CornerBench,
     folder: Path,
-    wanted: Wanted | None = None,
-    eyes: Eyes | None = None,
+    wanted: BenchGoal | None = None,
+    eyes: BenchEyes | None = None,
     teller: Teller | None = None,
 ) -> tuple[BenchRun, SelfPlacing]:
     """A run, and who places the board for it; ``eyes`` and ``teller`` instead of the bench's own."""
     person = SelfPlacing(bench)
     kept = kept_in(folder, bench)
-    fit = fit_in_rover(Frame(), bench.head.rig, kept.moved)
-    run = BenchRun(eyes or bench, kept, "board", BOARD, teller or person, fit, wanted or Wanted())
+    fit = fit_in_rover(RoverFrame(), bench.head.rig, kept.moved)
+    run = BenchRun(eyes or bench, kept, "board", BOARD, teller or person, fit, wanted or BenchGoal())
     return run, person

@@ -24,10 +24,10 @@ from calib.survey.reader import read_survey
 from calib.survey.writer import NotWritten, write_survey
 from calib.targets.board_file import save_board
 from calib.targets.boards import Charuco
-from mastctl.bench.eyes import Interrupted, Look, NoLight
-from mastctl.bench.folder import Kept, looks_of
+from mastctl.bench.eyes import BenchInterrupted, BenchLook, NoLight
+from mastctl.bench.folder import RunFolder, looks_of
 from mastctl.bench.run import BenchRun
-from mastctl.bench.search import BoardNotFound, Search
+from mastctl.bench.search import BoardNotFound, BoardSearch
 from mastctl.bench.teller import Terminal
 from mastctl.cli import calibrate_bench
 from mastctl.cli.main import main
@@ -62,7 +62,7 @@ def ended(
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
-        (Interrupted("somebody pressed stop"), 1, "somebody pressed stop; "),
+        (BenchInterrupted("somebody pressed stop"), 1, "somebody pressed stop; "),
         (KeyboardInterrupt(), 130, "interrupted; "),
         (NotWritten("x.csv", "p1-003", "cannot be written: No space left on device"), 2, "No space left"),
         (BenchNotFitted("pan slipped by about 9.8 mrad"), 1, "pan slipped by about 9.8 mrad; "),
@@ -163,10 +163,10 @@ def test_a_search_that_finds_another_board_ends_soon_and_says_why(
     teller.place = lambda *_: None  # type: ignore[method-assign]  # what stands there is none of ours
     looked = bench.look
 
-    def look(*at: Any) -> Look:
+    def look(*at: Any) -> BenchLook:
         told = "the board is not in the picture" if bench.looks == 1 else why
         seen = tuple(replace(one, why=told) for one in looked(*at).seen)
-        return Look(seen, 0, 0, 1.0)
+        return BenchLook(seen, 0, 0, 1.0)
 
     bench.look = look  # type: ignore[method-assign]
     with pytest.raises(BoardNotFound, match=re.escape(why)):
@@ -182,7 +182,7 @@ def in_the_night(bench: CornerBench, whys: Sequence[str]) -> None:
     """Around the one place that is lit, ``ASIDE_RAD`` to the right, views are no good; a lamp is not seen."""
     looked, lowest = bench.look, bench.head.tilt_limits_rad[0]
 
-    def look(pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> Look:
+    def look(pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> BenchLook:
         seen = looked(pan_rad, tilt_rad, approach)
         if abs(pan_rad - ASIDE_RAD) < LIT_RAD:
             return seen
@@ -211,7 +211,7 @@ def test_dark_blurred_or_empty_views_do_not_end_a_search_before_the_board_beside
     in_the_night(bench, [why])
     asked = Placement(2.0, 0.0, 0.0, (0.0, 0.0))
     bench.stand(replace(asked, bearing_deg=math.degrees(ASIDE_RAD)))
-    look = Search(bench, run.known.now, run.known.sought, teller).find(asked)
+    look = BoardSearch(bench, run.known.now, run.known.sought, teller).find(asked)
     assert look.found and bench.looks > 24
 
 
@@ -222,10 +222,10 @@ def test_a_search_through_a_narrow_view_ends_after_a_hundred_looks(
     run, teller = run_of(bench, tmp_path / "bench")
     monkeypatch.setattr("mastctl.bench.search.OVERLAP", 0.1)
     looks: list[tuple[float, float]] = []
-    bench.look = lambda *at: looks.append(at) or Look((), 0, 0, 1.0)  # type: ignore
+    bench.look = lambda *at: looks.append(at) or BenchLook((), 0, 0, 1.0)  # type: ignore
     asked = Placement(2.0, 0.0, 0.0, (0.0, 0.0))
     with pytest.raises(BoardNotFound, match=r"not found in 100 looks around where it was asked for \("):
-        Search(bench, run.known.now, run.known.sought, teller).find(asked)
+        BoardSearch(bench, run.known.now, run.known.sought, teller).find(asked)
     pans, tilts = np.ptp(looks, axis=0)
     assert len(looks) == 100 and pans < 1.0 and tilts < 1.0
 
@@ -235,7 +235,7 @@ def test_a_search_that_found_nothing_says_what_was_seen_where(repository: Path, 
     run, teller = run_of(bench, tmp_path / "bench")
     in_the_night(bench, [DARK + "; turn on a light", EMPTY])
     with pytest.raises(BoardNotFound) as told:
-        Search(bench, run.known.now, run.known.sought, teller).find(Placement(2.0, 0.0, 0.0, (0.0, 0.0)))
+        BoardSearch(bench, run.known.now, run.known.sought, teller).find(Placement(2.0, 0.0, 0.0, (0.0, 0.0)))
     words = str(told.value)
     assert "looks all over the head's limits (" in words
     shown = [words.index(part) for part in (f"{DARK}, ", "; no corners, ", f"; {EMPTY}, ")]
@@ -252,4 +252,4 @@ def test_a_search_that_found_nothing_says_what_was_seen_where(repository: Path, 
 def test_a_folder_whose_pictures_no_run_took_is_refused_in_a_sentence(tmp_path: Path) -> None:
     theirs = write_survey(simulate_bench(1, BenchPlan(attitudes=3, checks=1)), tmp_path / "theirs")
     with pytest.raises(BadFile, match="navcam_left-001 where PLACEMENT-NUMBER-CAMERA is expected"):
-        Kept(theirs.folder, theirs.boards, theirs.sigma, theirs.cameras, theirs.stereo)
+        RunFolder(theirs.folder, theirs.boards, theirs.sigma, theirs.cameras, theirs.stereo)

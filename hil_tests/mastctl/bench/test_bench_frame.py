@@ -21,9 +21,8 @@ from calib.survey.reader import read_survey
 from calib.survey.records import Survey
 from calib.survey.writer import write_survey
 from mastctl.bench import frame
-from mastctl.bench.fitting import fit_in_rover
 from mastctl.bench.folder import FORMER
-from mastctl.bench.frame import Frame
+from mastctl.bench.frame import RoverFrame, fit_in_rover
 from mastctl.calibration.bench_verdict import judge_bench
 from mastctl.cli.main import main
 from tools.sim_survey.bench import NAVCAMS, BenchCamera, BenchPlan, Placement, simulate_bench
@@ -146,8 +145,8 @@ def test_a_placement_that_moved_and_spoils_the_fit_is_left_out_with_a_sentence(
 
     monkeypatch.setattr(frame, "fit_bench", fits_only_without_p1)
     with pytest.raises(BenchNotFitted, match=r"24\.6 times"):
-        frame.fit_in_frame(survey, frame.Frame(), None)
-    done = frame.fit_in_frame(survey, frame.Frame(), None, moved={"p1": 24.7})
+        frame.fit_in_frame(survey, frame.RoverFrame(), None)
+    done = frame.fit_in_frame(survey, frame.RoverFrame(), None, moved={"p1": 24.7})
     assert {placement for _, placement in done.rover_from_board} == {"p2", "p3"}
     (reason,) = [r for r in judge_bench(survey, done).reasons if "placement p1" in r.sentence]
     assert reason.grade == "care" and "shows the board 24.7 px aside" in reason.sentence
@@ -157,5 +156,5 @@ def test_a_placement_that_moved_and_spoils_the_fit_is_left_out_with_a_sentence(
 def test_a_run_plans_with_corners_that_are_off_by_what_print_and_lens_add(print_m: float) -> None:
     survey = simulate_bench(1, BenchPlan(attitudes=9, checks=3, own_px=0.01, print_m=print_m))
     former = fit_bench(survey).rig
-    fitted = fit_in_rover(Frame(), former, dict)(survey)
+    fitted = fit_in_rover(RoverFrame(), former, dict)(survey)
     assert fitted.sigma_scale * 0.01 == pytest.approx(fitted.corner_rms_px, rel=0.4)

@@ -22,11 +22,10 @@ from calib.geometry.rigid import Rigid
 from calib.plan.knowledge import BenchShot, Knowledge, Workspace, pointing
 from calib.plan.placements import Placement
 from calib.survey.reader import read_survey
-from mastctl.bench.eyes import Look
+from mastctl.bench.eyes import BenchLook
 from mastctl.bench.folder import looks_of
-from mastctl.bench.looks import BoardLost
+from mastctl.bench.looks import BenchGoal, BoardLost
 from mastctl.bench.search import BoardNotFound
-from mastctl.bench.wanted import Wanted
 from tools.simulated.bench import CornerBench
 
 
@@ -105,7 +104,7 @@ def test_a_camera_that_cannot_show_the_board_or_has_seen_it_stand_takes_no_pictu
 
 def test_before_a_run_it_is_told_what_its_pictures_take() -> None:
     took_s = {"navcam_left": 1.0, "navcam_right": 1.0, "pancam_left": 2.0}
-    words = Wanted(pictures=60).will_take(took_s, ("navcam_left", "navcam_right"), 0.5)
+    words = BenchGoal(pictures=60).will_take(took_s, ("navcam_left", "navcam_right"), 0.5)
     # 21 looks of 1.5 s to turn, 0.5 s to choose and two pictures; 60 looks with all three
     assert words.startswith("21 to 60 looks will take 1.4 to 6 minutes here: one of all 3 cameras 6.0 s")
     assert (
@@ -123,7 +122,7 @@ class Mortal:
     def __init__(self, bench: CornerBench, looks: int) -> None:
         self.bench, self.left, self.head = bench, looks, bench.head
 
-    def look(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> Look:
+    def look(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> BenchLook:
         if not self.left:
             raise Dying
         self.left -= 1
@@ -181,7 +180,7 @@ def test_a_board_that_is_taken_away_ends_the_run_and_loses_nothing(repository: P
     looked = bench.look
     taken = 0
 
-    def look(pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> Look:
+    def look(pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> BenchLook:
         nonlocal taken
         taken += 1
         if taken == 6:
@@ -199,7 +198,7 @@ def test_play_and_harmonics_are_found_where_the_head_has_them(repository: Path, 
     bench = corner_bench(
         repository, one_sided=False, harmonics_rad=((0.0, 0.006), (0.002, 0.0)), backlash_rad=0.004
     )
-    run, _ = run_of(bench, tmp_path / "bench", Wanted(pointing_px=0.3))
+    run, _ = run_of(bench, tmp_path / "bench", BenchGoal(pointing_px=0.3))
     joints = run.run().rig.joints
     assert joints.pan.backlash_rad == pytest.approx(0.004, abs=4e-4)
     known = Knowledge(run.known.now.rig, {})
@@ -274,7 +273,7 @@ def test_a_head_that_slipped_ends_the_run_with_the_placement_and_names_it(
     run, _ = run_of(bench, tmp_path / "bench")
     looked, taken = bench.look, 0
 
-    def look(pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> Look:
+    def look(pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> BenchLook:
         nonlocal taken
         taken += 1
         shown = looked(pan_rad + 0.01 * (taken > 6), tilt_rad, approach)

@@ -14,7 +14,7 @@ from calib.plan.placements import Placement
 from calib.targets.boards import Charuco
 from mastctl.bench import daemon_eyes
 from mastctl.bench.daemon_eyes import DaemonEyes
-from mastctl.bench.eyes import Interrupted, NoLight, NotThere
+from mastctl.bench.eyes import BenchInterrupted, NoLight, NotThere
 from mastctl.bench.simulated import SimulatedPerson
 from mastctl.bench.teller import Terminal
 from mastctl.client import Client
@@ -87,7 +87,7 @@ def test_when_no_camera_gives_a_picture_the_bench_waits_and_then_says_so(
 ) -> None:
     for camera in CAMERAS:
         client.set_fault(camera, "off")
-    with pytest.raises(Interrupted, match="navcam"):
+    with pytest.raises(BenchInterrupted, match="navcam"):
         eyes.look(0.0, 0.0)
     client.clear_faults()
     assert eyes.look(0.0, 0.0).found  # and goes on
@@ -95,7 +95,7 @@ def test_when_no_camera_gives_a_picture_the_bench_waits_and_then_says_so(
 
 def test_a_head_that_is_silent_ends_the_look_in_a_sentence(client: Client, eyes: DaemonEyes) -> None:
     client.set_fault("pan_tilt", "off")
-    with pytest.raises(Interrupted):
+    with pytest.raises(BenchInterrupted):
         eyes.look(0.3, -0.1)
 
 
@@ -109,14 +109,14 @@ def test_pictures_in_the_dark_say_that_they_are_dark(client: Client, eyes: Daemo
 
 
 def test_who_else_steers_is_named(client: Client, eyes: DaemonEyes) -> None:
-    with Client(client.url, name="Ana") as other, other.lease(), pytest.raises(Interrupted, match="Ana"):
+    with Client(client.url, name="Ana") as other, other.lease(), pytest.raises(BenchInterrupted, match="Ana"):
         eyes.look(0.1, 0.0)
 
 
 def test_an_emergency_stop_ends_the_look_and_says_how_to_go_on(client: Client, eyes: DaemonEyes) -> None:
     client.estop(name="Ana", reason="a hand in the way")
     try:
-        with pytest.raises(Interrupted, match="'mastctl reset' releases it"):
+        with pytest.raises(BenchInterrupted, match="'mastctl reset' releases it"):
             eyes.look(0.1, 0.0)
     finally:
         client.reset(name="Ana", reason="the hand is away")

@@ -19,7 +19,7 @@ from hil_tests import forks
 from hil_tests.waiting import until
 from mastctl.bench import daemon_eyes
 from mastctl.bench.daemon_eyes import DaemonEyes, _beside
-from mastctl.bench.eyes import Interrupted
+from mastctl.bench.eyes import BenchInterrupted
 from mastctl.client import Client
 
 BOARD = Charuco(10, 7, 0.055, 0.042)
@@ -81,7 +81,7 @@ def far_look(url: str, act: Callable[[Client], object]) -> str:
     with Client(url, name="bench") as client, client.lease(name="calibrate bench"):
         eyes = DaemonEyes(client, ("navcam_left",), BOARD)
         thread = in_the_move(url, act)
-        with pytest.raises(Interrupted) as told:
+        with pytest.raises(BenchInterrupted) as told:
             eyes.look(FAR_RAD, 0.0)
         thread.join()
         return str(told.value)
@@ -108,7 +108,7 @@ def test_a_lease_that_is_taken_lets_the_move_end_and_no_other_begin(url: str) ->
         until(lambda: ana.status()["moving"], "the head turns")
         with (
             ana.lease("Ana", take_over="the head is needed"),
-            pytest.raises(Interrupted, match="Ana took over: the head is needed"),
+            pytest.raises(BenchInterrupted, match="Ana took over: the head is needed"),
         ):
             eyes.look(-FAR_RAD, 0.0)
         assert ana.operation(move)["state"] == "running"
@@ -128,7 +128,7 @@ def test_a_stop_between_two_moves_ends_it_and_is_told(url: str) -> None:
         client.wait(client.point(pan_rad=here["pan_rad"] + 0.01, tilt_rad=here["tilt_rad"]))
         ana.stop()
         stands = ana.status()["joints"]
-        with pytest.raises(Interrupted, match=r"^the head was stopped by Ana$"):
+        with pytest.raises(BenchInterrupted, match=r"^the head was stopped by Ana$"):
             eyes.look(FAR_RAD, 0.0)
         now = ana.status()["joints"]
         assert stands is not None and now is not None and now["pan_rad"] == stands["pan_rad"]

@@ -15,9 +15,9 @@ from typing import Any
 
 from calib.plan.placements import Placement
 from hil_tests.waiting import until
-from mastctl.bench.lines import LEFT_ALONE, Lines
-from mastctl.bench.teller import Progress
-from mastctl.guided.told import Run, heard
+from mastctl.bench.events import BenchProgress
+from mastctl.bench.teller import LEFT_ALONE, Lines
+from mastctl.guided.told import GuidedRun, heard
 
 HEAD: Any = None
 PLACE = Placement(1.1, -25.0, 8.0, (20.0, 0.0))
@@ -79,8 +79,8 @@ def test_what_is_told_is_what_the_daemon_understands_also_numbers_that_are_none(
     lines.say("the board is not where it was asked for")
     cells = {"navcam_left": tuple(range(48))}
     for predicted_px in (math.inf, 3.5):
-        lines.progress(Progress("p1", 3, 60, predicted_px, 0.2, 0.03, (0.1, -0.2), math.nan, cells))
-    run = Run("a", "b", "c")
+        lines.progress(BenchProgress("p1", 3, 60, predicted_px, 0.2, 0.03, (0.1, -0.2), math.nan, cells))
+    run = GuidedRun("a", "b", "c")
     for line in out.getvalue().splitlines():
         run = heard(run, line.encode())
     assert run.odd == 0 and run.curve == ((3, 3.5),) and run.expected_px is None
@@ -90,7 +90,7 @@ def test_what_is_told_is_what_the_daemon_understands_also_numbers_that_are_none(
 
 
 def test_when_the_answers_end_so_does_the_process() -> None:
-    script = "import sys, time\nfrom mastctl.bench.lines import Lines\n"
+    script = "import sys, time\nfrom mastctl.bench.teller import Lines\n"
     script += "Lines(sys.stdout, sys.stdin)\ntime.sleep(60)\n"
     ended = subprocess.run(
         [sys.executable, "-c", script], stdin=subprocess.DEVNULL, timeout=60.0, check=False

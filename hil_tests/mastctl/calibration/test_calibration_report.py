@@ -16,10 +16,16 @@ from calib.calibrate.paper import fit_paper
 from calib.calibrate.survey import fit_joint
 from calib.survey.records import Survey, SurveyFinding
 from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey
+from mastctl.calibration.checks import check_sizes
 from mastctl.calibration.drawn import boards
-from mastctl.calibration.expected import check_sizes
-from mastctl.calibration.landing import click, handoff_errors_px, pointing_error_px
-from mastctl.calibration.maps import CORNER, change_map, uncertainty_map
+from mastctl.calibration.landing import (
+    CORNER,
+    change_map,
+    click,
+    handoff_errors_px,
+    pointing_error_px,
+    uncertainty_map,
+)
 from mastctl.calibration.verdict import judge_calibration
 from mastctl.report import plots
 

@@ -104,9 +104,11 @@ def test_campaigns_of_numbers(places: tuple[Executor, Executor]) -> None:
     rig, head = load_rig(RIG_FILE).rig, PRESETS["ptu_d46_70"]
     works = works_of(
         {
-            refine.run_block: [refine.Block(rig, (2.0, 2.0), 1.0, n, 1, 9, 0.2, 0.4, 1) for n in (0, 10)],
+            refine.run_block: [
+                refine.RefineBlock(rig, (2.0, 2.0), 1.0, n, 1, 9, 0.2, 0.4, 1) for n in (0, 10)
+            ],
             life.offs: [life.LivedHead("few or more", head, moves, 1) for moves in (2, 3)],
-            keep_out.run_case: [keep_out.Case("suite/a", True)],
+            keep_out.run_case: [keep_out.KeepOutCase("suite/a", True)],
         }
     )
     same(places, works)
@@ -119,7 +121,7 @@ def test_campaigns_of_pictures(places: tuple[Executor, Executor]) -> None:
         {
             dots.run_cell: [dots.Cell(1290.0, 3.0, tilt, 1, 1, stress, True) for tilt in (0.0, 30.0)],
             render_bias.run_row: [render_bias.Row("flat", "hazcam turned", 2.0, n, 1, 2, 1) for n in (1, 2)],
-            match_sigma.run_look: [match_sigma.Look(rig, 0.5, 1, number, 1) for number in (0, 1)],
+            match_sigma.run_look: [match_sigma.MatchLook(rig, 0.5, 1, number, 1) for number in (0, 1)],
         }
     )
     (first, second), *_ = same(places, works)

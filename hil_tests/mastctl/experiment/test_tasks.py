@@ -25,7 +25,7 @@ from hil_tests.mastctl.calibration.survey_world import RIG_FILE
 from hil_tests.mastctl.experiment.toy_tasks import Draw, broken_when_odd, calls, drawn, drawn_or_stuck
 from mastctl.cli.main import main
 from mastctl.experiment import tasks
-from mastctl.experiment.tasks import Kept, OtherProgram, TaskFailed, Work
+from mastctl.experiment.tasks import KeptResults, OtherProgram, TaskFailed, Work
 from tools.studies.calibration_survey import one_survey, survey_tasks
 
 
@@ -57,17 +57,17 @@ def test_results_come_in_the_order_of_the_tasks_whatever_the_order_of_their_ends
 
 
 def test_what_is_kept_is_not_run_again_and_comes_back_to_the_last_bit(tmp_path: Path) -> None:
-    first = work(4).run(threads, Kept(tmp_path))
+    first = work(4).run(threads, KeptResults(tmp_path))
     told: list[int] = []
-    again = work(4).run(nothing, Kept(tmp_path), lambda task, _: told.append(task.seed))
+    again = work(4).run(nothing, KeptResults(tmp_path), lambda task, _: told.append(task.seed))
     assert sorted(calls) == [0, 1, 2, 3] and told == [0, 1, 2, 3]
     for one, other in zip(first, again, strict=True):
         assert one.tobytes() == other.tobytes()
 
 
 def test_more_tasks_go_on_from_the_ones_that_are_kept(tmp_path: Path) -> None:
-    work(3).run(threads, Kept(tmp_path))
-    work(5).run(threads, Kept(tmp_path))
+    work(3).run(threads, KeptResults(tmp_path))
+    work(5).run(threads, KeptResults(tmp_path))
     assert sorted(calls) == [0, 1, 2, 3, 4]
 
 
@@ -83,25 +83,26 @@ def test_the_same_task_twice_is_run_once() -> None:
 )
 def test_a_torn_result_is_run_again(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
     one = work(1)
-    whole = one.run(threads, Kept(tmp_path))[0]
+    whole = one.run(threads, KeptResults(tmp_path))[0]
     file = tmp_path / f"{one.ids[0]}.task"
     file.write_bytes(damage(file.read_bytes()))
-    assert not Kept(tmp_path).holds(one.ids[0])
-    np.testing.assert_array_equal(one.run(threads, Kept(tmp_path))[0], whole)
-    assert calls == [0, 0] and Kept(tmp_path).holds(one.ids[0])
+    assert not KeptResults(tmp_path).holds(one.ids[0])
+    np.testing.assert_array_equal(one.run(threads, KeptResults(tmp_path))[0], whole)
+    assert calls == [0, 0] and KeptResults(tmp_path).holds(one.ids[0])
 
 
 def test_two_runs_at_once_on_one_folder_agree(tmp_path: Path) -> None:
     found: list[list[np.ndarray]] = []
     runs = [
-        threading.Thread(target=lambda: found.append(work(10).run(threads, Kept(tmp_path)))) for _ in "ab"
+        threading.Thread(target=lambda: found.append(work(10).run(threads, KeptResults(tmp_path))))
+        for _ in "ab"
     ]
     for run in runs:
         run.start()
     for run in runs:
         run.join()
     np.testing.assert_array_equal(found[0], found[1])
-    assert all(Kept(tmp_path).holds(name) for name in work(10).ids)
+    assert all(KeptResults(tmp_path).holds(name) for name in work(10).ids)
 
 
 # Names
@@ -135,11 +136,11 @@ def test_another_program_and_another_function_give_other_names(
 ) -> None:
     """After an upgrade nothing old is taken for new."""
     before = work(1)
-    before.run(threads, Kept(tmp_path))
+    before.run(threads, KeptResults(tmp_path))
     assert before.ids != work(1, broken_when_odd).ids
     monkeypatch.setattr(tasks, "_program", lambda package: "mastctl of tomorrow")
     assert before.ids != work(1).ids
-    work(1).run(threads, Kept(tmp_path))
+    work(1).run(threads, KeptResults(tmp_path))
     assert calls == [0, 0]
 
 
@@ -169,8 +170,8 @@ def test_a_worker_with_another_program_is_refused() -> None:
 def test_a_task_that_fails_takes_no_other_with_it(tmp_path: Path) -> None:
     some = work(4, broken_when_odd)
     with pytest.raises(TaskFailed, match=r"2 of 4 tasks failed; task \w+ \(seed [13]\): ZeroDivisionError"):
-        some.run(threads, Kept(tmp_path))
-    assert [Kept(tmp_path).holds(name) for name in some.ids] == [True, False, True, False]
+        some.run(threads, KeptResults(tmp_path))
+    assert [KeptResults(tmp_path).holds(name) for name in some.ids] == [True, False, True, False]
 
 
 def test_a_folder_that_cannot_be_written_is_refused_in_words(tmp_path: Path, capsys: Any) -> None:
@@ -208,7 +209,7 @@ def test_a_killed_run_keeps_what_was_done_and_leaves_no_process(tmp_path: Path) 
         gone, left = psutil.wait_procs(workers, timeout=60)
     assert gone and not left
     done = Work(drawn_or_stuck, [Draw(1), Draw(2, scale=1e9)], str)
-    assert [Kept(tmp_path / "kept").holds(name) for name in done.ids] == [True, False]
+    assert [KeptResults(tmp_path / "kept").holds(name) for name in done.ids] == [True, False]
 
 
 # Commands
@@ -219,7 +220,7 @@ POINTING = ["experiment", "pointing", "--simulated", "--targets", "1", "--distan
 def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupted(self: Work[Any, Any], executor: Any, kept: Kept, done: Any) -> None:
+    def interrupted(self: Work[Any, Any], executor: Any, kept: KeptResults, done: Any) -> None:
         kept.write(self.ids[0], "first", 1)
         raise KeyboardInterrupt
 

@@ -14,9 +14,9 @@ from typing import Any
 from drivers.clock import SystemClock
 from hil_tests.waiting import NET_S, until
 from mastctl.commands.lease import Leases
-from mastctl.guided.guide import Door, Guide, Wanted
-from mastctl.guided.runs import Folder
-from mastctl.guided.told import Run
+from mastctl.guided.guide import Guide, RunRequest, WayIn
+from mastctl.guided.runs import GuidedFolder
+from mastctl.guided.told import GuidedRun
 from mastctl.state.publisher import Publisher
 
 PLACE = {
@@ -94,16 +94,16 @@ class World:
     publisher: Publisher
     stops: FakeStops
     masts: Path
-    told: list[Run] = field(default_factory=list)
+    told: list[GuidedRun] = field(default_factory=list)
     lent: list[str] = field(default_factory=list)
 
-    def begin(self, **wanted: Any) -> Run:
-        return self.guide.start(Wanted(**({"board": "charuco_a4"} | wanted)), "Ana")
+    def begin(self, **wanted: Any) -> GuidedRun:
+        return self.guide.start(RunRequest(**({"board": "charuco_a4"} | wanted)), "Ana")
 
-    def until(self, state: str) -> Run:
+    def until(self, state: str) -> GuidedRun:
         """The run, once it is in a state."""
 
-        def there() -> Run | None:
+        def there() -> GuidedRun | None:
             run = self.guide.run
             return run if run is not None and run.state == state else None
 
@@ -135,7 +135,7 @@ def world(folder: Path, script: str, simulated: bool = True) -> Iterator[World]:
         lambda control: publisher.publish("lease", "lease", None),
     )
 
-    def command(run: Folder, asked: dict[str, Any], door: Door, mast_file: Path) -> Sequence[str]:
+    def command(run: GuidedFolder, asked: dict[str, Any], door: WayIn, mast_file: Path) -> Sequence[str]:
         body = f"MAST, REPORT = {str(mast_file)!r}, {str(run.report)!r}\n{script}"
         return [sys.executable, "-c", HEAD + body]
 
@@ -147,7 +147,7 @@ def world(folder: Path, script: str, simulated: bool = True) -> Iterator[World]:
 
     guide = Guide(folder / "state", lambda: masts, leases, stops, stops, publisher, simulated, command)
     (folder / "state").mkdir(exist_ok=True)
-    guide.door = Door("http://127.0.0.1:1", lend)
+    guide.door = WayIn("http://127.0.0.1:1", lend)
     made = World(guide, leases, publisher, stops, masts, lent=lent)
     news = publisher.subscribe("bench")
 

@@ -17,9 +17,9 @@ from mastctl.commands.caller import Caller
 from mastctl.errors import BadRequest, MastctlError, NotKnown, NotNow, Unable
 from mastctl.guided import child as child_module
 from mastctl.guided import guide as guide_module
-from mastctl.guided.guide import Door, Wanted, command_of
-from mastctl.guided.runs import Folder
-from mastctl.guided.told import MOST_SENTENCES, Run, heard
+from mastctl.guided.guide import RunRequest, WayIn, command_of
+from mastctl.guided.runs import GuidedFolder
+from mastctl.guided.told import MOST_SENTENCES, GuidedRun, heard
 
 ANA, BO = Caller("Ana", "operate"), Caller("Bo", "operate")
 
@@ -83,9 +83,9 @@ def test_the_program_knows_its_lease_and_token_and_neither_stands_on_its_command
         assert work is not None and run.sentences == (f"secret-of-the-child{work.lease.id}",)
         shown = Path(f"/proc/{made.pid}/cmdline").read_bytes().decode()
         assert "secret" not in shown and work.lease.id not in shown
-    folder = Folder(tmp_path / "run")
+    folder = GuidedFolder(tmp_path / "run")
     asked = {"wanted_px": 0.2, "pictures": 60, "by_hand": True}
-    words = command_of(folder, asked, Door("http://127.0.0.1:1", None), tmp_path / "m.yaml")
+    words = command_of(folder, asked, WayIn("http://127.0.0.1:1", None), tmp_path / "m.yaml")
     assert words[3:6] == ["calibrate", "bench", "--lines"] and words[-1] == "--by-hand"
 
 
@@ -135,12 +135,12 @@ GARBAGE = [
 
 @pytest.mark.parametrize("line", GARBAGE)
 def test_a_line_that_makes_no_sense_changes_nothing_but_a_count(line: str) -> None:
-    before = heard(Run("a", "b", "c"), json.dumps(BEGUN).encode())
+    before = heard(GuidedRun("a", "b", "c"), json.dumps(BEGUN).encode())
     assert heard(before, line.encode()) == replace(before, odd=1)
 
 
 def test_a_run_stays_small_however_much_it_tells() -> None:
-    run = heard(Run("a", "b", "c"), json.dumps(BEGUN).encode())
+    run = heard(GuidedRun("a", "b", "c"), json.dumps(BEGUN).encode())
     for k in range(3000):
         run = heard(run, json.dumps({"event": "said", "sentence": "long " * 2000 + str(k)}).encode())
         run = heard(run, json.dumps({**PROGRESS, "pictures": k}).encode())
@@ -186,7 +186,7 @@ def test_a_stop_that_came_before_the_program_was_there_ends_the_run_too(
     with world(tmp_path, lines(BEGUN) + "time.sleep(60)\n") as made:
         before = made.leases.last_stop
         made.leases.stop_came()
-        made.guide.start(Wanted(board="charuco_a4"), "Ana", before)
+        made.guide.start(RunRequest(board="charuco_a4"), "Ana", before)
         assert made.leases.control() is None
         run = made.until("interrupted")
         assert run.code == "stopped" and run.sentence.startswith("somebody pressed stop")

@@ -7,19 +7,19 @@ import pytest
 
 from calib.files.mast_file import load_rig
 from mastctl.packaged import config_folder
-from tools.campaigns.match_sigma import Look, Row, Rows, run_look, together
+from tools.campaigns.match_sigma import MatchLook, MatchRow, Rows, run_look, together
 
 TARGETS, SEEDS = 8, (1, 2)
 
 
-def of_sigma(row: Row) -> float:
+def of_sigma(row: MatchRow) -> float:
     """Rms of error over told sigma along x, where ranges show."""
     return float(np.sqrt(np.mean((row.error_px / row.sigma_px)[:, 0] ** 2)))
 
 
 def rows_on(relief_m: float) -> Rows:
     rig = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig
-    return together([run_look(Look(rig, relief_m, seed, 0, TARGETS)) for seed in SEEDS])
+    return together([run_look(MatchLook(rig, relief_m, seed, 0, TARGETS)) for seed in SEEDS])
 
 
 @pytest.mark.long(1, "a campaign in small: many rendered matches for one scatter")

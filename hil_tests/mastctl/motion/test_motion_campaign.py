@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib.matching.same_patches import Posed
-from tools.campaigns.motion import View, is_lie, taken
+from tools.campaigns.motion import WalkView, is_lie, taken
 
 NAME = "navcam_left"
 
@@ -14,7 +14,7 @@ NAME = "navcam_left"
 @pytest.mark.parametrize(("true_pan_rad", "lie"), [(0.002, False), (0.02, True), (-0.02, True)])
 def test_a_lie_is_told_from_the_true_joints(true_pan_rad: float, lie: bool) -> None:
     told = Posed(np.zeros((8, 8), np.float32), 0.0, -0.4)
-    assert is_lie(View({NAME: told}, (true_pan_rad, -0.4)), told, (0.008, 0.008)) is lie
+    assert is_lie(WalkView({NAME: told}, (true_pan_rad, -0.4)), told, (0.008, 0.008)) is lie
 
 
 def test_with_a_head_that_has_backlash_the_true_joints_are_not_the_readings() -> None:

@@ -13,8 +13,7 @@ import pytest
 from jinja2 import UndefinedError
 
 from mastctl.report import pages, plots
-from mastctl.report.figures import Figure, data_url
-from mastctl.report.pictures import encoded, enlarged, photo
+from mastctl.report.pictures import Figure, data_url, encoded, enlarged, photo
 from mastctl.report.tables import Table, number, x_y
 from tools.studies import calibration
 

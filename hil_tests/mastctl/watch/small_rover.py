@@ -14,7 +14,7 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import rot_y
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
-from tools.campaigns.sentinel import Truth
+from tools.campaigns.sentinel import ChangedRig
 from tools.campaigns.sentinel_days import changed, smaller
 
 BY = 2
@@ -69,15 +69,15 @@ def truly(daemon: RunningDaemon, rig: Rig) -> Iterator[None]:
 
 def bumped(rig: Rig, camera: str, turn_rad: tuple[float, float, float]) -> Rig:
     """A camera turned about its own place, by small angles about x, y, z of the head."""
-    return _with(rig, camera, Truth(turned={camera: np.array(turn_rad)}))
+    return _with(rig, camera, ChangedRig(turned={camera: np.array(turn_rad)}))
 
 
 def refocused(rig: Rig, camera: str, part: float) -> Rig:
     """A camera whose focal length is longer by a part."""
-    return _with(rig, camera, Truth(focal={camera: part}))
+    return _with(rig, camera, ChangedRig(focal={camera: part}))
 
 
-def _with(rig: Rig, camera: str, truth: Truth) -> Rig:
+def _with(rig: Rig, camera: str, truth: ChangedRig) -> Rig:
     one = rig.cameras[camera]
     model = changed(one.model, camera, truth)
     return replace(rig, cameras={**rig.cameras, camera: replace(one, model=model)})

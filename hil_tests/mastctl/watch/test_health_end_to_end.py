@@ -15,7 +15,7 @@ from mastctl.client import Client
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.simulated import demo_config
-from mastctl.experiment.targets import Views
+from mastctl.experiment.targets import TargetViews
 from mastctl.packaged import config_folder
 
 BUMP_RAD = 2e-3
@@ -49,7 +49,7 @@ def test_a_bumped_camera_is_named_and_one_that_stands_is_not(tmp_path: Path, bum
     with RunningDaemon(config_of(tmp_path, bump_rad)) as daemon, Client(daemon.url) as client:
         said = []
         rig = daemon.service.stored.rig
-        views = Views(client, rig, PAIR, client.status()["limits"], np.random.default_rng(3), 1.0)
+        views = TargetViews(client, rig, PAIR, client.status()["limits"], np.random.default_rng(3), 1.0)
         aim = ("pancam_left", *rig.cameras["pancam_left"].model.image_center_px)
         for number in range(POINTINGS):
             target = next(one for _ in range(12) if (one := views.find_target(6.0)) is not None)

@@ -18,9 +18,9 @@ from hil_tests.mastctl.web.network import network_daemon
 from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
-from mastctl.guided.guide import Door
-from mastctl.guided.runs import Folder
-from mastctl.guided.told import Run
+from mastctl.guided.guide import WayIn
+from mastctl.guided.runs import GuidedFolder
+from mastctl.guided.told import GuidedRun
 
 Pair = tuple[RunningDaemon, FakeHardware]
 STEERS = """
@@ -34,15 +34,15 @@ client.use_lease(os.environ["MASTCTL_LEASE"])
 def scripted(daemon: RunningDaemon, script: str) -> None:
     """Have a daemon's guide run a script of the test."""
 
-    def command(run: Folder, asked: dict[str, Any], door: Door, mast_file: Path) -> list[str]:
+    def command(run: GuidedFolder, asked: dict[str, Any], door: WayIn, mast_file: Path) -> list[str]:
         names = f"URL, MAST, REPORT = {door.url!r}, {str(mast_file)!r}, {str(run.report)!r}\n"
         return [sys.executable, "-c", HEAD + names + script]
 
     daemon.service.guide._command = command
 
 
-def ended(daemon: RunningDaemon) -> Run:
-    def over() -> Run | None:
+def ended(daemon: RunningDaemon) -> GuidedRun:
+    def over() -> GuidedRun | None:
         run = daemon.service.guide.run
         return run if run is not None and run.over else None
 

@@ -25,7 +25,7 @@ from hil_tests.mastctl.web.network import NAME, Network, network_daemon
 from hil_tests.waiting import NET_S, joined, until
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped, Unable
-from mastctl.guided.told import Run
+from mastctl.guided.told import GuidedRun
 from mastctl.guided.told import heard as bench_heard
 from mastctl.state.publisher import TOPICS
 from mastctl.web import connections as connections_module
@@ -93,7 +93,7 @@ def test_each_topic_is_told_by_the_model_that_openapi_describes(pair: BOTH) -> N
         http.get("/api/v1/snapshot/navcam_left")
     publisher = daemon.service.machine.publisher
     publisher.publish("fault", "a device", ())
-    run = bench_heard(Run("20261122-120000", "2026-11-22T12:00:00+00:00", "Ana"), BENCH_BEGUN)
+    run = bench_heard(GuidedRun("20261122-120000", "2026-11-22T12:00:00+00:00", "Ana"), BENCH_BEGUN)
     publisher.publish("bench", "run", run)
     seen: set[str] = set()
     with socket_of(daemon.url) as line:

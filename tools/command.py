@@ -1,21 +1,29 @@
-"""A campaign: cases that are drawn, each a task of its own; what came of them as a table or as JSON.
+"""What the tools share: an orderly end, options of campaigns, cases as tasks, and tables.
 
-What a case is stands in the campaign: a value that carries its seed, and a function of it. The rest is here:
-the options that all have, the processes (or the cluster) that carry cases out, and how results are printed.
+A campaign has cases that are drawn, each a task of its own. What a case is stands in the campaign: a value
+that carries its seed, and a function of it. The rest is here: the options that all have, the processes (or
+the cluster) that carry cases out, and how results are printed.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mastctl.cli.output import at_least, positive_number
+from calib.errors import CalibError
+from drivers.errors import DriverError
+from mastctl import signals
+from mastctl.cli.output import CommandError, as_command_error, at_least, one_line, positive_number
 from mastctl.cli.tasks import add_task_options, results_of
+from mastctl.errors import MastctlError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -149,3 +157,43 @@ def numbers(words: str) -> tuple[float, ...]:
     if not all(0.0 <= value < np.inf for value in values):
         raise argparse.ArgumentTypeError(f"{words!r} where numbers of 0 or more are expected")
     return values
+
+
+def new_file(text: str) -> Path:
+    """Read the name of a file that can be written, before minutes are spent on it (argparse ``type``)."""
+    path = Path(text)
+    try:
+        path.touch()
+    except OSError as error:
+        raise argparse.ArgumentTypeError(f"{path}: {error.strerror}") from None
+    return path
+
+
+def end(main: Callable[[], int | None]) -> None:
+    """Run a tool and exit with its code; a signal ends it in order, with its folders and processes.
+
+    A refusal of the project's own is one sentence and the exit code that `mastctl` has for it; a file that
+    cannot be read or written is one sentence and 2. What refuses in its own way carries its exit code.
+    """
+    try:
+        with signals.raised():
+            sys.exit(_by_its_name(main)())
+    except signals.Ended as ended:
+        sys.exit(128 + ended.number)
+    except (CalibError, DriverError, MastctlError, CommandError) as error:
+        words, code = str(error), as_command_error(error).exit_code
+    except OSError as error:
+        if error.filename is None:
+            raise
+        words, code = f"{error.filename}: {error.strerror}", 2
+    sys.stderr.write(f"{one_line(words)}\n")
+    sys.exit(code)
+
+
+def _by_its_name(main: Callable[[], int | None]) -> Callable[[], int | None]:
+    """The same function of the module's own name: tasks and results travel by it, and by no ``__main__``."""
+    spec = main.__globals__.get("__spec__")
+    if main.__module__ != "__main__" or spec is None:
+        return main
+    named: Callable[[], int | None] = getattr(importlib.import_module(spec.name), main.__name__)
+    return named
