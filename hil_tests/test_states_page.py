@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from mastctl.state import table
-from mastctl.state.table import TABLE, WORDS
+from mastctl.control import table
+from mastctl.control.table import TABLE, WORDS
 from tools import states
 
 REPOSITORY = Path(__file__).resolve().parent.parent

@@ -53,13 +53,11 @@ from mastctl.web.connections import (
     most_connections,
     sweep,
 )
-from mastctl.web.entrance import Entrance
-from mastctl.web.secure import arriving
-from mastctl.web.server import Server
+from mastctl.web.entrance import Entrance, Names
+from mastctl.web.pictures import WatchedCameras
+from mastctl.web.server import Server, arriving
 from mastctl.web.sockets import LARGEST_BYTES, PING_S, Socket
-from mastctl.web.streams import Streams
-from mastctl.web.waiting import Waiting
-from mastctl.web.whose_page import Names
+from mastctl.web.waiting import Streams, Waiting
 
 log = logging.getLogger(__name__)
 
@@ -269,8 +267,9 @@ async def _serve(
     waiting = Waiting(service.clock)
     most = most_connections()
     streams = Streams(service.machine.publisher, most // 2)
+    watched = WatchedCameras(service.devices, service.clock)
     kind = type("Connection", (Connection,), {"most": most, "turns": waiting.turns})
-    settings = _settings(service, create_app(service, waiting, entrance, streams), kind)
+    settings = _settings(service, create_app(service, waiting, entrance, streams, watched), kind)
     server = Server(settings)
     ending = asyncio.Event()
 
@@ -320,6 +319,7 @@ async def _serve(
     log.info("ending: the mast is stopped first")
     await stopped
     streams.end()
+    watched.close()
     server.end()
     loop.call_later(GRACE_S - 0.5, _leave, server.server_state.connections)  # before uvicorn's own impatience
     await serving

@@ -4,7 +4,7 @@
     .venv/bin/python -m tools.states --svg docs/img/states.svg       # the picture
     .venv/bin/python -m tools.states --page docs/explanation/safety.md  # the tables in the page
 
-Both come from `mastctl.state.table`; only where a state stands in the picture is said here.
+Both come from `mastctl.control.table`; only where a state stands in the picture is said here.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from xml.sax.saxutils import escape
 
-from mastctl.state.table import CHOICES, EVENTS, HAPPENS, MEANINGS, TABLE, WORDS, Event, Word, leads_to
+from mastctl.control.table import CHOICES, EVENTS, HAPPENS, MEANINGS, TABLE, WORDS, Event, Word, leads_to
 from tools.command import end
 
 BEGIN, END = "<!-- states: begin -->", "<!-- states: end -->"

@@ -12,7 +12,7 @@ from drivers.hardware import DeviceSettings
 from mastctl.config import load_config
 from mastctl.conform.devices import head_under_test
 from mastctl.conform.head_trial import HeadTrial
-from mastctl.service.mast_in_use import bounds_of
+from mastctl.service.masts import bounds_of
 
 CHOSEN: str | None = None
 """The configuration that --hardware names."""

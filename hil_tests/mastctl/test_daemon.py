@@ -38,9 +38,9 @@ from hil_tests.mastctl.service_fakes import (
 from hil_tests.waiting import NET_S, joined, until
 from mastctl.client import Client
 from mastctl.config import Listen, load_config
+from mastctl.control import operations as operations_module
 from mastctl.daemon import AddressInUse, RunningDaemon, _suspend, _tcp_socket, run
 from mastctl.devices import devices as devices_module
-from mastctl.operations import operations as operations_module
 from mastctl.safety.stop_threads import StopThreads
 from mastctl.service import service as service_module
 from mastctl.web.server import Server

@@ -22,7 +22,7 @@ from typing import Any, get_args
 from calib.errors import BadFile
 from calib.files.atomic import remove, replace_bytes
 from mastctl.answers import Role
-from mastctl.commands.caller import ROLES
+from mastctl.control.caller import ROLES
 from mastctl.errors import MastctlError
 from mastctl.safety.state_file import StateFile
 

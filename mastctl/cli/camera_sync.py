@@ -53,7 +53,7 @@ def camera_sync(args: argparse.Namespace) -> int:
     from drivers.clock import SystemClock
     from mastctl.config import load_config
     from mastctl.devices.opening import devices_beside
-    from mastctl.service.mast_in_use import bounds_of
+    from mastctl.service.masts import bounds_of
     from mastctl.setup.sync_sweep import Sweep, plan_sweep
 
     config = load_config(args.config)

@@ -154,7 +154,7 @@ def _configured_frame(args: argparse.Namespace) -> StampedFrame:
     from drivers.absent import AbsentCamera
     from drivers.clock import SystemClock
     from mastctl.devices.opening import devices_beside
-    from mastctl.service.mast_in_use import bounds_of
+    from mastctl.service.masts import bounds_of
 
     config = config_of(args)
     settings, clock = with_cameras(config, [args.camera]), SystemClock()
@@ -223,7 +223,7 @@ def _check_any(args: argparse.Namespace, config: Config) -> int:
     """Hold a configured camera of any driver against what a driver promises."""
     from drivers.clock import SystemClock
     from mastctl.devices.opening import devices_beside, open_one_camera
-    from mastctl.service.mast_in_use import bounds_of
+    from mastctl.service.masts import bounds_of
     from mastctl.setup.camera_check import CameraCheck
 
     bounds = bounds_of(config)

@@ -145,7 +145,7 @@ def _device(
         return device_settings(args.driver, _options(args.options), kind, name), name, None, size_px
     from mastctl.cli.camera_sync import with_cameras
     from mastctl.config import load_config
-    from mastctl.service.mast_in_use import bounds_of
+    from mastctl.service.masts import bounds_of
 
     if args.driver is not None or args.options is not None:
         raise WrongUse("--driver and --options do not go with --config, which says them")

@@ -156,8 +156,7 @@ def _served(args: argparse.Namespace) -> int:
     """Serve a recording until told to end."""
     from mastctl import signals
     from mastctl.config import load_config
-    from mastctl.recorder.recorded import read_whole
-    from mastctl.recorder.replayed import replay_files
+    from mastctl.recorder.recorded import read_whole, replay_files
 
     listen = _listen(args.listen)
     queue_output()

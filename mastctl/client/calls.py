@@ -1,6 +1,6 @@
 """Every question of a client, once for the one that waits and the one for asyncio.
 
-A question is a coroutine over a `mastctl.client.connection.Daemon`, which alone sends and waits.
+A question is a coroutine over a `mastctl.client.connection.DaemonConnection`, which alone sends and waits.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mastctl.answers import (
     StopTold,
     TrackTold,
 )
-from mastctl.client.connection import ClientError, Daemon
+from mastctl.client.connection import ClientError, DaemonConnection
 from mastctl.client.following import followed
 from mastctl.client.jog import ANSWER_S, Jog
 from mastctl.client.keeping_calls import KeepingCalls
@@ -47,7 +47,7 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
         The connection that they go through.
     """
 
-    def __init__(self, daemon: Daemon) -> None:
+    def __init__(self, daemon: DaemonConnection) -> None:
         self._daemon = daemon
 
     async def status(self) -> Status:

@@ -1,7 +1,7 @@
 """Questions to a daemon over HTTP; whatever goes wrong is a `ClientError`.
 
-What is asked, how often, and what an answer means stands once, in `Daemon`, which waits for nothing itself.
-Of the two that send, `DaemonHttp` has the calling thread wait, and `AsyncDaemonHttp` asyncio.
+What is asked, how often, and what an answer means stands once, in `DaemonConnection`, which waits for
+nothing itself. Of the two that send, `DaemonHttp` has the calling thread wait, and `AsyncDaemonHttp` asyncio.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Broken(ClientError):
     """The connection broke: whether the daemon got the request is not known."""
 
 
-class Daemon(ABC):
+class DaemonConnection(ABC):
     """A connection to one daemon by either transport; parameters and errors as of `mastctl.client.Client`.
 
     Attributes
@@ -285,7 +285,7 @@ class Daemon(ABC):
         """Let go of the connection."""
 
 
-class DaemonHttp(Daemon):
+class DaemonHttp(DaemonConnection):
     """A connection whose questions the calling thread waits for: its coroutines are `finished` at once."""
 
     def __init__(self, url: str, timeout_s: float, name: str | None = None, token: str | None = None) -> None:
@@ -319,7 +319,7 @@ class DaemonHttp(Daemon):
         self._http.close()
 
 
-class AsyncDaemonHttp(Daemon):
+class AsyncDaemonHttp(DaemonConnection):
     """A connection whose questions are waited for by asyncio."""
 
     def __init__(self, url: str, timeout_s: float, name: str | None = None, token: str | None = None) -> None:

@@ -7,7 +7,7 @@ from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from contextlib import aclosing
 from typing import Any, TypeVar, cast
 
-from mastctl.client.connection import Broken, ClientError, Daemon
+from mastctl.client.connection import Broken, ClientError, DaemonConnection
 
 T = TypeVar("T")
 
@@ -19,7 +19,7 @@ ASK_S = 0.25  # between questions to a daemon that has no stream left
 
 
 async def followed(
-    daemon: Daemon,
+    daemon: DaemonConnection,
     query: Mapping[str, Any],
     ask: Callable[[], Awaitable[T]],
     timeout_s: float,
@@ -63,7 +63,9 @@ async def followed(
             return
 
 
-async def _stream(daemon: Daemon, query: Mapping[str, Any], until_s: float) -> AsyncGenerator[dict[str, Any]]:
+async def _stream(
+    daemon: DaemonConnection, query: Mapping[str, Any], until_s: float
+) -> AsyncGenerator[dict[str, Any]]:
     """Yield a stream's values until it ends, or a time, or some seconds before it."""
     left_s = until_s - time.monotonic()
     if left_s <= 0:

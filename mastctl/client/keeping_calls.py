@@ -26,13 +26,13 @@ from mastctl.answers import (
     SessionTold,
     SunTold,
 )
-from mastctl.client.connection import Daemon
+from mastctl.client.connection import DaemonConnection
 
 
 class KeepingCalls:
     """What is asked of a daemon that moves no head."""
 
-    _daemon: Daemon
+    _daemon: DaemonConnection
 
     async def reload(self) -> ReloadTold:
         """Have the daemon read its configuration again; return ``changed``, ``mast`` and ``notes``.

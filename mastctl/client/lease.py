@@ -10,7 +10,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 from mastctl.answers import ControlTold, LeaseGranted, LeaseTold
-from mastctl.client.connection import Broken, ClientError, Daemon, finished, plain_name
+from mastctl.client.connection import Broken, ClientError, DaemonConnection, finished, plain_name
 
 RENEWALS = 3  # within a lease's time, so that one may be lost
 LEAST_TIMEOUT_S = 0.5
@@ -27,7 +27,7 @@ class HeldLease:
         Why the lease is no longer held, None while it is; the next command is refused with the same reason.
     """
 
-    def __init__(self, daemon: Daemon, granted: LeaseGranted, for_s: float) -> None:
+    def __init__(self, daemon: DaemonConnection, granted: LeaseGranted, for_s: float) -> None:
         self.id = str(granted["lease_id"])
         self.holder = str(granted["holder"])
         self.lost: ClientError | None = None
@@ -69,7 +69,7 @@ class HeldLease:
 class LeaseCalls:
     """Acquiring, renewing and releasing a lease."""
 
-    _daemon: Daemon
+    _daemon: DaemonConnection
 
     @asynccontextmanager
     async def lease(

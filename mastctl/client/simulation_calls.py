@@ -17,13 +17,13 @@ from mastctl.answers import (
     WordsTold,
     WordTold,
 )
-from mastctl.client.connection import Daemon
+from mastctl.client.connection import DaemonConnection
 
 
 class SimulationCalls:
     """Where the rover truly stands, boards before it, its time, its faults; only of a simulated one."""
 
-    _daemon: Daemon
+    _daemon: DaemonConnection
 
     async def true_pose(self) -> StandTold:
         """Return where a simulated rover truly stands: ``position_m`` and ``quaternion``, site_from_rover."""

@@ -23,6 +23,7 @@ from drivers.clock import Clock, SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame
 from drivers.frame_times import Offset, Pairing, learned
 from drivers.interfaces import Camera, Frame, FrameTime, KnowsSize, Paced, Reading
+from mastctl.control.standing import StandingFault
 from mastctl.devices import frames as frame_checks
 from mastctl.devices.exposure_hold import ExposureHold
 from mastctl.devices.fault_watch import FaultWords
@@ -30,7 +31,6 @@ from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import JointHistory
 from mastctl.devices.thread import DeviceThread, ThreadCall
 from mastctl.errors import NoLonger
-from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
 

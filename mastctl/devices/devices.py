@@ -19,6 +19,8 @@ from calib.geometry.rig import AxisJoint, JointErrors, Rig
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import BadReply, DriverError, LineLost, NoReply
 from drivers.interfaces import COARSE_COUNT_RAD, AxisReport, Camera, PanTilt, Reporting, StopsBeside
+from mastctl.control.machine import StateMachine
+from mastctl.control.standing import StandingFault
 from mastctl.devices import joint_history
 from mastctl.devices.cameras import Cameras
 from mastctl.devices.fault_watch import FaultWatch, FaultWords
@@ -31,8 +33,6 @@ from mastctl.devices.stops import AT_ONCE_S, PATIENCE_S, StopRequests
 from mastctl.devices.thread import DeviceThread
 from mastctl.devices.ways import Way
 from mastctl.errors import MastctlError, Stopped
-from mastctl.state.faults import StandingFault
-from mastctl.state.machine import Machine
 
 log = logging.getLogger(__name__)
 
@@ -108,9 +108,9 @@ class Devices:
         camera_grace_s: float | None = None,
         new_run: Callable[[], str] | None = None,
         sun: SunDirection | None = None,
-        machine: Machine | None = None,
+        machine: StateMachine | None = None,
     ) -> None:
-        self._machine = machine or Machine(clock)
+        self._machine = machine or StateMachine(clock)
         self._publisher = self._machine.publisher
         self.on_turn: Callable[[], None] = lambda: None
         self._pan_tilt = hardware.pan_tilt

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from drivers.clock import Clock
-from mastctl.state.faults import StandingFault, same_faults
-from mastctl.state.in_turn import InTurn
-from mastctl.state.machine import Machine
+from mastctl.control.in_turn import InTurn
+from mastctl.control.machine import StateMachine
+from mastctl.control.standing import StandingFault, same_faults
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class FaultWatch:
     """
 
     def __init__(
-        self, faults: Callable[[], Sequence[StandingFault]], head: str, machine: Machine, clock: Clock
+        self, faults: Callable[[], Sequence[StandingFault]], head: str, machine: StateMachine, clock: Clock
     ) -> None:
         self._sources: tuple[Callable[[], Sequence[StandingFault]], ...] = (faults,)
         self._head = head

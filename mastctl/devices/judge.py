@@ -20,10 +20,10 @@ from drivers.clock import Clock
 from drivers.errors import BadOptions
 from drivers.interfaces import AxisMotion, PanTilt, Reading, StatesMotion
 from mastctl.answers import SunTold
+from mastctl.control.standing import StandingFault
 from mastctl.devices.keep_out import Box, KeepOuts, KeptOut, Pair, Span
 from mastctl.devices.limits import SUN, Limits, SunDirection, sun_boxes
 from mastctl.devices.ways import Way, duration_s, plan
-from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
 

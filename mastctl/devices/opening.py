@@ -22,6 +22,7 @@ from drivers.interfaces import Camera, PanTilt, Reading
 from drivers.open_hardware import open_hardware
 from drivers.open_hardware import open_one_camera as open_one_camera
 from drivers.serial_line import stable_name
+from mastctl.control.standing import latched_sentence
 from mastctl.devices.devices import HEAD, Devices
 from mastctl.devices.judge import KeepOutJudge
 from mastctl.devices.limits import Limits, SunDirection
@@ -29,7 +30,6 @@ from mastctl.errors import Stopped
 from mastctl.safety import heads
 from mastctl.safety.latch import Estopped, latched_at
 from mastctl.safety.state_folder import StateFolder
-from mastctl.state.standing import latched_sentence
 
 STILL = "this program moves no head"
 

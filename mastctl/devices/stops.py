@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, LineLost, NoReply
+from mastctl.control.standing import StandingFault
 from mastctl.devices.thread import DeviceThread, log
 from mastctl.errors import MastctlError, Stopped
-from mastctl.state.faults import StandingFault
 
 PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it goes out beside it
 AT_ONCE_S = 0.002  # the same for a driver that is at its best beside a call under way

@@ -19,9 +19,9 @@ from typing import Any, Generic, TypeVar
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, LineLost, NoReply
+from mastctl.control.standing import StandingFault
 from mastctl.devices.fault_watch import FaultWords
 from mastctl.errors import MastctlError, one_line
-from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")

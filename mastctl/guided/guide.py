@@ -25,13 +25,13 @@ from typing import Any, Protocol
 from calib.errors import BadFile
 from drivers.errors import DriverError
 from mastctl.answers import BenchState, BenchTold
-from mastctl.commands.caller import Caller
-from mastctl.commands.lease import Lease, Leases, StopCame
+from mastctl.control.caller import Caller
+from mastctl.control.lease import Lease, LeaseTable, StopCame
+from mastctl.control.publisher import Published, Publisher, ThreadSubscription
 from mastctl.errors import BadRequest, MastctlError, NotNow, Unable
 from mastctl.guided.child import GuidedProgram
 from mastctl.guided.runs import GuidedFolder, Runs, board_bytes, keep_board, known_boards
 from mastctl.guided.told import GuidedRun, ended, heard
-from mastctl.state.publisher import Published, Publisher, ThreadSubscription
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ class Stopper(Protocol):
 
 
 class Operating(Protocol):
-    """What of `mastctl.operations.operations.Operations` says what runs."""
+    """What of `mastctl.control.operations.OperationRunner` says what runs."""
 
     @property
     def running(self) -> str | None: ...
@@ -160,7 +160,7 @@ class Guide:
         self,
         state: Path,
         masts_folder: Callable[[], Path],
-        leases: Leases,
+        leases: LeaseTable,
         stopping: Stopper,
         operations: Operating,
         publisher: Publisher,
@@ -211,8 +211,8 @@ class Guide:
         wanted, who
             What is asked for, and by whom.
         last_stop
-            `mastctl.commands.lease.Leases.last_stop` when it was asked for: the next stop ends the program's
-            right to steer, before the program itself is ended. None: that of now.
+            `mastctl.control.lease.LeaseTable.last_stop` when it was asked for: the next stop ends the
+            program's right to steer, before the program itself is ended. None: that of now.
 
         Raises
         ------

@@ -18,17 +18,17 @@ from typing import Any, Protocol
 from calib.geometry.rig import Rig
 from drivers.clock import Clock
 from drivers.errors import DriverError
+from mastctl.control.publisher import TOPICS, Published, Publisher, ThreadSubscription
+from mastctl.control.standing import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError, Unable
 from mastctl.live.screen import Screen
 from mastctl.live.settings import LiveSettings
 from mastctl.recorder.entries import Entries
 from mastctl.recorder.feed import ELSEWHERE
-from mastctl.recorder.recorder import Told
+from mastctl.recorder.recorder import RecordedNews
 from mastctl.recorder.schemas import OWN_TOPICS
 from mastctl.recorder.writer import Clocks
-from mastctl.state.faults import StandingFault
-from mastctl.state.publisher import TOPICS, Published, Publisher, ThreadSubscription
 
 log = logging.getLogger(__name__)
 
@@ -208,7 +208,7 @@ class LiveView:
                 value = self._cameras.frame_by_id(value.frame_id)
             except MastctlError:
                 return  # a newer one is on its way
-        entries.write(screen, Told(one.topic, one.key, value, time_s), time.monotonic())
+        entries.write(screen, RecordedNews(one.topic, one.key, value, time_s), time.monotonic())
 
 
 class _Looker:

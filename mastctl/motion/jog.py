@@ -22,12 +22,12 @@ from typing import Any, Protocol
 from drivers.clock import Clock, SystemClock
 from drivers.interfaces import Reading
 from mastctl.answers import JogTold
+from mastctl.control.operations import OperationRunner
+from mastctl.control.refusals import busy
 from mastctl.devices.judge import KeepOutJudge
 from mastctl.devices.keep_out import KeptOut, Pair
 from mastctl.errors import MastctlError, NotNow
 from mastctl.motion.results import PointingError
-from mastctl.operations.operations import Operations
-from mastctl.state.refusals import busy
 
 log = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ class Jogs:
 
     def __init__(
         self,
-        operations: Operations,
+        operations: OperationRunner,
         devices: JogDevices,
         clock: Clock,
         people: Clock | None = None,
@@ -149,7 +149,7 @@ class Jogs:
         ------
         NotNow
             ``jog_ended`` if it names a jog that does not run, or may not begin one; ``busy`` if an operation
-            runs, or a jog that counts its heartbeats and is not named; else as `Operations.start`.
+            runs, or a jog that counts its heartbeats and is not named; else as `OperationRunner.start`.
         """
         if beat.jog is None:
             self._operations.let_stopped_end()

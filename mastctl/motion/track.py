@@ -13,9 +13,9 @@ from calib.geometry.rigid import FloatArray, Rigid, carried_covariance, quaterni
 from calib.matching.track import Track, moved_track
 from mastctl.answers import PoseTold, TrackStands, TrackState
 from mastctl.as_json import as_json
+from mastctl.control.records import Operation
 from mastctl.errors import BadRequest, NotNow
 from mastctl.motion.target_look import TrackSighting
-from mastctl.operations.records import Operation
 
 STANDS_M, STANDS_RAD = 0.005, 0.001
 """Within these of each other two poses are one standing, told twice: an odometer's noise, no motion."""

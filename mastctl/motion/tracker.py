@@ -20,6 +20,9 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid
 from calib.matching.handed_over import MatchedHandoff
 from drivers.clock import Clock
+from mastctl.control.machine import StateMachine
+from mastctl.control.operations import OperationRunner
+from mastctl.control.records import Operation
 from mastctl.devices.limits import Limits
 from mastctl.errors import BadRequest, MastctlError, NotNow
 from mastctl.motion.requests import PixelTarget, PositionTarget
@@ -41,9 +44,6 @@ from mastctl.motion.track import (
     stands,
     started,
 )
-from mastctl.operations.operations import Operations
-from mastctl.operations.records import Operation
-from mastctl.state.machine import Machine
 
 log = logging.getLogger(__name__)
 
@@ -83,16 +83,16 @@ class Tracker:
 
     def __init__(
         self,
-        operations: Operations,
+        operations: OperationRunner,
         devices: HoldingDevices,
         rig: Rig,
         limits: Limits,
         clock: Clock,
         settings: TrackingSettings | None = None,
         on_matched: Callable[[MatchedHandoff], None] = lambda matched: None,
-        machine: Machine | None = None,
+        machine: StateMachine | None = None,
     ) -> None:
-        self._machine = machine or Machine(clock)
+        self._machine = machine or StateMachine(clock)
         self._operations = operations
         self._devices = devices
         self._rig = rig
@@ -130,7 +130,7 @@ class Tracker:
         Raises
         ------
         NotNow
-            ``busy`` if a track or an operation runs; else as `Operations.start`.
+            ``busy`` if a track or an operation runs; else as `OperationRunner.start`.
         """
         with self._held():
             if self._status.state in ACTIVE:

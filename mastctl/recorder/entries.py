@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any, Protocol
 
 from google.protobuf.message import Message
@@ -11,6 +12,7 @@ from calib.geometry.rig import Rig
 from mastctl.as_json import as_json, picked
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
+from mastctl.frame_facts import FrameFacts
 from mastctl.recorder import messages
 from mastctl.recorder.writer import Clocks
 
@@ -18,10 +20,7 @@ SAME_RAD = 1e-6
 REST_S = 10.0
 """A head at rest is told this often, so that a daemon that does nothing writes next to nothing."""
 
-FACTS = (
-    "frame_id", "camera", "sequence", "mid_exposure_s", "exposure_s", "pan_rad", "tilt_rad", "moving",
-    "mast_digest", "true_pan_rad", "true_tilt_rad", "pan_approach", "tilt_approach",
-)  # fmt: skip
+FACTS = tuple(one.name for one in fields(FrameFacts))
 
 
 class ToldLike(Protocol):

@@ -7,10 +7,10 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+from mastctl.control.publisher import TOPICS, Publisher, ThreadSubscription, Topic
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError
 from mastctl.recorder.recorder import Recorder
-from mastctl.state.publisher import TOPICS, Publisher, ThreadSubscription, Topic
 
 log = logging.getLogger(__name__)
 

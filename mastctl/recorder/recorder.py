@@ -24,13 +24,13 @@ from typing import Any, TypeVar
 from calib.geometry.rig import Rig
 from drivers.clock import Clock
 from mastctl.answers import RecorderTold, RecordingDeleted, RecordingEnded, RecordingListed
+from mastctl.control.standing import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError, NotKnown, NotNow, Unable
 from mastctl.recorder.entries import Entries
 from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.shelf import MB, Recorded, Shelf
 from mastctl.recorder.writer import Attached, Clocks, RecordFile
-from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -52,7 +52,7 @@ ANOTHER_RUN = "another run begins"
 
 
 @dataclass(frozen=True)
-class Told:
+class RecordedNews:
     """One thing that was published, on its way to the file."""
 
     topic: str
@@ -69,7 +69,7 @@ class Told:
 
 
 @dataclass(frozen=True)
-class MastTold:
+class AttachedMast:
     """A mast file in use: its rig, and its bytes for the recording."""
 
     rig: Rig
@@ -111,7 +111,7 @@ class Recorder:
         self,
         settings: RecordSettings,
         folder: Path,
-        mast: MastTold,
+        mast: AttachedMast,
         others: list[Attached],
         facts: dict[str, str],
         clock: Clock,
@@ -125,7 +125,7 @@ class Recorder:
         self._clock = clock
         self._entries = Entries(mast.rig, mast.file.digest)
         self._lock = threading.Condition()  # held for an append or a hand-over, never for longer
-        self._queue: deque[Told] = deque()
+        self._queue: deque[RecordedNews] = deque()
         self._acts: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._queued_bytes = 0
         self._dropped: Counter[str] = Counter()
@@ -142,10 +142,10 @@ class Recorder:
     def tell(self, topic: str, key: str, value: Any, time_s: float | None = None) -> None:
         """Leave something to be written down; never waits, never raises."""
         now = self._now
-        mast = isinstance(value, MastTold)  # never left out: all later pictures are measured by it
+        mast = isinstance(value, AttachedMast)  # never left out: all later pictures are measured by it
         if not (self._ring_s or now.run or self._acts or mast or topic in Entries.STICKY):
             return  # nothing is recorded
-        one = Told(topic, key, value, self._clock.now_s() if time_s is None else time_s)
+        one = RecordedNews(topic, key, value, self._clock.now_s() if time_s is None else time_s)
         with self._lock:
             full = self._queued_bytes + one.bytes > QUEUE_BYTES or len(self._queue) >= QUEUE_LENGTH
             if (full and not mast) or self._closing:
@@ -160,7 +160,7 @@ class Recorder:
         with self._lock:
             self._dropped[topic] += count
 
-    def use_mast(self, mast: MastTold) -> None:
+    def use_mast(self, mast: AttachedMast) -> None:
         """Put another mast file into the recording, for what comes from now on."""
         self.tell("mast_file", "in_use", mast)
 
@@ -373,7 +373,7 @@ class Recorder:
         if before is None or before.code != code:
             log.error("%s", words)
 
-    def _write(self, batch: deque[Told]) -> None:
+    def _write(self, batch: deque[RecordedNews]) -> None:
         """Put what was told into the file, if there is one to be written."""
         dropped = self._dropped_so_far()
         for at, one in enumerate(batch):
@@ -395,16 +395,16 @@ class Recorder:
         if dropped and self._now.file is not None:
             self._entries.tell_dropped(self._now.file, dropped, self._clock.now_s(), time.monotonic())
 
-    def _remember(self, one: Told) -> None:
+    def _remember(self, one: RecordedNews) -> None:
         """Keep what the next file must begin with."""
         self._entries.remember(one)
-        if isinstance(one.value, MastTold):
+        if isinstance(one.value, AttachedMast):
             self._mast = one.value
             self._entries.use_mast(one.value.rig, one.value.file.digest)
 
-    def _notice(self, one: Told) -> None:
+    def _notice(self, one: RecordedNews) -> None:
         """See what changes the recording itself: another mast file, a fault."""
-        if isinstance(one.value, MastTold):
+        if isinstance(one.value, AttachedMast):
             self._remember(one)
             if self._now.file is not None:
                 self._now.file.attach(one.value.file, self._now.file.clocks.ns(one.time_s))

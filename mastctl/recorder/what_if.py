@@ -34,7 +34,7 @@ LEAST_PX = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SeenAgain:
     """What a recorded pointing measured: all that is needed to work it out again.
 
     Attributes
@@ -91,7 +91,7 @@ class WouldBe:
     have been left, and one sigma of it. None, and a sentence in ``error``, where it has no answer.
     """
 
-    seen: Seen
+    seen: SeenAgain
     commanded_rad: tuple[float, float] | None = None
     range_m: float | None = None
     residual_px: FloatArray | None = None
@@ -114,7 +114,7 @@ class HandedAgain:
 
 def seen_in(
     operations: Mapping[str, Mapping[str, Any]], frames: Mapping[str, Any]
-) -> tuple[list[Seen], dict[str, str]]:
+) -> tuple[list[SeenAgain], dict[str, str]]:
     """Return the pointings of a recording that can be worked out again, and why the others cannot.
 
     Parameters
@@ -124,7 +124,7 @@ def seen_in(
     frames
         Facts of recorded frames by id, for their joint angles and mast file; a record tells what is missing.
     """
-    found: list[Seen] = []
+    found: list[SeenAgain] = []
     others: dict[str, str] = {}
     for name, record in operations.items():
         if "pixel" not in (record.get("request") or {}):
@@ -142,7 +142,7 @@ def seen_in(
     return found, others
 
 
-def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) -> list[Seen]:
+def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) -> list[SeenAgain]:
     """The measured pointings of one operation."""
     clicked = str(record["request"]["pixel"]["camera"])
     results = (record.get("result") or {}).get("pointings") or []
@@ -152,7 +152,7 @@ def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) 
             steps[step["name"], int(step["detail"].get("pointing", 1))] = step["detail"]
     pair_ids = steps["frames", 1]["frame_ids"] if results else []
     rest = steps["rest", 1] if results else {}
-    found: list[Seen] = []
+    found: list[SeenAgain] = []
     for number, result in enumerate(results, start=1):
         if result.get("target_px") is None:
             continue
@@ -175,7 +175,7 @@ def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) 
         where, pair_approach = _joints(pair_facts, otherwise)
         facts = frames.get(result["frame_id"])
         found.append(
-            Seen(
+            SeenAgain(
                 operation=name,
                 pointing=number,
                 mast_digest="" if facts is None else str(facts["mast_digest"]),
@@ -197,13 +197,13 @@ def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) 
     return found
 
 
-def pointings_with(rig: Rig, seen: Sequence[Seen]) -> list[WouldBe]:
+def pointings_with(rig: Rig, seen: Sequence[SeenAgain]) -> list[WouldBe]:
     """Return each pointing as it would have been with another mast file."""
     servo_rad = _servo_scatter(seen)
     return [_would_be(rig, one, servo_rad) for one in seen]
 
 
-def _would_be(rig: Rig, seen: Seen, servo_rad: FloatArray) -> WouldBe:
+def _would_be(rig: Rig, seen: SeenAgain, servo_rad: FloatArray) -> WouldBe:
     """One pointing with another mast file."""
     missing = [name for name in (*seen.pair, seen.aim_camera) if name not in rig.cameras]
     if missing:
@@ -216,7 +216,7 @@ def _would_be(rig: Rig, seen: Seen, servo_rad: FloatArray) -> WouldBe:
     return WouldBe(seen, commanded, range_m, residual, sigma)
 
 
-def _residual(rig: Rig, seen: Seen) -> tuple[tuple[float, float], float, FloatArray]:
+def _residual(rig: Rig, seen: SeenAgain) -> tuple[tuple[float, float], float, FloatArray]:
     """Commanded angles, range and residual of a pointing with a mast file. Raises CalibError."""
     joints, came = rig.joints, seen.measured_approach
     at = joints.true_rad(seen.pair_rad, seen.pair_approach)
@@ -236,11 +236,11 @@ def _residual(rig: Rig, seen: Seen) -> tuple[tuple[float, float], float, FloatAr
     return commanded, range_m, np.asarray(pixel - seen.aim_px, dtype=float)
 
 
-def _sigma(rig: Rig, seen: Seen, servo_rad: FloatArray) -> FloatArray:
+def _sigma(rig: Rig, seen: SeenAgain, servo_rad: FloatArray) -> FloatArray:
     """(2,) one sigma of another run's residual, by what each measured number moves it."""
     _, _, here = _residual(rig, seen)
 
-    def moved(change: Callable[[], Seen], step: float) -> FloatArray:
+    def moved(change: Callable[[], SeenAgain], step: float) -> FloatArray:
         _, _, there = _residual(rig, change())
         return (there - here) / step
 
@@ -258,7 +258,7 @@ def _sigma(rig: Rig, seen: Seen, servo_rad: FloatArray) -> FloatArray:
     return np.sqrt(variance)
 
 
-def _servo_scatter(seen: Sequence[Seen]) -> FloatArray:
+def _servo_scatter(seen: Sequence[SeenAgain]) -> FloatArray:
     """(2,) rms of what the servos left of their commands, radians."""
     left = np.array([one.left_rad for one in seen]).reshape(-1, 2)
     return np.sqrt(np.mean(np.square(left), axis=0)) if len(left) else np.zeros(2)

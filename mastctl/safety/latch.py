@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Any
 
 from calib.errors import BadFile
+from mastctl.control.standing import Latched, latched_sentence
 from mastctl.errors import NotNow, Stopped, Unable, one_line
 from mastctl.safety.state_file import StateFile
 from mastctl.safety.state_folder import StateFolder
-from mastctl.state.standing import Latched, latched_sentence
 
 log = logging.getLogger(__name__)
 

@@ -19,7 +19,7 @@ HOME = "home"
 MOST = 50
 
 
-class Place(NamedTuple):
+class KeptPlace(NamedTuple):
     """Pan and tilt as the head reads them, radians."""
 
     pan_rad: float
@@ -30,7 +30,7 @@ class Place(NamedTuple):
         return {"pan_rad": self.pan_rad, "tilt_rad": self.tilt_rad}
 
 
-AT_HOME = Place(0.0, 0.0)
+AT_HOME = KeptPlace(0.0, 0.0)
 """Home, until somebody keeps another one."""
 
 
@@ -55,7 +55,7 @@ class Places:
         ordered = {HOME: kept.pop(HOME, AT_HOME), **dict(sorted(kept.items()))}
         return {"places": {name: place.told() for name, place in ordered.items()}}
 
-    def keep(self, name: str, place: Place) -> PlacesTold:
+    def keep(self, name: str, place: KeptPlace) -> PlacesTold:
         """Keep a place by a name, in the place of a former one, and return all.
 
         Raises
@@ -91,7 +91,7 @@ class Places:
             self._write({one: place for one, place in kept.items() if one != name})
         return self.told()
 
-    def _read(self) -> dict[str, Place]:
+    def _read(self) -> dict[str, KeptPlace]:
         try:
             document = self._file.read() or {}
             places = document.get("places", {})
@@ -102,16 +102,16 @@ class Places:
             words = f"{self._file.path}: places: {error!r} where pan_rad and tilt_rad of each are expected"
             raise Unable("unreadable", words) from None
 
-    def _write(self, places: Mapping[str, Place]) -> None:
+    def _write(self, places: Mapping[str, KeptPlace]) -> None:
         try:
             self._file.write({"places": {name: place.told() for name, place in places.items()}})
         except BadFile as error:
             raise Unable("not_saved", str(error)) from None
 
 
-def _place(told: Any) -> Place:
+def _place(told: Any) -> KeptPlace:
     """A place as it was written. Raises KeyError, TypeError, ValueError."""
-    place = Place(float(told["pan_rad"]), float(told["tilt_rad"]))
+    place = KeptPlace(float(told["pan_rad"]), float(told["tilt_rad"]))
     if not all(map(math.isfinite, place)):
         raise ValueError(f"{place} is not finite")
     return place

@@ -10,19 +10,19 @@ from calib.matching.handed_over import MatchedHandoff
 from drivers.clock import Clock
 from mastctl.answers import Recordings
 from mastctl.config import Config
+from mastctl.control.publisher import Publisher
+from mastctl.control.standing import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.recorder.feed import Feed
-from mastctl.recorder.recorder import MastTold, Recorder
+from mastctl.recorder.recorder import AttachedMast, Recorder
 from mastctl.recorder.writer import Attached
-from mastctl.service.mast_in_use import MastInUse
-from mastctl.state.faults import StandingFault
-from mastctl.state.publisher import Publisher
+from mastctl.service.masts import MastInUse
 from mastctl.watch.handoffs import line_of
 
 FOLDER = "records"
 
 
-class Recording:
+class DaemonRecorder:
     """A recorder that hears what the daemon publishes.
 
     Parameters
@@ -100,5 +100,5 @@ class Recording:
         self.recorder.close()
 
 
-def _told(mast: MastInUse) -> MastTold:
-    return MastTold(mast.stored.rig, Attached(mast.path.name, mast.data))
+def _told(mast: MastInUse) -> AttachedMast:
+    return AttachedMast(mast.stored.rig, Attached(mast.path.name, mast.data))

@@ -18,7 +18,7 @@ from mastctl.answers import ChangeTold, ReloadTold
 from mastctl.config import Config, check_cameras, load_config, parse_config
 from mastctl.devices.limits import OutsideLimits
 from mastctl.errors import BadRequest, NotNow
-from mastctl.service.mast_in_use import MastInUse, read_next
+from mastctl.service.masts import MastInUse, read_next
 from mastctl.service.service import Service
 
 log = logging.getLogger(__name__)

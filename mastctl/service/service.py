@@ -18,18 +18,21 @@ from calib.matching.handed_over import MatchedHandoff
 from drivers.clock import Clock, SystemClock
 from drivers.hardware import Hardware, clock_for, head_name
 from mastctl.answers import CalibrationTold, SelfCheck, SentinelTold, TrackTold
-from mastctl.commands.audit import STRANGERS, STRANGERS_FILES, AuditLog
-from mastctl.commands.entry import Entry
-from mastctl.commands.idempotency import Answers
-from mastctl.commands.lease import Control, Leases
 from mastctl.config import Config
+from mastctl.control.audit import STRANGERS, STRANGERS_FILES, AuditLog
+from mastctl.control.entry import CommandEntry
+from mastctl.control.idempotency import Answers
+from mastctl.control.lease import LeaseTable, WhoSteers
+from mastctl.control.machine import StateMachine
+from mastctl.control.operations import OperationRunner
+from mastctl.control.records import Operation, last_frame
+from mastctl.control.standing import StandingFault
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import StampedFrame, check_known
 from mastctl.devices.opening import open_rig
 from mastctl.errors import MastctlError
 from mastctl.guided.guide import Guide
 from mastctl.guided.reports import Reports
-from mastctl.live.pictures import WatchedCameras
 from mastctl.live.settings import LiveSettings
 from mastctl.live.view import LiveView, check_installed
 from mastctl.motion.jog import Jogs
@@ -37,25 +40,19 @@ from mastctl.motion.pairs import in_picture
 from mastctl.motion.requests import wrong_camera
 from mastctl.motion.track import ACTIVE, TrackStatus
 from mastctl.motion.tracker import Tracker
-from mastctl.operations.operations import Operations
-from mastctl.operations.records import Operation, last_frame
 from mastctl.safety import heads, stop_socket
 from mastctl.safety.latch import Latch
 from mastctl.safety.state_folder import StateFolder
 from mastctl.safety.stop_socket import StopSocket
 from mastctl.safety.stop_threads import StopThreads
-from mastctl.service.mast_in_use import MastInUse, configured, read_mast
-from mastctl.service.masts import Masts
+from mastctl.service.masts import MastInUse, Masts, configured, read_mast
 from mastctl.service.opening import bounded, run_names
 from mastctl.service.places import Places
-from mastctl.service.recording import Recording
-from mastctl.service.socket_stops import SocketStops
+from mastctl.service.recording import DaemonRecorder
 from mastctl.service.state import State
 from mastctl.service.steering import Steering
-from mastctl.service.stopping import Stopping, state_faults
+from mastctl.service.stopping import SocketStops, Stopping, state_faults
 from mastctl.service_manager import ServiceManager
-from mastctl.state.faults import StandingFault
-from mastctl.state.machine import Machine
 from mastctl.watch.handoffs import HandoffCheck
 from mastctl.watch.history import History
 from mastctl.watch.metrics import Metrics
@@ -120,8 +117,6 @@ class Service:
         The recorder, and what it hears.
     live
         What Foxglove shows, if the configuration asks for it.
-    watched
-        Pictures for who watches cameras by a page.
     stop_threads
         Where the web side stops: threads that nothing else can keep busy.
     folder, head_folder
@@ -160,14 +155,14 @@ class Service:
         beside = heads.others(head_name(config.hardware), head)
         self.latch = Latch(folder, others=beside) if head is None else Latch(head, folder, beside)
         entries = self.latch.entries
-        self.machine = Machine(clock, latch=self.latch.held, more_latched=entries[1:])
+        self.machine = StateMachine(clock, latch=self.latch.held, more_latched=entries[1:])
         publisher = self.machine.publisher
         self.health = CalibrationHealth(self.folder.path, mast.stored)
         self._open_head(mast)
         publisher.publish("track", "track", self.tracker.status)
         self.stop_threads = StopThreads()
         self.handoffs = HandoffCheck(config.tracking.handoff_log, mast.stored.digest, clock)
-        self.recording = Recording(
+        self.recording = DaemonRecorder(
             config,
             mast,
             {"hardware": hardware.kind, "version": self._version},
@@ -177,14 +172,13 @@ class Service:
             clock,
         )
         self.live = None if config.live is None else self._live_view(config.live)
-        self.watched = WatchedCameras(self.devices, clock)
         people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
-        self.leases = Leases(people_s, self._runs, self._steered, self.stopping.stop)
+        self.leases = LeaseTable(people_s, self._runs, self._steered, self.stopping.stop)
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
         strangers = self.folder.path / STRANGERS_FILE
         self.strangers = AuditLog(strangers, clock, files=STRANGERS_FILES, device=STRANGERS)
         answers = Answers(people_s, clock)
-        self.entry = Entry(
+        self.entry = CommandEntry(
             clock, self.leases, answers, self.audit, self.operations, publisher, self.strangers
         )
         self.guide = Guide(
@@ -224,7 +218,7 @@ class Service:
             machine,
         )
         rig = configured(mast.stored.rig, config.hardware.cameras)
-        self.operations = Operations(self.devices, clock, new_run(), self._ended, machine)
+        self.operations = OperationRunner(self.devices, clock, new_run(), self._ended, machine)
         self.tracker = Tracker(
             self.operations,
             self.devices,
@@ -399,7 +393,6 @@ class Service:
             self.health.close,
             self.sentinel.close,
             self.recording.close,
-            self.watched.close,
             *(() if self.live is None else (self.live.close,)),
             lambda: bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S),
             *(one.close for one in maybe if one is not None),
@@ -462,7 +455,7 @@ class Service:
         """Whether an operation or a track runs; takes no lock."""
         return self.operations.running is not None or self.tracker.status.state in ACTIVE
 
-    def _steered(self, control: Control | None) -> None:
+    def _steered(self, control: WhoSteers | None) -> None:
         """Publish who holds the lease."""
         told = None if control is None else asdict(control)
         self.machine.publisher.publish("lease", "lease", told)

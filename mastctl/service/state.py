@@ -21,12 +21,11 @@ from mastctl.answers import (
     Status,
 )
 from mastctl.as_json import as_json
+from mastctl.control.standing import Standing, StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.limits import Limits
 from mastctl.motion.track import TrackStatus
-from mastctl.state.faults import StandingFault
-from mastctl.state.standing import Standing
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class State:
     sentinel
         What its looks say (`mastctl.watch.sentinel.findings`); None where they were not read yet.
     control
-        Who steers, as `mastctl.commands.lease.Control.told` tells it; None for nobody.
+        Who steers, as `mastctl.control.lease.WhoSteers.told` tells it; None for nobody.
     """
 
     now_s: float

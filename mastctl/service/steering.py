@@ -12,8 +12,11 @@ import numpy as np
 
 from calib.geometry.rig import Rig
 from drivers.clock import Clock
+from mastctl.control.operations import OperationRunner
+from mastctl.control.records import Operation
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import check_known
+from mastctl.devices.limits import Limits
 from mastctl.errors import NotNow
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import (
@@ -29,12 +32,29 @@ from mastctl.motion.results import Preview
 from mastctl.motion.settings import PointingSettings
 from mastctl.motion.track import ACTIVE, RoverPose
 from mastctl.motion.tracker import Tracker
-from mastctl.operations.operations import Operations
-from mastctl.operations.records import Operation
 from mastctl.service.masts import Masts
 from mastctl.watch.residuals import CalibrationHealth
 
+LOOKS_S = 120.0  # a pointing's pictures, each of which may be waited for
+MARGIN_S = 15.0
 CLICK_AGE_S = 300.0  # a person may look at a picture for minutes before clicking; the sun moves meanwhile
+
+
+def usual_s(limits: Limits, looks: int) -> float:
+    """Return how long an operation is given that moves the head, seconds, if it asks for no time of its own.
+
+    Each move has its own deadline, from distance over speed; this one is behind those.
+
+    Parameters
+    ----------
+    limits
+        The longest way there is, one axis after the other, and the speed.
+    looks
+        How often it goes there and looks; 0 for a move without a picture.
+    """
+    way_rad = sum(high - low for low, high in (limits.pan_rad, limits.tilt_rad))
+    way_s = way_rad / limits.speed_rad_per_s
+    return max(1, looks) * way_s + looks * LOOKS_S + MARGIN_S
 
 
 class Steering:
@@ -62,7 +82,7 @@ class Steering:
         rig: Rig,
         devices: Devices,
         clock: Clock,
-        operations: Operations,
+        operations: OperationRunner,
         tracker: Tracker,
         health: CalibrationHealth,
         repeat_after_s: float | None = None,
@@ -100,7 +120,7 @@ class Steering:
             If camera, frame, pixel or joint angles do not fit this rig.
         NotNow
             If the frame is of another mast file, head or rover moved since, or what
-            `mastctl.operations.operations.Operations.start` says stands against it.
+            `mastctl.control.operations.OperationRunner.start` says stands against it.
         """
         with self._masts.unchanged() as mast:
             if isinstance(request.target, PositionTarget):

@@ -10,15 +10,17 @@ from collections.abc import Iterator
 
 from drivers.errors import DriverError
 from mastctl.answers import EstopTold, ResetTold, StopTold
+from mastctl.control.caller import Caller
+from mastctl.control.entry import ESTOP, STOP, CommandEntry, CommandRequest
+from mastctl.control.machine import StateMachine
+from mastctl.control.operations import STOP_ASKED, OperationRunner
+from mastctl.control.standing import Latched, StandingFault
 from mastctl.devices.devices import Devices
 from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.motion.tracker import Tracker
-from mastctl.operations.operations import STOP_ASKED, Operations
 from mastctl.safety.latch import Estopped, Latch
 from mastctl.safety.state_folder import StateFolder
-from mastctl.state.faults import StandingFault
-from mastctl.state.machine import Machine
-from mastctl.state.standing import Latched
+from mastctl.safety.stop_socket import StopRequests
 
 KEPT_S = 1.0  # what the disk is given before an emergency stop is answered without it
 STATE = "state"
@@ -38,7 +40,12 @@ class Stopping:
     """
 
     def __init__(
-        self, devices: Devices, operations: Operations, tracker: Tracker, machine: Machine, latch: Latch
+        self,
+        devices: Devices,
+        operations: OperationRunner,
+        tracker: Tracker,
+        machine: StateMachine,
+        latch: Latch,
     ) -> None:
         self._devices = devices
         self._operations = operations
@@ -183,3 +190,35 @@ def state_faults(folder: StateFolder, latch: Latch, started_s: float) -> Iterato
     elif latch.not_kept and not latch.folder.is_temporary:
         words = f"the emergency stop is held in memory only: {latch.not_kept}"
         yield StandingFault(STATE, "latch_not_kept", words, latch.since_s, "the disk takes it, or a reset")
+
+
+VIA = "stop socket"
+
+
+class SocketStops:
+    """Stops from whoever connects to a daemon's socket.
+
+    Parameters
+    ----------
+    stops
+        Carries them out.
+    entry
+        Records them.
+    """
+
+    def __init__(self, stops: StopRequests, entry: CommandEntry) -> None:
+        self._stops = stops
+        self._entry = entry
+
+    def stop_told(self) -> StopTold:
+        """Stop the mast; return what is to be told."""
+        return self._entry.first(STOP, CommandRequest(Caller(role="view", via=VIA)), self._stops.stop_told)
+
+    def estop(self, reason: str | None, name: str | None) -> EstopTold:
+        """Stop it and latch; return what is to be told."""
+        asked = CommandRequest(Caller(role="view", via=VIA), request={"reason": reason, "name": name})
+        return self._entry.first(ESTOP, asked, lambda: self._stops.estop(reason, name))
+
+    def latch_estop(self, reason: str | None, name: str | None) -> object:
+        """Let no move out from now on, at once."""
+        return self._stops.latch_estop(reason, name)

@@ -33,8 +33,8 @@ from calib.matching.handoff import RefinedVerdict
 from drivers.clock import Clock, SystemClock
 from drivers.recordings.mcap_file import BadRecording, is_mcap, read_messages
 from mastctl.as_json import picked
-from mastctl.state.faults import StandingFault
-from mastctl.watch.json_lines import OtherFile, append_line
+from mastctl.control.standing import StandingFault
+from mastctl.json_lines import OtherFile, append_line
 
 SCHEMA = "mastctl/handoff/1"
 TOPIC = "/handoff"

@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from drivers.clock import Clock
+from mastctl.control.publisher import Published, Publisher
 from mastctl.devices.joint_history import HeadReading
-from mastctl.state.publisher import Published, Publisher
 
 log = logging.getLogger(__name__)
 

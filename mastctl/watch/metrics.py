@@ -22,8 +22,8 @@ from prometheus_client.core import (
 from prometheus_client.process_collector import ProcessCollector
 
 from mastctl.answers import Word
-from mastctl.operations.records import Operation
-from mastctl.state.publisher import Published, Publisher
+from mastctl.control.publisher import Published, Publisher
+from mastctl.control.records import Operation
 
 log = logging.getLogger(__name__)
 

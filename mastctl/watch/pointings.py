@@ -19,8 +19,8 @@ from calib.errors import BadFile
 from calib.files.atomic import replace_bytes
 from calib.files.mast_file import StoredRig
 from drivers.interfaces import COARSE_COUNT_RAD
-from mastctl.operations.records import Operation
-from mastctl.watch.json_lines import append_line, read_lines
+from mastctl.control.records import Operation
+from mastctl.json_lines import append_line, read_lines
 
 DISAGREE = "eyes_disagree"
 

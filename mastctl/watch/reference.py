@@ -21,7 +21,7 @@ from calib.files import read_bytes
 from calib.files.atomic import replace_bytes
 from calib.files.yaml_text import Section
 from calib.matching.warp import Grey, grey
-from mastctl.watch.json_lines import append_line, read_lines
+from mastctl.json_lines import append_line, read_lines
 
 SCHEMA = "mastctl/sentinel/1"
 SENTINEL_FOLDER = "sentinel"

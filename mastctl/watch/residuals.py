@@ -29,7 +29,7 @@ from calib.files.mast_file import StoredRig
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from mastctl.operations.records import Operation
+from mastctl.control.records import Operation
 from mastctl.watch.evidence import Evidence, Expected, Judge, Sums, expected, sums_of
 from mastctl.watch.pointings import FILE, Journal, Measured, measured_by
 

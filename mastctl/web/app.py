@@ -25,15 +25,14 @@ from mastctl.web.events import add_events
 from mastctl.web.guard import Guard
 from mastctl.web.images import add_images
 from mastctl.web.keeping import add_bench, add_masts, add_places, add_recordings
-from mastctl.web.packed import text_answer
-from mastctl.web.page import add_page
+from mastctl.web.page import add_page, text_answer
 from mastctl.web.parts import Here, Parts
+from mastctl.web.pictures import WatchedCameras
 from mastctl.web.refusals import add_errors
 from mastctl.web.sessions import add_sessions
 from mastctl.web.simulation import add_simulation
 from mastctl.web.steering import add_estop, add_lease, add_limits, add_pointing, add_tracking
-from mastctl.web.streams import Streams
-from mastctl.web.waiting import Waiting
+from mastctl.web.waiting import Streams, Waiting
 from mastctl.web.watching import add_watching
 
 
@@ -42,6 +41,7 @@ def create_app(
     waiting: Waiting | None = None,
     entrance: Entrance | None = None,
     streams: Streams | None = None,
+    watched: WatchedCameras | None = None,
 ) -> ASGIApp:
     """Return the ASGI application that serves one service.
 
@@ -53,11 +53,14 @@ def create_app(
         What it asks of who comes in; nothing but a loopback name by default.
     streams
         Ends who listens to events when the daemon ends.
+    watched
+        Takes pictures for who watches cameras.
     """
     waiting = waiting or Waiting(service.clock)
     entrance = entrance or Entrance()
     streams = streams or Streams(service.machine.publisher)
-    parts = Parts(service, waiting, streams, entrance)
+    watched = watched or WatchedCameras(service.devices, service.clock)
+    parts = Parts(service, waiting, streams, entrance, watched)
     routes = api()
 
     async def served(scope: Scope, receive: Receive, send: Send) -> None:

@@ -13,9 +13,9 @@ from typing import Annotated, Any, TypeVar
 from fastapi import Depends, FastAPI, Header, Request
 from pydantic import BaseModel
 
-from mastctl.commands.caller import Caller, told_name
-from mastctl.commands.entry import Asked, Command
-from mastctl.commands.idempotency import Answer
+from mastctl.control.caller import Caller, told_name
+from mastctl.control.entry import Command, CommandRequest
+from mastctl.control.idempotency import Answer
 from mastctl.errors import Unable
 from mastctl.safety.stop_threads import StopsHang
 from mastctl.service.service import Service
@@ -41,13 +41,15 @@ async def _asked(
     deadline_s: Annotated[
         DeadlineS | None, Header(description="How long the command is given, seconds")
     ] = None,
-) -> Asked:
+) -> CommandRequest:
     service = here.service
     now_s, last_stop = service.clock.now_s(), service.leases.last_stop
-    return Asked(caller_of(request), now_s, NOTHING, mastctl_lease, idempotency_key, deadline_s, last_stop)
+    return CommandRequest(
+        caller_of(request), now_s, NOTHING, mastctl_lease, idempotency_key, deadline_s, last_stop
+    )
 
 
-Asks = Annotated[Asked, Depends(_asked)]
+Asks = Annotated[CommandRequest, Depends(_asked)]
 """What the headers of a request for a command say, and when it came."""
 
 
@@ -85,7 +87,9 @@ def command(
     def add(act: F) -> F:
         wanted = inspect.signature(act, eval_str=True)
 
-        async def endpoint(request: Request, here: Parts, asked: Asked, **given: Any) -> Mapping[str, Any]:
+        async def endpoint(
+            request: Request, here: Parts, asked: CommandRequest, **given: Any
+        ) -> Mapping[str, Any]:
             own = {name: one for name, one in (("here", here), ("asked", asked)) if name in wanted.parameters}
             told = recorded(**given, **own) if recorded is not None else _told(given)
             allowed_s = None if usual_s is None else usual_s(here, **given)
@@ -112,13 +116,13 @@ async def carried_out(
     here: Parts,
     request: Request,
     kind: Command,
-    asked: Asked,
+    asked: CommandRequest,
     told: Mapping[str, Any],
     act: Callable[[], Answer],
     usual_s: float | None = None,
     beside: bool = False,
 ) -> Answer:
-    """Return the answer of a command, whose refusals are those of `mastctl.commands.entry.Entry.run`.
+    """Return the answer of a command, whose refusals are those of `mastctl.control.entry.CommandEntry.run`.
 
     A ``deadline_s`` in what is ``told`` counts as the header does, the shorter of both. ``beside``: of the
     request nothing is kept but who asks, when, and under which lease.
@@ -140,7 +144,7 @@ async def stop_first(
     told: Mapping[str, Any] = NOTHING,
 ) -> Answer:
     """Return the answer of a stop: nothing is asked and no header is judged before it acts."""
-    asked = Asked(caller_of(request), request=told, lease=request.headers.get("mastctl-lease"))
+    asked = CommandRequest(caller_of(request), request=told, lease=request.headers.get("mastctl-lease"))
     entry = here.service.entry
     try:
         return await stopped(here.service, lambda: entry.first(kind, asked, act))

@@ -22,11 +22,11 @@ import h11
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from mastctl.commands.caller import Caller
+from mastctl.control.caller import Caller
 from mastctl.web import PREFIX
-from mastctl.web.answer import error_response
-from mastctl.web.stop_address import STOP_LINE, STOPS, TRACK_STOP, stop_named
-from mastctl.web.turns import Turns
+from mastctl.web.guard import STOP_LINE, STOPS, TRACK_STOP, stop_named
+from mastctl.web.refusals import error_response
+from mastctl.web.waiting import Turns
 
 log = logging.getLogger(__name__)
 log.setLevel(logging.ERROR)

@@ -20,17 +20,16 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
 from mastctl.as_json import as_json, writable
+from mastctl.control.publisher import LoopSubscription, Published, Topic
 from mastctl.errors import MastctlError
 from mastctl.service.service import Service
 from mastctl.service.state import fault_told, joints_told, standing_told
-from mastctl.state.publisher import LoopSubscription, Published, Topic
 from mastctl.web import PREFIX
-from mastctl.web.answer import error_response
 from mastctl.web.connections import EVENTS
 from mastctl.web.models import EventsQuery
 from mastctl.web.parts import Here, Parts
+from mastctl.web.refusals import error_response, sentence
 from mastctl.web.refusals import told as refused
-from mastctl.web.sentences import sentence
 
 ALIVE_S = 2.0  # between signs of life where nothing changes
 GOING_AWAY = 1001  # RFC 6455, 7.4.1

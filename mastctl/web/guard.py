@@ -1,6 +1,8 @@
 """What stands before the API: whose page asks, who comes in, how much it sends, and whether that is JSON.
 
-A stop passes nearly all of it: only another site's page is refused one.
+A stop passes nearly all of it: only another site's page is refused one. It is not refused for a slash too
+many in its address, nor for naming its host in front as a client of a proxy does. Everything else has one
+address.
 """
 
 from __future__ import annotations
@@ -8,24 +10,32 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import math
+import re
+import sys
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, NoReturn, Protocol
 from urllib.parse import parse_qsl
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from mastctl.access.guesses import neighbourhood
-from mastctl.commands.caller import Caller
+from mastctl.access.access import neighbourhood
+from mastctl.control.caller import Caller
 from mastctl.errors import MastctlError, one_line
 from mastctl.web import PREFIX
-from mastctl.web.answer import GuardError, error_response, marked
-from mastctl.web.bodies import once, read_json, whole_body
-from mastctl.web.entrance import Entrance, Rate, changes
-from mastctl.web.refusals import told
-from mastctl.web.stop_address import STOPS, TRACK_STOP, stop_named
-from mastctl.web.whose_page import check_site
+from mastctl.web.entrance import Entrance, Rate, changes, check_site
+from mastctl.web.refusals import GuardError, error_response, marked, told
 
 log = logging.getLogger(__name__)
+
+STOPS = frozenset({f"{PREFIX}/stop", f"{PREFIX}/estop"})
+"""What everybody may ask for who reaches the daemon, whatever else the request says."""
+TRACK_STOP = f"{PREFIX}/track/stop"
+
+_WRITTEN = "(?:(?i:https?)://[^/ ]*)?" + "/+".join(["", *PREFIX.split("/")[1:], "(stop|estop|track/+stop)/*"])
+_ADDRESS = re.compile(_WRITTEN)
+STOP_LINE = re.compile(f"POST {_WRITTEN}[ ?]".encode())
+"""How a request begins that stops something; everything else is read in turn."""
 
 UNREAD = frozenset({f"{PREFIX}/stop", TRACK_STOP})
 """Where no body is read; an emergency stop reads what it can of its own."""
@@ -53,7 +63,7 @@ _SECRETS = frozenset({"token", "access_token", "authorization", "api_key", "apik
 
 
 class Records(Protocol):
-    """What of `mastctl.commands.entry.Entry` keeps refusals."""
+    """What of `mastctl.control.entry.CommandEntry` keeps refusals."""
 
     def refused(
         self, caller: Caller, what: str, code: str, message: str, times: int | None = None
@@ -257,3 +267,97 @@ async def _refuse_websocket(refused: Exception, scope: Scope, receive: Receive, 
         await send({"type": "websocket.close", "code": 1008, "reason": ""})
         return
     await told(refused)(scope, receive, send)
+
+
+LARGEST_BODY_BYTES = 65536
+
+
+async def whole_body(receive: Receive, headers: Mapping[str, str]) -> bytes:
+    """Return the whole body, which may not be large. Raises GuardError."""
+    told = headers.get("content-length", "0")
+    if told.isdecimal() and int(told[:20]) > LARGEST_BODY_BYTES:
+        _too_large()
+    parts: list[bytes] = []
+    size = 0
+    while True:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            raise GuardError(400, "disconnected", "the client left before its request had come whole")
+        part = message.get("body", b"")
+        size += len(part)
+        if size > LARGEST_BODY_BYTES:
+            _too_large()
+        parts.append(part)
+        if not message.get("more_body", False):
+            return b"".join(parts)
+
+
+def _too_large() -> NoReturn:
+    raise GuardError(413, "too_large", f"the body is larger than {LARGEST_BODY_BYTES} bytes")
+
+
+def read_json(body: bytes, headers: Mapping[str, str]) -> Any:
+    """Return what a body holds: JSON with finite numbers and each key once; None for nothing.
+
+    Raises
+    ------
+    GuardError
+        ``not_json``; ``bad_request`` for a number that is JSON and larger than any float.
+    """
+    if not body.strip():
+        return None
+    kind = headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind != "application/json":
+        raise GuardError(415, "not_json", f"Content-Type is '{kind[:60]}' where application/json is expected")
+    try:
+        return json.loads(
+            body, parse_constant=_no_constant, parse_float=_finite, object_pairs_hook=_no_duplicates
+        )
+    except RecursionError:
+        raise GuardError(400, "not_json", "the body is nested too deeply") from None
+    except ValueError as error:
+        raise GuardError(400, "not_json", f"the body is not JSON: {' '.join(str(error).split())}") from None
+
+
+def _no_constant(word: str) -> NoReturn:
+    raise ValueError(f"{word} where a finite number is expected")
+
+
+def _finite(word: str) -> float:
+    number = float(word)
+    if math.isinf(number):
+        words = f"the body holds the number {word[:40]} where at most {sys.float_info.max:.1e} is possible"
+        raise GuardError(422, "bad_request", words)
+    return number
+
+
+def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"the key '{key[:60]}' is there twice")
+        found[key] = value
+    return found
+
+
+def once(body: bytes, receive: Receive) -> Receive:
+    """Give the body that was read already, then whatever comes."""
+    given = False
+
+    async def again() -> Message:
+        nonlocal given
+        if not given:
+            given = True
+            return {"type": "http.request", "body": body, "more_body": False}
+        return await receive()
+
+    return again
+
+
+def stop_named(scope: Scope) -> Scope:
+    """Return a request with the one address of the stop that it asks for; any other as it is."""
+    written = _ADDRESS.fullmatch(scope["path"]) if scope["method"] == "POST" else None
+    if written is None:
+        return scope
+    name = TRACK_STOP if written[1].startswith("track") else f"{PREFIX}/{written[1]}"
+    return {**scope, "path": name}

@@ -20,17 +20,16 @@ from starlette.websockets import WebSocketDisconnect
 from mastctl.as_json import as_json
 from mastctl.errors import MastctlError
 from mastctl.frame_facts import headers_of
-from mastctl.live.pictures import Picture, Watcher
 from mastctl.report.pictures import encoded
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
-from mastctl.web.answer import error_response
 from mastctl.web.connections import IMAGES
 from mastctl.web.events import GOING_AWAY
 from mastctl.web.models import ImagesQuery, SnapshotQuery
 from mastctl.web.parts import Here
+from mastctl.web.pictures import Picture, WatchedCameras, Watcher
+from mastctl.web.refusals import error_response, sentence
 from mastctl.web.refusals import told as refused
-from mastctl.web.sentences import sentence
 from mastctl.web.sockets import UNSUPPORTED
 
 ASKS = "?"
@@ -68,7 +67,7 @@ def add_images(app: FastAPI) -> None:
                 here.service.check_camera(camera)
             with here.streams.listening((), frozenset()) as ending:  # counted as a listener, and ended as one
                 await line.accept()
-                await _Line(here.service, line, query).run(asyncio.ensure_future(ending.wait()))
+                await _Line(here.service, here.watched, line, query).run(asyncio.ensure_future(ending.wait()))
         except ValidationError as error:
             words = sentence({**error.errors()[0], "loc": ("query", *error.errors()[0]["loc"])}, ImagesQuery)
             await line.send_denial_response(error_response(422, "bad_request", words))
@@ -88,12 +87,14 @@ def _asked(line: WebSocket) -> ImagesQuery:
 class _Line:
     """One WebSocket of pictures, until the daemon or the client ends."""
 
-    def __init__(self, service: Service, line: WebSocket, query: ImagesQuery) -> None:
+    def __init__(
+        self, service: Service, watched: WatchedCameras, line: WebSocket, query: ImagesQuery
+    ) -> None:
         self._service = service
         self._line = line
         self._there = asyncio.Event()
         self._loop = asyncio.get_running_loop()
-        self._watcher: Watcher = service.watched.watch(query.camera, self._wake, not query.on_request)
+        self._watcher: Watcher = watched.watch(query.camera, self._wake, not query.on_request)
 
     async def run(self, ending: asyncio.Future[Any]) -> None:
         """Send pictures until ``ending`` is done."""

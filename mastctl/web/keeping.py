@@ -20,7 +20,7 @@ from mastctl.answers import (
     ReloadTold,
     ReportsTold,
 )
-from mastctl.commands.entry import (
+from mastctl.control.entry import (
     BENCH,
     BENCH_FORGET,
     BENCH_LEAVE,
@@ -35,9 +35,8 @@ from mastctl.commands.entry import (
     RELOAD,
 )
 from mastctl.guided.runs import NAME
-from mastctl.service.mast_in_use import MastInUse
-from mastctl.service.masts import Masts
-from mastctl.service.places import Place
+from mastctl.service.masts import MastInUse, Masts
+from mastctl.service.places import KeptPlace
 from mastctl.service.reload import reload
 from mastctl.web import PREFIX
 from mastctl.web.commands import Asks, command
@@ -111,7 +110,7 @@ def add_places(app: FastAPI) -> None:
 
     @command(app, "POST /places/{name}", PLACE_KEEP, "Keep a place by a name")
     def keep(name: PlaceName, body: PlaceBody, here: Here) -> PlacesTold:
-        return here.service.places.keep(name, Place(body.pan_rad, body.tilt_rad))
+        return here.service.places.keep(name, KeptPlace(body.pan_rad, body.tilt_rad))
 
     @command(app, "DELETE /places/{name}", PLACE_FORGET, "Forget a place")
     def forget(name: PlaceName, here: Here) -> PlacesTold:

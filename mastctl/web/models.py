@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from calib.geometry.rigid import Rigid, rotation_of
-from mastctl.commands.entry import LONGEST_DEADLINE_S
-from mastctl.commands.lease import LONGEST_S, SHORTEST_S, USUAL_S
+from mastctl.control.entry import LONGEST_DEADLINE_S
+from mastctl.control.lease import LONGEST_S, SHORTEST_S, USUAL_S
+from mastctl.control.publisher import TOPICS, Topic
 from mastctl.devices.limits import LEAST_CONE_RAD, WIDEST_CONE_RAD, SunDirection, direction_of
 from mastctl.guided.guide import RunRequest
 from mastctl.motion.jog import Beat
@@ -33,7 +34,6 @@ from mastctl.motion.requests import (
 )
 from mastctl.motion.track import RoverPose
 from mastctl.safety.latch import LONGEST
-from mastctl.state.publisher import TOPICS, Topic
 
 Rate = Annotated[float, Field(ge=-100.0, le=100.0)]
 Slope = Annotated[float, Field(ge=-1.0, le=1.0)]

@@ -13,8 +13,8 @@ from fastapi.requests import HTTPConnection
 
 from mastctl.service.service import Service
 from mastctl.web.entrance import Entrance
-from mastctl.web.streams import Streams
-from mastctl.web.waiting import Waiting
+from mastctl.web.pictures import WatchedCameras
+from mastctl.web.waiting import Streams, Waiting
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,15 @@ class Parts:
         Who listens to events.
     entrance
         What is asked of who comes in.
+    watched
+        Pictures for who watches cameras by a page.
     """
 
     service: Service
     waiting: Waiting
     streams: Streams
     entrance: Entrance
+    watched: WatchedCameras
 
 
 async def _parts(line: HTTPConnection) -> Parts:

@@ -1,10 +1,11 @@
-"""Every refusal in the one form, with the HTTP status that fits."""
+"""Every refusal in the one form, its HTTP status and sentence, and the headers that every answer carries."""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, get_args
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -13,6 +14,7 @@ from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 
 from calib.errors import CalibError
+from calib.files.yaml_text import nearest
 from drivers.errors import BadOptions, DriverError, NoFreshFrame, NoReply
 from mastctl.errors import (
     BadRequest,
@@ -26,8 +28,131 @@ from mastctl.errors import (
     Unable,
     error_body,
 )
-from mastctl.web.answer import GuardError, error_response
-from mastctl.web.sentences import sentence
+
+HEADERS: Mapping[str, str] = {
+    "cache-control": "no-store",
+    "x-content-type-options": "nosniff",
+    "cross-origin-resource-policy": "same-origin",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+}
+NO_PAGE = "default-src 'none'; frame-ancestors 'none'"
+"""The Content-Security-Policy of what is no page: opened by itself it may do nothing."""
+PAGE = (
+    "default-src 'self'; img-src 'self' blob: data:; object-src 'none'; base-uri 'none'; "
+    "form-action 'self'; frame-ancestors 'none'"
+)
+"""The Content-Security-Policy of a page: its own files only, no script inside it, in nobody's frame."""
+
+Headers = list[tuple[bytes, bytes]]
+
+
+class GuardError(Exception):
+    """A request that does not get as far as the API."""
+
+    def __init__(
+        self, status: int, code: str, message: str, headers: Mapping[str, str] | None = None
+    ) -> None:
+        self.status = status
+        self.code = code
+        self.headers = dict(headers or {})
+        super().__init__(message)
+
+
+def error_response(
+    status: int, code: str, message: str, detail: Any = None, headers: Mapping[str, str] | None = None
+) -> JSONResponse:
+    """Return an error in the one form of docs/reference/http.md."""
+    body = {"error": {"code": code, "message": message, "detail": detail}}
+    told = {**HEADERS, "content-security-policy": NO_PAGE, **(headers or {})}
+    return JSONResponse(body, status_code=status, headers=told)
+
+
+def marked(headers: Iterable[tuple[bytes, bytes]]) -> Headers:
+    """Return an answer's headers with those of every answer that it does not have already."""
+    told = list(headers)
+    had = {name.lower() for name, _ in told}
+    kind = next((value for name, value in told if name.lower() == b"content-type"), b"")
+    policy = PAGE if kind.startswith(b"text/html") else NO_PAGE
+    wanted = {**HEADERS, "content-security-policy": policy}
+    return told + [(n.encode(), v.encode()) for n, v in wanted.items() if n.encode() not in had]
+
+
+def sentence(problem: Mapping[str, Any], model: object) -> str:
+    """Return one validation problem of pydantic as a plain sentence: place, value, what is expected.
+
+    Parameters
+    ----------
+    problem
+        One entry of pydantic's list of errors.
+    model
+        What the body or the query is read by, for the keys it knows and the words for what is expected; of a
+        path, the parameter's own facts. None if not known.
+    """
+    where = tuple(str(step) for step in problem["loc"])
+    place = _place(where)
+    kind = problem["type"]
+    words = str(problem["msg"])
+    if kind == "value_error":
+        return words.removeprefix("Value error, ")
+    if kind == "missing":
+        return f"{place} is missing" if len(where) > 1 else "the body is missing; a JSON object is expected"
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+        known = _keys(model, where[1:-1])
+        return f"{place}: unknown key; {nearest(where[-1], known)}" if known else f"{place}: unknown key"
+    value = _short(problem.get("input"))
+    if kind == "string_pattern_mismatch" and (expected := _described(model, where[1:])):
+        return f"{place}: {value} where {expected} is expected"
+    if kind in ("too_short", "too_long"):
+        size = 4 if where[-1] == "quaternion" else 3
+        return f"{place}: {value} where a list of {size} numbers is expected"
+    if kind in ("model_attributes_type", "model_type", "dict_type", "dataclass_type"):
+        return f"{place}: {value} where an object with keys is expected"
+    for start in ("Input should be ", "String should have "):
+        if words.startswith(start):
+            expected = words.removeprefix(start).partition(", unable to")[0]
+            return f"{place}: {value} where {expected} is expected"
+    return f"{place}: {value}: {words}"
+
+
+def _keys(model: object, place: Sequence[str]) -> list[str]:
+    """The keys that a model or dataclass knows, or at a place inside it what stands there."""
+    for candidate in (model, *get_args(model)):
+        fields = getattr(candidate, "model_fields", None) or getattr(candidate, "__pydantic_fields__", None)
+        if fields is None:
+            continue
+        if not place:
+            return list(fields)
+        if place[0] in fields:
+            return _keys(fields[place[0]].annotation, place[1:])
+    return []
+
+
+def _described(model: object, place: Sequence[str]) -> str | None:
+    """What is expected at a place, in the words of the model, or of a path's parameter itself."""
+    for candidate in (model, *get_args(model)):
+        fields = getattr(candidate, "model_fields", None) or {}
+        if place and place[0] in fields:
+            return fields[place[0]].description or _described(fields[place[0]].annotation, place[1:])
+    return getattr(model, "description", None)
+
+
+def _place(where: tuple[str, ...]) -> str:
+    """``("body", "position_m", "0")`` as ``position_m[0]``."""
+    place = ""
+    for step in where[1:]:
+        place += f"[{step}]" if step.isdecimal() else f".{step}" if place else step
+    return place[:120] or f"the {where[0]}"
+
+
+def _short(value: Any) -> str:
+    """A value as JSON, cut short."""
+    try:
+        text = json.dumps(value)
+    except (TypeError, ValueError):
+        text = str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
 
 STATUS_OF_KIND: Mapping[type[Exception], int] = {
     BadRequest: 422,

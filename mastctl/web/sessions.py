@@ -6,7 +6,7 @@ from fastapi import FastAPI, Request, Response
 
 from mastctl.access.access import SESSION_S
 from mastctl.answers import LoggedOut, Role, SessionTold
-from mastctl.commands.caller import Caller
+from mastctl.control.caller import Caller
 from mastctl.errors import NotNow
 from mastctl.web import PREFIX
 from mastctl.web.entrance import address_of, cookie_name, credentials

@@ -27,7 +27,7 @@ from mastctl.answers import (
     WordTold,
 )
 from mastctl.as_json import as_json
-from mastctl.commands.entry import (
+from mastctl.control.entry import (
     SIMULATION_BOARD,
     SIMULATION_BOARD_GONE,
     SIMULATION_FAULT,

@@ -27,9 +27,8 @@ from mastctl.answers import (
     TrackTold,
 )
 from mastctl.as_json import as_json
-from mastctl.commands.caller import told_name
-from mastctl.commands.deadlines import usual_s
-from mastctl.commands.entry import (
+from mastctl.control.caller import told_name
+from mastctl.control.entry import (
     ESTOP,
     JOG,
     LEASE,
@@ -45,14 +44,15 @@ from mastctl.commands.entry import (
     TRACK,
     TRACK_LOOK,
     TRACK_STOP,
-    Asked,
+    CommandRequest,
 )
-from mastctl.commands.lease import Lease, Leases
+from mastctl.control.lease import Lease, LeaseTable
 from mastctl.errors import BadRequest, NotNow, Unable, one_line
 from mastctl.motion.results import PointingError
 from mastctl.safety.latch import LONGEST
 from mastctl.safety.stop_threads import StopsHang
 from mastctl.service.service import Service
+from mastctl.service.steering import usual_s
 from mastctl.web import PREFIX
 from mastctl.web.commands import Asks, carried_out, command, stop_first
 from mastctl.web.models import (
@@ -292,17 +292,17 @@ def add_lease(app: FastAPI) -> None:
         return _granted(leases, leases.take(asked.caller, body.reason, name, body.for_s))
 
 
-def _granted(leases: Leases, lease: Lease) -> LeaseGranted:
+def _granted(leases: LeaseTable, lease: Lease) -> LeaseGranted:
     return {"lease_id": lease.id, **leases.told_of(lease)}
 
 
-def _which(asked: Asked) -> dict[str, str]:
+def _which(asked: CommandRequest) -> dict[str, str]:
     """What tells a lease from another in the record, without being it: a key that came with one is not good
     for the next."""
     return {"of": hashlib.sha256(_lease_of(asked).encode()).hexdigest()[:16]}
 
 
-def _lease_of(asked: Asked) -> str:
+def _lease_of(asked: CommandRequest) -> str:
     """The lease that a request speaks of. Raises BadRequest."""
     if asked.lease is None:
         raise BadRequest("bad_request", "Mastctl-Lease is missing; the id of the lease is expected")

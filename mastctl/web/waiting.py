@@ -1,9 +1,12 @@
-"""Requests that wait: for a thread, for a device, for a picture; and none that waits for a daemon that ends.
+"""Requests that wait: for a thread, a device, a picture, a change; and none for a daemon that ends.
 
 The event loop itself never waits for a lock, a file or a device. What may, runs here in worker threads; a
 request that waits when the daemon ends is refused at once, and what its thread still brings is dropped.
 Pictures have a limit of their own for each camera, so that a dead camera, however often it is asked, takes
 no thread from anything else. What computes for long does it in a few threads of the lowest standing.
+
+What is no stop is taken up in turn, one piece in each turn of the event loop: however many ask at once, what
+a stop still waits for is the work of a few of them, not of all.
 """
 
 from __future__ import annotations
@@ -12,13 +15,43 @@ import asyncio
 import contextlib
 import os
 import threading
-from collections.abc import Awaitable, Callable
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TypeVar
 
 from drivers.clock import Clock, SystemClock
+from mastctl.control.publisher import LoopSubscription, Publisher, Topic
 from mastctl.errors import Unable
-from mastctl.web.turns import Turns
+
+
+class Turns:
+    """What waits to be taken up on one event loop; used on that loop only."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[Callable[[], None]] = deque()
+
+    def call(self, function: Callable[[], None]) -> None:
+        """Have a function called when all that came before has had a turn of the event loop."""
+        self._waiting.append(function)
+        if len(self._waiting) == 1:
+            asyncio.get_running_loop().call_soon(self._next)
+
+    async def turn(self) -> None:
+        """Return when all that came before has had its turn."""
+        mine: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.call(lambda: None if mine.done() else mine.set_result(None))
+        await mine
+
+    def _next(self) -> None:
+        try:
+            self._waiting[0]()
+        finally:
+            self._waiting.popleft()  # now, so that what it has called comes a turn later
+            if self._waiting:
+                asyncio.get_running_loop().call_soon(self._next)
+
 
 T = TypeVar("T")
 
@@ -161,3 +194,52 @@ async def _in_thread(function: Callable[[], T]) -> T:
     except RuntimeError as error:
         raise Unable("no_thread", f"the request was not begun: {error}") from None
     return await answer
+
+
+MOST = 100
+FULL_S = 1.0
+
+
+class Streams:
+    """Who listens to one daemon; used on its event loop only.
+
+    Parameters
+    ----------
+    publisher
+        What is listened to.
+    most
+        How many may listen at once, so that they leave connections for everybody else.
+    """
+
+    def __init__(self, publisher: Publisher, most: int = MOST) -> None:
+        self._publisher = publisher
+        self._most = most
+        self._open: set[LoopSubscription] = set()
+        self._ended = False
+
+    @contextmanager
+    def listening(self, topics: tuple[Topic, ...], keys: frozenset[str] | None) -> Iterator[LoopSubscription]:
+        """Listen inside the block to topics, all of them if none is named, of some keys or of every one.
+
+        Raises
+        ------
+        Unable
+            ``too_many`` listen already, ``closing``.
+        """
+        if self._ended:
+            raise Unable("closing", "the daemon ends; no more events follow")
+        if len(self._open) >= self._most:
+            words = f"{self._most} listen to events already, and no more may; ask again later"
+            raise Unable("too_many", words, FULL_S)
+        with self._publisher.subscribe_here(*topics, keys=keys) as news:
+            self._open.add(news)
+            try:
+                yield news
+            finally:
+                self._open.discard(news)
+
+    def end(self) -> None:
+        """Let every stream tell what it has not told yet, and end."""
+        self._ended = True
+        for news in tuple(self._open):
+            news.close()

@@ -13,7 +13,7 @@ from mastctl.watch.metrics import CONTENT_TYPE
 from mastctl.watch.reference import SENTINEL_FOLDER
 from mastctl.watch.sentinel import findings
 from mastctl.web import PREFIX
-from mastctl.web.packed import passing_answer
+from mastctl.web.page import passing_answer
 from mastctl.web.parts import Here
 
 WELL: frozenset[Word] = frozenset({"ready", "moving", "tracking", "holding"})

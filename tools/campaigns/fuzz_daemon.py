@@ -40,8 +40,8 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from mastctl.client import Client, ClientError
-from mastctl.commands.lease import LONGEST_S
 from mastctl.config import Listen, load_config
+from mastctl.control.lease import LONGEST_S
 from mastctl.daemon import RunningDaemon
 from mastctl.web import PREFIX
 from tools.command import end, options

@@ -44,7 +44,7 @@ from mastctl.config import load_config
 from mastctl.devices.frames import StampedFrame
 from mastctl.packaged import default_config
 from mastctl.recorder import recorder as recorder_module
-from mastctl.recorder.recorder import MastTold, Recorder
+from mastctl.recorder.recorder import AttachedMast, Recorder
 from mastctl.recorder.repair import repair
 from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.writer import Attached
@@ -70,14 +70,14 @@ class Killed:
     wrong: str = ""
 
 
-def mast_of(config: Path) -> MastTold:
+def mast_of(config: Path) -> AttachedMast:
     """Return the mast file that a configuration names."""
     path = load_config(config).mast_file
     data = path.read_bytes()
-    return MastTold(parse_rig(data, path).rig, Attached(path.name, data))
+    return AttachedMast(parse_rig(data, path).rig, Attached(path.name, data))
 
 
-def record_until_killed(folder: Path, mast: MastTold, seed: int, told: mmap.mmap) -> None:
+def record_until_killed(folder: Path, mast: AttachedMast, seed: int, told: mmap.mmap) -> None:
     """What a child does: tell a recorder numbers and pictures, for ever."""
     pixels = np.random.default_rng(seed)
     clock = SystemClock()
@@ -104,7 +104,7 @@ def record_until_killed(folder: Path, mast: MastTold, seed: int, told: mmap.mmap
         time.sleep(max(0.0, next_s - time.monotonic()))
 
 
-def judged(folder: Path, mast: MastTold, told: mmap.mmap) -> Killed:
+def judged(folder: Path, mast: AttachedMast, told: mmap.mmap) -> Killed:
     """Read what a killed child left."""
     last_told, told_s, first_s = PLACE.unpack_from(told, 0)
     numbers: list[tuple[int, float]] = []
@@ -149,7 +149,7 @@ class RecordingChild:
     kill_s: float
 
 
-def begun(folder: Path, mast: MastTold, seed: int, life_s: float) -> RecordingChild:
+def begun(folder: Path, mast: AttachedMast, seed: int, life_s: float) -> RecordingChild:
     """Start a child."""
     folder.mkdir()
     told = mmap.mmap(-1, PLACE.size)
@@ -169,7 +169,7 @@ def killed(child: RecordingChild) -> int:
     return os.waitpid(child.pid, 0)[1]
 
 
-def ended(child: RecordingChild, mast: MastTold) -> Killed:
+def ended(child: RecordingChild, mast: AttachedMast) -> Killed:
     """Kill a child and judge what it left."""
     if not os.WIFSIGNALED(killed(child)):
         return Killed(0, 0, 0.0, 0, "it ended by itself")

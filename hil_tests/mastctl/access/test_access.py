@@ -11,8 +11,17 @@ from types import FunctionType, ModuleType
 import pytest
 
 from drivers.clock import ManualClock
-from mastctl.access.access import SESSION_S, SESSIONS_OF_ONE, Access
-from mastctl.access.guesses import MOST_ADDRESSES, MOST_OF_ALL, MOST_OF_ONE, WINDOW_S, Guesses, neighbourhood
+from mastctl.access.access import (
+    MOST_ADDRESSES,
+    MOST_OF_ALL,
+    MOST_OF_ONE,
+    SESSION_S,
+    SESSIONS_OF_ONE,
+    WINDOW_S,
+    Access,
+    Guesses,
+    neighbourhood,
+)
 from mastctl.access.tokens import TokenList, digest_of
 from mastctl.errors import NotLetIn, TooMany
 

@@ -13,7 +13,7 @@ import pytest
 from calib.errors import BadFile
 from hil_tests.waiting import joined
 from mastctl.access.tokens import MOST_TOKENS, TokenList, TokenRefused
-from mastctl.commands.caller import ROLES
+from mastctl.control.caller import ROLES
 
 
 def mode(path: Path) -> int:

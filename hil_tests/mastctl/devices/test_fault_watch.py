@@ -9,9 +9,9 @@ import pytest
 from drivers.errors import NoReply
 from hil_tests.mastctl.devices.turned import Hang, Turned
 from hil_tests.mastctl.service_fakes import FakeHardware, rig
+from mastctl.control.machine import StateMachine
 from mastctl.devices.devices import HEAD, Devices
 from mastctl.devices.limits import Limits
-from mastctl.state.machine import Machine
 
 
 @pytest.fixture
@@ -20,12 +20,12 @@ def hardware(clock: Turned) -> FakeHardware:
 
 
 @pytest.fixture
-def machine(clock: Turned) -> Machine:
-    return Machine(clock)
+def machine(clock: Turned) -> StateMachine:
+    return StateMachine(clock)
 
 
 @pytest.fixture
-def devices(hardware: FakeHardware, machine: Machine, clock: Turned) -> Iterator[Devices]:
+def devices(hardware: FakeHardware, machine: StateMachine, clock: Turned) -> Iterator[Devices]:
     limits = Limits((-2.0, 2.0), (-1.0, 1.0), 0.5)
     made = Devices(hardware, limits, "0" * 64, clock, rig(), machine=machine)
     with clock.at_work():
@@ -36,7 +36,7 @@ def devices(hardware: FakeHardware, machine: Machine, clock: Turned) -> Iterator
 
 
 def test_a_head_that_hangs_is_a_fault_although_nobody_asks(
-    devices: Devices, hardware: FakeHardware, machine: Machine, clock: Turned
+    devices: Devices, hardware: FakeHardware, machine: StateMachine, clock: Turned
 ) -> None:
     hang = Hang(clock)
     with machine.publisher.subscribe("fault", known=False) as heard:
@@ -53,7 +53,7 @@ def test_a_head_that_hangs_is_a_fault_although_nobody_asks(
 
 
 def test_what_the_head_reports_is_one_fault_as_long_as_it_lasts(
-    devices: Devices, hardware: FakeHardware, machine: Machine, clock: Turned
+    devices: Devices, hardware: FakeHardware, machine: StateMachine, clock: Turned
 ) -> None:
     hardware.head.faults = ("tilt motor is hot",)
     clock.until(lambda: machine.standing.word == "fault", "the fault")
@@ -68,7 +68,7 @@ def test_what_the_head_reports_is_one_fault_as_long_as_it_lasts(
 
 
 def test_a_stop_that_is_not_confirmed_is_told_before_it_is_over(
-    devices: Devices, hardware: FakeHardware, machine: Machine
+    devices: Devices, hardware: FakeHardware, machine: StateMachine
 ) -> None:
     def refuse(name: str) -> None:
         if name == "stop":
@@ -87,7 +87,7 @@ def test_a_stop_that_is_not_confirmed_is_told_before_it_is_over(
 
 
 def test_a_fault_of_a_camera_is_published_and_changes_no_state(
-    devices: Devices, hardware: FakeHardware, machine: Machine, clock: Turned
+    devices: Devices, hardware: FakeHardware, machine: StateMachine, clock: Turned
 ) -> None:
     def fail() -> None:
         raise NoReply("gone", device="navcam_left")
@@ -107,6 +107,6 @@ def test_a_fault_of_a_camera_is_published_and_changes_no_state(
     assert machine.standing.word == "ready"
 
 
-def test_readings_are_published_as_they_come(devices: Devices, machine: Machine) -> None:
+def test_readings_are_published_as_they_come(devices: Devices, machine: StateMachine) -> None:
     reading = devices.read()
     assert machine.publisher.newest("joints", HEAD).time_s >= reading.time_s

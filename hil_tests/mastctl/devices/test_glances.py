@@ -17,8 +17,8 @@ from hil_tests.waiting import until
 from mastctl.devices.cameras import GLANCES_SHARE
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
-from mastctl.live import pictures
-from mastctl.live.pictures import WatchedCameras
+from mastctl.web import pictures
+from mastctl.web.pictures import WatchedCameras
 
 LIMITS = Limits((-2.0, 2.0), (-1.0, 1.0), 0.5)
 LEFT, RIGHT = "navcam_left", "navcam_right"

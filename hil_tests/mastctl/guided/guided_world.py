@@ -13,11 +13,11 @@ from typing import Any
 
 from drivers.clock import SystemClock
 from hil_tests.waiting import NET_S, until
-from mastctl.commands.lease import Leases
+from mastctl.control.lease import LeaseTable
+from mastctl.control.publisher import Publisher
 from mastctl.guided.guide import Guide, RunRequest, WayIn
 from mastctl.guided.runs import GuidedFolder
 from mastctl.guided.told import GuidedRun
-from mastctl.state.publisher import Publisher
 
 PLACE = {
     "event": "place", "name": "p1", "range_m": 1.1, "bearing_deg": 0.0, "height_deg": 0.0,
@@ -90,7 +90,7 @@ class World:
     """A guide and what stands around it."""
 
     guide: Guide
-    leases: Leases
+    leases: LeaseTable
     publisher: Publisher
     stops: FakeStops
     masts: Path
@@ -129,7 +129,7 @@ def world(folder: Path, script: str, simulated: bool = True) -> Iterator[World]:
     masts = folder / "masts"
     masts.mkdir(exist_ok=True)
     publisher, stops = Publisher(), FakeStops()
-    leases = Leases(
+    leases = LeaseTable(
         SystemClock(),
         lambda: stops.running is not None,
         lambda control: publisher.publish("lease", "lease", None),

@@ -13,7 +13,7 @@ import pytest
 from guided_world import BEGUN, DONE, PLACE, PROGRESS, lines, world
 
 from hil_tests.waiting import until
-from mastctl.commands.caller import Caller
+from mastctl.control.caller import Caller
 from mastctl.errors import BadRequest, MastctlError, NotKnown, NotNow, Unable
 from mastctl.guided import child as child_module
 from mastctl.guided import guide as guide_module

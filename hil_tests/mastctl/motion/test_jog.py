@@ -16,13 +16,13 @@ from drivers.interfaces import Reading
 from drivers.sim.heads import PRESETS
 from drivers.sim.pan_tilt import SimulatedPanTilt
 from drivers.simulation_clock import SimulationClock
+from mastctl.control.operations import OperationRunner
+from mastctl.control.records import Operation
 from mastctl.devices.devices import Devices
 from mastctl.devices.keep_out import Box
 from mastctl.devices.limits import Limits
 from mastctl.errors import NotNow
 from mastctl.motion.jog import AHEAD_S, PATIENCE_S, TICK_S, Beat, Jogs
-from mastctl.operations.operations import Operations
-from mastctl.operations.records import Operation
 
 DECK = Box("deck", (-0.5, 0.5), (-1.2, -0.8))
 LIMITS = Limits((-1.0, 1.0), (-1.2, 0.6), 1.0, margin_rad=0.02, keep_out=(DECK,))
@@ -68,7 +68,7 @@ class Rig:
     panel: FaultPanel
     head: Watched
     devices: Devices
-    operations: Operations
+    operations: OperationRunner
     jogs: Jogs
 
     def pass_by(self, duration_s: float) -> None:
@@ -106,7 +106,7 @@ def rig() -> Iterator[Rig]:
     with clock.at_work():
         head = Watched(SimulatedPanTilt(HEAD, clock, panel))
         devices = Devices(SimpleNamespace(pan_tilt=head, cameras={}), LIMITS, "0" * 64, clock)
-        operations = Operations(devices, clock)
+        operations = OperationRunner(devices, clock)
     made = Rig(clock, panel, head, devices, operations, Jogs(operations, devices, clock))
     made.pass_by(0.1)
     yield made

@@ -17,17 +17,17 @@ from drivers.interfaces import Image
 from mastctl.config import load_config
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
-from mastctl.recorder.recorder import MastTold, Recorder
+from mastctl.recorder.recorder import AttachedMast, Recorder
 from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.writer import Attached
 
 CONFIG = Attached("config.yaml", b"schema: mastctl/config/1\n")
 
 
-def mast() -> MastTold:
+def mast() -> AttachedMast:
     path = load_config().mast_file
     data = path.read_bytes()
-    return MastTold(parse_rig(data, path).rig, Attached(path.name, data))
+    return AttachedMast(parse_rig(data, path).rig, Attached(path.name, data))
 
 
 def picture(seed: int = 0, shape: tuple[int, ...] = (24, 32)) -> Image:

@@ -26,14 +26,14 @@ from hil_tests.mastctl.recorder.recorder_world import (
     told,
     until,
 )  # fmt: skip
+from mastctl.control.standing import StandingFault
 from mastctl.errors import NotNow, Unable
 from mastctl.recorder import recorder as module
 from mastctl.recorder import shelf as shelf_module
 from mastctl.recorder.recorded import read_whole
-from mastctl.recorder.recorder import MastTold
+from mastctl.recorder.recorder import AttachedMast
 from mastctl.recorder.shelf import Shelf
 from mastctl.recorder.writer import Attached, RecordFile
-from mastctl.state.faults import StandingFault
 from tools.campaigns.kills import MOST_LOST_S, kills
 
 FAULT = StandingFault("pan_tilt", "no_reply", "it does not answer", 1.0, "it answers")
@@ -386,7 +386,7 @@ def test_another_mast_file_is_attached_and_its_cameras_told_when_it_comes(tmp_pa
     one.tell("joints", "pan_tilt", reading(0.1))
     until(lambda: one.told()["recording"] and one._busy_since_s is None, "the file has begun")
     other = Attached("other.yaml", b"another mast file")
-    one.use_mast(MastTold(mast().rig, other))
+    one.use_mast(AttachedMast(mast().rig, other))
     one.tell("joints", "pan_tilt", reading(0.2))
     one.close()
     (path,) = files(tmp_path)
@@ -398,9 +398,9 @@ def test_another_mast_file_is_attached_and_its_cameras_told_when_it_comes(tmp_pa
         assert other.data in [bytes(one.data) for one in make_reader(file).iter_attachments()]
 
 
-def another_mast(words: str) -> MastTold:
+def another_mast(words: str) -> AttachedMast:
     before = mast()
-    return MastTold(before.rig, Attached(f"{words}.yaml", before.file.data + f"# {words}\n".encode()))
+    return AttachedMast(before.rig, Attached(f"{words}.yaml", before.file.data + f"# {words}\n".encode()))
 
 
 def masts_of(path: Path) -> tuple[list[str], str]:

@@ -20,7 +20,7 @@ from mastctl.client import Client
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.recorder.recorded import Recording, read_whole
-from mastctl.recorder.recorder import MastTold, Recorder
+from mastctl.recorder.recorder import AttachedMast, Recorder
 from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.what_if import WouldBe, pointings_with, rms, seen_in
 from mastctl.recorder.writer import Attached
@@ -49,7 +49,7 @@ def recorded(mast_file: Path, folder: Path) -> Path:
         hardware=replace(config.hardware, simulation=simulation),
     )
     stored = load_rig(mast_file)
-    mast = MastTold(stored.rig, Attached(mast_file.name, mast_file.read_bytes()))
+    mast = AttachedMast(stored.rig, Attached(mast_file.name, mast_file.read_bytes()))
     settings = RecordSettings(ring_s=0.0, free_mb=0.0)
     attached = [replace(CONFIG, data=Path(config.path).read_bytes())]
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
@@ -159,7 +159,7 @@ def test_what_cannot_be_worked_out_is_named() -> None:
 
 
 def test_a_recording_is_served_as_it_was(files: dict[str, Path], tmp_path: Path) -> None:
-    from mastctl.recorder.replayed import replay_files
+    from mastctl.recorder.recorded import replay_files
 
     recording = read_whole(files["wrong run"])
     config = load_config(replay_files(recording, tmp_path, {"port": 0}))

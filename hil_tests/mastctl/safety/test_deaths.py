@@ -332,7 +332,7 @@ def test_with_a_full_log_pipe_stops_of_both_kinds_come_through_both_doors(bench:
 
 WALL_CLOCKS = ("time.time", "time.time_ns", "time.localtime", "datetime.now", "datetime.utcnow")
 STAMPS_ONLY = {
-    "mastctl/commands/audit.py", "mastctl/commands/entry.py", "mastctl/commands/lease.py",
+    "mastctl/control/audit.py", "mastctl/control/entry.py", "mastctl/control/lease.py",
     "mastctl/safety/latch.py",
 }  # fmt: skip
 

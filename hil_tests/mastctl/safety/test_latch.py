@@ -21,6 +21,8 @@ from hil_tests.mastctl.outside_daemon import daemon_process, free_port, line, un
 from hil_tests.mastctl.service_fakes import CONFIG, Hang, ScriptedLoop, fake_daemon
 from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
+from mastctl.control import machine as machine_module
+from mastctl.control.standing import Latched
 from mastctl.errors import NotNow, Unable
 from mastctl.safety import latch as latch_module
 from mastctl.safety import stop_threads
@@ -28,8 +30,6 @@ from mastctl.safety.latch import FILE, Estopped, Latch
 from mastctl.safety.state_file import StateFile
 from mastctl.safety.state_folder import StateFolder, StateInUse, usual_folder
 from mastctl.service import stopping as stopping_module
-from mastctl.state import machine as machine_module
-from mastctl.state.standing import Latched
 
 SECTOR_BYTES = 512
 KEPT = CONFIG + "state: {{folder: state}}\n"

@@ -10,10 +10,10 @@ import pytest
 from hil_tests.mastctl.service.test_rover_time import configured
 from hil_tests.waiting import until
 from mastctl.client import Client
-from mastctl.commands.deadlines import usual_s
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.limits import Limits
 from mastctl.motion.requests import AnglesTarget, PointRequest
+from mastctl.service.steering import usual_s
 
 FAR = {"pan_rad": 1.2, "tilt_rad": 0.2}
 

@@ -24,7 +24,7 @@ from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped
 from mastctl.motion.jog import Beat
 from mastctl.service import steering as steering_module
-from mastctl.service.mast_in_use import configured
+from mastctl.service.masts import configured
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ from calib.errors import BadFile
 from hil_tests.mastctl.service_fakes import fake_daemon
 from hil_tests.waiting import until
 from mastctl.client import Client
+from mastctl.control.standing import StandingFault
 from mastctl.safety.state_file import StateFile
-from mastctl.state.faults import StandingFault
 
 FULL = StandingFault("a file", "full", "the disk is full", 1.0, "it is not")
 

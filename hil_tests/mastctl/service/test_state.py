@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from drivers.interfaces import AxisMotion
+from mastctl.control.standing import Latched, Residual, Standing, StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.limits import Limits
 from mastctl.motion.track import TrackStatus
 from mastctl.service.state import State
-from mastctl.state.faults import StandingFault
-from mastctl.state.standing import Latched, Residual, Standing
 
 REST = State(
     now_s=100.0,

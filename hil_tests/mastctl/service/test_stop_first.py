@@ -20,13 +20,13 @@ from drivers.faults import FaultPanel
 from hil_tests.mastctl.service_fakes import HTTP, FakeHardware, Hang, ScriptedLoop, fake_daemon
 from hil_tests.waiting import NET_S, joined, until
 from mastctl.client import Client, ClientError
+from mastctl.control import operations as operations_module
+from mastctl.control.operations import OperationRunner
+from mastctl.control.records import Operation
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped, Unable
 from mastctl.motion import tracker as tracker_module
 from mastctl.motion.loop import PointingLoop
-from mastctl.operations import operations as operations_module
-from mastctl.operations.operations import Operations
-from mastctl.operations.records import Operation
 from mastctl.safety import stop_threads as stop_threads_module
 from mastctl.web import commands as commands_module
 
@@ -112,7 +112,7 @@ def test_no_lock_that_somebody_holds_keeps_the_event_loop(
         client.snapshot("navcam_left")
         found = dict(locks_of(daemon.service, set()))
         found["FaultPanel._lock"] = hardware.simulation.faults._lock
-        for one in ("Masts._lock", "Operations._lock", "Tracker._lock", "FrameStore._lock"):
+        for one in ("Masts._lock", "OperationRunner._lock", "Tracker._lock", "FrameStore._lock"):
             assert one in found
         for place, lock in found.items():
             with lock:
@@ -276,7 +276,7 @@ def test_an_operation_that_ends_while_the_head_is_being_stopped_was_stopped_by_t
         go.set()
         until(lambda: operations.running is None, "the operation's end")
 
-    operations = Operations(ScriptedMover(until_it_has_ended), SystemClock())
+    operations = OperationRunner(ScriptedMover(until_it_has_ended), SystemClock())
     name = operations.start({}, refused).id
     assert operations.stop() == name
     record = operations.get(name).told()
@@ -290,7 +290,7 @@ def test_an_operation_that_was_done_before_its_stop_is_not_told_as_stopped() -> 
         go.set()
         until(lambda: operations.running is None, "the operation's end")
 
-    operations = Operations(ScriptedMover(until_it_has_ended), SystemClock())
+    operations = OperationRunner(ScriptedMover(until_it_has_ended), SystemClock())
     name = operations.start({}, lambda record, cancelled: go.wait(NET_S)).id
     assert operations.stop() is None
     assert operations.get(name).state == "done"
@@ -299,7 +299,7 @@ def test_an_operation_that_was_done_before_its_stop_is_not_told_as_stopped() -> 
 def test_closing_twice_asks_the_head_once() -> None:
     stops: list[str] = []
     mover = ScriptedMover(lambda: stops.append("first"))
-    operations = Operations(mover, SystemClock())
+    operations = OperationRunner(mover, SystemClock())
     operations.close()
     mover.stop = lambda: stops.append("again, of devices that may be closed by now")  # type: ignore[method-assign]
     operations.close()
@@ -307,7 +307,7 @@ def test_closing_twice_asks_the_head_once() -> None:
 
 
 def test_whoever_sees_a_record_that_has_ended_sees_no_operation_running() -> None:
-    operations = Operations(ScriptedMover(lambda: None), SystemClock())
+    operations = OperationRunner(ScriptedMover(lambda: None), SystemClock())
     seen: list[str | None] = []
     keep = operations._keep
 

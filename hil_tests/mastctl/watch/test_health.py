@@ -15,8 +15,8 @@ from drivers.interfaces import COARSE_COUNT_RAD
 from hil_tests.mastctl.service_fakes import Hang
 from hil_tests.mastctl.watch.histories import DAY_S, NOON_S, bumped, pointing, stored_rig
 from hil_tests.waiting import NET_S, until
+from mastctl.control.records import Operation
 from mastctl.motion.results import Step
-from mastctl.operations.records import Operation
 from mastctl.watch import pointings as journal_module
 from mastctl.watch import residuals as health_module
 from mastctl.watch.pointings import FILE, Journal, Measured, measured_by, measured_of

@@ -6,9 +6,9 @@ import pytest
 
 from drivers.clock import SystemClock
 from hil_tests.waiting import until
+from mastctl.control.publisher import Publisher
+from mastctl.control.standing import StandingFault
 from mastctl.devices.joint_history import HeadReading
-from mastctl.state.faults import StandingFault
-from mastctl.state.publisher import Publisher
 from mastctl.watch import history as history_module
 from mastctl.watch.history import History
 

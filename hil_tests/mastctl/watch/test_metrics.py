@@ -13,8 +13,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from drivers.interfaces import Reading
 from hil_tests.mastctl.service_fakes import FakePointing, FakeResult
 from hil_tests.waiting import until
-from mastctl.operations.records import Operation
-from mastctl.state.publisher import Publisher
+from mastctl.control.publisher import Publisher
+from mastctl.control.records import Operation
 from mastctl.watch.metrics import Metrics
 
 STATUS: dict[str, Any] = {
@@ -142,7 +142,7 @@ def test_what_comes_in_quick_succession_is_counted_each_and_none_of_it_as_missed
 def test_news_that_could_not_be_counted_are_not_told_as_missed_frames(
     publisher: Publisher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mastctl.state.publisher.MOST_UNREAD", 1)
+    monkeypatch.setattr("mastctl.control.publisher.MOST_UNREAD", 1)
     metrics = Metrics(lambda: STATUS, dict, publisher)
     counting, go_on = threading.Event(), threading.Event()
 

@@ -28,7 +28,7 @@ from mastctl.devices import devices as devices_module
 from mastctl.service import service as service_module
 from mastctl.service import steering as steering_module
 from mastctl.web import described as described_module
-from mastctl.web.bodies import LARGEST_BODY_BYTES
+from mastctl.web.guard import LARGEST_BODY_BYTES
 
 ANGLES = {"pan_rad": 0.1, "tilt_rad": -0.1}
 

@@ -17,8 +17,8 @@ import pytest
 from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, ScriptedLoop, fake_daemon
 from hil_tests.waiting import NET_S, joined, until
 from mastctl.client import Client, ClientError
-from mastctl.commands.audit import AuditLog
-from mastctl.commands.caller import Caller
+from mastctl.control.audit import AuditLog
+from mastctl.control.caller import Caller
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped
 from mastctl.safety.stop_line import ask

@@ -26,7 +26,7 @@ from hil_tests.waiting import NET_S, joined, until
 from mastctl import daemon as daemon_module
 from mastctl.client import Client, ClientError
 from mastctl.web import connections as connections_module
-from mastctl.web.streams import Streams
+from mastctl.web.waiting import Streams
 
 
 def in_threads(count: int, ask: Callable[[], Any]) -> list[threading.Thread]:

@@ -19,7 +19,7 @@ from websockets.sync.client import ClientConnection, connect
 from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, fake_daemon
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
 from hil_tests.waiting import NET_S, until
-from mastctl.access.guesses import MOST_OF_ONE
+from mastctl.access.access import MOST_OF_ONE
 from mastctl.answers import Role
 from mastctl.web import guard
 

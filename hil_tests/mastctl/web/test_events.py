@@ -23,14 +23,14 @@ from hil_tests.described_answers import closed
 from hil_tests.mastctl.service_fakes import HTTP, PLAIN, FakeHardware, ScriptedLoop
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
 from hil_tests.waiting import NET_S, joined, until
+from mastctl.control.publisher import TOPICS
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped, Unable
 from mastctl.guided.told import GuidedRun
 from mastctl.guided.told import heard as bench_heard
-from mastctl.state.publisher import TOPICS
 from mastctl.web import connections as connections_module
 from mastctl.web import sockets as sockets_module
-from mastctl.web.streams import Streams
+from mastctl.web.waiting import Streams
 from tools.campaigns import fuzz_daemon
 
 BOTH = tuple[RunningDaemon, FakeHardware]

@@ -21,7 +21,7 @@ from hil_tests.mastctl.service_fakes import HTTP, PLAIN, FakeHardware, fake_daem
 from hil_tests.mastctl.web.network import network_daemon
 from hil_tests.waiting import NET_S, until
 from mastctl.daemon import RunningDaemon
-from mastctl.live import pictures
+from mastctl.web import pictures
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 LEFT, RIGHT = "navcam_left", "navcam_right"
@@ -108,7 +108,7 @@ def test_the_clicked_picture_stays_known_while_it_is_shown_however_many_another_
             received(quick)
             quick.send(LEFT)
         assert daemon.service.devices.frame_by_id(shown).frame_id == shown
-    until(lambda: not daemon.service.watched._watchers, "both have left")
+    until(nobody_watches, "both have left")
     assert not [key for key in daemon.service.devices._store._held if key[0] != "asked"]
 
 
@@ -162,11 +162,16 @@ def test_a_camera_that_fails_holds_no_other_up_and_comes_back(
             line.send(name)
 
 
+def nobody_watches() -> bool:
+    """Whether no camera is asked for pictures any more."""
+    return not any(thread.name.startswith("pictures of ") for thread in threading.enumerate())
+
+
 def test_nobody_watching_asks_no_camera(pair: BOTH) -> None:
     daemon, hardware = pair
     with watching(daemon.url, LEFT) as line:
         received(line)
-    until(lambda: not daemon.service.watched._at_work, "the camera's thread has ended")
+    until(nobody_watches, "the camera's thread has ended")
     asked = len(hardware.fake_cameras[LEFT].asked)
     with watching(daemon.url, RIGHT) as line:
         received(line)

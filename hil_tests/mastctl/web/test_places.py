@@ -11,7 +11,7 @@ from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, fake_daemon
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import MastctlError
-from mastctl.service.places import FILE, MOST, Place, Places
+from mastctl.service.places import FILE, MOST, KeptPlace, Places
 
 Pair = tuple[RunningDaemon, FakeHardware]
 HOME = {"pan_rad": 0.0, "tilt_rad": 0.0}
@@ -83,14 +83,14 @@ def test_a_file_of_something_else_is_refused_in_a_sentence(tmp_path: Path, text:
 def test_no_more_places_are_kept_than_a_page_can_show(tmp_path: Path) -> None:
     places = Places(tmp_path)
     for number in range(MOST):
-        places.keep(f"place {number}", Place(0.01 * number, 0.0))
+        places.keep(f"place {number}", KeptPlace(0.01 * number, 0.0))
     with pytest.raises(MastctlError, match="forget one"):
-        places.keep("one more", Place(0.0, 0.0))
-    assert len(places.keep("place 3", Place(1.0, 0.0))["places"]) == MOST + 1, "and home"
+        places.keep("one more", KeptPlace(0.0, 0.0))
+    assert len(places.keep("place 3", KeptPlace(1.0, 0.0))["places"]) == MOST + 1, "and home"
 
 
 def test_a_disk_that_takes_nothing_is_told(tmp_path: Path) -> None:
     places = Places(tmp_path / "gone")
     with pytest.raises(MastctlError, match="cannot be saved") as refusal:
-        places.keep("chart", Place(0.0, 0.0))
+        places.keep("chart", KeptPlace(0.0, 0.0))
     assert refusal.value.code == "not_saved"

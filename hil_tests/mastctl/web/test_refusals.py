@@ -28,8 +28,7 @@ from mastctl.errors import (
     Unable,
 )
 from mastctl.motion.results import PointingError
-from mastctl.web.answer import GuardError, error_response
-from mastctl.web.refusals import status_of
+from mastctl.web.refusals import GuardError, error_response, status_of
 from tools import error_codes
 
 KINDS = (BadRequest, NotAllowed, NotKnown, NotLetIn, NoLonger, NotNow, TooMany, Unable)

@@ -15,8 +15,8 @@ import pytest
 
 from hil_tests.mastctl.service_fakes import FakeHardware
 from hil_tests.waiting import NET_S, until
+from mastctl.control.publisher import Publisher
 from mastctl.daemon import RunningDaemon
-from mastctl.state.publisher import Publisher
 from mastctl.web import events as events_module
 from mastctl.web import guard as guard_module
 from mastctl.web.waiting import Waiting

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from drivers.clock import ManualClock
 from mastctl.access.access import Access
 from mastctl.access.tokens import TokenList
-from mastctl.web.entrance import Entrance
+from mastctl.web.entrance import Entrance, Names
 from mastctl.web.guard import Guard
-from mastctl.web.whose_page import Names
 
 NAME = "rover.test"
 ORIGIN = {"origin": f"http://{NAME}"}
@@ -112,7 +111,7 @@ class _Nobody(Access):
     def __init__(self) -> None:
         from collections import OrderedDict
 
-        from mastctl.access.guesses import Guesses
+        from mastctl.access.access import Guesses
 
         self._clock, self._tokens, self._lent = ManualClock(), (), ()
         self._guesses, self._sessions = Guesses(), OrderedDict()

@@ -20,7 +20,7 @@ from calib.errors import BadFile
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
 from hil_tests.waiting import NET_S, joined
 from mastctl.client import Client, ClientError
-from mastctl.web import connections, entrance, secure
+from mastctl.web import connections, entrance, server
 
 STATUS = f"GET /api/v1/status HTTP/1.1\r\nHost: {NAME}\r\n"
 STOP = f"POST /api/v1/stop HTTP/1.1\r\nHost: {NAME}\r\nConnection: close\r\n\r\n"
@@ -391,13 +391,13 @@ def test_a_stop_comes_through_any_number_of_handshakes_that_do_not_come_whole(
 def test_a_handshake_that_does_not_come_is_left_after_some_seconds(
     secured: Network, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(secure, "HANDSHAKE_S", 0.3)
+    monkeypatch.setattr(server, "HANDSHAKE_S", 0.3)
     began_s = time.monotonic()
     with lines(secured, 3) as silent:
         for one in silent:
             with contextlib.suppress(ConnectionResetError):
                 assert one.recv(1) == b""
-            assert time.monotonic() - began_s > secure.HANDSHAKE_S, "it was given its time"
+            assert time.monotonic() - began_s > server.HANDSHAKE_S, "it was given its time"
 
 
 def test_a_request_in_the_same_breath_as_the_handshakes_end_is_answered(

@@ -14,7 +14,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
 from hil_tests.waiting import NET_S
-from mastctl.live import pictures
+from mastctl.web import pictures
 from mastctl.web.page import page_files
 
 BOUND_MS = 1e3 * NET_S

@@ -30,7 +30,7 @@ from hil_tests.mastctl.web.network import network_daemon
 from hil_tests.mastctl.web.page.conftest import Visit
 from hil_tests.waiting import NET_S, until
 from mastctl.client import Client
-from mastctl.commands.caller import Caller
+from mastctl.control.caller import Caller
 from mastctl.daemon import RunningDaemon
 from mastctl.motion.requests import Aim
 from mastctl.motion.results import Preview

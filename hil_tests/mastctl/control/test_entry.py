@@ -1,0 +1,350 @@
+"""The one entry: what is asked in which order, and what is left of each command."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.clock import ManualClock
+from drivers.errors import NoReply
+from hil_tests.waiting import NET_S, joined
+from mastctl.control.audit import AuditLog
+from mastctl.control.caller import Caller
+from mastctl.control.entry import (
+    ESTOP,
+    JOG,
+    POINT,
+    POSE,
+    STOP,
+    Answer,
+    Command,
+    CommandEntry,
+    CommandRequest,
+)
+from mastctl.control.idempotency import Answers
+from mastctl.control.lease import LeaseTable
+from mastctl.control.publisher import Publisher
+from mastctl.errors import MastctlError, NotNow
+
+BENCH = Caller("bench")
+ROVER = Caller("rover")
+
+
+class World:
+    """An entry on a turned clock; what it tells operations; what it records."""
+
+    def __init__(self, path: Path, strangers: Path | None = None) -> None:
+        self.clock = ManualClock(100.0)
+        self.runs = False
+        self.leases = LeaseTable(self.clock, lambda: self.runs)
+        self.path = path
+        small = {} if strangers is None else {"file_bytes": 50_000, "files": 2}
+        self.audit = AuditLog(path, **small)
+        self.strangers = AuditLog(strangers, **small)
+        self.deadlines: list[tuple[str, float, float]] = []
+        self.ended_by_stop: list[str] = []
+        self.refuses: str | None = None
+        self.publisher = Publisher()
+        self.entry = CommandEntry(
+            self.clock,
+            self.leases,
+            Answers(self.clock),
+            self.audit,
+            self,
+            self.publisher,
+            self.strangers,
+        )
+        self.acts = 0
+
+    @property
+    def published(self) -> list[Any]:
+        """What who begins to listen now still hears of."""
+        with self.publisher.subscribe("command") as heard:
+            return heard.wait(0.0)
+
+    def end_within(self, name: str, left_s: float, allowed_s: float) -> None:
+        self.deadlines.append((name, left_s, allowed_s))
+
+    def end_stopped(self, name: str) -> None:
+        self.ended_by_stop.append(name)
+
+    def refusal(self, need: str) -> NotNow | None:
+        return None if self.refuses is None else NotNow(self.refuses, f"{need} does not fit")
+
+    def asked(self, caller: Caller = BENCH, **others: Any) -> CommandRequest:
+        return CommandRequest(caller, self.clock.now_s(), **others)
+
+    def act(self) -> Answer:
+        self.acts += 1
+        return {"id": f"00000{self.acts}-abcd"}
+
+    def lines(self) -> list[dict[str, Any]]:
+        assert self.audit.flush(NET_S)
+        return [json.loads(line) for line in self.path.read_text().splitlines()]
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    made = World(tmp_path / "audit.jsonl")
+    yield made
+    made.audit.close()
+
+
+def refused(code: str, act: Callable[[], object]) -> str:
+    with pytest.raises(MastctlError) as refusal:
+        act()
+    assert refusal.value.code == code
+    return str(refusal.value)
+
+
+def test_a_request_that_is_no_json_is_recorded_and_published_with_text_in_its_place(world: World) -> None:
+    deep: list[Any] = []
+    for _ in range(5000):
+        deep = [deep]
+    for request in ({"range_m": float("inf")}, {"range_m": [float("nan"), -float("inf")]}, {"deep": deep}):
+        world.entry.run(POSE, world.asked(request=request), dict)
+    recorded = [line["request"] for line in world.lines()]
+    assert recorded[:2] == [{"range_m": "inf"}, {"range_m": ["nan", "-inf"]}]
+    assert isinstance(recorded[2], str)
+    assert [one.value["request"] for one in world.published] == recorded
+
+
+def test_a_record_says_who_under_which_lease_what_when_and_with_which_result(world: World) -> None:
+    lease = world.leases.acquire(BENCH)
+    request = {"pan_rad": 0.1, "tilt_rad": 0.2}
+    world.entry.run(POINT, world.asked(request=request, lease=lease.id, key="k"), world.act)
+    (line,) = world.lines()
+    assert line.pop("time").endswith("+00:00")
+    assert line == {
+        "number": 1, "monotonic_s": 100.0, "command": "point", "who": "bench", "role": "admin",
+        "via": "loopback", "request": request, "lease": lease.id[:8], "key": "k", "again": False,
+        "result": "ok", "operation": "000001-abcd",
+    }  # fmt: skip
+    assert lease.id not in world.path.read_text()
+    assert [(one.key, one.value["number"]) for one in world.published] == [("1", 1)]
+
+
+def test_an_operations_end_is_a_line_of_its_own(world: World) -> None:
+    world.entry.run(POINT, world.asked(), world.act)
+    world.entry.ended("000001-abcd", "failed", {"code": "deadline_passed", "message": "too late"})
+    world.entry.ended("000009-abcd", "done", None)  # nobody's
+    line = world.lines()[1]
+    assert (line["number"], line["command"], line["who"]) == (1, "point", "bench")
+    assert (line["ended"], line["state"], line["code"]) == ("000001-abcd", "failed", "deadline_passed")
+    assert len(world.lines()) == 2
+
+
+def test_an_operation_that_ends_before_its_command_is_recorded_has_both_lines_in_order(world: World) -> None:
+    def act() -> Answer:
+        world.entry.ended("000001-abcd", "done", None)
+        return world.act()
+
+    world.entry.run(POINT, world.asked(), act)
+    assert [line.get("ended") for line in world.lines()] == [None, "000001-abcd"]
+
+
+@pytest.mark.parametrize("error", [NoReply("no answer"), ZeroDivisionError("secret")])
+def test_what_fails_is_recorded_with_its_code_and_raised(world: World, error: Exception) -> None:
+    def act() -> Answer:
+        raise error
+
+    with pytest.raises(type(error)):
+        world.entry.run(POINT, world.asked(), act)
+    (line,) = world.lines()
+    assert line["result"] == ("no_reply" if isinstance(error, NoReply) else "internal")
+    assert "secret" not in line["message"]
+
+
+def test_each_refusal_is_recorded_and_nothing_is_done(world: World) -> None:
+    entry, asked = world.entry, world.asked
+    refused("role", lambda: entry.run(POINT, asked(Caller("page", "view")), world.act))
+    lease = world.leases.acquire(BENCH)
+    refused("leased", lambda: entry.run(POINT, asked(ROVER), world.act))
+    refused("lease_unknown", lambda: entry.run(POINT, asked(ROVER, lease="x"), world.act))
+    world.refuses = "stopped"
+    refused("stopped", lambda: entry.run(POINT, asked(lease=lease.id), world.act))
+    late = asked(ROVER, deadline_s=1.0)
+    world.clock.advance(1.0)
+    refused("deadline_passed", lambda: entry.run(POSE, late, world.act))
+    assert [line["result"] for line in world.lines()] == [
+        "role", "leased", "lease_unknown", "stopped", "deadline_passed",
+    ]  # fmt: skip
+    assert world.acts == 0
+
+
+def test_a_stop_asks_for_nothing_acts_and_is_recorded_after(world: World) -> None:
+    world.leases.acquire(BENCH)
+    world.refuses = "stopped"
+    told: list[int] = []
+
+    def act() -> Answer:
+        told.append(len(world.published))
+        return {"stopped": True, "operation": "000001-abcd"}
+
+    locks = [world.leases._lock, world.entry._matching, world.entry._answers._changed]
+    for lock in locks:
+        lock.__enter__()  # whoever holds them holds no stop
+    try:
+        world.entry.first(STOP, world.asked(Caller("page", "view"), lease="x"), act)
+    finally:
+        for lock in locks:
+            lock.__exit__(None, None, None)
+    assert told == [0]
+    assert world.lines()[0]["result"] == "ok"
+
+
+def test_a_command_sent_twice_acts_once_and_both_are_recorded(world: World) -> None:
+    asked = world.asked(key="k", request={"pan_rad": 0.1})
+    assert world.entry.run(POINT, asked, world.act) == world.entry.run(POINT, asked, world.act)
+    assert world.acts == 1
+    assert [(line["operation"], line["again"]) for line in world.lines()] == [
+        ("000001-abcd", False),
+        ("000001-abcd", True),
+    ]
+    refused(
+        "key_reused",
+        lambda: world.entry.run(POINT, world.asked(key="k", request={"pan_rad": 0.2}), world.act),
+    )
+    refused(
+        "key_reused",
+        lambda: world.entry.run(POSE, world.asked(key="k", request={"pan_rad": 0.1}), world.act),
+    )
+
+
+def test_an_answer_is_given_again_after_the_lease_under_which_it_was_made(world: World) -> None:
+    lease = world.leases.acquire(BENCH, for_s=5.0)
+    asked = world.asked(key="k", lease=lease.id)
+    answer = world.entry.run(POINT, asked, world.act)
+    world.clock.advance(6.0)
+    world.leases.acquire(ROVER)
+    assert world.entry.run(POINT, asked, world.act) == answer
+    assert world.acts == 1
+
+
+def test_a_replay_while_the_first_is_at_work_under_a_lease_waits_for_it_and_holds_no_lock(
+    world: World,
+) -> None:
+    inside, go = threading.Event(), threading.Event()
+
+    def slow() -> Answer:
+        inside.set()
+        assert go.wait(NET_S)
+        return world.act()
+
+    asked, got = world.asked(key="k"), list[Answer]()
+    threads = [
+        threading.Thread(target=lambda: got.append(world.entry.run(POINT, asked, slow))) for _ in range(3)
+    ]
+    threads[0].start()
+    assert inside.wait(NET_S)
+    for thread in threads[1:]:
+        thread.start()
+    assert world.leases.control() is not None
+    refused("leased", lambda: world.leases.acquire(ROVER))
+    world.entry.first(STOP, world.asked(ROVER), lambda: {"stopped": True})
+    go.set()
+    joined(*threads)
+    assert got == [{"id": "000001-abcd"}] * 3
+
+
+def test_an_operation_is_given_what_is_left_of_its_time(world: World) -> None:
+    def slow() -> Answer:
+        world.clock.advance(2.0)
+        return world.act()
+
+    world.entry.run(POINT, world.asked(deadline_s=5.0), slow, usual_s=60.0)
+    world.entry.run(POINT, world.asked(), world.act, usual_s=60.0)
+    world.entry.run(POINT, world.asked(), world.act)
+    world.entry.run(POSE, world.asked(), lambda: {"operation": None, "track": {}}, usual_s=60.0)
+    assert world.deadlines == [("000001-abcd", 3.0, 5.0), ("000002-abcd", 60.0, 60.0)]
+
+
+@pytest.mark.parametrize("deadline_s", [0.0, -1.0, 3601.0, float("nan"), float("inf")])
+def test_a_deadline_out_of_bounds_is_refused(deadline_s: float) -> None:
+    assert "deadline_s" in refused("bad_request", lambda: CommandRequest(BENCH, 0.0, deadline_s=deadline_s))
+
+
+def test_what_does_not_steer_is_let_through_whoever_steers(world: World) -> None:
+    world.leases.acquire(BENCH)
+    world.entry.run(POSE, world.asked(ROVER), world.act)
+    world.entry.run(Command("reload", "admin"), world.asked(ROVER), world.act)
+    assert world.acts == 2
+
+
+def test_the_record_of_who_began_what_is_bounded(world: World) -> None:
+    for _ in range(300):
+        world.entry.run(POINT, world.asked(), world.act)
+    for number in range(300):
+        world.entry.ended(f"x{number}", "done", None)
+    assert len(world.entry._began) == 256
+    assert len(world.entry._ended) == 256
+
+
+def test_the_newest_256_records_stay_to_be_heard_of_whenever_what_they_began_ended(world: World) -> None:
+    world.entry.run(POINT, world.asked(), world.act)
+    world.entry.ended("000001-abcd", "done", None)
+    assert [one.key for one in world.published] == ["1", "1.end"]
+    for _ in range(300):
+        world.entry.run(POSE, world.asked(), dict)
+    assert [one.key for one in world.published] == [str(number) for number in range(46, 302)]
+
+
+def test_of_heartbeats_the_first_is_recorded_and_what_is_refused(world: World) -> None:
+    for _ in range(3):
+        world.entry.run(JOG, world.asked(deadline_s=9.0), lambda: {"id": "000001-abcd", "taken": True})
+    world.entry.run(JOG, world.asked(), lambda: {"id": None, "taken": False})
+    world.leases.acquire(BENCH)
+    refused("leased", lambda: world.entry.run(JOG, world.asked(ROVER), dict))
+    world.entry.ended("000001-abcd", "done", None)
+    told = [(line.get("result"), line.get("ended")) for line in world.lines()]
+    assert told == [("ok", None), ("leased", None), (None, "000001-abcd")]
+    assert world.deadlines == [("000001-abcd", 9.0, 9.0)]
+
+
+def test_what_steers_and_was_asked_for_before_a_stop_is_not_carried_out_after_it(world: World) -> None:
+    early = world.asked(last_stop=world.leases.last_stop)
+    world.entry.first(STOP, world.asked(ROVER), dict)
+    words = refused("stopped", lambda: world.entry.run(POINT, early, world.act))
+    assert "asked for before a stop came" in words and world.acts == 0
+    world.entry.run(POSE, early, dict)  # moves nothing
+    world.entry.run(POINT, world.asked(last_stop=world.leases.last_stop), world.act)
+    assert world.acts == 1 and world.ended_by_stop == []
+
+
+def test_what_begins_while_a_stop_comes_is_ended_by_it(world: World) -> None:
+    def act() -> Answer:
+        world.leases.stop_came()
+        return world.act()
+
+    world.entry.run(POINT, world.asked(last_stop=world.leases.last_stop), act)
+    assert world.ended_by_stop == ["000001-abcd"]
+
+
+def test_strangers_push_nobody_elses_records_out(tmp_path: Path) -> None:
+    world = World(tmp_path / "audit.jsonl", tmp_path / "strangers.jsonl")
+    who = Caller("anonymous", "view", "network", "10.0.0.9")
+    world.entry.run(POINT, world.asked(Caller("operate", via="token", address="10.0.0.1")), world.act)
+    for number in range(1000):
+        world.entry.first(ESTOP, world.asked(who, request={"reason": "x" * 4000}), lambda: {"id": "-"})
+        if number % 50 == 0:
+            assert world.strangers.flush(NET_S)
+    world.entry.refused(Caller("view", "view", "token", "10.0.0.2"), "POST /point", "role", "may view", 2000)
+    world.entry.refused(who, "GET /status", "wrong_token", "nobody's")
+    known = world.lines()
+    assert [(line["who"], line["address"], line["result"]) for line in known] == [
+        ("operate", "10.0.0.1", "ok"),
+        ("view", "10.0.0.2", "role"),
+    ]
+    assert known[1]["command"] == "POST /point" and known[1]["times"] == 2000
+    assert world.strangers.flush(NET_S)
+    last = json.loads((tmp_path / "strangers.jsonl").read_text().splitlines()[-1])
+    assert (last["address"], last["result"]) == ("10.0.0.9", "wrong_token")
+    told = [one.value["who"] for one in world.published]
+    assert (told.count("operate"), told.count("anonymous")) == (1, 32), "what is refused is not published"
+    world.audit.close()
+    world.strangers.close()

@@ -1,0 +1,292 @@
+"""Who steers: one at a time, by a lease on a turned clock, or by what it started."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import pytest
+
+from drivers.clock import ManualClock
+from hil_tests.waiting import joined
+from mastctl.control.caller import Caller
+from mastctl.control.lease import LONGEST_S, REMEMBERED, SHORTEST_S, Lease, Leased, LeaseTable, WhoSteers
+from mastctl.errors import BadRequest, MastctlError, NotNow
+
+BENCH = Caller("bench")
+ROVER = Caller("rover")
+
+
+class World:
+    """Leases on a clock that a test turns, and something that runs or does not."""
+
+    def __init__(self) -> None:
+        self.clock = ManualClock(100.0)
+        self.runs = False
+        self.changes: list[WhoSteers | None] = []
+        self.gave_way: list[str] = []
+        self.leases = LeaseTable(self.clock, lambda: self.runs, self.changes.append, self.give_way)
+
+    def give_way(self, why: str) -> None:
+        self.runs = False
+        self.gave_way.append(why)
+
+    def steer(self, caller: Caller, lease: Lease | None = None, starts: bool = False) -> None:
+        with self.leases.steering(caller, None if lease is None else lease.id):
+            self.runs = self.runs or starts
+
+
+@pytest.fixture
+def world() -> World:
+    return World()
+
+
+def refused(code: str, act: Callable[[], object]) -> str:
+    with pytest.raises(MastctlError) as refusal:
+        act()
+    assert refusal.value.code == code
+    return str(refusal.value)
+
+
+def test_of_many_who_acquire_at_once_exactly_one_steers() -> None:
+    for _ in range(50):
+        world = World()
+        start, got, refusals = threading.Barrier(8), list[Lease](), list[str]()
+
+        def acquire(number: int, world: World = world, start: threading.Barrier = start) -> None:
+            start.wait()
+            try:
+                got.append(world.leases.acquire(Caller(f"program {number % 4}")))  # noqa: B023
+            except NotNow as error:
+                refusals.append(error.code)  # noqa: B023
+
+        threads = [threading.Thread(target=acquire, args=(number,)) for number in range(8)]
+        for thread in threads:
+            thread.start()
+        joined(*threads)
+        assert (len(got), refusals) == (1, ["leased"] * 7)
+
+
+def test_who_holds_no_lease_is_told_who_does_and_how_long(world: World) -> None:
+    world.leases.acquire(BENCH, for_s=20.0)
+    world.clock.advance(5.0)
+    with pytest.raises(Leased, match=r"bench steers, for 15\.0 s more") as refusal:
+        world.steer(ROVER)
+    assert refusal.value.detail["holder"] == "bench"
+    assert refusal.value.detail["for_s"] == 15.0
+    assert refusal.value.detail["until"] is not None
+
+
+def test_the_holders_own_name_does_not_do_instead_of_its_lease(world: World) -> None:
+    lease = world.leases.acquire(BENCH)
+    refused("leased", lambda: world.steer(BENCH))
+    refused("leased", lambda: world.leases.acquire(BENCH))
+    refused("lease_unknown", lambda: world.steer(BENCH, Lease("0" * 32, "bench", 0, 1, 2)))
+    world.steer(ROVER, lease)  # who has been given the id steers in the holder's name
+
+
+def test_a_lease_holds_up_to_its_end_and_not_at_it(world: World) -> None:
+    lease = world.leases.acquire(BENCH, for_s=10.0)
+    world.clock.advance(9.999)
+    world.steer(BENCH, lease)
+    refused("leased", lambda: world.leases.acquire(ROVER))
+    world.clock.advance(0.001)
+    assert world.leases.control() is None
+    assert "its 10 s were over" in refused("lease_over", lambda: world.leases.renew(lease.id))
+    refused("lease_over", lambda: world.steer(BENCH, lease))
+    world.leases.acquire(ROVER)
+
+
+def test_renewing_counts_from_then_on(world: World) -> None:
+    lease = world.leases.acquire(BENCH, for_s=10.0)
+    world.clock.advance(9.0)
+    assert world.leases.renew(lease.id).until_s == 119.0
+    world.clock.advance(9.0)
+    assert world.leases.renew(lease.id, 2.0).until_s == 120.0
+    world.clock.advance(2.0)
+    refused("lease_over", lambda: world.leases.renew(lease.id))
+
+
+def test_a_lease_is_released_once(world: World) -> None:
+    lease = world.leases.acquire(BENCH)
+    world.leases.release(lease.id)
+    assert "released" in refused("lease_over", lambda: world.leases.release(lease.id))
+    world.steer(ROVER)
+
+
+def test_who_takes_over_steers_and_the_former_holder_hears_by_whom_and_why(world: World) -> None:
+    former = world.leases.acquire(BENCH)
+    lease = world.leases.take(ROVER, "the bench is empty")
+    words = refused("lease_over", lambda: world.steer(BENCH, former))
+    assert "rover took over: the bench is empty" in words
+    world.steer(ROVER, lease)
+    refused("lease_over", lambda: world.leases.release(former.id))  # the former id releases nobody else's
+
+
+def test_without_a_lease_whoever_starts_something_steers_until_it_has_ended(world: World) -> None:
+    world.steer(BENCH, starts=True)
+    assert world.leases.control() == WhoSteers("bench", "operation")
+    assert world.leases.told() == {"holder": "bench", "kind": "operation", "for_s": None, "until": None}
+    refused("leased", lambda: world.steer(ROVER))
+    refused("leased", lambda: world.leases.acquire(ROVER))
+    world.steer(BENCH)
+    world.runs = False
+    assert world.leases.control() is None
+    world.steer(ROVER)
+
+
+def test_nobody_gets_a_lease_while_anothers_command_is_under_way(world: World) -> None:
+    with world.leases.steering(BENCH, None):
+        refused("leased", lambda: world.leases.acquire(ROVER))
+        refused("leased", lambda: world.steer(ROVER))
+    world.leases.acquire(ROVER)
+
+
+def test_all_who_tell_no_name_are_one_party(world: World) -> None:
+    world.steer(Caller(), starts=True)
+    world.steer(Caller(via="unix"))
+    refused("leased", lambda: world.steer(BENCH))
+
+
+def test_what_a_holder_started_stays_its_own_after_its_lease(world: World) -> None:
+    lease = world.leases.acquire(BENCH, for_s=5.0)
+    world.steer(BENCH, lease, starts=True)
+    world.clock.advance(6.0)
+    assert world.leases.control() == WhoSteers("bench", "operation")
+    refused("leased", lambda: world.leases.acquire(ROVER))
+    taken = world.leases.take(ROVER, "it hangs")
+    world.steer(ROVER, taken)
+
+
+def test_a_command_that_fails_leaves_nobody_steering(world: World) -> None:
+    with pytest.raises(ZeroDivisionError), world.leases.steering(BENCH, None):
+        raise ZeroDivisionError
+    assert world.leases.control() is None
+
+
+@pytest.mark.parametrize("for_s", [0.0, -1.0, SHORTEST_S / 2, LONGEST_S + 1, float("nan"), float("inf")])
+def test_a_time_out_of_bounds_is_refused_and_changes_nothing(world: World, for_s: float) -> None:
+    refused("bad_request", lambda: world.leases.acquire(BENCH, for_s=for_s))
+    lease = world.leases.acquire(BENCH)
+    refused("bad_request", lambda: world.leases.renew(lease.id, for_s))
+    refused("bad_request", lambda: world.leases.take(ROVER, "why not", for_s=for_s))
+    assert world.leases.control() == WhoSteers("bench", "lease", lease.until_s)
+    with pytest.raises(BadRequest):
+        world.leases.take(ROVER, "why not", for_s=for_s)
+
+
+def test_each_change_is_told_once_an_end_by_time_when_somebody_asks(world: World) -> None:
+    lease = world.leases.acquire(BENCH, for_s=10.0)
+    lease = world.leases.renew(lease.id, 20.0)
+    world.leases.release(lease.id)
+    world.leases.acquire(ROVER, for_s=1.0)
+    world.clock.advance(2.0)
+    refused("lease_over", lambda: world.leases.renew(lease.id))
+    told = [None if one is None else (one.holder, one.until_s) for one in world.changes]
+    assert told == [("bench", 110.0), ("bench", 120.0), None, ("rover", 101.0), None]
+
+
+def test_the_ends_of_the_last_leases_are_remembered_and_no_more(world: World) -> None:
+    leases = []
+    for _ in range(REMEMBERED + 1):
+        leases.append(world.leases.acquire(BENCH))
+        world.leases.release(leases[-1].id)
+    refused("lease_unknown", lambda: world.leases.renew(leases[0].id))
+    refused("lease_over", lambda: world.leases.renew(leases[1].id))
+
+
+def test_an_id_of_any_signs_is_unknown_and_no_defect(world: World) -> None:
+    world.leases.acquire(BENCH)
+    for lease_id in ("", "é" * 9, "\x00", "x" * 10000):
+        refused("lease_unknown", lambda lease_id=lease_id: world.leases.renew(lease_id))  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("by", ["command", "lease", "take"])
+def test_a_lease_that_gives_way_ends_for_whoever_comes_and_what_runs_is_stopped_first(
+    world: World, by: str
+) -> None:
+    lease = world.leases.acquire(BENCH, for_s=60.0, gives_way=True)
+    world.steer(BENCH, lease, starts=True)
+    if by == "command":
+        with world.leases.steering(ROVER, None):
+            assert not world.runs, "what ran is stopped before the command is carried out"
+    elif by == "lease":
+        assert world.leases.acquire(ROVER).holder == "rover"
+    else:
+        assert world.leases.take(ROVER, "why not").holder == "rover"
+    assert len(world.gave_way) == 1
+    assert "rover" in world.gave_way[0]
+    assert "rover" in refused("lease_over", lambda: world.steer(BENCH, lease))
+
+
+def test_a_lease_that_gives_way_stops_nothing_where_nothing_runs(world: World) -> None:
+    world.leases.acquire(BENCH, gives_way=True)
+    world.steer(ROVER)
+    assert world.gave_way == []
+    assert world.leases.control() is None
+
+
+def test_a_lease_that_gives_way_is_renewed_and_stands_against_nobody_but_ends_by_time(world: World) -> None:
+    lease = world.leases.acquire(BENCH, for_s=10.0, gives_way=True)
+    world.clock.advance(9.0)
+    world.leases.renew(lease.id)
+    world.clock.advance(9.0)
+    world.steer(BENCH, lease)
+    world.clock.advance(1.0)
+    assert "its 10 s were over" in refused("lease_over", lambda: world.steer(BENCH, lease))
+
+
+def test_a_stop_ends_a_lease_that_gives_way_and_no_other(world: World) -> None:
+    lease = world.leases.acquire(BENCH)
+    world.leases.stop_came()
+    world.steer(BENCH, lease)
+    world.leases.release(lease.id)
+    lease = world.leases.acquire(BENCH, gives_way=True)
+    world.steer(BENCH, lease)
+    with world.leases._lock:  # whoever holds it, the stop waits for nobody
+        world.leases.stop_came()
+        assert world.leases.control() is None
+    assert "the head was stopped" in refused("lease_over", lambda: world.steer(BENCH, lease))
+    assert "the head was stopped" in refused("lease_over", lambda: world.leases.renew(lease.id))
+    world.steer(BENCH, world.leases.acquire(BENCH, gives_way=True))
+
+
+def test_a_lease_that_ends_with_a_stop_gives_way_to_nobody_and_is_over_when_one_comes(world: World) -> None:
+    lease = world.leases.acquire(BENCH, ends_with_stop=True)
+    refused("leased", lambda: world.steer(ROVER))
+    refused("leased", lambda: world.leases.acquire(ROVER))
+    world.leases.renew(lease.id)
+    assert not world.leases.was_stopped(lease)
+    with world.leases._lock:  # whoever holds it, the stop waits for nobody
+        world.leases.stop_came()
+        assert world.leases.was_stopped(lease) and world.leases.control() is None
+    assert "the head was stopped" in refused("lease_over", lambda: world.steer(BENCH, lease))
+    assert world.gave_way == []
+
+
+def test_a_lease_that_is_taken_ends_with_a_stop_that_came_while_it_was_being_asked_for(world: World) -> None:
+    before = world.leases.last_stop
+    world.leases.stop_came()
+    lease = world.leases.take(BENCH, "the run begins", last_stop=before)
+    assert world.leases.control() is None
+    assert "the head was stopped" in refused("lease_over", lambda: world.steer(BENCH, lease))
+    lease = world.leases.take(BENCH, "another begins", last_stop=world.leases.last_stop)
+    world.steer(BENCH, lease)
+
+
+def test_a_lease_ends_with_the_token_or_the_session_that_it_was_granted_to(world: World) -> None:
+    shown = {"of a token"}
+    world.leases.stands = shown.__contains__
+    inside = world.leases.acquire(BENCH)
+    assert world.leases.holds(inside.id), "who showed none keeps it"
+    world.leases.release(inside.id)
+    for grant in (world.leases.acquire, lambda caller: world.leases.take(caller, "a test")):
+        shown.add("of a token")
+        lease = grant(Caller("bench", credential="of a token"))
+        assert world.leases.renew(lease.id).credential == "of a token"
+        shown.clear()
+        assert world.leases.control() is None
+        assert not world.leases.holds(lease.id)
+        with pytest.raises(NotNow, match="token or the session"):
+            world.leases.renew(lease.id)
+        world.leases.release(world.leases.acquire(ROVER).id)

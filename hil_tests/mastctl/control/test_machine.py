@@ -1,0 +1,443 @@
+"""The machine: every event in every state, and what never happens whatever comes in whatever order."""
+
+from __future__ import annotations
+
+import itertools
+import random
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from drivers.clock import ManualClock
+from hil_tests.waiting import joined
+from mastctl.answers import Word
+from mastctl.control.machine import StateMachine
+from mastctl.control.publisher import Publisher, Topic
+from mastctl.control.standing import Latched, Residual, Standing, StandingFault
+from mastctl.control.table import CHOICES, EVENTS, HAPPENS, MEANINGS, TABLE, WORDS, leads_to
+from mastctl.errors import MastctlError, NotNow, Unable
+
+LATCH = Latched("Ana", "a hand in the way", "2026-01-02T03:04:05Z")
+SILENT = StandingFault("pan_tilt", "no_reply", "the head is silent", 3.0, "it answers")
+HOT = StandingFault("pan_tilt", "device_fault", "the tilt motor is hot", 4.0, "it has cooled")
+
+
+class Heard(Publisher):
+    """Keeps each standing that is published, in order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.standings: list[Standing] = []
+
+    def publish(self, topic: Topic, key: str, value: Any) -> None:
+        assert (topic, key) == ("state", "machine")
+        self.standings.append(value)
+        super().publish(topic, key, value)
+
+
+def stopped_head(machine: StateMachine) -> None:
+    machine.stop_asked()
+    machine.stop_ended()
+
+
+def latched(machine: StateMachine) -> None:
+    machine.stop_asked()
+    machine.estop_asked(LATCH)
+    machine.stop_ended()
+
+
+def asked_reset(machine: StateMachine, name: str) -> None:
+    refusal = machine.refusal("latch")
+    if refusal is not None:
+        raise refusal
+    machine.reset(name, "it is gone")
+
+
+# The way into each state, by what is told on it alone.
+INTO: dict[Word, Callable[[StateMachine], Any]] = {
+    "starting": lambda machine: None,
+    "ready": lambda machine: machine.head_read(False),
+    "moving": lambda machine: machine.operation_began("1", {}),
+    "tracking": lambda machine: machine.track_began("1"),
+    "holding": stopped_head,
+    "stopping": lambda machine: machine.stop_asked(),
+    "stopped": latched,
+    "fault": lambda machine: machine.head_faults((SILENT,)),
+    "closing": lambda machine: machine.closing(),
+}
+TELL: dict[str, Callable[[StateMachine], Any]] = {
+    "operation_began": lambda machine: machine.operation_began("2", {}),
+    "operation_ended": lambda machine: machine.operation_ended("1"),
+    "head_moves": lambda machine: machine.head_read(True),
+    "head_rests": lambda machine: machine.head_read(False),
+    "track_began": lambda machine: machine.track_began("2"),
+    "track_ended": lambda machine: machine.track_ended("1"),
+    "stop_asked": lambda machine: machine.stop_asked(),
+    "stop_ended": lambda machine: machine.stop_ended(),
+    "estop_asked": lambda machine: machine.estop_asked(LATCH),
+    "reset": lambda machine: asked_reset(machine, "Ana"),
+    "fault_stands": lambda machine: machine.head_faults((HOT,)),
+    "fault_cleared": lambda machine: machine.head_faults(()),
+    "closing": lambda machine: machine.closing(),
+}
+# What must follow, written down from what the states mean and not from the table: the state after each event,
+# ! and the code of a refusal. Columns as in TELL.
+MUST = """
+           began       ended    moves    rests    track    untrack  stop     stopped  estop    reset         fault fine    closing
+starting   moving      starting moving   ready    tracking starting stopping starting stopping !not_estopped  fault starting closing
+ready      moving      ready    moving   ready    tracking ready    stopping ready    stopping !not_estopped  fault ready    closing
+moving     !busy       ready    moving   moving   tracking moving   stopping moving   stopping !not_estopped  fault moving   closing
+tracking   tracking    tracking tracking tracking tracking ready    stopping tracking stopping !not_estopped  fault tracking closing
+holding    moving      holding  moving   holding  tracking holding  stopping holding  stopping !not_estopped  fault holding  closing
+stopping   !stopping   stopping stopping stopping stopping stopping stopping holding  stopping !stopping     stopping stopping closing
+stopped    !estopped   stopped  stopped  stopped  stopped  stopped  stopped  stopped  stopped  holding       stopped stopped closing
+fault      fault       fault    fault    fault    fault    fault    stopping fault    stopping !not_estopped  fault holding  closing
+closing    !closing    closing  closing  closing  closing  closing  closing  closing  closing  !closing      closing closing closing
+"""  # noqa: E501
+ROWS = [line.split() for line in MUST.strip().splitlines()[1:]]
+PAIRS = [(row[0], event, must) for row in ROWS for event, must in zip(TELL, row[1:], strict=True)]
+
+
+def machine_in(word: Word) -> tuple[StateMachine, Heard, ManualClock]:
+    clock, heard = ManualClock(10.0), Heard()
+    machine = StateMachine(clock, heard)
+    INTO[word](machine)
+    assert machine.standing.word == word
+    return machine, heard, clock
+
+
+@pytest.mark.parametrize(("word", "event", "must"), PAIRS)
+def test_every_event_in_every_state_does_what_the_states_mean(word: Word, event: str, must: str) -> None:
+    machine, heard, clock = machine_in(word)
+    before = machine.standing
+    clock.advance(5.0)
+    if must.startswith("!"):
+        with pytest.raises(MastctlError) as refused:
+            TELL[event](machine)
+        assert refused.value.code == must[1:] and len(str(refused.value)) > 20
+        assert machine.standing is before, "what is refused changes nothing"
+        return
+    TELL[event](machine)
+    now = machine.standing
+    assert now.word == must
+    assert now.word in leads_to(word, event)  # type: ignore[arg-type]
+    assert now.since_s == (before.since_s if now.word == word else 15.0)
+    assert now.reason or now.word == "ready"
+    assert heard.standings[-1] is now
+    assert now.sequence == before.sequence + (now is not before)
+
+
+def test_every_state_and_event_is_in_the_table_and_explained() -> None:
+    assert [row[0] for row in ROWS] == list(WORDS) and list(TELL) == list(EVENTS)
+    assert set(TABLE) == set(WORDS) == set(MEANINGS) and set(HAPPENS) == set(EVENTS)
+    for row in TABLE.values():
+        assert set(row) <= set(EVENTS)
+        for to in row.values():
+            assert to in WORDS or to in CHOICES or to.startswith("refused: ")
+
+
+def test_a_stop_is_over_when_every_stop_is_confirmed_and_what_ran_has_ended() -> None:
+    machine, _, _ = machine_in("moving")
+    machine.stop_asked()
+    machine.stop_asked()
+    machine.stop_ended()
+    assert machine.standing.word == "stopping" and "is being stopped" in machine.standing.reason
+    machine.stop_ended()
+    assert (machine.standing.word, machine.standing.reason) == ("stopping", "operation 1 is being stopped")
+    machine.operation_ended("1")
+    assert machine.standing.word == "holding" and "next command starts" in machine.standing.reason
+
+
+def test_a_stop_that_the_head_did_not_confirm_ends_in_a_fault_or_latched_with_its_words() -> None:
+    machine, _, _ = machine_in("ready")
+    machine.stop_asked()
+    machine.head_faults((SILENT,))
+    machine.stop_ended()
+    assert machine.standing.word == "fault"
+    assert machine.standing.reason == "the head is silent, until it answers"
+    latched(machine)
+    assert machine.standing.word == "stopped"
+    assert "Ana: a hand in the way" in machine.standing.reason and "silent" in machine.standing.reason
+    machine.reset("Ben", "nobody there")
+    assert machine.standing.word == "fault" and machine.standing.latch is None
+    machine.head_faults(())
+    assert machine.standing.word == "holding"
+    assert "Ben: nobody there" in machine.standing.reason
+
+
+def test_a_fault_that_is_over_leaves_a_head_that_holds_and_says_so() -> None:
+    machine, _, _ = machine_in("ready")
+    machine.head_faults((SILENT, HOT))
+    assert machine.standing.reason == "the head is silent, until it answers (and 1 more)"
+    machine.head_faults((HOT,))
+    assert machine.standing.reason == "the tilt motor is hot, until it has cooled"
+    machine.head_faults(())
+    assert machine.standing.word == "holding"
+    assert machine.standing.reason == "it is over: the tilt motor is hot; the next command starts"
+    machine.operation_began("1", {})
+    machine.operation_ended("1")
+    assert machine.standing.word == "ready"
+
+
+def test_an_operation_that_lives_through_a_fault_goes_on() -> None:
+    machine, _, _ = machine_in("moving")
+    machine.head_faults((SILENT,))
+    machine.head_faults(())
+    assert machine.standing.word == "moving"
+    machine.operation_ended("1")
+    assert machine.standing.word == "ready"
+
+
+def test_a_fault_whose_words_only_grow_older_is_told_once() -> None:
+    machine, heard, _ = machine_in("fault")
+    count = len(heard.standings)
+    machine.head_faults((replace(SILENT, message="the head has been silent for 2 s"),))
+    assert len(heard.standings) == count
+    machine.head_faults((replace(SILENT, since_s=9.0),))
+    assert len(heard.standings) == count
+    machine.head_faults((replace(SILENT, message="another", since_s=9.0),))
+    assert len(heard.standings) == count + 1
+
+
+def test_a_reading_that_says_the_same_again_is_not_told() -> None:
+    machine, heard, _ = machine_in("ready")
+    count = len(heard.standings)
+    for _ in range(100):
+        machine.head_read(False)
+    assert len(heard.standings) == count
+    machine.head_read(True)
+    assert (machine.standing.word, machine.standing.reason) == ("moving", "the head moves")
+
+
+def test_a_head_that_is_moved_while_it_holds_holds_again_afterwards() -> None:
+    machine, _, _ = machine_in("holding")
+    machine.head_read(True)
+    assert machine.standing.word == "moving"
+    machine.head_read(False)
+    assert machine.standing.word == "holding"
+
+
+def test_a_head_that_still_runs_out_after_a_confirmed_stop_holds() -> None:
+    machine, _, _ = machine_in("moving")
+    machine.head_read(True)
+    machine.stop_asked()
+    machine.operation_ended("1")
+    machine.stop_ended()
+    assert machine.standing.word == "holding" and machine.standing.head_moves
+    machine.head_read(False)
+    assert machine.standing.word == "holding"
+
+
+def test_an_operation_beside_a_track_leaves_the_track_active() -> None:
+    machine, _, _ = machine_in("tracking")
+    machine.operation_began("9", {"pan_rad": 0.1})
+    with pytest.raises(NotNow, match="operation 9 is running"):
+        machine.operation_began("10", {})
+    residual = Residual((0.1, 0.2), (0.1, 0.1), "9")
+    machine.operation_ended("9", residual)
+    now = machine.standing
+    assert (now.word, now.track, now.operation, now.residual) == ("tracking", "1", None, residual)
+    assert now.target == {"pan_rad": 0.1}
+
+
+def test_what_ended_before_ends_nothing_that_runs_now() -> None:
+    machine, heard, _ = machine_in("moving")
+    count = len(heard.standings)
+    machine.operation_ended("0")
+    machine.track_ended("0")
+    assert machine.standing.word == "moving" and len(heard.standings) == count
+
+
+def test_a_latch_from_before_holds_from_the_first_moment_and_the_first_one_stays() -> None:
+    machine = StateMachine(ManualClock(), latch=LATCH)
+    assert machine.standing.word == "stopped"
+    machine.head_read(False)
+    assert machine.standing.word == "stopped"
+    machine.stop_asked()
+    machine.estop_asked(Latched("Ben", "again", ""))
+    machine.stop_ended()
+    assert machine.standing.latch == LATCH
+    machine.reset("Ben", "checked")
+    assert (machine.standing.word, machine.standing.reason) == (
+        "holding",
+        "reset by Ben: checked; the next command starts",
+    )
+
+
+@pytest.mark.parametrize(
+    ("word", "codes"),
+    [
+        ("starting", (None, None, None, "not_estopped")),
+        ("ready", (None, None, None, "not_estopped")),
+        ("moving", ("busy", "busy", "busy", "not_estopped")),
+        ("tracking", (None, "busy", None, "not_estopped")),
+        ("holding", (None, None, None, "not_estopped")),
+        ("stopping", ("stopping", "stopping", "stopping", "stopping")),
+        ("stopped", ("estopped", "estopped", None, None)),
+        ("fault", (None, None, None, "not_estopped")),
+        ("closing", ("closing", "closing", "closing", "closing")),
+    ],
+)
+def test_what_each_state_refuses(word: Word, codes: Sequence[str | None]) -> None:
+    machine, _, _ = machine_in(word)
+    for need, code in zip(("motion", "track", "rest", "latch"), codes, strict=True):
+        refusal = machine.refusal(need)  # type: ignore[arg-type]
+        assert (None if refusal is None else refusal.code) == code, need
+        assert refusal is None or isinstance(refusal, Unable if code == "closing" else NotNow)
+
+
+def test_a_mast_file_is_not_changed_under_a_head_that_moves() -> None:
+    machine, _, _ = machine_in("ready")
+    machine.head_read(True)
+    refusal = machine.refusal("rest")
+    assert refusal is not None and refusal.code == "moving"
+    assert machine.refusal("motion") is None
+
+
+def test_noting_a_stop_waits_for_nothing_and_reading_shows_it() -> None:
+    machine, heard, _ = machine_in("ready")
+    count = len(heard.standings)
+    with machine._turns._lock, machine.publisher._turns._lock:
+        machine.stop_asked()
+        assert machine.standing.word == "ready", "somebody else has the turn"
+    assert len(heard.standings) == count
+    assert machine.standing.word == "stopping"
+
+
+class Storm:
+    """Random events from several threads, each of which knows what it may tell."""
+
+    def __init__(self, seed: int) -> None:
+        self.words = f"seed {seed}"
+        self.heard = Heard()
+        self.machine = StateMachine(ManualClock(), self.heard)
+        self.seed = seed
+        self.refused: list[MastctlError] = []
+        self.over = threading.Event()
+
+    def operator(self, name: str) -> None:
+        chance, machine = random.Random(f"{self.seed} {name}"), self.machine
+        for number in itertools.count():
+            if self.over.is_set():
+                return
+            mine = f"{name}{number}"
+            try:
+                machine.operation_began(mine, {})
+            except MastctlError as refusal:
+                self.refused.append(refusal)
+                continue
+            tracks = chance.random() < 0.3
+            if tracks:
+                machine.track_began(mine)
+            assert machine.standing.word != "ready", self.words
+            machine.operation_ended(mine)
+            if tracks:
+                machine.track_ended(mine)
+
+    def stopper(self, name: str) -> None:
+        chance, machine = random.Random(f"{self.seed} {name}"), self.machine
+        for _ in range(60):
+            machine.stop_asked()
+            time.sleep(0)  # the others' turn
+            latches = chance.random() < 0.3
+            if latches:
+                machine.estop_asked(LATCH)
+            if chance.random() < 0.3:
+                machine.head_faults((SILENT,))
+            machine.stop_ended()
+            if latches or chance.random() < 0.5:
+                try:
+                    asked_reset(machine, name)
+                except MastctlError as refusal:
+                    self.refused.append(refusal)
+
+    def head(self, name: str) -> None:
+        chance, machine = random.Random(f"{self.seed} {name}"), self.machine
+        while not self.over.is_set():
+            machine.head_read(chance.random() < 0.5)
+            if chance.random() < 0.2:
+                machine.head_faults(chance.choice(((), (), (HOT,), (SILENT, HOT))))
+
+    def still_stop(self) -> None:
+        """One stop alone: each storm meets every word and refusal, whichever thread had which turn."""
+        self.machine.stop_asked()
+        self.machine.estop_asked(LATCH)
+        self.is_refused()
+        self.machine.stop_ended()
+        self.is_refused()
+        asked_reset(self.machine, "a")
+
+    def is_refused(self) -> None:
+        with pytest.raises(MastctlError) as refusal:
+            self.machine.operation_began("late", {})
+        self.refused.append(refusal.value)
+
+    def blow(self) -> None:
+        defects: list[BaseException] = []
+
+        def run(work: Callable[[str], None], name: str) -> None:
+            try:
+                work(name)
+            except BaseException as defect:
+                defects.append(defect)
+
+        works = [(self.operator, "a"), (self.operator, "b"), (self.stopper, "c"), (self.stopper, "d")]
+        threads = [threading.Thread(target=run, args=one) for one in [*works, (self.head, "e")]]
+        for thread in threads:
+            thread.start()
+        joined(*threads[2:4])
+        self.over.set()
+        joined(*threads)
+        assert not defects, f"{self.words}: {defects}"
+        self.still_stop()
+        for faults in ((), (HOT,), ()):
+            self.machine.head_faults(faults)
+
+
+@pytest.fixture
+def hasty_threads() -> Iterator[None]:
+    """Threads take turns thousands of times as often as they do by themselves."""
+    before_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(before_s)
+
+
+@pytest.mark.usefixtures("hasty_threads")
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_comes_from_many_threads_each_change_is_told_once_and_none_breaks_a_promise(
+    seed: int,
+) -> None:
+    storm = Storm(seed)
+    storm.blow()
+    last = storm.machine.standing
+    told = storm.heard.standings
+    assert [one.sequence for one in told] == list(range(len(told))), storm.words
+    assert told[-1] is last
+    for before, now in pairwise(told):
+        words = f"{storm.words}: {before} -> {now}"
+        possible = {to for event in EVENTS for to in leads_to(before.word, event)}
+        assert now.word in possible, words
+        assert replace(now, sequence=0) != replace(before, sequence=0), words
+        if before.word == "stopped" and now.word != "stopped":
+            assert before.latch is not None and now.latch is None, words
+        if now.latch is not None:
+            assert now.word in ("stopping", "stopped"), words
+        if now.stops:
+            assert now.word in ("stopping", "stopped"), words
+        if now.word == "ready":
+            assert now.operation is None and now.track is None and not now.faults and not now.held, words
+            assert not now.head_moves, words
+        if now.word == "fault":
+            assert now.faults, words
+        if before.word in ("stopping", "stopped") and now.operation is not None:
+            assert before.operation == now.operation, words
+    assert (last.stops, last.operation, last.track) == (0, None, None), storm.words
+    assert {one.word for one in told} >= {"stopping", "stopped", "fault"}
+    assert {one.code for one in storm.refused} >= {"stopping", "estopped"}

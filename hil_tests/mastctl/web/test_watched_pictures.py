@@ -1,0 +1,106 @@
+"""Watching cameras: whoever has left holds no frame and has no camera asked."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from drivers.clock import SystemClock
+from hil_tests.mastctl.recorder.recorder_world import frame
+from hil_tests.waiting import until
+from mastctl.devices.frames import StampedFrame
+from mastctl.web import pictures
+from mastctl.web.pictures import Picture, WatchedCameras, Watcher
+
+LEFT, RIGHT = "navcam_left", "navcam_right"
+
+
+class FakeCameras:
+    """Gives pictures, and counts who holds any; ``as_held`` is called before each hold."""
+
+    def __init__(self) -> None:
+        self.held: Counter[str] = Counter()
+        self.glances: Counter[str] = Counter()
+        self.as_held = lambda: None
+
+    def glance(self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float) -> StampedFrame:
+        self.glances[camera] += 1
+        return frame(self.glances[camera], np.zeros((4, 4), np.uint8), b"jpeg", camera)
+
+    def hold(self, frame: StampedFrame, by: str, kept: int) -> None:
+        self.as_held()
+        self.held[by] += 1
+
+    def let_go(self, by: str) -> None:
+        self.held.pop(by, None)
+
+
+def pictures_threads() -> set[threading.Thread]:
+    return {one for one in threading.enumerate() if one.name.startswith("pictures of")}
+
+
+@pytest.fixture
+def others() -> set[threading.Thread]:
+    """Those of daemons that other tests of this process still hold."""
+    return pictures_threads()
+
+
+def test_a_watcher_who_leaves_as_a_picture_comes_holds_none(others: set[threading.Thread]) -> None:
+    cameras, leaving, left = FakeCameras(), threading.Event(), threading.Event()
+
+    def as_held() -> None:
+        leaving.set()
+        assert left.wait(60.0)
+
+    cameras.as_held = as_held
+    watched = WatchedCameras(cameras, SystemClock())
+    woken: list[str] = []
+    watcher = watched.watch((LEFT,), lambda: woken.append(LEFT))
+    assert leaving.wait(60.0)
+    watcher.end()
+    left.set()
+    until(lambda: not pictures_threads() - others, "the camera is asked no more")
+    assert cameras.held == Counter() and watcher.take() == [] and woken == []
+    watched.close()
+
+
+def test_a_picture_that_comes_as_the_one_before_is_taken_is_not_sent_after_it() -> None:
+    watched = WatchedCameras(FakeCameras(), SystemClock())
+    watcher = Watcher(watched, "slow", (LEFT,), lambda: None, ready=True)
+    first, second, third = (Picture(frame(k, np.zeros((4, 4), np.uint8), b"", LEFT), b"") for k in range(3))
+    watcher.put(first)  # not taken yet: its camera is asked for a newer one
+    assert watcher.ready(LEFT) and watcher.take() == [first]
+    watcher.put(second)
+    assert watcher.take() == [], "one is on its way until it is shown"
+    watcher.shown(LEFT)
+    watcher.put(third)
+    assert watcher.take() == [third]
+
+
+def test_a_watcher_whose_second_camera_has_no_thread_is_none(
+    monkeypatch: pytest.MonkeyPatch, others: set[threading.Thread]
+) -> None:
+    cameras = FakeCameras()
+    watched = WatchedCameras(cameras, SystemClock())
+    start, started = threading.Thread.start, list[str]()
+
+    def once(thread: threading.Thread) -> None:
+        if started:
+            raise RuntimeError("can't start new thread")
+        started.append(thread.name)
+        start(thread)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pictures.threading.Thread, "start", once)  # type: ignore[attr-defined]
+        with pytest.raises(RuntimeError, match="can't start"):
+            watched.watch((LEFT, RIGHT), lambda: None)
+    until(lambda: not pictures_threads() - others, "nobody watches")
+    assert cameras.held == Counter()
+    there = threading.Event()
+    again = watched.watch((LEFT, RIGHT), there.set)  # both cameras have their threads now
+    until(lambda: {LEFT, RIGHT} <= cameras.glances.keys(), "a picture of each")
+    again.end()
+    watched.close()

@@ -1,0 +1,381 @@
+"""The one entry: each command passes here, and leaves who, under which lease, what, and with which result.
+
+The order: may this role; was this asked before under the same key; is it too late; does somebody else steer;
+does the state allow it; then the act. What came of it is recorded after it. A stop goes the other way round
+(`CommandEntry.first`): it acts, and everything else follows.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any, Protocol
+
+from drivers.clock import Clock
+from mastctl.answers import Role
+from mastctl.as_json import writable
+from mastctl.control.audit import AuditLog
+from mastctl.control.caller import ANONYMOUS, NETWORK, Caller
+from mastctl.control.idempotency import Answer, Answers
+from mastctl.control.lease import LeaseTable, StopCame
+from mastctl.control.publisher import Publisher
+from mastctl.control.refusals import Need
+from mastctl.errors import BadRequest, MastctlError, NotNow, Stopped, error_body
+
+LONGEST_DEADLINE_S = 3600.0
+FOLLOWED = 256  # operations whose end is still recorded with who began them
+PUBLISHED = 256  # records that who begins to listen still hears of
+PUBLISHED_OF_STRANGERS = 32  # beside them
+
+
+@dataclass(frozen=True)
+class Command:
+    """A kind of command.
+
+    Attributes
+    ----------
+    name
+        As it stands in the record.
+    role
+        What a caller must be allowed at least.
+    steers
+        Whether it is refused while somebody else steers.
+    need
+        What it needs of the daemon's state; None for nothing.
+    goes_on
+        Whether it is sent again and again to keep its operation going: then only the first is recorded, and
+        what is refused.
+    grants
+        Whether its answer tells a lease's id, which proves the lease: none by a key that may be anybody's,
+        and none that has ended.
+    """
+
+    name: str
+    role: Role = "operate"
+    steers: bool = False
+    need: Need | None = None
+    goes_on: bool = False
+    grants: bool = False
+
+
+POINT = Command("point", steers=True, need="motion")
+JOG = Command("jog", steers=True, goes_on=True)
+TRACK = Command("track", steers=True, need="track")
+TRACK_LOOK = Command("track.look", steers=True, need="motion")
+TRACK_STOP = Command("track.stop", steers=True)
+MAST = Command("mast", steers=True)  # the service asks whether the head rests, after reading it
+MAST_BACK = Command("mast.back", steers=True)
+RELOAD = Command("reload", "admin", steers=True)  # asked as a mast file is
+POSE = Command(
+    "pose"
+)  # a fact about the rover, told by who knows it; the track that looks has its own holder
+SUN = Command("limits.sun")  # a fact too
+SUN_FORGET = Command("limits.sun.forget")
+STOP = Command("stop", "view")
+ESTOP = Command("estop", "view")
+RESET = Command("reset", need="latch")
+RECORD_START = Command("record.start")
+RECORD_STOP = Command("record.stop")
+RECORD_DELETE = Command("record.delete", "admin")  # of a fault, the evidence
+PLACE_KEEP = Command("place.keep")
+PLACE_FORGET = Command("place.forget")
+BENCH = Command("bench", steers=True, need="track")
+BENCH_STANDS = Command("bench.stands")  # a fact about the board, told by who has placed it
+BENCH_LEAVE = Command("bench.leave")
+BENCH_FORGET = Command("bench.forget")
+LEASE = Command("lease", grants=True)
+LEASE_RENEW = Command("lease.renew", grants=True)
+LEASE_RELEASE = Command("lease.release")
+LEASE_TAKE = Command("lease.take", grants=True)
+SIMULATION_POSE = Command("simulation.pose")  # acts on the world, not on the head
+SIMULATION_TIME = Command("simulation.time")
+SIMULATION_BOARD = Command("simulation.board")
+SIMULATION_BOARD_GONE = Command("simulation.board_gone")
+SIMULATION_FAULT = Command("simulation.fault")
+SIMULATION_FAULTS_OFF = Command("simulation.faults_off")
+
+
+@dataclass(frozen=True)
+class CommandRequest:
+    """One request for a command.
+
+    Attributes
+    ----------
+    caller
+        Who asks.
+    request
+        What exactly, as JSON.
+    lease
+        The lease's id that came with it.
+    key
+        The idempotency key that came with it.
+    deadline_s
+        How long it is given from ``asked_s`` on, seconds of the daemon's clock; None for the usual time.
+    asked_s
+        When it came, by the daemon's clock; needed for a deadline only.
+    last_stop
+        `mastctl.control.lease.LeaseTable.last_stop` when it came: what steers is not carried out after a
+        later one. None: that is not known.
+    """
+
+    caller: Caller
+    asked_s: float = 0.0
+    request: Mapping[str, Any] = field(default_factory=dict)
+    lease: str | None = None
+    key: str | None = None
+    deadline_s: float | None = None
+    last_stop: StopCame | None = None
+
+    def __post_init__(self) -> None:
+        deadline_s = self.deadline_s
+        if deadline_s is not None and not (
+            math.isfinite(deadline_s) and 0.0 < deadline_s <= LONGEST_DEADLINE_S
+        ):
+            expected = f"more than 0 and at most {LONGEST_DEADLINE_S:g} s is expected"
+            raise BadRequest("bad_request", f"deadline_s: {deadline_s:g} where {expected}")
+
+
+class JudgesAndEnds(Protocol):
+    """What of `mastctl.control.operations.OperationRunner` refuses what does not fit, and ends what is
+    late, or was asked for before a stop."""
+
+    def refusal(self, need: Need) -> MastctlError | None: ...
+    def end_within(self, name: str, left_s: float, told_s: float) -> None: ...
+    def end_stopped(self, name: str) -> None: ...
+
+
+class CommandEntry:
+    """The entry of one daemon; safe to use from any thread.
+
+    Parameters
+    ----------
+    clock
+        What deadlines run on, and what stamps the records: the daemon's.
+    leases, answers, audit
+        Who steers, what was answered to each key, where records go.
+    operations
+        Refuses what does not fit the state, and ends operations at their deadline.
+    publisher
+        Gets each record, the newest 256 to be had later; one of its own by default.
+    strangers
+        Where records of strangers go, who may be many: they push nobody else's out of ``audit``.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        leases: LeaseTable,
+        answers: Answers,
+        audit: AuditLog,
+        operations: JudgesAndEnds,
+        publisher: Publisher | None = None,
+        strangers: AuditLog | None = None,
+    ) -> None:
+        self.leases = leases
+        self.audit = audit
+        self.strangers = strangers or audit
+        self._clock = clock
+        self._answers = answers
+        self._operations = operations
+        self._publisher = publisher or Publisher()
+        # Keys, oldest first: of who is known, and of strangers.
+        self._published: tuple[deque[str], deque[str]] = deque(), deque()
+        self._numbers = itertools.count(1)
+        self._matching = threading.Lock()
+        self._began: dict[str, dict[str, Any]] = {}  # operation: who began it, until it has ended
+        self._ended: dict[str, dict[str, Any]] = {}  # operation: how it ended, until it is known who began it
+
+    def run(
+        self, command: Command, asked: CommandRequest, act: Callable[[], Answer], usual_s: float | None = None
+    ) -> Answer:
+        """Carry out a command and return its answer; an operation that it starts is named by ``id`` or
+        ``operation`` there.
+
+        Parameters
+        ----------
+        command
+            Its kind.
+        asked
+            Who asks, and how.
+        act
+            Carries it out.
+        usual_s
+            What an operation is given if nothing else was asked for, seconds.
+
+        Raises
+        ------
+        NotAllowed
+            ``role``.
+        BadRequest
+            ``key_reused``; ``bad_request`` for a key of nobody's name where a lease is granted.
+        NotNow
+            ``deadline_passed`` if its time was over before it began; ``leased``, ``lease_over``,
+            ``lease_unknown``; ``key_in_use``; ``stopped`` if a stop came since it was asked for; what the
+            state refuses.
+        """
+        again = False
+        try:
+            asked.caller.check_may(command.role, command.name)
+            if command.grants and asked.key is not None and asked.caller.name == ANONYMOUS:
+                words = (
+                    "Idempotency-Key without a name (Mastctl-Client) may be anybody's; a lease is one party's"
+                )
+                raise BadRequest("bad_request", words)
+            if asked.key is None:
+                answer = self._act(command, asked, act, usual_s)
+            else:
+                same = {"command": command.name, "request": asked.request}
+                answer, again = self._answers.once(
+                    asked.caller.name, asked.key, same, lambda: self._act(command, asked, act, usual_s)
+                )
+                if again and command.grants:
+                    self._check_holds(answer["lease_id"])
+        except BaseException as error:
+            self._record(command, asked, None, error, again)
+            raise
+        self._record(command, asked, answer, None, again)
+        return answer
+
+    def first(self, command: Command, asked: CommandRequest, act: Callable[[], Answer]) -> Answer:
+        """Carry out a stop: it acts before anything is asked, locked or written, and is recorded after."""
+        by = asked.caller.name
+        how = f"an emergency stop ({by})" if command is ESTOP else by
+        self.leases.stop_came(f"the head was stopped by {how}")  # takes no lock
+        try:
+            answer = act()
+        except BaseException as error:
+            self._record(command, asked, None, error, begins=False)
+            raise
+        self._record(command, asked, answer, None, begins=False)
+        return answer
+
+    def not_begun(self, command: Command, asked: CommandRequest, error: Exception) -> None:
+        """Record a stop that could not even be tried."""
+        self._record(command, asked, None, error, begins=False)
+
+    def refused(self, caller: Caller, what: str, code: str, message: str, times: int | None = None) -> None:
+        """Record a request that was refused before it was a command; ``times``, how often that has come to be
+        where not each one is recorded. Nobody is told of it."""
+        told = {"number": next(self._numbers), **self._now(), **_who(what, caller), "request": {}}
+        told |= {"result": code, "message": message}
+        if times is not None:
+            told["times"] = times
+        (self.strangers if caller.stranger else self.audit).put(told)
+
+    def ended(self, operation: str, state: str, error: Mapping[str, Any] | None) -> None:
+        """Record how an operation ended that a command began."""
+        told = {**self._now(), "ended": operation, "state": state}
+        if error is not None:
+            told |= {"code": error.get("code"), "message": error.get("message")}
+        self._matched(self._ended, operation, told)
+
+    def _act(
+        self, command: Command, asked: CommandRequest, act: Callable[[], Answer], usual_s: float | None
+    ) -> Answer:
+        """Carry it out if nothing stands against it; an operation of it gets its deadline."""
+        if asked.deadline_s is not None and self._left_s(asked, asked.deadline_s) <= 0.0:
+            words = f"the {asked.deadline_s:g} s for {command.name} were over before it could begin"
+            raise NotNow("deadline_passed", words)
+        if self._stopped_since(command, asked):
+            raise Stopped(
+                f"{command.name} was asked for before a stop came, and is not carried out; ask again"
+            )
+        steering: AbstractContextManager[None] = nullcontext()
+        if command.steers:
+            steering = self.leases.steering(asked.caller, asked.lease)
+        with steering:
+            refusal = None if command.need is None else self._operations.refusal(command.need)
+            if refusal is not None:
+                raise refusal
+            answer = act()
+            operation = _operation_of(answer)
+            if operation is not None and self._stopped_since(command, asked):
+                self._operations.end_stopped(operation)
+            allowed_s = usual_s if asked.deadline_s is None else asked.deadline_s
+            if operation is not None and allowed_s is not None and operation not in self._began:
+                self._operations.end_within(operation, self._left_s(asked, allowed_s), allowed_s)
+            return answer
+
+    def _check_holds(self, lease_id: str) -> None:
+        """Pass a lease that was granted before and still holds. Raises NotNow."""
+        try:
+            self.leases.check(lease_id)
+        except NotNow as over:
+            raise NotNow(over.code, f"{over}, with another Idempotency-Key") from None
+
+    def _stopped_since(self, command: Command, asked: CommandRequest) -> bool:
+        """Whether a stop came after a command that steers was asked for."""
+        return command.steers and asked.last_stop not in (None, self.leases.last_stop)
+
+    def _left_s(self, asked: CommandRequest, allowed_s: float) -> float:
+        return asked.asked_s + allowed_s - self._clock.now_s()
+
+    def _record(
+        self,
+        command: Command,
+        asked: CommandRequest,
+        answer: Mapping[str, Any] | None,
+        error: BaseException | None,
+        again: bool = False,
+        begins: bool = True,
+    ) -> None:
+        """Record what came of a command; ``begins``: an operation that its answer names is one it began."""
+        caller = asked.caller
+        operation = None if answer is None else _operation_of(answer)
+        if command.goes_on and error is None and (operation is None or operation in self._began):
+            return
+        who = _who(command.name, caller)
+        number = next(self._numbers)
+        told = {"number": number, **self._now(), **who, "request": writable(asked.request)}
+        if asked.lease is not None:
+            told["lease"] = asked.lease[:8]  # names it, without being it
+        if asked.key is not None:
+            told |= {"key": asked.key[:80], "again": again}
+        if error is None:
+            told |= {"result": "ok", "operation": operation}
+        else:
+            body = error_body(error)
+            told |= {"result": body["code"], "message": body["message"]}
+        self._tell(told)
+        if operation is not None and begins and not again:
+            self._matched(self._began, operation, {"number": number, **who})
+
+    def _matched(self, known: dict[str, dict[str, Any]], operation: str, told: dict[str, Any]) -> None:
+        """Keep who began an operation, or how it ended; record the end when both are known."""
+        with self._matching:
+            known[operation] = told
+            if operation in self._began and operation in self._ended:
+                self._tell({**self._began.pop(operation), **self._ended.pop(operation)})
+            while len(known) > FOLLOWED:
+                del known[next(iter(known))]
+
+    def _tell(self, told: dict[str, Any]) -> None:
+        stranger = told["via"] == NETWORK
+        (self.strangers if stranger else self.audit).put(told)
+        key = f"{told['number']}.end" if "ended" in told else f"{told['number']}"
+        self._publisher.publish("command", key, told)
+        keys, most = self._published[stranger], PUBLISHED_OF_STRANGERS if stranger else PUBLISHED
+        keys.append(key)
+        while len(keys) > most:
+            self._publisher.forget("command", keys.popleft())
+
+    def _now(self) -> dict[str, Any]:
+        return {"time": datetime.now(UTC).isoformat(), "monotonic_s": self._clock.now_s()}
+
+
+def _who(command: str, caller: Caller) -> dict[str, Any]:
+    """What is asked, and who asks, as it is recorded."""
+    who = {"command": command, "who": caller.name, "role": caller.role, "via": caller.via}
+    return who | ({"address": caller.address} if caller.address else {})
+
+
+def _operation_of(answer: Mapping[str, Any]) -> str | None:
+    """The id of the operation that an answer names."""
+    found = answer.get("id", answer.get("operation"))
+    return found if isinstance(found, str) else None

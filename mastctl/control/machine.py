@@ -1,0 +1,201 @@
+"""The one machine: who does something tells it here, and reads here what the daemon is doing.
+
+Operations, devices and the tracker keep no state word of their own. What they tell becomes an event of
+`mastctl.control.table`; each change of `StateMachine.standing` is published once, in order, as
+``("state", "machine", Standing)``.
+
+Nothing that a stop does on its way to the head waits here: `StateMachine.stop_asked`, `.estop_asked` and
+`.closing` only leave a note, which whoever reads or tells something next takes. Reading takes no lock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from drivers.clock import Clock
+from mastctl.control.in_turn import InTurn
+from mastctl.control.publisher import Publisher
+from mastctl.control.refusals import Need, refusal_of
+from mastctl.control.standing import Latched, Residual, Standing, StandingFault, same_faults, why
+from mastctl.control.table import CHOICES, TABLE, Event
+from mastctl.errors import MastctlError
+
+AFTER_A_STOP = "a stop dropped the goal; the next command starts"
+
+_News = Callable[[Standing], tuple[Event, Standing] | None]
+
+
+class StateMachine:
+    """What the daemon is doing; safe to use from any thread.
+
+    Parameters
+    ----------
+    clock
+        Stamps the changes.
+    publisher
+        Where they are published; one of its own by default.
+    latch, more_latched
+        The emergency stop that held when the daemon ended, if one did, and those of further people: it
+        begins ``stopped``.
+
+    Attributes
+    ----------
+    publisher
+        Where everything else that changes is published too.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        publisher: Publisher | None = None,
+        latch: Latched | None = None,
+        more_latched: tuple[Latched, ...] = (),
+    ) -> None:
+        self.publisher = publisher or Publisher()
+        self._clock = clock
+        self._turns = InTurn[_News](self._take)
+        now = Standing(since_s=clock.now_s())
+        if latch is not None:
+            now = replace(now, word="stopped", latch=latch, more_latched=more_latched)
+        self._standing = replace(now, reason=why(now))
+        self.publisher.publish("state", "machine", self._standing)
+
+    def go_on(self) -> None:
+        """Take what was noted, so that whoever listens hears it."""
+        self._turns.go_on()
+
+    @property
+    def standing(self) -> Standing:
+        """What it is doing now."""
+        self._turns.go_on()
+        return self._standing
+
+    def refusal(self, need: Need) -> MastctlError | None:
+        """Return why a command that needs something may not be carried out now, None if it may.
+
+        As `mastctl.control.refusals.refusal_of`, of this moment.
+        """
+        return refusal_of(self.standing, need)
+
+    # What is told
+
+    def operation_began(self, operation: str, target: Mapping[str, Any]) -> None:
+        """Let an operation begin. Raises what `refusal` returns for ``motion``; then nothing has changed."""
+        told = dict(target)
+        with self._turns.alone():
+            refused = refusal_of(self._standing, "motion")
+            if refused is not None:
+                raise refused
+            self._take(
+                lambda now: ("operation_began", replace(now, operation=operation, target=told, held=""))
+            )
+
+    def operation_ended(self, operation: str, residual: Residual | None = None) -> None:
+        """Take that an operation ended, and what it measured last; not twice of one."""
+
+        def news(now: Standing) -> tuple[Event, Standing] | None:
+            if now.operation != operation:
+                return None
+            return "operation_ended", replace(now, operation=None, residual=residual or now.residual)
+
+        self._turns.bring(news)
+
+    def track_began(self, track: str) -> None:
+        """Take that a track began, of which the operation of this id looks first.
+
+        Nothing is refused: its operation was begun, and a stop in between ends the track too.
+        """
+        self._turns.bring(lambda now: ("track_began", replace(now, track=track, held="")))
+
+    def track_ended(self, track: str) -> None:
+        """Take that a track ended."""
+        self._turns.bring(
+            lambda now: ("track_ended", replace(now, track=None)) if now.track == track else None
+        )
+
+    def head_read(self, moving: bool) -> None:
+        """Take what a reading of the head says; nothing is done if the one before said the same."""
+        now = self._standing
+        if now.head_moves != moving or now.word == "starting":
+            event: Event = "head_moves" if moving else "head_rests"
+            self._turns.bring(lambda now: (event, replace(now, head_moves=moving)))
+        else:
+            self._turns.go_on()
+
+    def head_faults(self, faults: tuple[StandingFault, ...]) -> None:
+        """Take all that is wrong with the head now; nothing is done if it is the same as before."""
+
+        def news(now: Standing) -> tuple[Event, Standing] | None:
+            if same_faults(now.faults, faults):
+                return None
+            if faults:
+                return "fault_stands", replace(now, faults=faults)
+            goes_on = now.operation is not None or now.track is not None
+            over = f"it is over: {now.faults[0].message}; the next command starts"
+            held = now.held or ("" if goes_on else over)
+            return "fault_cleared", replace(now, faults=(), held=held)
+
+        if not same_faults(self._standing.faults, faults):
+            self._turns.bring(news)
+
+    def stop_asked(self) -> None:
+        """Note that a stop was asked for; told once more when it is over (`stop_ended`)."""
+        self._turns.leave(lambda now: ("stop_asked", replace(now, stops=now.stops + 1, held=AFTER_A_STOP)))
+
+    def stop_ended(self) -> None:
+        """Take that a stop is over: the head has confirmed it, or its fault was told before."""
+        self._turns.bring(lambda now: ("stop_ended", replace(now, stops=max(0, now.stops - 1))))
+
+    def estop_asked(self, latch: Latched) -> None:
+        """Note an emergency stop, between `stop_asked` and `stop_ended` of its stop.
+
+        From then on nothing may begin. One that is latched already stays; the first one stays in front.
+        """
+
+        def news(now: Standing) -> tuple[Event, Standing]:
+            entries = now.latched if latch in now.latched else (*now.latched, latch)
+            return "estop_asked", replace(now, latch=entries[0], more_latched=entries[1:], held=AFTER_A_STOP)
+
+        self._turns.leave(news)
+
+    def reset(self, name: str, reason: str, latched: Callable[[], Sequence[Latched]] = tuple) -> None:
+        """Take that a latch was released, of a service that asked `refusal` of ``latch`` before.
+
+        ``latched`` tells what is latched then: other people's emergency stops, and what came since. It must
+        not wait.
+        """
+        held = f"reset by {name}: {reason}; the next command starts"
+
+        def news(now: Standing) -> tuple[Event, Standing] | None:
+            if now.latch is None:
+                return None
+            first, *more = latched() or (None,)
+            return "reset", replace(now, latch=first, more_latched=tuple(more), held=held)
+
+        self._turns.bring(news)
+
+    def closing(self) -> None:
+        """Note that the service is closing: nothing begins any more."""
+        self._turns.leave(lambda now: ("closing", now))
+
+    def _take(self, news: _News) -> None:
+        """Take one event: its facts, the word that the table has for it, and tell who listens."""
+        before = self._standing
+        told = news(before)
+        if told is None:
+            return
+        event, now = told
+        to = TABLE[before.word].get(event, before.word)
+        if to.startswith("refused: "):  # asked before, and true by now all the same
+            to = before.word
+        word = CHOICES[to][0](now) if to in CHOICES else to  # type: ignore[index]
+        now = replace(now, word=word)  # type: ignore[arg-type]
+        if word != before.word:
+            now = replace(now, since_s=self._clock.now_s())
+        now = replace(now, reason=why(now))
+        if now == before:
+            return
+        self._standing = replace(now, sequence=before.sequence + 1)
+        self.publisher.publish("state", "machine", self._standing)

@@ -1,0 +1,384 @@
+"""Operations: one at a time, in a thread of its own, each with a record of what it did.
+
+This module does not know how to point. It runs what it is given, keeps the record, and makes sure that a
+stop is the last word: from the moment a stop is asked for until the operation has ended, no move goes out.
+
+What is read from here (`OperationRunner.get`, `.all`) is read without a lock: the records are a mapping
+that is replaced, never edited. The lock is for those that write, and is not held while anything else is
+waited for. What runs and what is being stopped is told to the machine (`mastctl.control.machine`), each
+change of a record to its publisher.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import secrets
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any, Protocol
+
+from calib.errors import CalibError
+from drivers.clock import Clock, deadlines_on
+from drivers.errors import DriverError
+from mastctl.answers import OperationState
+from mastctl.control.machine import StateMachine
+from mastctl.control.records import Operation, last_residual
+from mastctl.control.refusals import Need
+from mastctl.control.standing import CLOSING
+from mastctl.errors import MastctlError, NotKnown, NotNow, Stopped, Unable, error_body
+
+log = logging.getLogger(__name__)
+
+KEPT_OPERATIONS = 200
+END_TIMEOUT_S = 5.0  # for a cancelled operation to notice, when the service closes
+ENDS_SOON_S = 0.25  # a stopped operation ends within 20 ms or so; who comes next waits for that
+
+STOP_ASKED = "a stop was asked for"
+
+
+class Mover(Protocol):
+    """What of `mastctl.devices.devices.Devices` is needed to stop and to keep stopped."""
+
+    def stop(self) -> None: ...
+    def block_moves(self, holder: object, reason: str) -> None: ...
+    def allow_moves(self, holder: object) -> None: ...
+
+
+Work = Callable[[Callable[[Any], None], threading.Event], Any]
+OnEnd = Callable[[Operation], None]
+
+
+class OperationRunner:
+    """The operations of this run of the service; safe to use from any thread.
+
+    Parameters
+    ----------
+    mover
+        Stops the mast.
+    clock
+        Stamps the records.
+    run
+        A word in every id, so that an id from before a restart names nothing; a random one by default.
+    on_ended
+        Gets the last record of each operation, in its thread; must return at once.
+    machine
+        Is told what runs, and refuses what may not begin now; one of its own by default.
+    """
+
+    def __init__(
+        self,
+        mover: Mover,
+        clock: Clock,
+        run: str | None = None,
+        on_ended: OnEnd = lambda operation: None,
+        machine: StateMachine | None = None,
+    ) -> None:
+        self._mover = mover
+        self._machine = machine or StateMachine(clock)
+        self._publisher = self._machine.publisher
+        self._clock = clock
+        self._time = deadlines_on(clock)
+        self._ended = self._time.signal()
+        self._lock = threading.Lock()
+        self._records: Mapping[str, Operation] = {}  # oldest first
+        self._numbers = itertools.count(1)
+        self._run = run or secrets.token_hex(2)
+        self._on_ended = on_ended
+        self._current: tuple[str, threading.Event, threading.Thread] | None = None
+        self._closed = False
+        self._stops_of_its_own = (
+            0  # under way, for operations beyond their deadline; whoever waits, waits by `_ended`
+        )
+        self._cancelled_because: MastctlError = Stopped(STOP_ASKED)
+
+    @property
+    def running(self) -> str | None:
+        """Id of the running operation, None when none runs."""
+        return self._machine.standing.operation
+
+    def start(self, request: Mapping[str, Any], work: Work, on_end: OnEnd | None = None) -> Operation:
+        """Start ``work(record_step, cancelled)`` in a thread and return its first record.
+
+        ``on_end`` gets the last record, in the same thread, when the next operation may be started already.
+        Waits for nobody: `let_stopped_end` does, before any lock is taken.
+
+        Raises
+        ------
+        NotNow
+            ``busy``, ``stopping``, ``latched``: as `StateMachine.refusal` of ``motion``.
+        Unable
+            ``no_thread`` if the machine has none for it (the record says so too), ``closing``.
+        """
+        with self._lock:
+            name = f"{next(self._numbers):06d}-{self._run}"
+            self._machine.operation_began(name, request)
+            operation = Operation(name, "queued", dict(request), self._clock.now_s())
+            cancelled = threading.Event()
+            thread = self._clock.thread(
+                lambda: self._work(name, work, cancelled, on_end), f"operation {name}"
+            )
+            self._keep(operation)
+            self._current = (name, cancelled, thread)
+        try:
+            thread.start()
+        except RuntimeError as error:  # no thread to be had: nothing has moved, and the next may have one
+            unable = Unable("no_thread", f"operation {name} was not started: {error}")
+            self._end(name, "failed", None, error_body(unable))
+            raise unable from None
+        return operation
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Let no operation start and no move go out inside the block; waits for nobody."""
+        hold = object()
+        self._machine.stop_asked()
+        self._mover.block_moves(hold, STOP_ASKED)
+        try:
+            yield
+        finally:
+            self._mover.allow_moves(hold)
+            self._machine.stop_ended()
+
+    def stop(self, reason: str = STOP_ASKED) -> str | None:
+        """Stop the mast, then the running operation, if any; return its id.
+
+        The head comes first: nothing is asked, written or locked before it was told. ``reason`` is what the
+        operation's record says.
+
+        Raises
+        ------
+        DriverError
+            If the head did not confirm the stop; the operation is stopped all the same.
+        """
+        with self.held():
+            running = self._current
+            if running is not None:  # what ends from here on, ends by the stop
+                self._cancelled_because = Stopped(reason)
+                running[1].set()
+            try:
+                self._mover.stop()
+            finally:
+                with self._lock:
+                    name = self._cancel(reason)
+        if name is None and running is not None and self.get(running[0]).state == "stopped":
+            name = running[0]
+        log.info("stop%s", f": operation {name}" if name else "")
+        return name
+
+    def refusal(self, need: Need) -> MastctlError | None:
+        """Return why a command may not be carried out now, as `mastctl.control.machine.StateMachine.refusal`.
+
+        What a stop has ended may end first (`let_stopped_end`).
+        """
+        self.let_stopped_end()
+        return self._machine.refusal(need)
+
+    def let_stopped_end(self) -> None:
+        """Wait for an operation that is being ended, and for a deadline's stop; `ENDS_SOON_S` at most.
+
+        Returns at once if there is none. Who asks for a stop is answered when the head has confirmed it.
+        """
+        until_s = self._time.now_s() + ENDS_SOON_S
+        with self._ended:
+            while self._being_ended():
+                left_s = until_s - self._time.now_s()
+                if left_s <= 0:
+                    return
+                self._ended.wait(left_s)
+
+    def _being_ended(self) -> bool:
+        current = self._current
+        return self._stops_of_its_own > 0 or (current is not None and current[1].is_set())
+
+    def end_within(self, name: str, left_s: float, allowed_s: float) -> None:
+        """Stop the mast and end an operation with ``deadline_passed`` if it runs longer; returns at once.
+
+        A stop that comes before is the last word.
+
+        Parameters
+        ----------
+        left_s
+            How long it may run from now on, seconds.
+        allowed_s
+            Of how long altogether; for the message.
+        """
+        until_s = self._time.now_s() + left_s
+        late = NotNow("deadline_passed", f"operation {name} did not end in the {allowed_s:g} s it was given")
+
+        def watch() -> None:
+            with self._ended:
+                while (current := self._current) is not None and current[0] == name:
+                    wait_s = until_s - self._time.now_s()
+                    if wait_s <= 0.0:
+                        break
+                    self._ended.wait(wait_s, idle=True)
+                else:
+                    return
+            self._end_by(name, late)
+
+        try:
+            self._time.thread(watch, f"deadline of {name}").start()
+        except RuntimeError as error:
+            words = f"operation {name} was ended, since nothing could watch its deadline: {error}"
+            self._end_by(name, Unable("no_thread", words))
+
+    def end_stopped(self, name: str, reason: str = STOP_ASKED) -> None:
+        """Stop the mast and end an operation if it runs: one that began after a stop which came before it was
+        let begin, or one that is for nothing any more.
+        """
+        self._end_by(name, Stopped(reason))
+
+    def get(self, name: str) -> Operation:
+        """Return one record.
+
+        Raises
+        ------
+        NotKnown
+            ``operation_unknown`` if this run of the service does not know it, or no longer.
+        """
+        operation = self._records.get(name)
+        if operation is None:
+            words = f"operation {name[:80]} is not known; the newest {KEPT_OPERATIONS} of this run are kept"
+            raise NotKnown("operation_unknown", words)
+        return operation
+
+    def all(self) -> list[Operation]:
+        """Return the kept records, newest first."""
+        return list(self._records.values())[::-1]
+
+    def close(self) -> None:
+        """Take no more, stop the mast and what runs, and wait some seconds for it to end; never raises.
+
+        The second time nothing is done: the devices may be closed by then.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        self._machine.closing()
+        self._mover.block_moves(self, CLOSING)
+        self._stop_unasked("as the service closes")
+        self._machine.go_on()
+        with self._lock:
+            current = self._current
+            self._cancel(CLOSING)
+        if current is None:
+            return
+        current[2].join(END_TIMEOUT_S)
+        if current[2].is_alive():
+            log.error("operation %s did not end within %.0f s; it is given up", current[0], END_TIMEOUT_S)
+            self._end(current[0], "stopped", None, error_body(Stopped(CLOSING)))
+
+    def _end_by(self, name: str, error: MastctlError) -> None:
+        """End an operation with an error and stop the mast, unless it is being stopped already."""
+        with self._lock:
+            current = self._current
+            if current is None or current[0] != name or current[1].is_set():
+                return
+            with self._ended:
+                self._stops_of_its_own += 1
+            self._cancelled_because = error
+            current[1].set()
+            self._mover.block_moves(name, str(error))
+        self._machine.stop_asked()
+        self._stop_unasked(f"when operation {name} was to end")
+        self._machine.stop_ended()
+        with self._ended:
+            self._stops_of_its_own -= 1
+            self._ended.notify_all()
+
+    def _stop_unasked(self, when: str) -> None:
+        """Stop the mast where nobody waits for the answer; whatever its driver raises must not go further."""
+        try:
+            self._mover.stop()
+        except BaseException as error:
+            log.error("the head did not confirm the stop %s: %s", when, error_body(error)["message"])
+
+    def _keep(self, operation: Operation) -> None:
+        """Keep a record, and forget the oldest; the lock is held."""
+        records = {**self._records, operation.id: operation}
+        while len(records) > KEPT_OPERATIONS:
+            oldest = next(iter(records))
+            del records[oldest]
+            self._publisher.forget("operation", oldest)
+        self._records = records
+        self._publisher.publish("operation", operation.id, operation)
+
+    def _cancel(self, reason: str) -> str | None:
+        """Tell the running operation to end and let no further move of it out; the lock is held."""
+        if self._current is None:
+            return None
+        name, cancelled, _ = self._current
+        self._cancelled_because = Stopped(reason)
+        cancelled.set()
+        self._mover.block_moves(name, reason)
+        return name
+
+    def _work(self, name: str, work: Work, cancelled: threading.Event, on_end: OnEnd | None) -> None:
+        """Run one operation, then tell who wants to know."""
+        self._run_to_end(name, work, cancelled)
+        for tell in (self._on_ended, on_end):
+            if tell is None:
+                continue
+            try:
+                tell(self.get(name))
+            except Exception:  # nothing is left that it could be told to
+                log.exception("what follows upon operation %s met a defect of the program", name)
+
+    def _run_to_end(self, name: str, work: Work, cancelled: threading.Event) -> None:
+        """Run one operation to its end; whatever happens is in its record afterwards."""
+
+        def record(step: Any) -> None:
+            with self._lock:
+                known = self._records.get(name)
+                if known is not None:
+                    self._keep(replace(known, steps=(*known.steps, step)))
+
+        with self._lock:
+            self._keep(replace(self._records[name], state="running", started_s=self._clock.now_s()))
+        result: Any = None
+        error: BaseException | None = None
+        try:
+            result = work(record, cancelled)
+        except (MastctlError, DriverError, CalibError) as refusal:
+            error = refusal
+        except BaseException as defect:  # the one broad catch: nothing may leave the mast moving
+            log.exception("operation %s met a defect of the program", name)
+            error = defect
+        if error is None:
+            self._end(name, "done", result, None)
+            log.info("operation %s done", name)
+            return
+        self._stop_unasked(f"after operation {name}")
+        partial = getattr(error, "result", None)
+        if cancelled.is_set():
+            error = self._cancelled_because
+        body = error_body(error)
+        if isinstance(error, Stopped) and cancelled.is_set():
+            self._end(name, "stopped", partial, body)
+            log.info("operation %s stopped", name)
+        else:
+            self._end(name, "failed", partial, body)
+            log.warning("operation %s failed: %s", name, body["message"])
+
+    def _end(self, name: str, state: OperationState, result: Any, error: dict[str, Any] | None) -> None:
+        """Close a record and make room for the next operation."""
+        try:
+            residual = last_residual(result, name)
+        except Exception:  # a result that is none must not keep the next operation out
+            log.exception("the result of operation %s tells no residual", name)
+            residual, result = None, None
+        with self._lock:
+            if self._current is None or self._current[0] != name:
+                return  # given up before
+            self._mover.allow_moves(name)
+            self._machine.operation_ended(name, residual)
+            known = self._records.get(name)
+            if known is not None:  # last, since it is what clients wait for
+                ended_s = self._clock.now_s()
+                self._keep(replace(known, state=state, result=result, error=error, ended_s=ended_s))
+            self._current = None  # whoever waits for the end finds it told
+        with self._ended:
+            self._ended.notify_all()

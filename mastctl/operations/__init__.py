@@ -1,1 +1,0 @@
-"""Operations: what runs, one at a time, and the records of what ran."""

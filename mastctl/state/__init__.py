@@ -1,1 +1,0 @@
-"""What the daemon is doing, in one place, and how each change of it reaches who wants to know."""
