@@ -69,7 +69,7 @@ MOST_PEM_BYTES = 1_000_000
 
 
 class AddressInUse(MastctlError):
-    """Somebody else listens there already."""
+    """Another program listens there already."""
 
     code = "address_in_use"
 

@@ -25,7 +25,7 @@ UPRIGHT = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 class NoSuchFrame(MastctlError):
-    """What the rover frame should hang on is not there."""
+    """The object that should define the rover frame is not there."""
 
     code = "no_such_frame"
     exit_code = 2

@@ -34,7 +34,7 @@ COLUMNS, ROWS = 33, 11
 
 
 class NobodyThere(MastctlError):
-    """Nobody answers at the terminal."""
+    """No operator answers at the terminal."""
 
     code = "nobody_there"
 

@@ -185,7 +185,7 @@ class DaemonConnection(ABC):
 
     def bad_answer(self, reason: str) -> ClientError:
         """Return the error of an answer that no daemon of this program gives."""
-        return ClientError("bad_answer", f"what answers at {self.url} is no mastctl daemon: {reason}")
+        return ClientError("bad_answer", f"the program at {self.url} is no mastctl daemon: {reason}")
 
     def _refused(self, answer: httpx.Response) -> ClientError:
         """What an answer says that is not a good one."""

@@ -29,7 +29,7 @@ REMEMBERED = 64  # ended leases whose end is still told to who comes with them
 
 
 class Leased(NotNow):
-    """Somebody else steers; ``detail`` says who, and for how long."""
+    """Another client steers; ``detail`` has its name, and for how long."""
 
     def __init__(self, control: WhoSteers, now_s: float) -> None:
         self.detail = control.told(now_s)

@@ -414,7 +414,7 @@ class _Run:
         """
         if len(confirmed) < 2:
             with self._steps.step("triangulate"):
-                words = "a second pointing needs two eyes of a pair that see the target after the first one"
+                words = "a second pointing needs two cameras of a pair that see the target after the first"
                 raise PointingError("no_stereo", words)
         (one, own), (other, seen) = confirmed[-2:]
         self._triangulate(one, own.pixel_px, other, seen)

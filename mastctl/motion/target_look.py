@@ -43,7 +43,7 @@ BEFORE_TIMEOUT_S = 2.0
 
 
 class NotTrackable(MastctlError):
-    """A track that cannot begin: sky, plain surface, an edge, hidden from one eye, nothing at the place."""
+    """A track that cannot begin: sky, plain surface, edge, hidden from one camera, nothing at the place."""
 
     code = "not_trackable"
 

@@ -23,7 +23,7 @@ SMOOTHING_S = 0.065  # readings so far to either side even each other out; short
 
 
 class CannotTell(MastctlError):
-    """The pictures do not tell the offset; the message says why."""
+    """The images do not determine the offset; the message says why."""
 
     code = "cannot_tell"
 

@@ -32,7 +32,7 @@ NOT_THE_CAMERA = frozenset({"lease_over", "lease_unknown", "leased", "no_daemon"
 
 
 class LookEnded(MastctlError):
-    """A look that was broken off: somebody stopped the head, or another mast file is in use."""
+    """A look that was broken off: a stop came, or another mast file is in use."""
 
     code = "look_ended"
 
