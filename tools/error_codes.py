@@ -18,6 +18,7 @@ REFUSALS = Path("docs/reference/http.md")
 CODE = re.compile(r"[a-z]+(_[a-z]+)*")
 DEFINED = re.compile(r"^``([a-z_]+)``: ((?:.+\n?)+?)(?=\n\n|``[a-z_]+``:|\Z)", re.MULTILINE)
 SHOWN = 2
+OPERATION = "operation"  # its remedy in the table is that of all codes of operations
 ANSWER = "error_response"
 STATUS_FIRST = (ANSWER, "GuardError")
 
@@ -69,7 +70,9 @@ def meanings(listed: Collection[str], root: Path = REPOSITORY) -> dict[str, list
     for module in modules:
         known: dict[str, str] = {}
         for node in _in_order(module):
-            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                known = {}
+            elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
                 known[node.targets[0].id] = _message(node.value, known)
             elif isinstance(node, ast.Tuple):
                 for code, message in _side_by_side(node.elts, known):
@@ -136,7 +139,7 @@ def _message(node: ast.expr, words: dict[str, str]) -> str:
 
 
 def rows(root: Path = REPOSITORY) -> list[tuple[str, str, str, str]]:
-    """Return code, status, meaning and remedy of every code; those of commands alone have no status."""
+    """Return code, status, meaning and remedy (Markdown) of every code; a command's own has no status."""
     listed = refusals((root / REFUSALS).read_text(encoding="utf-8"))
     meant = meanings(listed, root)
     codes = sorted({*listed, *meant})
@@ -145,7 +148,7 @@ def rows(root: Path = REPOSITORY) -> list[tuple[str, str, str, str]]:
             code,
             ", ".join(status for status, _ in listed.get(code, ())),
             "; or: ".join(list(dict.fromkeys(meant.get(code, ())))[:SHOWN]),
-            "; ".join(dict.fromkeys(remedy for _, remedy in listed.get(code, ()))),
+            "; ".join(dict.fromkeys(what for status, what in listed.get(code, ()) if status != OPERATION)),
         )
         for code in codes
     ]

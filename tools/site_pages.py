@@ -163,7 +163,9 @@ def _kind(schema: dict[str, Any]) -> str:
 
 def error_codes_page() -> str:
     """Return every error code with its meaning; those of commands alone stand apart."""
-    rows = [(f"`{code}`", *(_cell(text) for text in cells)) for code, *cells in error_codes.rows()]
+    rows = [
+        (f"`{code}`", status, _cell(meaning), remedy) for code, status, meaning, remedy in error_codes.rows()
+    ]
     lines = [
         "# Error codes",
         "",
