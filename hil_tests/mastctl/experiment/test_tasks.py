@@ -185,13 +185,13 @@ LONG = """
 import sys, time
 from pathlib import Path
 from mastctl.experiment.tasks import open_executor
-from mastctl.experiment.tasks import Kept, Work
+from mastctl.experiment.tasks import KeptResults, Work
 from hil_tests.mastctl.experiment.toy_tasks import Draw, drawn_or_stuck
 
 if __name__ == "__main__":
     folder = Path(sys.argv[1])
     work = Work(drawn_or_stuck, [Draw(1), Draw(2, scale=1e9)], str)
-    work.run(lambda: open_executor("local", 2), Kept(folder), lambda *_: print("kept", flush=True))
+    work.run(lambda: open_executor("local", 2), KeptResults(folder), lambda *_: print("kept", flush=True))
 """
 
 
