@@ -1,11 +1,10 @@
 """Least-squares matching: the last step to sub-pixel, with the covariance of the found position.
 
-Model (Gruen 1985, Foerstner 1982): I(p + (1 + D) q) = g (1 + s·q) T(q) + b over the patch's offsets q from
-the target, with the position p (2), the small deformation D (2x2), the gain g, its slope s (2) and the offset
-b free. Without the slope a lens that dims towards its corners would pull the place along its radius.
-Gauss-Newton on the grey differences r, with the template's gradient for the image's: step = -(WᵀJ)⁻¹ Wᵀ r. J
-(n, 10) holds the model's derivatives; W the same of the slightly smoothed template (instrumental variables:
-the template's own noise is in r too, and must not weigh it).
+Model (Gruen 1985, Foerstner 1982): I(p + (1 + D) q) = g T(q) + b over the patch's offsets q from the target,
+with the position p (2), the small deformation D (2x2), the gain g and the offset b free. Gauss-Newton on the
+grey differences r, with the template's gradient for the image's: step = -(WᵀJ)⁻¹ Wᵀ r. J (n, 8) holds the
+model's derivatives; W the same of the slightly smoothed template (instrumental variables: the template's own
+noise is in r too, and must not weigh it).
 
 Covariance, by leaving out one block b of pixels at a time (the jackknife of Tukey 1958; over groups, Bell and
 McCaffrey 2002), with N = WᵀJ:
@@ -121,7 +120,7 @@ def match_least_squares(
         if part is None:
             return None
         free = slice(None) if deforms else _RIGID
-        rates, steps = (one[part][..., free] for one in (jacobian, weights))
+        rates, steps = (one[part][..., free].reshape(-1, 8 if deforms else 4) for one in (jacobian, weights))
         return _settled(fit, surface, q[part], t[part], rates, steps, counts[part], enough_px)
 
     first = _PatchFit(start, np.zeros((2, 2)))
@@ -183,12 +182,10 @@ def _refined(fit: _PatchFit, block_px: float) -> LeastSquaresMatch | None:
 
 @dataclass(frozen=True, eq=False)
 class _PatchFit:
-    """A state of the iteration: place, deformation and the gain's slope; once settled also what its
-    covariance is made of."""
+    """A state of the iteration: place and deformation; once settled also what its covariance is made of."""
 
     position: FloatArray
     deformation: FloatArray
-    slope: FloatArray = field(default_factory=lambda: np.zeros(2))
     gain: float = 1.0
     template: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     rest: FloatArray = field(default_factory=lambda: np.empty(0))
@@ -207,13 +204,8 @@ def _settled(
     counts: FloatArray,
     enough_px: float,
 ) -> _PatchFit | None:
-    """Iterate, pixels weighted by ``counts``, until a step is shorter than ``enough_px``; None if none is.
-
-    Without columns for them deformation and slope stay those of ``fit``.
-    """
-    terms = jacobian.shape[-1]
-    weighted = (weights * counts[..., None]).reshape(-1, terms)
-    jacobian = jacobian.reshape(-1, terms)
+    """Iterate, pixels weighted by ``counts``, until a step is shorter than ``enough_px``; None if none is."""
+    weighted = weights * counts.reshape(-1, 1)
     normal = weighted.T @ jacobian
     try:
         inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
@@ -222,17 +214,17 @@ def _settled(
     # Largest entries for norms: within a factor of the matrix' size of the condition.
     if not float(np.abs(normal).max() * np.abs(inverse).max()) < WORST_CONDITION:
         return None
-    position, deformation, slope = fit.position, fit.deformation, fit.slope
-    lights = [t, t * q[..., 0], t * q[..., 1]] if terms > len(_RIGID) else [t * (1.0 + q @ slope)]
-    photometry = _Photometry(lights, counts)
+    position, deformation = fit.position, fit.deformation
+    photometry = _Photometry(t, counts)
     for _ in range(MOST_STEPS):
         places = position + q + q @ deformation.T
         if not surface.inside(places[[0, 0, -1, -1], [0, -1, 0, -1]]):  # the corners
             return None
         seen = surface.at(places)
-        (gain, *sloping), rest = photometry.of(seen)
+        gain, offset = photometry.of(seen)
         if gain <= 0.05:
             return None
+        rest = (seen - gain * t - offset).reshape(-1)
         step = -inverse @ (weighted.T @ rest)
         move = step[:2] / gain
         length = float(np.linalg.norm(move))
@@ -245,8 +237,7 @@ def _settled(
         if np.linalg.norm(deformation) > WORST_DEFORMATION:
             return None
         if length < enough_px:
-            slope = np.array(sloping) / gain if sloping else slope
-            return _PatchFit(position, deformation, slope, gain, t, rest, counts, weighted, jacobian)
+            return _PatchFit(position, deformation, gain, t, rest, counts, weighted, jacobian)
     return None
 
 
@@ -261,25 +252,25 @@ def _gradient(values: FloatArray) -> FloatArray:
 
 
 def _columns(gradient: FloatArray, q: FloatArray, t: FloatArray) -> FloatArray:
-    """Return the derivatives (h, w, 10) of image minus model: position, deformation by rows, gain, offset,
-    slope."""
+    """Return the derivatives (h, w, 8) of image minus model: position, deformation by rows, gain, offset."""
     columns = [gradient[..., 0], gradient[..., 1]]
     columns += [gradient[..., a] * q[..., b] for a in (0, 1) for b in (0, 1)]
-    return np.stack([*columns, -t, -np.ones_like(t), -t * q[..., 0], -t * q[..., 1]], axis=-1)
+    return np.stack([*columns, -t, -np.ones_like(t)], axis=-1)
 
 
 class _Photometry:
-    """What multiples of some pictures (h, w) and what offset, weighted by counts, are nearest to a patch."""
+    """Gain and offset that bring a template (h, w), weighted by ``counts``, nearest to what is seen."""
 
-    def __init__(self, lights: list[FloatArray], counts: FloatArray) -> None:
-        self._columns = np.stack([light.reshape(-1) for light in [*lights, np.ones_like(counts)]], axis=-1)
-        weighted = self._columns * counts.reshape(-1, 1)
-        self._solve = np.linalg.pinv(weighted.T @ self._columns) @ weighted.T
+    def __init__(self, template: FloatArray, counts: FloatArray) -> None:
+        self._shares = counts.reshape(-1) / float(counts.sum())
+        self._mean = float(self._shares @ template.reshape(-1))
+        self._weights = self._shares * (template.reshape(-1) - self._mean)
+        self._variance = max(float(self._weights @ template.reshape(-1)), 1e-12)
 
-    def of(self, seen: FloatArray) -> tuple[list[float], FloatArray]:
-        """Return the multiples, and what (n,) they leave of a seen patch (h, w)."""
-        found = self._solve @ seen.reshape(-1)
-        return found[:-1].tolist(), seen.reshape(-1) - self._columns @ found
+    def of(self, seen: FloatArray) -> tuple[float, float]:
+        """Return gain and offset of a seen patch (h, w)."""
+        gain = float(self._weights @ seen.reshape(-1)) / self._variance
+        return gain, float(self._shares @ seen.reshape(-1)) - gain * self._mean
 
 
 def _correlation(a: FloatArray, b: FloatArray, counts: FloatArray) -> float:

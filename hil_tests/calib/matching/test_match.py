@@ -99,22 +99,6 @@ def test_sigma_grows_with_noise_and_stays_honest() -> None:
     assert HONEST[0] < rms < HONEST[1], rms
 
 
-def test_a_lens_that_dims_towards_its_corners_does_not_pull_the_place() -> None:
-    """Cosine to the fourth 20 degrees off a Navcam's axis: by a thousandth a pixel."""
-    plane, rng, moved_px = wall(2), np.random.default_rng(8), []
-    x, y = np.meshgrid(*(np.arange(side) - side / 2 for side in SIZE_PX))
-    dimmed = (seen(LEFT, 2) * (1.0 + 0.9e-3 * x - 0.6e-3 * y)).astype(np.float32)
-    for _ in range(20):
-        pixel = np.array([rng.uniform(90, 270), rng.uniform(70, 210)])
-        surface = Plane(plane.hit(LEFT.position_m, LEFT.rays(pixel)), plane.normal)
-        found = [
-            match_patch(one, LEFT.model, pixel, surface, seen(TURNED, 2), TURNED.model, 5, PLANE).pixel_px
-            for one in (seen(LEFT, 2), dimmed)
-        ]
-        moved_px.append(found[1] - found[0])
-    assert np.sqrt(np.mean(np.square(moved_px))) < 0.003
-
-
 def shared_noise(image: np.ndarray, seed: int) -> np.ndarray:
     """Noise of 4 grey levels as interpolated between a colour's filters, which are two pixels apart."""
     noise = np.random.default_rng(seed).normal(size=image.shape)
