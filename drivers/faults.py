@@ -2,7 +2,7 @@
 
 The panel only remembers; the simulated devices ask it: a head in memory, or the axes and the line of a byte
 simulator, by the same words. Words are those of PX4's failure injection, more for a head's mechanism and its
-line, and more for cameras. docs/how-to/drivers.md shows ``HEAD_WORDS`` and ``CAMERA_WORDS`` as tables.
+line, and more for cameras. docs/drivers.md shows ``HEAD_WORDS`` and ``CAMERA_WORDS`` as tables.
 """
 
 from __future__ import annotations

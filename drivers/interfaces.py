@@ -1,4 +1,4 @@
-"""The protocols of devices (docs/how-to/drivers.md) and the records that travel through them.
+"""The protocols of devices (docs/drivers.md) and the records that travel through them.
 
 Times are seconds of CLOCK_MONOTONIC. Calls may block; the service gives each device a thread of its own.
 """

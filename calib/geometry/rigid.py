@@ -2,7 +2,7 @@
 
 A transform is named ``b_from_a`` and maps coordinates in frame a to coordinates in frame b, so inner
 names touch in a product: ``c_from_a = c_from_b @ b_from_a``. Quaternions are (w, x, y, z). The six numbers of
-a small motion are a turn, then a shift (docs/reference/conventions.md).
+a small motion are a turn, then a shift (docs/conventions.md).
 """
 
 from __future__ import annotations

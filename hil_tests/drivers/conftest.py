@@ -1,4 +1,4 @@
-"""A small rig, one scene for all tests of the simulated rover, and the package of docs/how-to/drivers.md."""
+"""A small rig, one scene for all tests of the simulated rover, and the package of docs/drivers.md."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def small_rig(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 @pytest.fixture(scope="session")
 def sources(repository: Path) -> dict[str, str]:
     """File name to text, from the code blocks of the page that follow a file's name."""
-    page = (repository / "docs" / "how-to" / "drivers.md").read_text()
+    page = (repository / "docs" / "drivers.md").read_text()
     return dict(re.findall(r"`([\w/]+\.(?:py|toml))`[^\n]*:\n\n```\w+\n(.*?)```", page, re.DOTALL))
 
 

@@ -174,7 +174,7 @@ def test_every_word_of_a_camera_is_asked_for(bench: Bench, monkeypatch: pytest.M
 
 
 def test_the_documentation_shows_the_same_words_and_parameters(repository: Path) -> None:
-    text = (repository / "docs" / "how-to" / "drivers.md").read_text()
+    text = (repository / "docs" / "drivers.md").read_text()
     for title, words in (("head", HEAD_WORDS), ("camera", CAMERA_WORDS), ("log", LOG_WORDS)):
         rows = {
             cells[0].strip("` "): (cells[1].strip(), cells[2].strip())

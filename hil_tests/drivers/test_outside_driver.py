@@ -1,4 +1,4 @@
-"""The package of docs/how-to/drivers.md, installed from outside the repository, works as head and cameras."""
+"""The package of docs/drivers.md, installed from outside the repository, works as head and cameras."""
 
 from __future__ import annotations
 

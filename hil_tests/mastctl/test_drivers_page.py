@@ -1,4 +1,4 @@
-"""What docs/how-to/drivers.md says to an author of a driver is what the service does."""
+"""What docs/drivers.md says to an author of a driver is what the service does."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from mastctl.service import service as service_module
 
 @pytest.fixture(scope="module")
 def page(repository: Path) -> str:
-    text = (repository / "docs" / "how-to" / "drivers.md").read_text(encoding="utf-8")
+    text = (repository / "docs" / "drivers.md").read_text(encoding="utf-8")
     return " ".join(text.split("## What a driver promises", 1)[1].split("\n## ", 1)[0].split())
 
 
 def test_every_driver_has_its_row(repository: Path) -> None:
-    text = (repository / "docs" / "how-to" / "drivers.md").read_text(encoding="utf-8")
+    text = (repository / "docs" / "drivers.md").read_text(encoding="utf-8")
     named = re.findall(r"^\| `([^`]+)` \|", text.split("## What a driver promises", 1)[0], re.MULTILINE)
     assert {*named} == {*BUILT_IN, "package.module:factory"}
 

@@ -31,7 +31,7 @@ JSON lines on standard input, one order each, answered on standard error:
   {"word": "mute", "replies": 5}                       a fault of the head, with parameters
   {"word": "overload", "angle_rad": 0.3, "at_s": 2}    from two seconds on
   {"clear": true}                                      all faults off
-The words are those of docs/how-to/drivers.md. SIGTERM or Ctrl-C ends it."""
+The words are those of docs/drivers.md. SIGTERM or Ctrl-C ends it."""
 
 
 _PAN_TILT: tuple[Literal[0], Literal[1]] = (0, 1)

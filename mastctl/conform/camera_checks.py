@@ -1,4 +1,4 @@
-"""What a camera driver promises (docs/how-to/drivers.md), asked of any camera."""
+"""What a camera driver promises (docs/drivers.md), asked of any camera."""
 
 from __future__ import annotations
 

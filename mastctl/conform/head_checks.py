@@ -1,4 +1,4 @@
-"""What a pan/tilt driver promises (docs/how-to/drivers.md), asked of any head."""
+"""What a pan/tilt driver promises (docs/drivers.md), asked of any head."""
 
 from __future__ import annotations
 

@@ -148,7 +148,7 @@ class SimulatedRover:
         device
             ``pan_tilt``, or a camera's name.
         word
-            A fault word of docs/how-to/drivers.md.
+            A fault word of docs/drivers.md.
         **parameters
             Those of the word, and ``after_s`` and ``for_s`` of every word.
 

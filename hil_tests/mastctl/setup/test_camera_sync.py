@@ -1,4 +1,4 @@
-"""``mastctl camera sync`` on the outside package of docs/how-to/drivers.md, with shifted stamps."""
+"""``mastctl camera sync`` on the outside package of docs/drivers.md, with shifted stamps."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ IMPORTS = "from turned_time import threading, time\n"
 @pytest.fixture
 def package(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The package of the page and the shifting driver, importable."""
-    page = (repository / "docs" / "how-to" / "drivers.md").read_text()
+    page = (repository / "docs" / "drivers.md").read_text()
     sources = dict(re.findall(r"`(bench_rig/\w+\.py)`[^\n]*:\n\n```\w+\n(.*?)```", page, re.DOTALL))
     (tmp_path / "bench_rig").mkdir()
     (tmp_path / "bench_rig" / "__init__.py").touch()
