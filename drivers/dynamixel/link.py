@@ -166,6 +166,16 @@ class Link:
                 found[register.window] = self.block(Part(servo_id, *register.window)).statuses[servo_id].data
         return [register.decode_window(found[register.window]) for register in registers]
 
+    def agreed(self, servo_id: int, register: Register) -> int:
+        """Return a register of any servo, also of one whose counter stands elsewhere; raises as `proven`."""
+        found = self._agreed(servo_id, {register.window: register})
+        return register.decode_window(found[register.window])
+
+    def heard(self, servo_id: int, register: Register) -> int:
+        """Return what a register seems to be, asked one time and after a silence; raises as `proven`."""
+        self.quiet(QUIET_S)
+        return register.decode(self.exchange.read(servo_id, *register.window, register.name))
+
     def _agreed(self, servo_id: int, asked: dict[tuple[int, int], Register]) -> dict[tuple[int, int], bytes]:
         """What is said twice in a row, around a silence, of each window."""
         found: dict[tuple[int, int], bytes] = {}

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from drivers.dynamixel.registers import Register, vendor_table
+from drivers.dynamixel.registers import Register, vendor_names, vendor_table
 from drivers.errors import BadOptions
 from drivers.faults import nearest
 
@@ -128,7 +128,9 @@ def _p(name: str, number: int, most_current_counts: int) -> ServoModel:
 
 
 # Current units and limits, backlash: e-manual, and the makers' data sheets where they state backlash
-# (15' for XM430, XM540, XH540; 20' for MX; under 6' for PH; nothing for XL330 and XC330).
+# (15' for XM430, XM540, XH430, XH540; XD has the tables and gears of XH; 20' for MX; under 6' for PH; nothing
+# for XL and XC). XL430, XC430 and MX-28 measure their load, no current. A 2XL430 and a 2XC430 are two servos
+# in one case, with an id and a table each; they share the baud rate alone.
 _MODELS = (
     #  name             number  A/count  most counts  backlash, degrees
     _x("XL330-M077-T", 1190, 0.001, 1750, None),
@@ -137,12 +139,27 @@ _MODELS = (
     _x("XC330-T288-T", 1220, 0.001, 910, None),
     _x("XC330-M181-T", 1230, 0.001, 2352, None),
     _x("XC330-M288-T", 1240, 0.001, 2352, None),
+    _x("XL430-W250", 1060, None, 0, None),
+    _x("2XL430-W250", 1090, None, 0, None),
+    _x("XC430-W150", 1070, None, 0, None),
+    _x("XC430-W240", 1080, None, 0, None),
+    _x("2XC430-W250", 1160, None, 0, None),
     _x("XM430-W350", 1020, 0.00269, 1193, 0.25),
     _x("XM430-W210", 1030, 0.00269, 1193, 0.25),
     _x("XM540-W270", 1120, 0.00269, 2047, 0.25),
     _x("XM540-W150", 1130, 0.00269, 2047, 0.25),
+    _x("XH430-W350", 1000, 0.00269, 648, 0.25),
+    _x("XH430-W210", 1010, 0.00269, 648, 0.25),
+    _x("XH430-V350", 1040, 0.00134, 689, 0.25),
+    _x("XH430-V210", 1050, 0.00134, 689, 0.25),
     _x("XH540-W270", 1100, 0.00269, 2047, 0.25),
     _x("XH540-W150", 1110, 0.00269, 2047, 0.25),
+    _x("XH540-V270", 1140, 0.00269, 1188, 0.25),
+    _x("XH540-V150", 1150, 0.00269, 1188, 0.25),
+    _x("XD430-T350", 1001, 0.00269, 648, 0.25),
+    _x("XD430-T210", 1011, 0.00269, 648, 0.25),
+    _x("XD540-T270", 1101, 0.00269, 2047, 0.25),
+    _x("XD540-T150", 1111, 0.00269, 2047, 0.25),
     _x("MX-28", 30, None, 0, 0.33),
     _x("MX-64", 311, 0.00336, 1941, 0.33),
     _x("MX-106", 321, 0.00336, 2047, 0.33),
@@ -167,9 +184,26 @@ def model_named(name: str) -> ServoModel:
     """
     wanted = str(name).upper().replace("_", "-")
     for known, model in MODELS.items():
-        if wanted in (known, known.removesuffix("-T")):
+        if wanted.removesuffix("-T").removesuffix("-R") == known.removesuffix("-T"):
             return model
+    for number, theirs in vendor_names().items():
+        if number not in MODELS_BY_NUMBER and wanted.startswith(theirs.upper().replace("_", "-")):
+            raise BadOptions(f"the driver does not know {what_is_needed(number)}")
     raise BadOptions(f"there is no servo model {name!r}{nearest(wanted, MODELS)}")
+
+
+def what_is_needed(number: int) -> str:
+    """Return what a servo is that the driver does not drive, and what it would need, by its model number."""
+    theirs = vendor_names().get(number)
+    if theirs is None:
+        return (
+            f"the model number {number}, nor do the tables of the installed dynamixel-sdk: needed is a "
+            "dynamixel-sdk that holds its .model table"
+        )
+    words = f"the {theirs} (model number {number}); mastctl servo info reads it"
+    if theirs.startswith("ym"):
+        return f"{words}. It needs registers laid out as those of X or P, which the Y family's are not"
+    return f"{words}. Needed is a row in drivers/dynamixel/models.py: its unit of current and its backlash"
 
 
 def hardware_error_words(value: int) -> list[str]:

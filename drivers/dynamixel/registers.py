@@ -7,6 +7,7 @@ from the ROBOTIS e-manual (emanual.robotis.com, one page per model).
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ _NAMES = {
     "Present Input Voltage": "present_voltage",
 }
 """What is called otherwise here than in the tables of the SDK, small letters and underscores aside."""
+
+_SIGNED_POSITIONS = {"Homing Offset", "Goal Position", "Present Position", "Position Trajectory"}
 
 _KNOWN = """
     model_number firmware id baud return_delay drive_mode operating_mode secondary_id -homing_offset
@@ -108,6 +111,27 @@ def vendor_table(number: int, first_ram_address: int) -> VendorTable:
     turn = {name: round(float(value)) for name, value in found["type info"]}
     ends = (turn[f"value_of_{end}_radian_position"] for end in ("min", "max", "zero"))
     return VendorTable(_registers(found["control table"], first_ram_address), *ends)
+
+
+def vendor_names() -> Mapping[int, str]:
+    """Return every servo that the SDK has a table of, as it spells them, by model number."""
+    return {number: file.stem for number, file in _files().items()}
+
+
+def vendor_registers(number: int) -> list[Register]:
+    """Return every register that the SDK's table of a model holds, by address; indirect ones are left out.
+
+    Which are permanent is not known here; signed are those that the table says to be, and positions.
+    """
+    found = _sections(_files()[number])
+    signed = {row[0] for row in found.get("unit info", []) if row[-1] == "signed"} | _SIGNED_POSITIONS
+    registers = {}
+    for address, length, theirs in found["control table"]:
+        if not theirs.startswith("Indirect"):
+            window = int(address), int(length)
+            name = re.sub(r"\W+", "_", theirs.lower()).strip("_")
+            registers[window] = Register(name, *window, theirs in signed, window=window)
+    return [registers[window] for window in sorted(registers)]
 
 
 @cache

@@ -17,6 +17,7 @@ from drivers.dynamixel.models import (
     NO_SECONDARY_ID,
     POSITION_MODE,
     hardware_error_words,
+    what_is_needed,
 )
 from drivers.dynamixel.motion import ServoSample, Truth, motion_blocks
 from drivers.dynamixel.packets import Part
@@ -104,8 +105,11 @@ class Servo(ServoTable):
         number, firmware = self._model_and_firmware()
         if number != model.number:
             other = MODELS_BY_NUMBER.get(number)
-            found = f"a {other.name}" if other else f"of the unknown model number {number}"
-            raise WrongDevice(f"{self.name} is {found}, the configuration says {model.name}")
+            if other is None:
+                raise WrongDevice(
+                    f"{self.name} is no {model.name}: the driver does not know {what_is_needed(number)}"
+                )
+            raise WrongDevice(f"{self.name} is a {other.name}, the configuration says {model.name}")
         if self._head.watchdog_s > 0 and firmware < model.watchdog_firmware:
             raise WrongDevice(
                 f"{self.name} has firmware {firmware}; the bus watchdog needs "

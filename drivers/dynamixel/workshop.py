@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 
 from drivers.clock import Clock
 from drivers.dynamixel.link import Link, Pinged
@@ -22,8 +23,9 @@ from drivers.dynamixel.models import (
     ServoModel,
     hardware_error_words,
     register_words,
+    what_is_needed,
 )
-from drivers.dynamixel.registers import RegisterBlock
+from drivers.dynamixel.registers import RegisterBlock, vendor_names, vendor_registers
 from drivers.dynamixel.servo_table import ServoTable, again, identified
 from drivers.errors import BadOptions, DriverError, HardwareFault, NoReply, OutOfRange, Refused, WrongDevice
 from drivers.serial_line import OpenLine, SerialLine
@@ -91,7 +93,7 @@ def _found(link: Link, ping: Pinged) -> FoundServo:
     words: list[str] = []
     if ping.alert and model is not None:
         words = hardware_error_words(table_of(link, ping.servo_id, model).get("hardware_error"))
-    name = model.name if model else "unknown"
+    name = model.name if model else vendor_names().get(ping.model_number, "unknown")
     return FoundServo(link.baud, ping.servo_id, ping.model_number, name, ping.firmware, tuple(words))
 
 
@@ -107,16 +109,19 @@ class ServoFacts:
 
 
 def facts(link: Link, servo_id: int) -> ServoFacts:
-    """Read every register of a servo that the table knows.
+    """Read every register of a servo that the driver knows; of another one, all that the SDK's table holds.
 
     Raises
     ------
     WrongDevice
-        If its model is not in the table.
+        If neither knows its model.
     NoReply, BadReply, Refused, LineLost
         If it cannot be read.
     """
-    model, firmware = identify(link, servo_id)
+    pinged = identified(link, servo_id, f"servo {servo_id}")
+    if pinged.model_number not in MODELS_BY_NUMBER and pinged.model_number in vendor_names():
+        return _vendor_facts(link, pinged)
+    model, firmware = _known(pinged), pinged.firmware
     table = table_of(link, servo_id, model)
     values: dict[str, int] = {}
     for name in model.registers:
@@ -126,15 +131,34 @@ def facts(link: Link, servo_id: int) -> ServoFacts:
     return ServoFacts(servo_id, model.name, firmware, values, {n: w for n, w in words.items() if w})
 
 
+def _vendor_facts(link: Link, pinged: Pinged) -> ServoFacts:
+    """Read a servo by the SDK's table, one register after another, each after a silence.
+
+    What changes by itself is read one time, all else until two answers agree.
+    """
+    values: dict[str, int] = {}
+    for register in vendor_registers(pinged.model_number):
+        changing = register.name.startswith(("present_", "realtime_", "moving")) or "traj" in register.name
+        ask = partial(link.heard if changing else link.agreed, pinged.servo_id, register)
+        with suppress(Refused):  # this firmware has none
+            values[register.name] = again(link, ask)
+    name = vendor_names()[pinged.model_number]
+    return ServoFacts(pinged.servo_id, name, pinged.firmware, values, {})
+
+
 def identify(link: Link, servo_id: int) -> tuple[ServoModel, int]:
-    """Return a servo's model and firmware. Raises as `facts`."""
+    """Return a servo's model and firmware. Raises as `facts`; WrongDevice for one that is not driven."""
     pinged = identified(link, servo_id, f"servo {servo_id}")
+    return _known(pinged), pinged.firmware
+
+
+def _known(pinged: Pinged) -> ServoModel:
+    """The model of a servo. Raises WrongDevice."""
     model = MODELS_BY_NUMBER.get(pinged.model_number)
     if model is None:
-        raise WrongDevice(
-            f"servo {servo_id} has the model number {pinged.model_number}, which is not in the table"
-        )
-    return model, pinged.firmware
+        words = what_is_needed(pinged.model_number)
+        raise WrongDevice(f"servo {pinged.servo_id}: the driver does not know {words}")
+    return model
 
 
 def table_of(link: Link, servo_id: int, model: ServoModel) -> ServoTable:

@@ -38,7 +38,8 @@ def test_every_option_of_the_ptu_is_on_the_page(repository: Path, option: str) -
 
 def test_pixels_of_a_count_are_the_models_own(repository: Path) -> None:
     text = (repository / "docs" / "how-to" / "hardware.md").read_text(encoding="utf-8")
-    for row, model in (("Dynamixel X, MX | one", "XM430-W350"), ("Dynamixel PH42 | one", "PH42-020-S300")):
+    rows = ("Dynamixel X (XL, XC, XM, XH, XD), MX | one", "Dynamixel PH42 | one")
+    for row, model in zip(rows, ("XM430-W350", "PH42-020-S300"), strict=True):
         cells = [cell.strip() for cell in text[text.index(row) :].split("\n")[0].split("|")]
         count_rad = model_named(model).count_rad
         assert float(cells[2]) == pytest.approx(math.degrees(count_rad), rel=0.01)

@@ -35,7 +35,8 @@ class DynamixelBus:
     Parameters
     ----------
     servos
-        Those on the line. Two may have the same id: then their answers collide.
+        Those on the line. Two may have the same id: then their answers collide. Of a model of two axes each
+        two that follow one another are in one case.
     waits_for_predecessor
         In a sync or bulk read a servo answers after the one before it in the list; when that one is not
         there, it and all behind it stay silent. False: the list is answered without the missing one.
@@ -49,6 +50,9 @@ class DynamixelBus:
 
     def __init__(self, servos: Iterable[SimulatedServo], *, waits_for_predecessor: bool = True) -> None:
         self.servos = list(servos)
+        twins = [servo for servo in self.servos if servo.model.axes == 2]
+        for one, other in zip(twins[::2], twins[1::2], strict=False):
+            one.mate, other.mate = other, one
         self.waits_for_predecessor = waits_for_predecessor
         self.host_baud: int | None = None
         self._parser = InstructionParser()

@@ -60,6 +60,8 @@ class SimulatedModel:
         It answers fast sync and bulk reads.
     voltage_v
         What it is fed with, the manual's recommendation.
+    axes
+        Servos in one case, each with an id and a table; they share the baud rate.
     """
 
     name: str
@@ -79,6 +81,7 @@ class SimulatedModel:
     drive_bits: int
     fast: bool
     voltage_v: float
+    axes: int = 1
 
     @property
     def count_rad(self) -> float:
@@ -139,6 +142,7 @@ def _x(
     drive_bits: int = 0b1101,
     fast: bool = True,
     voltage_v: float = 12.0,
+    axes: int = 1,
 ) -> SimulatedModel:
     table = [r for r in rows(X_EEPROM + X_RAM + more) if r.name not in without]
     return SimulatedModel(
@@ -159,6 +163,7 @@ def _x(
         drive_bits=drive_bits,
         fast=fast,
         voltage_v=voltage_v,
+        axes=axes,
     )
 
 
@@ -200,8 +205,41 @@ _MX_WITHOUT = frozenset({"startup_configuration", "backup_ready"})
 _540 = {"current_limit": (2047, 0, 2047)}
 
 
+_LOAD_ONLY = frozenset({"current_limit", "goal_current", "present_current"})
+_LOAD = "126 2 present_load r - -1000 1000\n"
+
+
 def _velocity(initial: int, high: int = 1023) -> dict[str, tuple[int, int, int]]:
     return {"velocity_limit": (initial, 0, high)}
+
+
+def _voltage(high: int, low: int = 60) -> dict[str, tuple[int, int, int]]:
+    return {"max_voltage_limit": (high, low, high), "min_voltage_limit": (low, low, high)}
+
+
+def _x430_of_load(
+    name: str, number: int, changes: Mapping[str, tuple[int, int, int]], axes: int = 1
+) -> SimulatedModel:
+    """A servo without a current sensor: address 126 is Present Load (0.1 %), 38 and 102 are empty."""
+    modes, without = frozenset({1, 3, 4, 16}), _LOAD_ONLY
+    bits = 0b1101
+    if axes == 2:
+        without, bits = without | _MX_WITHOUT, 0b0001
+    return _x(name, number, changes, more=_LOAD, without=without, modes=modes, drive_bits=bits, axes=axes)
+
+
+def _xh(
+    name: str, number: int, velocity: int, current: int, *, unit_a: float = 0.00269, volts: float = 12.0
+) -> SimulatedModel:
+    """An XH or XD servo; the XD's tables are the XH's, the manual says."""
+    changes = {
+        "current_limit": (current, 0, current),
+        **_velocity(velocity),
+        **(_voltage(300, 110) if volts == 24 else {}),
+    }
+    if "540" in name:
+        return _x(name, number, changes, more=X540_MORE, drive_bits=0b1111, voltage_v=volts)
+    return _x(name, number, changes, current_unit_a=unit_a, voltage_v=volts)
 
 
 def _p(
@@ -302,15 +340,31 @@ _ALL = (
     _x("xm430_w350", 1020, {}),
     _x("xm540_w150", 1130, {**_540, **_velocity(230)}, more=X540_MORE, drive_bits=0b1111),
     _x("xm540_w270", 1120, {**_540, **_velocity(128)}, more=X540_MORE, drive_bits=0b1111),
-    _x("xh540_w270", 1100, {**_540, **_velocity(167)}, more=X540_MORE, drive_bits=0b1111),
-    _x("xh540_w150", 1110, {**_540, **_velocity(300)}, more=X540_MORE, drive_bits=0b1111),
-    # No current sensor: address 126 is Present Load (0.1 %), and there is nothing at 38 and 102.
+    _x430_of_load("xl430_w250", 1060, {"temperature_limit": (72, 0, 100), **_voltage(140), **_velocity(265)}),
+    _x430_of_load(
+        "2xl430_w250", 1090, {"temperature_limit": (72, 0, 100), **_voltage(140), **_velocity(250)}, axes=2
+    ),
+    _x430_of_load("xc430_w150", 1070, {**_voltage(160), **_velocity(460), "moving_threshold": (20, 0, 1023)}),
+    _x430_of_load("xc430_w240", 1080, {**_voltage(160), **_velocity(306), "moving_threshold": (20, 0, 1023)}),
+    _x430_of_load("2xc430_w250", 1160, {**_voltage(160), **_velocity(275)}, axes=2),
+    _xh("xh430_w350", 1000, 130, 648),
+    _xh("xh430_w210", 1010, 210, 648),
+    _xh("xh430_v350", 1040, 135, 689, unit_a=0.00134, volts=24.0),
+    _xh("xh430_v210", 1050, 227, 689, unit_a=0.00134, volts=24.0),
+    _xh("xh540_w270", 1100, 167, 2047),
+    _xh("xh540_w150", 1110, 300, 2047),
+    _xh("xh540_v270", 1140, 128, 1188, volts=24.0),
+    _xh("xh540_v150", 1150, 230, 1188, volts=24.0),
+    _xh("xd430_t350", 1001, 130, 648),
+    _xh("xd430_t210", 1011, 210, 648),
+    _xh("xd540_t270", 1101, 167, 2047),
+    _xh("xd540_t150", 1111, 300, 2047),
     _x(
         "mx_28",
         30,
         {**_MX, **_velocity(230)},
-        more=MX_MORE + "126 2 present_load r - -1000 1000\n",
-        without=_MX_WITHOUT | {"current_limit", "goal_current", "present_current"},
+        more=MX_MORE + _LOAD,
+        without=_MX_WITHOUT | _LOAD_ONLY,
         modes=frozenset({1, 3, 4, 16}),
         drive_bits=0b0101,
         fast=False,

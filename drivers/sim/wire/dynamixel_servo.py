@@ -56,6 +56,11 @@ class SimulatedServo:
     time_s
         When it is switched on.
 
+    Attributes
+    ----------
+    mate
+        The other servo in its case, with which it shares the baud rate; None for a servo of one axis.
+
     Raises
     ------
     BadOptions
@@ -94,6 +99,7 @@ class SimulatedServo:
         self._backup_pointers: list[int] = []
         self._registered: list[RegisterChange] = []
         self._raised = 0
+        self.mate: SimulatedServo | None = None
         self._since_s: float | None = None
         self._started_s = self._fed_s = self._retune_s = time_s
         self._rate = self.table["baud_rate"]
@@ -271,6 +277,9 @@ class SimulatedServo:
                 self.drive.into_one_turn(time_s)
             elif name == "baud_rate":
                 self._retune_s = time_s + self.return_delay_s + _ANSWER_BITS / self.baud
+                if self.mate is not None:
+                    self.mate.table["baud_rate"] = self.table["baud_rate"]
+                    self.mate._retune_s = self._retune_s
         for name in goals:
             if not self.table["torque_enable"] and self.table["drive_mode"] & 8:
                 self._torque_by_goal(name, time_s)

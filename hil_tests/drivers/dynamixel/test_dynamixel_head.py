@@ -49,7 +49,8 @@ from hil_tests.waiting import NET_S
 
 
 @pytest.mark.parametrize(
-    "models", [(X, X), (X, "mx_28"), ("mx_64", "ph42_020_s300"), ("ph54_200_s500", "xl330_m288")]
+    "models",
+    [(X, X), (X, "mx_28"), ("mx_64", "ph42_020_s300"), ("ph54_200_s500", "xl330_m288"), ("2xl430_w250",) * 2],
 )
 def test_start_up_sets_the_servos_and_moves_neither(models: tuple[str, str]) -> None:
     with opened(models=models, starts_rad=(0.4, -0.3)) as (it, head):

@@ -187,6 +187,8 @@ def test_a_position_that_leaps_is_refused() -> None:
         ({"approach": "up", "approach_rad": 0.04}, "none or positive or negative or gravity"),
         ({"sign": 0}, "expected 1 or -1"),
         ({"sign": True}, "expected 1 or -1"),
+        ({"model": "YM070-210-M001-RH"}, "which the Y family's are not"),
+        ({"model": "XW540-T260-R"}, "(model number 1170); mastctl servo info reads it. Needed is a row"),
         ({"model": "MX-28", "current_limit_A": 1.0}, "has no current limit"),
         ({"current_limit_A": 3.3}, "expected 0.00269 to 3.209 A for a XM430-W350"),
         ({"current_limit_A": 0.001}, "expected 0.00269 to 3.209 A for a XM430-W350"),

@@ -7,6 +7,7 @@ import math
 import re
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +104,37 @@ def test_info_tells_every_register_in_numbers_and_words(
     assert "PH42-020-S300" in out
 
 
+def called(bench: Bench, number: int) -> None:
+    """Have the first servo give another model number."""
+    bench.servos[0].model = replace(bench.servos[0].model, number=number)
+    bench.servos[0].table["model_number"] = number
+
+
+def test_info_reads_a_servo_that_is_not_driven_by_the_sdks_table(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    called(bench, 1270)  # XW430-T333, whose table is an XM430's without the LED
+    bench.servos[0].table["homing_offset"] = -12
+    code, told, _ = run(capsys, "info", bench.line.path, "1", "--baud", BAUD, "--json")
+    assert (code, told["model"]) == (0, "xw430_t333")
+    names = {r.name for r in bench.servos[0].model.registers} - {"led"}
+    assert names - told["registers"].keys() == {"startup_configuration", "backup_ready", "secondary_id"}
+    assert told["registers"]["homing_offset"] == -12
+    assert told["registers"]["present_position"] == 2048 - 12
+    code, _, err = run(capsys, "test", bench.line.path, "1", "--baud", BAUD)
+    assert code == 1
+    assert "the driver does not know the xw430_t333 (model number 1270)" in err and "Needed is a row" in err
+
+
+def test_a_servo_that_nobody_knows_is_told_by_its_number_and_what_is_needed(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    called(bench, 9999)
+    code, _, err = run(capsys, "info", bench.line.path, "1", "--baud", BAUD)
+    assert code == 1
+    assert "the model number 9999" in err and "dynamixel-sdk that holds its .model table" in err
+
+
 def test_set_id_changes_id_and_rate_and_checks_both(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("set-id", bench.line.path, "1", "7", "--baud", BAUD, "--json")
     code, told, _ = run(capsys, *words)
@@ -111,6 +143,21 @@ def test_set_id_changes_id_and_rate_and_checks_both(bench: Bench, capsys: pytest
     code, told, _ = run(capsys, "set-id", bench.line.path, "7", "7", *words[4:], "--new-baud", "2000000")
     assert (code, told) == (0, {"id": 7, "old_id": 7, "baud": 2_000_000})
     assert bench.servos[0].baud == 2_000_000
+
+
+def test_two_axes_in_one_case_keep_one_baud_rate(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.servos[:] = [
+        SimulatedServo("2XL430-W250-T", n, axis, settings={"baud_rate": 3}, time_s=bench.clock.now_s())
+        for n, axis in enumerate(bench.axes, start=1)
+    ]
+    bench.line.device = DynamixelBus(bench.servos)
+    words = ("set-id", bench.line.path, "1", "1", "--baud", BAUD, "--new-baud", "2000000")
+    assert run(capsys, *words)[0] == 0
+    code, told, _ = run(capsys, "scan", bench.line.path, "--baud", BAUD, "2000000", "--json")
+    assert code == 0
+    assert [(s["id"], s["model"], s["baud"]) for s in told["servos"]] == [
+        (n, "2XL430-W250", 2_000_000) for n in (1, 2)
+    ]
 
 
 @pytest.mark.parametrize(
