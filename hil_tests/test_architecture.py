@@ -91,7 +91,7 @@ def test_every_tool_says_how_it_is_used(
     assert not rest.startswith(("options:", "positional arguments:")), "it does not say what it does"
 
 
-@pytest.mark.parametrize("room", ["dynamixel", "flir_ptu"])
+@pytest.mark.parametrize("room", ["dynamixel", "flir_ptu", "servo_bus"])
 def test_a_driver_waits_on_the_clock_that_it_is_given_and_on_nothing_beside_it(
     room: str, repository: Path
 ) -> None:

@@ -7,9 +7,10 @@ which good answers narrow, so that a chain of answers, each a little late, canno
 
 from __future__ import annotations
 
-from drivers.dynamixel.packets import GroupQuestion, StatusPacket
-from drivers.dynamixel.port import QUIET_S, Exchange
+from drivers.dynamixel.packets import GroupQuestion
 from drivers.errors import BadReply, DriverError, LineLost
+from drivers.servo_bus.exchange import Exchange
+from drivers.servo_bus.port import QUIET_S, Status
 
 MODULUS_S = 32.768
 STEP_S = 0.001
@@ -88,7 +89,7 @@ class TickCounters:
                     return error
         return None
 
-    def doubts(self, question: GroupQuestion, status: StatusPacket, sent_s: float) -> BadReply | None:
+    def doubts(self, question: GroupQuestion, status: Status, sent_s: float) -> BadReply | None:
         """Return why a reply that just came is not to this question; None if it is, or holds no counter."""
         servo_id = status.servo_id
         if servo_id not in question.ticks:

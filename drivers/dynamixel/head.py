@@ -12,33 +12,19 @@ only where the configuration says ``on_hardware_error: reboot``.
 
 from __future__ import annotations
 
-import logging
-import threading
-from collections.abc import Callable, Mapping
-from contextlib import suppress
-from typing import Any, TypeVar
+from collections.abc import Mapping
+from typing import Any
 
-from drivers.absent import Absence
-from drivers.approach import rising_below_rad
-from drivers.clock import Clock, SystemClock, deadlines_on
-from drivers.dynamixel.bus import Bus
+from drivers.clock import Clock
 from drivers.dynamixel.link import Link
 from drivers.dynamixel.models import WATCHDOG_TRIPPED
-from drivers.dynamixel.pair import ServoAxis, ready_pair
+from drivers.dynamixel.pair import Axis, Pair, head_axes, ready_pair
 from drivers.dynamixel.servo import Reboots
-from drivers.dynamixel.session import ServoSession
 from drivers.dynamixel.settings import DynamixelSettings, dynamixel_settings
-from drivers.dynamixel.watch import GivenUp
-from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
-from drivers.interfaces import AxisMotion, AxisReport, Reading, Reporting
+from drivers.dynamixel.watch import Watch
+from drivers.errors import DriverError, NoReply
 from drivers.serial_line import OpenLine, SerialLine
-
-log = logging.getLogger(__name__)
-T = TypeVar("T")
-
-CALL_TIMEOUT_S = 0.8  # the service waits 1 s
-CLOSE_TIMEOUT_S = 2.0
-AXES = ("pan", "tilt")
+from drivers.servo_bus.head import BusHead
 
 HALT_TRIES = 5
 HALT_REST_S = 2.0
@@ -60,212 +46,20 @@ def open_head(
     return DynamixelHead(dynamixel_settings(options), clock, open_line)
 
 
-class DynamixelHead(Reporting):
-    """The head; every method may be called from any thread.
+class DynamixelHead(BusHead):
+    """The head; parameters and errors as of `BusHead`."""
 
-    Parameters
-    ----------
-    settings
-        What it is made of.
-    clock
-        Stamps the readings. Deadlines run on it too if it runs, else on the machine's.
-    open_line
-        Opens the line, whose waits end by the clock of the deadlines.
-
-    Raises
-    ------
-    LineLost, NoReply, WrongDevice, HardwareFault, Refused
-        As `open_head`.
-    """
+    settings: DynamixelSettings
 
     def __init__(
         self, settings: DynamixelSettings, clock: Clock | None = None, open_line: OpenLine = SerialLine
     ) -> None:
-        self.settings = settings
-        self._stamps = clock or SystemClock()
-        self._clock = deadlines_on(self._stamps)
-        self._open_line = open_line
         self._reboots = Reboots()
-        self._absence = Absence()
-        self._closed = False
-        self._state = threading.Lock()
-        self._bus = Bus(settings.port, self._round, self._clock)
-        self._session: ServoSession | None = self._connect()
-        self._motions = [axis.motion for axis in self._session.pair.axes]
-        self._bus.start()
+        super().__init__(settings, clock, open_line)
 
-    # What the service calls
-
-    def read(self) -> Reading:
-        """Return what both servos measure now.
-
-        Raises
-        ------
-        LineLost, NoReply, BadReply, WrongDevice, HardwareFault
-            If they cannot be read, at once while the line is known to be lost.
-        """
-        return self._call("read", ServoSession.read)
-
-    def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
-        """Start both axes together towards the angles, rounded to the nearest count, and return.
-
-        Raises
-        ------
-        OutOfRange
-            For an angle outside the limits, or a speed that is no positive number or slower than a servo can
-            be told (0.024 rad/s of an X or MX, 0.001 of a P; its 0 means as fast as it can);
-            nothing moves. Speeds between are rounded down.
-        HardwareFault, WatchdogTripped
-            While a servo reports a hardware error, or the watchdog has stopped the head.
-        LineLost, NoReply, BadReply
-            If the servos do not confirm the goals.
-        """
-        speed = self.settings.speed_rad_per_s if speed_rad_per_s is None else speed_rad_per_s
-        if not speed > 0:
-            raise OutOfRange(f"speed {speed_rad_per_s} rad/s is not a positive number")
-        slowest = max(a.model.velocity_unit_rad_per_s for a in (self.settings.pan, self.settings.tilt))
-        if speed < slowest:
-            raise OutOfRange(
-                f"speed {speed:g} rad/s is less than the {slowest:.4f} rad/s that the servos know"
-            )
-        for name, axis, angle in zip(
-            AXES, (self.settings.pan, self.settings.tilt), (pan_rad, tilt_rad), strict=True
-        ):
-            low, high = axis.limits_rad
-            if not low <= angle <= high:
-                raise OutOfRange(
-                    f"{name} {angle:.4f} rad is outside the head's limits {low:.4f} to {high:.4f} rad"
-                )
-        capped = min(speed, self.settings.speed_rad_per_s)
-        self._call("move", lambda session: session.move((pan_rad, tilt_rad), capped), moves=True)
-
-    def stop(self) -> None:
-        """Brake both axes; each then holds or lets go as its ``at_stop`` says.
-
-        Each is told to brake by itself before anything is asked, and what else was under way on the line is
-        broken off for it; a move that waits for its turn is not begun. After the watchdog has stopped the
-        head this is the deliberate act that arms it anew.
-
-        Raises
-        ------
-        LineLost, NoReply, BadReply
-            If a servo did not confirm. The driver then keeps silent until its watchdog has stopped it, a
-            further stop included: both were told to brake when the line was given up, and every packet more
-            would feed the watchdog of one that did not hear it. With ``watchdog_s: 0`` nothing can be fed:
-            a stop tries a line that is away at once.
-        """
-        self._call("stop", ServoSession.stop, first=True, tries=not self.settings.watchdog_counts)
-
-    def close(self) -> None:
-        """Stop, leave each servo as its ``at_close`` says, and let go of the line; never raises."""
-        with self._state:
-            if self._closed:
-                return
-            self._closed = True
-        self._bus.close(self._close_now, CLOSE_TIMEOUT_S)
-
-    def report(self) -> dict[str, AxisReport]:
-        """Return where each axis was sent and where it stood when it was last read; asks nobody."""
-        reports = {axis: motion.report() for axis, motion in zip(AXES, self._motions, strict=True)}
-        return {axis: report for axis, report in reports.items() if report is not None}
-
-    def axis_motion(self) -> dict[str, AxisMotion]:
-        """Return how each axis moves: its profile, as the servo rounds it, and its approach."""
-        told = {}
-        for name, axis in zip(AXES, (self.settings.pan, self.settings.tilt), strict=True):
-            counts = axis.acceleration_counts(self.settings.acceleration_rad_per_s2)
-            told[name] = AxisMotion(
-                counts * axis.model.acceleration_unit_rad_per_s2,
-                axis.approach_rad,
-                rising_below_rad(axis.approach, axis.gravity_turnover_rad),
-                axis.model.count_rad,
-            )
-        return told
-
-    # In the thread that owns the bus
-
-    def _call(
-        self,
-        what: str,
-        function: Callable[[ServoSession], T],
-        *,
-        first: bool = False,
-        moves: bool = False,
-        tries: bool = False,
-    ) -> T:
-        """Have something done in the bus thread; one that ``tries`` does not leave an absent line alone."""
-        with self._state:
-            if self._closed:
-                raise NoReply(f"the head on {self.settings.port} is closed; {what} was not sent")
-        if not tries:
-            self._absence.check()
-        return self._bus.call(
-            what, lambda: self._within(function, tries), CALL_TIMEOUT_S, first=first, moves=moves
-        )
-
-    def _within(self, function: Callable[[ServoSession], T], tries: bool = False) -> T:
-        """Do something with the servos, which may end in giving the line up."""
-        if tries and self._session is None:
-            self._come_back()
-        self._absence.check()
-        session = self._session
-        assert session is not None
-        try:
-            return function(session)
-        except GivenUp as given_up:
-            self._give_up(session, given_up.error)
-            raise given_up.error from None
-
-    def _round(self) -> float:
-        """What the thread does between calls; returns when it wants to be called again."""
-        now_s = self._clock.now_s()
-        if self._session is None:
-            if now_s >= self._absence.again_s:
-                self._come_back()
-        elif now_s >= self._session.poll_due_s:
-            self._within(ServoSession.look)
-        return self._absence.again_s if self._session is None else self._session.poll_due_s
-
-    def _connect(self) -> ServoSession:
-        """Open the line, make both servos ready without moving them, and read them once."""
-        head = self.settings
-        pair = ready_pair(head, self._reboots, self._bus.urgent, clock=self._clock, open_line=self._open_line)
-        session = ServoSession(pair, head, self._stamps, self._reboots)
-        try:
-            session.poll_once()
-        except BaseException as error:  # whatever it was goes on to the caller; the line is not left open
-            pair.close()
-            raise (error.error if isinstance(error, GivenUp) else error) from None
-        log.info("%s: %s", head.port, "; ".join(f"{axis.servo.name} is ready" for axis in pair.axes))
-        return session
-
-    def _come_back(self) -> None:
-        """Try to open the line and set the servos up again."""
-        try:
-            session = self._connect()
-        except DriverError as error:
-            if str(error) != str(self._absence.error):
-                log.warning("%s: still away: %s", self.settings.port, error)
-            self._absence.note(error, self._clock.now_s())
-            return
-        log.warning("%s is back: limits and modes checked, the head stands still", self.settings.port)
-        self._session, self._motions = session, [axis.motion for axis in session.pair.axes]
-        self._absence.end()
-
-    def _give_up(self, session: ServoSession, error: DriverError) -> None:
-        """Have both axes brake, close the line, and try again when the watchdogs must have stopped them."""
-        with suppress(LineLost):
-            session.pair.brake()
-        session.pair.close()
-        now_s = self._clock.now_s()
-        self._session = None
-        self._absence.note(error, now_s, self.settings.silence_s)
-        log.warning("%s; trying again in %.1f s", error, self._absence.again_s - now_s)
-
-    def _close_now(self) -> None:
-        if self._session is not None:
-            self._session.end()
-            self._session = None
+    def _ready(self, clock: Clock, open_line: OpenLine) -> tuple[Pair, Watch]:
+        pair = ready_pair(self.settings, self._reboots, self._bus.urgent, clock=clock, open_line=open_line)
+        return pair, Watch(pair, self.settings, self._reboots)
 
 
 def halt(
@@ -287,7 +81,7 @@ def halt(
     head = dynamixel_settings(options)
     link = Link(head.port, head.baud, head.reply_timeout_s, clock=clock, open_line=open_line)
     try:
-        axes = (ServoAxis(link, "pan", head.pan, head), ServoAxis(link, "tilt", head.tilt, head))
+        axes = head_axes(link, head)
         told: dict[str, str] = {}
         failed: dict[str, DriverError] = {}
         for _ in range(HALT_TRIES):  # each once before any of them again
@@ -309,7 +103,7 @@ def halt(
     return [f"{name} {words}" for name, words in told.items()]
 
 
-def _stood(axis: ServoAxis) -> str:
+def _stood(axis: Axis) -> str:
     """Tell one axis to stand, unless its watchdog has stopped it or it holds nothing."""
     servo = axis.servo
     if servo.get("bus_watchdog") == WATCHDOG_TRIPPED:
@@ -320,7 +114,7 @@ def _stood(axis: ServoAxis) -> str:
     return "was told to stand where it is, and holds"
 
 
-def _see_rest(axis: ServoAxis, clock: Clock) -> None:
+def _see_rest(axis: Axis, clock: Clock) -> None:
     """Wait until an axis stands. Raises NoReply."""
     until_s = clock.now_s() + HALT_REST_S
     while abs(axis.servo.look().values["present_velocity"]) > HALT_SLOW:

@@ -15,32 +15,44 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 
 from drivers.clock import Clock
 from drivers.dynamixel.counter import TickCounters
 from drivers.dynamixel.packets import (
     BROADCAST_ID,
+    ERROR_WORDS,
     PING,
+    READ,
     REBOOT,
     WRITE,
     GroupAnswer,
     GroupQuestion,
     Part,
-    StatusPacket,
     fast_blocks,
     group_question,
     group_write_packet,
     instruction_packet,
+    take_status,
     tick_at,
 )
-from drivers.dynamixel.port import QUIET_S, Exchange, Port
 from drivers.dynamixel.registers import Register
 from drivers.errors import BadReply, DriverError, LineLost, Refused
 from drivers.serial_line import OpenLine, SerialLine
+from drivers.servo_bus.exchange import Exchange
+from drivers.servo_bus.port import QUIET_S, PacketFormat, Port, Status
 
 REPLY_TIMEOUT_S = 0.05  # USB adapters hold bytes back for up to 16 ms, the servo for up to 0.5 ms
 
 PING_REPLY_BYTES = 14
+FORMAT = PacketFormat(
+    take_status,
+    instruction_packet,
+    lambda address, length: address.to_bytes(2, "little") + length.to_bytes(2, "little"),
+    11,
+    {PING: "ping", READ: "read", WRITE: "write", REBOOT: "reboot"},
+    ERROR_WORDS,
+)
 AGREEING_TRIES = 5  # of two answers in a row that are to be the same
 
 
@@ -94,9 +106,9 @@ class Link:
         open_line: OpenLine = SerialLine,
     ) -> None:
         self.name = port
-        self._port = Port(port, baud, reply_timeout_s, urgent, clock=clock, open_line=open_line)
+        self._port = Port(port, baud, reply_timeout_s, take_status, urgent, clock=clock, open_line=open_line)
         self.clock = self._port.clock
-        self.exchange = Exchange(self._port)
+        self.exchange = Exchange(self._port, FORMAT)
         self._counters = TickCounters(self.exchange)
         self._group_questions: dict[tuple[bool, tuple[Part, ...]], GroupQuestion] = {}
 
@@ -314,14 +326,14 @@ class Link:
 
     def _replies(
         self, question: GroupQuestion, sent_s: float
-    ) -> tuple[dict[int, StatusPacket], dict[int, DriverError]]:
+    ) -> tuple[dict[int, Status], dict[int, DriverError]]:
         """The replies to a group read until all have come or the deadline passes.
 
         They come in the order of the list; where they do not, or a servo says two things, none is certain.
         """
         parts = question.parts
         waited = list(parts)
-        taken: dict[int, StatusPacket] = {}
+        taken: dict[int, Status] = {}
         wrong: dict[int, DriverError] = {}
         while waited and (status := self._port.receive()) is not None:
             servo_id = status.servo_id
@@ -343,12 +355,12 @@ class Link:
 
     def _fast_replies(
         self, question: GroupQuestion, sent_s: float
-    ) -> tuple[dict[int, StatusPacket], dict[int, DriverError]]:
+    ) -> tuple[dict[int, Status], dict[int, DriverError]]:
         """The replies in the common reply to a fast group read."""
         parts = list(question.parts.values())
-        taken: dict[int, StatusPacket] = {}
+        taken: dict[int, Status] = {}
         wrong: dict[int, DriverError] = {}
-        while (status := self._port.receive(fast=True)) is not None:
+        while (status := self._port.receive(partial(take_status, fast=True))) is not None:
             blocks = fast_blocks(status, parts)
             if blocks is None:
                 self.exchange.stray(status)
@@ -366,7 +378,7 @@ class Link:
         return taken, wrong
 
 
-def _pinged(status: StatusPacket) -> Pinged:
+def _pinged(status: Status) -> Pinged:
     """What the data of a ping's reply say."""
     model = int.from_bytes(status.data[:2], "little")
     return Pinged(status.servo_id, model, status.data[2], status.alert)

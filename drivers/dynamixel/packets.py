@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from drivers.dynamixel.models import TICK_ADDRESSES
 from drivers.errors import DriverError
+from drivers.servo_bus.port import Status
 
 HEADER = b"\xff\xff\xfd\x00"
 START = b"\xff\xff\xfd"
@@ -150,7 +151,7 @@ class GroupAnswer:
     The servos measured after ``sent_s`` and before ``received_s``, seconds of CLOCK_MONOTONIC.
     """
 
-    statuses: Mapping[int, StatusPacket]
+    statuses: Mapping[int, Status]
     missing: Mapping[int, DriverError]
     sent_s: float
     received_s: float
@@ -202,7 +203,7 @@ def group_write_packet(parts: Sequence[Part]) -> bytes:
     return instruction_packet(BROADCAST_ID, BULK_WRITE, body)
 
 
-def fast_blocks(status: StatusPacket, parts: Sequence[Part]) -> list[StatusPacket] | None:
+def fast_blocks(status: Status, parts: Sequence[Part]) -> list[StatusPacket] | None:
     """Return the replies in the common reply to a fast group read, those before the first broken block.
 
     Blocks are error, id, data and the checksum of all bytes so far; the last checksum is the packet's, which

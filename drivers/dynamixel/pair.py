@@ -11,13 +11,14 @@ from collections.abc import Callable, Sequence
 
 from drivers.clock import Clock
 from drivers.dynamixel.link import Link
-from drivers.dynamixel.motion import AxisCourse, ServoSample, motion_blocks
 from drivers.dynamixel.packets import GroupAnswer, Part
 from drivers.dynamixel.registers import RegisterBlock
-from drivers.dynamixel.servo import Reboots, Servo
-from drivers.dynamixel.settings import DynamixelSettings, ServoAxisSettings
+from drivers.dynamixel.servo import Reboots, Servo, motion_blocks
+from drivers.dynamixel.settings import DynamixelAxisSettings, DynamixelSettings
 from drivers.errors import DriverError, LineLost
 from drivers.serial_line import OpenLine, SerialLine
+from drivers.servo_bus.axis import ServoAxis
+from drivers.servo_bus.course import ServoSample
 
 log = logging.getLogger(__name__)
 
@@ -26,67 +27,16 @@ STAND_ROUNDS = 2
 BRAKE_COPIES = 3  # more than a reply of 54 bytes can collide with
 
 
-class ServoAxis:
-    """One axis while its servo is at hand.
+Axis = ServoAxis[Servo, DynamixelAxisSettings]
 
-    Parameters
-    ----------
-    link
-        The open line.
-    name
-        ``pan`` or ``tilt``.
-    settings, head
-        What the configuration says.
 
-    Attributes
-    ----------
-    servo, motion
-        Who turns it, and what it is doing.
-    hardware_error
-        What its servo has reported, in words; empty if nothing.
-    acceleration_rad_per_s2
-        Of its profile, as the servo rounds it.
-    """
-
-    def __init__(self, link: Link, name: str, settings: ServoAxisSettings, head: DynamixelSettings) -> None:
-        self.settings = settings
-        self._clock = link.clock
-        self.servo = Servo(link, name, settings, head)
-        self.motion = AxisCourse(self.servo.name, settings, head.settle_s)
-        self.hardware_error = ""
-        counts = settings.acceleration_counts(head.acceleration_rad_per_s2)
-        self.acceleration_rad_per_s2 = counts * settings.model.acceleration_unit_rad_per_s2
-
-    def take_hold(self) -> None:
-        """Hold where the axis stands, with nothing commanded; raises as `Servo.take_hold`."""
-        self.motion.begin(self.servo.take_hold())
-        self.motion.profile = self.servo.profile
-
-    def let_go(self) -> None:
-        """Switch the torque off; raises as `Servo.set`."""
-        self.servo.set("torque_enable", 0)
-        self.motion.limp()
-
-    def halt(self) -> int | None:
-        """Take where the axis stands if it brakes now as its goal; returns that, None if it holds nothing."""
-        if not self.motion.holds or self.motion.sample is None:
-            return None
-        goal = self.motion.braking_counts(self._clock.now_s(), self.acceleration_rad_per_s2)
-        self.motion.halt(goal)
-        return goal
-
-    def brake(self) -> None:
-        """Brake and hold where that ends, if the axis holds at all; raises as `Servo.set`."""
-        goal = self.halt()
-        if goal is not None:
-            self.servo.set("goal_position", goal)
-
-    def go_on(self) -> None:
-        """Send the next leg of a move if the present one has ended; raises as `Servo.set`."""
-        goal = self.motion.next_leg()
-        if goal is not None:
-            self.servo.send_leg(self.motion.profile or self.servo.profile, goal)
-            self.motion.begin_leg()
+def head_axes(link: Link, head: DynamixelSettings) -> tuple[Axis, Axis]:
+    """Return pan and tilt on an open line."""
+    pan, tilt = (
+        ServoAxis(Servo(link, name, axis, head), link.clock, axis, head)
+        for name, axis in (("pan", head.pan), ("tilt", head.tilt))
+    )
+    return pan, tilt
 
 
 class Pair:
@@ -108,7 +58,7 @@ class Pair:
     """
 
     def __init__(self, link: Link, head: DynamixelSettings) -> None:
-        self.axes = (ServoAxis(link, "pan", head.pan, head), ServoAxis(link, "tilt", head.tilt, head))
+        self.axes = head_axes(link, head)
         self.link = link
         self.fast = False
         self._head = head
@@ -119,6 +69,11 @@ class Pair:
     def _parts(self, blocks: Sequence[RegisterBlock]) -> tuple[Part, ...]:
         """A block of each servo."""
         return tuple(Part(i, b.address, b.length) for i, b in zip(self._ids, blocks, strict=True))
+
+    @property
+    def clock(self) -> Clock:
+        """Of the line's deadlines."""
+        return self.link.clock
 
     def samples(self) -> list[ServoSample]:
         """Return what both servos say about their motion now, pan first, in one transaction.
@@ -142,7 +97,7 @@ class Pair:
             axis.servo.truth.check(sample)
         return samples
 
-    def sample(self, axis: ServoAxis) -> ServoSample:
+    def sample(self, axis: Axis) -> ServoSample:
         """Return what one servo says about its motion now, asking it alone; raises as `samples`."""
         return axis.servo.look_once()
 
@@ -189,6 +144,21 @@ class Pair:
             entry.decode_window(answer.statuses[i].data) if i in answer.statuses else None
             for i, entry in zip(self._ids, entries, strict=True)
         ]
+
+    def send_goals(self, goals: Sequence[int], speeds: Sequence[int]) -> None:
+        """Write profile and goal of both axes with one packet. Raises LineLost, BadReply."""
+        values = []
+        for axis, goal, speed in zip(self.axes, goals, speeds, strict=True):
+            acceleration = axis.servo.profile[0]
+            axis.motion.profile = acceleration, speed
+            values.append(
+                [
+                    ("profile_acceleration", acceleration),
+                    ("profile_velocity", speed),
+                    ("goal_position", goal),
+                ]
+            )
+        self.send(values)
 
     def send(self, values: Sequence[Sequence[tuple[str, int]]]) -> None:
         """Write neighbouring registers of each servo, all with one packet. Raises LineLost, BadReply."""

@@ -19,11 +19,13 @@ from drivers.dynamixel.models import (
     hardware_error_words,
     what_is_needed,
 )
-from drivers.dynamixel.motion import ServoSample, Truth, motion_blocks
 from drivers.dynamixel.packets import Part
-from drivers.dynamixel.servo_table import ServoTable, again, identified
-from drivers.dynamixel.settings import DynamixelSettings, ServoAxisSettings
+from drivers.dynamixel.registers import RegisterBlock
+from drivers.dynamixel.servo_table import ServoTable, identified
+from drivers.dynamixel.settings import DynamixelAxisSettings, DynamixelSettings
 from drivers.errors import BadReply, DriverError, HardwareFault, NoReply, Refused, WrongDevice
+from drivers.servo_bus.course import ServoSample, Truth
+from drivers.servo_bus.exchange import again
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +36,15 @@ REVERSE_BIT, SLAVE_BIT = 0x01, 0x02
 HOMING_LIMIT = 1024  # what position mode honours of an X servo's homing offset, counts
 REBOOT_S = 2.0  # how long a servo may be deaf after a reboot
 COME_TO_REST_S = 0.5
+
+
+def motion_blocks(settings: DynamixelAxisSettings) -> tuple[RegisterBlock, ...]:
+    """Return what is read of a servo all the time, by turns: from its goals to its temperature.
+
+    They differ in length, so that a reply to one of the last questions is none to the next.
+    """
+    names = ("goal_velocity", "profile_acceleration", "profile_velocity")
+    return tuple(RegisterBlock(settings.model.registers, name, "present_temperature") for name in names)
 
 
 class Reboots:
@@ -82,7 +93,9 @@ class Servo(ServoTable):
         What its samples are compared with.
     """
 
-    def __init__(self, link: Link, axis: str, settings: ServoAxisSettings, head: DynamixelSettings) -> None:
+    def __init__(
+        self, link: Link, axis: str, settings: DynamixelAxisSettings, head: DynamixelSettings
+    ) -> None:
         name = f"{axis} (servo {settings.servo_id})"
         super().__init__(link, settings.servo_id, settings.model.registers, name)
         self._settings = settings

@@ -2,29 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import TypeVar
+from collections.abc import Mapping
 
 from drivers.dynamixel.link import Link, Pinged
 from drivers.dynamixel.packets import GroupAnswer, Part
-from drivers.dynamixel.port import QUIET_S
 from drivers.dynamixel.registers import Register, RegisterBlock
-from drivers.errors import BadReply, NoReply, Refused, WrongDevice
-
-T = TypeVar("T")
-
-ATTEMPTS = 3
-LATE_S = 0.1  # a reply that did not come is waited out this long before the next question
-
-
-def again(link: Link, ask: Callable[[], T], late_s: float = LATE_S) -> T:
-    """Ask again after a lost or wrong reply, when one that is merely late has come."""
-    for _ in range(ATTEMPTS - 1):
-        try:
-            return ask()
-        except (NoReply, BadReply):
-            link.quiet(late_s)
-    return ask()
+from drivers.errors import BadReply, Refused, WrongDevice
+from drivers.servo_bus.exchange import ATTEMPTS, LATE_S, again
+from drivers.servo_bus.port import QUIET_S
 
 
 def identified(link: Link, servo_id: int, name: str) -> Pinged:

@@ -7,80 +7,44 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from drivers.approach import APPROACHES, ApproachedAxis
 from drivers.dynamixel.models import ServoModel, model_named
-from drivers.dynamixel.port import QUIET_S
-from drivers.errors import BadOptions
 from drivers.options import OptionReader
+from drivers.servo_bus.port import QUIET_S
+from drivers.servo_bus.settings import (
+    RESTING_POLL_S,
+    STANDS_WITHIN_S,
+    ServoAxisSettings,
+    axis_values,
+    check_axis,
+    checked_pair,
+)
 
-Rest = Literal["hold", "torque_off"]
 OnHardwareError = Literal["report", "reboot"]
 
-STANDS_WITHIN_S = 0.5  # after this process has died: the last poll's age, the watchdog, and braking
-RESTING_POLL_S = 0.1  # of servos that stand: an idle computer stays idle
 USUAL_WATCHDOG_S, SHORTEST_WATCHDOG_S = 0.3, 0.1
 WATCHDOG_STEP_S = 0.02
-LEAST_SLACK_COUNTS = 3
 LONGEST_REPLY_S = 0.3  # a few of them must fit into a call
 SILENCE_SPARE_S = 0.05  # the servo's oscillator against ours
 POLL_BYTES = 20 + 2 * (11 + 43)  # the longer of the two instructions, and two replies of 43 bytes of data
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServoAxisSettings(ApproachedAxis):
-    """One axis of the head, as of `ApproachedAxis`; its limits are also the servo's position limits.
+class DynamixelAxisSettings(ServoAxisSettings):
+    """One axis, as of `ServoAxisSettings`.
 
     Attributes
     ----------
-    servo_id, model
+    model
         Which servo.
-    zero_counts
-        The servo's position where the axis is at zero.
-    at_stop, at_close
-        Whether the servo then holds, or its torque is switched off (a tilt axis may fall).
     on_hardware_error
         ``report`` leaves the servo as it is; ``reboot`` restarts it, which drops its torque.
     current_limit_A
         Written to the servo; None leaves it as it is.
-    settle_rad
-        How near to its goal the axis counts as in position.
     """
 
-    servo_id: int
     model: ServoModel
-    zero_counts: int
-    at_stop: Rest = "hold"
-    at_close: Rest = "hold"
     on_hardware_error: OnHardwareError = "report"
     current_limit_A: float | None = None
-    settle_rad: float = 0.01
-
-    def counts(self, angle_rad: float) -> int:
-        """Return the nearest count to an angle."""
-        return self.zero_counts + round(self.sign * angle_rad / self.model.count_rad)
-
-    def angle_rad(self, counts: float) -> float:
-        """Return the angle of a position."""
-        return self.sign * (counts - self.zero_counts) * self.model.count_rad
-
-    @property
-    def limit_counts(self) -> tuple[int, int]:
-        """The limits in counts, lower first; rounded inwards."""
-        ends = sorted(self.zero_counts + self.sign * a / self.model.count_rad for a in self.limits_rad)
-        return math.ceil(ends[0] - 1e-6), math.floor(ends[1] + 1e-6)
-
-    @property
-    def slack_counts(self) -> int:
-        """How far beyond a limit an axis that was sent to it may stand: it droops, or dithers."""
-        return max(LEAST_SLACK_COUNTS, math.ceil(self.settle_rad / self.model.count_rad))
-
-    def acceleration_counts(self, acceleration_rad_per_s2: float) -> int:
-        """Return a profile acceleration, not below the one given: braking takes no longer than promised."""
-        return max(1, math.ceil(acceleration_rad_per_s2 / self.model.acceleration_unit_rad_per_s2 - 1e-6))
-
-    def velocity_counts(self, speed_rad_per_s: float) -> int:
-        """Return a profile velocity, not above the speed; never 0, which would mean as fast as it can."""
-        return max(1, math.floor(speed_rad_per_s / self.model.velocity_unit_rad_per_s + 1e-9))
 
 
 @dataclass(frozen=True)
@@ -109,8 +73,8 @@ class DynamixelSettings:
     """
 
     port: str
-    pan: ServoAxisSettings
-    tilt: ServoAxisSettings
+    pan: DynamixelAxisSettings
+    tilt: DynamixelAxisSettings
     baud: int = 1_000_000
     speed_rad_per_s: float = 1.0
     acceleration_rad_per_s2: float = 4.0
@@ -164,8 +128,7 @@ def dynamixel_settings(options: Mapping[str, Any]) -> DynamixelSettings:
     read = OptionReader(options, known, ("port", "pan", "tilt"))
     port = read.text("port", "a serial device such as /dev/ttyUSB0 or a URL")
     pan, tilt = (_axis(read, name) for name in ("pan", "tilt"))
-    if pan.servo_id == tilt.servo_id:
-        raise BadOptions(f"options.pan.id and options.tilt.id are both {pan.servo_id}, expected two ids")
+    checked_pair(pan, tilt)
     poll_hz = read.number("poll_hz", 50.0, 10.0, 500.0)
     baud = _baud(read, poll_hz)
     speed = read.number("speed_rad_per_s", 1.0, 0.03, 10.0)
@@ -238,80 +201,20 @@ def _reply_timeout_s(read: OptionReader, watchdog_s: float, poll_hz: float) -> f
     return reply_timeout_s
 
 
-def _axis(options: OptionReader, name: str) -> ServoAxisSettings:
+def _axis(options: OptionReader, name: str) -> DynamixelAxisSettings:
     """One axis of the options."""
-    known = {
-        "id", "model", "zero_counts", "sign", "limits_rad", "approach", "approach_rad",
-        "gravity_turnover_rad", "at_stop", "at_close", "on_hardware_error", "current_limit_A", "settle_rad",
-    }  # fmt: skip
-    expected = "a mapping with id, model, zero_counts ..."
-    read = options.section(name, expected, known, ("id", "model", "limits_rad"))
-    try:
-        model = model_named(read.values["model"])
-    except BadOptions as error:
-        raise read.refused("model", f": {error}") from None
-    limits_rad = read.pair("limits_rad", "[low, high] in radians")
-    if not limits_rad[0] < limits_rad[1]:
-        raise read.bad("limits_rad", "[low, high] with low below high")
-    axis = ServoAxisSettings(
-        servo_id=read.whole("id", 1, 0, 252),
-        model=model,
-        zero_counts=read.whole("zero_counts", model.centre_count, -(2**31), 2**31 - 1),
-        limits_rad=limits_rad,
-        sign=read.one_of("sign", 1, (1, -1)),
-        approach=read.one_of("approach", "none", APPROACHES),
-        approach_rad=read.number("approach_rad", 0.0, 0.0, 0.5),
-        gravity_turnover_rad=read.number("gravity_turnover_rad", math.pi / 2, -math.pi, math.pi),
-        at_stop=read.one_of("at_stop", "hold", ("hold", "torque_off")),
-        at_close=read.one_of("at_close", "hold", ("hold", "torque_off")),
+    read, values = axis_values(options, name, model_named, ("on_hardware_error", "current_limit_A"))
+    axis = DynamixelAxisSettings(
+        **values,
         on_hardware_error=read.one_of("on_hardware_error", "report", ("report", "reboot")),
         current_limit_A=read.number("current_limit_A", None, 0.0001, 30.0),
-        settle_rad=read.number("settle_rad", max(0.001, 3 * model.count_rad), model.count_rad, 0.1),
     )
-    _check_reach(read, axis)
-    _check_approach(read, axis)
+    check_axis(read, axis)
     _check_current(read, axis)
     return axis
 
 
-def _check_reach(read: OptionReader, axis: ServoAxisSettings) -> None:
-    """Refuse limits that the servo cannot hold."""
-    model = axis.model
-    low, high = axis.limit_counts
-    if low >= high:
-        raise read.refused(
-            "limits_rad",
-            f" [{axis.limits_rad[0]:g}, {axis.limits_rad[1]:g}] hold no two counts of a {model.name}, whose "
-            f"count is {model.count_rad:.2g} rad; expected limits further apart",
-        )
-    if low < model.low_count or high > model.high_count:
-        reach = sorted((axis.angle_rad(model.low_count), axis.angle_rad(model.high_count)))
-        raise read.refused(
-            "limits_rad",
-            f" are the servo's counts {low} to {high}, but a {model.name} in position mode holds "
-            f"{model.low_count} to {model.high_count}, which with zero_counts {axis.zero_counts} is "
-            f"{reach[0]:.4f} to {reach[1]:.4f} rad; mount the horn so that the range does not cross the seam",
-        )
-
-
-def _check_approach(read: OptionReader, axis: ServoAxisSettings) -> None:
-    """Refuse an approach that takes no backlash up."""
-    if (axis.approach == "none") != (axis.approach_rad == 0.0):
-        raise read.refused(
-            "approach",
-            f" is {axis.approach!r} with approach_rad {axis.approach_rad:g}; expected a stretch above zero "
-            "with a side, and neither or both",
-        )
-    least = axis.model.backlash_rad or 0.0
-    if axis.approach != "none" and axis.approach_rad <= least:
-        raise read.refused(
-            "approach_rad",
-            f" {axis.approach_rad:g} rad does not take up the backlash of a {axis.model.name}, "
-            f"{least:.4f} rad; expected more",
-        )
-
-
-def _check_current(read: OptionReader, axis: ServoAxisSettings) -> None:
+def _check_current(read: OptionReader, axis: DynamixelAxisSettings) -> None:
     """Refuse a limit of the current that the servo does not know."""
     model, limit_A = axis.model, axis.current_limit_A
     if limit_A is None:

@@ -10,25 +10,15 @@ import math
 from collections.abc import Sequence
 
 from drivers.dynamixel.models import WATCHDOG_TRIPPED
-from drivers.dynamixel.pair import Pair, ServoAxis
+from drivers.dynamixel.pair import Axis, Pair
 from drivers.dynamixel.servo import Reboots, hardware_fault_words
 from drivers.dynamixel.settings import DynamixelSettings
-from drivers.errors import BadReply, DriverError, HardwareFault, Refused, WatchdogTripped
+from drivers.errors import BadReply, HardwareFault, Refused, WatchdogTripped
+from drivers.servo_bus.session import GivenUp
 
 log = logging.getLogger(__name__)
 
 WATCH_S = 0.2  # how often torque and watchdog registers are looked at while all goes well
-
-
-class GivenUp(Exception):
-    """The servos are not as this driver left them, or only silence can stop them: start anew.
-
-    Whoever owns the line closes it and raises ``error`` instead.
-    """
-
-    def __init__(self, error: DriverError) -> None:
-        super().__init__(str(error))
-        self.error = error
 
 
 class Watch:
@@ -60,6 +50,15 @@ class Watch:
     def look_soon(self) -> None:
         """Have the next `look` look: the servos may have stopped by themselves."""
         self._looked_s = -math.inf
+
+    def heard_again(self, silence_s: float) -> None:
+        """Look soon after a silence: the servos may have stopped by themselves meanwhile."""
+        if self._head.watchdog_counts and silence_s > self._head.watchdog_s / 2:
+            self.look_soon()
+
+    def has_stopped(self, axis: Axis) -> bool:
+        """Return whether an axis' watchdog has tripped; raises as `Servo.get`."""
+        return axis.servo.get("bus_watchdog") == WATCHDOG_TRIPPED
 
     def look(self) -> None:
         """Look now and then, and after every silence, whether a watchdog has tripped or torque is gone.
@@ -96,13 +95,13 @@ class Watch:
             for axis, value in zip(self._pair.axes, glanced, strict=True)
         ]
 
-    def _as_left(self, axis: ServoAxis, register: str, value: int) -> bool:
+    def _as_left(self, axis: Axis, register: str, value: int) -> bool:
         """Whether a register is as this driver left it."""
         if register == "bus_watchdog":
             return value == self._head.watchdog_counts
         return bool(value) == axis.motion.holds
 
-    def _judge(self, axis: ServoAxis, register: str, value: int | None) -> None:
+    def _judge(self, axis: Axis, register: str, value: int | None) -> None:
         """Give up if a register is not as it was left."""
         if value is None or axis.hardware_error:
             return  # asked again soon, or known
@@ -129,7 +128,7 @@ class Watch:
         if self._head.watchdog_counts:
             self._looked_s = self._clock.now_s()
 
-    def arm_axis(self, axis: ServoAxis) -> None:
+    def arm_axis(self, axis: Axis) -> None:
         """Arm one watchdog; raises as `Servo.set`."""
         if self._head.watchdog_counts:
             axis.servo.set("bus_watchdog", self._head.watchdog_counts)
@@ -140,7 +139,7 @@ class Watch:
         self.look_soon()
         log.warning("the head is armed anew after its watchdog had stopped it")
 
-    def note_alert(self, axis: ServoAxis) -> None:
+    def note_alert(self, axis: Axis) -> None:
         """A servo reports a hardware error: brake both axes, say which error it is, follow the reboot policy.
 
         Not every hardware error switches the torque off, so the axis itself is braked too.

@@ -26,9 +26,10 @@ from drivers.dynamixel.models import (
     what_is_needed,
 )
 from drivers.dynamixel.registers import RegisterBlock, vendor_names, vendor_registers
-from drivers.dynamixel.servo_table import ServoTable, again, identified
+from drivers.dynamixel.servo_table import ServoTable, identified
 from drivers.errors import BadOptions, DriverError, HardwareFault, NoReply, OutOfRange, Refused, WrongDevice
 from drivers.serial_line import OpenLine, SerialLine
+from drivers.servo_bus.exchange import again
 
 HIGHEST_ID = 252
 

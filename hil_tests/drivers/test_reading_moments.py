@@ -8,11 +8,11 @@ from typing import Any, cast
 
 import pytest
 
-from drivers.dynamixel import session
-from drivers.dynamixel.motion import ServoSample
 from drivers.flir_ptu.axis import SeenPosition, StepAxis
 from drivers.flir_ptu.conversation import Conversation
 from drivers.flir_ptu.unit import measure
+from drivers.servo_bus import session
+from drivers.servo_bus.course import ServoSample
 
 
 class TurnedClock:
@@ -37,9 +37,7 @@ class Motion:
         return True
 
 
-def test_servos_are_read_in_the_middle_of_their_exchange_whatever_was_done_since(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_servos_are_read_in_the_middle_of_their_exchange_whatever_was_done_since() -> None:
     """Asked from 99.90 to 99.96 s, so measured at 99.93 s; told at 100 s, or 5000 s of the stamps."""
     samples = [
         ServoSample({"present_position": 10}, False, 99.90, 99.94),
@@ -54,12 +52,11 @@ def test_servos_are_read_in_the_middle_of_their_exchange_whatever_was_done_since
         )
         for _ in samples
     ]
-    watch = SimpleNamespace(look=lambda: None, faults=lambda now_s: ())
-    monkeypatch.setattr(session, "Watch", lambda *_: watch)
-    line = SimpleNamespace(clock=TurnedClock(100.0))
-    pair: Any = SimpleNamespace(axes=axes, samples=lambda: samples, link=line)
-    head: Any = SimpleNamespace(poll_hz=10.0, resting_poll_s=0.1, watchdog_counts=0)
-    it = session.ServoSession(pair, head, TurnedClock(5000.0), cast(Any, None))
+    nothing = {name: lambda *_: None for name in ("look", "heard_again")}
+    watch: Any = SimpleNamespace(**nothing, faults=lambda now_s: ())
+    pair: Any = SimpleNamespace(axes=axes, samples=lambda: samples, clock=TurnedClock(100.0))
+    head: Any = SimpleNamespace(poll_hz=10.0, resting_poll_s=0.1)
+    it = session.ServoSession(pair, watch, head, TurnedClock(5000.0))
     reading = it.read()
     assert (reading.pan_rad, reading.tilt_rad) == (0.1, 0.2)
     assert reading.time_s == pytest.approx(5000.0 - 0.07)

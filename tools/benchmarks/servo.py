@@ -156,7 +156,7 @@ def link(path: str) -> Iterator[tuple[CALL, CALL]]:
 @contextmanager
 def bus(path: str) -> Iterator[tuple[CALL, CALL]]:
     """The driver's transactions through the owner thread."""
-    from drivers.dynamixel.bus import Bus
+    from drivers.servo_bus.bus import Bus
 
     with link(path) as (read, write_read):
         owner = Bus("bench", lambda: time.monotonic() + 60.0)

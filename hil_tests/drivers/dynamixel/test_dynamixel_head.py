@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 
 from drivers.dynamixel.head import open_head
-from drivers.dynamixel.port import QUIET_S
 from drivers.dynamixel.servo import Servo
 from drivers.errors import (
     DriverError,
@@ -33,6 +32,7 @@ from drivers.errors import (
     WrongDevice,
 )
 from drivers.interfaces import PanTilt
+from drivers.servo_bus.port import QUIET_S
 from drivers.sim.wire.dynamixel_servo import HEAT, OVERLOAD
 from hil_tests.drivers.dynamixel.dynamixel_rig import (
     COUNT_RAD,

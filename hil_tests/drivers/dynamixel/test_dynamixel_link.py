@@ -20,13 +20,13 @@ import serial
 import serial.rfc2217
 
 from drivers.clock import SystemClock
-from drivers.dynamixel.bus import Bus
 from drivers.dynamixel.link import Link
 from drivers.dynamixel.models import MODELS
 from drivers.dynamixel.packets import Part
 from drivers.dynamixel.registers import Register
 from drivers.errors import BadOptions, BadReply, LineLost, NoReply, Refused
 from drivers.serial_line import SerialLine
+from drivers.servo_bus.bus import Bus
 from drivers.sim.wire.dynamixel_packets import Instruction, fast_status_packets
 from drivers.sim.wire.line import Reply, TcpLine
 from hil_tests.drivers.dynamixel.scripted_servos import BAUD_RATE, ScriptedServos, number, says, scripted

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from drivers.dynamixel.models import MODELS
-from drivers.dynamixel.motion import AxisCourse, ServoSample, Truth
 from drivers.dynamixel.settings import dynamixel_settings
 from drivers.errors import BadOptions, BadReply
+from drivers.servo_bus.course import AxisCourse, ServoSample, Truth
 
 COUNT_RAD = math.tau / 4096
 PERIOD_S = 0.02

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from drivers.clock import ManualClock
-from drivers.dynamixel.session import ServoSession
+from drivers.dynamixel.watch import Watch
 from drivers.errors import NoReply
+from drivers.servo_bus.session import ServoSession
 
 WATCHDOG_S, REPLY_S = 0.4, 0.1
 
@@ -18,6 +19,7 @@ class SilentPair:
     """Servos that answer, or let the host wait for its time-out."""
 
     def __init__(self, clock: ManualClock) -> None:
+        self.clock = clock
         self.link = SimpleNamespace(clock=clock)
         self.axes: tuple[Any, ...] = ()
         self.answers = True
@@ -33,10 +35,11 @@ def test_an_attempt_that_failed_within_a_look_is_a_part_of_the_silence() -> None
     clock = ManualClock(10.0)
     pair = SilentPair(clock)
     head = SimpleNamespace(poll_hz=50.0, watchdog_counts=20, watchdog_s=WATCHDOG_S, resting_poll_s=0.1)
-    session = ServoSession(pair, head, clock, SimpleNamespace())  # type: ignore[arg-type]
+    watch = Watch(pair, head, SimpleNamespace())  # type: ignore[arg-type]
+    session = ServoSession(pair, watch, head, clock)  # type: ignore[arg-type]
     looked: list[float] = []
-    session._watch.look_soon = lambda: looked.append(clock.now_s())  # type: ignore[method-assign]
-    session._watch.look = lambda: None  # type: ignore[method-assign]
+    watch.look_soon = lambda: looked.append(clock.now_s())  # type: ignore[method-assign]
+    watch.look = lambda: None  # type: ignore[method-assign]
     session.look()
     looked.clear()
     clock.advance(0.02)

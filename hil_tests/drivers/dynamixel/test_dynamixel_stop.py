@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from drivers.dynamixel.bus import Bus
 from drivers.dynamixel.head import DynamixelHead
 from drivers.dynamixel.link import Link
 from drivers.dynamixel.pair import Pair
 from drivers.dynamixel.servo import Servo
 from drivers.errors import DriverError, LineLost, NoReply
+from drivers.servo_bus.bus import Bus
 from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.dynamixel_packets import BROADCAST, Instruction
 from drivers.sim.wire.dynamixel_servo import VOLTAGE

@@ -7,25 +7,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drivers.approach import legs_to
-from drivers.dynamixel.registers import RegisterBlock
-from drivers.dynamixel.settings import ServoAxisSettings
 from drivers.errors import BadReply
 from drivers.interfaces import AxisReport, Side
+from drivers.servo_bus.settings import ServoAxisSettings
 
-FASTEST_RAD_PER_S = 15.0  # no servo of the table turns faster
+FASTEST_RAD_PER_S = 15.0  # no servo of the tables turns faster
 LEAP_RAD = 0.05
 STILL_RAD = 5e-4
 STUCK_S = 1.0
 IN_POSITION_BIT, PROFILE_BIT = 0x01, 0x02
-
-
-def motion_blocks(settings: ServoAxisSettings) -> tuple[RegisterBlock, ...]:
-    """Return what is read of a servo all the time, by turns: from its goals to its temperature.
-
-    They differ in length, so that a reply to one of the last questions is none to the next.
-    """
-    names = ("goal_velocity", "profile_acceleration", "profile_velocity")
-    return tuple(RegisterBlock(settings.model.registers, name, "present_temperature") for name in names)
 
 
 @dataclass(frozen=True)
@@ -49,7 +39,7 @@ class ServoSample:
 class Truth:
     """Judges whether a servo can be where a sample says, after where it was before.
 
-    That a sample is of its question is seen by the link (`drivers.dynamixel.counter`).
+    That a sample is of its question is seen by the link.
     """
 
     def __init__(self, name: str, settings: ServoAxisSettings) -> None:
@@ -106,6 +96,7 @@ class AxisCourse:
         self._sampled = False  # since the goal was sent
         self._speed_rad_per_s = 0.0  # of the profile
         self.goal = 0
+        self.sent: int | None = None  # what of the way to the goal was sent; None: all of it
         self.profile: tuple[int, int] | None = None  # acceleration and velocity that were sent, counts
         self.holds = True
 
@@ -124,7 +115,7 @@ class AxisCourse:
         self._legs, self._commanded_rad, self._rest = [], None, None
         self._sample, self._sampled = None, False
         self._side = "unknown"
-        self.goal, self.holds = goal, True
+        self.goal, self.sent, self.holds = goal, None, True
 
     def plan(self, angle_rad: float, speed_rad_per_s: float, acceleration_rad_per_s2: float) -> int:
         """Take a new goal and return the count to send first: the goal, or the start of the last stretch."""
@@ -159,7 +150,24 @@ class AxisCourse:
         here = self._sample.counts if self._sample else legs[0]
         self.goal, self._legs = legs[0], legs[1:]
         self._note_side(self.goal - here)
-        self._rest, self._sampled = None, False
+        self._rest, self._sampled, self.sent = None, False, None
+
+    def stretch(self, lease_s: float, acceleration_rad_per_s2: float) -> int:
+        """Return how much of the way to the goal to send now, as a goal.
+
+        It reaches as far as the axis comes in ``lease_s`` at its profile's speed, and brakes then: so far an
+        axis goes of which nobody is heard any more.
+        """
+        sample, speed = self._sample, self._speed_rad_per_s
+        assert sample is not None
+        reach_rad = speed * lease_s + speed**2 / (2 * acceleration_rad_per_s2)
+        reach = math.ceil(reach_rad / self.settings.model.count_rad) + 1
+        return min(max(self.goal, sample.counts - reach), sample.counts + reach)
+
+    def lent(self, goal: int) -> None:
+        """Note that so much of the way was sent."""
+        self.sent = None if goal == self.goal else goal
+        self._sampled = False
 
     def next_leg(self) -> int | None:
         """Return the next goal to send when the present leg has ended; `begin_leg` when it was sent.
@@ -256,8 +264,9 @@ class AxisCourse:
         if self._sample is None or not self.holds or not self._sampled:
             return ""
         values = self._sample.values
-        if values["goal_position"] != self.goal:
-            return f"{self.name} holds the goal {values['goal_position']} where {self.goal} was sent"
+        sent = self.goal if self.sent is None else self.sent
+        if values["goal_position"] != sent:
+            return f"{self.name} holds the goal {values['goal_position']} where {sent} was sent"
         if self.profile is None:
             return ""
         acceleration = values.get("profile_acceleration", self.profile[0])  # not in every block

@@ -16,8 +16,8 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 from drivers.clock import Clock, SystemClock
-from drivers.dynamixel.port import Overtaken
 from drivers.errors import DriverError, NoReply
+from drivers.servo_bus.port import Overtaken
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")

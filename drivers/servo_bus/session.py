@@ -10,21 +10,115 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from typing import Any, Protocol
 
 from drivers.clock import Clock
-from drivers.dynamixel.models import WATCHDOG_TRIPPED
-from drivers.dynamixel.pair import Pair, ServoAxis
-from drivers.dynamixel.servo import Reboots
-from drivers.dynamixel.settings import DynamixelSettings
-from drivers.dynamixel.watch import GivenUp, Watch
 from drivers.errors import DriverError, LineLost, NoReply, WatchdogTripped
 from drivers.interfaces import Reading
+from drivers.servo_bus.axis import ServoAxis
+from drivers.servo_bus.course import ServoSample
+from drivers.servo_bus.settings import HeadSettings
 
 log = logging.getLogger(__name__)
+Axis = ServoAxis[Any, Any]
 
 ATTEMPTS, PATIENCE_S = 3, 0.15  # of a poll, before it counts as failed
 FAILED_POLLS = 2  # in a row, before the servos are set up anew
 STOP_PATIENCE_S = 0.2  # how long a stop asks for a confirmation that does not come
+
+
+class GivenUp(Exception):
+    """The servos are not as this driver left them, or only silence can stop them: start anew.
+
+    Whoever owns the line closes it and raises ``error`` instead.
+    """
+
+    def __init__(self, error: DriverError) -> None:
+        super().__init__(str(error))
+        self.error = error
+
+
+class ServoPair(Protocol):
+    """Pan and tilt on one open line."""
+
+    @property
+    def axes(self) -> Sequence[ServoAxis[Any, Any]]:
+        """Pan and tilt."""
+        ...
+
+    @property
+    def clock(self) -> Clock:
+        """Of the line's deadlines."""
+        ...
+
+    def samples(self) -> Sequence[ServoSample]:
+        """Return what both servos say about their motion now, pan first. Raises DriverError."""
+        ...
+
+    def sample(self, axis: Any) -> ServoSample:
+        """Return what one servo says about its motion now, asking it alone. Raises DriverError."""
+        ...
+
+    def send_goals(self, goals: Sequence[int], speeds: Sequence[int]) -> None:
+        """Write profile and goal of both axes with one packet. Raises LineLost, BadReply."""
+        ...
+
+    def brake(self) -> None:
+        """Tell each axis that holds to brake, whatever the line or the other axis does. Raises LineLost."""
+        ...
+
+    def close(self) -> None:
+        """Close the line."""
+        ...
+
+
+class SessionWatch(Protocol):
+    """Looks for what servos do by themselves."""
+
+    @property
+    def tripped(self) -> bool:
+        """Whether silence has stopped a motion; latched until `end_trip`."""
+        ...
+
+    def heard_again(self, silence_s: float) -> None:
+        """Note how long nothing was heard of the servos."""
+        ...
+
+    def look(self) -> None:
+        """Look whether they are as they were left. Raises GivenUp, DriverError."""
+        ...
+
+    def look_soon(self) -> None:
+        """Have the next `look` look."""
+        ...
+
+    def note_alert(self, axis: Any) -> None:
+        """A servo reports a fault: brake both axes and say which. Raises GivenUp, DriverError."""
+        ...
+
+    def check_free(self) -> None:
+        """See that nothing forbids a move. Raises HardwareFault, WatchdogTripped."""
+        ...
+
+    def arm(self) -> None:
+        """Have silence stop the servos from now on. Raises DriverError."""
+        ...
+
+    def arm_axis(self, axis: Any) -> None:
+        """The same of one axis. Raises DriverError."""
+        ...
+
+    def has_stopped(self, axis: Any) -> bool:
+        """Return whether silence has stopped an axis, which obeys no goal then. Raises DriverError."""
+        ...
+
+    def end_trip(self) -> None:
+        """Forget a trip: both axes stand where they were stopped."""
+        ...
+
+    def faults(self, now_s: float) -> tuple[str, ...]:
+        """Return what is wrong, in plain words."""
+        ...
 
 
 class ServoSession:
@@ -34,12 +128,12 @@ class ServoSession:
     ----------
     pair
         The servos, ready.
+    watch
+        Of them.
     head
         What the configuration says.
     clock
         Stamps the readings; deadlines run on that of the pair's line.
-    reboots
-        Done to this head, over all its lines.
 
     Attributes
     ----------
@@ -47,13 +141,13 @@ class ServoSession:
         When the servos want to be read again, seconds of the line's clock.
     """
 
-    def __init__(self, pair: Pair, head: DynamixelSettings, clock: Clock, reboots: Reboots) -> None:
+    def __init__(self, pair: ServoPair, watch: SessionWatch, head: HeadSettings, clock: Clock) -> None:
         self.pair = pair
         self.poll_due_s = 0.0
         self._head = head
         self._stamps = clock
-        self._clock = pair.link.clock
-        self._watch = Watch(pair, head, reboots)
+        self._clock = pair.clock
+        self._watch = watch
         self._heard_s = -math.inf
         self._failed_polls = 0
 
@@ -108,8 +202,7 @@ class ServoSession:
             axis.motion.take(sample)
             if sample.alert and not axis.hardware_error:
                 self._watch.note_alert(axis)
-        if self._head.watchdog_counts and silence_s > self._head.watchdog_s / 2:
-            self._watch.look_soon()  # the servos may have stopped by themselves meanwhile
+        self._watch.heard_again(silence_s)
         for axis in self.pair.axes:
             axis.go_on()
         if all(axis.motion.settled(now_s) for axis in self.pair.axes):
@@ -166,19 +259,8 @@ class ServoSession:
     def _send_goals(self, goals: Sequence[int], speeds: Sequence[int]) -> None:
         """Write profile and goal of both axes with one packet and see that they are held."""
         motions = [axis.motion for axis in self.pair.axes]
-        values = []
-        for axis, goal, speed in zip(self.pair.axes, goals, speeds, strict=True):
-            acceleration = axis.servo.profile[0]
-            axis.motion.profile = acceleration, speed
-            values.append(
-                [
-                    ("profile_acceleration", acceleration),
-                    ("profile_velocity", speed),
-                    ("goal_position", goal),
-                ]
-            )
         for _ in range(ATTEMPTS):
-            self.pair.send(values)
+            self.pair.send_goals(goals, speeds)
             self._poll()
             held = [motion.sample.values["goal_position"] for motion in motions if motion.sample]
             wanted = [motion.goal for motion in motions]  # a short first leg may have ended already
@@ -214,9 +296,9 @@ class ServoSession:
         if self._watch.tripped:
             self._watch.end_trip()
 
-    def _stop_each(self) -> dict[ServoAxis, DriverError]:
+    def _stop_each(self) -> dict[Axis, DriverError]:
         """Brake each axis by itself; returns those that did not confirm, and why."""
-        failed: dict[ServoAxis, DriverError] = {}
+        failed: dict[Axis, DriverError] = {}
         try:
             self.pair.brake()
         except LineLost as error:
@@ -235,7 +317,7 @@ class ServoSession:
                     failed.pop(axis, None)
         return failed
 
-    def _confirm(self, axis: ServoAxis) -> None:
+    def _confirm(self, axis: Axis) -> None:
         """See that an axis brakes as it was told, or tell it again; raises as `Pair.samples`, `Servo.set`."""
         motion = axis.motion
         told = motion.goal
@@ -247,7 +329,7 @@ class ServoSession:
             return
         held = sample.values["goal_position"]
         strange = held != told or self._watch.tripped
-        if strange and axis.servo.get("bus_watchdog") == WATCHDOG_TRIPPED:
+        if strange and self._watch.has_stopped(axis):
             axis.take_hold()
             self._watch.arm_axis(axis)
         elif held != told or not motion.braking_well(told, axis.acceleration_rad_per_s2):
@@ -267,7 +349,7 @@ class ServoSession:
         self.pair.close()
 
 
-def _stop_error(pair: Pair, failed: Mapping[ServoAxis, DriverError]) -> DriverError:
+def _stop_error(pair: ServoPair, failed: Mapping[Axis, DriverError]) -> DriverError:
     """What to tell of a stop that not every axis has confirmed."""
     error = next(iter(failed.values()))
     names = " and ".join(axis.servo.name for axis in failed)

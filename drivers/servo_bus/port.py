@@ -1,39 +1,87 @@
 """The line to servos: packets sent, replies gathered until a deadline, what nobody asked for dropped.
 
-Every wait gives way to a stop; a stop itself goes out whatever is under way. `Exchange` asks one servo one
-thing. Every failure names port, servo id, register and instruction, in its sentence and in ``detail``. No
-value is ever made up: what a servo did not say is an error.
+Every wait gives way to a stop; a stop itself goes out whatever is under way. What a packet is, a
+`PacketFormat` knows.
 """
 
 from __future__ import annotations
 
 import contextlib
-import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Protocol
 
 from drivers.clock import Clock, SystemClock
-from drivers.dynamixel.packets import (
-    ERROR_WORDS,
-    PING,
-    READ,
-    REBOOT,
-    WRITE,
-    StatusPacket,
-    instruction_packet,
-    take_status,
-)
-from drivers.errors import BadReply, LineLost, NoReply, Refused
+from drivers.errors import BadReply
 from drivers.serial_line import OpenLine, SerialLine
-
-log = logging.getLogger(__name__)
 
 QUIET_S = 0.02  # a USB adapter may hold bytes back for 16 ms
 LONGEST_DRAIN_S = 0.3
 SLICE_S = 0.005  # how soon a wait sees that it has to give way
 REPLY_UNDER_WAY_S = 0.01  # how long it then lets a reply come in that would collide with what is sent next
 
-STATUS_BYTES = 11  # of a reply without data
-INSTRUCTION_WORDS = {PING: "ping", READ: "read", WRITE: "write", REBOOT: "reboot"}
+
+class Status(Protocol):
+    """A reply as a servo gave it."""
+
+    @property
+    def servo_id(self) -> int:
+        """Who speaks."""
+        ...
+
+    @property
+    def data(self) -> bytes:
+        """What it was asked for."""
+        ...
+
+    @property
+    def error(self) -> int:
+        """Its error byte."""
+        ...
+
+    @property
+    def refused(self) -> int:
+        """Why it did not do what it was asked to; 0 if it did."""
+        ...
+
+    @property
+    def alert(self) -> bool:
+        """Whether it reports a fault of its own."""
+        ...
+
+
+class Take(Protocol):
+    """Takes packets out of what came in."""
+
+    def __call__(self, buffer: bytearray, *, at_end: bool = False) -> Status | None:
+        """Return the next reply and drop it and all before it; ``at_end`` if no more will come."""
+        ...
+
+
+@dataclass(frozen=True)
+class PacketFormat:
+    """What the packets of a family of servos look like.
+
+    Attributes
+    ----------
+    take
+        Finds replies.
+    packet
+        Makes an instruction of a servo's id, the instruction and its parameters.
+    read_parameters
+        Those of a read, of an address and a length.
+    status_bytes
+        The size of a reply without data.
+    words, refusals
+        Of instructions and of refusals, for messages.
+    """
+
+    take: Take
+    packet: Callable[[int, int, bytes], bytes]
+    read_parameters: Callable[[int, int], bytes]
+    status_bytes: int
+    words: Mapping[int, str]
+    refusals: Mapping[int, str]
 
 
 class Overtaken(Exception):
@@ -56,6 +104,8 @@ class Port:
         As of `SerialLine`.
     reply_timeout_s
         How long a reply may take beyond its time on the wire.
+    take
+        Finds replies in what comes in.
     urgent
         Says that something urgent waits for the line: then nothing more is sent and no wait goes on.
     clock
@@ -73,6 +123,8 @@ class Port:
         Until when `receive` waits, seconds of the clock.
     received_bytes
         In all, since the line was opened.
+    echoes
+        Whether the adapter gives back what is sent (half duplex): then that is dropped before a reply.
 
     Raises
     ------
@@ -87,6 +139,7 @@ class Port:
         name: str,
         baud: int,
         reply_timeout_s: float,
+        take: Take,
         urgent: Callable[[], bool] = lambda: False,
         *,
         clock: Clock | None = None,
@@ -98,6 +151,9 @@ class Port:
         self.suspect = False
         self.deadline_s = 0.0
         self.received_bytes = 0
+        self.echoes = False
+        self._echo = b""
+        self._take = take
         self._urgent = urgent
         self._buffer = bytearray()
         self._open_line = open_line
@@ -152,6 +208,7 @@ class Port:
         sent_s = self.clock.now_s()
         if self._urgent():
             raise Overtaken
+        self._echo = packet if self.echoes else b""
         self._line.write(packet)
         wire_s = (len(packet) + reply_bytes) * self._line.byte_s
         self.deadline_s = self.clock.now_s() + self.reply_timeout_s + wire_s
@@ -161,19 +218,33 @@ class Port:
         """Send bytes whatever else wants the line or is under way on it. Raises LineLost."""
         self._line.write(data)
 
-    def receive(self, *, fast: bool = False) -> StatusPacket | None:
+    def receive(self, take: Take | None = None) -> Status | None:
         """Return the next status packet, or None when the deadline passes first.
 
-        After a None the port counts as suspect: the reply may still come. Raises LineLost.
+        ``take`` finds it where it looks otherwise. After a None the port counts as suspect: the reply may
+        still come. Raises LineLost.
         """
+        take = take or self._take
         while True:
-            status = take_status(self._buffer, fast=fast)
+            status = take(self._buffer) if self._past_echo() else None
             if status is not None:
                 return status
             if not self._fetch(max(0.0, self.deadline_s - self.clock.now_s())):
-                status = take_status(self._buffer, at_end=True, fast=fast)
+                status = take(self._buffer, at_end=True)
                 self.suspect = self.suspect or status is None
                 return status
+
+    def _past_echo(self) -> bool:
+        """Drop the echo of what was sent; returns whether what is in the buffer is more than that."""
+        echo = self._echo
+        if not echo:
+            return True
+        if len(self._buffer) < len(echo):
+            return not echo.startswith(self._buffer)
+        if self._buffer.startswith(echo):
+            del self._buffer[: len(echo)]
+        self._echo = b""
+        return True
 
     def drain(self, quiet_s: float = QUIET_S, longest_s: float = LONGEST_DRAIN_S) -> None:
         """Read and drop everything until the line was quiet for ``quiet_s``.
@@ -215,92 +286,3 @@ class Port:
             if give_way_s is not None and now_s >= give_way_s:
                 self.suspect = True
                 raise Overtaken
-
-
-class Exchange:
-    """Asking one servo at a time; for the thread that has the port.
-
-    Parameters
-    ----------
-    port
-        Open. `Overtaken` may come from whatever asks.
-    """
-
-    def __init__(self, port: Port) -> None:
-        self.port = port
-
-    def ask(
-        self, servo_id: int, instruction: int, parameters: bytes, length: int, register: str = ""
-    ) -> StatusPacket:
-        """Send an instruction to one servo and return its reply of ``length`` bytes.
-
-        ``register`` is for messages. Raises NoReply, BadReply, Refused, LineLost.
-        """
-        word = INSTRUCTION_WORDS[instruction]
-        packet = instruction_packet(servo_id, instruction, parameters)
-        try:
-            self.port.send(packet, STATUS_BYTES + length)
-            while (status := self.port.receive()) is not None:
-                if status.servo_id != servo_id or not (status.refused or len(status.data) == length):
-                    self.stray(status)
-                elif status.refused:
-                    raise self.refusal(status, word, register)
-                else:
-                    return status
-        except LineLost as error:
-            raise self.placed(error, [servo_id], word, register) from error
-        raise self.silence(servo_id, word, register)
-
-    def read(self, servo_id: int, address: int, length: int, register: str) -> bytes:
-        """Return bytes of one servo's table, as they seem to be; raises as `ask`."""
-        asked = address.to_bytes(2, "little") + length.to_bytes(2, "little")
-        return self.ask(servo_id, READ, asked, length, register).data
-
-    def quiet(self, quiet_s: float) -> None:
-        """Drop what comes until nothing has come for ``quiet_s``: late replies. Raises LineLost, BadReply."""
-        self.port.drain(quiet_s, 1.0)
-
-    def stray(self, status: StatusPacket) -> None:
-        """Note a reply to another question; the line is listened to until quiet before the next one."""
-        self.port.suspect = True
-        log.debug("%s: dropped a reply of id %d that nobody waits for", self.port.name, status.servo_id)
-
-    def silence(self, servo_id: int, word: str, register: str) -> NoReply:
-        """Return the error of a servo that did not answer."""
-        self.port.suspect = True
-        return NoReply(
-            f"servo {servo_id} on {self.port.name} at {self.port.baud} baud gave no usable answer to "
-            f"{_what(word, register)} within {1000 * self.port.reply_timeout_s:g} ms",
-            detail=self.where(servo_id, word, register),
-        )
-
-    def refusal(self, status: StatusPacket, word: str, register: str) -> Refused:
-        """Return the error of a servo that refused."""
-        reason = ERROR_WORDS.get(status.refused, f"unknown error {status.refused}")
-        alert = ", and it reports a hardware error" if status.alert else ""
-        return Refused(
-            f"servo {status.servo_id} on {self.port.name} refused the {_what(word, register)}: "
-            f"{reason}{alert}",
-            detail={**self.where(status.servo_id, word, register), "error": status.error},
-        )
-
-    def placed(self, error: LineLost, servo_ids: Sequence[int], word: str, register: str = "") -> LineLost:
-        """Return the same loss, saying what was being asked."""
-        servos = " and ".join(str(servo_id) for servo_id in servo_ids)
-        where = self.where(servo_ids[0], word, register)
-        words = f"{error} during {_what(word, register)} of servo {servos}"
-        return LineLost(words, detail={**where, **error.detail})
-
-    def where(self, servo_id: int, word: str, register: str) -> dict[str, object]:
-        """Return the place of an error, for programs."""
-        return {
-            "port": self.port.name,
-            "baud": self.port.baud,
-            "servo_id": servo_id,
-            "register": register,
-            "instruction": word,
-        }
-
-
-def _what(word: str, register: str) -> str:
-    return f"{word} of {register}" if register else word

@@ -1,0 +1,247 @@
+"""What options say of an axis that a servo turns, read strictly; a family of servos adds its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+from drivers.approach import APPROACHES, ApproachedAxis
+from drivers.errors import BadOptions
+from drivers.options import OptionReader
+
+Rest = Literal["hold", "torque_off"]
+
+STANDS_WITHIN_S = 0.5  # after this process has died: the last poll's age, the patience, and braking
+RESTING_POLL_S = 0.1  # of servos that stand: an idle computer stays idle
+LEAST_SLACK_COUNTS = 3
+
+
+class CountedModel(Protocol):
+    """A kind of servo, by its counts."""
+
+    @property
+    def name(self) -> str:
+        """As its maker calls it."""
+        ...
+
+    @property
+    def low_count(self) -> int:
+        """The lowest position limit."""
+        ...
+
+    @property
+    def high_count(self) -> int:
+        """The highest position limit."""
+        ...
+
+    @property
+    def centre_count(self) -> int:
+        """Where its own angle is zero."""
+        ...
+
+    @property
+    def count_rad(self) -> float:
+        """One count."""
+        ...
+
+    @property
+    def velocity_unit_rad_per_s(self) -> float:
+        """One count of velocity."""
+        ...
+
+    @property
+    def acceleration_unit_rad_per_s2(self) -> float:
+        """One count of acceleration."""
+        ...
+
+    @property
+    def current_unit_A(self) -> float | None:
+        """One count of current; None where it measures none."""
+        ...
+
+    @property
+    def backlash_rad(self) -> float | None:
+        """As the maker states it; None where nothing is stated."""
+        ...
+
+
+class HeadSettings(Protocol):
+    """What a head of two servos is made of, whatever their family."""
+
+    @property
+    def port(self) -> str: ...
+    @property
+    def pan(self) -> ServoAxisSettings: ...
+    @property
+    def tilt(self) -> ServoAxisSettings: ...
+    @property
+    def speed_rad_per_s(self) -> float: ...
+    @property
+    def acceleration_rad_per_s2(self) -> float: ...
+    @property
+    def poll_hz(self) -> float: ...
+    @property
+    def settle_s(self) -> float: ...
+    @property
+    def resting_poll_s(self) -> float:
+        """How often servos that stand are read, seconds."""
+        ...
+
+    @property
+    def silence_s(self) -> float:
+        """How long nothing may be sent so that both axes have stopped by themselves; 0 if they never do."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServoAxisSettings(ApproachedAxis):
+    """One axis of the head, as of `ApproachedAxis`; its limits are also the servo's position limits.
+
+    Attributes
+    ----------
+    servo_id, model
+        Which servo.
+    zero_counts
+        The servo's position where the axis is at zero.
+    at_stop, at_close
+        Whether the servo then holds, or its torque is switched off (a tilt axis may fall).
+    settle_rad
+        How near to its goal the axis counts as in position.
+    """
+
+    servo_id: int
+    model: CountedModel
+    zero_counts: int
+    at_stop: Rest = "hold"
+    at_close: Rest = "hold"
+    settle_rad: float = 0.01
+
+    def counts(self, angle_rad: float) -> int:
+        """Return the nearest count to an angle."""
+        return self.zero_counts + round(self.sign * angle_rad / self.model.count_rad)
+
+    def angle_rad(self, counts: float) -> float:
+        """Return the angle of a position."""
+        return self.sign * (counts - self.zero_counts) * self.model.count_rad
+
+    @property
+    def limit_counts(self) -> tuple[int, int]:
+        """The limits in counts, lower first; rounded inwards."""
+        ends = sorted(self.zero_counts + self.sign * a / self.model.count_rad for a in self.limits_rad)
+        return math.ceil(ends[0] - 1e-6), math.floor(ends[1] + 1e-6)
+
+    @property
+    def slack_counts(self) -> int:
+        """How far beyond a limit an axis that was sent to it may stand: it droops, or dithers."""
+        return max(LEAST_SLACK_COUNTS, math.ceil(self.settle_rad / self.model.count_rad))
+
+    def acceleration_counts(self, acceleration_rad_per_s2: float) -> int:
+        """Return a profile acceleration, not below the one given: braking takes no longer than promised."""
+        return max(1, math.ceil(acceleration_rad_per_s2 / self.model.acceleration_unit_rad_per_s2 - 1e-6))
+
+    def velocity_counts(self, speed_rad_per_s: float) -> int:
+        """Return a profile velocity, not above the speed; never 0, which would mean as fast as it can."""
+        return max(1, math.floor(speed_rad_per_s / self.model.velocity_unit_rad_per_s + 1e-9))
+
+
+AXIS_KEYS = (
+    "id", "model", "zero_counts", "sign", "limits_rad", "approach", "approach_rad", "gravity_turnover_rad",
+    "at_stop", "at_close", "settle_rad",
+)  # fmt: skip
+"""What the options of an axis hold, whatever the servo."""
+
+
+def axis_values(
+    options: OptionReader, name: str, model_named: Callable[[str], CountedModel], more: tuple[str, ...] = ()
+) -> tuple[OptionReader, Mapping[str, Any]]:
+    """Return the reader of an axis' options, and the values of `AXIS_KEYS` as `ServoAxisSettings` has them.
+
+    Parameters
+    ----------
+    options
+        Of the head.
+    name
+        ``pan`` or ``tilt``.
+    model_named
+        Finds a model; raises BadOptions.
+    more
+        Keys that the family of servos has beside these.
+
+    Raises
+    ------
+    BadOptions
+        For an unknown or missing key or a value that cannot be.
+    """
+    expected = "a mapping with id, model, zero_counts ..."
+    read = options.section(name, expected, (*AXIS_KEYS, *more), ("id", "model", "limits_rad"))
+    try:
+        model = model_named(read.values["model"])
+    except BadOptions as error:
+        raise read.refused("model", f": {error}") from None
+    limits_rad = read.pair("limits_rad", "[low, high] in radians")
+    if not limits_rad[0] < limits_rad[1]:
+        raise read.bad("limits_rad", "[low, high] with low below high")
+    return read, {
+        "servo_id": read.whole("id", 1, 0, 252),
+        "model": model,
+        "zero_counts": read.whole("zero_counts", model.centre_count, -(2**31), 2**31 - 1),
+        "limits_rad": limits_rad,
+        "sign": read.one_of("sign", 1, (1, -1)),
+        "approach": read.one_of("approach", "none", APPROACHES),
+        "approach_rad": read.number("approach_rad", 0.0, 0.0, 0.5),
+        "gravity_turnover_rad": read.number("gravity_turnover_rad", math.pi / 2, -math.pi, math.pi),
+        "at_stop": read.one_of("at_stop", "hold", ("hold", "torque_off")),
+        "at_close": read.one_of("at_close", "hold", ("hold", "torque_off")),
+        "settle_rad": read.number("settle_rad", max(0.001, 3 * model.count_rad), model.count_rad, 0.1),
+    }
+
+
+def check_axis(read: OptionReader, axis: ServoAxisSettings) -> None:
+    """Refuse limits that the servo cannot hold, and an approach that takes no backlash up."""
+    _check_reach(read, axis)
+    _check_approach(read, axis)
+
+
+def checked_pair(pan: ServoAxisSettings, tilt: ServoAxisSettings) -> None:
+    """Refuse two servos of one id. Raises BadOptions."""
+    if pan.servo_id == tilt.servo_id:
+        raise BadOptions(f"options.pan.id and options.tilt.id are both {pan.servo_id}, expected two ids")
+
+
+def _check_reach(read: OptionReader, axis: ServoAxisSettings) -> None:
+    """Refuse limits that the servo cannot hold."""
+    model = axis.model
+    low, high = axis.limit_counts
+    if low >= high:
+        raise read.refused(
+            "limits_rad",
+            f" [{axis.limits_rad[0]:g}, {axis.limits_rad[1]:g}] hold no two counts of a {model.name}, whose "
+            f"count is {model.count_rad:.2g} rad; expected limits further apart",
+        )
+    if low < model.low_count or high > model.high_count:
+        reach = sorted((axis.angle_rad(model.low_count), axis.angle_rad(model.high_count)))
+        raise read.refused(
+            "limits_rad",
+            f" are the servo's counts {low} to {high}, but a {model.name} in position mode holds "
+            f"{model.low_count} to {model.high_count}, which with zero_counts {axis.zero_counts} is "
+            f"{reach[0]:.4f} to {reach[1]:.4f} rad; mount the horn so that the range does not cross the seam",
+        )
+
+
+def _check_approach(read: OptionReader, axis: ServoAxisSettings) -> None:
+    """Refuse an approach that takes no backlash up."""
+    if (axis.approach == "none") != (axis.approach_rad == 0.0):
+        raise read.refused(
+            "approach",
+            f" is {axis.approach!r} with approach_rad {axis.approach_rad:g}; expected a stretch above zero "
+            "with a side, and neither or both",
+        )
+    least = axis.model.backlash_rad or 0.0
+    if axis.approach != "none" and axis.approach_rad <= least:
+        raise read.refused(
+            "approach_rad",
+            f" {axis.approach_rad:g} rad does not take up the backlash of a {axis.model.name}, "
+            f"{least:.4f} rad; expected more",
+        )
