@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import email
 import json
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -15,8 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from markdown_it import MarkdownIt
 
 from hil_tests.waiting import until
+from tools import dist
 
 TIMEOUT_S = 600.0
 WHOLE = pytest.mark.long(1, "the whole demo and a whole project on the installed package")
@@ -34,16 +38,19 @@ def run(*command: str | Path, timeout_s: float, **options: object) -> subprocess
 
 
 @pytest.fixture(scope="module")
-def wheel(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel, built from the sdist, which is built from this checkout."""
-    out = tmp_path_factory.mktemp("dist")
-    run(
-        sys.executable, "-m", "build", "--no-isolation", "--outdir", out, repository,
-        timeout_s=TIMEOUT_S,
-    )  # fmt: skip
-    assert len(list(out.glob("mastctl-*.tar.gz"))) == 1
-    (built,) = out.glob("mastctl-*.whl")
-    return built
+def built(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The sdist, the wheel that was built from it, and the client's wheel, from this checkout."""
+    return dist.build(tmp_path_factory.mktemp("dist"))
+
+
+@pytest.fixture(scope="module")
+def wheel(built: list[Path]) -> Path:
+    return built[1]
+
+
+@pytest.fixture(scope="module")
+def client_wheel(built: list[Path]) -> Path:
+    return built[2]
 
 
 def test_wheel_holds_three_packages_and_the_configs(wheel: Path) -> None:
@@ -56,6 +63,79 @@ def test_wheel_holds_three_packages_and_the_configs(wheel: Path) -> None:
     assert templates <= set(names)
 
 
+def readme_of(wheel: Path) -> str:
+    """What an index of packages shows of a wheel."""
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (one for one in archive.namelist() if one.endswith(".dist-info/METADATA"))
+        return str(email.message_from_bytes(archive.read(name)).get_payload())
+
+
+def test_an_index_is_given_no_link_that_works_in_a_checkout_only(built: list[Path], repository: Path) -> None:
+    readme = (repository / "README.md").read_text()
+    at = dist.for_an_index(readme, "https://example.org/mastctl/", "v1")
+    assert "https://example.org/mastctl/raw/v1/docs/img/page.jpg" in targets(at)
+    assert "https://example.org/mastctl/blob/v1/docs/index.md" in targets(at)
+    assert len(targets(at)) == len(targets(readme)) > 10
+    for page in (at, *map(readme_of, built[1:])):
+        assert [target for target in targets(page) if not target.startswith("https://")] == []
+    assert "[The suite]" not in readme_of(built[1]) and "The suite says" in readme_of(built[1])
+
+
+def targets(readme: str) -> list[str]:
+    """Where its links and pictures lead, by a parser of Markdown."""
+    flat = [token for block in MarkdownIt().parse(readme) for token in (block, *(block.children or ()))]
+    found = [token.attrs.get("href") or token.attrs.get("src") for token in flat]
+    return [str(target) for target in found if target]
+
+
+CLIENT_ALONE = """
+import importlib, pkgutil, sys
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {refused}:
+            raise ImportError(f"{{name}} is not there")
+
+sys.meta_path.insert(0, Refuse())
+sys.path.insert(0, sys.argv[1])
+import mastctl
+for module in pkgutil.walk_packages(mastctl.__path__, "mastctl."):
+    importlib.import_module(module.name)
+    assert sys.modules[module.name].__file__.startswith(sys.argv[1]), module.name
+    print(module.name)
+"""
+
+
+def test_the_client_alone_needs_nothing_of_the_daemon(client_wheel: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(client_wheel) as archive:
+        archive.extractall(tmp_path)
+    (path_file,) = tmp_path.glob("*.pth")
+    apart = tmp_path / path_file.read_text().strip()
+    assert {one.name for one in tmp_path.iterdir() if not one.name.endswith(".dist-info")} == {
+        path_file.name, apart.name,
+    }  # fmt: skip
+    refused = {"calib", "drivers", "numpy", "cv2", "scipy", "yaml", "pydantic", "fastapi", "serial"}
+    done = run(sys.executable, "-c", CLIENT_ALONE.format(refused=refused), apart, timeout_s=TIMEOUT_S)
+    assert {"mastctl.client.client", "mastctl.client.snapshot", "mastctl.answers.status"} <= set(
+        done.stdout.split()
+    )
+
+
+@pytest.mark.long(3, "builds everything once more")
+def test_the_same_checkout_gives_the_same_bytes(
+    built: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TZ", "Pacific/Auckland")
+    before = os.umask(0o077)
+    try:
+        again = dist.build(tmp_path)
+    finally:
+        os.umask(before)
+    assert [file.name for file in again] == [file.name for file in built]
+    for one, other in zip(built, again, strict=True):
+        assert one.read_bytes() == other.read_bytes(), one.name
+
+
 @dataclass(frozen=True)
 class Installed:
     """An environment with nothing but the wheel and pytest in it."""
@@ -66,6 +146,14 @@ class Installed:
     def program(self, name: str) -> Path:
         return self.folder / "bin" / name
 
+    def install(self, *what: str | Path) -> None:
+        """Install from the folder of wheels, without a network."""
+        run(
+            self.program("pip"), "install", "-q", "--no-index", "--find-links",
+            Path(sys.prefix) / "wheels", *what,
+            timeout_s=TIMEOUT_S, env=self.environ,
+        )  # fmt: skip
+
     def processes(self) -> list[str]:
         """What runs from it."""
         lines = []
@@ -75,26 +163,28 @@ class Installed:
         return [line for line in lines if str(self.folder) in line]
 
 
-@pytest.fixture(scope="module")
-def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
-    """The wheel, installed from a folder of wheels into an environment of its own."""
+def environment(folder: Path, *what: str | Path) -> Installed:
+    """Make an environment and install from the folder of wheels into it."""
     wheels = Path(sys.prefix) / "wheels"
     if not wheels.is_dir():
         pytest.skip(f"no folder of wheels at {wheels}: tools/setup makes it")
-    environment = tmp_path_factory.mktemp("installed") / "environment"
-    run(sys.executable, "-m", "venv", environment, timeout_s=TIMEOUT_S)
+    run(sys.executable, "-m", "venv", folder, timeout_s=TIMEOUT_S)
     clean = {
         key: value
         for key, value in os.environ.items()
         if not key.startswith(("PYTHON", "PYTEST", "PIP_", "VIRTUAL_"))
     }
     clean["PIP_DISABLE_PIP_VERSION_CHECK"] = "1"
-    run(
-        environment / "bin" / "pip", "install", "-q", "--no-compile", "--no-index", "--find-links", wheels,
-        f"{wheel}[sim,report]", "pytest", "pytest-xdist",
-        timeout_s=TIMEOUT_S, env=clean,
-    )  # fmt: skip
-    return Installed(environment, clean)
+    made = Installed(folder, clean)
+    made.install(*what)
+    return made
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    """The wheel, installed into an environment of its own."""
+    folder = tmp_path_factory.mktemp("installed") / "environment"
+    return environment(folder, "--no-compile", f"{wheel}[sim,report]", "pytest", "pytest-xdist")
 
 
 @pytest.mark.long(2, "an environment of its own from the built wheel")
@@ -136,17 +226,78 @@ def assert_report(path: Path) -> None:
 
 
 @WHOLE
-def test_installed_wheel_runs_the_demo_from_another_folder(installed: Installed, tmp_path: Path) -> None:
+def test_a_first_contact_costs_what_two_processors_do_in_a_minute(wheel: Path, tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    done = run(
-        installed.program("mastctl"), "demo", "--targets", "1", "--out", "demo", "--json",
-        timeout_s=TIMEOUT_S, env=installed.environ, cwd=elsewhere,
-    )  # fmt: skip
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    there = environment(tmp_path / "environment", f"{wheel}[sim]")
+    clean = {**there.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}  # all is compiled anew
+    clean.pop("NUMBA_CACHE_DIR", None)
+    done = run(there.program("mastctl"), "demo", "--json", timeout_s=TIMEOUT_S, env=clean, cwd=elsewhere)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
     distances = json.loads(done.stdout)["distances"]
-    assert [row["distance_m"] for row in distances] == [10.0, 6.0, 2.0]
-    assert all(row["targets"] == 1 for row in distances)
-    assert_report(elsewhere / "demo" / "report.html")
+    assert [(row["distance_m"], row["targets"], row["failed"]) for row in distances] == [
+        (10.0, 3, 0), (6.0, 3, 0), (2.0, 3, 0),
+    ]  # fmt: skip
+    assert (elsewhere / "mastctl_demo" / "report.html").read_text().endswith("</html>\n")
+    processor_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    assert processor_s < 2 * 60.0
+
+
+CLIENT_ASKS = """
+import sys
+from mastctl.client import Client
+with Client(sys.argv[1]) as client:
+    shot = client.snapshot("navcam_left")
+    assert shot.data.startswith(b"\\x89PNG")
+    try:
+        shot.image
+    except ImportError as error:
+        print(error)
+    record = client.wait(client.point(pixel=("navcam_left", shot.frame_id, 400, 300)))
+    print(record["state"], max(map(abs, record["residual_px"])) < 1.0)
+    print(client.stop()["stopped"] is not None)
+"""
+
+
+@pytest.mark.long(2, "an environment of its own from the built client, and a daemon")
+def test_the_client_by_itself_takes_a_picture_points_and_stops(
+    client_wheel: Path, mast_daemon: str, tmp_path: Path
+) -> None:
+    alone = environment(tmp_path / "environment", client_wheel)
+    packages = json.loads(
+        run(alone.program("pip"), "list", "--format", "json", timeout_s=TIMEOUT_S, env=alone.environ).stdout
+    )
+    assert {one["name"] for one in packages} - {"pip", "setuptools"} == {
+        "mastctl-client", "httpx", "httpcore", "h11", "anyio", "idna", "certifi", "annotated-types",
+        "typing_extensions",
+    }  # fmt: skip
+    said = run(
+        alone.program("python"), "-c", CLIENT_ASKS, mast_daemon,
+        timeout_s=TIMEOUT_S, env=alone.environ, cwd=tmp_path,
+    ).stdout.splitlines()  # fmt: skip
+    assert "pip install opencv-python-headless" in said[0]
+    assert said[1:] == ["done True", "True"]
+
+
+@pytest.mark.long(2, "an environment of its own with both distributions")
+def test_where_both_are_installed_that_of_mastctl_comes_first_and_either_may_leave(
+    wheel: Path, client_wheel: Path, tmp_path: Path
+) -> None:
+    both = environment(tmp_path / "environment", "--no-compile", "--no-deps", wheel, client_wheel)
+    both.install("--no-compile", "httpx", "annotated-types", "typing-extensions")
+
+    def place() -> Path:
+        words = "import mastctl.client; print(mastctl.client.__file__)"
+        done = run(both.program("python"), "-c", words, timeout_s=TIMEOUT_S, env=both.environ, cwd=tmp_path)
+        return Path(done.stdout.strip()).parents[2]
+
+    assert place().name == "site-packages"
+    run(both.program("pip"), "uninstall", "-q", "-y", "mastctl", timeout_s=TIMEOUT_S, env=both.environ)
+    assert place().name == "mastctl_client"
+    both.install("--no-compile", "--no-deps", wheel)
+    run(both.program("pip"), "uninstall", "-q", "-y", "mastctl-client", timeout_s=TIMEOUT_S, env=both.environ)
+    assert place().name == "site-packages"
 
 
 @WHOLE

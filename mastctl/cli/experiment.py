@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from mastctl.experiment.pointing import ClickTruth, PointingExperiment, TargetRecord
 
 DEFAULT_TARGETS = 10
+DEMO_TARGETS = 3  # a first contact: a minute with installation and compiling
 DEFAULT_DISTANCES_M = (10.0, 6.0, 2.0)
 HEADS = ("ptu_d46_70", "dynamixel_x", "ph42")
 
@@ -55,7 +56,7 @@ def add_commands(subparsers: Any) -> None:
     pointing.set_defaults(run=run_pointing)
 
     demo = subparsers.add_parser("demo", help="the pointing experiment on the packaged simulated rover")
-    _add_common(demo, out_help="folder for the report (default mastctl_demo)")
+    _add_common(demo, "folder for the report (default mastctl_demo)", DEMO_TARGETS)
     demo.add_argument(
         "--config", type=Path, metavar="FILE",
         help="a simulated rig of one's own, with its own seed; --seed then chooses views and pixels only",
@@ -83,14 +84,14 @@ def _speed(text: str) -> float | str:
         return text
 
 
-def _add_common(parser: argparse.ArgumentParser, out_help: str) -> None:
+def _add_common(parser: argparse.ArgumentParser, out_help: str, targets: int = DEFAULT_TARGETS) -> None:
     """Options that both commands take."""
     parser.add_argument(
         "--targets",
         type=at_least_one,
-        default=DEFAULT_TARGETS,
+        default=targets,
         metavar="N",
-        help="targets at each distance (default 10)",
+        help=f"targets at each distance (default {targets})",
     )
     add_run_options(parser, "chooses views and pixels", out_help)
 

@@ -6,7 +6,7 @@ A question is a coroutine over a `mastctl.client.connection.DaemonConnection`, w
 from __future__ import annotations
 
 from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import Any, Literal, cast
 from urllib.parse import quote
 
 from mastctl.answers import (
@@ -31,9 +31,7 @@ from mastctl.client.jog import ANSWER_S, Jog
 from mastctl.client.keeping_calls import KeepingCalls
 from mastctl.client.lease import LeaseCalls
 from mastctl.client.simulation_calls import SimulationCalls
-
-if TYPE_CHECKING:
-    from mastctl.client.snapshot import Snapshot
+from mastctl.client.snapshot import Snapshot, read_snapshot
 
 ENDED = ("done", "failed", "stopped")
 
@@ -342,8 +340,6 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
         format
             ``png`` is lossless.
         """
-        from mastctl.client.snapshot import read_snapshot  # the image library, only where there is an image
-
         query: dict[str, str] = {"format": format}
         if frame_id is None:
             query["fresh"] = "true" if fresh else "false"
