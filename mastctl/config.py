@@ -43,10 +43,10 @@ _FULL_TURN_RAD = 6.2832
 _FASTEST_RAD_PER_S = 100.0
 _STEEPEST_RAD_PER_S2 = 1000.0
 _WIDEST_MARGIN_RAD = 0.5
-_HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,252})|[0-9A-Fa-f:]*:[0-9A-Fa-f:.]*")
+HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,252})|[0-9A-Fa-f:]*:[0-9A-Fa-f:.]*")
 _MOST_MB = 1e7
 _LATEST_REPEAT_S = 60.0
-_LONGEST_SOCKET_PATH = 100  # bytes; the kernel's own bound is 108
+LONGEST_SOCKET_PATH = 100  # bytes; the kernel's own bound is 108
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ def _camera(top: Section, name: str) -> DeviceSettings:
     """Read ``{driver: NAME, options: {...}, offset_s: SECONDS}``."""
     holder = top.mapping("cameras")[name]
     section = Section(top.path, f"cameras.{name}", holder, ("driver",), ("options", "offset_s"))
-    offset_s = _number_between(section, "offset_s", 0.0, -MOST_OFFSET_S, MOST_OFFSET_S)
+    offset_s = section.between("offset_s", -MOST_OFFSET_S, MOST_OFFSET_S, 0.0)
     return DeviceSettings(section.text("driver"), section.free("options"), offset_s)
 
 
@@ -230,8 +230,8 @@ def parse_address(text: str) -> Listen:
         In words that say what is expected.
     """
     if "/" in text:
-        if len(text.encode()) > _LONGEST_SOCKET_PATH:
-            raise ValueError(f"'{text[:40]}...' is longer than {_LONGEST_SOCKET_PATH} bytes, a socket's most")
+        if len(text.encode()) > LONGEST_SOCKET_PATH:
+            raise ValueError(f"'{text[:40]}...' is longer than {LONGEST_SOCKET_PATH} bytes, a socket's most")
         return Listen(socket=Path(text).absolute())
     host, colon, port = text.rpartition(":")
     if host.startswith("[") and host.endswith("]"):
@@ -254,8 +254,8 @@ def _listen(top: Section, folder: Path) -> Listen:
             if other in section:
                 raise section.bad(other, "stands beside 'socket'; one or the other is expected")
         socket = folder / section.text("socket")
-        if len(str(socket).encode()) > _LONGEST_SOCKET_PATH:
-            raise section.bad("socket", f"{socket} is longer than {_LONGEST_SOCKET_PATH} bytes")
+        if len(str(socket).encode()) > LONGEST_SOCKET_PATH:
+            raise section.bad("socket", f"{socket} is longer than {LONGEST_SOCKET_PATH} bytes")
         return Listen(socket=socket, hosts=hosts)
     host = section.text("host") if "host" in section else DEFAULT_HOST
     port = section.integer("port", 0, 65535) if "port" in section else DEFAULT_PORT
@@ -272,7 +272,7 @@ def _hosts(section: Section) -> tuple[str, ...]:
     if not isinstance(named, list) or not all(isinstance(one, str) for one in named):
         raise section.bad("hosts", "a list of names such as rover.local is expected")
     for name in named:
-        if not _HOST_NAME.fullmatch(name):
+        if not HOST_NAME.fullmatch(name):
             raise section.bad("hosts", f"'{name[:60]}' where a name without scheme and port is expected")
     return tuple(name.lower() for name in named)
 
@@ -280,7 +280,7 @@ def _hosts(section: Section) -> tuple[str, ...]:
 def _limits(top: Section) -> Limits:
     """Read the soft limits."""
     section = _limits_section(top)
-    margin_rad = _number_between(section, "margin_rad", 0.0, 0.0, _WIDEST_MARGIN_RAD)
+    margin_rad = section.between("margin_rad", 0.0, _WIDEST_MARGIN_RAD, 0.0)
     pan_rad, tilt_rad = (_within(section, key, margin_rad) for key in ("pan_rad", "tilt_rad"))
     keep_out = tuple(_box(section, name) for name in section.mapping("keep_out"))
     if keep_out and margin_rad == 0.0:
@@ -289,9 +289,9 @@ def _limits(top: Section) -> Limits:
     return Limits(
         pan_rad,
         tilt_rad,
-        _above_zero(section, "speed_rad_per_s", _FASTEST_RAD_PER_S),
+        section.positive("speed_rad_per_s", _FASTEST_RAD_PER_S),
         margin_rad,
-        _above_zero(section, "acceleration_rad_per_s2", _STEEPEST_RAD_PER_S2)
+        section.positive("acceleration_rad_per_s2", _STEEPEST_RAD_PER_S2)
         if "acceleration_rad_per_s2" in section
         else None,
         keep_out,
@@ -305,7 +305,7 @@ def _limits_section(top: Section) -> Section:
 
 def _within(section: Section, key: str, margin_rad: float) -> tuple[float, float]:
     """Read an axis's range and leave the margin at both ends."""
-    low, high = _range(section, key)
+    low, high = section.ends(key, _FULL_TURN_RAD)
     if low + margin_rad >= high - margin_rad:
         words = f"[{low:g}, {high:g}] leaves nothing between margins of {margin_rad:g} rad"
         raise section.bad(key, words)
@@ -318,7 +318,7 @@ def _box(limits: Section, name: str) -> Box:
     if not isinstance(name, str) or not name.isidentifier() or name == SUN:
         raise limits.bad(f"keep_out.{name}", f"a name of letters, digits and _ is expected, not '{SUN}'")
     section = Section(limits.path, place, limits.mapping("keep_out")[name], ("pan_rad", "tilt_rad"))
-    pan_rad, tilt_rad = _range(section, "pan_rad"), _range(section, "tilt_rad")
+    pan_rad, tilt_rad = section.ends("pan_rad", _FULL_TURN_RAD), section.ends("tilt_rad", _FULL_TURN_RAD)
     return Box(name, pan_rad, tilt_rad)
 
 
@@ -330,18 +330,11 @@ def _sun(top: Section) -> SunDirection | None:
     section = limits.section("sun", ("azimuth_rad", "elevation_rad", "half_angle_rad"), ("frame",))
     azimuth_rad = section.number("azimuth_rad", _FULL_TURN_RAD)
     elevation_rad = section.number("elevation_rad", math.pi / 2)
-    half_angle_rad = _number_between(section, "half_angle_rad", 0.0, LEAST_CONE_RAD, WIDEST_CONE_RAD)
+    half_angle_rad = section.between("half_angle_rad", LEAST_CONE_RAD, WIDEST_CONE_RAD)
     frame: Frame = "site"
     if "frame" in section and section.choice("frame", ("site", "rover")) == "rover":
         frame = "rover"
     return SunDirection(direction_of(azimuth_rad, elevation_rad), frame, half_angle_rad)
-
-
-def _above_zero(section: Section, key: str, most: float) -> float:
-    value = section.number(key, most)
-    if value <= 0.0:
-        raise section.bad(key, f"{value:g} where a number above 0 is expected")
-    return value
 
 
 def _tracking(top: Section, folder: Path) -> TrackingSettings:
@@ -358,16 +351,14 @@ def _tracking(top: Section, folder: Path) -> TrackingSettings:
         pairs = {name: _pair_bounds(handoff, name) for name in named}
         rules = HandoffRules(
             pairs={**rules.pairs, **pairs},
-            margin_px=_number_between(handoff, "margin_px", rules.margin_px, 0.0, 1000.0),
-            disparity_error_px=_number_between(
-                handoff, "disparity_error_px", rules.disparity_error_px, 0.001, 100.0
-            ),
-            range_error=_number_between(handoff, "range_error", rules.range_error, 0.001, 10.0),
+            margin_px=handoff.between("margin_px", 0.0, 1000.0, rules.margin_px),
+            disparity_error_px=handoff.between("disparity_error_px", 0.001, 100.0, rules.disparity_error_px),
+            range_error=handoff.between("range_error", 0.001, 10.0, rules.range_error),
         )
     return TrackingSettings(
         handoff=rules,
-        most_step=_number_between(section, "most_step", usual.most_step, 0.01, 1.0),
-        start_error=_number_between(section, "start_error", usual.start_error, 0.001, 1.0),
+        most_step=section.between("most_step", 0.01, 1.0, usual.most_step),
+        start_error=section.between("start_error", 0.001, 1.0, usual.start_error),
         named_pairs=named,
         handoff_log=folder / section.text("handoff_log") if "handoff_log" in section else None,
     )
@@ -380,7 +371,7 @@ def _repeat_after_s(top: Section) -> float | None:
     section = top.section("pointing", (), ("repeat_after_s",))
     if "repeat_after_s" not in section:
         return None
-    return _number_between(section, "repeat_after_s", 0.0, 0.0, _LATEST_REPEAT_S)
+    return section.between("repeat_after_s", 0.0, _LATEST_REPEAT_S)
 
 
 def _state_folder(top: Section, folder: Path) -> Path | None:
@@ -410,11 +401,11 @@ def _record(top: Section, folder: Path) -> RecordSettings:
         return usual
     section = top.section("record", (), ("ring_s", "ring_mb", "kept_mb", "run_mb", "free_mb", "folder"))
     return RecordSettings(
-        ring_s=_number_between(section, "ring_s", 0.0, 0.0, 86400.0) if "ring_s" in section else None,
-        ring_mb=_number_between(section, "ring_mb", usual.ring_mb, 10.0, _MOST_MB),
-        kept_mb=_number_between(section, "kept_mb", usual.kept_mb, 10.0, _MOST_MB),
-        run_mb=_number_between(section, "run_mb", usual.run_mb, 10.0, _MOST_MB),
-        free_mb=_number_between(section, "free_mb", usual.free_mb, 10.0, _MOST_MB),
+        ring_s=section.between("ring_s", 0.0, 86400.0) if "ring_s" in section else None,
+        ring_mb=section.between("ring_mb", 10.0, _MOST_MB, usual.ring_mb),
+        kept_mb=section.between("kept_mb", 10.0, _MOST_MB, usual.kept_mb),
+        run_mb=section.between("run_mb", 10.0, _MOST_MB, usual.run_mb),
+        free_mb=section.between("free_mb", 10.0, _MOST_MB, usual.free_mb),
         folder=folder / section.text("folder") if "folder" in section else None,
     )
 
@@ -426,29 +417,6 @@ def _pair_bounds(handoff: Section, name: str) -> PairBounds:
     value = handoff.mapping("pairs")[name]
     section = Section(handoff.path, place, value, (), ("nearest_m", "steepest_rad"))
     return PairBounds(
-        nearest_m=_number_between(section, "nearest_m", usual.nearest_m, 0.0, 1000.0),
-        steepest_rad=_number_between(section, "steepest_rad", usual.steepest_rad, 0.0, usual.steepest_rad),
+        nearest_m=section.between("nearest_m", 0.0, 1000.0, usual.nearest_m),
+        steepest_rad=section.between("steepest_rad", 0.0, usual.steepest_rad, usual.steepest_rad),
     )
-
-
-def _number_between(section: Section, key: str, usual: float, low: float, high: float) -> float:
-    """Read a number within bounds, or return the usual one."""
-    if key not in section:
-        return usual
-    value = section.number(key)
-    if not low <= value <= high:
-        raise section.bad(key, f"{value:g} where a number from {low:g} to {high:g} is expected")
-    return value
-
-
-def _range(section: Section, key: str) -> tuple[float, float]:
-    """Read ``[lowest, highest]`` in radians, at most a full turn either way."""
-    value = section.values[key]
-    if not isinstance(value, list) or len(value) != 2:
-        raise section.bad(key, "[lowest, highest] in radians is expected")
-    place = section.at(key)
-    ends = Section(section.path, place, {"lowest": value[0], "highest": value[1]}, ("lowest", "highest"))
-    low, high = ends.number("lowest", _FULL_TURN_RAD), ends.number("highest", _FULL_TURN_RAD)
-    if low >= high:
-        raise section.bad(key, f"[{low:g}, {high:g}] where the lowest must be below the highest")
-    return low, high

@@ -26,3 +26,8 @@ def config_folder() -> Path:
 def default_config() -> Path:
     """Return the configuration that runs when none is named: the packaged simulated rover."""
     return config_folder() / "default.yaml"
+
+
+def schema_files() -> dict[str, Path]:
+    """Return the JSON Schemas of the files that a person writes, by name."""
+    return {file.stem: file for file in sorted((config_folder() / "schemas").glob("*.json"))}

@@ -315,6 +315,35 @@ class Section:
         """Return a value that must be a finite number of at most ``limit`` in size."""
         return self._number(key, self.values[key], limit)
 
+    def between(self, key: str, low: float, high: float, usual: float | None = None) -> float:
+        """Return a value that must be a number from low to high; ``usual``, if any, where it is left out."""
+        if usual is not None and key not in self:
+            return usual
+        value = self.number(key)
+        if not low <= value <= high:
+            raise self.bad(key, f"{value:g} where a number from {low:g} to {high:g} is expected")
+        return value
+
+    def positive(self, key: str, most: float) -> float:
+        """Return a value that must be a number above 0, at most ``most``."""
+        value = self.number(key, most)
+        if value <= 0.0:
+            raise self.bad(key, f"{value:g} where a number above 0 is expected")
+        return value
+
+    def ends(self, key: str, limit: float) -> tuple[float, float]:
+        """Return a value that must be ``[lowest, highest]``, each at most ``limit`` rad in size."""
+        value = self.values[key]
+        if not isinstance(value, list) or len(value) != 2:
+            raise self.bad(key, "[lowest, highest] in radians is expected")
+        low, high = (
+            self._number(f"{key}.{name}", end, limit)
+            for name, end in zip(("lowest", "highest"), value, strict=True)
+        )
+        if low >= high:
+            raise self.bad(key, f"[{low:g}, {high:g}] where the lowest must be below the highest")
+        return low, high
+
     def integer(self, key: str, low: int, high: int) -> int:
         """Return a value that must be an integer from low to high."""
         return self._integer(key, self.values[key], low, high)

@@ -327,7 +327,10 @@ BOARD_KEYS = ("rows", "columns", "spacing_m", "dot_diameter_m", "tapes_in_board_
 
 
 def dot_board_of(section: Section) -> Board:
-    spacing_m, dot_m = _positive(section, "spacing_m"), _positive(section, "dot_diameter_m")
+    spacing_m, dot_m = (
+        section.positive("spacing_m", FURTHEST_M),
+        section.positive("dot_diameter_m", FURTHEST_M),
+    )
     if dot_m >= spacing_m:
         raise section.bad("dot_diameter_m", f"{dot_m:g} where less than spacing_m {spacing_m:g} is expected")
     return Board(
@@ -337,13 +340,6 @@ def dot_board_of(section: Section) -> Board:
         dot_m,
         places_of(section, "tapes_in_board_m", "tape"),
     )
-
-
-def _positive(section: Section, key: str) -> float:
-    value = section.number(key, FURTHEST_M)
-    if value <= 0:
-        raise section.bad(key, f"{value:g} where a number above 0 is expected")
-    return value
 
 
 def places_of(section: Section, key: str, what: str) -> dict[str, FloatArray]:
@@ -366,20 +362,15 @@ def places_of(section: Section, key: str, what: str) -> dict[str, FloatArray]:
 
 
 def sigma_of(section: Section) -> Sigma:
-    optional = {
-        key: section.number(key, 10.0) if key in section else 0.0 for key in ("joint_rad", "prism_cad_m")
-    }
-    for key, value in optional.items():
-        if value < 0:
-            raise section.bad(key, f"{value:g} where 0 or more is expected")
-    return Sigma(_positive(section, "station_m"), _positive(section, "dot_px"), **optional)
+    optional = {key: section.between(key, 0.0, 10.0, 0.0) for key in ("joint_rad", "prism_cad_m")}
+    return Sigma(
+        section.positive("station_m", FURTHEST_M), section.positive("dot_px", FURTHEST_M), **optional
+    )
 
 
 def bench_sigma_of(section: Section) -> Sigma:
-    joint_rad = section.number("joint_rad", 10.0) if "joint_rad" in section else 0.0
-    if joint_rad < 0:
-        raise section.bad("joint_rad", f"{joint_rad:g} where 0 or more is expected")
-    return Sigma(0.0, 0.0, joint_rad, corner_px=_positive(section, "corner_px"))
+    joint_rad = section.between("joint_rad", 0.0, 10.0, 0.0)
+    return Sigma(0.0, 0.0, joint_rad, corner_px=section.positive("corner_px", FURTHEST_M))
 
 
 def cameras_of(top: Section) -> dict[str, SurveyCamera]:
@@ -404,7 +395,7 @@ def cameras_of(top: Section) -> dict[str, SurveyCamera]:
             on=cast(Literal["head", "rover"], section.choice("on", ("head", "rover"))),
             size_px=(width, height),
             kind=cast(Kind, section.choice("model", ("CAHV", "CAHVOR", "CAHVORE"))),
-            focal_px=_positive(section, "focal_px"),
+            focal_px=section.positive("focal_px", FURTHEST_M),
             **camera,
         )
     if not cameras:

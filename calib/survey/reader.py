@@ -236,6 +236,8 @@ def _with_station(read: SurveyFolder, document: object) -> Survey:
     board = dot_board_of(top.section("board", BOARD_KEYS))
     prisms = places_of(top, "prisms_in_rover_m", "prism")
     cameras = cameras_of(top)
+    stereo = read_stereo(top, cameras)
+    sigma = sigma_of(top.section("sigma", ("station_m", "dot_px"), ("joint_rad", "prism_cad_m")))
     station = _station(read, board, prisms)
     images = _images(read, cameras, sorted({point.setup for point in station}))
     by_name = {image.name: image for image in images}
@@ -243,9 +245,9 @@ def _with_station(read: SurveyFolder, document: object) -> Survey:
         folder=read.path,
         board=board,
         prisms_in_rover_m=prisms,
-        sigma=sigma_of(top.section("sigma", ("station_m", "dot_px"), ("joint_rad", "prism_cad_m"))),
+        sigma=sigma,
         cameras=cameras,
-        stereo=read_stereo(top, cameras),
+        stereo=stereo,
         station=station,
         images=images,
         dots=_dots(read, board, cameras, by_name),

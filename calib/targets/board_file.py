@@ -170,15 +170,15 @@ def _drawn(kind: str, section: Section) -> AnyBoard:
     if kind == "aprilgrid":
         return _aprilgrid(section, columns, rows)
     if kind == "checkerboard":
-        return Checkerboard(columns, rows, _positive(section, "square_m"))
-    spacing_m, dot_m = _positive(section, "spacing_m"), _positive(section, "dot_diameter_m")
+        return Checkerboard(columns, rows, section.positive("square_m", LARGEST_M))
+    spacing_m, dot_m = section.positive("spacing_m", LARGEST_M), section.positive("dot_diameter_m", LARGEST_M)
     if dot_m >= spacing_m:
         raise section.bad("dot_diameter_m", f"{dot_m:g} where less than spacing_m {spacing_m:g} is expected")
     return DotBoard(columns, rows, spacing_m, dot_m)
 
 
 def _charuco(section: Section, columns: int, rows: int) -> Charuco:
-    square_m, marker_m = _positive(section, "square_m"), _positive(section, "marker_m")
+    square_m, marker_m = section.positive("square_m", LARGEST_M), section.positive("marker_m", LARGEST_M)
     if marker_m >= square_m:
         raise section.bad("marker_m", f"{marker_m:g} where less than square_m {square_m:g} is expected")
     dictionary = section.choice("dictionary", dictionaries())
@@ -192,7 +192,7 @@ def _charuco(section: Section, columns: int, rows: int) -> Charuco:
 
 
 def _aprilgrid(section: Section, columns: int, rows: int) -> AprilGrid:
-    tag_m, gap_m = _positive(section, "tag_m"), _positive(section, "gap_m")
+    tag_m, gap_m = section.positive("tag_m", LARGEST_M), section.positive("gap_m", LARGEST_M)
     if gap_m > tag_m:
         raise section.bad("gap_m", f"{gap_m:g} where at most tag_m {tag_m:g} is expected")
     family = section.choice("family", tuple(FAMILIES)) if "family" in section else "tag36h11"
@@ -240,7 +240,7 @@ def scaled(board: AnyBoard, scale: float, aspect: float) -> AnyBoard:
 
 def _bars(section: Section) -> tuple[float, float]:
     bars = section.section("bar_m", ("across", "down"))
-    return _positive(bars, "across"), _positive(bars, "down")
+    return bars.positive("across", LARGEST_M), bars.positive("down", LARGEST_M)
 
 
 def _near(section: Section, key: str, value: float, wanted: float, part: float) -> float:
@@ -248,13 +248,6 @@ def _near(section: Section, key: str, value: float, wanted: float, part: float) 
     low, high = wanted * (1 - part), wanted * (1 + part)
     if not low <= value <= high:
         raise section.bad(key, f"{value:g} where {low:.4g} to {high:.4g} is expected, {wanted:.4g} as drawn")
-    return value
-
-
-def _positive(section: Section, key: str) -> float:
-    value = section.number(key, LARGEST_M)
-    if value <= 0:
-        raise section.bad(key, f"{value:g} where a number above 0 is expected")
     return value
 
 

@@ -121,10 +121,10 @@ def dynamixel_settings(options: Mapping[str, Any]) -> DynamixelSettings:
     BadOptions
         For an unknown or missing key or a value that cannot be: which, what it is, what would be right.
     """
-    known = {
+    known = (
         "port", "baud", "pan", "tilt", "speed_rad_per_s", "acceleration_rad_per_s2", "watchdog_s", "poll_hz",
         "reply_timeout_s", "settle_s", "torque_off_at_start", "fast_read",
-    }  # fmt: skip
+    )  # fmt: skip
     read = OptionReader(options, known, ("port", "pan", "tilt"))
     port = read.text("port", "a serial device such as /dev/ttyUSB0 or a URL")
     pan, tilt = (_axis(read, name) for name in ("pan", "tilt"))

@@ -34,7 +34,7 @@ BOUNDS = {
 }
 """Lowest and highest value; of all others 0 or more."""
 
-_CLOCK_BOUNDS: Mapping[str, tuple[float, float]] = {
+CLOCK_BOUNDS: Mapping[str, tuple[float, float]] = {
     "offset_s": (0.0, 1.0),
     "drift_ppm": (-500.0, 500.0),
     "stamped_late_s": (-1.0, 1.0),
@@ -47,7 +47,7 @@ STEP_K = 1 / 16
 """Temperatures are taken in such steps, since every other camera model costs the renderer a table of rays: at
 the default coefficients a step moves a picture's corner by 0.006 px."""
 
-_DAY_BOUNDS: Mapping[str, tuple[float, float]] = {
+DAY_BOUNDS: Mapping[str, tuple[float, float]] = {
     "amplitude_k": (0.0, 100.0),
     "period_s": (1.0, 1e6),
     "phase_rad": (-6.2832, 6.2832),
@@ -179,7 +179,7 @@ def clock_settings(values: Any) -> dict[str, ClockSettings]:
     clocks: dict[str, ClockSettings] = {}
     for name, entry in values.items():
         own: ClockSettings = filled(ClockSettings(), entry, f"simulation.clocks.{name}")
-        check_bounds(own, _CLOCK_BOUNDS, f"simulation.clocks.{name}")
+        check_bounds(own, CLOCK_BOUNDS, f"simulation.clocks.{name}")
         clocks[str(name)] = own
     return clocks
 
@@ -270,5 +270,5 @@ class TemperatureSettings:
 def temperature_settings(values: Any) -> TemperatureSettings:
     """Return what a configuration says of the day. Raises BadOptions."""
     day: TemperatureSettings = filled(TemperatureSettings(), values, "simulation.temperature")
-    check_bounds(day, _DAY_BOUNDS, "simulation.temperature")
+    check_bounds(day, DAY_BOUNDS, "simulation.temperature")
     return day

@@ -41,7 +41,7 @@ HIGHEST_M = 30.0
 FADE_M = 2.0
 """Beyond the map's edge the ground goes back to the height of the origin within so far."""
 
-_BOUNDS = {
+BOUNDS = {
     "m_per_px": (0.005, 20.0),
     "origin_x_m": (-1e4, 1e4),
     "origin_y_m": (-1e4, 1e4),
@@ -158,7 +158,7 @@ def read_terrain(section: Any, folder: Path) -> OwnTerrain:
     if isinstance(section, Mapping) and "digest" in section:
         raise BadOptions(f"{KEY} has no key 'digest'")
     terrain: OwnTerrain = filled(OwnTerrain(), section, KEY)
-    check_bounds(terrain, _BOUNDS, KEY)
+    check_bounds(terrain, BOUNDS, KEY)
     if not terrain.heights:
         raise BadOptions(f"{KEY} has no heights; the name of a .npy or PNG file is expected")
     path = (folder / terrain.heights).resolve()

@@ -13,8 +13,9 @@ from drivers.faults import nearest
 from drivers.options import is_number
 from drivers.sim.axis import AxisSettings
 
+ZERO_ALLOWED = ("backlash_rad", "approach_rad", "sag_rad")
 _TILT_ONLY = ("sag_rad", "gravity_turnover_rad", "gravity_friction")
-_BOUNDS: Mapping[str, tuple[float, float]] = {
+BOUNDS: Mapping[str, tuple[float, float]] = {
     "gravity_turnover_rad": (-math.pi, math.pi),
     "gravity_friction": (0.0, 1.0),
     "ring_hz": (0.0, 100.0),
@@ -84,15 +85,14 @@ def axis_changes(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, A
 
 def _number(name: str, value: Any) -> float:
     """A number of the head, within its bounds."""
-    low, high = _BOUNDS.get(name, (0.0, math.inf))
-    if name in _BOUNDS:
+    low, high = BOUNDS.get(name, (0.0, math.inf))
+    if name in BOUNDS:
         if not is_number(value) or not low <= value <= high:
             raise BadOptions(
                 f"simulation.head.{name} is {value!r}, expected a number from {low:g} to {high:g}"
             )
         return float(value)
-    zero_allowed = name in ("backlash_rad", "approach_rad", "sag_rad")
-    if not is_number(value) or value < 0 or (value == 0 and not zero_allowed):
+    if not is_number(value) or value < 0 or (value == 0 and name not in ZERO_ALLOWED):
         raise BadOptions(f"simulation.head.{name} is {value!r}, expected a positive number")
     return float(value)
 

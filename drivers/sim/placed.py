@@ -128,7 +128,7 @@ Placed = PlacedRock | PlacedBrick | PlacedBoard
 
 _ANGLE = (-2 * math.pi, 2 * math.pi)
 _PLACE = {"x_m": (-REACH_M, REACH_M), "y_m": (-REACH_M, REACH_M), "heading_rad": _ANGLE}
-_BOUNDS: Mapping[type, Mapping[str, tuple[float, float]]] = {
+BOUNDS: Mapping[type, Mapping[str, tuple[float, float]]] = {
     PlacedRock: {**_PLACE, "diameter_m": (0.03, 3.0)},
     PlacedBrick: {**_PLACE, "length_m": (0.02, 3.0), "width_m": (0.02, 3.0), "height_m": (0.02, 3.0)},
     PlacedBoard: {**_PLACE, "lean_rad": (-1.0, 1.0), "raised_m": (0.0, 3.0)},
@@ -167,7 +167,7 @@ def _one(kind: str, value: Any, key: str, folder: Path) -> Placed:
     if kind == "boards":
         return _board(dict(value), key, folder)
     thing: Placed = filled(PlacedRock() if kind == "rocks" else PlacedBrick(), value, key)
-    check_bounds(thing, _BOUNDS[type(thing)], key)
+    check_bounds(thing, BOUNDS[type(thing)], key)
     return thing
 
 
@@ -182,14 +182,14 @@ def _board(value: dict[str, Any], key: str, folder: Path) -> PlacedBoard:
         if name not in own | known:
             raise BadOptions(f"{key} has no key {name!r} for kind {kind!r}{nearest(str(name), own | known)}")
     face = filled(FACES[kind], {k: v for k, v in value.items() if k in known}, key)
-    check_bounds(face, _BOUNDS[type(face)], key)
+    check_bounds(face, BOUNDS[type(face)], key)
     _check_face(face, key)
     if isinstance(face, PlacedPicture):
         face = _with_digest(face, key, folder)
     board: PlacedBoard = filled(PlacedBoard(), {k: v for k, v in value.items() if k in own}, key)
     if math.isnan(board.heading_rad) and "heading_rad" not in value:
         board = replace(board, heading_rad=math.atan2(-board.y_m, -board.x_m))
-    check_bounds(board, _BOUNDS[PlacedBoard], key)
+    check_bounds(board, BOUNDS[PlacedBoard], key)
     if not 0.05 <= max(face.size_m) <= 4.0:
         raise BadOptions(f"{key} is {face.size_m[0]:g} x {face.size_m[1]:g} m, expected 0.05 to 4 m")
     return replace(board, face=face)

@@ -42,6 +42,13 @@ OUTER_CELLS = 512
 OUTER_CELL_M = 4.0
 LEVEL_WITHIN_M = 0.8  # round the rover the relief is nearly flat...
 ROUGH_BEYOND_M = 2.5  # ...and whole from here on
+SCENE_BOUNDS = {
+    "seed": (0, 2**63),
+    "relief_m": (0, 1),
+    "rocks": (0, 500),
+    "bricks": (0, 24),
+    "sun_elevation_rad": (0.2, 1.5),
+}
 HILLS_FROM_M = 70.0
 HILL_M = 9.0
 SHADOW_SAMPLES = 4  # across a ground texel
@@ -84,14 +91,7 @@ class SceneSettings:
     options: dict[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        bounds = (
-            ("seed", 0, 2**63),
-            ("relief_m", 0, 1),
-            ("rocks", 0, 500),
-            ("bricks", 0, 24),
-            ("sun_elevation_rad", 0.2, 1.5),
-        )
-        for name, low, high in bounds:
+        for name, (low, high) in SCENE_BOUNDS.items():
             value = getattr(self, name)
             if not isinstance(value, tuple) and not low <= value <= high:
                 raise BadOptions(f"scene: {name} {value} is not between {low} and {high}")

@@ -144,11 +144,7 @@ def _placement(file: Path, place: str, row: Any) -> Placement:
     if not isinstance(row, dict):
         raise BadFile(file, place, "keys and values are expected, as {range_m: 1.2, bearing_deg: -30}")
     section = Section(file, place, row, ("range_m",), ("bearing_deg", "height_deg", "turned_deg"))
-    numbers = {}
-    for key, (low, high) in _BOUNDS.items():
-        numbers[key] = section.number(key) if key in section else 0.0
-        if not low <= numbers[key] <= high:
-            raise section.bad(key, f"{numbers[key]:g} where {low:g} to {high:g} is expected")
+    numbers = {key: section.between(key, low, high, 0.0) for key, (low, high) in _BOUNDS.items()}
     turned: Sequence[float] = (0.0, 0.0)
     if "turned_deg" in section:
         turned = section.values["turned_deg"]

@@ -35,7 +35,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.stop": ("stop", "estop", "reset", "halt"),
     "mastctl.cli.steering": ("lease", "track", "jog"),
     "mastctl.cli.operations": ("reload", "operations", "events", "mast", "fault"),
-    "mastctl.cli.setup": ("token", "completion", "doctor"),
+    "mastctl.cli.setup": ("token", "completion", "doctor", "schema"),
     "mastctl.cli.camera_files": ("camera",),
     "mastctl.cli.geometry": ("solve", "triangulate", "budget", "handoff"),
     "mastctl.cli.board": ("board",),

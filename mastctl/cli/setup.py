@@ -1,4 +1,4 @@
-"""Setting up: ``doctor``, ``token``, ``completion``."""
+"""Setting up: ``doctor``, ``schema``, ``token``, ``completion``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.output import CommandError
+from mastctl.cli.output import CommandError, WrongUse
 
 if TYPE_CHECKING:
     from mastctl.access.tokens import TokenList
@@ -20,8 +20,8 @@ MARKS = {"good": "✓", "unsure": "?", "bad": "✗"}
 
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add doctor, token and completion."""
-    for add in (_add_doctor, _add_token, _add_completion):
+    """Add doctor, schema, token and completion."""
+    for add in (_add_doctor, _add_schema, _add_token, _add_completion):
         add(subparsers)
 
 
@@ -67,6 +67,35 @@ def _asked(url: str) -> Status | None:
             return client.status()
     except ClientError:
         return None
+
+
+def _add_schema(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add schema."""
+    schema = subparsers.add_parser(
+        "schema",
+        help="print the JSON Schema of a file that people write, for editors; without NAME: a list",
+    )
+    schema.add_argument("name", nargs="?", metavar="NAME", help="config, mast, board ...")
+    schema.set_defaults(run=_schema)
+
+
+def _schema(args: argparse.Namespace) -> int:
+    import json
+
+    from mastctl.packaged import schema_files
+
+    files = schema_files()
+    if args.name is None:
+        titles = {name: json.loads(file.read_bytes())["title"] for name, file in files.items()}
+        if args.json:
+            output.print_json({"schemas": titles})
+        else:
+            output.print_table("schemas", ("name", "of"), list(titles.items()))
+        return 0
+    if args.name not in files:
+        raise WrongUse(f"'{args.name}' is not a valid schema; there are {', '.join(files)}")
+    sys.stdout.write(files[args.name].read_text(encoding="utf-8"))
+    return 0
 
 
 def _add_token(subparsers: argparse._SubParsersAction[Any]) -> None:

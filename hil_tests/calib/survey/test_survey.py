@@ -92,7 +92,7 @@ REFUSALS: dict[str, Refusal] = {
         "dot_px: 0.1}",
         "dot_px: 0.1, joint_rad: -1}",
         "sigma.joint_rad",
-        "0 or more",
+        "from 0 to 10",
     ),
     "camera name": ("survey", "  hazcam_left:", "  haz cam:", "cameras.haz cam", "letters, digits"),
     "no such model": ("survey", "model: CAHVORE", "model: CAHVAR", "cameras.hazcam_left.model", "CAHVORE"),

@@ -1,0 +1,487 @@
+"""Which files a person writes, how each is read, and what their readers look at by hand."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import re
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from copy import deepcopy
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from calib.errors import BadFile
+from calib.files import mast_file
+from calib.files.yaml_text import dump_mapping, parse_mapping
+from calib.survey.folder import SCHEMA as SURVEY_SCHEMA
+from calib.survey.reader import read_survey
+from calib.targets import board_file
+from drivers.approach import ApproachedAxis
+from drivers.dynamixel.models import MODELS
+from drivers.dynamixel.settings import DynamixelAxisSettings, DynamixelSettings, dynamixel_settings
+from drivers.faults import BOUNDS, CAMERA_WORDS, HEAD_WORDS, LOG_WORDS, WHEN
+from drivers.flir_ptu import options as flir_ptu
+from drivers.recordings.replay import OPTIONS as REPLAY_OPTIONS
+from drivers.servo_bus.settings import ServoAxisSettings
+from drivers.sim import camera_settings, ground, heads, placed, scene
+from drivers.sim.pan_tilt import DEFAULT_HEADS
+from drivers.sim.settings import simulation_settings
+from drivers.v4l2 import options as v4l2
+from drivers.v4l2.exposure import AutoExposureSettings
+from drivers.v4l2.pixels import FORMATS
+from mastctl.bench import simulated
+from mastctl.config import CONFIG_SCHEMA, HOST_NAME, LONGEST_SOCKET_PATH, parse_config
+from tools.schemas.watched import FLAG, TEXT, Schema, number, settings_schema, vector, watched
+
+REPOSITORY = Path(__file__).parents[2]
+PAGE = REPOSITORY / "docs" / "reference" / "configuration.md"
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+IDENTIFIER = r"^[A-Za-z_][A-Za-z0-9_]*$"
+CAMERA = f"^{mast_file.CAMERA_NAME.pattern}$"
+NUMBER: Schema = {"type": "number"}
+NAMES = ("NAME", "PAIR")
+"""What stands for a name of one's own in the page's tables."""
+
+
+def examples() -> list[dict[str, Any]]:
+    """Return the examples of docs/reference/configuration.md: a configuration, then mast files."""
+    return [
+        parse_mapping(one.encode(), PAGE)
+        for one in re.findall(r"```yaml\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    ]
+
+
+def config() -> Schema:
+    """A daemon's configuration, with the options of our own drivers."""
+    whole = examples()[0]
+    with watched() as noted:
+        for listen in (whole["listen"], {"socket": "mast.sock"}):
+            parse_config(_bytes({**whole, "listen": listen}), "config.yaml")
+    host = {"type": "string", "pattern": f"^({HOST_NAME.pattern})$"}
+    _tell(noted.at("listen.hosts"), {"type": "array", "items": host})
+    noted.at("listen.socket").value = {**TEXT, "maxLength": LONGEST_SOCKET_PATH}
+    noted.at("simulation").value = {}
+    found = noted.schema()
+    inner = found["properties"]
+    inner["schema"] = {"const": CONFIG_SCHEMA}
+    inner["simulation"] = simulation()
+    inner["limits"]["properties"]["keep_out"]["propertyNames"] = {
+        "pattern": IDENTIFIER,
+        "not": {"const": "sun"},
+    }
+    drivers = {"dynamixel": dynamixel(), "flir_ptu": ptu(), "replay": replay()}
+    _by(inner["pan_tilt"], "driver", {name: {"options": one} for name, one in drivers.items()})
+    for name in ("dynamixel", "flir_ptu"):
+        inner["pan_tilt"]["allOf"][list(drivers).index(name)]["then"]["required"] = ["options"]
+    camera = inner["cameras"]["additionalProperties"]
+    _by(camera, "driver", {"v4l2": {"options": camera_options()}, "replay": {"options": replay()}})
+    camera["allOf"][0]["then"]["required"] = ["options"]
+    inner["listen"]["dependentSchemas"] = {
+        "socket": {"properties": dict.fromkeys(("host", "port", "tls"), False)},
+    }
+    inner["limits"]["if"] = {"required": ["keep_out"], "properties": {"keep_out": {"minProperties": 1}}}
+    inner["limits"]["then"] = {
+        "required": ["margin_rad"],
+        "properties": {"margin_rad": {"exclusiveMinimum": 0}},
+    }
+    return found
+
+
+def mast() -> Schema:
+    """A mast file."""
+    with watched() as noted:
+        for document in examples()[1:]:
+            mast_file.parse_rig(_bytes(document), "mast.yaml")
+    found = noted.schema()
+    inner = found["properties"]
+    _model(inner["cameras"]["additionalProperties"])
+    inner["schema"] = {"const": mast_file.MAST_SCHEMA}
+    inner["cameras"]["propertyNames"] = {"pattern": CAMERA}
+    inner["stereo"] = _stereo()
+    for joint in inner["joints"]["properties"].values():
+        joint["properties"]["backlash_rad"]["minimum"] = 0
+    return found
+
+
+def camera() -> Schema:
+    """A camera file."""
+    made = examples()[-1]["cameras"]["navcam_right"]
+    document = {"schema": mast_file.CAMERA_SCHEMA, "frame": "head", **made}
+    del document["on"]
+    with watched() as noted:
+        mast_file.parse_camera(_bytes(document), "camera.yaml")
+    found = noted.schema()
+    found["properties"]["schema"] = {"const": mast_file.CAMERA_SCHEMA}
+    return _model(found)
+
+
+def board() -> Schema:
+    """A board."""
+    found: Schema = {"type": "object", "required": ["schema", "kind"], **_boards()}
+    for kind in found["allOf"]:
+        kind["then"]["properties"]["schema"] = {"const": board_file.SCHEMA}
+    return found
+
+
+def survey() -> Schema:
+    """A survey's survey.yaml, of a station or of a bench."""
+    eye = {
+        "on": "head",
+        "size_px": [640, 480],
+        "model": "CAHVOR",
+        "focal_px": 600.0,
+        "rough": {"C": [0, 0, 0], "A": [1, 0, 0]},
+    }
+    points = {"a": [0.0, 0.0, 0.0], "b": [1.0, 0.0, 0.0], "c": [0.0, 1.0, 0.0]}
+    common = {
+        "schema": SURVEY_SCHEMA,
+        "cameras": {"cam_left": eye, "cam_right": eye},
+        "stereo": {"cam": ["cam_left", "cam_right"]},
+    }
+    station = {
+        **common,
+        "board": {
+            "rows": 10,
+            "columns": 10,
+            "spacing_m": 0.1,
+            "dot_diameter_m": 0.05,
+            "tapes_in_board_m": points,
+        },
+        "prisms_in_rover_m": points,
+        "sigma": {"station_m": 0.001, "dot_px": 0.1, "joint_rad": 0.0, "prism_cad_m": 0.0},
+    }
+    bench = {
+        **common,
+        "boards": {"b1": {"kind": "dots", **DRAWN["dots"]}},
+        "sigma": {"corner_px": 0.1, "joint_rad": 0.0},
+    }
+    kinds = []
+    for document in (station, bench):
+        with TemporaryDirectory() as folder, watched() as noted:
+            (Path(folder) / "survey.yaml").write_bytes(_bytes(document))
+            with suppress(BadFile):  # there is no station.csv
+                read_survey(folder)
+        for key in ("board.tapes_in_board_m", "prisms_in_rover_m"):
+            if key.partition(".")[0] in document:
+                place = noted.at(key)
+                place.read, place.required = False, []  # the names are anybody's
+        found = noted.schema()
+        inner = found["properties"]
+        inner["schema"] = {"const": SURVEY_SCHEMA}
+        inner["stereo"] = _stereo()
+        inner["cameras"] |= {"propertyNames": {"pattern": CAMERA}, "minProperties": 1}
+        if "board" in inner:
+            for points_of in (inner["prisms_in_rover_m"], inner["board"]["properties"]["tapes_in_board_m"]):
+                points_of["minProperties"] = 3
+        if "boards" in inner:
+            drawn = {"type": "object", "required": ["kind"], **_boards()}
+            inner["boards"] = {"type": "object", "minProperties": 1, "additionalProperties": drawn}
+        kinds.append(found)
+    return {"type": "object", "if": {"required": ["boards"]}, "then": kinds[1], "else": kinds[0]}
+
+
+def placements() -> Schema:
+    """Where the board of a simulated bench stands in turn."""
+    row = {"range_m": 1.0, "bearing_deg": 0.0, "height_deg": 0.0, "turned_deg": [0.0, 0.0]}
+    with TemporaryDirectory() as folder, watched() as noted:
+        file = Path(folder) / "placements.yaml"
+        file.write_bytes(_bytes({"schema": simulated.SCHEMA, "placements": [row]}))
+        simulated.read_placements(file)
+    turned = vector(number(-80, 80), 2)
+    _tell(noted.at("placements[0].turned_deg"), turned)
+    noted.at("placements").value = {"minItems": 1}
+    found = noted.schema()
+    found["properties"]["schema"] = {"const": simulated.SCHEMA}
+    return found
+
+
+def faults() -> Schema:
+    """A script of faults for simulated hardware."""
+    return {
+        "type": "object",
+        "additionalProperties": False,
+        "required": ["faults"],
+        "properties": {"faults": _fault_list()},
+    }
+
+
+FILES: Mapping[str, Callable[[], Schema]] = {
+    "config": config,
+    "mast": mast,
+    "camera": camera,
+    "board": board,
+    "survey": survey,
+    "placements": placements,
+    "faults": faults,
+}
+"""By the name that `mastctl schema` takes."""
+
+
+def schema_of(name: str) -> Schema:
+    """Return the whole JSON Schema of a file."""
+    made = FILES[name]
+    title = (made.__doc__ or "").strip().rstrip(".")
+    found = {"$schema": DIALECT, "title": title, **deepcopy(made())}
+    for heading, of in (("A whole configuration", "config"), ("The mast file", "mast")):
+        if name == of:
+            _describe(found, heading)
+    return found
+
+
+def _describe(schema: Schema, heading: str) -> None:
+    """Add the meanings that the tables of docs/reference/configuration.md have."""
+    section = PAGE.read_text().split(f"\n## {heading}\n", 1)[1].split("\n## ", 1)[0]
+    for line in re.findall(r"^\| `.*$", section, re.MULTILINE):
+        keys, *_, meaning = (cell.strip() for cell in re.split(r"(?<!\\)\|", line.strip("|")))
+        words = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", meaning).replace("`", "")
+        for key in re.findall(r"`([^`]+)`", keys):
+            here: Any = schema
+            for step in key.split("."):
+                here = here["additionalProperties"] if step in NAMES else here["properties"][step]
+            if words:
+                here["description"] = words
+
+
+def _settings(found: Schema, *kinds: type) -> Schema:
+    """Add what the docstrings of settings say of their attributes."""
+    for kind in kinds:
+        text = inspect.cleandoc(kind.__doc__ or "").partition("Attributes\n----------\n")[2]
+        for names, words in re.findall(r"^(\w[\w, ]*)\n((?:    .*\n?)+)", text, re.MULTILINE):
+            for name in names.split(", "):
+                if name in found["properties"]:
+                    found["properties"][name]["description"] = " ".join(words.split())
+    return found
+
+
+def _bytes(document: Any) -> bytes:
+    return dump_mapping(document)
+
+
+def _tell(noted: Any, value: Schema) -> None:
+    """Say what a reader looks at by hand."""
+    noted.value, noted.keys, noted.read, noted.named = value, {}, False, False
+
+
+def _by(holder: Schema, key: str, cases: Mapping[str, Mapping[str, Schema]]) -> None:
+    """Let a word decide what its neighbors must be."""
+    holder["allOf"] = [
+        {"if": {"required": [key], "properties": {key: {"const": word}}}, "then": {"properties": dict(then)}}
+        for word, then in cases.items()
+    ]
+
+
+def _model(found: Schema) -> Schema:
+    """Which vectors a camera model has."""
+    zero = vector({"const": 0}, 3)
+    cases = {
+        "CAHV": ([], {"R": zero, "E": zero, "type": False, "linearity": False}),
+        "CAHVOR": (["O", "R"], {"E": zero, "type": False, "linearity": False}),
+        "CAHVORE": (["O", "R", "E", "type"], {}),
+    }
+    _by(found, "model", {kind: then for kind, (_, then) in cases.items()})
+    for case, (needed, _) in zip(found["allOf"], cases.values(), strict=True):
+        if needed:
+            case["then"]["required"] = needed
+    found["allOf"].append(
+        {
+            "if": {"required": ["type"], "properties": {"type": {"const": 3}}},
+            "then": {"required": ["linearity"]},
+        }
+    )
+    return found
+
+
+def _stereo() -> Schema:
+    """Pairs of cameras by name."""
+    sides = [{"type": "string", "pattern": f"_{side}$"} for side in ("left", "right")]
+    pair = {"type": "array", "minItems": 2, "maxItems": 2, "prefixItems": sides}
+    return {"type": "object", "propertyNames": {"pattern": CAMERA}, "additionalProperties": pair}
+
+
+DRAWN: Mapping[str, dict[str, Any]] = {
+    "charuco": {
+        "square_m": 0.02,
+        "marker_m": 0.015,
+        "dictionary": "DICT_5X5_100",
+        "first_id": 0,
+        "legacy": False,
+    },
+    "aprilgrid": {"tag_m": 0.02, "gap_m": 0.006, "family": "tag36h11", "first_id": 0, "border": 2},
+    "dots": {"columns": 9, "rows": 12, "spacing_m": 0.02, "dot_diameter_m": 0.01},
+    "checkerboard": {"square_m": 0.02},
+}
+"""A board of each kind, with every key of it."""
+
+
+def _boards() -> Schema:
+    """The keys of each kind of board."""
+    print_keys = {
+        "name": "a board",
+        "aspect": 1.0,
+        "bar_m": {"across": 0.15, "down": 0.15},
+        "measured": {"across_m": 0.15, "down_m": 0.15},
+    }
+    then: dict[str, Schema] = {}
+    for kind, own in DRAWN.items():
+        with watched() as noted:
+            board_file.board_of(
+                "board.yaml", "", {"columns": 9, "rows": 12, **own, "kind": kind, **print_keys}
+            )
+        _tell(noted.at("legacy"), FLAG) if kind == "charuco" else None
+        for key in ("measured.across_m", "measured.down_m"):
+            noted.at(key).value = {"type": "number", "exclusiveMinimum": 0}
+        if "first_id" in noted.keys:
+            noted.at("first_id").value.pop("maximum", None)
+        found = noted.schema()
+        found["properties"]["kind"] = {"const": kind}
+        found["dependentRequired"] = {"measured": ["bar_m"]}
+        found.pop("required", None)
+        needed = ["kind", "columns", "rows", *board_file._KEYS[kind][0]]
+        then[kind] = {**found, "required": needed}
+    cases = [
+        {"if": {"required": ["kind"], "properties": {"kind": {"const": kind}}}, "then": one}
+        for kind, one in then.items()
+    ]
+    return {"properties": {"kind": {"enum": list(DRAWN)}}, "allOf": cases}
+
+
+def dynamixel() -> Schema:
+    """Options of a Dynamixel head, whatever the models."""
+    with watched("options.") as noted:
+        for model in ("XM430-W350", "PH54-200-S500", "PH42-020-S300"):
+            axis = {"id": 1, "model": model, "limits_rad": [-0.1, 0.1], "current_limit_A": 1.0}
+            axis |= {"approach": "positive", "approach_rad": 0.1}
+            dynamixel_settings({"port": "/dev/x", "pan": axis, "tilt": {**axis, "id": 2}})
+    for axis_name in ("pan", "tilt"):
+        _tell(noted.at(f"{axis_name}.model"), {"type": "string", "examples": sorted(MODELS)})
+    noted.at("watchdog_s").value.pop("default")  # it depends on speed and acceleration
+    found = _settings(noted.schema(), DynamixelSettings)
+    for name in ("pan", "tilt"):
+        _settings(found["properties"][name], ApproachedAxis, ServoAxisSettings, DynamixelAxisSettings)
+    return found
+
+
+def ptu() -> Schema:
+    """Options of a FLIR PTU."""
+    axis = {"limits_rad": [-0.5, 0.5]}
+    with watched("options.") as noted:
+        flir_ptu.options_from({"port": "/dev/x", "pan": axis, "tilt": axis, "supply_V": [10.0, 30.0]})
+    noted.at("supply_V").value = {**noted.at("supply_V").value, "type": ["array", "null"]}
+    for name in ("pan", "tilt"):
+        noted.at(f"{name}.limits_rad").value["items"] = number(-math.tau, math.tau)
+    found = _settings(noted.schema(), flir_ptu.Options)
+    for name in ("pan", "tilt"):
+        _settings(found["properties"][name], ApproachedAxis, flir_ptu.AxisOptions)
+    return found
+
+
+def camera_options() -> Schema:
+    """Options of a V4L2 camera."""
+    with watched("options.") as noted:
+        v4l2.parse_options({"device": "/dev/v4l/by-id/x", "exposure_s": 0.01, "auto_exposure": {}}, "cam")
+    inner = noted.at("auto_exposure").schema()
+    for name in ("device", "card", "bus"):
+        noted.at(name).value = TEXT
+    noted.at("format").value = {"enum": sorted(FORMATS), "default": "YUYV"}
+    noted.at("rate_hz").value["type"] = ["number", "null"]
+    noted.at("size_px").value = {**vector(number(1, 16384, kind="integer"), 2), "default": [640, 480]}
+    noted.at("controls").value = {
+        "type": "object",
+        "additionalProperties": {"type": ["integer", "string", "boolean"]},
+    }
+    found = _settings(noted.schema(), v4l2.CameraOptions)
+    _settings(inner, AutoExposureSettings)
+    found["properties"]["auto_exposure"] = {"anyOf": [FLAG, inner], "default": False}
+    found["anyOf"] = [{"required": [key]} for key in ("device", "card", "bus")]
+    found["dependentSchemas"] = {"device": {"properties": {"card": False, "bus": False}}}
+    return found
+
+
+def replay() -> Schema:
+    """Options of a replayed recording."""
+    words: Schema = dict.fromkeys(REPLAY_OPTIONS, TEXT)
+    words["products"] = {"type": ["array", "string"]}
+    words["tolerance_rad"] = number(1e-9, 1000)
+    words["grey_range_dn"] = {**vector(NUMBER, 2), "type": ["array", "null"]}
+    return {"type": "object", "additionalProperties": False, "properties": words}
+
+
+def simulation() -> Schema:
+    """The simulated rover."""
+    with watched("simulation.") as noted:
+        simulation_settings({"rover": "true.yaml"}, Path())
+    found = noted.schema()
+    inner = found["properties"]
+    usual = camera_settings.CameraSettings()
+    inner["cameras"] = settings_schema(usual, camera_settings.BOUNDS, 0)
+    inner["temperature"] = settings_schema(camera_settings.TemperatureSettings(), camera_settings.DAY_BOUNDS)
+    clock = settings_schema(camera_settings.ClockSettings(), camera_settings.CLOCK_BOUNDS)
+    inner["clocks"] = {"type": "object", "additionalProperties": clock}
+    inner["head"] = {"anyOf": [{"enum": list(heads.PRESETS)}, _head()], "default": "ptu_d46_70"}
+    inner["wire"] = {"enum": [*DEFAULT_HEADS, None]}
+    inner["speed"] = {"anyOf": [number(0.1, 1000), {"const": "max"}], "default": 1}
+    inner["faults"] = {"anyOf": [TEXT, _fault_list()]}
+    inner["scene"] = _scene()
+    return found
+
+
+def _head() -> Schema:
+    """The keys of a simulated head."""
+    part = number(-heads.HARMONIC_RAD, heads.HARMONIC_RAD)
+    keys: Schema = {"preset": {"enum": list(heads.PRESETS)}}
+    for key in sorted(heads.HEAD_KEYS):
+        if key.endswith("harmonics_rad"):
+            keys[key] = {"type": "array", "maxItems": heads.MOST_HARMONICS, "items": vector(part, 2)}
+        elif key in heads.BOUNDS:
+            keys[key] = number(*heads.BOUNDS[key])
+        elif key in heads.ZERO_ALLOWED:
+            keys[key] = number(0, None)
+        else:
+            keys[key] = {"type": "number", "exclusiveMinimum": 0}
+    return {"type": "object", "additionalProperties": False, "properties": keys}
+
+
+def _scene() -> Schema:
+    """A scene, and what stands in it."""
+    found = settings_schema(scene.SceneSettings(), scene.SCENE_BOUNDS)
+    inner = found["properties"]
+    things = {"rocks": placed.PlacedRock(), "bricks": placed.PlacedBrick()}
+    for kind, usual in things.items():
+        one = settings_schema(usual, placed.BOUNDS[type(usual)])
+        some = {"type": "array", "maxItems": placed.MOST[kind], "items": {**one, "required": ["x_m", "y_m"]}}
+        inner[kind] = {"anyOf": [inner[kind], some], "default": inner[kind]["default"]}
+    keys = settings_schema(placed.PlacedBoard(), placed.BOUNDS[placed.PlacedBoard])["properties"]
+    del keys["face"]
+    faces = {}
+    for kind, face in placed.FACES.items():
+        own = settings_schema(face, placed.BOUNDS[type(face)])["properties"]
+        own.pop("digest", None)
+        faces[kind] = {**own, **keys, "kind": {"const": kind}}
+    board = {
+        "type": "object",
+        "required": ["x_m", "y_m"],
+        "anyOf": [{"additionalProperties": False, "properties": one} for one in faces.values()],
+    }
+    board["anyOf"][1]["required"] = board["anyOf"][2]["required"] = ["kind"]
+    inner["boards"] = {"type": "array", "maxItems": placed.MOST["boards"], "items": board}
+    inner["terrain"] = settings_schema(ground.OwnTerrain(), ground.BOUNDS)
+    del inner["terrain"]["properties"]["digest"]
+    inner["terrain"]["required"] = ["heights"]
+    return found
+
+
+def _fault_list() -> Schema:
+    """Faults of heads and cameras."""
+    words = {word: one for kind in (HEAD_WORDS, CAMERA_WORDS, LOG_WORDS) for word, one in kind.items()}
+    parameters = {*WHEN, *(name for word in words.values() for name in word.parameters)}
+    keys = {name: number(*BOUNDS[name]) for name in sorted(parameters)}
+    one = {
+        "type": "object",
+        "additionalProperties": False,
+        "required": ["device", "word"],
+        "properties": {"device": TEXT, "word": {"enum": sorted(words)}, **keys, "at_s": keys["after_s"]},
+        "not": {"required": ["at_s", "after_s"]},
+    }
+    return {"type": "array", "items": one}
