@@ -1,7 +1,7 @@
 """What a reader asks of a file while it reads one: keys, kinds, bounds, choices, defaults, as a JSON Schema.
 
 `watched` lets the strict readers (`calib.files.yaml_text.Section`, `drivers.options.OptionReader`) read an
-example, and notes each question. What a reader looks at by hand is told beside it, by `Reading.told`.
+example, and notes each question. What a reader looks at by hand is told beside it, by `Noted.tell`.
 """
 
 from __future__ import annotations
@@ -49,6 +49,10 @@ class Noted:
                 del self.value[key]
         if self.value.get("default", MISSING) != value.get("default", MISSING):
             self.value.pop("default", None)
+
+    def tell(self, value: Schema) -> None:
+        """Say what a reader looks at by hand."""
+        self.value, self.keys, self.read, self.named = value, {}, False, False
 
     def schema(self) -> Schema:
         """Return the JSON Schema of what was noted."""

@@ -1,0 +1,176 @@
+"""The options of our own drivers, of replay and of the simulated rover: how each is read, and what is read by hand."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import re
+from pathlib import Path
+
+from drivers.approach import ApproachedAxis
+from drivers.dynamixel.models import MODELS
+from drivers.dynamixel.settings import DynamixelAxisSettings, DynamixelSettings, dynamixel_settings
+from drivers.faults import BOUNDS, CAMERA_WORDS, HEAD_WORDS, LOG_WORDS, WHEN
+from drivers.flir_ptu import options as flir_ptu
+from drivers.recordings.replay import OPTIONS as REPLAY_OPTIONS
+from drivers.servo_bus.settings import ServoAxisSettings
+from drivers.sim import camera_settings, ground, heads, placed, scene
+from drivers.sim.pan_tilt import DEFAULT_HEADS
+from drivers.sim.settings import simulation_settings
+from drivers.v4l2 import options as v4l2
+from drivers.v4l2.exposure import AutoExposureSettings
+from drivers.v4l2.pixels import FORMATS
+from tools.schemas.watched import FLAG, TEXT, Schema, number, settings_schema, vector, watched
+
+NUMBER: Schema = {"type": "number"}
+
+
+def _settings(found: Schema, *kinds: type) -> Schema:
+    """Add what the docstrings of settings say of their attributes."""
+    for kind in kinds:
+        text = inspect.cleandoc(kind.__doc__ or "").partition("Attributes\n----------\n")[2]
+        for names, words in re.findall(r"^(\w[\w, ]*)\n((?:    .*\n?)+)", text, re.MULTILINE):
+            for name in names.split(", "):
+                if name in found["properties"]:
+                    found["properties"][name]["description"] = " ".join(words.split())
+    return found
+
+
+def dynamixel() -> Schema:
+    """Options of a Dynamixel head, whatever the models."""
+    with watched("options.") as noted:
+        for model in ("XM430-W350", "PH54-200-S500", "PH42-020-S300"):
+            axis = {"id": 1, "model": model, "limits_rad": [-0.1, 0.1], "current_limit_A": 1.0}
+            axis |= {"approach": "positive", "approach_rad": 0.1}
+            dynamixel_settings({"port": "/dev/x", "pan": axis, "tilt": {**axis, "id": 2}})
+    for axis_name in ("pan", "tilt"):
+        noted.at(f"{axis_name}.model").tell({"type": "string", "examples": sorted(MODELS)})
+    noted.at("watchdog_s").value.pop("default")  # it depends on speed and acceleration
+    found = _settings(noted.schema(), DynamixelSettings)
+    for name in ("pan", "tilt"):
+        _settings(found["properties"][name], ApproachedAxis, ServoAxisSettings, DynamixelAxisSettings)
+    return found
+
+
+def ptu() -> Schema:
+    """Options of a FLIR PTU."""
+    axis = {"limits_rad": [-0.5, 0.5]}
+    with watched("options.") as noted:
+        flir_ptu.options_from({"port": "/dev/x", "pan": axis, "tilt": axis, "supply_V": [10.0, 30.0]})
+    noted.at("supply_V").value = {**noted.at("supply_V").value, "type": ["array", "null"]}
+    for name in ("pan", "tilt"):
+        noted.at(f"{name}.limits_rad").value["items"] = number(-math.tau, math.tau)
+    found = _settings(noted.schema(), flir_ptu.Options)
+    for name in ("pan", "tilt"):
+        _settings(found["properties"][name], ApproachedAxis, flir_ptu.AxisOptions)
+    return found
+
+
+def camera_options() -> Schema:
+    """Options of a V4L2 camera."""
+    with watched("options.") as noted:
+        v4l2.parse_options({"device": "/dev/v4l/by-id/x", "exposure_s": 0.01, "auto_exposure": {}}, "cam")
+    inner = noted.at("auto_exposure").schema()
+    for name in ("device", "card", "bus"):
+        noted.at(name).value = TEXT
+    noted.at("format").value = {"enum": sorted(FORMATS), "default": "YUYV"}
+    noted.at("rate_hz").value["type"] = ["number", "null"]
+    noted.at("size_px").value = {**vector(number(1, 16384, kind="integer"), 2), "default": [640, 480]}
+    noted.at("controls").value = {
+        "type": "object",
+        "additionalProperties": {"type": ["integer", "string", "boolean"]},
+    }
+    found = _settings(noted.schema(), v4l2.CameraOptions)
+    _settings(inner, AutoExposureSettings)
+    found["properties"]["auto_exposure"] = {"anyOf": [FLAG, inner], "default": False}
+    found["anyOf"] = [{"required": [key]} for key in ("device", "card", "bus")]
+    found["dependentSchemas"] = {"device": {"properties": {"card": False, "bus": False}}}
+    return found
+
+
+def replay() -> Schema:
+    """Options of a replayed recording."""
+    words: Schema = dict.fromkeys(REPLAY_OPTIONS, TEXT)
+    words["products"] = {"type": ["array", "string"]}
+    words["tolerance_rad"] = number(1e-9, 1000)
+    words["grey_range_dn"] = {**vector(NUMBER, 2), "type": ["array", "null"]}
+    return {"type": "object", "additionalProperties": False, "properties": words}
+
+
+def simulation() -> Schema:
+    """The simulated rover."""
+    with watched("simulation.") as noted:
+        simulation_settings({"rover": "true.yaml"}, Path())
+    found = noted.schema()
+    inner = found["properties"]
+    usual = camera_settings.CameraSettings()
+    inner["cameras"] = settings_schema(usual, camera_settings.BOUNDS, 0)
+    inner["temperature"] = settings_schema(camera_settings.TemperatureSettings(), camera_settings.DAY_BOUNDS)
+    clock = settings_schema(camera_settings.ClockSettings(), camera_settings.CLOCK_BOUNDS)
+    inner["clocks"] = {"type": "object", "additionalProperties": clock}
+    inner["head"] = {"anyOf": [{"enum": list(heads.PRESETS)}, _head()], "default": "ptu_d46_70"}
+    inner["wire"] = {"enum": [*DEFAULT_HEADS, None]}
+    inner["speed"] = {"anyOf": [number(0.1, 1000), {"const": "max"}], "default": 1}
+    inner["faults"] = {"anyOf": [TEXT, fault_list()]}
+    inner["scene"] = _scene()
+    return found
+
+
+def _head() -> Schema:
+    """The keys of a simulated head."""
+    part = number(-heads.HARMONIC_RAD, heads.HARMONIC_RAD)
+    keys: Schema = {"preset": {"enum": list(heads.PRESETS)}}
+    for key in sorted(heads.HEAD_KEYS):
+        if key.endswith("harmonics_rad"):
+            keys[key] = {"type": "array", "maxItems": heads.MOST_HARMONICS, "items": vector(part, 2)}
+        elif key in heads.BOUNDS:
+            keys[key] = number(*heads.BOUNDS[key])
+        elif key in heads.ZERO_ALLOWED:
+            keys[key] = number(0, None)
+        else:
+            keys[key] = {"type": "number", "exclusiveMinimum": 0}
+    return {"type": "object", "additionalProperties": False, "properties": keys}
+
+
+def _scene() -> Schema:
+    """A scene, and what stands in it."""
+    found = settings_schema(scene.SceneSettings(), scene.SCENE_BOUNDS)
+    inner = found["properties"]
+    things = {"rocks": placed.PlacedRock(), "bricks": placed.PlacedBrick()}
+    for kind, usual in things.items():
+        one = settings_schema(usual, placed.BOUNDS[type(usual)])
+        some = {"type": "array", "maxItems": placed.MOST[kind], "items": {**one, "required": ["x_m", "y_m"]}}
+        inner[kind] = {"anyOf": [inner[kind], some], "default": inner[kind]["default"]}
+    keys = settings_schema(placed.PlacedBoard(), placed.BOUNDS[placed.PlacedBoard])["properties"]
+    del keys["face"]
+    faces = {}
+    for kind, face in placed.FACES.items():
+        own = settings_schema(face, placed.BOUNDS[type(face)])["properties"]
+        own.pop("digest", None)
+        faces[kind] = {**own, **keys, "kind": {"const": kind}}
+    board = {
+        "type": "object",
+        "required": ["x_m", "y_m"],
+        "anyOf": [{"additionalProperties": False, "properties": one} for one in faces.values()],
+    }
+    board["anyOf"][1]["required"] = board["anyOf"][2]["required"] = ["kind"]
+    inner["boards"] = {"type": "array", "maxItems": placed.MOST["boards"], "items": board}
+    inner["terrain"] = settings_schema(ground.OwnTerrain(), ground.BOUNDS)
+    del inner["terrain"]["properties"]["digest"]
+    inner["terrain"]["required"] = ["heights"]
+    return found
+
+
+def fault_list() -> Schema:
+    """Faults of heads and cameras."""
+    words = {word: one for kind in (HEAD_WORDS, CAMERA_WORDS, LOG_WORDS) for word, one in kind.items()}
+    parameters = {*WHEN, *(name for word in words.values() for name in word.parameters)}
+    keys = {name: number(*BOUNDS[name]) for name in sorted(parameters)}
+    one = {
+        "type": "object",
+        "additionalProperties": False,
+        "required": ["device", "word"],
+        "properties": {"device": TEXT, "word": {"enum": sorted(words)}, **keys, "at_s": keys["after_s"]},
+        "not": {"required": ["at_s", "after_s"]},
+    }
+    return {"type": "array", "items": one}
