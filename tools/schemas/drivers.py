@@ -1,4 +1,4 @@
-"""The options of our own drivers, of replay and of the simulated rover: how each is read, and what is read by hand."""
+"""The options of our own drivers, of replay and of the simulated rover, and what is read of them by hand."""
 
 from __future__ import annotations
 

@@ -298,7 +298,8 @@ def _boards() -> Schema:
             board_file.board_of(
                 "board.yaml", "", {"columns": 9, "rows": 12, **own, "kind": kind, **print_keys}
             )
-        _tell(noted.at("legacy"), FLAG) if kind == "charuco" else None
+        if "legacy" in own:
+            noted.at("legacy").value = FLAG
         for key in ("measured.across_m", "measured.down_m"):
             noted.at(key).value = {"type": "number", "exclusiveMinimum": 0}
         if "first_id" in noted.keys:
