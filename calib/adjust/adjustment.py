@@ -122,10 +122,10 @@ class Adjustment:
         for name, model in start.cameras.items():
             names = tuple(f"cameras.{name}.{p}" for p in parameter_names(model.kind))
             step, usual = np.ones(len(names)), np.zeros(len(names), dtype=bool)
-            for letter in dict.fromkeys(model.kind):
+            for letter in dict.fromkeys(model.letters):
                 part = parameter_part(model.kind, letter)
                 step[part] = float(np.linalg.norm(model.H)) if letter in "HV" else 1.0
-                usual[part] = letter in "ORE"
+                usual[part] = letter in "ORED"
             yield Unknown(("camera", name), names, step, usual=usual)
         yield Unknown(
             MAST, tuple(f"mast.{MAST_NAMES[i]}" for i in self.mast_free), np.ones(len(self.mast_free))
@@ -408,7 +408,7 @@ class Adjustment:
             kind, *which = key
             if kind == "camera":
                 model = state.cameras[str(which[0])]
-                if "O" in model.kind:
+                if "O" in model.letters:
                     residual, rates = lens_knowledge(model)
                     yield Known(key, None), ResidualBlock.of(self.unknowns, residual, {key: rates}, width=1)
             elif unknown.prior is not None and unknown.sigma is not None and len(unknown.names):

@@ -191,7 +191,7 @@ def lens_notes(rig: Rig, sigma: Mapping[str, Any]) -> tuple[str, ...]:
     for name, camera in rig.cameras.items():
         held = []
         for letter, word in (("O", "lens axis"), ("R", "distortion"), ("E", "entrance point")):
-            if letter not in camera.model.kind or name not in sigma["cameras"]:
+            if letter not in camera.model.letters or name not in sigma["cameras"]:
                 continue
             found = np.array(sigma["cameras"][name][letter])
             found = found[1:] if letter == "R" else found[:1] if letter == "E" else found

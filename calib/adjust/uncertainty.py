@@ -160,7 +160,7 @@ def sigma_by_key(rig: Rig, names: Sequence[str], covariance: FloatArray) -> dict
             continue
         mine = covariance[np.ix_(first, first)]
         cameras[name] = {}
-        for letter in dict.fromkeys(kind):
+        for letter in dict.fromkeys(camera.model.letters):
             part = parameter_part(kind, letter)
             block = mine[part, part]
             if letter in "AO":

@@ -348,9 +348,9 @@ def _moved_parameters(model: CameraModel, correction: BodyPose) -> tuple[FloatAr
     rotation = correction.motion.rotation
     size = len(parameter_names(model.kind))
     rates, turn = np.zeros((size, 6)), np.eye(size)
-    for letter in dict.fromkeys(model.kind):
+    for letter in dict.fromkeys(model.letters):
         part = parameter_part(model.kind, letter)
-        if letter in "RE":
+        if letter in "RED":
             continue
         now: FloatArray = getattr(moved, letter)
         about = correction.origin_m + correction.step[3:] if letter == "C" else np.zeros(3)

@@ -82,7 +82,7 @@ class TwoSteps:
         s = np.setdiff1d(np.arange(total), np.concatenate([k, m]))
         camera_matrix = first[np.ix_(k, k)] + np.diag(problem.weak[k])
         for name, model in self.cameras.items():
-            if "O" in model.kind:
+            if "O" in model.letters:
                 _, rows = lens_knowledge(model)
                 part = np.searchsorted(k, problem.at(("camera", name)))
                 camera_matrix[np.ix_(part, part)] += rows.T @ rows
@@ -182,11 +182,11 @@ class TwoSteps:
         for letter in "HV":
             out[parameter_part(nominal.kind, letter)] = parts[letter] - getattr(nominal, letter)
         for letter in "AO":
-            if letter in nominal.kind:
+            if letter in nominal.letters:
                 out[parameter_part(nominal.kind, letter)] = tangents(getattr(nominal, letter)) @ parts[letter]
-        if "R" in nominal.kind:
+        if "R" in nominal.letters:
             out[parameter_part(nominal.kind, "R")] = (model.R - nominal.R)[1:]
-        if "E" in nominal.kind:
+        if "E" in nominal.letters:
             out[parameter_part(nominal.kind, "E")] = model.E - nominal.E
         return out
 

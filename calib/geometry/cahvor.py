@@ -1,7 +1,10 @@
-"""CAHV, CAHVOR and CAHVORE camera models: project, ray, Jacobians, motion.
+"""Camera models: project, ray, Jacobians, motion. CAHV, CAHVOR, CAHVORE, and OpenCV's lenses behind a CAHV.
 
 Pixels are (x, y) = (column, row), 0-based; the centre of the top-left pixel is (0, 0). H and V need not be at
 right angles, and mirrored images are as good as others.
+
+A camera of OpenCV's families is a CAHV with a lens in front: z of the lens is A, y is the part of V across A,
+and x is at right angles to both. H, V and A in those axes are the camera matrix, with its skew in H.
 
 Sources: Yakimovsky and Cunningham 1978 (CAHV); Gennery 2001, 2006 (CAHVOR, CAHVORE); JPL's camera-model
 library as published with VICAR (``cmod_cahv*.c``).
@@ -19,10 +22,28 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.geometry.lens import Lens
-from calib.geometry.projection import Place, Projection, project_as_published
+from calib.geometry.lenses.fisheye import FisheyeLens
+from calib.geometry.lenses.opencv import OpencvLens
+from calib.geometry.lenses.projection import FreeLens, FreeProjection
+from calib.geometry.projection import PixelMap, Place, Projection, project_as_published
 from calib.geometry.rigid import FloatArray, ReadOnlyArrays, Rigid, frozen_array, tangents, turning
 
-Kind = Literal["CAHV", "CAHVOR", "CAHVORE"]
+Kind = Literal[
+    "CAHV",
+    "CAHVOR",
+    "CAHVORE",
+    "OPENCV4",
+    "OPENCV5",
+    "OPENCV8",
+    "OPENCV12",
+    "OPENCV14",
+    "OPENCV_FISHEYE",
+]
+
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+COEFFICIENTS: dict[str, int] = {f"OPENCV{n}": n for n in (4, 5, 8, 12, 14)} | {"OPENCV_FISHEYE": 4}
+"""How many coefficients each of OpenCV's families has."""
 
 _UNIT = 1e-9
 """How far the length of A and O may be from 1."""
@@ -45,15 +66,20 @@ class Rays(NamedTuple):
     valid: np.ndarray
 
 
+def letters_of(kind: str) -> str:
+    """Return the letters of what a kind has numbers for: those of CAHVORE, and D for OpenCV's coefficients."""
+    return "CAHVD" if kind in COEFFICIENTS else kind
+
+
 @dataclass(frozen=True, eq=False)
 class CameraModel(ReadOnlyArrays):
-    """One camera of the CAHV family; A and O are unit vectors (see ``normalised``).
+    """One camera; A and O are unit vectors (see ``normalised``).
 
     Attributes
     ----------
     kind
-        Says which letters count: CAHV ignores O, R and E, CAHVOR ignores E. Those that do not count are
-        kept as O = A, R = 0, E = 0.
+        Says which letters count: CAHV ignores O, R and E, CAHVOR ignores E, OpenCV's families all three.
+        Those that do not count are kept as O = A, R = 0, E = 0.
     size_px
         (width, height).
     C, A, H, V, O, R, E
@@ -61,6 +87,8 @@ class CameraModel(ReadOnlyArrays):
     cahvore_type
         1 (perspective, linearity 1), 2 (fisheye, linearity 0) or 3 (``linearity`` as given); 0 for CAHV
         and CAHVOR.
+    distortion
+        (n,) OpenCV's coefficients in its order, 4 to 14 as the kind says; none of the CAHV family.
 
     Raises
     ------
@@ -72,7 +100,8 @@ class CameraModel(ReadOnlyArrays):
     A point has a pixel if the lens reaches it: for CAHV and CAHVOR it is in front of C along A and along O,
     for CAHVORE its ray is within the angle that the linearity allows (a right angle over ``linearity``, at
     most half a turn), and for both it is nearer to O than where the polynomial of R first folds. Points so
-    near a CAHVORE lens that two rays of the image pass through them have none. Everything else comes out
+    near a CAHVORE lens that two rays of the image pass through them have none. A lens of OpenCV's reaches
+    what is nearer to A than where it first folds (``limit_words``). Everything else comes out
     as not-a-number and False. A point outside the image keeps its numbers.
 
     Examples
@@ -95,15 +124,16 @@ class CameraModel(ReadOnlyArrays):
     E: FloatArray = None  # type: ignore[assignment]  # 0 if not given
     cahvore_type: int = 0
     linearity: float = 1.0
+    distortion: FloatArray = None  # type: ignore[assignment]  # 0 if not given
     _rows: FloatArray = field(init=False, repr=False)  # C, H, V, A, and the lens frame's x, y, z = O
-    _projection: Projection = field(init=False, repr=False)
+    _projection: PixelMap = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         self._set_words()
         for letter in "CAHV":
             self._set(letter, _vector(letter, getattr(self, letter)))
         for letter, default in (("O", self.A), ("R", np.zeros(3)), ("E", np.zeros(3))):
-            given = getattr(self, letter) if letter in self.kind else None
+            given = getattr(self, letter) if letter in self.letters else None
             self._set(letter, _vector(letter, default if given is None else given))
         for letter, axis in (("A", self.A), ("O", self.O)):
             if not abs(sqrt(float(axis @ axis)) - 1.0) <= _UNIT:
@@ -118,18 +148,22 @@ class CameraModel(ReadOnlyArrays):
         lengths = np.sqrt(np.einsum("ij,ij->i", hva, hva))
         if not lengths.all() or not abs(np.linalg.det(hva / lengths[:, None])) > _FLAT:
             raise ValueError("H, V and A lie in one plane where three directions are expected")
-        axes = np.array([*tangents(self.O), self.O])
+        free = self.kind in COEFFICIENTS
+        axes = _axes_of(self.A, self.V) if free else np.array([*tangents(self.O), self.O])
         self._set("_rows", np.array([self.C, *hva, *axes]))
         self._rows.setflags(write=False)
-        self._set("_projection", self._make_projection(hva @ axes.T))
+        if free:
+            self._set_projection(np.triu(np.vstack([hva[:2] @ axes.T, [0.0, 0.0, 1.0]])))
+        else:
+            self._set("_projection", self._make_projection(hva @ axes.T))
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
 
     def _set_words(self) -> None:
         """Check and settle what is not a vector: kind, size, type and linearity."""
-        if self.kind not in get_args(Kind):
-            raise ValueError(f"the kind is {self.kind!r} where CAHV, CAHVOR or CAHVORE is expected")
+        if self.kind not in KINDS:
+            raise ValueError(f"the kind is {self.kind!r} where one of {', '.join(KINDS)} is expected")
         try:
             sizes = [n if isinstance(n, Integral) and not isinstance(n, bool) else 0 for n in self.size_px]
         except TypeError:
@@ -147,6 +181,21 @@ class CameraModel(ReadOnlyArrays):
         if not isfinite(linearity):
             raise ValueError(f"the linearity is {linearity} where a finite number is expected")
         self._set("linearity", linearity)
+        count = COEFFICIENTS.get(self.kind, 0)
+        given = np.zeros(count) if self.distortion is None else self.distortion
+        self._set("distortion", _vector("distortion", given, count))
+
+    def _set_projection(self, camera_matrix: FloatArray) -> None:
+        """Set what stays when a camera of OpenCV's families moves."""
+        (fx, skew, cx), (_, fy, cy), _ = camera_matrix.tolist()
+        back = np.array([[1 / fx, -skew / fx / fy, (skew * cy / fy - cx) / fx], [0, 1 / fy, -cy / fy], [0, 0, 1]])
+        lens: FreeLens
+        told, image_slope = tuple(self.distortion.tolist()), _largest_slope(self.size_px, back)
+        fisheye = self.kind == "OPENCV_FISHEYE"
+        lens = FisheyeLens(told, image_slope) if fisheye else OpencvLens(told, image_slope)
+        for matrix in (camera_matrix, back):
+            matrix.setflags(write=False)
+        self._set("_projection", FreeProjection(lens, camera_matrix, back))
 
     def _make_projection(self, pixel_from_slope: FloatArray) -> Projection:
         """Return what stays when the camera moves."""
@@ -191,7 +240,7 @@ class CameraModel(ReadOnlyArrays):
             As the class, and if A or O is zero.
         """
         given = {"A": _vector("A", A)}
-        if O is not None and "O" in str(kind):
+        if O is not None and "O" in letters_of(str(kind)):
             given["O"] = _vector("O", O)
         units, stretched = {}, False
         for letter, axis in given.items():
@@ -203,7 +252,7 @@ class CameraModel(ReadOnlyArrays):
             stretched |= not is_unit
         vectors = {"C": C, "H": H, "V": V, "O": None, "R": R, "E": E} | units
         model = cls(kind, size_px, cahvore_type=cahvore_type, linearity=linearity, **vectors)  # type: ignore[arg-type]
-        if not stretched:
+        if not stretched or kind in COEFFICIENTS:
             return model, 0.0
         x, y = np.meshgrid(*(np.linspace(-0.5, n - 0.5, 17) for n in model.size_px))
         pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
@@ -220,10 +269,105 @@ class CameraModel(ReadOnlyArrays):
             shift_px = max(shift_px, float(np.where(np.isfinite(far), far, inf).max(initial=0.0)))
         return model, shift_px
 
+    @classmethod
+    def of_matrix(
+        cls,
+        kind: Kind,
+        size_px: tuple[int, int],
+        camera_matrix: ArrayLike,
+        distortion: ArrayLike,
+        rotation: ArrayLike,
+        C: ArrayLike,
+    ) -> CameraModel:
+        """Return a camera of OpenCV's numbers; they come back from it to the last bit.
+
+        Parameters
+        ----------
+        kind
+            One of OpenCV's families, or CAHV, which has no ``distortion``.
+        size_px
+            (width, height).
+        camera_matrix
+            (3, 3) [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]; fx and fy of two signs mirror the image.
+        distortion
+            (n,) coefficients.
+        rotation
+            (3, 3) OpenCV's R: rows are the camera's x right, y down and z ahead in the frame of C.
+        C
+            (3,) where the camera is, metres: -R^T t of OpenCV's t.
+
+        Raises
+        ------
+        ValueError
+            As the class; if the rotation or the matrix is none; if fy is negative.
+        """
+        matrix, axes = _vector("camera_matrix", camera_matrix, (3, 3)), _vector("rotation", rotation, (3, 3))
+        if matrix[1, 0] or matrix[2].tolist() != [0.0, 0.0, 1.0] or not matrix[0, 0] or not matrix[1, 1] > 0.0:
+            raise ValueError(
+                f"the camera matrix is {matrix.tolist()} where [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with "
+                "fy above 0 is expected"
+            )
+        if not np.abs(axes @ axes.T - np.eye(3)).max() <= _UNIT or not np.linalg.det(axes) > 0.0:
+            raise ValueError(f"{axes.tolist()} is no rotation")
+        h, v = matrix[:2] @ axes
+        if kind == "CAHV":
+            return cls(kind, size_px, _vector("C", C), axes[2], h, v)
+        model = cls(kind, size_px, _vector("C", C), axes[2], h, v, distortion=_vector("distortion", distortion, -1))
+        rows = model._rows.copy()
+        rows[4:] = axes
+        rows.setflags(write=False)
+        model._set("_rows", rows)
+        model._set_projection(matrix.copy())
+        return model
+
+    @property
+    def letters(self) -> str:
+        """Letters of what this kind has numbers for (``letters_of``)."""
+        return letters_of(self.kind)
+
     @property
     def lens(self) -> Lens:
-        """Distortion, entrance point and reach: what stays when the camera moves."""
+        """The round lens of a CAHV, CAHVOR or CAHVORE camera: what stays when the camera moves.
+
+        Raises
+        ------
+        AttributeError
+            If the camera is of another family.
+        """
+        if not isinstance(self._projection, Projection):
+            raise AttributeError(f"{self.kind} has no round lens")
         return self._projection.lens
+
+    @property
+    def free_lens(self) -> FreeLens | None:
+        """The lens of a camera of OpenCV's families; None for the CAHV family."""
+        return self._projection.lens if isinstance(self._projection, FreeProjection) else None
+
+    @property
+    def moving(self) -> bool:
+        """Whether rays begin elsewhere the more they bend: only a CAHVORE's do."""
+        return self._projection.moving
+
+    @property
+    def limit_words(self) -> str:
+        """Where the lens ends, as a sentence's end: "the lens folds at 61.2 degrees from its axis".
+
+        Empty if it has no end but that of its family.
+        """
+        return self._projection.limit_words
+
+    @property
+    def camera_matrix(self) -> FloatArray:
+        """(3, 3) [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] of a CAHV camera or one of OpenCV's families."""
+        if isinstance(self._projection, FreeProjection):
+            return self._projection.pixel_from_slope
+        inner = np.stack([self.H, self.V]) @ self.rotation.T
+        return np.triu(np.vstack([inner, [0.0, 0.0, 1.0]]))
+
+    @property
+    def rotation(self) -> FloatArray:
+        """(3, 3) OpenCV's R: rows are x right, y down (as V says) and z along A, in the model's frame."""
+        return self._axes if self.kind in COEFFICIENTS else _axes_of(self.A, self.V)
 
     @property
     def image_center_px(self) -> tuple[float, float]:
@@ -269,6 +413,8 @@ class CameraModel(ReadOnlyArrays):
     @property
     def axes(self) -> FloatArray:
         """(3, 3): columns are x right, y down and z along A, in the model's frame."""
+        if self.kind in COEFFICIENTS:
+            return self._axes.T
         across = self.H - (self.H @ self.A) * self.A
         x = across / np.linalg.norm(across)
         return np.stack([x, np.cross(self.A, x), self.A], axis=-1)
@@ -346,12 +492,21 @@ class CameraModel(ReadOnlyArrays):
         return c, x, y, o
 
 
-def _vector(letter: str, given: ArrayLike) -> FloatArray:
-    """Return one of the model's vectors, read-only, or say which letter is wrong."""
+def _vector(letter: str, given: ArrayLike, shape: int | tuple[int, ...] = 3) -> FloatArray:
+    """Return some of the model's numbers, read-only, or say which are wrong; a count of -1 is any."""
     try:
-        return frozen_array(given, (3,))
+        if shape == -1:
+            shape = len(np.atleast_1d(np.asarray(given)))
+        return frozen_array(given, (shape,) if isinstance(shape, int) else shape)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{letter}: {error}") from None
+
+
+def _axes_of(a: FloatArray, v: FloatArray) -> FloatArray:
+    """(3, 3): rows x, y, z with z = A and y the part of V across it."""
+    y = v - (v @ a) * a
+    y = y / np.linalg.norm(y)
+    return np.array([np.cross(y, a), y, a])
 
 
 def _as_rows(values: ArrayLike, width: int, what: str) -> FloatArray:

@@ -21,7 +21,7 @@ f(theta) = 0 on the side where f grows, and only if no second ray of the image p
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import asin, atan, inf, isfinite, pi, sin, sqrt, tan
+from math import asin, atan, degrees, inf, isfinite, pi, sin, sqrt, tan
 
 import numpy as np
 
@@ -103,6 +103,14 @@ class Lens:
         in_image = self.undistorted(self.image_slope)
         object.__setattr__(self, "theta_image_rad", theta if in_image is None else self.theta_of(in_image))
         object.__setattr__(self, "near_m", self._farthest_crossing() if self.moving else 0.0)
+
+    @property
+    def limit_words(self) -> str:
+        """Where the lens ends, as the end of a sentence; empty if that is where its family ends."""
+        end = self.theta_of(self.chi_limit)
+        if self.chi_limit == inf or end >= self.theta_of(inf):
+            return ""
+        return f"the lens folds at {degrees(end):.1f} degrees from its axis"
 
     def distorted(self, chi: float) -> float:
         """Return chi' of chi."""

@@ -1,7 +1,8 @@
 """A camera's free parameters, and how its pixels depend on them.
 
 A fit moves a camera by a *step* in this order: C (3, metres), A (2, radians), H (3), V (3, pixels), then for
-CAHVOR and CAHVORE O (2, radians) and R1, R2, then for CAHVORE E0, E1, E2. A and O are unit vectors: they move
+CAHVOR and CAHVORE O (2, radians) and R1, R2, then for CAHVORE E0, E1, E2; for OpenCV's families D, the
+coefficients in OpenCV's order. A and O are unit vectors: they move
 in their tangent plane, along the two directions of ``tangents``. R0 is not among them: I + r0 (I - OOᵀ) is a
 linear map that H, V and A absorb, so R0 stays what it is (0 in every fit).
 
@@ -10,6 +11,10 @@ V.q) / (A.q). ``calib.geometry.lens_rays`` gives m with dm = n lambda.dlambda + 
 right angles to it) changes zeta by lambda.o and lambda by -(lambda.o) O - zeta o, hence
 
     dq = (1 - m zeta) o + ((k - n zeta) lambda - m O) (lambda.o).
+
+OpenCV's lenses turn with A and V: with q = u x + v y + A, a turn omega of the lens frame moves (x, y) by
+omega.(q x d pixel/dq - d x d pixel/d point). A step a of A turns the frame by (-a.y, a.x, cy/fy a.x), a step
+of V about A by -dV.x / fy.
 """
 
 from __future__ import annotations
@@ -19,9 +24,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.geometry.cahvor import CameraModel, Kind
+from calib.geometry.cahvor import CameraModel, letters_of
 from calib.geometry.lens import TINY, Lens, ray_angle
 from calib.geometry.lens_rays import bend
+from calib.geometry.lenses import fisheye, opencv
+from calib.geometry.lenses.projection import FreeLens
 from calib.geometry.rigid import FloatArray, tangents
 
 _LETTERS = {
@@ -32,6 +39,10 @@ _LETTERS = {
     "O": ("O.1", "O.2"),
     "R": ("R.1", "R.2"),
     "E": ("E.0", "E.1", "E.2"),
+}
+_COEFFICIENTS = {
+    **{f"OPENCV{n}": tuple(f"D.{name}" for name in opencv.NAMES[:n]) for n in opencv.COUNTS},
+    "OPENCV_FISHEYE": tuple(f"D.{name}" for name in fisheye.NAMES),
 }
 
 
@@ -44,16 +55,20 @@ class Prediction(NamedTuple):
     valid: np.ndarray
 
 
-def parameter_names(kind: Kind) -> tuple[str, ...]:
-    """Return the names of a camera's parameters, in the order of a step: 11, 15 or 18 of them."""
-    return tuple(name for letter in kind for name in _LETTERS[letter])
+def parameter_names(kind: str) -> tuple[str, ...]:
+    """Return the names of a camera's parameters, in the order of a step: 11 to 25 of them."""
+    return tuple(name for letter in letters_of(kind) for name in _names(kind, letter))
 
 
-def parameter_part(kind: Kind, letter: str) -> slice:
+def _names(kind: str, letter: str) -> tuple[str, ...]:
+    return _COEFFICIENTS[kind] if letter == "D" else _LETTERS[letter]
+
+
+def parameter_part(kind: str, letter: str) -> slice:
     """Return where a letter's parameters are in a step of a camera of this kind."""
     start = 0
-    for other in kind:
-        size = len(_LETTERS[other])
+    for other in letters_of(kind):
+        size = len(_names(kind, other))
         if other == letter:
             return slice(start, start + size)
         start += size
@@ -62,8 +77,10 @@ def parameter_part(kind: Kind, letter: str) -> slice:
 
 def camera_numbers(model: CameraModel) -> FloatArray:
     """Return the values (p,) of a camera's parameters; 0 for those of A and O, which count from its own."""
-    values = {"A": np.zeros(2), "O": np.zeros(2), "R": model.R[1:]}
-    return np.concatenate([values.get(letter, getattr(model, letter)) for letter in model.kind])
+    values = {"A": np.zeros(2), "O": np.zeros(2), "R": model.R[1:], "D": model.distortion}
+    return np.concatenate(
+        [values[letter] if letter in values else getattr(model, letter) for letter in model.letters]
+    )
 
 
 def stepped(model: CameraModel, step: FloatArray) -> CameraModel:
@@ -75,7 +92,7 @@ def stepped(model: CameraModel, step: FloatArray) -> CameraModel:
         If the step leads to something that is no camera.
     """
     kind = model.kind
-    parts = {letter: step[parameter_part(kind, letter)] for letter in kind}
+    parts = {letter: step[parameter_part(kind, letter)] for letter in model.letters}
     changed = {"C": model.C + parts["C"], "H": model.H + parts["H"], "V": model.V + parts["V"]}
     for letter, axis in (("A", model.A), ("O", model.O)):
         if letter in parts:
@@ -85,6 +102,8 @@ def stepped(model: CameraModel, step: FloatArray) -> CameraModel:
         changed["R"] = model.R + np.concatenate([[0.0], parts["R"]])
     if "E" in parts:
         changed["E"] = model.E + parts["E"]
+    if "D" in parts:
+        changed["distortion"] = model.distortion + parts["D"]
     return replace(model, **changed)  # type: ignore[arg-type]  # letters only
 
 
@@ -93,6 +112,8 @@ def predict(model: CameraModel, points_m: FloatArray) -> Prediction:
 
     Points that have no pixel come out as not-a-number.
     """
+    if model.free_lens is not None:
+        return _predict_free(model, model.free_lens, points_m)
     o, axis = model.O, model.A
     lens = model.lens
     d = points_m - model.C
@@ -124,6 +145,41 @@ def predict(model: CameraModel, points_m: FloatArray) -> Prediction:
         )
         d_step = _to_step(
             model, lens, Slopes(d_q, q / depth[:, None], pixels, along, across), lam, zeta, m, n, k
+        )
+    if not valid.all():
+        for array in (pixels, d_step, d_points):
+            array[~valid] = np.nan
+    return Prediction(pixels, d_step, d_points, valid)
+
+
+def _predict_free(model: CameraModel, lens: FreeLens, points_m: FloatArray) -> Prediction:
+    """The same for a camera of OpenCV's families."""
+    kind, axes, matrix = model.kind, model.rotation, model.camera_matrix
+    x, _, z = axes
+    d = points_m - model.C
+    local = np.ascontiguousarray((d @ axes.T).T)
+    d_step = np.zeros((len(d), 2, len(parameter_names(kind))))
+    with np.errstate(all="ignore"):
+        bent = lens.bend(local, True)
+        if bent.rates is None:
+            raise AssertionError("bend was asked for derivatives")
+        pixels = (matrix[:2, :2] @ bent.slopes + matrix[:2, 2:]).T
+        valid = bent.valid & np.isfinite(pixels).all(axis=-1)
+        d_points = np.einsum("ij,jkn->nik", matrix[:2, :2], bent.rates) @ axes
+        q = bent.slopes.T @ axes[:2] + z
+        d_q = np.stack([model.H - pixels[:, :1] * z, model.V - pixels[:, 1:] * z], axis=1)
+        d_turn = np.cross(q[:, None], d_q) - np.cross(d[:, None], d_points)
+        d_step[..., parameter_part(kind, "C")] = -d_points
+        on_a, (_, fy, cy) = tangents(model.A), matrix[1]
+        turns = np.stack([-on_a @ axes[1], on_a @ x, cy / fy * (on_a @ x)], axis=1) @ axes
+        d_step[..., parameter_part(kind, "A")] = (
+            d_turn @ turns.T - pixels[..., None] * (q @ on_a.T)[:, None, :]
+        )
+        d_step[:, 0, parameter_part(kind, "H")] = q
+        d_step[..., parameter_part(kind, "V")] = (d_turn @ z)[..., None] * (-x / fy)
+        d_step[:, 1, parameter_part(kind, "V")] += q
+        d_step[..., parameter_part(kind, "D")] = np.einsum(
+            "ij,jkn->nik", matrix[:2, :2], lens.coefficient_rates(local)
         )
     if not valid.all():
         for array in (pixels, d_step, d_points):

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf, isfinite, nan
+from typing import Protocol
 
 import numpy as np
 
@@ -22,12 +23,57 @@ from calib.geometry.lens import Lens
 from calib.geometry.lens_rays import bend, bend_point, unbend, unbend_point
 from calib.geometry.rigid import FloatArray, ReadOnlyArrays
 
-_CHUNK = 4096
+CHUNK = 4096
 """Points at a time: some thirty rows of them stay in a core's own cache."""
 
 Triple = tuple[float, float, float]
 Place = tuple[list[float], list[float], list[float], list[float]]
 """C and the lens frame's x, y and z = O as plain floats."""
+
+Rays = tuple[FloatArray, FloatArray, np.ndarray, FloatArray, FloatArray]
+
+
+class PixelMap(Protocol):
+    """What a camera needs of a lens with the plane behind it, wherever the camera stands.
+
+    `Projection` is that of the CAHV family, `calib.geometry.lenses.projection.FreeProjection` that of lenses
+    which are not round about O.
+    """
+
+    @property
+    def moving(self) -> bool:
+        """Whether the entrance point moves with a ray's angle."""
+        ...
+
+    @property
+    def limit_words(self) -> str:
+        """Where the lens ends, as the end of a sentence; empty if it ends nowhere."""
+        ...
+
+    def project(
+        self, points: FloatArray, center: FloatArray, frame: FloatArray, derivatives: bool
+    ) -> tuple[FloatArray, FloatArray, np.ndarray]:
+        """Return pixels (n, 2), Jacobians (n, 2, 3) if asked for, and which are valid (n,).
+
+        ``points`` (n, 3) metres, ``center`` (3,) and ``frame`` (4, 3) are in one frame; the rows of the last
+        are A and the lens frame's axes.
+        """
+        ...
+
+    def rays(self, pixels: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool) -> Rays:
+        """Return origins (n, 3), directions (n, 3) and validity (n,) of the rays of pixels (n, 2).
+
+        Then d direction / d pixel and d origin / d pixel, (n, 3, 2) each if asked for, else with no rows.
+        """
+        ...
+
+    def project_point(self, x: float, y: float, z: float, place: Place) -> tuple[float, float]:
+        """Return the pixel of one point, not-a-number if it has none."""
+        ...
+
+    def ray_of_pixel(self, x_px: float, y_px: float, place: Place) -> tuple[Triple, Triple] | None:
+        """Return origin and direction of one pixel's ray, None if it has none."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +94,16 @@ class Projection(ReadOnlyArrays):
     pixel_from_slope: FloatArray
     slope_from_pixel: FloatArray
 
+    @property
+    def moving(self) -> bool:
+        """Whether the entrance point moves with a ray's angle."""
+        return self.lens.moving
+
+    @property
+    def limit_words(self) -> str:
+        """Where the lens ends, as the end of a sentence; empty if it ends nowhere."""
+        return self.lens.limit_words
+
     def project(
         self, points: FloatArray, center: FloatArray, frame: FloatArray, derivatives: bool
     ) -> tuple[FloatArray, FloatArray, np.ndarray]:
@@ -60,10 +116,10 @@ class Projection(ReadOnlyArrays):
         pixels, valid = np.empty((count, 2)), np.empty(count, dtype=bool)
         jacobian = np.empty((count if derivatives else 0, 2, 3))
         with np.errstate(all="ignore"):
-            if 0 < count <= _CHUNK:
+            if 0 < count <= CHUNK:
                 self._project(points, center, frame, pixels, jacobian, valid)
             else:
-                for part in _chunks(count):
+                for part in chunks(count):
                     self._project(points[part], center, frame, pixels[part], jacobian[part], valid[part])
         return pixels, jacobian, valid
 
@@ -109,9 +165,7 @@ class Projection(ReadOnlyArrays):
             pixels[~valid] = nan
             jacobian[~valid[: len(jacobian)]] = nan
 
-    def rays(
-        self, pixels: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
-    ) -> tuple[FloatArray, FloatArray, np.ndarray, FloatArray, FloatArray]:
+    def rays(self, pixels: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool) -> Rays:
         """Return origins (n, 3), directions (n, 3) and validity (n,) of the rays of pixels (n, 2).
 
         Then d direction / d pixel and d origin / d pixel, (n, 3, 2) each if asked for, else with no rows.
@@ -122,10 +176,10 @@ class Projection(ReadOnlyArrays):
         d_directions, d_origins = np.empty((rows, 3, 2)), np.zeros((rows, 3, 2))
         filled = (origins, directions, valid, d_directions, d_origins)
         with np.errstate(all="ignore"):
-            if 0 < count <= _CHUNK:
+            if 0 < count <= CHUNK:
                 self._rays(pixels, center, axes, *filled)
             else:
-                for part in _chunks(count):
+                for part in chunks(count):
                     self._rays(pixels[part], center, axes, *(array[part] for array in filled))
         return filled
 
@@ -224,9 +278,9 @@ class Projection(ReadOnlyArrays):
         )
 
 
-def _chunks(count: int) -> Iterator[slice]:
+def chunks(count: int) -> Iterator[slice]:
     """Cut ``count`` rows into slices that fit the cache."""
-    return (slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK))
+    return (slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK))
 
 
 def project_as_published(

@@ -105,7 +105,7 @@ class Knowledge:
         for camera in self.rig.cameras.values():
             kind = camera.model.kind
             mine = np.empty(len(parameter_names(kind)))
-            for letter in dict.fromkeys(kind):
+            for letter in dict.fromkeys(camera.model.letters):
                 scale = float(np.linalg.norm(camera.model.H)) if letter in "HV" else 1.0
                 mine[parameter_part(kind, letter)] = BEFOREHAND[letter] * scale
             sigma += mine.tolist()

@@ -235,9 +235,9 @@ def _parameter_change(model: CameraModel, moved: CameraModel) -> FloatArray:
         moved.H - model.H,
         moved.V - model.V,
     ]
-    if "O" in model.kind:
+    if "O" in model.letters:
         change += [tangents(model.O) @ (moved.O - model.O), (moved.R - model.R)[1:]]
-    if "E" in model.kind:
+    if "E" in model.letters:
         change.append(moved.E - model.E)
     return np.concatenate(change)
 

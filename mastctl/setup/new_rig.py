@@ -259,7 +259,7 @@ def _errors(model: CameraModel) -> list[Callable[[float], CameraModel]]:
 
 def _step(model: CameraModel, other: CameraModel) -> FloatArray:
     """The step of a fit from one camera to another near it, to first order."""
-    parts = {letter: getattr(other, letter) - getattr(model, letter) for letter in model.kind}
+    parts = {letter: getattr(other, letter) - getattr(model, letter) for letter in model.letters}
     parts["A"] = tangents(model.A) @ parts["A"]
     if "O" in parts:
         parts["O"], parts["R"] = tangents(model.O) @ parts["O"], parts["R"][1:]

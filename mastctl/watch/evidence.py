@@ -284,7 +284,7 @@ def _rates_of_position(
 def _turn_rates(model: CameraModel) -> FloatArray:
     """(p, 3) of a camera's parameters to a turn about its own place, by the axes of the model's frame."""
     rates = np.zeros((len(parameter_names(model.kind)), 3))
-    for letter in dict.fromkeys(model.kind):
+    for letter in dict.fromkeys(model.letters):
         if letter in "CRE":
             continue
         x, y, z = getattr(model, letter)
