@@ -408,7 +408,7 @@ class Adjustment:
             kind, *which = key
             if kind == "camera":
                 model = state.cameras[str(which[0])]
-                if "O" in model.letters:
+                if model.kind != "CAHV":
                     residual, rates = lens_knowledge(model)
                     yield Known(key, None), ResidualBlock.of(self.unknowns, residual, {key: rates}, width=1)
             elif unknown.prior is not None and unknown.sigma is not None and len(unknown.names):

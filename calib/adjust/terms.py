@@ -159,27 +159,47 @@ these; a survey that sees a lens well does not feel them, and one that does not 
 LIMITS = {"O": (O_SIGMA_RAD,) * 3, "R": R_SIGMA, "E": (E_SIGMA_M,) * 3}
 """The same by a camera's letters."""
 
+D_SIGMA = {"p": 0.02, "s": 0.05, "tau": 0.1, "k": 1.0}
+RATIONAL_SIGMA = 10.0
+"""What OpenCV's coefficients are like, one sigma, by their first letter. Of a ratio of polynomials both parts
+may grow together, far beyond what either would be alone."""
+
+
+def coefficient_sigma(kind: str) -> FloatArray:
+    """Return what the coefficients of one of OpenCV's families are like, one sigma each (n,)."""
+    names = [name.removeprefix("D.") for name in parameter_names(kind)[parameter_part(kind, "D")]]
+    ratio = "k6" in names
+    words = [name.rstrip("0123456789").split("_")[0] for name in names]
+    return np.array([RATIONAL_SIGMA if ratio and word == "k" else D_SIGMA[word] for word in words])
+
+
 HARDLY = 0.7
 """A lens whose sigma stays above this part of what was known beforehand is hardly seen."""
 
 
 def lens_knowledge(model: CameraModel) -> tuple[FloatArray, FloatArray]:
-    """Return how far a lens is from usual, in sigmas, and the Jacobian to the camera's step."""
+    """Return how far a lens is from usual, in sigmas, and the Jacobian to the step; nothing of a CAHV."""
     kind = model.kind
     size = len(parameter_names(kind))
+    if "O" not in model.letters:
+        sigma = coefficient_sigma(kind) if "D" in model.letters else np.zeros(0)
+        rows = np.zeros((len(sigma), size))
+        if len(sigma):
+            rows[:, parameter_part(kind, "D")] = np.diag(1 / sigma)
+        return model.distortion / sigma, rows
     aside = np.zeros((3, size))
     aside[:, parameter_part(kind, "O")] = tangents(model.O).T / O_SIGMA_RAD
     aside[:, parameter_part(kind, "A")] = -tangents(model.A).T / O_SIGMA_RAD
-    residuals, rows = [(model.O - model.A) / O_SIGMA_RAD, model.R[1:] / np.array(R_SIGMA)], [aside]
+    residuals, blocks = [(model.O - model.A) / O_SIGMA_RAD, model.R[1:] / np.array(R_SIGMA)], [aside]
     bends = np.zeros((2, size))
     bends[:, parameter_part(kind, "R")] = np.diag(1 / np.array(R_SIGMA))
-    rows.append(bends)
+    blocks.append(bends)
     if "E" in kind:
         enters = np.zeros((3, size))
         enters[:, parameter_part(kind, "E")] = np.eye(3) / E_SIGMA_M
-        rows.append(enters)
+        blocks.append(enters)
         residuals.append(model.E / E_SIGMA_M)
-    return np.concatenate(residuals), np.concatenate(rows)
+    return np.concatenate(residuals), np.concatenate(blocks)
 
 
 def lens_notes(rig: Rig, sigma: Mapping[str, Any]) -> tuple[str, ...]:

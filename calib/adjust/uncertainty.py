@@ -167,7 +167,8 @@ def sigma_by_key(rig: Rig, names: Sequence[str], covariance: FloatArray) -> dict
                 on = tangents(camera.model.A if letter == "A" else camera.model.O)
                 block = on.T @ block @ on
             spread = np.sqrt(np.maximum(np.diag(block), 0.0)).tolist()
-            cameras[name][letter] = [0.0, *spread] if letter == "R" else spread
+            key = "distortion" if letter == "D" else letter
+            cameras[name][key] = [0.0, *spread] if letter == "R" else spread
     return {"mast": mast, "cameras": cameras}
 
 

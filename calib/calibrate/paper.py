@@ -82,7 +82,7 @@ class TwoSteps:
         s = np.setdiff1d(np.arange(total), np.concatenate([k, m]))
         camera_matrix = first[np.ix_(k, k)] + np.diag(problem.weak[k])
         for name, model in self.cameras.items():
-            if "O" in model.letters:
+            if model.kind != "CAHV":
                 _, rows = lens_knowledge(model)
                 part = np.searchsorted(k, problem.at(("camera", name)))
                 camera_matrix[np.ix_(part, part)] += rows.T @ rows
@@ -188,6 +188,8 @@ class TwoSteps:
             out[parameter_part(nominal.kind, "R")] = (model.R - nominal.R)[1:]
         if "E" in nominal.letters:
             out[parameter_part(nominal.kind, "E")] = model.E - nominal.E
+        if "D" in nominal.letters:
+            out[parameter_part(nominal.kind, "D")] = model.distortion - nominal.distortion
         return out
 
 

@@ -13,11 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
 
+import numpy as np
+
 from calib.errors import BadFile
-from calib.files import LARGEST_IMAGE_PX, CameraFile, build_model, digest_of, read_bytes
+from calib.files import LARGEST_IMAGE_PX, TOLD_SHIFT_PX, CameraFile, build_model, digest_of, read_bytes
 from calib.files.atomic import save_bytes
 from calib.files.yaml_text import MAX_BYTES, Section, dump_mapping, kind_of, parse_mapping
-from calib.geometry.cahvor import CameraModel, Kind
+from calib.geometry.cahvor import COEFFICIENTS, KINDS, CameraModel, Kind
 from calib.geometry.rig import MOST_HARMONICS, AxisJoint, JointErrors, Mast, Rig, RigCamera
 
 MAST_SCHEMA = "mastctl/mast/1"
@@ -27,9 +29,11 @@ CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """``<pair>_left`` and ``<pair>_right`` for the eyes of a pair; a camera alone has a name without a side."""
 CAMERA_NAME_WORDS = "a camera's name is letters, digits, '_' and '-'"
 _PAIR_NAME = CAMERA_NAME
-_LETTERS: dict[str, str] = {"CAHV": "CAHV", "CAHVOR": "CAHVOR", "CAHVORE": "CAHVORE"}
-_MODEL_KEYS = ("size_px", "model", "C", "A", "H", "V")
-_MODEL_OPTIONS = ("O", "R", "E", "type", "linearity")
+_ROUNDED, _NO_ROTATION = 1e-15, 1e-3
+_MODEL_KEYS = ("size_px", "model", "C")
+_CAHVORE_KEYS = ("A", "H", "V", "O", "R", "E", "type", "linearity")
+_OPENCV_KEYS = ("camera_matrix", "distortion", "rotation")
+_MODEL_OPTIONS = (*_CAHVORE_KEYS, *_OPENCV_KEYS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,8 +170,15 @@ def _check_schema(document: dict[str, Any], path: str | Path, expected: str) -> 
 
 def _model(section: Section) -> tuple[CameraModel, tuple[str, ...]]:
     """Read the keys of one camera model."""
-    kind = cast(Kind, section.choice("model", tuple(_LETTERS)))
-    letters = _LETTERS[kind]
+    kind = cast(Kind, section.choice("model", KINDS))
+    size = section.integers("size_px", 2, 1, LARGEST_IMAGE_PX)
+    opencv = kind in COEFFICIENTS
+    for key in _CAHVORE_KEYS if opencv else _OPENCV_KEYS:
+        if key in section:
+            raise section.bad(key, f"{kind} has no '{key}'; another 'model' has it")
+    if opencv:
+        return build_opencv(section, kind, (size[0], size[1]))
+    letters = str(kind)
     for letter in letters:
         if letter not in section:
             raise section.bad(letter, f"the key is missing; {kind} has it")
@@ -188,16 +199,53 @@ def _model(section: Section) -> tuple[CameraModel, tuple[str, ...]]:
         for key in ("type", "linearity"):
             if key in section:
                 raise section.bad(key, f"{kind} has no '{key}'; CAHVORE has it")
-    size = section.integers("size_px", 2, 1, LARGEST_IMAGE_PX)
     return build_model(
         section.path, section.place, kind, (size[0], size[1]), vectors, cahvore_type, linearity
     )
 
 
+def build_opencv(
+    section: Section, kind: Kind, size_px: tuple[int, int]
+) -> tuple[CameraModel, tuple[str, ...]]:
+    """Return the camera of a section with ``camera_matrix``, ``distortion``, ``rotation`` and ``C``.
+
+    A rotation of few digits is made one, with a note if that moves a pixel by more than 0.01.
+
+    Raises
+    ------
+    BadFile
+        If a key is missing or the numbers are no camera.
+    """
+    for key in _OPENCV_KEYS:
+        if key not in section:
+            raise section.bad(key, f"the key is missing; {kind} has it")
+    matrix = section.rows("camera_matrix", 3, 3)
+    given = section.rows("rotation", 3, 3, 1.001)
+    distortion = section.vector("distortion", 1e6, COEFFICIENTS[kind])
+    rotation, notes = given, tuple[str, ...]()
+    if np.abs(given @ given.T - np.eye(3)).max() > _ROUNDED:
+        turn, _, other = np.linalg.svd(given)
+        rotation = turn @ other
+    off = float(np.abs(rotation - given).max())
+    if not off < _NO_ROTATION or np.linalg.det(rotation) < 0.0:
+        raise section.bad("rotation", f"{given.tolist()} where a rotation is expected")
+    try:
+        model = CameraModel.of_matrix(kind, size_px, matrix, distortion, rotation, section.vector("C"))
+        model.project(model.C + model.A)  # a lens that folds at its axis is told here
+    except (ValueError, ArithmeticError) as error:
+        raise section.bad("", f"is no usable camera: {error}") from None
+    if (shift_px := off * max(abs(matrix[0, 0]), abs(matrix[1, 1]))) > TOLD_SHIFT_PX:
+        where = section.place or "camera"
+        notes = (f"{where}: 'rotation' made one, which moves pixels by up to {shift_px:.2g} px",)
+    return model, notes
+
+
 def _model_keys(model: CameraModel) -> dict[str, Any]:
     """Return one camera model's keys in the order of docs/reference/configuration.md."""
     keys: dict[str, Any] = {"size_px": list(model.size_px), "model": model.kind}
-    keys.update({letter: getattr(model, letter) for letter in _LETTERS[model.kind]})
+    if model.kind in COEFFICIENTS:
+        return keys | {"C": model.C, **{key: getattr(model, key) for key in _OPENCV_KEYS}}
+    keys.update({letter: getattr(model, letter) for letter in model.letters})
     if model.kind == "CAHVORE":
         keys.update(type=int(model.cahvore_type), linearity=float(model.linearity))
     return keys

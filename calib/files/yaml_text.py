@@ -360,6 +360,16 @@ class Section:
         items = self._list(key, count, "numbers")
         return np.array([self._number(f"{key}[{i}]", item, limit) for i, item in enumerate(items)])
 
+    def rows(self, key: str, rows: int, columns: int, limit: float = 1e9) -> FloatArray:
+        """Return a value that must be ``rows`` lists of ``columns`` finite numbers, as (rows, columns)."""
+        items = self._list(key, rows, f"lists of {columns} numbers")
+        found = np.empty((rows, columns))
+        for i, item in enumerate(items):
+            if not isinstance(item, list) or len(item) != columns:
+                raise self.bad(f"{key}[{i}]", f"{kind_of(item)} where {columns} numbers are expected")
+            found[i] = [self._number(f"{key}[{i}][{j}]", part, limit) for j, part in enumerate(item)]
+        return found
+
     def pairs(self, key: str, most: int, limit: float = 1e9) -> tuple[tuple[float, float], ...]:
         """Return a value that must be a list of at most ``most`` pairs of finite numbers."""
         value = self.values[key]

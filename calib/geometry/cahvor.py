@@ -67,7 +67,7 @@ class Rays(NamedTuple):
 
 
 def letters_of(kind: str) -> str:
-    """Return the letters of what a kind has numbers for: those of CAHVORE, and D for OpenCV's coefficients."""
+    """Return the letters of what a kind has numbers for; D stands for OpenCV's coefficients."""
     return "CAHVD" if kind in COEFFICIENTS else kind
 
 
@@ -188,7 +188,9 @@ class CameraModel(ReadOnlyArrays):
     def _set_projection(self, camera_matrix: FloatArray) -> None:
         """Set what stays when a camera of OpenCV's families moves."""
         (fx, skew, cx), (_, fy, cy), _ = camera_matrix.tolist()
-        back = np.array([[1 / fx, -skew / fx / fy, (skew * cy / fy - cx) / fx], [0, 1 / fy, -cy / fy], [0, 0, 1]])
+        back = np.array(
+            [[1 / fx, -skew / fx / fy, (skew * cy / fy - cx) / fx], [0, 1 / fy, -cy / fy], [0, 0, 1]]
+        )
         lens: FreeLens
         told, image_slope = tuple(self.distortion.tolist()), _largest_slope(self.size_px, back)
         fisheye = self.kind == "OPENCV_FISHEYE"
@@ -302,7 +304,12 @@ class CameraModel(ReadOnlyArrays):
             As the class; if the rotation or the matrix is none; if fy is negative.
         """
         matrix, axes = _vector("camera_matrix", camera_matrix, (3, 3)), _vector("rotation", rotation, (3, 3))
-        if matrix[1, 0] or matrix[2].tolist() != [0.0, 0.0, 1.0] or not matrix[0, 0] or not matrix[1, 1] > 0.0:
+        if (
+            matrix[1, 0]
+            or matrix[2].tolist() != [0.0, 0.0, 1.0]
+            or not matrix[0, 0]
+            or not matrix[1, 1] > 0.0
+        ):
             raise ValueError(
                 f"the camera matrix is {matrix.tolist()} where [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with "
                 "fy above 0 is expected"
@@ -312,7 +319,9 @@ class CameraModel(ReadOnlyArrays):
         h, v = matrix[:2] @ axes
         if kind == "CAHV":
             return cls(kind, size_px, _vector("C", C), axes[2], h, v)
-        model = cls(kind, size_px, _vector("C", C), axes[2], h, v, distortion=_vector("distortion", distortion, -1))
+        model = cls(
+            kind, size_px, _vector("C", C), axes[2], h, v, distortion=_vector("distortion", distortion, -1)
+        )
         rows = model._rows.copy()
         rows[4:] = axes
         rows.setflags(write=False)
@@ -355,6 +364,11 @@ class CameraModel(ReadOnlyArrays):
         Empty if it has no end but that of its family.
         """
         return self._projection.limit_words
+
+    @property
+    def why_no_ray(self) -> str:
+        """``limit_words`` as what follows "has no ray in this camera"; empty if there is nothing to tell."""
+        return f": {self.limit_words}" if self.limit_words else ""
 
     @property
     def camera_matrix(self) -> FloatArray:
@@ -403,6 +417,16 @@ class CameraModel(ReadOnlyArrays):
         """Return the camera with a focal length longer by a part of itself."""
         h, v = (letter + part * (letter - (letter @ self.A) * self.A) for letter in (self.H, self.V))
         return replace(self, H=h, V=v)
+
+    def bent(self, place: int, by: float) -> CameraModel:
+        """Return the camera whose lens bends otherwise: R1 or R2, OpenCV's k1 or k2, larger by ``by``.
+
+        ``place`` is 0 for the term that grows with the square of the slope, 1 for that of its fourth power.
+        A CAHV camera stays what it is.
+        """
+        if self.kind in COEFFICIENTS:
+            return replace(self, distortion=self.distortion + by * np.eye(len(self.distortion))[place])
+        return replace(self, R=self.R + by * np.eye(3)[place + 1])
 
     @property
     def focal_px(self) -> tuple[float, float]:

@@ -255,7 +255,9 @@ def _camera_ray(camera_in_head: CameraModel, x_px: float, y_px: float) -> Ray:
     rays = camera_in_head.ray(np.array([x_px, y_px]))
     if not rays.valid:
         raise Unreachable(
-            "bad_pixel", f"pixel ({x_px:g}, {y_px:g}) has no ray in this {camera_in_head.kind} camera"
+            "bad_pixel",
+            f"pixel ({x_px:g}, {y_px:g}) has no ray in this "
+            f"{camera_in_head.kind} camera{camera_in_head.why_no_ray}",
         )
     return ray_of(rays.origins_m.tolist(), rays.directions.tolist())
 

@@ -152,7 +152,8 @@ def triangulate(
     for side, model, xy, has_ray in zip(SIDES, (left, right), pixels, seen.has_ray, strict=True):
         if not has_ray[0]:
             raise NoStereoPoint(
-                "bad_pixel", f"{side} pixel {xy.tolist()} has no ray in this {model.kind} camera"
+                "bad_pixel",
+                f"{side} pixel {xy.tolist()} has no ray in this {model.kind} camera{model.why_no_ray}",
             )
     sine, (s1, s2) = float(seen.sines[0]), seen.ranges_m[0].tolist()
     if sine < PARALLEL_RAD:

@@ -35,7 +35,7 @@ from calib.geometry.rig import JOINTS_NAMES, Gimbal, Rig, gimbal, gimbal_rates, 
 from calib.geometry.rigid import FloatArray, Rigid, rigid_rates
 
 AXES = ("mast.axis_offset_m", "mast.axis_twist_rad")
-BEFOREHAND = {"C": 0.2, "A": 0.2, "H": 0.3, "V": 0.3, "O": 0.02, "R": 0.3, "E": 0.1}
+BEFOREHAND = {"C": 0.2, "A": 0.2, "H": 0.3, "V": 0.3, "O": 0.02, "R": 0.3, "E": 0.1, "D": 0.3}
 """Sigma of a camera's letters before any picture: metres, radians, and of one focal length for H and V."""
 AXIS_OFFSET_M, AXIS_TWIST_RAD, JOINT_ERROR_RAD = 0.05, 0.05, 0.01
 """Sigma beforehand of the axes, and of each term of a joint: hobby encoders are off by 6 to 9 mrad."""

@@ -239,6 +239,7 @@ def _parameter_change(model: CameraModel, moved: CameraModel) -> FloatArray:
         change += [tangents(model.O) @ (moved.O - model.O), (moved.R - model.R)[1:]]
     if "E" in model.letters:
         change.append(moved.E - model.E)
+    change.append(moved.distortion - model.distortion)
     return np.concatenate(change)
 
 

@@ -133,7 +133,9 @@ def target_scene(position_m: Sequence[float], time_ns: int) -> Message:
 
 def _model_told(model: CameraModel) -> dict[str, Any]:
     told: dict[str, Any] = {"model": model.kind, "size_px": list(model.size_px)}
-    told |= {letter: as_json(getattr(model, letter)) for letter in model.kind}  # the kind is its letters
+    told |= {letter: as_json(getattr(model, letter)) for letter in model.letters if letter != "D"}
+    if len(model.distortion):
+        told |= {key: as_json(getattr(model, key)) for key in ("distortion", "camera_matrix", "rotation")}
     if model.kind == "CAHVORE":
         told |= {"type": int(model.cahvore_type), "linearity": float(model.linearity)}
     return told

@@ -245,7 +245,7 @@ def _errors(model: CameraModel) -> list[Callable[[float], CameraModel]]:
         return replace(model, H=h, V=v)
 
     def bent(place: int) -> Callable[[float], CameraModel]:
-        return lambda t: replace(model, R=model.R + t * BENDS[place] * np.eye(3)[place + 1])
+        return lambda t: model.bent(place, t * BENDS[place])
 
     found = [shifted(axis) for axis in range(3)] + [turned(turn) for turn in (rot_x, rot_y, rot_z)] + [zoomed]
     found += [
@@ -259,10 +259,14 @@ def _errors(model: CameraModel) -> list[Callable[[float], CameraModel]]:
 
 def _step(model: CameraModel, other: CameraModel) -> FloatArray:
     """The step of a fit from one camera to another near it, to first order."""
-    parts = {letter: getattr(other, letter) - getattr(model, letter) for letter in model.letters}
+    parts = {
+        letter: getattr(other, letter) - getattr(model, letter) for letter in model.letters if letter != "D"
+    }
     parts["A"] = tangents(model.A) @ parts["A"]
     if "O" in parts:
         parts["O"], parts["R"] = tangents(model.O) @ parts["O"], parts["R"][1:]
+    if "D" in model.letters:
+        parts["D"] = other.distortion - model.distortion
     step = np.zeros(len(parameter_names(model.kind)))
     for letter, part in parts.items():
         step[parameter_part(model.kind, letter)] = part

@@ -285,7 +285,7 @@ def _turn_rates(model: CameraModel) -> FloatArray:
     """(p, 3) of a camera's parameters to a turn about its own place, by the axes of the model's frame."""
     rates = np.zeros((len(parameter_names(model.kind)), 3))
     for letter in dict.fromkeys(model.letters):
-        if letter in "CRE":
+        if letter in "CRED":
             continue
         x, y, z = getattr(model, letter)
         follows = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # of turn x letter

@@ -187,5 +187,5 @@ def corrected(rig: Rig, names: Sequence[str], values: FloatArray) -> Rig:
 
 
 def lensed(model: CameraModel, scale: float = 0.0, r1: float = 0.0) -> CameraModel:
-    """Return a camera of a focal length longer by a part ``scale`` of itself, and of R1 larger by ``r1``."""
-    return replace(model.zoomed(scale), R=model.R + np.array([0.0, r1, 0.0]))
+    """Return a camera of a focal length longer by a part ``scale`` of itself, R1 or k1 larger by ``r1``."""
+    return model.zoomed(scale).bent(0, r1)

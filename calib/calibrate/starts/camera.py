@@ -268,7 +268,7 @@ class FixedPoints:
         residual = ((seen.pixels_px - self.pixels_px) / self.sigma_px[:, None]).ravel()
         jacobian = (seen.d_step / self.sigma_px[:, None, None]).reshape(len(residual), -1)
         cost, matrix, gradient = float(residual @ residual), jacobian.T @ jacobian, jacobian.T @ residual
-        if "O" in state.letters:
+        if state.kind != "CAHV":
             known, rows = lens_knowledge(state)
             cost, matrix = cost + float(known @ known), matrix + rows.T @ rows
             gradient = gradient + rows.T @ known
@@ -278,7 +278,7 @@ class FixedPoints:
         seen, _ = state.project(self.points_m)
         residual = (seen - self.pixels_px) / self.sigma_px[:, None]
         cost = float(np.sum(residual**2))
-        if "O" in state.letters:
+        if state.kind != "CAHV":
             known, _ = lens_knowledge(state)
             cost += float(known @ known)
         return cost if np.isfinite(cost) else float("inf")

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from calib.geometry.lens import NEAREST_M, SETTLED, TINY
-from calib.geometry.lenses.opencv import Bent, Unbent
+from calib.geometry.lenses.opencv import Bent, Unbent, first_root
 from calib.geometry.rigid import FloatArray
 
 NAMES = ("k1", "k2", "k3", "k4")
@@ -211,8 +211,7 @@ class FisheyeLens:
         """The angle from which on nothing is reached: where the polynomial folds, at most half a turn."""
         k1, k2, k3, k4 = self.distortion
         growth = np.polynomial.Polynomial([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4])
-        roots = [r.real for r in growth.trim().roots() if abs(r.imag) <= 1e-9 * abs(r) and r.real > 0.0]
-        return min(pi, float(np.sqrt(min(roots)))) if roots else pi
+        return min(pi, float(np.sqrt(first_root(growth))))
 
     @cached_property
     def _start(self) -> tuple[tuple[float, ...], float]:

@@ -273,6 +273,8 @@ class OpencvLens:
             if abs(step_x) + abs(step_y) < SETTLED:
                 per = 1.0 / sqrt(1.0 + x * x + y * y)
                 return x * per, y * per, per
+        if not u * u + v * v < self._start[2] ** 2:
+            return None
         some_x, some_y, found = self._follow(np.array([u]), np.array([v]))
         if not found[0]:
             return None
@@ -285,7 +287,9 @@ class OpencvLens:
         """Where the lens ends, as the end of a sentence; empty if it has no end before a right angle."""
         if self.near >= _STEEPEST:
             return ""
-        return f"the lens folds at {degrees(atan(self.near)):.1f} degrees from its axis (slope {self.near:.3g})"
+        return (
+            f"the lens folds at {degrees(atan(self.near)):.1f} degrees from its axis (slope {self.near:.3g})"
+        )
 
     @property
     def near(self) -> float:
@@ -312,10 +316,9 @@ class OpencvLens:
             raise ValueError("the lens folds at its axis: no image can be formed")
         ends = rho[np.minimum(first, _RADII - 1)]
         near = float(rho[first.min() - 1])
+        far = float(ends.max())
         if first.max() == _RADII:
             far = inf if steepest == _STEEPEST else steepest
-        else:
-            far = float(ends.max())
         later = good & (np.arange(_RADII) >= first[:, None]) & (rho < far)
         return (near, near) if later.any() else (near, far)
 
@@ -325,13 +328,7 @@ class OpencvLens:
         below = np.polynomial.Polynomial([1.0, *(self._below or (0.0, 0.0, 0.0))])  # type: ignore[attr-defined]
         y = np.polynomial.Polynomial([0.0, 1.0])
         growth = (above + 2.0 * y * above.deriv()) * below - 2.0 * y * above * below.deriv()
-        ends = [
-            root.real
-            for part in (growth, below)
-            for root in part.trim().roots()
-            if abs(root.imag) <= 1e-9 * abs(root) and root.real > 0.0
-        ]
-        return float(np.sqrt(min(ends))) if ends else inf
+        return float(np.sqrt(min(first_root(growth), first_root(below))))
 
     def _upright(self, x: FloatArray, y: FloatArray) -> np.ndarray:
         """Where the picture is not turned inside out."""
@@ -369,7 +366,7 @@ class OpencvLens:
 
     @cached_property
     def _start(self) -> tuple[tuple[float, ...], float, float]:
-        """Polynomial of chi / t by t^2, highest first, the t^2 up to which it holds, and the largest t seen."""
+        """Polynomial of chi / t by t^2, highest first, the t^2 it holds up to, and the largest t seen."""
         end = min(self.near, _STEEPEST)
         rho = np.tan(np.linspace(0.0, atan(end), 1025))[:-1]
         bent = rho * self._radial(rho * rho)[0]
@@ -384,8 +381,10 @@ class OpencvLens:
         farthest = inf
         if self.far < inf:
             around = np.linspace(0.0, 2.0 * np.pi, 4 * _DIRECTIONS)
-            x, y = self.far * np.cos(around), self.far * np.sin(around)
-            farthest = 1.05 * float(np.hypot(*self._flat(x, y)[:2]).max())
+            farthest = 1.002 * max(
+                float(np.hypot(*self._flat(rho * np.cos(around), rho * np.sin(around))[:2]).max())
+                for rho in (self.near, self.far)
+            )
         return tuple(power[::-1].tolist()), float(square[-1]), farthest if isfinite(farthest) else inf
 
     def _begin(self, u: Any, v: Any) -> tuple[Any, Any]:
@@ -439,8 +438,10 @@ class OpencvLens:
             largest = float(size.max(initial=0.0))
             if largest < SETTLED:
                 break
-        valid = tau < min(self.near * self.near, 1e300) if largest < SETTLED else (
-            (size < SETTLED) & (tau < min(self.near * self.near, 1e300))
+        valid = (
+            tau < min(self.near * self.near, 1e300)
+            if largest < SETTLED
+            else ((size < SETTLED) & (tau < min(self.near * self.near, 1e300)))
         )
         if not valid.all():
             rows = np.flatnonzero(~valid)
@@ -471,6 +472,13 @@ class OpencvLens:
         return x, y, found
 
 
+def first_root(polynomial: np.polynomial.Polynomial) -> float:
+    """Return the smallest real root above zero; infinite if there is none."""
+    roots = np.asarray(polynomial.trim().roots(), dtype=complex)
+    real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
+    return float(real.min(initial=inf))
+
+
 def _product(one: Any, other: Any) -> Any:
     """The product of two (2, 2) of arrays."""
     (a, b), (c, d) = one
@@ -479,7 +487,7 @@ def _product(one: Any, other: Any) -> Any:
 
 
 def tilted(tau_x: Any, tau_y: Any) -> Any:
-    """Return (3, 3): slopes on the plane at right angles to z to slopes on the turned one (OpenCV's matTilt)."""
+    """Return (3, 3): slopes on the plane at right angles to z to those on the turned one (matTilt)."""
     cx, sx, cy, sy = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
     turned = np.array([[cy, sy * sx, -sy * cx], [0.0, cx, sx], [sy, -cy * sx, cy * cx]])
     onto = np.array([[turned[2, 2], 0.0, -turned[0, 2]], [0.0, turned[2, 2], -turned[1, 2]], [0.0, 0.0, 1.0]])
