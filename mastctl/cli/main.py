@@ -45,6 +45,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.conform": ("conform",),
     "mastctl.cli.record": ("record", "replay"),
     "mastctl.cli.sim": ("sim",),
+    "mastctl.cli.rig": ("rig",),
     "mastctl.cli.sentinel": ("sentinel",),
     "mastctl.cli.servos": ("servo", "ptu"),
 }
@@ -307,6 +308,7 @@ record show afternoon.mcap
 record repair broken.mcap --out whole.mcap
 replay afternoon.mcap --mast other.yaml
 sim new twin --height 1.9 --baseline 0.42
+rig new rig --pan-deg -90 90 --tilt-deg -40 30
 sim dynamixel --servo xl330_m288:1 --servo xl330_m288:2 --pty
 sim ptu --pty
 servo scan /dev/ttyUSB0

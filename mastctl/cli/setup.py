@@ -37,7 +37,7 @@ def _add_doctor(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 
 def _doctor(args: argparse.Namespace) -> int:
-    from mastctl.setup.doctor import examine
+    from mastctl.setup.doctor import examine, next_command
 
     found = []
     for finding in examine(args.config, _asked):
@@ -51,10 +51,18 @@ def _doctor(args: argparse.Namespace) -> int:
     bad = sum(finding.level == "bad" for finding in found)
     unsure = sum(finding.level == "unsure" for finding in found)
     if args.json:
-        output.print_json({"bad": bad, "unsure": unsure, "findings": [vars(finding) for finding in found]})
+        output.print_json(
+            {
+                "bad": bad,
+                "unsure": unsure,
+                "findings": [vars(finding) for finding in found],
+                "next": next_command(args.config, found),
+            }
+        )
     else:
         words = "nothing stands in the way" if not bad else f"{bad} to be mended before the daemon can work"
         sys.stdout.write(f"{words}{f'; {unsure} to think about' if unsure else ''}\n")
+        sys.stdout.write(output.one_line(f"next: {next_command(args.config, found)}") + "\n")
     return 1 if bad else 0
 
 

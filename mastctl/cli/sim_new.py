@@ -24,7 +24,7 @@ def add_parser(kinds: Any) -> None:
         help="a simulated rover of one's own: config.yaml, mast.yaml (what the service believes) and "
         "true_rig.yaml (what is simulated)",
     )
-    new.add_argument("folder", type=_folder, metavar="FOLDER", help="where the three files go")
+    new.add_argument("folder", type=folder_name, metavar="FOLDER", help="where the three files go")
     new.add_argument(
         "--from", dest="mast_file", type=Path, metavar="MAST.yaml",
         help="the twin of this mast file: the file is believed, the true rig drawn from its covariance",
@@ -56,7 +56,7 @@ def add_parser(kinds: Any) -> None:
     new.set_defaults(run=run)
 
 
-def _folder(text: str) -> Path:
+def folder_name(text: str) -> Path:
     """Read a folder's name; an empty one (a variable that is not set) would be the current folder."""
     if not text.strip():
         raise argparse.ArgumentTypeError("the name is empty, a folder is expected ('.' is the current one)")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -76,6 +76,16 @@ def examine(
     yield examine_kept()
     yield examine_clock()
     yield examine_descriptors()
+
+
+def next_command(config: str | None, found: Sequence[DoctorFinding]) -> str:
+    """Return what comes next: the first thing to mend, else to start the daemon, else to point."""
+    named = "" if config is None else f" --config {config}"
+    bad = next((finding for finding in found if finding.level == "bad"), None)
+    if bad is not None:
+        return f"{bad.advice or bad.sentence}; then mastctl doctor{named}"
+    runs = any(one.what == "daemon" and one.sentence.startswith("one runs") for one in found)
+    return f"mastctl point{named} --angles 0.2 0.0" if runs else f"mastctl run{named}"
 
 
 def _sentinel(folder: Path) -> Iterator[DoctorFinding]:

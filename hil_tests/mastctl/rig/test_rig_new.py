@@ -1,0 +1,252 @@
+"""`mastctl rig new`: simulated servos and a PTU behind pseudo terminals, no hardware, and the files."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jsonschema_rs
+import pytest
+
+from calib.files.mast_file import load_rig
+from calib.files.yaml_text import parse_mapping
+from drivers.clock import SystemClock
+from drivers.dynamixel.settings import dynamixel_settings
+from drivers.dynamixel.workshop import FoundServo
+from drivers.flir_ptu.options import options_from
+from drivers.sim.heads import PRESETS
+from drivers.sim.wire.axis import WireAxis
+from drivers.sim.wire.dynamixel_bus import DynamixelBus
+from drivers.sim.wire.dynamixel_servo import SimulatedServo
+from drivers.sim.wire.line import PtyLine
+from drivers.sim.wire.ptu import SimulatedPtu
+from drivers.v4l2.options import parse_options
+from mastctl.cli.main import main
+from mastctl.client import Client
+from mastctl.config import load_config
+from mastctl.daemon import RunningDaemon
+from mastctl.packaged import schema_files
+from mastctl.rig import plugged
+from mastctl.rig.drawing import RigAnswers
+from mastctl.rig.folder import CONFIG, MAST, README, RULES, write_rig
+from mastctl.rig.plugged import Plugged, PluggedCamera, PluggedHead
+from mastctl.rig.questions import Questions
+from mastctl.setup import doctor
+from mastctl.setup.machine import ExaminedMachine
+
+X = PRESETS["dynamixel_x"]
+
+
+class Servos:
+    """Two XL330 on a pseudo terminal, at 1 Mbaud."""
+
+    def __init__(self, folder: Path) -> None:
+        clock = SystemClock()
+        self.axes = [WireAxis(axis, number=n, time_s=clock.now_s()) for n, axis in enumerate((X.pan, X.tilt))]
+        self.servos = [
+            SimulatedServo("xl330_m288", n + 3, axis, settings={"baud_rate": 3}, time_s=clock.now_s())
+            for n, axis in enumerate(self.axes)
+        ]
+        self.line = PtyLine(DynamixelBus(self.servos), clock, link=folder / "ttyServos")
+
+
+@pytest.fixture
+def nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine into which nothing is plugged."""
+    monkeypatch.setattr(plugged, "serial_lines", lambda machine: [])
+    monkeypatch.setattr(plugged, "ask_cameras", lambda: ([], []))
+
+
+@pytest.fixture
+def servos(tmp_path: Path, nothing: None) -> Iterator[Servos]:
+    it = Servos(tmp_path)
+    with it.line:
+        yield it
+
+
+def written(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
+    """What the command tells a program."""
+    assert main(["rig", "new", *words, "--json"]) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def good_by_schema(folder: Path) -> None:
+    """The files that it wrote, by the schemas beside them."""
+    for name, kind in ((CONFIG, "config"), (MAST, "mast")):
+        text = (folder / name).read_text()
+        assert text.startswith(f"# yaml-language-server: $schema=schemas/{kind}.json\n")
+        schema = json.loads((folder / "schemas" / f"{kind}.json").read_bytes())
+        assert schema == json.loads(schema_files()[kind].read_bytes())
+        jsonschema_rs.validator_for(schema).validate(parse_mapping(text.encode(), name))
+
+
+def test_two_servos_become_a_rig_that_turns_and_the_scan_changes_nothing(
+    servos: Servos, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "rig"
+    before = [dict(servo.table.values) for servo in servos.servos]
+    told = written(capsys, str(folder), "--port", servos.line.path)
+    after = [dict(servo.table.values) for servo in servos.servos]
+    assert before == after
+    assert told["heads"] == [
+        f"{servos.line.path}: XL330-M288-T (id 3, 1000000 baud), XL330-M288-T (id 4, 1000000 baud)"
+    ]
+    assert told["next"][0] == f"mastctl doctor --config {folder / CONFIG}"
+    good_by_schema(folder)
+    config = load_config(folder / CONFIG)
+    settings = dynamixel_settings(config.hardware.pan_tilt.options)
+    assert (settings.pan.servo_id, settings.tilt.servo_id) == (3, 4)
+    assert [one for one in doctor.examine(str(folder / CONFIG), lambda url: None) if one.level == "bad"] == []
+    text = (folder / CONFIG).read_text()
+    (folder / CONFIG).write_text(text.replace("port: 8420", "port: 0"))
+    with RunningDaemon(load_config(folder / CONFIG)) as daemon, Client(daemon.url) as mast:
+        assert mast.wait(mast.point(pan_rad=0.2, tilt_rad=-0.1))["state"] == "done"
+        joints = mast.status()["joints"]
+        assert (joints["pan_rad"], joints["tilt_rad"]) == pytest.approx((0.2, -0.1), abs=3e-3)
+
+
+def test_a_ptu_is_known_and_its_own_limits_hold(
+    tmp_path: Path, nothing: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock, head = SystemClock(), PRESETS["ptu_d46_70"]
+    axes = [WireAxis(axis, number=n, time_s=clock.now_s()) for n, axis in enumerate((head.pan, head.tilt))]
+    unit = SimulatedPtu("d46_70", *axes)
+    folder = tmp_path / "rig"
+    with PtyLine(unit, clock, link=tmp_path / "ttyPtu") as line:
+        told = written(capsys, str(folder), "--port", line.path, "--tilt-deg", "-90", "80")
+    assert [axis.angle_rad(clock.now_s()) for axis in axes] == [0.0, 0.0]
+    assert "a FLIR PTU" in told["heads"][0]
+    good_by_schema(folder)
+    options = options_from(load_config(folder / CONFIG).hardware.pan_tilt.options)
+    low, high = options.tilt.limits_rad
+    assert -math.pi / 2 < low < -1.0 and 0.4 < high < 0.7, "the unit's own ends"
+
+
+def test_without_hardware_it_writes_the_twin_that_runs(
+    tmp_path: Path, nothing: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "rig"
+    told = written(capsys, str(folder), "--height", "1.2")
+    assert told["simulated"] and told["heads"] == told["cameras"] == []
+    good_by_schema(folder)
+    assert load_rig(folder / MAST).rig.mast.translation_m[2] == pytest.approx(-1.2, abs=0.01)
+    findings = list(doctor.examine(str(folder / CONFIG), lambda url: None))
+    assert [one for one in findings if one.level == "bad"] == []
+    assert doctor.next_command(str(folder / CONFIG), findings) == f"mastctl run --config {folder / CONFIG}"
+    kept = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+    assert main(["rig", "new", str(folder)]) == 2
+    assert "exists, and nothing is replaced" in capsys.readouterr().err
+    assert {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()} == kept
+
+
+def test_a_line_on_which_nothing_answers_is_told(
+    tmp_path: Path, nothing: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = written(capsys, str(tmp_path / "rig"), "--port", str(tmp_path / "ttyNone"))
+    assert told["simulated"] and "ttyNone does not exist" in told["unused"][0]
+
+
+CAMERAS = tuple(
+    PluggedCamera(
+        card="C270",
+        bus=f"usb-{n}",
+        node=Path(f"/dev/video{n}"),
+        options={"device": f"/dev/v4l/by-id/c{n}", "format": "YUYV", "size_px": [640, 480]},
+    )
+    for n in (0, 2)
+)
+SERVOS = tuple(FoundServo(1_000_000, number, 1020, "XM430-W350", 45, ()) for number in (1, 2))
+
+
+def machine_with(tmp_path: Path, serial: str | None) -> ExaminedMachine:
+    """A machine with an adapter at ttyUSB0 and a camera at video0, in a folder."""
+    for place, kind, node in (("1-2", "tty", "ttyUSB0"), ("1-3", "video4linux", "video0")):
+        device = tmp_path / "sys/devices" / place / f"{place}:1.0"
+        device.mkdir(parents=True)
+        (device.parent / "idVendor").write_text("0403\n")
+        if serial is not None:
+            (device.parent / "serial").write_text(f"{serial}\n")
+        of_class = tmp_path / "sys/class" / kind / node
+        of_class.mkdir(parents=True)
+        (of_class / "device").symlink_to(device)
+    return ExaminedMachine(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("serial", "told"), [("FT12345", 'ATTRS{serial}=="FT12345"'), (None, 'KERNELS=="1-2"')]
+)
+def test_an_adapter_without_a_stable_name_gets_one_by_a_rule(
+    tmp_path: Path, serial: str | None, told: str
+) -> None:
+    machine = machine_with(tmp_path / "machine", serial)
+    folder = tmp_path / "rig"
+    head = PluggedHead("/dev/ttyUSB0", SERVOS)
+    made = write_rig(folder, Plugged((head,), CAMERAS), head, RigAnswers(), machine)
+    lines = (folder / RULES).read_text().splitlines()
+    line = next(one for one in lines if one.endswith('SYMLINK+="mast"') and not one.startswith("#"))
+    assert line.startswith('SUBSYSTEM=="tty", SUBSYSTEMS=="usb", ATTRS{idVendor}=="0403", ')
+    assert told in line
+    assert 'SYMLINK+="v4l/by-id/mast-cam-left"' in (folder / RULES).read_text()
+    assert load_config(folder / CONFIG).hardware.pan_tilt.options["port"] == "/dev/mast"
+    assert made.next[0].startswith("sudo cp ") and str(folder / RULES) in made.next[0]
+    assert all(step in (folder / README).read_text() for step in made.next)
+
+
+def test_a_pair_of_cameras_is_drawn_and_its_options_are_those_of_the_driver(tmp_path: Path) -> None:
+    head = PluggedHead("/dev/serial/by-id/usb-FTDI", SERVOS)
+    answers = RigAnswers(baseline_m=0.16, view_deg=90.0)
+    write_rig(tmp_path / "rig", Plugged((head,), CAMERAS), head, answers, ExaminedMachine(tmp_path))
+    good_by_schema(tmp_path / "rig")
+    config = load_config(tmp_path / "rig" / CONFIG)
+    rig = load_rig(config.mast_file).rig
+    assert dict(rig.stereo) == {"cam": ("cam_left", "cam_right")}
+    left, right = rig.cameras["cam_left"].model, rig.cameras["cam_right"].model
+    assert (right.C - left.C).tolist() == pytest.approx([0.0, 0.16, 0.0])
+    assert left.H.tolist() == pytest.approx([319.5, 320.0, 0.0])
+    for name, camera in config.hardware.cameras.items():
+        assert parse_options(camera.options, name).size_px == (640, 480)
+    assert dynamixel_settings(config.hardware.pan_tilt.options).port == "/dev/serial/by-id/usb-FTDI"
+
+
+def test_cameras_alone_lack_a_head_and_doctor_names_what_to_do(tmp_path: Path) -> None:
+    found = Plugged((), CAMERAS[:1])
+    made = write_rig(tmp_path / "rig", found, None, RigAnswers(), ExaminedMachine(tmp_path))
+    findings = list(doctor.examine(str(made.folder / CONFIG), lambda url: None))
+    bad = {one.what for one in findings if one.level == "bad"}
+    assert bad == {"port", "camera cam"}
+    assert doctor.next_command(None, findings).startswith("plug the adapter in")
+    assert "mastctl servo scan PORT" in made.next
+
+
+def test_answers_are_asked_again_until_they_fit_and_never_without_a_terminal() -> None:
+    out = io.StringIO()
+    asks = Questions(io.StringIO("tall\n9\n1.4\nc\nb\n\n"), out, terminal=True)
+    assert asks.number("height, m", 1.0, 0.3, 5.0) == 1.4
+    assert asks.one_of("which", ("a", "b"), "a") == "b"
+    assert asks.one_of("which", ("a", "b"), "a") == "a"
+    assert asks.number("at the end of the input", 2.0, 0.0, 9.0) == 2.0
+    assert out.getvalue().count("a number from 0.3 to 5 is expected") == 2
+    silent = io.StringIO()
+    assert Questions(io.StringIO("3\n"), silent).number("height, m", 1.0, 0.3, 5.0) == 1.0
+    assert silent.getvalue() == ""
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--height", "9"), "height of the axes over the ground, m: 9 where 0.3 to 5 is expected"),
+        (("--pan-deg", "10", "5"), "pan may turn from 10 to 5 degrees"),
+        (("--pan-id", "2", "--tilt-id", "2"), "--pan-id and --tilt-id are both 2"),
+    ],
+)
+def test_options_that_cannot_be_are_refused_and_nothing_is_written(
+    tmp_path: Path, nothing: None, words: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["rig", "new", str(tmp_path / "rig"), *words]) == 2
+    assert told in capsys.readouterr().err
+    assert not (tmp_path / "rig").exists()

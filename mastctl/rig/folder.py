@@ -1,0 +1,206 @@
+"""The folder of a new rig: configuration, drawing, udev rules, schemas for editors, and what to do next.
+
+Nothing that is there is ever replaced. Without any hardware the folder holds the simulated twin, which runs.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.files.atomic import save_bytes
+from calib.files.mast_file import load_rig
+from calib.files.yaml_text import dump_mapping
+from mastctl.config import check_cameras, load_config
+from mastctl.packaged import config_folder, schema_files
+from mastctl.rig.drawing import RigAnswers, camera_names, configuration, drawing
+from mastctl.rig.plugged import Plugged, PluggedHead, usb_of
+from mastctl.setup.machine import ExaminedMachine
+from mastctl.setup.new_rig import RigNumbers, built_rig, focal_of
+from mastctl.setup.rig_folder import CONFIG, MAST, TRUE_RIG, InTheWay, write_built
+
+RULES, README, SCHEMAS = "60-mastctl.rules", "README.md", "schemas"
+LINE = "/dev/mast"
+"""What the rules call the head's line."""
+TWIN_SIZE_PX, TWIN_SEED = (640, 480), 1
+_NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
+_USB = re.compile(rf"{_NUMBERED.pattern}|/dev/serial/by-.*")
+
+
+@dataclass(frozen=True)
+class NewRigFolder:
+    """What was written.
+
+    Attributes
+    ----------
+    folder, files
+        Where, and the names in it.
+    simulated
+        Whether it is the twin, since no head and no camera is plugged in.
+    next
+        The three commands.
+    """
+
+    folder: Path
+    files: tuple[str, ...]
+    simulated: bool
+    next: tuple[str, ...]
+
+
+def check_free(folder: Path) -> None:
+    """Refuse a folder in which a file would be replaced. Raises InTheWay with the first."""
+    for name in (CONFIG, MAST, TRUE_RIG, RULES, README, SCHEMAS):
+        if (folder / name).exists():
+            raise InTheWay(f"{folder / name} exists, and nothing is replaced; another folder is expected")
+
+
+def write_rig(
+    folder: Path, plugged: Plugged, head: PluggedHead | None, answers: RigAnswers, machine: ExaminedMachine
+) -> NewRigFolder:
+    """Write the files of a rig with a head, cameras or both, and read them as the daemon does.
+
+    Raises
+    ------
+    InTheWay
+        If there is a file of a rig already.
+    BadFile, BadOptions
+        If the answers make no rig, or the file system refuses.
+    """
+    check_free(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras = list(plugged.cameras)
+    port = LINE if head is None or _NUMBERED.fullmatch(head.port) else head.port
+    name = re.sub(r"\W+", "_", folder.resolve().name) or "rig"
+    files = {
+        CONFIG: _commented("config", _CONFIG_WORDS, configuration(head, cameras, answers, port)),
+        MAST: _commented("mast", _MAST_WORDS, drawing(name, cameras, answers)),
+        RULES: rules(head, plugged, machine).encode(),
+    }
+    steps = _steps(folder, head, len(cameras))
+    files[README] = _readme(plugged, steps).encode()
+    return _written(folder, files, steps, simulated=False)
+
+
+def write_simulated(folder: Path, plugged: Plugged, answers: RigAnswers) -> NewRigFolder:
+    """Write the simulated twin of a rig that is not plugged in yet. Raises as `write_rig`, and BadRig."""
+    check_free(folder)
+    numbers = RigNumbers(
+        height_m=answers.height_m,
+        baseline_m=answers.baseline_m,
+        focal_px=focal_of(np.deg2rad(answers.view_deg), TWIN_SIZE_PX[0]),
+        size_px=TWIN_SIZE_PX,
+    )
+    simulation = {"wire": "dynamixel", "seed": TWIN_SEED}
+    write_built(built_rig(numbers, np.random.default_rng(TWIN_SEED)), folder, simulation, TWIN_SEED)
+    for name, kind in ((CONFIG, "config"), (MAST, "mast"), (TRUE_RIG, "mast")):
+        save_bytes(folder / name, _first_line(kind) + (folder / name).read_bytes())
+    config = f"--config {folder / CONFIG}"
+    steps = (
+        f"mastctl doctor {config}",
+        f"mastctl run {config}",
+        f"mastctl point {config} --camera navcam_left --at 320 300",
+    )
+    made = _written(folder, {README: _readme(plugged, steps).encode()}, steps, simulated=True)
+    return NewRigFolder(folder, (CONFIG, MAST, TRUE_RIG, *made.files), True, steps)
+
+
+def _written(
+    folder: Path, files: Mapping[str, bytes], steps: tuple[str, ...], simulated: bool
+) -> NewRigFolder:
+    """Write the files and the schemas that their first lines name, and read configuration and drawing."""
+    names = [*files]
+    for kind in ("config", "mast"):
+        (folder / SCHEMAS).mkdir(exist_ok=True)
+        save_bytes(folder / SCHEMAS / f"{kind}.json", schema_files()[kind].read_bytes())
+        names.append(f"{SCHEMAS}/{kind}.json")
+    for name, data in files.items():
+        save_bytes(folder / name, data)
+    config = load_config(folder / CONFIG)
+    check_cameras(config, load_rig(config.mast_file).rig)
+    return NewRigFolder(folder, tuple(names), simulated, steps)
+
+
+_CONFIG_WORDS = """\
+# Written by `mastctl rig new`; every key: docs/reference/configuration.md. Angles are radians.
+# Check before the first move: which servo turns which axis, its sign (sign: -1), and the limits.
+# `mastctl servo test PORT ID` turns one servo by 5 degrees, slowly.
+"""
+_MAST_WORDS = """\
+# Drawn, not calibrated: `mastctl calibrate bench` replaces it. Lengths to 2 cm are enough (meters, z down).
+# C: the camera from the meeting point of the axes at pan and tilt zero.
+# H and V: the image's center, and the focal length in pixels.
+"""
+
+
+def _commented(kind: str, words: str, document: Mapping[str, Any]) -> bytes:
+    """A YAML file whose first line names its schema for editors."""
+    return _first_line(kind) + words.encode() + dump_mapping(document)
+
+
+def _first_line(kind: str) -> bytes:
+    return f"# yaml-language-server: $schema={SCHEMAS}/{kind}.json\n".encode()
+
+
+def rules(head: PluggedHead | None, plugged: Plugged, machine: ExaminedMachine) -> str:
+    """Return the packaged udev rules, and a stable name for each device of this rig."""
+    text = (config_folder() / "udev" / RULES).read_text(encoding="utf-8")
+    lines = ["", "# This rig:"]
+    if head is not None and "://" not in head.port:
+        device = machine.at("/sys/class/tty") / machine.at(head.port).resolve().name / "device"
+        lines += _rule('SUBSYSTEM=="tty", SUBSYSTEMS=="usb"', list(usb_of(device, machine)), LINE[5:])
+    for name, camera in zip(camera_names(len(plugged.cameras)), plugged.cameras, strict=False):
+        device = machine.at("/sys/class/video4linux") / camera.node.name / "device"
+        about = 'SUBSYSTEM=="video4linux", ATTR{index}=="0"'
+        lines += _rule(about, list(usb_of(device, machine)), f"v4l/by-id/mast-{name.replace('_', '-')}")
+    return text + "\n".join(lines) + "\n" if len(lines) > 2 else text
+
+
+def _rule(about: str, matches: Sequence[tuple[str, str]], name: str) -> list[str]:
+    """One line of a rule, if there is something to know the device by."""
+    if not matches:
+        return []
+    told = "".join(f', {key}=="{value}"' for key, value in matches)
+    return [f'{about}{told}, SYMLINK+="{name}"']
+
+
+def _steps(folder: Path, head: PluggedHead | None, cameras: int) -> tuple[str, ...]:
+    """The next three commands."""
+    config = f"--config {folder / CONFIG}"
+    rules = f"sudo cp {folder / RULES} /etc/udev/rules.d/ && sudo udevadm control --reload"
+    doctor, run = f"mastctl doctor {config}", f"mastctl run {config}"
+    if head is None:
+        return f"{rules} && sudo udevadm trigger", "mastctl servo scan PORT", doctor
+    if _USB.fullmatch(head.port) or cameras:
+        return f"{rules} && sudo udevadm trigger", doctor, run
+    return doctor, run, f"mastctl point {config} --angles 0.2 0.0"
+
+
+def _readme(plugged: Plugged, steps: Sequence[str]) -> str:
+    """What was found, the next three commands, and what comes after them."""
+    found = [f"- {words}" for words in plugged.words]
+    found += [f"- not used: {words}" for words in plugged.unused]
+    return "\n".join(
+        [
+            "# A rig of your own",
+            "",
+            "Found by `mastctl rig new`:" if found else "`mastctl rig new` found no head and no camera.",
+            *(["", *found] if found else []),
+            "",
+            "Next:",
+            "",
+            "```console",
+            *(f"$ {step}" for step in steps),
+            "```",
+            "",
+            "`mastctl doctor` names what is missing, and the command that mends it. With the daemon running,",
+            "`mastctl point --angles 0.2 0.0` turns the head to 0.2 rad; `mastctl stop` stops it.",
+            "`mastctl calibrate bench` then replaces the drawing (docs/how-to/bench-calibration.md).",
+            "After an upgrade, `mastctl schema config > schemas/config.json` renews what editors check by.",
+            "",
+        ]
+    )

@@ -1,0 +1,199 @@
+"""What is plugged in: servos and pan/tilt units that answer on serial lines, and cameras. Moves nothing.
+
+Each line is asked in the words of each head that this program drives, until one answers. Nothing is written
+to a servo; a PTU that answers in short form is set to its usual one, which it forgets at power-off.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drivers.dynamixel import workshop as dynamixel
+from drivers.dynamixel.link import REPLY_TIMEOUT_S
+from drivers.dynamixel.models import MODELS, ServoModel
+from drivers.dynamixel.workshop import FoundServo
+from drivers.errors import BadOptions, DriverError
+from drivers.flir_ptu import workshop as flir_ptu
+from drivers.flir_ptu.workshop import Facts
+from drivers.v4l2 import find
+from drivers.v4l2.node import capture_nodes
+from mastctl.setup.machine import ExaminedMachine, examine_port
+
+BAUDS = (1_000_000, 57_600, 115_200, 2_000_000, 3_000_000, 4_000_000)
+"""Of servos: as they are set up, then as they come from the factory, then the rest."""
+PTU_BAUD = 9600
+
+
+@dataclass(frozen=True)
+class PluggedHead:
+    """What answered on a line.
+
+    Attributes
+    ----------
+    port
+        As it is named on this machine.
+    servos
+        Dynamixel servos that this program drives, by id.
+    others
+        Models that answered and that it does not drive.
+    unit
+        A PTU's facts.
+    """
+
+    port: str
+    servos: tuple[FoundServo, ...] = ()
+    others: tuple[str, ...] = ()
+    unit: Facts | None = None
+
+    @property
+    def words(self) -> str:
+        """What it is, in one sentence."""
+        if self.unit is not None:
+            return f"{self.port}: a FLIR PTU, {self.unit.version}"
+        servos = [f"{one.model} (id {one.servo_id}, {one.baud} baud)" for one in self.servos]
+        others = [f"{name}, which mastctl does not drive" for name in self.others]
+        return f"{self.port}: {', '.join([*servos, *others])}"
+
+
+@dataclass(frozen=True)
+class PluggedCamera:
+    """A camera that has a format that is read: its names, its node now, and options of driver ``v4l2``."""
+
+    card: str
+    bus: str
+    node: Path
+    options: dict[str, Any]
+
+    @property
+    def words(self) -> str:
+        """What it is, in one sentence."""
+        width, height = self.options["size_px"]
+        return f"{self.card} at {self.bus}: {self.options['format']} {width}x{height}"
+
+
+@dataclass(frozen=True)
+class Plugged:
+    """All that was found, and a sentence for each line or camera that is of no use, with the reason."""
+
+    heads: tuple[PluggedHead, ...] = ()
+    cameras: tuple[PluggedCamera, ...] = ()
+    unused: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> list[str]:
+        """A sentence for each head and camera."""
+        return [*(one.words for one in self.heads), *(one.words for one in self.cameras)]
+
+
+def look(ports: Sequence[str], machine: ExaminedMachine, say: Callable[[str], None]) -> Plugged:
+    """Ask every serial line and camera what it is.
+
+    Parameters
+    ----------
+    ports
+        The lines to ask; none: every USB adapter of the machine.
+    machine
+        Where devices lie.
+    say
+        Told what is being asked; a line takes some seconds.
+    """
+    heads: list[PluggedHead] = []
+    unused: list[str] = []
+    for port in ports or serial_lines(machine):
+        say(f"asking {port}")
+        found, why = ask_line(port, machine)
+        if found is not None:
+            heads.append(found)
+        else:
+            unused.append(why)
+    say("asking the cameras")
+    cameras, no_cameras = ask_cameras()
+    return Plugged(tuple(heads), tuple(cameras), (*unused, *no_cameras))
+
+
+def serial_lines(machine: ExaminedMachine) -> list[str]:
+    """Return the USB serial adapters of a machine, each by its stable name where udev gives one."""
+    named = {link.resolve(): link for link in sorted(machine.at("/dev/serial/by-id").glob("*"))}
+    devices = sorted([*machine.at("/dev").glob("ttyUSB*"), *machine.at("/dev").glob("ttyACM*")])
+    found = [named.get(device.resolve(), device) for device in devices]
+    return [f"/{path.relative_to(machine.root)}" for path in found]
+
+
+def ask_line(port: str, machine: ExaminedMachine) -> tuple[PluggedHead | None, str]:
+    """Return what answers on a line, or None and why nothing does; a line in use is left alone."""
+    path = port if "://" in port else str(machine.at(port))
+    pseudo = os.path.realpath(path).startswith("/dev/pts/")  # both its ends are open in the program behind it
+    for finding in examine_port(port, machine):
+        if finding.level == "bad" or (finding.what == "port in use" and not pseudo):
+            return None, f"{finding.sentence}; {finding.advice}"
+    try:
+        return PluggedHead(port, unit=flir_ptu.facts(path, PTU_BAUD)), ""
+    except DriverError:
+        pass  # no PTU
+    servos: list[FoundServo] = []
+    garbled: list[int] = []
+    for baud in BAUDS:
+        try:
+            scan = dynamixel.scan(path, (baud,), REPLY_TIMEOUT_S)
+        except BadOptions:
+            continue  # a rate that the adapter does not have
+        except DriverError as error:
+            return None, str(error)
+        servos += scan.found
+        garbled += scan.garbled
+        if len(servos) > 1:
+            break
+    if not servos:
+        noise = f"; at {garbled[0]} baud something answers: two servos of one id?" if garbled else ""
+        return None, f"{port}: no servo and no PTU answers{noise}; is its power on?"
+    driven = tuple(one for one in servos if one.model in MODELS)
+    others = tuple(one.model for one in servos if one.model not in MODELS)
+    return PluggedHead(port, driven, others), ""
+
+
+def model_of(servo: FoundServo) -> ServoModel:
+    """Return the model of a servo that is driven."""
+    return MODELS[servo.model]
+
+
+def ask_cameras() -> tuple[list[PluggedCamera], list[str]]:
+    """Return the cameras with a format that is read, and a sentence for each of the others."""
+    cameras: list[PluggedCamera] = []
+    others = list(find.refused_nodes(capture_nodes()))
+    for one in find.list_cameras():
+        try:
+            options = find.options_for(str(one.node), None, None, None, {})
+        except DriverError as error:
+            others.append(f"{one.card} at {one.bus}: {error}")
+            continue
+        cameras.append(PluggedCamera(one.card, one.bus, one.node, _named(options, one)))
+    return cameras, others
+
+
+def _named(options: dict[str, Any], camera: find.FoundCamera) -> dict[str, Any]:
+    """The options of a camera by its stable link, or by card and bus where udev gives none."""
+    address = {"device": str(camera.links[0])} if camera.links else {"card": camera.card, "bus": camera.bus}
+    return {**address, "format": options["format"], "size_px": options["size_px"]}
+
+
+def usb_of(device: Path, machine: ExaminedMachine) -> Iterator[tuple[str, str]]:
+    """Yield the udev matches that tell a USB device from all others: by its serial number, else its socket.
+
+    ``device`` is its folder in sysfs; nothing is yielded for what is not on USB.
+    """
+    place = device.resolve()
+    for folder in (place, *place.parents):
+        if (folder / "idVendor").is_file():
+            yield "ATTRS{idVendor}", (folder / "idVendor").read_text().strip()
+            serial = folder / "serial"
+            if serial.is_file():
+                yield "ATTRS{serial}", serial.read_text().strip()
+            else:
+                yield "KERNELS", folder.name
+            return
+        if folder == machine.root:
+            return
