@@ -20,6 +20,7 @@ from calib.survey.writer import BenchFolder, NotWritten
 from calib.targets.boards import AnyBoard
 from mastctl.bench.eyes import BenchLook, SeenBoard
 from mastctl.bench.frame import RoverFrame, frame_of
+from mastctl.json_lines import append_line
 
 JOURNAL = "bench.jsonl"
 
@@ -90,12 +91,7 @@ class RunFolder:
         """Write a line into the journal."""
         line = json.dumps(told, allow_nan=False)
         try:
-            with self._journal.open("ab") as file:
-                if file.tell() and not _ends_a_line(self._journal):
-                    file.write(b"\n")  # a line that a kill cut short
-                file.write(line.encode() + b"\n")
-                file.flush()
-                os.fsync(file.fileno())
+            append_line(self._journal, line.encode() + b"\n")
         except OSError as error:
             raise NotWritten(self._journal, "", f"cannot be written: {error.strerror or error}") from None
         self.notes.append(told)
@@ -234,12 +230,6 @@ def _number_of(image: SurveyImage, path: Path) -> int:
         )
         raise BadFile(path / "images.csv", "", words)
     return int(number)
-
-
-def _ends_a_line(path: Path) -> bool:
-    with path.open("rb") as file:
-        file.seek(-1, os.SEEK_END)
-        return file.read(1) == b"\n"
 
 
 def _read_notes(path: Path) -> list[dict[str, Any]]:

@@ -72,6 +72,11 @@ class StateMachine:
         self._turns.go_on()
         return self._standing
 
+    def something_runs(self) -> bool:
+        """Return whether an operation or a track runs. Takes no lock."""
+        now = self.standing
+        return now.operation is not None or now.track is not None
+
     def refusal(self, need: Need) -> MastctlError | None:
         """Return why a command that needs something may not be carried out now, None if it may.
 

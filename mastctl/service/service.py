@@ -173,7 +173,7 @@ class Service:
         )
         self.live = None if config.live is None else self._live_view(config.live)
         people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
-        self.leases = LeaseTable(people_s, self._runs, self._steered, self.stopping.stop)
+        self.leases = LeaseTable(people_s, self.machine.something_runs, self._steered, self.stopping.stop)
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
         strangers = self.folder.path / STRANGERS_FILE
         self.strangers = AuditLog(strangers, clock, files=STRANGERS_FILES, device=STRANGERS)
@@ -450,10 +450,6 @@ class Service:
         return LiveView(
             settings, stored.rig, stored.digest, names, self.machine.publisher, self.devices, self.clock
         )
-
-    def _runs(self) -> bool:
-        """Whether an operation or a track runs; takes no lock."""
-        return self.operations.running is not None or self.tracker.status.state in ACTIVE
 
     def _steered(self, control: WhoSteers | None) -> None:
         """Publish who holds the lease."""

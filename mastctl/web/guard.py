@@ -178,6 +178,7 @@ class Guard:
         else:
             caller = entrance.caller(scope, headers)
             _hand_on(scope, caller)
+            # The entry asks each command's role. A body, and a jog's heartbeat, are heard before the entry.
             if changes(scope) and path != LOGOUT and not caller.may("operate"):
                 words = f"{caller.name} may {caller.role}; {scope['method']} {path[:80]} needs operate"
                 raise GuardError(403, "role", words)

@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from drivers.interfaces import Reading
 from hil_tests.mastctl.service_fakes import FakePointing, FakeResult
-from hil_tests.waiting import until
+from hil_tests.waiting import NET_S, until
 from mastctl.control.publisher import Publisher
 from mastctl.control.records import Operation
 from mastctl.watch.metrics import Metrics
@@ -49,6 +49,22 @@ def scraped(metrics: Metrics) -> Found:
         for family in text_string_to_metric_families(metrics.text().decode())
         for sample in family.samples
     }
+
+
+def hold_counting(publisher: Publisher) -> threading.Event:
+    """Publish a frame in whose counting the metrics wait until the event is set."""
+    counting, go_on = threading.Event(), threading.Event()
+
+    class Held:
+        @property
+        def sequence(self) -> int:
+            counting.set()
+            assert go_on.wait(NET_S)
+            return 0
+
+    publisher.publish("frame", "navcam_left", Held())
+    assert counting.wait(NET_S)
+    return go_on
 
 
 def test_the_status_is_told_as_it_is_when_somebody_asks(publisher: Publisher) -> None:
@@ -111,17 +127,7 @@ def test_what_comes_in_quick_succession_is_counted_each_and_none_of_it_as_missed
     publisher: Publisher,
 ) -> None:
     metrics = Metrics(lambda: STATUS, dict, publisher)
-    counting, go_on = threading.Event(), threading.Event()
-
-    class Held:
-        @property
-        def sequence(self) -> int:
-            counting.set()
-            assert go_on.wait(60.0)
-            return 0
-
-    publisher.publish("frame", "navcam_left", Held())
-    assert counting.wait(60.0)
+    go_on = hold_counting(publisher)
     for sequence in (1, 2, 3):
         publisher.publish("frame", "navcam_left", SimpleNamespace(sequence=sequence))
         publisher.publish("joints", "pan_tilt", Reading(0.0, 0.0, False, 10.0 + 0.1 * sequence))
@@ -144,17 +150,7 @@ def test_news_that_could_not_be_counted_are_not_told_as_missed_frames(
 ) -> None:
     monkeypatch.setattr("mastctl.control.publisher.MOST_UNREAD", 1)
     metrics = Metrics(lambda: STATUS, dict, publisher)
-    counting, go_on = threading.Event(), threading.Event()
-
-    class Held:
-        @property
-        def sequence(self) -> int:
-            counting.set()
-            assert go_on.wait(60.0)
-            return 0
-
-    publisher.publish("frame", "navcam_left", Held())
-    assert counting.wait(60.0)
+    go_on = hold_counting(publisher)
     for sequence in (1, 2, 3):
         publisher.publish("frame", "navcam_left", SimpleNamespace(sequence=sequence))
     go_on.set()
