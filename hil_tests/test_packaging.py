@@ -53,7 +53,7 @@ def client_wheel(built: list[Path]) -> Path:
     return built[2]
 
 
-def test_wheel_holds_three_packages_and_the_configs(wheel: Path) -> None:
+def test_wheel_holds_three_packages_and_the_configs(wheel: Path, repository: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
     tops = {name.split("/")[0] for name in names}
@@ -61,6 +61,8 @@ def test_wheel_holds_three_packages_and_the_configs(wheel: Path) -> None:
     assert "mastctl/configs/default.yaml" in names
     templates = {f"mastctl/report/templates/{name}" for name in ("base.html", "style.css", "pointing.html")}
     assert templates <= set(names)
+    built = (repository / "docs/_build/html/index.html").is_file()
+    assert ("mastctl/site/index.html" in names) == built, "the site is in the wheel where tools/docs built it"
 
 
 def readme_of(wheel: Path) -> str:

@@ -77,9 +77,16 @@ def test_what_was_interrupted_is_taken_up_again(checkout: Path) -> None:
 @pytest.mark.parametrize("changed", INPUTS)
 def test_with_other_packages_it_begins_anew(checkout: Path, changed: str) -> None:
     set_up(checkout)
-    with (checkout / changed).open("a") as file:
-        file.write("\n# changed\n")
+    first, rest = (checkout / changed).read_text().split("\n", 1)
+    (checkout / changed).write_text(f"{first}\n# changed\n{rest}")
     assert set_up(checkout, "demo")[0] == "-m venv .venv"
+
+
+def test_a_setting_of_a_tool_sets_nothing_up_anew(checkout: Path) -> None:
+    set_up(checkout)
+    with (checkout / "pyproject.toml").open("a") as file:
+        file.write('\n[tool.ruff.lint.isort]\nknown-first-party = ["tools"]\n')
+    assert set_up(checkout) == []
 
 
 def entries(text: str) -> dict[str, set[str]]:

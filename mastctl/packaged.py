@@ -31,3 +31,13 @@ def default_config() -> Path:
 def schema_files() -> dict[str, Path]:
     """Return the JSON Schemas of the files that a person writes, by name."""
     return {file.stem: file for file in sorted((config_folder() / "schemas").glob("*.json"))}
+
+
+def site_folder() -> Path:
+    """Return the folder of the documentation: in the wheel, or where `tools/docs` builds it.
+
+    It need not exist: a wheel holds the site if the site had been built before.
+    """
+    package = Path(__file__).resolve().parent
+    inside = package / "site"
+    return inside if inside.is_dir() else package.parent / "docs" / "_build" / "html"

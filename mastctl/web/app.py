@@ -31,6 +31,7 @@ from mastctl.web.pictures import WatchedCameras
 from mastctl.web.refusals import add_errors
 from mastctl.web.sessions import add_sessions
 from mastctl.web.simulation import add_simulation
+from mastctl.web.site import add_site
 from mastctl.web.steering import add_estop, add_lease, add_limits, add_pointing, add_tracking
 from mastctl.web.waiting import Streams, Waiting
 from mastctl.web.watching import add_watching
@@ -114,6 +115,7 @@ def api() -> FastAPI:
     for add in (
         *(add_sessions, add_pointing, add_estop, add_lease, add_tracking, add_limits, add_masts, add_places),
         *(add_recordings, add_bench, add_simulation, add_watching, add_events, add_images, add_page),
+        add_site,
     ):
         add(app)
 

@@ -40,9 +40,10 @@ STOP_LINE = re.compile(f"POST {_WRITTEN}[ ?]".encode())
 UNREAD = frozenset({f"{PREFIX}/stop", TRACK_STOP})
 """Where no body is read; an emergency stop reads what it can of its own."""
 LOGIN, LOGOUT = f"{PREFIX}/login", f"{PREFIX}/logout"
-PAGES = frozenset({"/"})
-FILES = "/page/"
-"""Before the name of each of a page's files, which tell nothing and so ask for no token."""
+PAGES = frozenset({"/", "/docs"})
+SITE = "/docs/"
+FILES = ("/page/", SITE)
+"""Before the name of each file of the page and of the documentation: no data, so no token is required."""
 LARGEST_HEADERS_BYTES = 16384
 MOST_HEADERS = 100
 
@@ -171,7 +172,7 @@ class Guard:
         entrance.names.check_host(headers)
         if changes(scope):
             entrance.names.check_origin(headers)
-        check_site(headers, page=path in PAGES and not changes(scope))
+        check_site(headers, page=(path in PAGES or path.startswith(SITE)) and not changes(scope))
         _check_no_secret(scope)
         if path == LOGIN or path in PAGES or path.startswith(FILES):
             _hand_on(scope, entrance.stranger(scope, headers))
