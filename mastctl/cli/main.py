@@ -48,6 +48,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.rig": ("rig",),
     "mastctl.cli.sentinel": ("sentinel",),
     "mastctl.cli.servos": ("servo", "ptu"),
+    "mastctl.cli.ros2": ("ros2",),
 }
 
 # argparse's own pattern knows -1 and -1.5 but takes -1e-3 for an option; "not finite" words get our message.
@@ -317,6 +318,7 @@ servo set-id /dev/ttyUSB0 1 2
 servo test /dev/ttyUSB0 1 --degrees 5
 ptu info /dev/ttyUSB0
 ptu home /dev/ttyUSB0
+ros2 --url http://127.0.0.1:8420
 """
 _GROUPS = frozenset(
     (

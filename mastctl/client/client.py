@@ -6,11 +6,14 @@ from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator
 from contextlib import AbstractAsyncContextManager, AbstractContextManager
 from functools import update_wrapper
 from types import MethodType, TracebackType
-from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
 
 from mastctl.client.calls import Calls
 from mastctl.client.connection import AsyncDaemonHttp, DaemonHttp, finished, iterated
 from mastctl.client.jog import Jog
+
+if TYPE_CHECKING:
+    from mastctl.client.pictures import LivePictures
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -184,6 +187,21 @@ class Client:
                 time.sleep(1.5)
         """
         return self._calls.jog()
+
+    def live_pictures(self, *cameras: str) -> AbstractContextManager[LivePictures]:
+        """Return a context in which pictures of some cameras come, as JPEG at the cameras' own rate.
+
+        Examples
+        --------
+        ::
+
+            with client.live_pictures("navcam_left") as pictures:
+                pictures.wanted("navcam_left")
+                picture = pictures.next(timeout_s=1.0)     # facts, jpeg; None if there was none
+        """
+        from mastctl.client.pictures import live_pictures  # WebSockets, only where pictures are watched
+
+        return live_pictures(self._calls._daemon, cameras)
 
     close = waits(Calls.close)
 

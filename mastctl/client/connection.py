@@ -54,7 +54,7 @@ class ClientError(Exception):
         super().__init__(message)
 
 
-def _trusted() -> ssl.SSLContext:
+def trusted() -> ssl.SSLContext:
     """Whose certificates are taken: those of the machine, and of ``$MASTCTL_CA_FILE``. Raises ClientError."""
     own = os.environ.get(OWN_CERTIFICATE)
     if own:
@@ -222,7 +222,13 @@ class DaemonConnection(ABC):
             raise Broken("no_daemon", f"the connection to {self.url} broke: {error}") from None
 
     @property
-    def _socket(self) -> str | None:
+    def shown(self) -> dict[str, str]:
+        """The headers by which the daemon knows this program."""
+        shown = {"Authorization": f"Bearer {self._token}"} if self._token else {}
+        return {"Mastctl-Client": self.name, **shown}
+
+    @property
+    def socket_path(self) -> str | None:
         """Path of the daemon's Unix socket, if it has one."""
         if not self.url.startswith("unix:"):
             return None
@@ -230,9 +236,8 @@ class DaemonConnection(ABC):
 
     def _made(self, kind: Callable[..., T], transport: Callable[..., object]) -> T:
         """Make the client of httpx. Raises ClientError ``bad_url``."""
-        path = self._socket
+        path = self.socket_path
         base = "http://localhost" if path is not None else self.url.rstrip("/")
-        shown = {"Authorization": f"Bearer {self._token}"} if self._token else {}
         try:
             parts = urlsplit(base)
             if parts.scheme not in ("http", "https") or not parts.hostname or (parts.port or 1) < 1:
@@ -241,10 +246,10 @@ class DaemonConnection(ABC):
             return kind(
                 base_url=base,
                 timeout=self.timeout_s,
-                headers={"Mastctl-Client": self.name, **shown},
+                headers=self.shown,
                 trust_env=False,
                 transport=None if path is None else transport(uds=path),
-                verify=_trusted() if parts.scheme == "https" else False,
+                verify=trusted() if parts.scheme == "https" else False,
             )
         except (ValueError, httpx.InvalidURL):
             raise ClientError(

@@ -94,7 +94,7 @@ class _Line:
         self._line = line
         self._there = asyncio.Event()
         self._loop = asyncio.get_running_loop()
-        self._watcher: Watcher = watched.watch(query.camera, self._wake, not query.on_request)
+        self._watcher: Watcher = watched.watch(query.camera, self._wake, not query.on_request, query.every)
 
     async def run(self, ending: asyncio.Future[Any]) -> None:
         """Send pictures until ``ending`` is done."""

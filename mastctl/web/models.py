@@ -459,12 +459,15 @@ class EventsQuery(BaseModel):
 
 
 class ImagesQuery(BaseModel):
-    """``GET /images``, a WebSocket: of which cameras, and whether the first pictures are asked for too."""
+    """``GET /images``, a WebSocket: of which cameras; whether the first pictures are asked for too, and all of them
+    come at the cameras' own rate.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
     camera: Annotated[list[Name], Field(min_length=1, max_length=MOST_KEYS)]
     on_request: bool = False
+    every: bool = False
 
 
 class TruthQuery(BaseModel):

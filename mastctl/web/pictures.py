@@ -27,12 +27,17 @@ log = logging.getLogger(__name__)
 
 JPEG_QUALITY = 80  # 110 kB of 1024x768 gravel; a pixel's own grey is off by 2 of 255
 APART_S = 0.045  # least time between two pictures: more than 15 a second from cameras of 15, 20, 30 or 60
+NEXT_S = 1e-3  # the same where somebody watches every picture
 NEW_S = 0.05  # a picture that was exposed this long ago is still new
 STANDS_S = 0.25  # and one this long ago where the clock may stand: two frames of 15 Hz, and their read-out
 AGAIN_S = 0.25  # a picture that stays the newest, since its clock stands, is shown again so often, real time
 TIMEOUT_S = 1.0
 FAILING_S = 0.5  # how long a camera is left alone that gave none
 HELD = 4  # pictures of a camera that each watcher may click though newer ones came
+HELD_OF_EVERY, HELD_BYTES = (
+    32,
+    64_000_000,
+)  # the same where every picture is watched: a second of 30 Hz, at most
 REDUCED = ((1, 55), (1, 35), (2, 70), (2, 45), (2, 25), (4, 60), (4, 30))
 """By what a picture's sides are divided, and the quality of its JPEG, the largest first: some 110 kB of
 gravel become 70, 50, 28, 18, 12, 7 and 4."""
@@ -89,7 +94,9 @@ class WatchedCameras:
         self._closed = False
         self._numbers = count(1)
 
-    def watch(self, cameras: Sequence[str], wake: Callable[[], None], ready: bool = True) -> Watcher:
+    def watch(
+        self, cameras: Sequence[str], wake: Callable[[], None], ready: bool = True, every: bool = False
+    ) -> Watcher:
         """Begin to watch some cameras. Whoever does ends it by `Watcher.end`.
 
         Parameters
@@ -100,13 +107,15 @@ class WatchedCameras:
             Called from another thread when a picture is there; must return at once.
         ready
             Whether a first picture of each is wanted before `Watcher.shown` asks for one.
+        every
+            Whether pictures are wanted at the cameras' own rate, and not only as a person sees them move.
 
         Raises
         ------
         RuntimeError
             If the system gives no thread; nobody watches then.
         """
-        watcher = Watcher(self, f"watcher {next(self._numbers)}", cameras, wake, ready)
+        watcher = Watcher(self, f"watcher {next(self._numbers)}", cameras, wake, ready, every)
         with self._changed:
             self._watchers.add(watcher)
         try:
@@ -154,7 +163,11 @@ class WatchedCameras:
         pause_s = 0.0
         while self._wanted(camera, pause_s):
             try:
-                after_s = -math.inf if made is None or stands else made.frame.exposure_began_s + APART_S
+                after_s = (
+                    -math.inf
+                    if made is None or stands
+                    else made.frame.exposure_began_s + self._apart_s(camera)
+                )
                 frame = self._cameras.glance(camera, after_s, STANDS_S if stands else NEW_S, TIMEOUT_S)
                 if made is not None and made.frame is frame:
                     pause_s = AGAIN_S
@@ -169,7 +182,7 @@ class WatchedCameras:
                 made, pause_s = None, FAILING_S
             else:
                 for watcher in self._ready(camera):
-                    self._cameras.hold(frame, watcher.name, HELD)
+                    self._cameras.hold(frame, watcher.name, watcher.held_of(frame))
                     if self._is_there(watcher):
                         watcher.put(made.within(watcher.most_bytes(camera)))
                     else:  # it left before the frame was held, and would hold it for ever
@@ -187,6 +200,11 @@ class WatchedCameras:
                 return True
             self._at_work.discard(camera)
             return False
+
+    def _apart_s(self, camera: str) -> float:
+        with self._changed:
+            every = any(one.every for one in self._watchers if camera in one.cameras)
+        return NEXT_S if every else APART_S
 
     def _watch(self, camera: str) -> bool:
         return not self._closed and any(camera in one.cameras for one in self._watchers)
@@ -209,6 +227,8 @@ class Watcher:
         Nobody else's.
     cameras
         What is watched.
+    every
+        Whether at the cameras' own rate.
     """
 
     def __init__(
@@ -218,9 +238,11 @@ class Watcher:
         cameras: Sequence[str],
         wake: Callable[[], None],
         ready: bool,
+        every: bool = False,
     ) -> None:
         self.name = name
         self.cameras = frozenset(cameras)
+        self.every = every
         self._owner = owner
         self._wake = wake
         self._lock = threading.Lock()
@@ -246,6 +268,10 @@ class Watcher:
     def most_bytes(self, camera: str) -> int | None:
         """Of a camera's next picture; None: any number."""
         return self._most_bytes[camera]
+
+    def held_of(self, frame: StampedFrame) -> int:
+        """How many pictures of a camera may be clicked."""
+        return max(HELD, min(HELD_OF_EVERY, HELD_BYTES // frame.image.nbytes)) if self.every else HELD
 
     def put(self, picture: Picture) -> None:
         """Leave a picture to be taken, in the place of one that was not; none if that was taken meanwhile."""

@@ -1,0 +1,198 @@
+"""What the daemon tells as ROS messages, and ROS messages as what it takes: no node, no connection."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import TransformStamped, Vector3Stamped
+from sensor_msgs.msg import CameraInfo, CompressedImage, JointState
+from std_msgs.msg import Header
+
+from calib.files.opencv_camera import even_axes
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid, quaternion_of, rot_x, rot_y, rot_z, rotation_of
+from mastctl.ros2.lens import RosLens
+from mastctl.ros2.times import NS, RosTime
+
+OK, WARN, ERROR = 0, 1, 2
+LEVELS = {"fault": ERROR} | dict.fromkeys(("stopped", "stopping", "holding", "starting", "closing"), WARN)
+
+
+class Names:
+    """The names of joints and frames, each with the prefix that the user gave."""
+
+    def __init__(self, prefix: str = "", base: str = "base_link") -> None:
+        self.base = base
+        self.pan, self.tilt = f"{prefix}pan", f"{prefix}tilt"
+        self.rover, self.mast = f"{prefix}rover", f"{prefix}mast"
+        self.pan_link, self.head = f"{prefix}pan_link", f"{prefix}head"
+        self._prefix = prefix
+
+    def optical(self, camera: str) -> str:
+        """The frame of a camera: x right, y down, z ahead."""
+        return f"{self._prefix}{camera}_optical_frame"
+
+    def camera_of(self, frame: str, rig: Rig) -> str | None:
+        """The camera whose optical frame this is."""
+        return next((name for name in rig.cameras if self.optical(name) == frame), None)
+
+
+def stamp(ns: int) -> Time:
+    """Return nanoseconds since 1970 as ROS has them."""
+    return Time(sec=ns // NS, nanosec=ns % NS)
+
+
+def stamp_ns(time: Time) -> int:
+    """Return a stamp as nanoseconds."""
+    return int(time.sec) * NS + int(time.nanosec)
+
+
+def joint_state(names: Names, at_ns: int, pan_rad: float, tilt_rad: float) -> JointState:
+    """Return the joints as the head reads them, radians."""
+    return JointState(
+        header=Header(stamp=stamp(at_ns)), name=[names.pan, names.tilt], position=[pan_rad, tilt_rad]
+    )
+
+
+def moving_transforms(
+    names: Names, rig: Rig, at_ns: int, true_pan_rad: float, true_tilt_rad: float
+) -> list[TransformStamped]:
+    """Return mast <- pan_link <- head at true joint angles."""
+    mast = rig.mast
+    arm = Rigid(rot_x(mast.axis_twist_rad) @ rot_y(true_tilt_rad), np.array([mast.axis_offset_m, 0.0, 0.0]))
+    return [
+        transform(names.mast, names.pan_link, at_ns, Rigid(rot_z(true_pan_rad), np.zeros(3))),
+        transform(names.pan_link, names.head, at_ns, arm),
+    ]
+
+
+def fixed_transforms(names: Names, rig: Rig, at_ns: int) -> list[TransformStamped]:
+    """Return base <- rover <- mast, and each camera's optical frame in what carries it.
+
+    The base has ROS's axes (x ahead, y left, z up), the rover those of mastctl (y right, z down).
+    """
+    carriers = {"head": names.head, "rover": names.rover}
+    told = [
+        transform(names.base, names.rover, at_ns, Rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3))),
+        transform(names.rover, names.mast, at_ns, rig.mast.rover_from_mast),
+    ]
+    for name, camera in rig.cameras.items():
+        place = Rigid(even_axes(camera.model), camera.model.C)
+        told.append(transform(carriers[camera.on], names.optical(name), at_ns, place))
+    return told
+
+
+def transform(parent: str, child: str, at_ns: int, parent_from_child: Rigid) -> TransformStamped:
+    """Return a transform as tf has it."""
+    told = TransformStamped(header=Header(stamp=stamp(at_ns), frame_id=parent), child_frame_id=child)
+    w, x, y, z = quaternion_of(parent_from_child.rotation)
+    place, turn = told.transform.translation, told.transform.rotation
+    place.x, place.y, place.z = parent_from_child.translation_m.tolist()
+    turn.w, turn.x, turn.y, turn.z = float(w), float(x), float(y), float(z)
+    return told
+
+
+def rigid(told: TransformStamped) -> Rigid:
+    """Return parent_from_child of a transform. Raises ValueError if it is none."""
+    place, turn = told.transform.translation, told.transform.rotation
+    quaternion = np.array([turn.w, turn.x, turn.y, turn.z])
+    if not np.isfinite(quaternion).all() or np.linalg.norm(quaternion) < 0.1:
+        raise ValueError(f"the rotation of '{told.child_frame_id}' is no quaternion")
+    return Rigid(rotation_of(quaternion / np.linalg.norm(quaternion)), np.array([place.x, place.y, place.z]))
+
+
+def camera_info(lens: RosLens) -> CameraInfo:
+    """Return a camera as ROS has it; its header is set with each image."""
+    width, height = lens.size_px
+    return CameraInfo(
+        width=width,
+        height=height,
+        distortion_model=lens.name,
+        d=lens.distortion.tolist(),
+        k=lens.matrix_px.ravel().tolist(),
+        r=np.eye(3).ravel().tolist(),
+        p=np.hstack([lens.matrix_px, np.zeros((3, 1))]).ravel().tolist(),
+    )
+
+
+def image(header: Header, jpeg: bytes) -> CompressedImage:
+    """Return a camera's JPEG."""
+    return CompressedImage(
+        header=header, format="jpeg", data=array("B", jpeg)
+    )  # bytes are checked one by one
+
+
+def residual(header: Header, pixels: Sequence[float | None]) -> Vector3Stamped:
+    """Return a residual, or its sigma, of an image, pixels: x right, y down, NaN where not measured."""
+    told = Vector3Stamped(header=header)
+    told.vector.x, told.vector.y = (float("nan") if one is None else float(one) for one in pixels)
+    return told
+
+
+def pointing(
+    at_ns: int, name: str, state: str, message: str, operation: Mapping[str, Any] | None
+) -> DiagnosticArray:
+    """Return how an operation ended."""
+    told = {} if operation is None else {
+        key: operation.get(key) for key in ("residual_px", "residual_sigma_px", "position_m", "range_m")
+    }  # fmt: skip
+    level = OK if state == "done" else ERROR
+    return diagnostics(at_ns, [status(name, level, message or state, {"state": state, **told})])
+
+
+def status(
+    name: str, level: int, message: str, values: Mapping[str, Any], hardware: str = ""
+) -> DiagnosticStatus:
+    """Return one line of diagnostics."""
+    told = [KeyValue(key=key, value=str(value)) for key, value in values.items() if value is not None]
+    return DiagnosticStatus(
+        level=bytes([level]), name=name, message=message, hardware_id=hardware, values=told
+    )
+
+
+def diagnostics(at_ns: int, lines: Iterable[DiagnosticStatus]) -> DiagnosticArray:
+    """Return lines of diagnostics."""
+    return DiagnosticArray(header=Header(stamp=stamp(at_ns)), status=list(lines))
+
+
+def health(told: Mapping[str, Any], clock: RosTime) -> list[DiagnosticStatus]:
+    """Return a daemon's status as lines of diagnostics: state, clock, mast file, each camera, each fault."""
+    hardware = str(told["mast"]["name"])
+    control = told["control"]
+    state = told["state"]
+    lines = [
+        status(
+            "mastctl: state", LEVELS.get(state, OK), f"{state}: {told['reason']}",
+            {"steers": control and control["holder"], "hardware": told["hardware"]}, hardware,
+        ),
+        _clock_line(clock, hardware),
+    ]  # fmt: skip
+    calibration = told["calibration"]
+    if calibration is not None:
+        level = WARN if calibration["verdict"] == "drifts" else OK
+        values = {"verdict": calibration["verdict"], "pointings": calibration["pointings"]}
+        lines.append(status("mastctl: mast file", level, calibration["sentence"], values, hardware))
+    faults: dict[str, list[Mapping[str, Any]]] = {name: [] for name in told["cameras"]}
+    for fault in told["faults"]:
+        faults.setdefault(fault["device"], []).append(fault)
+    for device, found in faults.items():
+        values = {one["code"]: f"{one['message']}; until {one['until']}" for one in found}
+        words = "; ".join(one["message"] for one in found) or "no fault"
+        lines.append(status(f"mastctl: {device}", ERROR if found else OK, words, values, hardware))
+    return lines
+
+
+def _clock_line(clock: RosTime, hardware: str) -> DiagnosticStatus:
+    used = clock.exchange
+    if used is None:
+        return status("mastctl: clock", ERROR, "the daemon's time is not known yet", {}, hardware)
+    values = {"offset_s": f"{used.offset_ns / NS:.9f}", "doubt_s": f"{used.half_s:.6f}", "steps": clock.steps}
+    if not clock.steady:
+        words = f"the offset of ROS time from the daemon's clock has changed {clock.steps} times"
+        return status("mastctl: clock", WARN, words, values, hardware)
+    return status("mastctl: clock", OK, "ROS time follows the daemon's clock", values, hardware)
