@@ -459,8 +459,8 @@ class EventsQuery(BaseModel):
 
 
 class ImagesQuery(BaseModel):
-    """``GET /images``, a WebSocket: of which cameras; whether the first pictures are asked for too, and all of them
-    come at the cameras' own rate.
+    """``GET /images``, a WebSocket: of which cameras; whether their first pictures are asked for too, and all
+    of them come at the cameras' own rate.
     """
 
     model_config = ConfigDict(extra="forbid")

@@ -31,10 +31,11 @@ AMENT = (
     "ament-cmake-export-link-flags", "ament-cmake-export-targets", "ament-cmake-gen-version-h",
     "ament-cmake-gmock", "ament-cmake-gtest", "ament-cmake-include-directories", "ament-cmake-libraries",
     "ament-cmake-pytest", "ament-cmake-python", "ament-cmake-ros", "ament-cmake-target-dependencies",
-    "ament-cmake-test", "ament-cmake-version", "ament-package", "python-cmake-module",
+    "ament-cmake-test", "ament-cmake-version", "ament-package",
     "rosidl-core-generators", "rosidl-default-generators",
 )  # fmt: skip
 COLCON = ("colcon-core", "colcon-cmake", "colcon-ros", "colcon-metadata", "colcon-recursive-crawl")
+OF_ONE = {"jazzy": ("python-cmake-module",), "kilted": ()}
 BUILT_AT = "/opt/python/cp311-cp311/include/python3.11"
 NUMPY_AT = "/opt/python/cp311-cp311/lib/python3.11/site-packages/numpy/_core/include"
 """Where the builder of the wheels had Python; their CMake files say so."""
@@ -149,7 +150,10 @@ def made(distro: str, folder: Path | None = None) -> Path:
     prefix.parent.mkdir(parents=True, exist_ok=True)
     _run([sys.executable, "-m", "venv", str(prefix)])
     pip = [str(prefix / "bin" / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-    wheels = [f"ros-{distro}-rclpy[fastrtps]", *(f"ros-{distro}-{name}" for name in (*MESSAGES, *AMENT))]
+    wheels = [
+        f"ros-{distro}-rclpy[fastrtps]",
+        *(f"ros-{distro}-{name}" for name in (*MESSAGES, *AMENT, *OF_ONE[distro])),
+    ]
     try:
         _run([*pip, f"numpy=={version('numpy')}", *wheels, *COLCON])
     except NotMade as error:
@@ -166,7 +170,7 @@ def build(prefix: Path, source: Path, install: Path) -> None:
     python = prefix / "bin" / "python"
     environment = os.environ | variables(prefix) | {"CMAKE_PREFIX_PATH": str(prefix)}
     environment["PATH"] = f"{prefix / 'bin'}:{os.environ['PATH']}"
-    work = prefix / "work"
+    work = install / "work"
     _run(
         [
             str(prefix / "bin" / "colcon"), "--log-base", str(work / "log"), "build",
