@@ -6,7 +6,8 @@ A question is a coroutine over a `mastctl.client.connection.DaemonConnection`, w
 from __future__ import annotations
 
 from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
-from typing import Any, Literal, cast
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Any, Literal, cast
 from urllib.parse import quote
 
 from mastctl.answers import (
@@ -32,6 +33,9 @@ from mastctl.client.keeping_calls import KeepingCalls
 from mastctl.client.lease import LeaseCalls
 from mastctl.client.simulation_calls import SimulationCalls
 from mastctl.client.snapshot import Snapshot, read_snapshot
+
+if TYPE_CHECKING:
+    from mastctl.client.pictures import LivePictures
 
 ENDED = ("done", "failed", "stopped")
 
@@ -318,6 +322,23 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
                 time.sleep(1.5)
         """
         return Jog(lambda: self._daemon.beside(ANSWER_S))
+
+    def live_pictures(self, *cameras: str) -> AbstractContextManager[LivePictures]:
+        """Return a context in which pictures of some cameras come, as JPEG at the cameras' own rate.
+
+        It waits, so under asyncio it belongs into a thread of its own.
+
+        Examples
+        --------
+        ::
+
+            with client.live_pictures("navcam_left") as pictures:
+                pictures.wanted("navcam_left")
+                picture = pictures.next(timeout_s=1.0)     # facts, jpeg; None if there was none
+        """
+        from mastctl.client.pictures import live_pictures  # WebSockets, only where pictures are watched
+
+        return live_pictures(self._daemon, cameras)
 
     async def snapshot(
         self,

@@ -199,9 +199,7 @@ class Client:
                 pictures.wanted("navcam_left")
                 picture = pictures.next(timeout_s=1.0)     # facts, jpeg; None if there was none
         """
-        from mastctl.client.pictures import live_pictures  # WebSockets, only where pictures are watched
-
-        return live_pictures(self._calls._daemon, cameras)
+        return self._calls.live_pictures(*cameras)
 
     close = waits(Calls.close)
 

@@ -79,6 +79,7 @@ class LeaseCalls:
         take_over: str | None = None,
         gives_way: bool = False,
         ends_with_stop: bool = False,
+        stops_when_silent: bool = False,
     ) -> AsyncIterator[HeldLease]:
         """Steer alone inside the block: a thread renews the lease, and this client's commands carry it.
 
@@ -96,6 +97,9 @@ class LeaseCalls:
         ends_with_stop
             Whether it ends as soon as anybody stops the head: for a program that would go on with its next
             move otherwise.
+        stops_when_silent
+            Whether the daemon stops what runs when nobody renews it any more: this process has died, or
+            cannot reach the daemon.
 
         Yields
         ------
@@ -107,7 +111,8 @@ class LeaseCalls:
         ClientError
             ``leased`` if somebody else steers.
         """
-        granted = await self.acquire_lease(name, for_s, take_over, gives_way, ends_with_stop)
+        ends = gives_way, ends_with_stop, stops_when_silent
+        granted = await self.acquire_lease(name, for_s, take_over, *ends)
         before, held = self._daemon.lease_id, HeldLease(self._daemon, granted, for_s)
         self._daemon.lease_id = held.id
         try:
@@ -127,6 +132,7 @@ class LeaseCalls:
         take_over: str | None = None,
         gives_way: bool = False,
         ends_with_stop: bool = False,
+        stops_when_silent: bool = False,
     ) -> LeaseGranted:
         """Acquire or take over a lease that nobody renews; arguments as for `lease`.
 
@@ -143,6 +149,8 @@ class LeaseCalls:
             body["gives_way"] = True
         if ends_with_stop:
             body["ends_with_stop"] = True
+        if stops_when_silent:
+            body["stops_when_silent"] = True
         return await self._daemon.command(LeaseGranted, "POST", "/lease", body)
 
     def use_lease(self, lease_id: str | None) -> None:

@@ -25,6 +25,8 @@ from mastctl.control.caller import Caller
 from mastctl.errors import BadRequest, NotNow
 
 SHORTEST_S, USUAL_S, LONGEST_S = 1.0, 30.0, 3600.0
+OUT_OF_TIME = "s were over"
+SILENT_S = 0.2  # how soon after its time what runs under a lease that stops it is stopped, at most
 REMEMBERED = 64  # ended leases whose end is still told to who comes with them
 
 
@@ -49,7 +51,8 @@ class Lease:
 
     One that ``gives_way`` ends as soon as anybody else wants to steer, or stops the head.
     ``last_stop`` is that of `LeaseTable.last_stop` after which the next one ends it; None: no stop does.
-    ``credential`` is what its caller showed, without which it ends; empty: nothing.
+    ``credential`` is what its caller showed, without which it ends; empty: nothing. One that
+    ``stops_when_silent`` takes what runs with it when its time runs out.
     """
 
     id: str
@@ -60,6 +63,7 @@ class Lease:
     gives_way: bool = False
     last_stop: StopCame | None = None
     credential: str = field(default="", repr=False)
+    stops_when_silent: bool = False
 
 
 @dataclass(frozen=True)
@@ -172,6 +176,7 @@ class LeaseTable:
         for_s: float = USUAL_S,
         gives_way: bool = False,
         ends_with_stop: bool = False,
+        stops_when_silent: bool = False,
     ) -> Lease:
         """Return a new lease if nobody else steers, or who does gives way.
 
@@ -187,6 +192,8 @@ class LeaseTable:
             Whether it ends as soon as anybody else wants to steer, or stops the head.
         ends_with_stop
             Whether it ends as soon as anybody stops the head, and for that alone.
+        stops_when_silent
+            Whether what runs is stopped when its time runs out: its holder has died, or is out of reach.
 
         Raises
         ------
@@ -201,10 +208,26 @@ class LeaseTable:
         with self._changing():
             why = self._check_free(caller)
             last_stop = self._last_stop if gives_way or ends_with_stop else None
-            lease = self._grant(caller, name, for_s, gives_way, last_stop)
+            lease = self._grant(caller, name, for_s, gives_way, last_stop, stops_when_silent)
+        if stops_when_silent:
+            threading.Thread(target=self._watch, args=(lease,), name="silent holder", daemon=True).start()
         if why:
             self._give_way(why)
         return lease
+
+    def _watch(self, lease: Lease) -> None:
+        while not self.stopped_silent(lease):
+            self._clock.sleep(SILENT_S)
+
+    def stopped_silent(self, lease: Lease) -> bool:
+        """Return whether a lease has ended; what runs is stopped if that was because its time ran out."""
+        with self._changing():
+            if self._lease is not None and self._lease.id == lease.id:
+                return False
+            how = self._over.get(lease.id, "")
+        if how.endswith(OUT_OF_TIME) and self._running():
+            self._give_way(f"{lease.holder} began it and has fallen silent: {how}")
+        return True
 
     def holds(self, lease_id: str) -> bool:
         """Return whether a lease runs now; takes no lock."""
@@ -318,7 +341,7 @@ class LeaseTable:
     def _over_by(self, lease: Lease) -> str:
         """What has ended a lease that nobody released or took, '' if nothing has; takes no lock."""
         if self._clock.now_s() >= lease.until_s:
-            return f"its {lease.for_s:g} s were over"
+            return f"its {lease.for_s:g} {OUT_OF_TIME}"
         if self.was_stopped(lease):
             return self._last_stop.how
         if lease.credential and not self.stands(lease.credential):
@@ -357,10 +380,19 @@ class LeaseTable:
         for_s: float,
         gives_way: bool = False,
         last_stop: StopCame | None = None,
+        stops_when_silent: bool = False,
     ) -> Lease:
         now_s, holder = self._clock.now_s(), name or caller.name
         times_s = now_s, for_s, now_s + for_s
-        lease = Lease(secrets.token_hex(16), holder, *times_s, gives_way, last_stop, caller.credential)
+        lease = Lease(
+            secrets.token_hex(16),
+            holder,
+            *times_s,
+            gives_way,
+            last_stop,
+            caller.credential,
+            stops_when_silent,
+        )
         self._lease = lease
         return lease
 

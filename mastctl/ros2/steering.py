@@ -2,7 +2,7 @@
 
 A wish is an operation of the daemon: joint angles, or a point of the rover frame. A new wish takes the place
 of the one before, which is stopped first. The lease is held from a wish's beginning to its end and renewed
-meanwhile, so that others can steer in between.
+meanwhile, so that others can steer in between; when nobody renews it, the daemon stops what runs.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ class Steering:
         try:
             with self._connect() as client:
                 asked = wish.request(client)
-                with client.lease(for_s=LEASE_S, ends_with_stop=True):
+                with client.lease(for_s=LEASE_S, ends_with_stop=True, stops_when_silent=True):
                     return self._carried_out(client, wish, asked)
         except ValueError as error:
             return Outcome("refused", "bad_request", str(error))

@@ -73,13 +73,14 @@ class LeaseBody(_Strict):
     """``POST /lease``: how long, and whose it is, if not the caller's.
 
     ``gives_way``: it ends as soon as anybody else wants to steer, or stops the head; ``ends_with_stop``: with
-    a stop only.
+    a stop only. ``stops_when_silent``: what runs is stopped when its time runs out.
     """
 
     name: Name | None = None
     for_s: LeaseS = USUAL_S
     gives_way: bool = False
     ends_with_stop: bool = False
+    stops_when_silent: bool = False
 
 
 class RenewBody(_Strict):

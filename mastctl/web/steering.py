@@ -264,7 +264,8 @@ def add_lease(app: FastAPI) -> None:
     @command(app, "POST /lease", LEASE, "Acquire the lease, if nobody else steers")
     def acquire(body: LeaseBody, here: Here, asked: Asks) -> LeaseGranted:
         leases, name = here.service.leases, None if body.name is None else told_name(body.name)
-        granted = leases.acquire(asked.caller, name, body.for_s, body.gives_way, body.ends_with_stop)
+        ends = body.gives_way, body.ends_with_stop, body.stops_when_silent
+        granted = leases.acquire(asked.caller, name, body.for_s, *ends)
         return _granted(leases, granted)
 
     @command(

@@ -35,6 +35,8 @@ KEPT = 100_000
 LONG = 100
 NET_S = 30.0
 LOOK_S = 0.005
+MATCHED_S = 0.5
+"""A subscriber that is known here already may not know this publisher yet, and nobody tells that."""
 
 
 def type_of(name: str) -> Any:
@@ -104,6 +106,7 @@ class Peer:
             self._publishers[topic] = self.node.create_publisher(type_of(kind), topic, qos)
         publisher = self._publishers[topic]
         self._until(publisher.get_subscription_count, NET_S)
+        time.sleep(MATCHED_S)
         publisher.publish(filled(type_of(kind)(), fields))
 
     def call(self, service: str, kind: str, fields: dict[str, Any]) -> Any:

@@ -290,3 +290,29 @@ def test_a_lease_ends_with_the_token_or_the_session_that_it_was_granted_to(world
         with pytest.raises(NotNow, match="token or the session"):
             world.leases.renew(lease.id)
         world.leases.release(world.leases.acquire(ROVER).id)
+
+
+def test_what_a_silent_holder_began_is_stopped_when_its_lease_runs_out(world: World) -> None:
+    lease = world.leases.acquire(ROVER, for_s=2.0)
+    world.steer(ROVER, lease, starts=True)
+    world.clock.advance(1.9)
+    lease = world.leases.renew(lease.id)
+    world.clock.advance(1.9)
+    assert not world.leases.stopped_silent(lease)
+    assert world.runs
+    world.clock.advance(0.2)
+    assert world.leases.stopped_silent(lease)
+    assert world.gave_way == ["rover began it and has fallen silent: its 2 s were over"]
+
+
+@pytest.mark.parametrize("how", ["released", "taken over"])
+def test_a_lease_that_did_not_run_out_leaves_what_runs_alone(world: World, how: str) -> None:
+    lease = world.leases.acquire(ROVER, for_s=2.0)
+    world.steer(ROVER, lease, starts=True)
+    if how == "released":
+        world.leases.release(lease.id)
+    else:
+        world.leases.take(BENCH, "it is my turn")
+    world.clock.advance(5.0)
+    assert world.leases.stopped_silent(lease)
+    assert world.runs and not world.gave_way
