@@ -35,7 +35,7 @@ AMENT = (
     "rosidl-core-generators", "rosidl-default-generators",
 )  # fmt: skip
 COLCON = ("colcon-core", "colcon-cmake", "colcon-ros", "colcon-metadata", "colcon-recursive-crawl")
-OF_ONE = {"jazzy": ("python-cmake-module",), "kilted": ()}
+OF_ONE = {"jazzy": ("python-cmake-module",), "kilted": ("ament-cmake-ros-core",)}
 BUILT_AT = "/opt/python/cp311-cp311/include/python3.11"
 NUMPY_AT = "/opt/python/cp311-cp311/lib/python3.11/site-packages/numpy/_core/include"
 """Where the builder of the wheels had Python; their CMake files say so."""
