@@ -29,7 +29,11 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
         help="the rover's frame with the axes of ROS (default: base_link)",
     )  # fmt: skip
     ros2.add_argument(
-        "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...", help="remappings and parameters of ROS: -r, -p, ..."
+        "--ros-args",
+        nargs=argparse.REMAINDER,
+        default=[],
+        metavar="...",
+        help="remappings and parameters of ROS: -r, -p, ...",
     )
     ros2.set_defaults(run=_run)
 

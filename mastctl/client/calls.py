@@ -336,8 +336,11 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
                 pictures.wanted("navcam_left")
                 picture = pictures.next(timeout_s=1.0)     # facts, jpeg; None if there was none
         """
-        from mastctl.client.pictures import live_pictures  # WebSockets, only where pictures are watched
-
+        try:
+            from mastctl.client.pictures import live_pictures  # WebSockets, only where pictures are watched
+        except ImportError:
+            words = "live pictures need the package websockets; 'pip install websockets' brings it"
+            raise ClientError("no_websockets", words) from None
         return live_pictures(self._daemon, cameras)
 
     async def snapshot(

@@ -1,8 +1,9 @@
 """The ROS lens nearest to a camera, as ``camera_info`` has it, and how far its pixels are off.
 
-Three lenses are fitted to the rays of the whole image: ``plumb_bob``, ``rational_polynomial``,
-``equidistant``; OpenCV's own projections say what their numbers mean. The simplest one that is as good as
-the best is taken. Points are far away: a moving entrance pupil has no place in any of them.
+A camera of one of OpenCV's families that ROS has keeps its numbers. For the others, three lenses are fitted
+to the rays of the whole image: ``plumb_bob``, ``rational_polynomial``, ``equidistant``; OpenCV's own
+projections say what their numbers mean. The simplest one that is as good as the best is taken. Points are far
+away: a moving entrance pupil has no place in any of them.
 """
 
 from __future__ import annotations
@@ -17,6 +18,13 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
 
 COUNTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
+KEPT = {
+    "OPENCV4": "plumb_bob",
+    "OPENCV5": "plumb_bob",
+    "OPENCV8": "rational_polynomial",
+    "OPENCV_FISHEYE": "equidistant",
+}
+EXACT_PX = 1e-6
 GRID = (25, 19)
 AS_GOOD_PX = 0.01
 """A lens of more numbers has to be nearer by this much."""
@@ -65,6 +73,13 @@ def nearest_lens(model: CameraModel) -> RosLens:
     if np.count_nonzero(seen) < len(pixels) // 2:
         raise ValueError("more than half of the image looks sideways or backwards; no ROS lens can say that")
     pixels, directions = pixels[seen], directions[seen]
+    if model.kind in KEPT:
+        name, (fx, fy, cx, cy) = KEPT[model.kind], model.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+        numbers = np.zeros(4 + COUNTS[name])
+        numbers[: 4 + len(model.distortion)] = fx, fy, cx, cy, *model.distortion
+        kept = _measured(name, numbers, model.size_px, directions, pixels)
+        if kept.worst_px < EXACT_PX:  # not so with a skewed image
+            return kept
     start = np.array([*model.focal_px, model.A @ model.H, model.A @ model.V])
     found = [_fitted(name, start, model.size_px, directions, pixels) for name in COUNTS]
     best_px = min(one.worst_px for one in found)
@@ -99,7 +114,14 @@ def _fitted(
     if np.abs(off_px(first)).max() > 1e-9:
         scale = np.concatenate([start[:2], np.array(size_px, dtype=np.float64), np.ones(COUNTS[name])])
         numbers = np.asarray(least_squares(off_px, first, x_scale=scale, method="lm").x)
-    worst_px = float(np.linalg.norm(off_px(numbers).reshape(-1, 2), axis=1).max())
+    return _measured(name, numbers, size_px, directions, pixels)
+
+
+def _measured(
+    name: str, numbers: FloatArray, size_px: tuple[int, int], directions: FloatArray, pixels: FloatArray
+) -> RosLens:
+    """The lens of some numbers, with how far it is off; infinitely where it bends away."""
+    off = np.nan_to_num(projected(name, numbers, directions) - pixels, nan=np.inf)
     fx, fy, cx, cy = numbers[:4].tolist()
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    return RosLens(name, size_px, matrix, numbers[4:], worst_px)
+    return RosLens(name, size_px, matrix, numbers[4:], float(np.linalg.norm(off, axis=1).max()))

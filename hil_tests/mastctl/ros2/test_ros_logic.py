@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.files.mast_file import load_rig
 from calib.files.opencv_camera import OpencvCamera, even_axes
+from calib.geometry.cahvor import CameraModel, Kind
 from calib.geometry.rigid import Rigid, rot_z
 from hil_tests.waiting import until
 from mastctl.cli.main import main
@@ -78,25 +79,31 @@ def test_the_lens_projects_as_opencv_does_and_its_worst_error_is_that(navcam: An
     assert np.abs(ours.project(directions)[0] - found.reshape(-1, 2)).max() < ROUNDING_PX
 
 
-class _Fisheye:
-    """A camera of OpenCV's fisheye lens, with what `nearest_lens` asks of a model."""
+@pytest.mark.parametrize(
+    ("kind", "name", "distortion"),
+    [
+        ("OPENCV4", "plumb_bob", [-0.2, 0.05, 0.001, -0.0005]),
+        ("OPENCV5", "plumb_bob", [-0.2, 0.05, 0.001, -0.0005, 0.01]),
+        ("OPENCV8", "rational_polynomial", [0.3, 0.02, 0.001, -0.0005, 0.001, 0.5, 0.06, 0.002]),
+        ("OPENCV_FISHEYE", "equidistant", [0.01, -0.002, 0.001, 0.0]),
+    ],
+)
+def test_a_camera_of_opencv_keeps_its_numbers(kind: Kind, name: str, distortion: list[float]) -> None:
+    matrix = [[410.0, 0.0, 322.0], [0.0, 411.0, 236.0], [0.0, 0.0, 1.0]]
+    turn = Rotation.from_euler("xyz", [0.2, -0.1, 0.05]).as_matrix()
+    model = CameraModel.of_matrix(kind, (640, 480), matrix, distortion, turn, [0.1, 0.2, 0.3])
+    lens = nearest_lens(model)
+    assert (lens.name, lens.distortion.tolist()[: len(distortion)]) == (name, distortion)
+    assert np.allclose(lens.matrix_px, matrix, rtol=1e-15)
+    assert lens.worst_px < ROUNDING_PX
 
-    size_px = (640, 480)
-    focal_px = (200.0, 201.0)
-    A, H, V = np.array([0.0, 0.0, 1.0]), np.array([200.0, 0.0, 322.0]), np.array([0.0, 201.0, 236.0])
 
-    def ray(self, pixels: Any) -> Any:
-        center, distortion = np.array([322.0, 236.0]), np.array([0.01, -0.002, 0.001, 0.0])
-        return OpencvCamera("equidistant", self.size_px, np.array(self.focal_px), center, distortion).ray(
-            pixels
-        )
-
-
-def test_a_fisheye_becomes_equidistant_with_its_own_numbers() -> None:
-    lens = nearest_lens(_Fisheye())  # type: ignore[arg-type]
+def test_a_fisheye_of_the_cahv_family_becomes_equidistant() -> None:
+    vectors = {"A": [0.0, 0.0, 1.0], "H": [200.0, 0.0, 319.5], "V": [0.0, 200.0, 239.5]}
+    model = CameraModel("CAHVORE", (640, 480), C=[0.0, 0.0, 0.0], **vectors, cahvore_type=2, linearity=0.0)
+    lens = nearest_lens(model)
     assert lens.name == "equidistant"
-    assert lens.worst_px < 1e-4
-    assert np.allclose(lens.distortion, [0.01, -0.002, 0.001, 0.0], atol=1e-5)
+    assert lens.worst_px < ROUNDING_PX
 
 
 def test_a_way_through_tf_is_that_of_its_parts_between_their_stamps() -> None:
