@@ -13,6 +13,8 @@ Word = Literal[
     "starting", "ready", "moving", "tracking", "holding", "stopping", "stopped", "fault", "closing"
 ]
 """What the daemon is doing."""
+WELL: frozenset[Word] = frozenset({"ready", "moving", "tracking", "holding"})
+"""States in which a command is carried out."""
 OperationState = Literal["queued", "running", "done", "failed", "stopped"]
 TrackState = Literal["idle", "starting", "tracking", "lost", "stopped"]
 BenchState = Literal["running", "asking", "done", "interrupted"]

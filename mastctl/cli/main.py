@@ -35,7 +35,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.stop": ("stop", "estop", "reset", "halt"),
     "mastctl.cli.steering": ("lease", "track", "jog"),
     "mastctl.cli.operations": ("reload", "operations", "events", "mast", "fault"),
-    "mastctl.cli.setup": ("token", "completion", "doctor", "schema"),
+    "mastctl.cli.setup": ("token", "completion", "man", "doctor", "schema"),
     "mastctl.cli.camera_files": ("camera",),
     "mastctl.cli.geometry": ("solve", "triangulate", "budget", "handoff"),
     "mastctl.cli.board": ("board",),
@@ -295,7 +295,9 @@ calibrate survey --out mast.yaml --report report
 calibrate bench --config rig.yaml --board board.yaml --out mast.yaml --report report
 experiment pointing --targets 20 --out pointing
 demo --out demo
-completion bash
+completion bash --install
+man
+schema config
 conform http://127.0.0.1:8420
 doctor --config rover.yaml
 sentinel reference --folder sentinel --rest 0,-0.3

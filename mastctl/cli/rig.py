@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from mastctl.rig.questions import Questions
 
 
+LEAST_DEG = 15.0
+"""Between the ends of an axis: both keep a margin (`mastctl.rig.drawing.MARGIN_RAD`)."""
+
+
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add rig with new."""
     rig = subparsers.add_parser("rig", help="write the files of a rig of your own")
@@ -122,11 +126,10 @@ def _answers(
     for axis, (low, high) in {"pan": usual.pan_deg, "tilt": usual.tilt_deg}.items():
         given = getattr(args, f"{axis}_deg")
         least, most = given if given is not None else (None, None)
-        from_deg = number(least, f"{axis} may turn from, degrees", low, -175.0, 175.0)
-        ends[axis] = from_deg, number(most, f"{axis} may turn to, degrees", high, -175.0, 175.0)
-        if ends[axis][0] + 15.0 > ends[axis][1]:
-            words = f"{axis} may turn from {ends[axis][0]:g} to {ends[axis][1]:g} degrees"
-            raise WrongUse(f"{words} where 15 degrees or more are expected between the two")
+        from_deg = number(least, f"{axis} may turn from, degrees", low, -175.0, 175.0 - LEAST_DEG)
+        lowest_deg = from_deg + LEAST_DEG
+        to_deg = number(most, f"{axis} may turn to, degrees", max(high, lowest_deg), lowest_deg, 175.0)
+        ends[axis] = from_deg, to_deg
     none = head is None and not found.cameras
     return RigAnswers(
         height_m=number(args.height, "height of the axes over the ground, m", usual.height_m, 0.3, 5.0),

@@ -10,6 +10,7 @@ import os
 import signal
 import socket
 import sys
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from mastctl.client.answers import ControlTold, LeaseGranted, OperationTold, Status, StepTold
     from mastctl.config import Config, Listen
 
+LOOK_S = 0.1  # how often `status --wait` asks
 SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 
 
@@ -51,6 +53,10 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     run.set_defaults(run=_run)
 
     status = subparsers.add_parser("status", help="show what a running daemon knows")
+    status.add_argument(
+        "--wait", type=positive_number, metavar="S",
+        help="wait so long for a daemon that carries out commands; exit 1 if there is none by then",
+    )  # fmt: skip
     status.set_defaults(run=_status)
 
     point = subparsers.add_parser("point", help="point a camera at something and measure the residual")
@@ -166,13 +172,36 @@ def serve_config(config: Config, args: argparse.Namespace) -> None:
 
 def _status(args: argparse.Namespace) -> int:
     with client_of(args) as client:
-        status = client.status()
+        status = client.status() if args.wait is None else _ready(client, args.wait)
     if args.json:
         output.print_json(status)
         return 0
     rows = [(name, text) for name, text in _status_rows(status)]
     output.print_table(f"mastctl at {client.url}", ("what", "now"), rows, _fault_lines(status))
     return 0
+
+
+def _ready(client: Client, wait_s: float) -> Status:
+    """The status as soon as the daemon carries out commands; of a stop or a fault at the end of the wait."""
+    from mastctl.answers.words import WELL
+    from mastctl.client import ClientError
+    from mastctl.client.following import PASSING
+
+    until_s = time.monotonic() + wait_s
+    while True:
+        try:
+            status = client.status()
+            if status["state"] in WELL:
+                return status
+            reason = status.get("reason")
+            words = f"the daemon is {status['state']}{f': {reason}' if reason else ''}"
+        except ClientError as error:
+            if error.code not in PASSING:
+                raise
+            words = str(error)
+        if time.monotonic() > until_s:
+            raise CommandError("not_ready", f"not ready after {wait_s:g} s: {words}")
+        time.sleep(LOOK_S)
 
 
 def _point(args: argparse.Namespace) -> int:

@@ -1,8 +1,9 @@
-"""Setting up: ``doctor``, ``schema``, ``token``, ``completion``."""
+"""Setting up: ``doctor``, ``schema``, ``token``, ``completion``, ``man``."""
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from mastctl.client.answers import Status
 
 
+SHELLS = ("bash", "zsh", "tcsh")
 MARKS = {"good": "✓", "unsure": "?", "bad": "✗"}
 
 
@@ -173,16 +175,24 @@ def _folder(args: argparse.Namespace) -> Path:
     return config.state_folder or usual_folder(config.path, config.listen.url)
 
 
-SHELLS = ("bash", "zsh", "tcsh")
-
-
 def _add_completion(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add completion."""
+    """Add completion and man."""
     completion = subparsers.add_parser(
-        "completion", help="print what makes a shell complete commands and options"
+        "completion", help="print what makes a shell complete commands and options, or install it"
     )
     completion.add_argument("shell", choices=SHELLS)
+    completion.add_argument(
+        "--install",
+        action="store_true",
+        help="write it where the shell finds it, for this user (bash and zsh)",
+    )
     completion.set_defaults(run=_completion)
+    man = subparsers.add_parser("man", help="write the man pages, one for each command, where man finds them")
+    man.add_argument(
+        "--to", type=Path, metavar="FOLDER",
+        help="a folder man1 (default: share/man/man1 beside the program's own bin)",
+    )  # fmt: skip
+    man.set_defaults(run=_man)
 
 
 def _completion(args: argparse.Namespace) -> int:
@@ -193,5 +203,43 @@ def _completion(args: argparse.Namespace) -> int:
     except ImportError:
         words = "shtab is not installed, which writes completions: pip install 'mastctl[completion]'"
         raise CommandError("no_shtab", words) from None
-    sys.stdout.write(shtab.complete(build_parser([]), shell=args.shell))
+    script = shtab.complete(build_parser([]), shell=args.shell)
+    if not args.install:
+        sys.stdout.write(script)
+        return 0
+    if args.shell not in PLACES:
+        raise WrongUse(f"--install knows no place for {args.shell}; bash or zsh is expected")
+    data = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
+    file = Path(data) / PLACES[args.shell]
+    _write(file, script)
+    advice = f"; add to ~/.zshrc before compinit: fpath+=({file.parent})" if args.shell == "zsh" else ""
+    output.tell(f"written: {file}; it works in the next {args.shell}{advice}")
+    return 0
+
+
+PLACES = {"bash": "bash-completion/completions/mastctl", "zsh": "zsh/site-functions/_mastctl"}
+"""Under $XDG_DATA_HOME; bash-completion looks there by itself."""
+
+
+def _write(file: Path, text: str) -> None:
+    """Write a file and the folders to it."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise output.unusable(str(file), str(error.strerror)) from None
+
+
+def _man(args: argparse.Namespace) -> int:
+    from mastctl.cli.main import build_parser
+    from mastctl.cli.man import man_pages
+
+    folder = args.to if args.to is not None else Path(sys.prefix) / "share" / "man" / "man1"
+    pages = man_pages(build_parser([]))
+    for name, text in pages.items():
+        _write(folder / name, text)
+    if args.json:
+        output.print_json({"written": [str(folder / name) for name in pages]})
+    else:
+        sys.stdout.write(output.one_line(f"{len(pages)} pages in {folder}; try: man mastctl-point") + "\n")
     return 0

@@ -20,12 +20,13 @@ from drivers.errors import BadOptions, DriverError
 from drivers.flir_ptu import workshop as flir_ptu
 from drivers.flir_ptu.workshop import Facts
 from drivers.v4l2 import find
-from drivers.v4l2.node import capture_nodes
+from drivers.v4l2.node import Node, capture_nodes
 from mastctl.setup.machine import ExaminedMachine, examine_port
 
 BAUDS = (1_000_000, 57_600, 115_200, 2_000_000, 3_000_000, 4_000_000)
 """Of servos: as they are set up, then as they come from the factory, then the rest."""
 PTU_BAUD = 9600
+LEAST_PX, USUAL_HZ = (640, 480), 30.0
 
 
 @dataclass(frozen=True)
@@ -166,18 +167,26 @@ def ask_cameras() -> tuple[list[PluggedCamera], list[str]]:
     others = list(find.refused_nodes(capture_nodes()))
     for one in find.list_cameras():
         try:
-            options = find.options_for(str(one.node), None, None, None, {})
+            options = _options(one)
         except DriverError as error:
             others.append(f"{one.card} at {one.bus}: {error}")
             continue
-        cameras.append(PluggedCamera(one.card, one.bus, one.node, _named(options, one)))
+        cameras.append(PluggedCamera(one.card, one.bus, one.node, options))
     return cameras, others
 
 
-def _named(options: dict[str, Any], camera: find.FoundCamera) -> dict[str, Any]:
-    """The options of a camera by its stable link, or by card and bus where udev gives none."""
+def _options(camera: find.FoundCamera) -> dict[str, Any]:
+    """A camera's options: its stable link, or card and bus; its format, size and rate, of now or usual."""
+    now = find.options_for(str(camera.node), None, None, None, {})
+    code, size_px = now["format"], tuple(now["size_px"])
+    with Node(camera.node) as node:
+        if size_px < LEAST_PX and LEAST_PX in node.sizes(code)[0]:
+            size_px = LEAST_PX
+        rates_hz = node.rates_hz(code, size_px)
+    slow_hz = [rate for rate in rates_hz if rate <= USUAL_HZ + 1e-3]
+    rate = {"rate_hz": round(max(slow_hz or rates_hz), 3)} if rates_hz else {}
     address = {"device": str(camera.links[0])} if camera.links else {"card": camera.card, "bus": camera.bus}
-    return {**address, "format": options["format"], "size_px": options["size_px"]}
+    return {**address, "format": code, "size_px": list(size_px), **rate}
 
 
 def usb_of(device: Path, machine: ExaminedMachine) -> Iterator[tuple[str, str]]:

@@ -7,7 +7,8 @@ from typing import cast
 
 from fastapi import FastAPI, Request, Response
 
-from mastctl.answers import CalibrationHealthTold, LiveTold, ReadyTold, SentinelTold, Word
+from mastctl.answers import CalibrationHealthTold, LiveTold, ReadyTold, SentinelTold
+from mastctl.answers.words import WELL
 from mastctl.errors import Unable
 from mastctl.watch.metrics import CONTENT_TYPE
 from mastctl.watch.reference import SENTINEL_FOLDER
@@ -15,9 +16,6 @@ from mastctl.watch.sentinel import findings
 from mastctl.web import PREFIX
 from mastctl.web.page import passing_answer
 from mastctl.web.parts import Here
-
-WELL: frozenset[Word] = frozenset({"ready", "moving", "tracking", "holding"})
-"""States in which a command is carried out."""
 
 
 def add_watching(app: FastAPI) -> None:

@@ -64,6 +64,22 @@ def test_status_for_programs_and_for_people(run: Run, pair: BOTH) -> None:
         assert words in out
 
 
+def test_status_waits_for_a_daemon_that_carries_out_commands(run: Run, pair: BOTH) -> None:
+    assert document(run("status", "--wait", "60", "--json"))["state"] == "ready"
+    assert run("estop", "--name", "Ana", "--reason", "sparks")[0] == 0
+    code, _, told = run("status", "--wait", "0.2")
+    assert code == 1
+    assert "not ready after 0.2 s: the daemon is stopped" in told and "sparks" in told
+
+
+def test_status_waits_for_a_daemon_that_is_not_there_yet(capsys: pytest.CaptureFixture[str]) -> None:
+    nobody = ["--url", "http://127.0.0.1:1", "--json"]
+    assert main(["status", "--wait", "0.2", *nobody]) == 1
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert error["code"] == "not_ready" and "no daemon answers" in error["message"]
+    assert main(["status", "--wait", "9", "--url", "mars"]) == 2, "what no waiting mends is told at once"
+
+
 def test_status_tells_faults(run: Run, pair: BOTH) -> None:
     def fail(name: str) -> None:
         raise NoReply("no answer on the bus", device="pan_tilt")

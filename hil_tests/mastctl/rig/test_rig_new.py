@@ -240,7 +240,7 @@ def test_answers_are_asked_again_until_they_fit_and_never_without_a_terminal() -
     ("words", "told"),
     [
         (("--height", "9"), "height of the axes over the ground, m: 9 where 0.3 to 5 is expected"),
-        (("--pan-deg", "10", "5"), "pan may turn from 10 to 5 degrees"),
+        (("--pan-deg", "10", "5"), "pan may turn to, degrees: 5 where 25 to 175 is expected"),
         (("--pan-id", "2", "--tilt-id", "2"), "--pan-id and --tilt-id are both 2"),
     ],
 )
