@@ -31,9 +31,9 @@ CAMERA_NAME_WORDS = "a camera's name is letters, digits, '_' and '-'"
 _PAIR_NAME = CAMERA_NAME
 _ROUNDED, _NO_ROTATION = 1e-15, 1e-3
 _MODEL_KEYS = ("size_px", "model", "C")
-_CAHVORE_KEYS = ("A", "H", "V", "O", "R", "E", "type", "linearity")
-_OPENCV_KEYS = ("camera_matrix", "distortion", "rotation")
-_MODEL_OPTIONS = (*_CAHVORE_KEYS, *_OPENCV_KEYS)
+CAHVORE_KEYS = ("A", "H", "V", "O", "R", "E", "type", "linearity")
+OPENCV_KEYS = ("camera_matrix", "distortion", "rotation")
+_MODEL_OPTIONS = (*CAHVORE_KEYS, *OPENCV_KEYS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +173,7 @@ def _model(section: Section) -> tuple[CameraModel, tuple[str, ...]]:
     kind = cast(Kind, section.choice("model", KINDS))
     size = section.integers("size_px", 2, 1, LARGEST_IMAGE_PX)
     opencv = kind in COEFFICIENTS
-    for key in _CAHVORE_KEYS if opencv else _OPENCV_KEYS:
+    for key in CAHVORE_KEYS if opencv else OPENCV_KEYS:
         if key in section:
             raise section.bad(key, f"{kind} has no '{key}'; another 'model' has it")
     if opencv:
@@ -216,7 +216,7 @@ def build_opencv(
     BadFile
         If a key is missing or the numbers are no camera.
     """
-    for key in _OPENCV_KEYS:
+    for key in OPENCV_KEYS:
         if key not in section:
             raise section.bad(key, f"the key is missing; {kind} has it")
     matrix = section.rows("camera_matrix", 3, 3)
@@ -244,7 +244,7 @@ def _model_keys(model: CameraModel) -> dict[str, Any]:
     """Return one camera model's keys in the order of docs/reference/configuration.md."""
     keys: dict[str, Any] = {"size_px": list(model.size_px), "model": model.kind}
     if model.kind in COEFFICIENTS:
-        return keys | {"C": model.C, **{key: getattr(model, key) for key in _OPENCV_KEYS}}
+        return keys | {"C": model.C, **{key: getattr(model, key) for key in OPENCV_KEYS}}
     keys.update({letter: getattr(model, letter) for letter in model.letters})
     if model.kind == "CAHVORE":
         keys.update(type=int(model.cahvore_type), linearity=float(model.linearity))

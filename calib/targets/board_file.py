@@ -35,7 +35,7 @@ LARGEST_M, MOST_CELLS = 10.0, 100
 WORST_SCALE, WORST_ASPECT = 0.3, 0.03
 """A bar further than this from what was drawn is another bar, or told in other units."""
 
-_KEYS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+KEYS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "charuco": (("square_m", "marker_m", "dictionary"), ("first_id", "legacy")),
     "aprilgrid": (("tag_m", "gap_m"), ("family", "first_id", "border")),
     "dots": (("spacing_m", "dot_diameter_m"), ()),
@@ -127,7 +127,7 @@ def _save(path: str | Path, document: dict[str, Any]) -> None:
 
 def document_of(board: AnyBoard) -> dict[str, Any]:
     """Return what a file holds of a board, as plain data."""
-    required, optional = _KEYS[board.kind]
+    required, optional = KEYS[board.kind]
     document: dict[str, Any] = {"kind": board.kind, "columns": board.columns, "rows": board.rows}
     document |= {key: getattr(board, key) for key in (*required, *optional)}
     if board.aspect != 1.0:
@@ -151,7 +151,7 @@ def board_of(path: str | Path, place: str, value: Any) -> AnyBoard:
         )
     # the kind first: it says which other keys there may be
     kind = Section(path, place, {"kind": value["kind"]}, ("kind",)).choice("kind", KINDS)
-    required, optional = _KEYS[kind]
+    required, optional = KEYS[kind]
     section = Section(path, place, value, (*_GRID_KEYS, *required), (*optional, *_PRINT_KEYS, "name"))
     if "name" in section:
         section.text("name")
@@ -234,7 +234,7 @@ def _as_printed(board: AnyBoard, section: Section) -> AnyBoard:
 
 def scaled(board: AnyBoard, scale: float, aspect: float) -> AnyBoard:
     """Return the board with every length times ``scale``, and another aspect."""
-    lengths = [key for key in (*_KEYS[board.kind][0],) if key.endswith("_m")]
+    lengths = [key for key in (*KEYS[board.kind][0],) if key.endswith("_m")]
     return replace(board, **{key: scale * getattr(board, key) for key in lengths}, aspect=aspect)
 
 

@@ -29,6 +29,7 @@ from drivers.sim.scene import SceneSettings
 from drivers.v4l2 import options as v4l2
 from mastctl import config
 from mastctl.motion.settings import PointingSettings
+from tools.schemas.page import generated, missing
 
 PAGE = Path("docs") / "reference" / "configuration.md"
 
@@ -94,6 +95,11 @@ def general(key: str) -> str:
 def covered(key: str, told: dict[str, list[str]]) -> bool:
     """Whether the table has a key, or what stands below it."""
     return key in told or any(other.startswith(f"{key}.") for other in told)
+
+
+def test_defaults_and_bounds_of_the_tables_are_what_the_readers_ask(page: str) -> None:
+    assert generated(page) == page, "run python -m tools.schemas --page docs/reference/configuration.md"
+    assert missing(page) == []
 
 
 def test_every_key_of_the_configuration_is_on_the_page(

@@ -24,7 +24,13 @@ from mastctl.packaged import config_folder, schema_files
 from tools.schemas.__main__ import written
 from tools.schemas.files import FILES, examples, schema_of
 
-CONFIGS = sorted(config_folder().rglob("*.yaml"))
+OF_OTHERS = ("monitoring", "ros2")
+"""Folders with files of other programs."""
+CONFIGS = sorted(
+    file
+    for file in config_folder().rglob("*.yaml")
+    if file.relative_to(config_folder()).parts[0] not in OF_OTHERS
+)
 
 CANNOT = {
     "config": {

@@ -2,6 +2,7 @@
 
 .venv/bin/python -m tools.schemas                   # writes configs/schemas/NAME.json
 .venv/bin/python -m tools.schemas --show config     # one of them on stdout
+.venv/bin/python -m tools.schemas --page docs/reference/configuration.md    # defaults and bounds there
 
 An option of a driver with a default or a bound of its own is in them after this has run.
 """
@@ -16,6 +17,7 @@ from typing import Any
 
 from tools.command import end
 from tools.schemas.files import FILES, REPOSITORY, schema_of
+from tools.schemas.page import generated
 
 FOLDER = REPOSITORY / "configs" / "schemas"
 WIDTH = 160
@@ -37,6 +39,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the command's parser."""
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--show", choices=tuple(FILES), help="print this one and write none")
+    made.add_argument("--page", type=Path, metavar="FILE", help="fill the tables of this page instead")
     made.add_argument("--folder", type=Path, default=FOLDER, help="where they go (default configs/schemas)")
     return made
 
@@ -46,6 +49,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     if args.show:
         print(written(schema_of(args.show)))
+        return 0
+    if args.page is not None:
+        args.page.write_text(generated(args.page.read_text(encoding="utf-8")), encoding="utf-8")
         return 0
     args.folder.mkdir(exist_ok=True)
     for name in FILES:

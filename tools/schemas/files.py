@@ -13,6 +13,7 @@ from typing import Any
 from calib.errors import BadFile
 from calib.files import mast_file
 from calib.files.yaml_text import dump_mapping, parse_mapping
+from calib.geometry.cahvor import COEFFICIENTS
 from calib.survey.folder import SCHEMA as SURVEY_SCHEMA
 from calib.survey.reader import read_survey
 from calib.targets import board_file
@@ -92,11 +93,11 @@ def mast() -> Schema:
 
 def camera() -> Schema:
     """A camera file."""
-    made = examples()[-1]["cameras"]["navcam_right"]
-    document = {"schema": mast_file.CAMERA_SCHEMA, "frame": "head", **made}
-    del document["on"]
     with watched() as noted:
-        mast_file.parse_camera(_bytes(document), "camera.yaml")
+        for drawn in examples()[-1]["cameras"].values():
+            document = {"schema": mast_file.CAMERA_SCHEMA, "frame": "head", **drawn}
+            del document["on"]
+            mast_file.parse_camera(_bytes(document), "camera.yaml")
     found = noted.schema()
     found["properties"]["schema"] = {"const": mast_file.CAMERA_SCHEMA}
     return _model(found)
@@ -242,17 +243,23 @@ def _by(holder: Schema, key: str, cases: Mapping[str, Mapping[str, Schema]]) -> 
 
 
 def _model(found: Schema) -> Schema:
-    """Which vectors a camera model has."""
+    """Which keys a camera model has."""
     zero = vector({"const": 0}, 3)
-    cases = {
-        "CAHV": ([], {"R": zero, "E": zero, "type": False, "linearity": False}),
-        "CAHVOR": (["O", "R"], {"E": zero, "type": False, "linearity": False}),
-        "CAHVORE": (["O", "R", "E", "type"], {}),
-    }
-    _by(found, "model", {kind: then for kind, (_, then) in cases.items()})
-    for case, (needed, _) in zip(found["allOf"], cases.values(), strict=True):
-        if needed:
-            case["then"]["required"] = needed
+    others = dict.fromkeys(mast_file.OPENCV_KEYS, False)
+    fixed = {"type": False, "linearity": False}
+    cases: list[tuple[str, list[str], Schema]] = [
+        ("CAHV", list("AHV"), {"R": zero, "E": zero, **fixed, **others}),
+        ("CAHVOR", list("AHVOR"), {"E": zero, **fixed, **others}),
+        ("CAHVORE", [*"AHVORE", "type"], others),
+    ]
+    for kind, count in COEFFICIENTS.items():
+        lens = {"distortion": {"minItems": count, "maxItems": count}}
+        own = {**dict.fromkeys(mast_file.CAHVORE_KEYS, False), **lens}
+        cases.append((kind, list(mast_file.OPENCV_KEYS), own))
+    _by(found, "model", {kind: then for kind, _, then in cases})
+    for case, (_, needed, _) in zip(found["allOf"], cases, strict=True):
+        case["then"]["required"] = needed
+    found["properties"]["distortion"] = {"type": "array", "items": number(-1e6, 1e6)}
     found["allOf"].append(
         {
             "if": {"required": ["type"], "properties": {"type": {"const": 3}}},
@@ -308,7 +315,7 @@ def _boards() -> Schema:
         found["properties"]["kind"] = {"const": kind}
         found["dependentRequired"] = {"measured": ["bar_m"]}
         found.pop("required", None)
-        needed = ["kind", "columns", "rows", *board_file._KEYS[kind][0]]
+        needed = ["kind", "columns", "rows", *board_file.KEYS[kind][0]]
         then[kind] = {**found, "required": needed}
     cases = [
         {"if": {"required": ["kind"], "properties": {"kind": {"const": kind}}}, "then": one}

@@ -110,6 +110,7 @@ SECTION: Mapping[str, Callable[..., Schema]] = {
     "integer": lambda low, high: number(low, high, kind="integer"),
     "integers": lambda count, low, high: vector(number(low, high, kind="integer"), count),
     "vector": lambda limit=1e9, count=3: vector(number(-limit, limit), count),
+    "rows": lambda rows, columns, limit=1e9: vector(vector(number(-limit, limit), columns), rows),
     "pairs": lambda most, limit=1e9: {
         "type": "array",
         "maxItems": most,
