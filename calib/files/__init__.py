@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.errors import BadFile
-from calib.files.opencv_camera import OpencvCamera
 from calib.geometry.cahvor import CameraModel, Kind
 
 #: A shift of a pixel by the normalisation of A and O is told from this size on.
@@ -43,9 +42,6 @@ class CameraFile:
         Sentences for the user: what was changed on reading, what was not read.
     path, digest
         Where it was read and the SHA-256 of the bytes read; None and empty for one made in the program.
-    as_read
-        The camera as a file of OpenCV's families has it, in ``frame``; ``model`` is then the nearest to it,
-        and a note says how near. None where ``model`` is what the file holds.
     """
 
     model: CameraModel
@@ -55,7 +51,6 @@ class CameraFile:
     notes: tuple[str, ...] = ()
     path: Path | None = None
     digest: str = ""
-    as_read: OpencvCamera | None = None
 
     def __post_init__(self) -> None:
         for name in ("fit", "provenance"):

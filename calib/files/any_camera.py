@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +25,10 @@ from calib.files.mrcal_kalibr_colmap import (
     parse_mrcal,
     refuse_mirrored,
 )
-from calib.files.opencv_camera import LensKind, OpencvCamera
 from calib.files.opencv_ros import (
-    error_words,
     format_camera_info,
     format_opencv,
+    lens_pose,
     looks_like_camera_info,
     looks_like_opencv,
     parse_camera_info,
@@ -38,16 +37,18 @@ from calib.files.opencv_ros import (
 )
 from calib.files.pds3 import MAX_FILE_BYTES, load_pds3_camera, looks_like_pds3
 from calib.files.twin import (
+    FISHEYE,
     GOOD_PX,
-    CameraLike,
     TwinError,
+    error_words,
+    held_as,
+    nearest_cahvor,
     nearest_opencv,
     nearest_square,
-    nearest_tilted,
     twin_error,
 )
 from calib.files.yaml_text import parse_mapping
-from calib.geometry.cahvor import CameraModel
+from calib.geometry.cahvor import COEFFICIENTS, CameraModel, Kind
 
 KNOWN_FORMATS = (
     "a mast file, a camera file, a .cahvor file, a PDS3 label, OpenCV's or ROS's YAML, Kalibr's camchain, "
@@ -66,15 +67,15 @@ _BY_SUFFIX = {
 }
 FORMATS = ("mastctl", "cahvor", "opencv", "ros", "kalibr", "mrcal", "colmap")
 
-_PINHOLE: LensKind = "pinhole"
-LENSES: dict[str, tuple[LensKind, tuple[int, ...]]] = {
-    "radtan": (_PINHOLE, (4,)),
-    "plumb_bob": (_PINHOLE, (5, 4)),
-    "rational_polynomial": (_PINHOLE, (8,)),
-    "equidistant": ("equidistant", (4,)),
-    "tilted": (_PINHOLE, (14,)),
+LENSES: dict[str, Kind] = {
+    "radtan": "OPENCV4",
+    "plumb_bob": "OPENCV5",
+    "rational_polynomial": "OPENCV8",
+    "thin_prism": "OPENCV12",
+    "equidistant": FISHEYE,
+    "tilted": "OPENCV14",
 }
-"""The lenses that can be asked for: family, and how many coefficients files give it (the first fitted)."""
+"""The lenses that can be asked for, by the kind that a camera then is."""
 
 _OFFERED: dict[str, tuple[str, ...]] = {
     "opencv": ("plumb_bob", "rational_polynomial", "equidistant", "tilted"),
@@ -83,7 +84,16 @@ _OFFERED: dict[str, tuple[str, ...]] = {
     "mrcal": ("cahvor", "plumb_bob", "rational_polynomial"),
     "colmap": ("radtan", "rational_polynomial", "equidistant"),
 }
-"""Each format's lenses, the plainest first."""
+"""Each format's lenses that a camera of another family is fitted as, the plainest first."""
+
+_HELD: dict[str, tuple[str, ...]] = {
+    "opencv": ("radtan", "plumb_bob", "rational_polynomial", "thin_prism", "tilted", "equidistant"),
+    "ros": ("plumb_bob", "rational_polynomial", "equidistant"),
+    "kalibr": ("radtan", "equidistant"),
+    "mrcal": ("radtan", "plumb_bob", "rational_polynomial", "thin_prism"),
+    "colmap": ("radtan", "rational_polynomial", "equidistant"),
+}
+"""Each format's lenses that hold a camera of the same family as it is, the shortest first."""
 
 _NO_POSE = {"ros": "a camera_info", "colmap": "a cameras.txt"}
 
@@ -233,22 +243,30 @@ def save_any(
     if to in ("mastctl", "cahvor"):
         if lens:
             raise BadFile(path, "", f"'{to}' holds the camera's own model; leave the lens out")
-        (only,) = cameras.values()
-        errors = _reading_error(only, path, limit_px)
-        if to == "cahvor":
-            return Conversion(Path(path), "cahvor", save_cahvor(only, path), (), errors)
-        save_camera(only, path)
-        return Conversion(Path(path), CAMERA_SCHEMA, (), (), errors)
+        ((name, only),) = cameras.items()
+        if to == "mastctl":
+            save_camera(only, path)
+            return Conversion(Path(path), CAMERA_SCHEMA, ())
+        twin, errors = _as_cahvor(name, only, path, limit_px)
+        lost = save_cahvor(twin, path)
+        return Conversion(Path(path), "cahvor", lost, (twin.model.kind,) if errors else (), errors)
     return _save_twins(cameras, path, to, lens, limit_px)
 
 
-def _reading_error(camera: CameraFile, path: str | Path, limit_px: float) -> tuple[TwinError, ...]:
-    """What reading a camera of another family cost; nothing where the model is what was read."""
-    if camera.as_read is None:
-        return ()
-    error = twin_error(camera.as_read, camera.model)
-    _hold(error, limit_px, f"as {camera.model.kind}", "", path)
-    return (error,)
+def _as_cahvor(
+    name: str, camera: CameraFile, path: str | Path, limit_px: float
+) -> tuple[CameraFile, tuple[TwinError, ...]]:
+    """The camera, or its nearest twin of the CAHV family and how near that is."""
+    if camera.model.kind not in COEFFICIENTS:
+        return camera, ()
+    try:
+        with np.errstate(all="ignore"):
+            model = nearest_cahvor(camera.model)
+            error = twin_error(camera.model, model)
+    except (ValueError, np.linalg.LinAlgError) as problem:
+        raise BadFile(path, "", f"the camera has no twin in this format: {problem}") from None
+    _hold(error, limit_px, f"'{name}' as {model.kind}", "", path)
+    return replace(camera, model=model, fit={}), (error,)
 
 
 def _hold(error: TwinError, limit_px: float, what: str, why: str, path: str | Path) -> None:
@@ -261,33 +279,30 @@ def _save_twins(
     cameras: Mapping[str, CameraFile], path: str | Path, to: str, lens: str, limit_px: float
 ) -> Conversion:
     """Write the nearest cameras that a format of other lenses holds."""
-    offered = _OFFERED[to]
+    offered = tuple(dict.fromkeys((*_OFFERED[to], *_HELD[to])))
     if lens and lens not in offered:
         raise BadFile(path, "", f"lens '{lens[:20]}' where one of {', '.join(offered)} is expected for {to}")
-    found: dict[str, tuple[str, CameraLike, TwinError]] = {}
+    found: dict[str, tuple[str, CameraModel, TwinError]] = {}
     for name, camera in cameras.items():
         refuse_mirrored(camera.model, path)
-        found[name] = _nearest(camera, (lens,) if lens else offered, path)
+        found[name] = _nearest(camera.model, to, lens, path)
         taken, _, error = found[name]
         _hold(error, limit_px, f"'{name}' as {taken}", _why(camera.model), path)
     frame = next(iter(cameras.values())).frame
     twins = {name: twin for name, (_, twin, _) in found.items()}
     first = next(iter(twins.values()))
-    opencv = {name: twin for name, twin in twins.items() if isinstance(twin, OpencvCamera)}
     match to:
         case "kalibr":
-            data = format_kalibr(opencv, frame)
+            data = format_kalibr(twins, frame)
         case "colmap":
-            data = format_colmap(opencv)
+            data = format_colmap(twins)
         case "ros":
             ((name, (taken, _, _)),) = found.items()
-            data = format_camera_info(opencv[name], taken, name)
+            data = format_camera_info(first, taken, name)
         case "mrcal":
-            assert isinstance(first, CameraModel | OpencvCamera)
             data = format_mrcal(first, frame)
         case _:
-            (only,) = opencv.values()
-            data = format_opencv(only, frame)
+            data = format_opencv(first, frame)
     save_bytes(path, data)
     lost = list(_lost(cameras, twins, to, frame))
     return Conversion(
@@ -299,19 +314,19 @@ def _save_twins(
     )
 
 
-def _nearest(
-    camera: CameraFile, lenses: tuple[str, ...], path: str | Path
-) -> tuple[str, CameraLike, TwinError]:
-    """Lens, twin and error: the plainest lens that is good enough, else the nearest of them."""
-    original: CameraLike = camera.as_read or camera.model
-    near = camera.model.lens.moving
-    best: tuple[str, CameraLike, TwinError] | None = None
+def _nearest(model: CameraModel, to: str, lens: str, path: str | Path) -> tuple[str, CameraModel, TwinError]:
+    """Lens, twin and error: the camera itself where the format holds it, else the plainest lens that is good
+    enough, else the nearest of them."""
+    for name in (lens,) if lens else _HELD[to]:
+        if name in LENSES and model.kind != "CAHV" and (same := held_as(model, LENSES[name])) is not None:
+            return name, same, twin_error(model, same)
+    best: tuple[str, CameraModel, TwinError] | None = None
     problem = ""
-    for name in lenses:
+    for name in (lens,) if lens else _OFFERED[to]:
         try:
             with np.errstate(all="ignore"):
-                twin = _twin(camera, name)
-                error = twin_error(original, twin, near)
+                twin = _twin(model, name)
+                error = twin_error(model, twin, model.moving)
         except (ValueError, np.linalg.LinAlgError) as reason:
             problem = str(reason)
             continue
@@ -324,22 +339,12 @@ def _nearest(
     return best
 
 
-def _twin(camera: CameraFile, lens: str) -> CameraLike:
-    """The camera itself where the lens holds it, else the nearest one."""
-    if lens == "cahvor":
-        return camera.model if _is_square(camera.model) else nearest_square(camera.model)
-    family, counts = LENSES[lens]
-    was = camera.as_read
-    if was is not None and was.lens == family:
-        used = np.flatnonzero(was.distortion).tolist()
-        kept = was.distortion[: used[-1] + 1] if used else np.zeros(0)
-        count = next((count for count in sorted(counts) if count >= len(kept)), None)
-        if count is not None:
-            told = np.concatenate([kept, np.zeros(count - len(kept))])
-            return OpencvCamera(family, was.size_px, was.focal_px, was.center_px, told, was.frame_from_camera)
-    if lens == "tilted":
-        return nearest_tilted(camera.model)
-    return nearest_opencv(camera.model, family, [True] * counts[0])
+def _twin(model: CameraModel, lens: str) -> CameraModel:
+    """The nearest camera of a lens; the camera itself where that is one."""
+    if lens != "cahvor":
+        return nearest_opencv(model, LENSES[lens])
+    near = nearest_cahvor(model)
+    return near if _is_square(near) else nearest_square(near)
 
 
 def _is_square(model: CameraModel) -> bool:
@@ -353,7 +358,7 @@ def _why(model: CameraModel) -> str:
     reasons = []
     if abs(off_rad) > 1e-5:
         reasons.append(f"H and V are {1e3 * off_rad:.2g} mrad off a right angle")
-    if model.lens.moving:
+    if model.moving:
         reasons.append("the entrance point moves")
     if (beside := float(np.arccos(min(1.0, float(model.A @ model.O))))) > 1e-5:
         reasons.append(f"O is {1e3 * beside:.2g} mrad beside A")
@@ -361,14 +366,13 @@ def _why(model: CameraModel) -> str:
 
 
 def _lost(
-    cameras: Mapping[str, CameraFile], twins: Mapping[str, CameraLike], to: str, frame: str
+    cameras: Mapping[str, CameraFile], twins: Mapping[str, CameraModel], to: str, frame: str
 ) -> tuple[str, ...]:
     """What a format of other lenses cannot hold, a sentence each."""
     lost = []
     if to in _NO_POSE:
         for name, twin in twins.items():
-            assert isinstance(twin, OpencvCamera)
-            pose = twin.frame_from_camera
+            pose = lens_pose(twin)
             rows = ", ".join(f"[{', '.join(f'{value:.9g}' for value in row)}]" for row in pose.rotation)
             where = ", ".join(f"{value:.9g}" for value in pose.translation_m)
             lost.append(

@@ -32,10 +32,20 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import BadFile
 from calib.files import LARGEST_IMAGE_PX, CameraFile, build_model, digest_of
-from calib.files.opencv_camera import LensKind, OpencvCamera
-from calib.files.opencv_ros import CAMERA_FRAME, Loose, as_camera_file, lens_camera, matrix44, pose_of, row
+from calib.files.opencv_ros import (
+    CAMERA_FRAME,
+    Loose,
+    as_camera_file,
+    lens_camera,
+    lens_pose,
+    matrix44,
+    matrix_of,
+    pose_of,
+    row,
+)
+from calib.files.twin import FISHEYE, LensFamily
 from calib.files.yaml_text import kind_of, parse_mapping
-from calib.geometry.cahvor import CameraModel, Kind
+from calib.geometry.cahvor import COEFFICIENTS, CameraModel, Kind
 from calib.geometry.rigid import Rigid
 
 UNKNOWN_FRAME = "unknown"
@@ -80,7 +90,7 @@ def parse_mrcal(data: bytes, path: str | Path) -> CameraFile:
     if name in _OPENCV:
         numbers = top.vector("intrinsics", count=4 + _OPENCV[name])
         camera = lens_camera(
-            top, "pinhole", (width, height), numbers[:2], numbers[2:4], numbers[4:], frame_from_camera
+            top, "pinhole", (width, height), matrix_of(numbers[:4]), numbers[4:], frame_from_camera
         )
         return as_camera_file(camera, top, UNKNOWN_FRAME, digest_of(data), notes)
     model, model_notes = _cahvor(top, name, (width, height), frame_from_camera)
@@ -127,12 +137,11 @@ def _cahvor(
     return build_model(top.path, "", kind, size_px, vectors, cahvore_type, linearity)
 
 
-def format_mrcal(camera: CameraModel | OpencvCamera, frame: str) -> bytes:
-    """Return a camera as a .cameramodel; H and V of a CameraModel are at right angles."""
-    if isinstance(camera, OpencvCamera):
-        pose = camera.frame_from_camera
-        name = f"LENSMODEL_OPENCV{len(camera.distortion)}" if len(camera.distortion) else "LENSMODEL_PINHOLE"
-        numbers = [*camera.focal_px, *camera.center_px, *camera.distortion]
+def format_mrcal(camera: CameraModel, frame: str) -> bytes:
+    """Return a camera as a .cameramodel; its H and V are at right angles."""
+    if camera.kind in COEFFICIENTS:
+        name, pose = f"LENSMODEL_{camera.kind}", lens_pose(camera)
+        numbers = [*camera.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *camera.distortion]
     else:
         name, numbers, pose = _numbers_of(camera)
     camera_from_frame = pose.inverse
@@ -174,7 +183,7 @@ def refuse_mirrored(model: CameraModel, path: str | Path) -> None:
 
 
 _CAMERA = re.compile(r"cam(0|[1-9][0-9]?)")
-_LENSES: dict[str, tuple[LensKind, tuple[int, ...]]] = {
+_LENSES: dict[str, tuple[LensFamily, tuple[int, ...]]] = {
     "radtan": ("pinhole", (4,)),
     "equidistant": ("equidistant", (4,)),
     "none": ("pinhole", (0,)),
@@ -232,7 +241,7 @@ def _pose(section: Loose) -> Rigid:
     return pose_of(section, "T_cn_cnm1", np.array([inner.vector(key, count=4) for key in inner.values]))
 
 
-def _kalibr_camera(section: Loose, frame_from_camera: Rigid) -> OpencvCamera:
+def _kalibr_camera(section: Loose, frame_from_camera: Rigid) -> CameraModel:
     for key in ("camera_model", "intrinsics", "distortion_model", "resolution"):
         section.need(key)
     if section.values["camera_model"] != "pinhole":
@@ -243,23 +252,21 @@ def _kalibr_camera(section: Loose, frame_from_camera: Rigid) -> OpencvCamera:
     distortion = section.numbers(section.need("distortion_coeffs"), counts) if counts != (0,) else np.zeros(0)
     numbers = section.vector("intrinsics", count=4)
     width, height = section.integers("resolution", 2, 1, LARGEST_IMAGE_PX)
-    return lens_camera(
-        section, lens, (width, height), numbers[:2], numbers[2:], distortion, frame_from_camera
-    )
+    return lens_camera(section, lens, (width, height), matrix_of(numbers), distortion, frame_from_camera)
 
 
-def format_kalibr(cameras: Mapping[str, OpencvCamera], frame: str) -> bytes:
+def format_kalibr(cameras: Mapping[str, CameraModel], frame: str) -> bytes:
     """Return the cameras, all placed in one frame, as a camchain in their order; names go into comments."""
     lines = [f"# T_cn_cnm1 of cam0 maps coordinates in the frame {frame!r}, metres, to cam0's"]
     before = Rigid.identity()
     for at, (name, camera) in enumerate(cameras.items()):
-        pose = matrix44(camera.frame_from_camera.inverse @ before)
-        before = camera.frame_from_camera
+        pose = matrix44(lens_pose(camera).inverse @ before)
+        before = lens_pose(camera)
         lines += [
             f"cam{at}:  # {name}",
             "  camera_model: pinhole",
-            f"  intrinsics: {row([*camera.focal_px, *camera.center_px])}",
-            f"  distortion_model: {'equidistant' if camera.lens == 'equidistant' else 'radtan'}",
+            f"  intrinsics: {row(camera.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]])}",
+            f"  distortion_model: {'equidistant' if camera.kind == FISHEYE else 'radtan'}",
             f"  distortion_coeffs: {row(camera.distortion if len(camera.distortion) else np.zeros(4))}",
             f"  resolution: [{camera.size_px[0]}, {camera.size_px[1]}]",
             f"  rostopic: /{name}/image_raw",
@@ -270,7 +277,7 @@ def format_kalibr(cameras: Mapping[str, OpencvCamera], frame: str) -> bytes:
 
 
 #: Model: family, focal lengths, which of OpenCV's coefficients the file has, and how many OpenCV has.
-_MODELS: dict[str, tuple[LensKind, int, tuple[int, ...], int]] = {
+_MODELS: dict[str, tuple[LensFamily, int, tuple[int, ...], int]] = {
     "SIMPLE_PINHOLE": ("pinhole", 1, (), 0),
     "PINHOLE": ("pinhole", 2, (), 0),
     "SIMPLE_RADIAL": ("pinhole", 1, (0,), 4),
@@ -320,7 +327,7 @@ def parse_colmap(data: bytes, path: str | Path) -> dict[str, CameraFile]:
     return cameras
 
 
-def _colmap_camera(section: Loose, words: list[str]) -> OpencvCamera:
+def _colmap_camera(section: Loose, words: list[str]) -> CameraModel:
     if len(words) < 4 or not re.fullmatch(r"\d{1,9}", words[0]):
         raise section.bad(
             "", f"'{' '.join(words)[:40]}' where CAMERA_ID MODEL WIDTH HEIGHT PARAMS... is expected"
@@ -341,25 +348,26 @@ def _colmap_camera(section: Loose, words: list[str]) -> OpencvCamera:
         )
     distortion = np.zeros(count)
     distortion[list(places)] = numbers[focals + 2 :]
-    focal = np.array([numbers[0], numbers[focals - 1]])
     center = np.array(numbers[focals : focals + 2]) - HALF_PX
-    return lens_camera(section, lens, (int(words[2]), int(words[3])), focal, center, distortion)
+    matrix = matrix_of(np.array([numbers[0], numbers[focals - 1], *center]))
+    return lens_camera(section, lens, (int(words[2]), int(words[3])), matrix, distortion)
 
 
-def format_colmap(cameras: Mapping[str, OpencvCamera]) -> bytes:
+def format_colmap(cameras: Mapping[str, CameraModel]) -> bytes:
     """Return the cameras as cameras.txt, numbered from 1 in their order; names go into comments."""
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]; the corner of the first pixel is (0, 0)"]
     for at, (name, camera) in enumerate(cameras.items(), 1):
         count = len(camera.distortion)
         model = (
             "OPENCV_FISHEYE"
-            if camera.lens == "equidistant"
+            if camera.kind == FISHEYE
             else {0: "PINHOLE", 4: "OPENCV"}.get(count, "FULL_OPENCV")
         )
         distortion = (
             [*camera.distortion, *[0.0] * (8 - count)] if model == "FULL_OPENCV" else camera.distortion
         )
-        numbers = [*camera.focal_px, *(camera.center_px + HALF_PX), *distortion]
+        fx, fy, cx, cy = camera.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+        numbers = [fx, fy, cx + HALF_PX, cy + HALF_PX, *distortion]
         told = " ".join(repr(float(number)) for number in numbers)
         lines += [f"# {name}", f"{at} {model} {camera.size_px[0]} {camera.size_px[1]} {told}"]
     return ("\n".join(lines) + "\n").encode()

@@ -23,15 +23,17 @@ import numpy as np
 
 from calib.errors import BadFile
 from calib.files import LARGEST_COMPONENT, LARGEST_IMAGE_PX, CameraFile, digest_of
-from calib.files.opencv_camera import COUNTS, LensKind, OpencvCamera
-from calib.files.twin import EXACT_PX, TwinError, nearest_cahvor, twin_error
+from calib.files.twin import FISHEYE, ODD, LensFamily, grid_px, kind_of_lens
 from calib.files.yaml_text import Section, dump_mapping, kind_of, parse_mapping
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.lenses import opencv
 from calib.geometry.rigid import FloatArray, Rigid
 
 CAMERA_FRAME = "camera"
 """The frame of a file that holds no pose: the camera's own, x right, y down, z ahead."""
 
 LARGEST_COEFFICIENT = 1e6
+BLIND_GRID = (38, 31)
 MOST_BLIND = 0.5
 """A lens with no ray in more than this part of its image is refused; a fisheye's corners often have none."""
 
@@ -78,11 +80,17 @@ class Loose(Section):
         return (f"{', '.join(f'{self.at(key)!s}' for key in left[:8])} not read",) if left else ()
 
 
-def camera_matrix(section: Section, key: str, matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return focal lengths and centre (2,) each of a matrix K (3, 3), which has no skew."""
+def camera_matrix(section: Section, key: str, matrix: FloatArray) -> FloatArray:
+    """Return a matrix K (3, 3), which has no skew: cv2 and those who build on it leave a skew out."""
     if matrix[0, 1] or matrix[1, 0] or matrix[2].tolist() != [0.0, 0.0, 1.0]:
         raise section.bad(key, f"{matrix.tolist()} where [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] is expected")
-    return matrix[[0, 1], [0, 1]], matrix[:2, 2]
+    return matrix
+
+
+def matrix_of(numbers: FloatArray) -> FloatArray:
+    """Return fx, fy, cx, cy as a camera matrix (3, 3)."""
+    fx, fy, cx, cy = numbers.tolist()
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def pose_of(section: Section, key: str, matrix: FloatArray) -> Rigid:
@@ -97,65 +105,65 @@ def pose_of(section: Section, key: str, matrix: FloatArray) -> Rigid:
 
 def lens_camera(
     section: Section,
-    lens: LensKind,
+    family: LensFamily,
     size_px: tuple[int, int],
-    focal_px: FloatArray,
-    center_px: FloatArray,
+    matrix: FloatArray,
     distortion: FloatArray,
     frame_from_camera: Rigid | None = None,
-) -> OpencvCamera:
-    """Return the camera of numbers that were read, or refuse them."""
+) -> CameraModel:
+    """Return the camera of numbers that were read, or refuse them; one without a lens is a CAHV."""
     if np.abs(distortion).max(initial=0.0) > LARGEST_COEFFICIENT:
         raise section.bad("", f"coefficients {distortion.tolist()} where numbers up to 1e6 are expected")
-    if not ((np.abs(focal_px) > 1e-3) & (np.abs(focal_px) < 1e7)).all() or np.abs(center_px).max() > 1e7:
+    focal_px = matrix[[0, 1], [0, 1]]
+    if not ((np.abs(focal_px) > 1e-3) & (np.abs(focal_px) < 1e7)).all() or np.abs(matrix[:2, 2]).max() > 1e7:
         raise section.bad("", f"focal length {focal_px.tolist()} where pixels are expected")
     if focal_px.prod() < 0.0:
         raise section.bad("", f"focal lengths {focal_px.tolist()} of two signs: a mirrored image is not read")
     pose = Rigid.identity() if frame_from_camera is None else frame_from_camera
+    if focal_px[1] < 0.0:  # the same as a camera turned about z by half a turn
+        pose = pose @ Rigid(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+        matrix = matrix * [[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0]]
+        if family == "pinhole":
+            distortion = distortion * np.where(np.isin(np.arange(len(distortion)), ODD), -1.0, 1.0)
     try:
-        return OpencvCamera(lens, size_px, focal_px, center_px, distortion, pose)
+        return CameraModel.of_matrix(
+            kind_of_lens(family, distortion), size_px, matrix, distortion, pose.rotation.T, pose.translation_m
+        )
     except ValueError as error:
         raise section.bad("", str(error)) from None
 
 
 def as_camera_file(
-    camera: OpencvCamera, section: Section, frame: str, digest: str, notes: Sequence[str] = ()
+    camera: CameraModel, section: Section, frame: str, digest: str, notes: Sequence[str] = ()
 ) -> CameraFile:
-    """Return the camera with its nearest twin of the CAHV family, and a note of how near that is.
+    """Return the camera, with a note of the part of its image that has no ray.
 
     Raises
     ------
     BadFile
-        If more than half of the image has no ray, or no twin is found.
+        If more than half of the image has no ray, or the lens folds at its axis.
     """
     try:
-        with np.errstate(all="ignore"):
-            model = nearest_cahvor(camera)
-            error = twin_error(camera, model)
-    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as problem:
+        blind = float(1.0 - camera.ray(grid_px(camera.size_px, BLIND_GRID, 0.5)).valid.mean())
+    except ValueError as problem:
         raise section.bad("", f"is no usable camera: {problem}") from None
-    if error.blind > MOST_BLIND:
-        raise section.bad("", f"{100 * error.blind:.0f} % of the image has no ray: the lens folds")
-    told = f"read as {model.kind}: {error_words(error)}"
-    if error.blind:
-        told += f"; {100 * error.blind:.2g} % of the image has no ray, where the lens folds or looks sideways"
+    why = camera.limit_words or "the lens looks sideways"
+    if blind > MOST_BLIND:
+        raise section.bad("", f"{100 * blind:.0f} %, more than half of the image has no ray: {why}")
     where = f"{section.place}: " if section.place else ""
-    return CameraFile(
-        model, frame, {}, {}, (*notes, where + told), Path(section.path), digest, as_read=camera
-    )
-
-
-def error_words(error: TwinError) -> str:
-    """Return how far a twin is, in words."""
-    if error.worst_px < EXACT_PX:
-        return "exact"
-    x, y = error.worst_at_px
-    return f"{error.worst_px:.2g} px off at worst (at pixel {x:.0f}, {y:.0f}), {error.rms_px:.2g} px rms"
+    if blind:
+        notes = (*notes, f"{where}{100 * blind:.2g} % of the image has no ray: {why}")
+    return CameraFile(camera, frame, {}, {}, tuple(notes), Path(section.path), digest)
 
 
 def row(values: Any) -> str:
     """Return numbers as YAML's and Python's list, in shortest round-trip form."""
     return f"[{', '.join(repr(float(value)) for value in np.asarray(values).ravel())}]"
+
+
+def lens_pose(camera: CameraModel) -> Rigid:
+    """Return the camera's axes (x right, y down, z ahead) and C in its frame."""
+    return Rigid(camera.rotation.T, camera.C)
 
 
 def matrix44(pose: Rigid) -> FloatArray:
@@ -165,7 +173,7 @@ def matrix44(pose: Rigid) -> FloatArray:
     return whole
 
 
-LENSES: dict[str, tuple[LensKind, tuple[int, ...]]] = {
+LENSES: dict[str, tuple[LensFamily, tuple[int, ...]]] = {
     "plumb_bob": ("pinhole", (0, 4, 5)),
     "rational_polynomial": ("pinhole", (8,)),
     "equidistant": ("equidistant", (4,)),
@@ -214,7 +222,6 @@ def parse_camera_info(data: bytes, path: str | Path) -> CameraFile:
         key = top.need("k", "K")
         matrix = top.numbers(key, (9,)).reshape(3, 3)
         distortion = top.numbers(top.need("d", "D"), counts)
-    focal, center = camera_matrix(top, key, matrix)
     for name in ("binning_x", "binning_y"):
         if name in top and top.integer(name, 0, 64) > 1:
             raise top.bad(name, "the picture is binned; the camera of the whole picture is expected (0 or 1)")
@@ -225,7 +232,7 @@ def parse_camera_info(data: bytes, path: str | Path) -> CameraFile:
             notes.append("roi: not read; the camera is that of the whole picture")
     if _is_rectified(top):
         notes.append("R or P turn or scale the picture for rectification; they are not read")
-    camera = lens_camera(top, lens, size, focal, center, distortion)
+    camera = lens_camera(top, lens, size, camera_matrix(top, key, matrix), distortion)
     return as_camera_file(camera, top, CAMERA_FRAME, digest_of(data), notes)
 
 
@@ -240,9 +247,11 @@ def _is_rectified(top: Loose) -> bool:
     return False
 
 
-def format_camera_info(camera: OpencvCamera, lens: str, name: str) -> bytes:
+def format_camera_info(camera: CameraModel, lens: str, name: str) -> bytes:
     """Return the camera as camera_calibration_parsers writes it; its pose is left out."""
-    distortion = camera.distortion if len(camera.distortion) else np.zeros(5)
+    distortion = camera.distortion
+    if lens == "plumb_bob":
+        distortion = np.concatenate([distortion, np.zeros(5 - len(distortion))])
 
     def matrix(values: FloatArray) -> dict[str, object]:
         return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel()}
@@ -252,11 +261,11 @@ def format_camera_info(camera: OpencvCamera, lens: str, name: str) -> bytes:
             "image_width": camera.size_px[0],
             "image_height": camera.size_px[1],
             "camera_name": name,
-            "camera_matrix": matrix(camera.matrix_px),
+            "camera_matrix": matrix(camera.camera_matrix),
             "distortion_model": lens,
             "distortion_coefficients": matrix(distortion[None]),
             "rectification_matrix": matrix(np.eye(3)),
-            "projection_matrix": matrix(np.hstack([camera.matrix_px, np.zeros((3, 1))])),
+            "projection_matrix": matrix(np.hstack([camera.camera_matrix, np.zeros((3, 1))])),
         }
     )
 
@@ -283,11 +292,11 @@ def parse_opencv(data: bytes, path: str | Path) -> CameraFile:
     """
     top = Loose(path, "", parse_mapping(_TAG.sub(b"", _HEAD.sub(b"", data)), path))
     matrix_key, distortion_key = top.need(*_MATRIX), top.need(*_COEFFICIENTS)
-    focal, center = camera_matrix(top, matrix_key, top.matrix(matrix_key, ((3, 3),)))
+    matrix = camera_matrix(top, matrix_key, top.matrix(matrix_key, ((3, 3),)))
     width_key, height_key = top.need(*_WIDTH), top.need(*_HEIGHT)
     size = top.size(width_key, height_key)
     fisheye = _is_fisheye(top)
-    counts = COUNTS["equidistant" if fisheye else "pinhole"]
+    counts = (4,) if fisheye else (0, *opencv.COUNTS)
     shapes = [shape for count in counts for shape in ((1, count), (count, 1))]
     distortion = top.matrix(distortion_key, shapes).ravel()
     frame, pose = CAMERA_FRAME, None
@@ -296,7 +305,7 @@ def parse_opencv(data: bytes, path: str | Path) -> CameraFile:
         pose = pose_of(top, "camera_from_frame", top.matrix("camera_from_frame", ((4, 4),))).inverse
         frame = top.text(top.need("frame"))
         known += ["frame", "camera_from_frame"]
-    camera = lens_camera(top, "equidistant" if fisheye else "pinhole", size, focal, center, distortion, pose)
+    camera = lens_camera(top, "equidistant" if fisheye else "pinhole", size, matrix, distortion, pose)
     return as_camera_file(camera, top, frame, digest_of(data), top.unread(known))
 
 
@@ -307,9 +316,9 @@ def _is_fisheye(top: Loose) -> bool:
     return bool(top.integer("fisheye_model", 0, 1)) if "fisheye_model" in top else False
 
 
-def format_opencv(camera: OpencvCamera, frame: str) -> bytes:
+def format_opencv(camera: CameraModel, frame: str) -> bytes:
     """Return the camera as OpenCV's YAML, its pose with it."""
-    fisheye = camera.lens == "equidistant"
+    fisheye = camera.kind == FISHEYE
     distortion = camera.distortion if len(camera.distortion) else np.zeros(4)
     lines = [
         "%YAML:1.0",
@@ -319,10 +328,10 @@ def format_opencv(camera: OpencvCamera, frame: str) -> bytes:
         f"image_height: {camera.size_px[1]}",
         f"camera_model: {'fisheye' if fisheye else 'pinhole'}",
         f"fisheye_model: {int(fisheye)}",
-        *_matrix("camera_matrix", camera.matrix_px),
+        *_matrix("camera_matrix", camera.camera_matrix),
         *_matrix("distortion_coefficients", distortion[:, None] if fisheye else distortion[None]),
         f'frame: "{_quoted(frame)}"',
-        *_matrix("camera_from_frame", matrix44(camera.frame_from_camera.inverse)),
+        *_matrix("camera_from_frame", matrix44(lens_pose(camera).inverse)),
     ]
     return ("\n".join(lines) + "\n").encode()
 

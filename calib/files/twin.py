@@ -10,15 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from calib.files.opencv_camera import LensKind, OpencvCamera, even_axes
-from calib.geometry.cahvor import CameraModel, Kind, Rays
-from calib.geometry.parameters import parameter_names, predict, stepped
-from calib.geometry.rigid import FloatArray, Rigid, moved_rigid
+from calib.geometry.cahvor import COEFFICIENTS, CameraModel, Kind
+from calib.geometry.parameters import parameter_names, parameter_part, predict, stepped
+from calib.geometry.rigid import FloatArray, Rigid, moved_rigid, tangents
 
 FIT_GRID = (25, 19)
 """Columns and rows of the pixels that a twin is fitted at, from corner to corner of the image."""
@@ -44,19 +44,46 @@ _STEPS = 60
 _LOST_PX = 1e3
 """What a fit is told of a point that its camera does not see."""
 
+_SQUARE = 1e-12
+"""Skew below this part of the focal length is none."""
 
-Built = TypeVar("Built", bound="CameraLike")
+
+LensFamily = Literal["pinhole", "equidistant"]
+FISHEYE: Kind = "OPENCV_FISHEYE"
+ODD = (2, 3, 8, 9, 10, 11, 12, 13)
+"""Coefficients of a pinhole lens that turn their sign where x and y do."""
 
 
-class CameraLike(Protocol):
-    """What two cameras are compared by."""
+def kind_of_lens(family: LensFamily, distortion: ArrayLike) -> Kind:
+    """Return the kind of a camera of one of OpenCV's two families; CAHV if the lens does nothing."""
+    numbers = np.asarray(distortion)
+    if family == "equidistant":
+        return FISHEYE
+    return f"OPENCV{len(numbers)}" if numbers.any() else "CAHV"  # type: ignore[return-value]  # checked by the class
 
-    @property
-    def size_px(self) -> tuple[int, int]: ...
 
-    def project(self, points_m: FloatArray, /) -> tuple[FloatArray, np.ndarray]: ...
+def held_as(model: CameraModel, kind: Kind) -> CameraModel | None:
+    """Return the same camera as one of another of OpenCV's kinds; None if that cannot hold it.
 
-    def ray(self, pixels_px: FloatArray, /) -> Rays: ...
+    A longer list of coefficients holds a shorter one, and a shorter one those of a longer that are not zero.
+    None of them holds skew.
+    """
+    if (
+        model.kind not in (*COEFFICIENTS, "CAHV")
+        or abs(model.camera_matrix[0, 1]) > _SQUARE * model.focal_px[0]
+    ):
+        return None
+    if (model.kind == FISHEYE) != (kind == FISHEYE):
+        return None
+    count, used = COEFFICIENTS[kind], np.flatnonzero(model.distortion)
+    if len(used) and used[-1] >= count:
+        return None
+    told = np.concatenate([model.distortion, np.zeros(14)])[:count]
+    return CameraModel.of_matrix(kind, model.size_px, _no_skew(model), told, model.rotation, model.C)
+
+
+def _no_skew(model: CameraModel) -> FloatArray:
+    return model.camera_matrix * [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]
 
 
 @dataclass(frozen=True)
@@ -80,6 +107,14 @@ class TwinError:
     blind: float
 
 
+def error_words(error: TwinError) -> str:
+    """Return how far a twin is, in words."""
+    if error.worst_px < EXACT_PX:
+        return "exact"
+    x, y = error.worst_at_px
+    return f"{error.worst_px:.2g} px off at worst (at pixel {x:.0f}, {y:.0f}), {error.rms_px:.2g} px rms"
+
+
 def grid_px(size_px: tuple[int, int], counts: tuple[int, int], margin_px: float = 0.0) -> FloatArray:
     """Return pixels (n, 2) in rows and columns over an image, the outer ones ``margin_px`` outside it."""
     axes = [
@@ -89,7 +124,7 @@ def grid_px(size_px: tuple[int, int], counts: tuple[int, int], margin_px: float 
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
 
 
-def twin_error(camera: CameraLike, twin: CameraLike, near: bool = False) -> TwinError:
+def twin_error(camera: CameraModel, twin: CameraModel, near: bool = False) -> TwinError:
     """Return how far ``twin`` is from ``camera`` (both in one frame), over the image to its outer border.
 
     Parameters
@@ -134,115 +169,105 @@ def lens_axes(model: CameraModel) -> FloatArray:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def nearest_opencv(model: CameraModel, lens: LensKind, coefficients: Sequence[bool]) -> OpencvCamera:
-    """Return the camera of OpenCV's families whose pixels come nearest to a model's, in the model's frame.
+def even_axes(model: CameraModel) -> FloatArray:
+    """Return (3, 3): columns are the camera's x, y, z in the model's frame; z along A, x as H and V say."""
+    z = model.A
+    right = model.H - (model.H @ z) * z
+    down = model.V - (model.V @ z) * z
+    x = right / np.linalg.norm(right) + np.cross(down / np.linalg.norm(down), z)  # each has half a say
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
 
-    Parameters
-    ----------
-    model
-        The camera, CAHV, CAHVOR or CAHVORE.
-    lens
-        The family.
-    coefficients
-        (n,) which coefficients of the lens may be other than zero.
+
+def nearest_opencv(model: CameraModel, kind: Kind) -> CameraModel:
+    """Return the camera of one of OpenCV's kinds, without skew, whose pixels come nearest to a model's.
+
+    Of 14 coefficients k1, k2, k3, p1, p2 and the turns of the plane are used. A plane turned about both axes
+    and a camera turned back leave a picture that leans by the product of both turns: so OpenCV holds H and V
+    that are not at right angles.
 
     Raises
     ------
     ValueError
-        If fewer than half of the image's pixels have a ray that such a lens can have.
+        If fewer than half of the image's pixels have a ray that such a lens can have; of 14 coefficients, if
+        the entrance point moves.
     """
     pixels, points = _what_it_sees(model)
-    axes = lens_axes(model)
-    free = np.flatnonzero(coefficients)
-    moving = model.lens.moving
+    if (same := held_as(model, kind)) is not None:
+        return same
+    if kind == "OPENCV14":
+        return _nearest_tilted(model, pixels, points)
+    return _fit(_plain_start(model, kind), pixels, points, range(COEFFICIENTS[kind]), model.moving)
+
+
+def _plain_start(model: CameraModel, kind: Kind) -> CameraModel:
+    """A camera of the kind to begin with: axes, focal lengths and the first coefficients of the model."""
+    free = model.kind in COEFFICIENTS
+    axes = even_axes(model) if free else lens_axes(model)
     focal = np.array([model.H @ axes[:, 0], model.V @ axes[:, 1]]) * (1.0 + model.R[0]) / (model.A @ model.O)
     center = np.array([model.H @ model.O, model.V @ model.O]) / (model.A @ model.O)
-    distortion = np.zeros(len(coefficients))
-    if len(distortion) >= 2 and lens == ("equidistant" if model.cahvore_type == 2 else "pinhole"):
+    distortion = np.zeros(COEFFICIENTS[kind])
+    if free and (model.kind == FISHEYE) == (kind == FISHEYE):
+        count = min(len(distortion), len(model.distortion))
+        distortion[:count] = model.distortion[:count]
+    elif not free and (kind == FISHEYE) == (model.cahvore_type == 2):
         distortion[:2] = model.R[1:] / (1.0 + model.R[0])
-    start = np.concatenate([np.zeros(6 if moving else 3), focal, center, distortion[free]])
-    scale = np.concatenate([np.full(3, 0.01), np.full(3 if moving else 0, 0.001), np.full(4, 10.0)])
-    scale = np.concatenate([scale, np.where((free == 2) | (free == 3) | (free > 7), 0.01, 0.1)])
-    if lens == "equidistant":
-        scale[-len(free) :] = 0.1
-    place = Rigid(axes, model.C)
-
-    def build(numbers: FloatArray) -> OpencvCamera:
-        pose, inner = (numbers[:6], numbers[6:]) if moving else (np.r_[numbers[:3], 0, 0, 0], numbers[3:])
-        told = np.zeros(len(coefficients))
-        told[free] = inner[4:]
-        return OpencvCamera(lens, model.size_px, inner[:2], inner[2:4], told, moved_rigid(place, pose))
-
-    return _fitted(build, start, scale, pixels, points, np.arange(len(start)) >= len(start) - len(free))
+    matrix = [[focal[0], 0.0, center[0]], [0.0, focal[1], center[1]], [0.0, 0.0, 1.0]]
+    return CameraModel.of_matrix(kind, model.size_px, matrix, distortion, axes.T, model.C)
 
 
-def nearest_tilted(model: CameraModel) -> OpencvCamera:
-    """Return the pinhole camera with a turned image plane (OpenCV's 14 coefficients) that comes nearest.
-
-    A plane turned about both axes and a camera turned back leave a picture that leans by the product of both
-    turns: so OpenCV holds H and V that are not at right angles. Free are k1, k2, k3, p1, p2 and both turns.
-
-    Raises
-    ------
-    ValueError
-        As ``nearest_opencv``; and if the entrance point moves.
-    """
-    if model.lens.moving:
+def _nearest_tilted(model: CameraModel, pixels: FloatArray, points: FloatArray) -> CameraModel:
+    if model.moving:
         raise ValueError("the entrance point moves")
-    plain = nearest_opencv(model, "pinhole", [True] * 5)
-    pixels, points = _what_it_sees(model)
+    plain = _fit(_plain_start(model, "OPENCV5"), pixels, points, range(5), False)
     across, down = (vector - (vector @ model.A) * model.A for vector in (model.H, model.V))
     lean = float(across @ down / np.linalg.norm(across) / np.linalg.norm(down))
     # From no turn at all no fit begins: what a turn does to the lean grows as its square.
     turn = max(np.sqrt(abs(lean)), 1e-3)
-    scale = np.concatenate([np.full(3, 0.01), np.full(4, 10.0), [0.1, 0.1, 0.01, 0.01, 0.1, 0.01, 0.01]])
-
-    def build(numbers: FloatArray) -> OpencvCamera:
-        told = np.concatenate([numbers[7:12], np.zeros(7), numbers[12:]])
-        place = moved_rigid(plain.frame_from_camera, np.r_[numbers[:3], 0.0, 0.0, 0.0])
-        return OpencvCamera("pinhole", model.size_px, numbers[3:5], numbers[5:7], told, place)
-
     found = []
     for sign in (1.0, -1.0):
-        inner = [plain.focal_px, plain.center_px, plain.distortion, [turn, sign * turn]]
-        start = np.concatenate([np.zeros(3), *inner])
-        found.append(_fitted(build, start, scale, pixels, points, np.arange(len(start)) > 6))
+        told = np.concatenate([plain.distortion, np.zeros(7), [turn, sign * turn]])
+        start = CameraModel.of_matrix(
+            "OPENCV14", model.size_px, plain.camera_matrix, told, plain.rotation, plain.C
+        )
+        found.append(_fit(start, pixels, points, (0, 1, 2, 3, 4, 12, 13), False))
     return min(found, key=lambda camera: twin_error(model, camera).worst_px)
 
 
-def nearest_cahvor(camera: OpencvCamera) -> CameraModel:
-    """Return the camera of the CAHV family whose pixels come nearest to another's, in the same frame.
+def nearest_cahvor(camera: CameraModel) -> CameraModel:
+    """Return the camera of the CAHV family whose pixels come nearest to one of OpenCV's, in the same frame.
 
-    CAHV without distortion; CAHVOR of a pinhole lens, or CAHVORE of type 3 without E where that comes nearer;
-    CAHVORE of type 2 of an equidistant one, or type 3.
+    CAHVOR of a pinhole lens, or CAHVORE of type 3 without E where that comes nearer; CAHVORE of type 2 of an
+    equidistant one, or type 3. One of the CAHV family is its own.
 
     Raises
     ------
     ValueError
         If fewer than half of the image's pixels have a ray.
     """
+    if camera.kind not in COEFFICIENTS:
+        return camera
     pixels, points = _what_it_sees(camera)
-    axes = camera.frame_from_camera.rotation
-    focal, center = camera.focal_px, camera.center_px
-    vectors = {
-        "C": camera.frame_from_camera.translation_m,
-        "A": axes[:, 2],
-        "H": focal[0] * axes[:, 0] + center[0] * axes[:, 2],
-        "V": focal[1] * axes[:, 1] + center[1] * axes[:, 2],
-    }
-    if not camera.distortion.any() and camera.lens == "pinhole":
-        return CameraModel("CAHV", camera.size_px, **vectors)
+    fisheye = camera.kind == FISHEYE
     r = np.array([0.0, *camera.distortion[:2]])
-    tries: list[tuple[Kind, int]] = [("CAHVOR", 0), ("CAHVORE", 3)]
-    if camera.lens == "equidistant":
-        tries = [("CAHVORE", 2), ("CAHVORE", 3)]
+    tries: list[tuple[Kind, int]] = (
+        [("CAHVORE", 2), ("CAHVORE", 3)] if fisheye else [("CAHVOR", 0), ("CAHVORE", 3)]
+    )
     best: tuple[float, CameraModel] | None = None
     for kind, cahvore_type in tries:
-        linearity = 1.0 if camera.lens == "pinhole" else 0.0
         start = CameraModel(
-            kind, camera.size_px, **vectors, O=axes[:, 2], R=r, cahvore_type=cahvore_type, linearity=linearity
+            kind,
+            camera.size_px,
+            camera.C,
+            camera.A,
+            camera.H,
+            camera.V,
+            O=camera.A,
+            R=r,
+            cahvore_type=cahvore_type,
+            linearity=0.0 if fisheye else 1.0,
         )
-        found = _fitted_cahvor(start, pixels, points)
+        found = _fit(start, pixels, points, (), False)
         worst_px = twin_error(camera, found).worst_px
         if best is None or worst_px < 0.5 * best[0]:
             best = worst_px, found
@@ -281,28 +306,22 @@ def nearest_square(model: CameraModel) -> CameraModel:
 
 
 def _fitted(
-    build: Callable[[FloatArray], Built],
+    build: Callable[[FloatArray], CameraModel],
     start: FloatArray,
     scale: FloatArray,
     pixels: FloatArray,
     points: FloatArray,
-    lens: np.ndarray | None = None,
-) -> Built:
-    """The camera whose pixels of the points come nearest, least squares from ``start``.
-
-    ``lens`` says which numbers are coefficients of a lens: what pixels cannot tell of them stays small.
-    """
-    held = np.zeros(len(start), dtype=bool) if lens is None else lens
+) -> CameraModel:
+    """The camera whose pixels of the points come nearest, least squares from ``start``."""
 
     def off_px(numbers: FloatArray) -> FloatArray:
-        small = _HELD_PX * numbers[held]
         try:
             seen, valid = build(numbers).project(points)
         except ValueError:
-            return np.concatenate([np.full(2 * len(pixels), _LOST_PX), small])
-        return np.concatenate([np.where(valid[:, None], seen - pixels, _LOST_PX).ravel(), small])
+            return np.full(2 * len(pixels), _LOST_PX)
+        return np.where(valid[:, None], seen - pixels, _LOST_PX).ravel()
 
-    if np.abs(off_px(start)[: 2 * len(pixels)]).max() < EXACT_PX:
+    if np.abs(off_px(start)).max() < EXACT_PX:
         return build(start)
     found = least_squares(
         off_px, start, x_scale=scale, method="lm", xtol=1e-12, ftol=1e-12, max_nfev=_STEPS * len(start)
@@ -310,27 +329,32 @@ def _fitted(
     return build(found.x)
 
 
-def _fitted_cahvor(start: CameraModel, pixels: FloatArray, points: FloatArray) -> CameraModel:
-    """The camera of the kind of ``start`` that comes nearest; C stays, and E, which is zero.
+def _fit(
+    start: CameraModel, pixels: FloatArray, points: FloatArray, coefficients: Sequence[int], placed: bool
+) -> CameraModel:
+    """The camera of the kind of ``start`` that comes nearest; of OpenCV's kinds without skew.
 
-    Levenberg and Marquardt's steps, each about the camera that the last one led to.
+    Levenberg and Marquardt's steps, each about the camera that the last one led to. ``coefficients`` are
+    those of OpenCV's that may change, ``placed`` whether C may; E stays, which is zero.
     """
     names = parameter_names(start.kind)
-    free = [at for at, name in enumerate(names) if name[0] not in "CE"]
+    free = [at for at, name in enumerate(names) if name[0] not in ("E" if placed else "CE") + "D"]
+    if "D" in start.letters:
+        free += [parameter_part(start.kind, "D").start + at for at in coefficients]
     general = start.cahvore_type == 3
     camera, damping = start, 1e-6
-    off, rates = _off_and_rates(camera, pixels, points, free, general)
+    off, rates, basis = _off_and_rates(camera, pixels, points, free, general)
     for _ in range(_STEPS):
+        if np.abs(off[: 2 * len(points)]).max() < EXACT_PX * 1e-3:
+            break
         scale = np.maximum(np.linalg.norm(rates, axis=0), 1e-30)
         normal = rates.T @ rates / np.outer(scale, scale)
         step = -np.linalg.solve(normal + damping * np.eye(len(scale)), rates.T @ off / scale) / scale
-        told = np.zeros(len(names))
-        told[free] = step[: len(free)]
         try:
-            moved = stepped(camera, told)
+            moved = _squared(stepped(camera, basis @ step[: basis.shape[1]]))
             if general:
                 moved = replace(moved, linearity=moved.linearity + float(step[-1]))
-            moved_off, moved_rates = _off_and_rates(moved, pixels, points, free, general)
+            moved_off, moved_rates, moved_basis = _off_and_rates(moved, pixels, points, free, general)
         except ValueError:  # the step led to no camera
             moved_off = np.full(1, np.inf)
         if not moved_off @ moved_off < off @ off:
@@ -339,32 +363,64 @@ def _fitted_cahvor(start: CameraModel, pixels: FloatArray, points: FloatArray) -
                 break
             continue
         settled = moved_off @ moved_off > (1.0 - 1e-6) * (off @ off)
-        camera, off, rates, damping = moved, moved_off, moved_rates, max(0.1 * damping, 1e-12)
-        if settled or np.abs(off).max() < EXACT_PX * 1e-3:
+        camera, off, rates, basis, damping = (
+            moved,
+            moved_off,
+            moved_rates,
+            moved_basis,
+            max(0.1 * damping, 1e-12),
+        )
+        if settled:
             break
     return camera
 
 
+def _squared(model: CameraModel) -> CameraModel:
+    """A camera of OpenCV's kinds without its skew; another as it is."""
+    if model.kind not in COEFFICIENTS:
+        return model
+    return CameraModel.of_matrix(
+        model.kind, model.size_px, _no_skew(model), model.distortion, model.rotation, model.C
+    )
+
+
 def _off_and_rates(
     camera: CameraModel, pixels: FloatArray, points: FloatArray, free: Sequence[int], general: bool
-) -> tuple[FloatArray, FloatArray]:
-    """Pixels off (2n,) and their rates (2n, p) by the free parameters, and by the linearity if it is one."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Pixels off (n,), their rates (n, f) to what is free, the linearity last, and what is free (p, f).
+
+    What pixels cannot tell of coefficients stays small: each costs a little.
+    """
     seen = predict(camera, points)
+    basis = np.eye(seen.d_step.shape[2])[:, free]
+    if "D" in camera.letters:
+        a, h, v, d = (parameter_part(camera.kind, letter) for letter in "AHVD")
+        x, y, z = camera.rotation
+        square = np.zeros((seen.d_step.shape[2], 7))  # turns about x, y, z; H along x and z, V along y and z
+        for column, axis in enumerate((x, y, z)):
+            square[a, column] = tangents(z) @ np.cross(axis, z)
+            square[h, column], square[v, column] = np.cross(axis, camera.H), np.cross(axis, camera.V)
+        square[h, 3], square[h, 4], square[v, 5], square[v, 6] = x, z, y, z
+        others = [at for at in free if not a.start <= at < v.stop]
+        basis = np.hstack([np.eye(len(square))[:, others], square])
     off = np.where(seen.valid[:, None], seen.pixels_px - pixels, _LOST_PX).ravel()
-    rates = np.nan_to_num(seen.d_step[..., free]).reshape(len(off), -1)
+    rates = np.nan_to_num(seen.d_step @ basis).reshape(len(off), -1)
     if general:
         bit = 1e-6
         other = replace(camera, linearity=camera.linearity + bit).project(points)[0]
         rates = np.column_stack([rates, np.nan_to_num((other - seen.pixels_px) / bit).ravel()])
-    return off, rates
+    if "D" in camera.letters:
+        off = np.concatenate([off, _HELD_PX * camera.distortion])
+        rates = np.concatenate([rates, _HELD_PX * basis[d]])
+    return off, rates, basis
 
 
-def _what_it_sees(camera: CameraLike) -> tuple[FloatArray, FloatArray]:
+def _what_it_sees(camera: CameraModel) -> tuple[FloatArray, FloatArray]:
     """Pixels (n, 2) over the image and points (n, 3) seen there, near ones too where that matters."""
     pixels = grid_px(camera.size_px, FIT_GRID, 0.5)
     rays = camera.ray(pixels)
     if np.count_nonzero(rays.valid) < len(pixels) // 2:
         raise ValueError("more than half of the image has no ray that such a camera can have")
-    ranges = RANGES_M if isinstance(camera, CameraModel) and camera.lens.moving else RANGES_M[1:]
+    ranges = RANGES_M if camera.moving else RANGES_M[1:]
     seen = [rays.origins_m[rays.valid] + range_m * rays.directions[rays.valid] for range_m in ranges]
     return np.tile(pixels[rays.valid], (len(ranges), 1)), np.concatenate(seen)

@@ -16,7 +16,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from calib.files.opencv_camera import PlumbBob, even_axes, nearest_plumb_bob
+from calib.files.twin import TwinError, even_axes, nearest_opencv, twin_error
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid, quaternion_of
@@ -55,7 +55,7 @@ def calibration(name: str, model: CameraModel, time_ns: int) -> tuple[Message | 
     """Return the nearest ``plumb_bob`` camera (None if there is none) and the camera itself, as JSON."""
     told: dict[str, Any] = {"camera": name, "model": _model_told(model)}
     try:
-        near = _nearest(model)
+        near, error_px = _nearest(model)
     except ValueError as error:
         return None, told | {"plumb_bob": {"none": str(error)}}
     width, height = model.size_px
@@ -66,17 +66,18 @@ def calibration(name: str, model: CameraModel, time_ns: int) -> tuple[Message | 
         height=height,
         distortion_model="plumb_bob",
         D=near.distortion.tolist(),
-        K=near.matrix_px.ravel().tolist(),
+        K=near.camera_matrix.ravel().tolist(),
         R=np.eye(3).ravel().tolist(),
-        P=np.hstack([near.matrix_px, np.zeros((3, 1))]).ravel().tolist(),
+        P=np.hstack([near.camera_matrix, np.zeros((3, 1))]).ravel().tolist(),
     )
-    return message, told | {"plumb_bob": _near_told(near)}
+    return message, told | {"plumb_bob": _near_told(error_px)}
 
 
 @lru_cache(maxsize=64)
-def _nearest(model: CameraModel) -> PlumbBob:
-    """The fit of a camera, once for all files that begin with it."""
-    return nearest_plumb_bob(model)
+def _nearest(model: CameraModel) -> tuple[CameraModel, TwinError]:
+    """The fit of a camera, once for all files that begin with it, and how near it comes."""
+    near = nearest_opencv(model, "OPENCV5")
+    return near, twin_error(model, near)
 
 
 def transforms(rig: Rig, pan_rad: float, tilt_rad: float, time_ns: int) -> Message:
@@ -141,8 +142,10 @@ def _model_told(model: CameraModel) -> dict[str, Any]:
     return told
 
 
-def _near_told(near: PlumbBob) -> dict[str, Any]:
-    return {"rms_px": near.rms_px, "worst_px": near.worst_px}
+def _near_told(error: TwinError) -> dict[str, Any]:
+    """How far the nearest camera is; null where it does not see all of the image."""
+    told = {"rms_px": error.rms_px, "worst_px": error.worst_px}
+    return {name: value if np.isfinite(value) else None for name, value in told.items()}
 
 
 def _stamp(time_ns: int) -> Timestamp:

@@ -81,7 +81,7 @@ def _row(model: CameraModel, format: str) -> str:
         seen = "" if format == "mrcal" else f"{_by_opencv(model, path, format):9.4f}"
         back = np.nan
         if format in ("opencv", "kalibr", "mrcal"):  # a camera_info holds no pose
-            back = twin_error(model, read.model, model.lens.moving).worst_px
+            back = twin_error(model, read.model, model.moving).worst_px
         return f"{done.lens[0]:20s} {done.worst_px:9.4f} {seen:>9s} {back:9.4f}"
 
 
