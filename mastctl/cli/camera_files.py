@@ -75,7 +75,15 @@ def add_commands(subparsers: Any) -> None:
     )
     convert.add_argument(
         "--lens",
-        choices=("cahvor", "radtan", "plumb_bob", "rational_polynomial", "thin_prism", "equidistant", "tilted"),
+        choices=(
+            "cahvor",
+            "radtan",
+            "plumb_bob",
+            "rational_polynomial",
+            "thin_prism",
+            "equidistant",
+            "tilted",
+        ),
         default="",
         help="the lens of OUT (default: the plainest of its format that comes near enough)",
     )
