@@ -231,9 +231,10 @@ def build_opencv(
         raise section.bad("rotation", f"{given.tolist()} where a rotation is expected")
     try:
         model = CameraModel.of_matrix(kind, size_px, matrix, distortion, rotation, section.vector("C"))
-        model.project(model.C + model.A)  # a lens that folds at its axis is told here
     except (ValueError, ArithmeticError) as error:
         raise section.bad("", f"is no usable camera: {error}") from None
+    if not model.project(model.C + model.A)[1]:
+        raise section.bad("distortion", "the lens folds at its axis: no image can be formed")
     if (shift_px := off * max(abs(matrix[0, 0]), abs(matrix[1, 1]))) > TOLD_SHIFT_PX:
         where = section.place or "camera"
         notes = (f"{where}: 'rotation' made one, which moves pixels by up to {shift_px:.2g} px",)

@@ -66,6 +66,10 @@ class Rays(NamedTuple):
     valid: np.ndarray
 
 
+WIDE: tuple[str, ...] = ("CAHVORE", "OPENCV_FISHEYE")
+"""Kinds whose slope follows the angle: a fit of one begins as an even fisheye."""
+
+
 def letters_of(kind: str) -> str:
     """Return the letters of what a kind has numbers for; D stands for OpenCV's coefficients."""
     return "CAHVD" if kind in COEFFICIENTS else kind

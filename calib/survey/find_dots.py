@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calib.geometry.cahvor import CameraModel
+from calib.geometry.cahvor import WIDE, CameraModel
 from calib.geometry.rigid import FloatArray, Rigid, rot_y, rot_z
 from calib.survey.alignment import NotAligned, rover_from_station, station_from_board
 from calib.survey.folder import spoiled_png
@@ -180,7 +180,7 @@ def _rough_model(
     right = right - (right @ A) * A
     right = right / np.linalg.norm(right)
     x_px, y_px = ((n - 1) / 2 for n in camera.size_px)
-    wide = camera.kind == "CAHVORE"
+    wide = camera.kind in WIDE
     return CameraModel(
         "CAHVORE" if wide else "CAHV",
         camera.size_px,

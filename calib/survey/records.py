@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -118,6 +118,11 @@ class Survey:
     digest: str = ""
     boards: Mapping[str, AnyBoard] = field(default_factory=dict)
     corners: Mapping[str, Corners] = field(default_factory=dict)
+
+    def as_model(self, kind: Kind) -> Survey:
+        """Return the survey with all its cameras fitted as one camera model."""
+        cameras = {name: replace(camera, kind=kind) for name, camera in self.cameras.items()}
+        return replace(self, cameras=cameras)
 
     def measured(self, kind: StationKind) -> dict[tuple[str, str], dict[str, FloatArray]]:
         """Return set-up and placement ('' for prisms) to the points (3,) of a kind measured there, metres."""

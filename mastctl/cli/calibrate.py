@@ -70,6 +70,7 @@ def add_commands(subparsers: Any) -> None:
         choices=(4, 6, 8),
         help="mast parameters: 4 upright, 6 the paper's (default), 8 two skew axes",
     )
+    output.add_model(parser)
     parser.add_argument(
         "--in-use",
         type=Path,
@@ -81,6 +82,8 @@ def add_commands(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, check, find dots, fit, save, report; nothing is written before the fit is good."""
+    if args.model is not None and (args.refine or args.refine_scene is not None):
+        raise output.WrongUse("--model is for a survey; a correction keeps the cameras' models")
     if args.refine and args.refine_scene is not None:
         raise output.WrongUse("--refine and --refine-scene: one of them is expected")
     if args.refine:
@@ -102,6 +105,8 @@ def _from_survey(args: argparse.Namespace) -> int:
     from mastctl.calibration.run import SurveyRefused, calibrate, checked_survey, sentence_of
 
     survey = read_survey(args.survey)
+    if args.model is not None:
+        survey = survey.as_model(args.model)
     try:
         checked_survey(survey, args.method)
     except SurveyRefused as refusal:

@@ -101,9 +101,7 @@ def add_commands(subparsers: Any) -> None:
         "--body-stays", action="store_true", help="body cameras stay where the former mast file has them"
     )
     again = parser.add_argument_group("with FOLDER")
-    again.add_argument(
-        "--model", choices=("CAHV", "CAHVOR", "CAHVORE"), help="of all cameras (default: as survey.yaml says)"
-    )
+    output.add_model(again)
     parser.set_defaults(run=run)
 
 

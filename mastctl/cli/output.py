@@ -192,6 +192,27 @@ def at_least(least: int) -> Callable[[str], int]:
     return read
 
 
+def add_model(parser: Any) -> None:
+    """Add ``--model`` to a parser or a group of one."""
+    parser.add_argument(
+        "--model",
+        type=_model_kind,
+        metavar="MODEL",
+        help="camera model of all cameras: cahv, cahvor, cahvore, opencv4, opencv5, opencv8, opencv12, "
+        "opencv14 or opencv_fisheye (default: as survey.yaml says)",
+    )
+
+
+def _model_kind(text: str) -> str:
+    """Return a camera model's name as files have it; argparse tells the refusal."""
+    from calib.geometry.cahvor import KINDS
+
+    if text.upper() not in KINDS:
+        known = ", ".join(kind.lower() for kind in KINDS)
+        raise argparse.ArgumentTypeError(f"'{text}' is not a camera model; known are {known}")
+    return text.upper()
+
+
 def check_file(path: Path, option: str) -> None:
     """Refuse a file that cannot be written, by what is there now."""
     try:

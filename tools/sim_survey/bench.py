@@ -37,14 +37,14 @@ GROSS_PX = (3.0, 30.0)
 class BenchCamera:
     """A true camera in OpenCV's terms, at ``place_m`` in the head (or rover), turned from straight ahead.
 
-    ``lens`` is k1, k2 of OpenCV's model; ``turn_rad`` a rotation vector in the head's axes.
+    ``lens`` are the first coefficients of OpenCV's model; ``turn_rad`` a rotation vector in the head's axes.
     """
 
     on: Literal["head", "rover"] = "head"
     size_px: tuple[int, int] = (1024, 768)
     focal_px: tuple[float, float] = (1226.0, 1224.0)
     centre_px: tuple[float, float] = (511.5, 383.5)
-    lens: tuple[float, float] = (-0.12, 0.05)
+    lens: tuple[float, ...] = (-0.12, 0.05)
     place_m: tuple[float, float, float] = (0.06, 0.0, 0.03)
     turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -59,7 +59,7 @@ class BenchCamera:
         (fx, fy), (cx, cy) = self.focal_px, self.centre_px
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         seen, _ = cv2.projectPoints(
-            points, np.zeros(3), np.zeros(3), matrix, np.array([*self.lens, 0.0, 0.0])
+            points, np.zeros(3), np.zeros(3), matrix, np.array([*self.lens, *[0.0] * (8 - len(self.lens))])
         )
         seen = seen.reshape(-1, 2)
         # Beyond the picture a lens's polynomial folds back.
@@ -71,7 +71,7 @@ class BenchCamera:
         x, y, a = self.axes
         (fx, fy), (cx, cy) = self.focal_px, self.centre_px
         h, v = fx * x + cx * a, fy * y + cy * a
-        bends = np.array([0.0, *self.lens]) if kind != "CAHV" else np.zeros(3)
+        bends = np.array([0.0, *self.lens[:2]]) if kind != "CAHV" else np.zeros(3)
         return CameraModel(kind, self.size_px, np.array(self.place_m), a, h, v, a, bends)
 
 

@@ -223,7 +223,7 @@ def pinhole(
     """
     middle = (np.array(size_px) - 1) / 2
     slopes = (pixels_px - middle) / focal_px
-    if cahvore_type == 2:
+    if cahvore_type == 2 or kind == "OPENCV_FISHEYE":
         theta = np.linalg.norm(slopes, axis=1)
         near = theta < WIDEST_RAD
         theta = np.maximum(theta[near], 1e-12)

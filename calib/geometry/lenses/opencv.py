@@ -72,11 +72,12 @@ class OpencvLens:
     image_slope
         The largest slope (u, v) inside the image.
 
+    A lens that folds at its axis has no image: nothing is reached.
+
     Raises
     ------
     ValueError
-        If there are other counts of them, they are not finite, the plane is turned by 1.5 rad or more, or
-        the lens folds at its axis.
+        If there are other counts of them, they are not finite, or the plane is turned by 1.5 rad or more.
     """
 
     distortion: tuple[float, ...]
@@ -313,7 +314,7 @@ class OpencvLens:
         good = self._upright(x, y)
         first = np.where(good.all(axis=1), _RADII, good.argmin(axis=1))
         if first.min() < 2:
-            raise ValueError("the lens folds at its axis: no image can be formed")
+            return 0.0, 0.0
         ends = rho[np.minimum(first, _RADII - 1)]
         near = float(rho[first.min() - 1])
         far = float(ends.max())
@@ -367,7 +368,7 @@ class OpencvLens:
     @cached_property
     def _start(self) -> tuple[tuple[float, ...], float, float]:
         """Polynomial of chi / t by t^2, highest first, the t^2 it holds up to, and the largest t seen."""
-        end = min(self.near, _STEEPEST)
+        end = min(max(self.near, 1e-3), _STEEPEST)
         rho = np.tan(np.linspace(0.0, atan(end), 1025))[:-1]
         bent = rho * self._radial(rho * rho)[0]
         last = max(int(np.searchsorted(bent, 1.1 * self.image_slope)), 8)

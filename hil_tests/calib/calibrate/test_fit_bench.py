@@ -67,6 +67,20 @@ def test_a_head_without_errors_is_found_from_rough_focal_lengths_alone() -> None
         assert np.abs(off / np.array(fit.sigma["cameras"][name]["C"])).max() < IN_SIGMAS
 
 
+def test_a_lens_of_opencvs_is_fitted_as_one_and_its_sigmas_hold() -> None:
+    lens = (-0.12, 0.05, 0.004, -0.003, 0.01)
+    cameras = {name: replace(camera, lens=lens) for name, camera in NAVCAMS.items()}
+    plan = BenchPlan(attitudes=10, cameras=cameras)
+    fit = fit_bench(simulate_bench(3, plan), BenchOptions(kind="OPENCV5"))
+    assert fit.chi2_probability > 1e-3
+    for name in plan.cameras:
+        model, sigma = fit.rig.cameras[name].model, np.array(fit.sigma["cameras"][name]["distortion"])
+        assert model.kind == "OPENCV5"
+        assert np.abs((model.distortion - lens) / sigma).max() < IN_SIGMAS
+        assert np.abs(errors_in_sigmas(plan, fit, name)).max() < IN_SIGMAS
+        assert fit.check_rms_px[name] == pytest.approx((0.1, 0.1), rel=0.2)
+
+
 def test_harmonics_backlash_and_bow_enter_and_say_what_they_gain() -> None:
     plan = BenchPlan(attitudes=16, bow_m=(0.002, -0.001), **SERVO)
     fit = fit_bench(simulate_bench(1, plan))
