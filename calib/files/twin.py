@@ -14,7 +14,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
 
 from calib.geometry.cahvor import COEFFICIENTS, CameraModel, Kind
 from calib.geometry.parameters import parameter_names, parameter_part, predict, stepped
@@ -313,6 +312,7 @@ def _fitted(
     points: FloatArray,
 ) -> CameraModel:
     """The camera whose pixels of the points come nearest, least squares from ``start``."""
+    from scipy.optimize import least_squares  # slow to load
 
     def off_px(numbers: FloatArray) -> FloatArray:
         try:

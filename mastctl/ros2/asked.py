@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.files.opencv_camera import even_axes
+from calib.files.twin import even_axes
 from calib.geometry.cahvor import CameraModel
 from mastctl.client import Client
 from mastctl.ros2.known import FRAMES, Known

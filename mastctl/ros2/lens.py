@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calib.files.opencv_camera import even_axes
+from calib.files.twin import even_axes
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
 

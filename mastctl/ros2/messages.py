@@ -13,7 +13,7 @@ from geometry_msgs.msg import TransformStamped, Vector3Stamped
 from sensor_msgs.msg import CameraInfo, CompressedImage, JointState
 from std_msgs.msg import Header
 
-from calib.files.opencv_camera import even_axes
+from calib.files.twin import even_axes
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid, quaternion_of, rot_x, rot_y, rot_z, rotation_of
 from mastctl.ros2.lens import RosLens

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.files.mast_file import load_rig
-from calib.files.opencv_camera import OpencvCamera, even_axes
+from calib.files.twin import even_axes, kind_of_lens
 from calib.geometry.cahvor import CameraModel, Kind
 from calib.geometry.rigid import Rigid, rot_z
 from hil_tests.waiting import until
@@ -74,8 +74,8 @@ def test_the_lens_projects_as_opencv_does_and_its_worst_error_is_that(navcam: An
     off_px = np.linalg.norm(found.reshape(-1, 2) - pixels, axis=1)
     assert off_px.max() == pytest.approx(lens.worst_px, abs=ROUNDING_PX)
     assert lens.worst_px < 0.25
-    ours = OpencvCamera("pinhole", lens.size_px, np.diag(lens.matrix_px)[:2], lens.matrix_px[:2, 2],
-                        lens.distortion)  # fmt: skip
+    kind = kind_of_lens("pinhole", lens.distortion)
+    ours = CameraModel.of_matrix(kind, lens.size_px, lens.matrix_px, lens.distortion, np.eye(3), np.zeros(3))
     assert np.abs(ours.project(directions)[0] - found.reshape(-1, 2)).max() < ROUNDING_PX
 
 
