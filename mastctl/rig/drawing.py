@@ -9,11 +9,9 @@ from datetime import UTC, datetime
 from typing import Any
 
 from calib.files.mast_file import MAST_SCHEMA
-from drivers.dynamixel.settings import POLL_BYTES
-from drivers.dynamixel.workshop import FoundServo
 from drivers.flir_ptu.workshop import AxisFacts
 from mastctl.config import CONFIG_SCHEMA
-from mastctl.rig.plugged import PluggedCamera, PluggedHead, model_of
+from mastctl.rig.plugged import FAMILIES, PluggedCamera, PluggedHead
 
 ARCSEC_RAD = math.radians(1 / 3600)
 FORWARD_M, DOWN_M = 0.04, 0.02
@@ -23,7 +21,7 @@ MARGIN_RAD = 0.1
 APPROACH_RAD = 0.02
 PTU_SIGNS = {"pan": -1, "tilt": 1}
 """A unit counts pan to the left and tilt upwards, the mast to the right and upwards."""
-FASTEST_POLL_HZ = 50.0
+FASTEST_POLL_HZ, USUAL_BAUD, USUAL_MODEL = 50.0, 1_000_000, "XL330-M288-T"
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,8 @@ def configuration(
         ends = {axis: _within(ends[axis], getattr(head.unit, axis), PTU_SIGNS[axis]) for axis in ends}
         driver, options, speed = "flir_ptu", _ptu(ends), 0.5
     else:
-        driver, options, speed = "dynamixel", _dynamixel(head, answers, ends), 0.8
+        driver = FAMILIES[0].driver if head is None or head.family is None else head.family.driver
+        options, speed = _servos(head, answers, ends), 0.8
     names = camera_names(len(cameras))
     return {
         "schema": CONFIG_SCHEMA,
@@ -112,27 +111,26 @@ def _ptu(ends: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
     return {"baud": 9600, **axes}
 
 
-def _dynamixel(
+def _servos(
     head: PluggedHead | None, answers: RigAnswers, ends: Mapping[str, tuple[float, float]]
 ) -> dict[str, Any]:
+    family = head.family if head is not None and head.family is not None else FAMILIES[0]
     servos = {one.servo_id: one for one in head.servos} if head is not None else {}
-    baud = next(iter(servos.values())).baud if servos else 1_000_000
-    poll_hz = min(FASTEST_POLL_HZ, math.floor(baud / (10 * POLL_BYTES)))
+    baud = next(iter(servos.values())).baud if servos else USUAL_BAUD
+    poll_hz = min(FASTEST_POLL_HZ, math.floor(baud / (10 * family.poll_bytes)))
     axes = {}
     for axis, number in (("pan", answers.pan_id), ("tilt", answers.tilt_id)):
-        approach = "positive" if axis == "pan" else "gravity"
-        model, stretch_rad = _model(servos.get(number))
-        axes[axis] = {"id": number, "model": model, "limits_rad": list(ends[axis]), "approach": approach}
-        axes[axis]["approach_rad"] = stretch_rad
+        name = servos[number].model if number in servos else USUAL_MODEL
+        backlash_rad = family.models[name].backlash_rad if number in servos else None
+        axes[axis] = {
+            "id": number,
+            "model": name,
+            "limits_rad": list(ends[axis]),
+            "approach": "positive" if axis == "pan" else "gravity",
+            "approach_rad": max(APPROACH_RAD, round(1.5 * (backlash_rad or 0.0), 3)),
+        }
     slow = {} if poll_hz == FASTEST_POLL_HZ else {"poll_hz": float(poll_hz)}
     return {"baud": baud, **slow, **axes}
-
-
-def _model(servo: FoundServo | None) -> tuple[str, float]:
-    """The model's name, and a stretch that takes up its backlash."""
-    if servo is None:
-        return "XL330-M288-T", APPROACH_RAD
-    return servo.model, max(APPROACH_RAD, round(1.5 * (model_of(servo).backlash_rad or 0.0), 3))
 
 
 def drawing(name: str, cameras: list[PluggedCamera], answers: RigAnswers) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from calib.files.mast_file import load_rig
 from calib.files.yaml_text import dump_mapping
 from mastctl.config import check_cameras, load_config
 from mastctl.packaged import config_folder, schema_files
-from mastctl.rig.drawing import RigAnswers, camera_names, configuration, drawing
+from mastctl.rig.drawing import USUAL_BAUD, RigAnswers, camera_names, configuration, drawing
 from mastctl.rig.plugged import Plugged, PluggedHead, usb_of
 from mastctl.setup.machine import ExaminedMachine
 from mastctl.setup.new_rig import RigNumbers, built_rig, focal_of
@@ -200,7 +200,29 @@ def _readme(plugged: Plugged, steps: Sequence[str]) -> str:
             "`mastctl doctor` names what is missing, and the command that mends it. With the daemon running,",
             "`mastctl point --angles 0.2 0.0` turns the head to 0.2 rad; `mastctl stop` stops it.",
             "`mastctl calibrate bench` then replaces the drawing (docs/how-to/bench-calibration.md).",
+            *_slow(plugged),
             "After an upgrade, `mastctl schema config > schemas/config.json` renews what editors check by.",
             "",
         ]
     )
+
+
+def _slow(plugged: Plugged) -> list[str]:
+    """How to raise the rate of servos as they come from the factory."""
+    for head in plugged.heads:
+        slow = [one for one in head.servos if one.baud < USUAL_BAUD]
+        if slow and head.family is not None and head.family.driver == "dynamixel":
+            number, baud = slow[0].servo_id, slow[0].baud
+            set_id = (
+                f"mastctl servo set-id {head.port} {number} {number} --baud {baud} --new-baud {USUAL_BAUD}"
+            )
+            return [
+                "",
+                f"The servos speak {baud} baud, which delays every reading. This raises one servo's rate:",
+                "",
+                f"`{set_id}`",
+                "",
+                f"Do so for each, then write `baud: {USUAL_BAUD}` and take `poll_hz` out of {CONFIG}.",
+                "",
+            ]
+    return []

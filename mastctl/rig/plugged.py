@@ -7,24 +7,71 @@ to a servo; a PTU that answers in short form is set to its usual one, which it f
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from drivers.dynamixel import workshop as dynamixel
 from drivers.dynamixel.link import REPLY_TIMEOUT_S
-from drivers.dynamixel.models import MODELS, ServoModel
+from drivers.dynamixel.models import MODELS
+from drivers.dynamixel.settings import POLL_BYTES
 from drivers.dynamixel.workshop import FoundServo
 from drivers.errors import BadOptions, DriverError
 from drivers.flir_ptu import workshop as flir_ptu
 from drivers.flir_ptu.workshop import Facts
+from drivers.servo_bus.settings import CountedModel
 from drivers.v4l2 import find
 from drivers.v4l2.node import Node, capture_nodes
 from mastctl.setup.machine import ExaminedMachine, examine_port
 
-BAUDS = (1_000_000, 57_600, 115_200, 2_000_000, 3_000_000, 4_000_000)
-"""Of servos: as they are set up, then as they come from the factory, then the rest."""
+
+class ServoScan(Protocol):
+    """What a scan of a line found."""
+
+    @property
+    def found(self) -> Sequence[FoundServo]:
+        """Who answered."""
+        ...
+
+    @property
+    def garbled(self) -> Sequence[int]:
+        """Rates at which something else came."""
+        ...
+
+
+@dataclass(frozen=True)
+class ServoFamily:
+    """Servos of one driver: how a line is asked for them, and at which rates, the likely ones first.
+
+    Attributes
+    ----------
+    driver
+        Its name in a configuration.
+    scan
+        Called with port, rates and a reply's patience.
+    models
+        Those that the driver turns, by name.
+    poll_bytes
+        Of one reading of both servos on the wire.
+    """
+
+    driver: str
+    scan: Callable[[str, Sequence[int], float], ServoScan]
+    bauds: tuple[int, ...]
+    models: Mapping[str, CountedModel]
+    poll_bytes: int
+
+
+FAMILIES = (
+    ServoFamily(
+        "dynamixel",
+        dynamixel.scan,
+        (1_000_000, 57_600, 115_200, 2_000_000, 3_000_000, 4_000_000),
+        MODELS,
+        POLL_BYTES,
+    ),
+)
 PTU_BAUD = 9600
 LEAST_PX, USUAL_HZ = (640, 480), 30.0
 
@@ -37,8 +84,10 @@ class PluggedHead:
     ----------
     port
         As it is named on this machine.
+    family
+        Whose servos they are; None for a PTU.
     servos
-        Dynamixel servos that this program drives, by id.
+        Those that the driver turns, by id.
     others
         Models that answered and that it does not drive.
     unit
@@ -46,6 +95,7 @@ class PluggedHead:
     """
 
     port: str
+    family: ServoFamily | None = None
     servos: tuple[FoundServo, ...] = ()
     others: tuple[str, ...] = ()
     unit: Facts | None = None
@@ -135,30 +185,35 @@ def ask_line(port: str, machine: ExaminedMachine) -> tuple[PluggedHead | None, s
         return PluggedHead(port, unit=flir_ptu.facts(path, PTU_BAUD)), ""
     except DriverError:
         pass  # no PTU
-    servos: list[FoundServo] = []
-    garbled: list[int] = []
-    for baud in BAUDS:
+    noise = ""
+    for family in FAMILIES:
         try:
-            scan = dynamixel.scan(path, (baud,), REPLY_TIMEOUT_S)
-        except BadOptions:
-            continue  # a rate that the adapter does not have
+            found, garbled = _servos(path, family)
         except DriverError as error:
             return None, str(error)
-        servos += scan.found
+        if found:
+            driven = tuple(one for one in found if one.model in family.models)
+            others = tuple(one.model for one in found if one.model not in family.models)
+            return PluggedHead(port, family, driven, others), ""
+        if garbled:
+            noise = f"; at {garbled[0]} baud something answers: two servos of one id?"
+    return None, f"{port}: no servo and no PTU answers{noise}; is its power on?"
+
+
+def _servos(path: str, family: ServoFamily) -> tuple[list[FoundServo], list[int]]:
+    """The servos of a line, and the rates at which something else came; two servos end the search."""
+    found: list[FoundServo] = []
+    garbled: list[int] = []
+    for baud in family.bauds:
+        try:
+            scan = family.scan(path, (baud,), REPLY_TIMEOUT_S)
+        except BadOptions:
+            continue  # a rate that the adapter does not have
+        found += scan.found
         garbled += scan.garbled
-        if len(servos) > 1:
+        if len(found) > 1:
             break
-    if not servos:
-        noise = f"; at {garbled[0]} baud something answers: two servos of one id?" if garbled else ""
-        return None, f"{port}: no servo and no PTU answers{noise}; is its power on?"
-    driven = tuple(one for one in servos if one.model in MODELS)
-    others = tuple(one.model for one in servos if one.model not in MODELS)
-    return PluggedHead(port, driven, others), ""
-
-
-def model_of(servo: FoundServo) -> ServoModel:
-    """Return the model of a servo that is driven."""
-    return MODELS[servo.model]
+    return found, garbled
 
 
 def ask_cameras() -> tuple[list[PluggedCamera], list[str]]:

@@ -33,7 +33,7 @@ from mastctl.packaged import schema_files
 from mastctl.rig import plugged
 from mastctl.rig.drawing import RigAnswers
 from mastctl.rig.folder import CONFIG, MAST, README, RULES, write_rig
-from mastctl.rig.plugged import Plugged, PluggedCamera, PluggedHead
+from mastctl.rig.plugged import FAMILIES, Plugged, PluggedCamera, PluggedHead
 from mastctl.rig.questions import Questions
 from mastctl.setup import doctor
 from mastctl.setup.machine import ExaminedMachine
@@ -185,7 +185,7 @@ def test_an_adapter_without_a_stable_name_gets_one_by_a_rule(
 ) -> None:
     machine = machine_with(tmp_path / "machine", serial)
     folder = tmp_path / "rig"
-    head = PluggedHead("/dev/ttyUSB0", SERVOS)
+    head = PluggedHead("/dev/ttyUSB0", FAMILIES[0], SERVOS)
     made = write_rig(folder, Plugged((head,), CAMERAS), head, RigAnswers(), machine)
     lines = (folder / RULES).read_text().splitlines()
     line = next(one for one in lines if one.endswith('SYMLINK+="mast"') and not one.startswith("#"))
@@ -198,7 +198,7 @@ def test_an_adapter_without_a_stable_name_gets_one_by_a_rule(
 
 
 def test_a_pair_of_cameras_is_drawn_and_its_options_are_those_of_the_driver(tmp_path: Path) -> None:
-    head = PluggedHead("/dev/serial/by-id/usb-FTDI", SERVOS)
+    head = PluggedHead("/dev/serial/by-id/usb-FTDI", FAMILIES[0], SERVOS)
     answers = RigAnswers(baseline_m=0.16, view_deg=90.0)
     write_rig(tmp_path / "rig", Plugged((head,), CAMERAS), head, answers, ExaminedMachine(tmp_path))
     good_by_schema(tmp_path / "rig")
@@ -211,6 +211,16 @@ def test_a_pair_of_cameras_is_drawn_and_its_options_are_those_of_the_driver(tmp_
     for name, camera in config.hardware.cameras.items():
         assert parse_options(camera.options, name).size_px == (640, 480)
     assert dynamixel_settings(config.hardware.pan_tilt.options).port == "/dev/serial/by-id/usb-FTDI"
+
+
+def test_servos_as_they_come_from_the_factory_are_read_as_often_as_their_rate_allows(tmp_path: Path) -> None:
+    slow = tuple(FoundServo(57_600, number, 1200, "XL330-M288-T", 45, ()) for number in (1, 2))
+    head = PluggedHead("/dev/ttyUSB0", FAMILIES[0], slow)
+    made = write_rig(tmp_path / "rig", Plugged((head,)), head, RigAnswers(), ExaminedMachine(tmp_path))
+    settings = dynamixel_settings(load_config(made.folder / CONFIG).hardware.pan_tilt.options)
+    assert (settings.baud, settings.poll_hz) == (57_600, 45.0)
+    page = (made.folder / README).read_text()
+    assert "mastctl servo set-id /dev/ttyUSB0 1 1 --baud 57600 --new-baud 1000000" in page
 
 
 def test_cameras_alone_lack_a_head_and_doctor_names_what_to_do(tmp_path: Path) -> None:
