@@ -26,7 +26,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-HEADS = {"dynamixel": "drivers.dynamixel.head", "flir_ptu": "drivers.flir_ptu.head"}
+HEADS = {
+    "dynamixel": "drivers.dynamixel.head",
+    "feetech": "drivers.feetech.head",
+    "flir_ptu": "drivers.flir_ptu.head",
+}
 """Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them, and whose
 ``halt(options)`` stops a head that no daemon drives any more."""
 

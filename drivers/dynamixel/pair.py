@@ -145,8 +145,8 @@ class Pair:
             for i, entry in zip(self._ids, entries, strict=True)
         ]
 
-    def send_goals(self, goals: Sequence[int], speeds: Sequence[int]) -> None:
-        """Write profile and goal of both axes with one packet. Raises LineLost, BadReply."""
+    def send_goals(self, goals: Sequence[int], speeds: Sequence[int]) -> Sequence[int]:
+        """Write profile and goal of both axes with one packet and return the goals. Raises LineLost."""
         values = []
         for axis, goal, speed in zip(self.axes, goals, speeds, strict=True):
             acceleration = axis.servo.profile[0]
@@ -159,6 +159,7 @@ class Pair:
                 ]
             )
         self.send(values)
+        return goals
 
     def send(self, values: Sequence[Sequence[tuple[str, int]]]) -> None:
         """Write neighbouring registers of each servo, all with one packet. Raises LineLost, BadReply."""

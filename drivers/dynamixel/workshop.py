@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from functools import partial
 
 from drivers.clock import Clock
@@ -29,6 +28,7 @@ from drivers.dynamixel.registers import RegisterBlock, vendor_names, vendor_regi
 from drivers.dynamixel.servo_table import ServoTable, identified
 from drivers.errors import BadOptions, DriverError, HardwareFault, NoReply, OutOfRange, Refused, WrongDevice
 from drivers.serial_line import OpenLine, SerialLine
+from drivers.servo_bus.bench import FoundServo, Scan, ServoFacts, Trial, TrialStep
 from drivers.servo_bus.exchange import again
 
 HIGHEST_ID = 252
@@ -38,27 +38,6 @@ TRIAL_ACCELERATION_RAD_PER_S2 = 1.0
 TRIAL_WATCHDOG = 15  # times 20 ms
 TRIAL_POLL_S = 0.02
 TRIAL_WARM_MARGIN_C = 10  # below the servo's own limit
-
-
-@dataclass(frozen=True)
-class FoundServo:
-    """A servo that answered a scan."""
-
-    baud: int
-    servo_id: int
-    model_number: int
-    model: str
-    firmware: int
-    hardware_errors: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Scan:
-    """What a scan found; ``garbled`` are the baud rates at which bytes came that were no reply."""
-
-    found: tuple[FoundServo, ...]
-    bauds: tuple[int, ...]
-    garbled: tuple[int, ...]
 
 
 def scan(
@@ -96,17 +75,6 @@ def _found(link: Link, ping: Pinged) -> FoundServo:
         words = hardware_error_words(table_of(link, ping.servo_id, model).get("hardware_error"))
     name = model.name if model else vendor_names().get(ping.model_number, "unknown")
     return FoundServo(link.baud, ping.servo_id, ping.model_number, name, ping.firmware, tuple(words))
-
-
-@dataclass(frozen=True)
-class ServoFacts:
-    """Everything a servo says: its registers as they stand, and in words where a number needs them."""
-
-    servo_id: int
-    model: str
-    firmware: int
-    values: dict[str, int]
-    words: dict[str, str]
 
 
 def facts(link: Link, servo_id: int) -> ServoFacts:
@@ -232,34 +200,6 @@ def _confirm(link: Link, servo_id: int, model: ServoModel, otherwise: str) -> No
         raise WrongDevice(otherwise) from None
     if found.model_number != model.number:
         raise WrongDevice(f"{otherwise}: model number {found.model_number} answers")
-
-
-@dataclass(frozen=True)
-class TrialStep:
-    """One short move of a trial: where it should have gone, where it went, and how hard it was."""
-
-    goal_counts: int
-    measured_counts: int
-    seconds: float
-    most_current_A: float | None
-    voltage_V: float
-    temperature_C: int
-
-    @property
-    def left_counts(self) -> int:
-        """Measured minus goal."""
-        return self.measured_counts - self.goal_counts
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A trial's steps, and the servo's model."""
-
-    servo_id: int
-    model: str
-    count_rad: float
-    start_counts: int
-    steps: tuple[TrialStep, ...] = field(default=())
 
 
 def try_out(link: Link, servo_id: int, amplitude_rad: float, torque_percent: float) -> Trial:

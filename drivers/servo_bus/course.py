@@ -97,6 +97,7 @@ class AxisCourse:
         self._speed_rad_per_s = 0.0  # of the profile
         self.goal = 0
         self.sent: int | None = None  # what of the way to the goal was sent; None: all of it
+        self._sent_before: int | None = None  # which a servo holds that did not hear the last of it
         self.profile: tuple[int, int] | None = None  # acceleration and velocity that were sent, counts
         self.holds = True
 
@@ -150,7 +151,7 @@ class AxisCourse:
         here = self._sample.counts if self._sample else legs[0]
         self.goal, self._legs = legs[0], legs[1:]
         self._note_side(self.goal - here)
-        self._rest, self._sampled, self.sent = None, False, None
+        self._rest, self._sampled, self.sent, self._sent_before = None, False, None, None
 
     def stretch(self, lease_s: float, acceleration_rad_per_s2: float) -> int:
         """Return how much of the way to the goal to send now, as a goal.
@@ -166,8 +167,21 @@ class AxisCourse:
 
     def lent(self, goal: int) -> None:
         """Note that so much of the way was sent."""
+        self._sent_before = self.sent
         self.sent = None if goal == self.goal else goal
         self._sampled = False
+
+    def more_of_the_way(self, stretch: int) -> int | None:
+        """Return what to send next where a way is lent, which never goes back; None for nothing."""
+        sample = self._sample
+        if sample is None or not self.holds or not self._sampled:
+            return None
+        sent = self.goal if self.sent is None else self.sent
+        if sample.values["goal_position"] not in (sent, self._sent_before):
+            return None  # somebody else's
+        if self.sent is not None and abs(self.goal - stretch) < abs(self.goal - sent):
+            return stretch
+        return None if sample.values["goal_position"] == sent else sent
 
     def next_leg(self) -> int | None:
         """Return the next goal to send when the present leg has ended; `begin_leg` when it was sent.
@@ -265,7 +279,7 @@ class AxisCourse:
             return ""
         values = self._sample.values
         sent = self.goal if self.sent is None else self.sent
-        if values["goal_position"] != sent:
+        if values["goal_position"] not in (sent, self._sent_before):
             return f"{self.name} holds the goal {values['goal_position']} where {sent} was sent"
         if self.profile is None:
             return ""

@@ -203,12 +203,14 @@ class Port:
         LineLost
             If it is gone.
         """
-        if self.suspect or self._buffer or self._fetch(0.0):
+        self._fetch(0.0)
+        if self.suspect or (self._past_echo() and self._buffer):
             self.drain()
         sent_s = self.clock.now_s()
         if self._urgent():
             raise Overtaken
-        self._echo = packet if self.echoes else b""
+        if self.echoes:
+            self._echo += packet
         self._line.write(packet)
         wire_s = (len(packet) + reply_bytes) * self._line.byte_s
         self.deadline_s = self.clock.now_s() + self.reply_timeout_s + wire_s
@@ -234,6 +236,17 @@ class Port:
                 self.suspect = self.suspect or status is None
                 return status
 
+    def comes_back(self, packet: bytes) -> bool:
+        """Send a packet that nobody answers; returns whether it comes back. Raises LineLost, BadReply."""
+        self.echoes = False
+        self.send(packet, 0)
+        until_s = self.clock.now_s() + QUIET_S + 2 * len(packet) * self.byte_s
+        while len(self._buffer) < len(packet) and self._fetch(max(0.0, until_s - self.clock.now_s())):
+            pass
+        echoed = bytes(self._buffer) == packet
+        self.drain()
+        return echoed
+
     def _past_echo(self) -> bool:
         """Drop the echo of what was sent; returns whether what is in the buffer is more than that."""
         echo = self._echo
@@ -243,6 +256,8 @@ class Port:
             return not echo.startswith(self._buffer)
         if self._buffer.startswith(echo):
             del self._buffer[: len(echo)]
+        else:
+            self.suspect = True  # something was said into it
         self._echo = b""
         return True
 
@@ -268,6 +283,7 @@ class Port:
                     detail={"port": self.name},
                 )
         self.suspect = False
+        self._echo = b""
 
     def _fetch(self, wait_s: float) -> bool:
         """Move bytes that come within ``wait_s`` to the buffer; returns whether any did."""

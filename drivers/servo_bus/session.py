@@ -59,8 +59,11 @@ class ServoPair(Protocol):
         """Return what one servo says about its motion now, asking it alone. Raises DriverError."""
         ...
 
-    def send_goals(self, goals: Sequence[int], speeds: Sequence[int]) -> None:
-        """Write profile and goal of both axes with one packet. Raises LineLost, BadReply."""
+    def send_goals(self, goals: Sequence[int], speeds: Sequence[int]) -> Sequence[int]:
+        """Write profile and goal of both axes with one packet; returns as much of the goals as was sent.
+
+        Raises LineLost, BadReply.
+        """
         ...
 
     def brake(self) -> None:
@@ -260,18 +263,18 @@ class ServoSession:
         """Write profile and goal of both axes with one packet and see that they are held."""
         motions = [axis.motion for axis in self.pair.axes]
         for _ in range(ATTEMPTS):
-            self.pair.send_goals(goals, speeds)
+            sent = self.pair.send_goals(goals, speeds)
             self._poll()
             held = [motion.sample.values["goal_position"] for motion in motions if motion.sample]
             wanted = [motion.goal for motion in motions]  # a short first leg may have ended already
-            if held == list(goals) or held == wanted:
+            if held == list(sent) or held == wanted:
                 return
         self._watch.look_soon()
         self._watch.look()
         if self._watch.tripped:
             raise WatchdogTripped("the servos' bus watchdog stopped the head before the goals came")
         raise GivenUp(  # one axis may be under way: silence stops it
-            NoReply(f"the servos hold the goals {held} where {list(goals)} were sent {ATTEMPTS} times")
+            NoReply(f"the servos hold the goals {held} where {list(sent)} were sent {ATTEMPTS} times")
         )
 
     def stop(self) -> None:

@@ -35,18 +35,21 @@ KERNEL = pytest.mark.long(
     2, "in the quick run it is on a turned clock; here each case drives a head for seconds"
 )
 LONG = [pytest.param(name, marks=KERNEL) for name in REAL]
-WIRES = ["dynamixel", "ptu"]
+WIRES = ["dynamixel", "feetech", "ptu"]
+OTHER = pytest.mark.long(2, "its session is that of Dynamixel's, and quick where a line is wanted (feetech)")
+SAME = [pytest.param(name, marks=OTHER) for name in ("feetech", "scs")]
+QUICK = [name for name in TURNED if name not in ("feetech", "scs")]
 MADE = {**RIGS, **TURNED}
 T = TypeVar("T")
 
 
-@pytest.fixture(params=[*TURNED, *LONG])
+@pytest.fixture(params=[*QUICK, *SAME, *LONG])
 def rig(request: pytest.FixtureRequest) -> Iterator[HeadRig]:
     with MADE[request.param]() as made:
         yield made
 
 
-@pytest.fixture(params=[*WIRES, *LONG])
+@pytest.fixture(params=[*WIRES, pytest.param("scs", marks=OTHER), *LONG])
 def wired(request: pytest.FixtureRequest) -> Iterator[HeadRig]:
     with MADE[request.param]() as made:
         yield made

@@ -18,6 +18,7 @@ from calib.files.yaml_text import Section
 from drivers import options as driver_options
 from drivers.dynamixel import settings as dynamixel
 from drivers.errors import BadOptions
+from drivers.feetech import settings as feetech
 from drivers.flir_ptu import options as flir_ptu
 from drivers.hardware import CAMERAS, HEADS, OURS
 from drivers.recordings.replay import OPTIONS as REPLAY_OPTIONS
@@ -131,6 +132,11 @@ def dynamixel_options() -> dict[str, Any]:
     return {"port": "/dev/x", "pan": {"id": 1, **ends}, "tilt": {"id": 2, **ends}}
 
 
+def feetech_options() -> dict[str, Any]:
+    ends = {"model": "STS3215", "limits_rad": [-0.5, 0.5]}
+    return {"port": "/dev/x", "pan": {"id": 1, **ends}, "tilt": {"id": 2, **ends}}
+
+
 def ptu_options() -> dict[str, Any]:
     return {"port": "/dev/x", "pan": {"limits_rad": [-0.5, 0.5]}, "tilt": {"limits_rad": [-0.5, 0.5]}}
 
@@ -164,6 +170,8 @@ def simulated(values: dict[str, Any]) -> simulation.SimulationSettings:
 def known_of(driver: str) -> set[str]:
     if driver == "dynamixel":
         return options_known(dynamixel.dynamixel_settings, dynamixel_options())
+    if driver == "feetech":
+        return options_known(feetech.feetech_settings, feetech_options())
     if driver == "flir_ptu":
         return options_known(flir_ptu.options_from, ptu_options())
     assert driver == "v4l2", f"say here how the options of {driver} are read"
@@ -227,6 +235,7 @@ def bounded(told: dict[str, list[str]], column: int) -> dict[str, tuple[float, f
 
 SOURCES: dict[str, tuple[str, Callable[[dict[str, Any]], Any], Callable[[], dict[str, Any]]]] = {
     "dynamixel": ("Options of `dynamixel`", dynamixel.dynamixel_settings, dynamixel_options),
+    "feetech": ("Options of `feetech`", feetech.feetech_settings, feetech_options),
     "flir_ptu": ("Options of `flir_ptu`", flir_ptu.options_from, ptu_options),
     "v4l2": ("Options of `v4l2`", lambda values: v4l2.parse_options(values, "cam_left"), v4l2_options),
     "simulation": ("Simulation", simulated, lambda: {"rover": "true.yaml"}),

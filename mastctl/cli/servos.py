@@ -1,4 +1,4 @@
-"""Real heads on their lines: ``mastctl servo`` and ``mastctl ptu``."""
+"""Real heads on their lines: ``mastctl servo`` (two families) and ``mastctl ptu``."""
 
 from __future__ import annotations
 
@@ -6,18 +6,26 @@ import argparse
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
 from mastctl.cli.output import CommandError, WrongUse, positive_number
 
+REPLY_TIMEOUT_S = 0.05
+
 if TYPE_CHECKING:
     from drivers.dynamixel.link import Link
+    from drivers.feetech.link import FeetechLink
     from drivers.flir_ptu.workshop import Facts
 
 
-SCANNED_BAUDS = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
-FACTORY_BAUD = 57_600
+FAMILIES = {
+    "dynamixel": (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000),
+    "feetech": (1_000_000, 115_200, 500_000, 57_600),
+}
+"""The baud rates that a scan tries, first that of the factory."""
+
 FARTHEST_DEG = 20.0
 
 
@@ -29,14 +37,15 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def _add_servo(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add servo with its four commands."""
-    servo = subparsers.add_parser("servo", help="find, read, number and try Dynamixel servos on the bench")
+    servo = subparsers.add_parser(
+        "servo", help="find, read, number and try Dynamixel or Feetech servos on the bench"
+    )
     commands = servo.add_subparsers(dest="servo_command", metavar="WHAT", required=True)
 
     scan = commands.add_parser("scan", help="ask at every baud rate which servos are there; moves nothing")
     _add_port(scan)
     scan.add_argument(
-        "--baud", nargs="+", type=_whole, metavar="B", default=list(SCANNED_BAUDS),
-        help="the rates to try (default: all usual ones)",
+        "--baud", nargs="+", type=_whole, metavar="B", help="the rates to try (default: all usual ones)",
     )  # fmt: skip
     scan.set_defaults(run=_scan)
 
@@ -75,13 +84,22 @@ def _add_servo(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def _add_port(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("port", metavar="PORT", help="serial device, or a URL such as socket://host:port")
+    parser.add_argument(
+        "--family", choices=FAMILIES, default="dynamixel", help="of the servos on it (default dynamixel)"
+    )
 
 
 def _add_baud(parser: argparse.ArgumentParser) -> None:
+    told = ", ".join(f"{family} {bauds[0]}" for family, bauds in FAMILIES.items())
     parser.add_argument(
-        "--baud", type=_whole, default=FACTORY_BAUD, metavar="B",
-        help=f"bits per second (default {FACTORY_BAUD}, as servos come from the factory)",
+        "--baud", type=_whole, metavar="B",
+        help=f"bits per second (default as servos come from the factory: {told})",
     )  # fmt: skip
+
+
+def _workshop(args: argparse.Namespace) -> Any:
+    """The workshop of a family of servos."""
+    return import_module(f"drivers.{args.family}.workshop")
 
 
 def _whole(text: str) -> int:
@@ -92,11 +110,18 @@ def _whole(text: str) -> int:
 
 
 @contextmanager
-def _line(args: argparse.Namespace) -> Iterator[Link]:
+def _line(args: argparse.Namespace) -> Iterator[Any]:
     """The open line of a command."""
-    from drivers.dynamixel.link import Link
+    baud = FAMILIES[args.family][0] if args.baud is None else args.baud
+    link: Link | FeetechLink
+    if args.family == "feetech":
+        from drivers.feetech.link import open_link
 
-    link = Link(args.port, args.baud)
+        link = open_link(args.port, baud)
+    else:
+        from drivers.dynamixel.link import Link
+
+        link = Link(args.port, baud)
     try:
         yield link
     finally:
@@ -105,10 +130,7 @@ def _line(args: argparse.Namespace) -> Iterator[Link]:
 
 def _scan(args: argparse.Namespace) -> int:
     """List the servos of a line."""
-    from drivers.dynamixel.link import REPLY_TIMEOUT_S
-    from drivers.dynamixel.workshop import scan
-
-    result = scan(args.port, args.baud, REPLY_TIMEOUT_S)
+    result = _workshop(args).scan(args.port, args.baud or FAMILIES[args.family], REPLY_TIMEOUT_S)
     bauds = ", ".join(str(baud) for baud in result.bauds)
     garbled = [
         f"at {baud} baud something answered that cannot be understood: two servos of one id, or a bad line"
@@ -118,7 +140,7 @@ def _scan(args: argparse.Namespace) -> int:
         raise CommandError(
             "no_servo",
             f"no servo answered on {args.port} at {bauds} baud"
-            + (f"; {'; '.join(garbled)}" if garbled else "; is its power on, is it protocol 2.0?"),
+            + (f"; {'; '.join(garbled)}" if garbled else f"; is its power on, is it a {args.family} servo?"),
         )
     if args.json:
         rows = [
@@ -148,10 +170,8 @@ def _scan(args: argparse.Namespace) -> int:
 
 def _info(args: argparse.Namespace) -> int:
     """Show a servo's registers."""
-    from drivers.dynamixel.workshop import facts
-
     with _line(args) as link:
-        found = facts(link, args.id)
+        found = _workshop(args).facts(link, args.id)
     if args.json:
         output.print_json(
             {
@@ -173,11 +193,10 @@ def _info(args: argparse.Namespace) -> int:
 
 def _set_id(args: argparse.Namespace) -> int:
     """Change a servo's id and baud rate."""
-    from drivers.dynamixel.workshop import set_id
     from mastctl.devices.opening import line_held
 
     with line_held(args.port), _line(args) as link:
-        set_id(link, args.id, args.new_id, args.new_baud, torque_off=args.torque_off)
+        _workshop(args).set_id(link, args.id, args.new_id, args.new_baud, torque_off=args.torque_off)
         baud = link.baud
     if args.json:
         output.print_json({"id": args.new_id, "old_id": args.id, "baud": baud})
@@ -188,7 +207,6 @@ def _set_id(args: argparse.Namespace) -> int:
 
 def _test(args: argparse.Namespace) -> int:
     """Turn a servo a little."""
-    from drivers.dynamixel.workshop import try_out
     from mastctl.devices.opening import line_held
 
     if args.degrees > FARTHEST_DEG:
@@ -200,7 +218,7 @@ def _test(args: argparse.Namespace) -> int:
         f"{args.torque_percent:g} % of its strength"
     )
     with line_held(args.port), _line(args) as link:
-        trial = try_out(link, args.id, math.radians(args.degrees), args.torque_percent)
+        trial = _workshop(args).try_out(link, args.id, math.radians(args.degrees), args.torque_percent)
     count_deg = math.degrees(trial.count_rad)
     worst = max(abs(step.left_counts) for step in trial.steps)
     if args.json:
@@ -216,8 +234,14 @@ def _test(args: argparse.Namespace) -> int:
             }
             for step in trial.steps
         ]
-        output.print_json({"id": trial.servo_id, "model": trial.model, "count_deg": count_deg, "steps": rows})
+        told = {"id": trial.servo_id, "model": trial.model, "count_deg": count_deg, "steps": rows}
+        if trial.speed_unit_counts is not None:
+            told["speed_unit_counts"] = trial.speed_unit_counts
+        output.print_json(told)
         return 0
+    notes = [f"It missed its goals by {worst} counts ({worst * count_deg:.3f} deg) at most."]
+    if trial.speed_unit_counts is not None:
+        notes.append(f"Its unit of speed is {trial.speed_unit_counts} counts/s: speed_unit_counts.")
     output.print_table(
         f"Servo {trial.servo_id}: {trial.model}, one count is {count_deg:.4f} degrees",
         ("goal", "measured", "left", "seconds", "most A", "V", "C"),
@@ -233,7 +257,7 @@ def _test(args: argparse.Namespace) -> int:
             )
             for s in trial.steps
         ],
-        [f"It missed its goals by {worst} counts ({worst * count_deg:.3f} deg) at most."],
+        notes,
     )
     return 0
 

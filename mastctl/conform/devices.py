@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from importlib import import_module
 from typing import Any
 
 from drivers.clock import SystemClock
@@ -34,7 +35,7 @@ from mastctl.devices.opening import Bounds, head_beside, open_one_camera
 
 log = logging.getLogger(__name__)
 
-COUNTS = {"dynamixel": 3, "flir_ptu": 1}
+COUNTS = {"dynamixel": 3, "feetech": 3, "flir_ptu": 1}
 """How many counts from its goal a head of this repository may stand when it calls itself settled."""
 
 STOPS_WITHIN_S = 3.0
@@ -193,9 +194,8 @@ def check_camera(
 def count_of(device: DeviceSettings) -> float | None:
     """Return one count of a head of this repository, radians, the coarser axis; None for another."""
     options = device.options
-    if device.driver == "dynamixel":
-        from drivers.dynamixel.models import model_named
-
+    if device.driver in ("dynamixel", "feetech"):
+        model_named = import_module(f"drivers.{device.driver}.models").model_named
         try:
             return float(max(model_named(options[axis]["model"]).count_rad for axis in ("pan", "tilt")))
         except (LookupError, TypeError):

@@ -10,34 +10,23 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from drivers.dynamixel import workshop as dynamixel
 from drivers.dynamixel.link import REPLY_TIMEOUT_S
 from drivers.dynamixel.models import MODELS
 from drivers.dynamixel.settings import POLL_BYTES
-from drivers.dynamixel.workshop import FoundServo
 from drivers.errors import BadOptions, DriverError
+from drivers.feetech import models as feetech_models
+from drivers.feetech import settings as feetech_settings
+from drivers.feetech import workshop as feetech
 from drivers.flir_ptu import workshop as flir_ptu
 from drivers.flir_ptu.workshop import Facts
+from drivers.servo_bus.bench import FoundServo, Scan
 from drivers.servo_bus.settings import CountedModel
 from drivers.v4l2 import find
 from drivers.v4l2.node import Node, capture_nodes
 from mastctl.setup.machine import ExaminedMachine, examine_port
-
-
-class ServoScan(Protocol):
-    """What a scan of a line found."""
-
-    @property
-    def found(self) -> Sequence[FoundServo]:
-        """Who answered."""
-        ...
-
-    @property
-    def garbled(self) -> Sequence[int]:
-        """Rates at which something else came."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -57,7 +46,7 @@ class ServoFamily:
     """
 
     driver: str
-    scan: Callable[[str, Sequence[int], float], ServoScan]
+    scan: Callable[[str, Sequence[int], float], Scan]
     bauds: tuple[int, ...]
     models: Mapping[str, CountedModel]
     poll_bytes: int
@@ -70,6 +59,13 @@ FAMILIES = (
         (1_000_000, 57_600, 115_200, 2_000_000, 3_000_000, 4_000_000),
         MODELS,
         POLL_BYTES,
+    ),
+    ServoFamily(
+        "feetech",
+        feetech.scan,
+        (1_000_000, 115_200, 500_000),
+        feetech_models.MODELS,
+        feetech_settings.POLL_BYTES,
     ),
 )
 PTU_BAUD = 9600

@@ -20,6 +20,7 @@ from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.head import DynamixelHead
 from drivers.dynamixel.head import open_head as open_dynamixel
 from drivers.faults import FaultPanel
+from drivers.feetech.head import open_head as open_feetech
 from drivers.flir_ptu.head import open_head as open_flir_ptu
 from drivers.interfaces import PanTilt
 from drivers.serial_line import OpenLine, SerialLine
@@ -28,6 +29,8 @@ from drivers.sim.pan_tilt import SimulatedPanTilt
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
+from drivers.sim.wire.feetech_bus import FeetechBus
+from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
 from drivers.sim.wire.line import PtyLine, TcpLine, WireDevice
 from drivers.sim.wire.memory_line import MemoryLine
 from drivers.sim.wire.ptu import SimulatedPtu
@@ -125,6 +128,38 @@ def dynamixel(
         head = open_dynamixel(options, clock, opens)
         stack.callback(head.close)
         yield HeadRig("Dynamixel", head, clock, panel, _truth(axes), X_COUNT_RAD, line, sent)
+
+
+@contextmanager
+def feetech(
+    model: str = "STS3215",
+    reply_timeout_s: float = 0.2,
+    *,
+    lease_s: float = 0.0,
+    echoes: bool = False,
+    turned: bool = False,
+) -> Iterator[HeadRig]:
+    """Two Feetech servos behind a serial line; by default patient, and without a lease."""
+    with ExitStack() as stack:
+        clock = _clock(turned)
+        panel, axes = _axes(clock)
+        settings = {"return_delay": 0}
+        servos = [
+            SimulatedFeetechServo(model, number, axis, settings=settings, time_s=clock.now_s())
+            for number, axis in enumerate(axes, start=1)
+        ]
+        sent = [0]
+        line, opens = _serial_line(stack, FeetechBus(servos, echoes=echoes), clock, panel, sent)
+        ends = [{"id": n, "model": model, "limits_rad": list(LIMITS_RAD[n - 1])} for n in (1, 2)]
+        options: dict[str, Any] = {
+            "port": line.path, "pan": ends[0], "tilt": ends[1], "speed_rad_per_s": SPEED_RAD_PER_S,
+            "acceleration_rad_per_s2": ACCELERATION_RAD_PER_S2, "lease_s": lease_s,
+            "reply_timeout_s": reply_timeout_s,
+        }  # fmt: skip
+        head = open_feetech(options, clock, opens)
+        stack.callback(head.close)
+        count_rad = head.settings.pan.model.count_rad
+        yield HeadRig(f"Feetech {model}", head, clock, panel, _truth(axes), count_rad, line, sent)
 
 
 class CountedServo(SimulatedServo):
@@ -302,6 +337,7 @@ def _counter(sent: list[int]) -> Callable[..., None]:
 RIGS: dict[str, Callable[[], Any]] = {
     "in_memory": in_memory,
     "dynamixel_pty": dynamixel,
+    "feetech_pty": feetech,
     "ptu_pty": ptu,
     "ptu_tcp": ptu_tcp,
 }
@@ -310,6 +346,8 @@ RIGS: dict[str, Callable[[], Any]] = {
 TURNED: dict[str, Callable[[], Any]] = {
     "in_memory": partial(in_memory, turned=True),
     "dynamixel": partial(dynamixel, turned=True),
+    "feetech": partial(feetech, lease_s=0.2, reply_timeout_s=0.1, turned=True),
+    "scs": partial(feetech, "SCS0009", reply_timeout_s=0.1, echoes=True, turned=True),
     "ptu": partial(ptu, turned=True),
 }
 """On a turned clock."""

@@ -18,7 +18,6 @@ from typing import Literal, Protocol, TypeVar, runtime_checkable
 
 from drivers.clock import Clock
 from drivers.faults import PAN_TILT, Fault, FaultPanel
-from drivers.sim.wire.dynamixel_packets import renamed
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +46,7 @@ class Reply:
     delay_s
         From the end of what it answers: of the received packet, or of the reply before it in the sequence.
     sender
-        The servo's id; 0 for a pan/tilt unit.
+        The servo's id; 0 for a pan/tilt unit; below 0 for an adapter's echo, which no fault falls on.
     """
 
     data: bytes
@@ -72,11 +71,21 @@ class Sent:
     late_s: float = 0.0
 
 
+@runtime_checkable
+class Named(Protocol):
+    """A device whose replies bear the name of their sender."""
+
+    def renamed(self, data: bytes, servo_id: int) -> bytes:
+        """Return a reply as if another had sent it, with a checksum that fits."""
+        ...
+
+
 class LineFaults:
     """The faults of one line, asked of a panel; without a panel there are none."""
 
-    def __init__(self, panel: FaultPanel | None) -> None:
+    def __init__(self, panel: FaultPanel | None, device: object = None) -> None:
         self._panel = panel
+        self._names = device if isinstance(device, Named) else None
         self._held: list[Sent] = []  # a reply that waits to change places with the next one
 
     def hung_up(self, time_s: float) -> bool:
@@ -94,6 +103,9 @@ class LineFaults:
             return [Sent(reply.data, reply.delay_s) for reply in replies]
         sent: list[Sent] = []
         for reply in replies:
+            if reply.sender < 0:
+                sent.append(Sent(reply.data, reply.delay_s))
+                continue
             if self.deaf(time_s) or panel.strikes(PAN_TILT, time_s):
                 continue
             if panel.takes(PAN_TILT, "mute", time_s, reply.sender):
@@ -111,8 +123,9 @@ class LineFaults:
     def _damaged(self, panel: FaultPanel, reply: Reply, time_s: float) -> Sent:
         """A reply of another sender, with a wrong byte, cut short, with garbage in front, or late."""
         data, late_s = reply.data, 0.0
-        if fault := panel.takes(PAN_TILT, "misnamed", time_s, reply.sender):
-            data = renamed(data, int(fault.number("as_id")))
+        fault = panel.takes(PAN_TILT, "misnamed", time_s, reply.sender) if self._names else None
+        if fault and self._names:
+            data = self._names.renamed(data, int(fault.number("as_id")))
         if data and (fault := panel.takes(PAN_TILT, "corrupt", time_s, reply.sender)):
             place = _below(panel, fault, len(data))
             changed = data[place] ^ (1 + _below(panel, fault, 255))
@@ -174,7 +187,7 @@ class Line(ABC):
     ) -> None:
         self.device = device
         self._clock = clock
-        self._faults = LineFaults(faults)
+        self._faults = LineFaults(faults, device)
         self._wire_time = wire_time
         self._observer = observer
         self._schedule: list[tuple[float, int, bool, bytes]] = []  # when, order, to the device?, bytes

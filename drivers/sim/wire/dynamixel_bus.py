@@ -48,6 +48,8 @@ class DynamixelBus:
         rate of the first servo.
     """
 
+    renamed = staticmethod(packets.renamed)
+
     def __init__(self, servos: Iterable[SimulatedServo], *, waits_for_predecessor: bool = True) -> None:
         self.servos = list(servos)
         twins = [servo for servo in self.servos if servo.model.axes == 2]

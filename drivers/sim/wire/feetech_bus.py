@@ -1,0 +1,118 @@
+"""A simulated bus of Feetech servos: bytes of the host in, answers of the servos out, in their order."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Sequence
+
+from drivers.sim.wire import feetech_packets as packets
+from drivers.sim.wire.carrier import Reply
+from drivers.sim.wire.feetech_packets import BROADCAST, Instruction, InstructionParser
+from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
+
+
+class FeetechBus:
+    """Servos on one line, a ``WireDevice``; safe from any thread.
+
+    Parameters
+    ----------
+    servos
+        Those on the line.
+    echoes
+        Whether the adapter is a half-duplex one that gives the host its own bytes back.
+
+    Attributes
+    ----------
+    host_baud
+        Bits a second of the host, set by who knows it; a servo with another rate hears nothing.
+    """
+
+    renamed = staticmethod(packets.renamed)
+
+    def __init__(self, servos: Iterable[SimulatedFeetechServo], *, echoes: bool = False) -> None:
+        self.servos = list(servos)
+        self.echoes = echoes
+        self.host_baud: int | None = None
+        self._parser = InstructionParser()
+        self._lock = threading.RLock()
+
+    @property
+    def baud(self) -> int:
+        """Bits a second that the line is listened to at."""
+        return self.host_baud or (self.servos[0].baud if self.servos else 1_000_000)
+
+    def receive(self, data: bytes, time_s: float) -> Sequence[Reply]:
+        """Take bytes of the host, return what the adapter and the servos give back."""
+        with self._lock:
+            replies = [Reply(data, sender=-1)] if self.echoes else []
+            for instruction in self._parser.feed(data):
+                replies += self._answer(instruction, time_s)
+            return replies
+
+    def poll(self, time_s: float) -> Sequence[Reply]:
+        """Let happen what happens without a packet; servos never speak unasked."""
+        with self._lock:
+            for servo in self.servos:
+                servo.update(time_s)
+            return ()
+
+    def _answer(self, instruction: Instruction, time_s: float) -> list[Reply]:
+        here = [s for s in self.servos if s.hears(time_s) and s.baud == self.baud]
+        for servo in here:
+            servo.update(time_s)
+        code, parameters = instruction.code, instruction.parameters
+        if code == packets.SYNC_WRITE and instruction.servo_id == BROADCAST and len(parameters) > 1:
+            self._sync_write(parameters, here, time_s)
+            return []
+        if code == packets.SYNC_READ and instruction.servo_id == BROADCAST and len(parameters) > 1:
+            return self._sync_read(parameters, here, time_s)
+        replies: list[Reply] = []
+        for servo in here:
+            if instruction.servo_id in (servo.servo_id, BROADCAST):
+                servo_id, delay_s, level = servo.servo_id, servo.return_delay_s, servo.answers_writes
+                data = _done(servo, code, parameters, time_s)
+                own = instruction.servo_id != BROADCAST or code == packets.PING
+                if data is not None and own and (level or code in (packets.PING, packets.READ)):
+                    answer = packets.packet(servo_id, servo.status(time_s), data)
+                    replies.append(Reply(answer, delay_s, servo_id))
+        return replies
+
+    def _sync_read(self, parameters: bytes, here: list[SimulatedFeetechServo], time_s: float) -> list[Reply]:
+        """Answer in the order of the list; a servo that is not there silences those behind it (assumed)."""
+        address, length = parameters[:2]
+        replies = []
+        for servo_id in parameters[2:]:
+            servo = next((s for s in here if s.servo_id == servo_id and s.model.sync_read), None)
+            if servo is None:
+                break
+            data = servo.read(address, length, time_s)
+            answer = packets.packet(servo_id, servo.status(time_s), data)
+            replies.append(Reply(answer, servo.return_delay_s, servo_id))
+        return replies
+
+    @staticmethod
+    def _sync_write(parameters: bytes, here: list[SimulatedFeetechServo], time_s: float) -> None:
+        """Write the same cells of several servos; nobody answers."""
+        address, length = parameters[:2]
+        for at in range(2, len(parameters) - length, length + 1):
+            for servo in here:
+                if servo.servo_id == parameters[at]:
+                    servo.write(address, parameters[at + 1 : at + 1 + length], time_s)
+
+
+def _done(servo: SimulatedFeetechServo, code: int, parameters: bytes, time_s: float) -> bytes | None:
+    """Carry out one instruction; returns the data of its answer, None for one that is not answered."""
+    if code == packets.PING:
+        return b""
+    if code == packets.READ and len(parameters) == 2:
+        return servo.read(parameters[0], parameters[1], time_s)
+    if code == packets.WRITE and len(parameters) > 1:
+        servo.write(parameters[0], parameters[1:], time_s)
+        return b""
+    if code == packets.REG_WRITE and len(parameters) > 1:
+        servo.reg_write(parameters[0], parameters[1:])
+        return b""
+    if code == packets.ACTION:
+        servo.action(time_s)
+        return b""
+    return None

@@ -1,0 +1,236 @@
+"""One simulated Feetech servo: its memory, its motion, its protection. It has no watchdog."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from drivers.errors import BadOptions
+from drivers.sim.wire.axis import WireAxis
+from drivers.sim.wire.feetech_memory import BAUDS, RAM_FROM, model_named
+
+VOLTAGE, SENSOR, HEAT, CURRENT, OVERLOAD = 1, 2, 4, 8, 32
+"""Bits of the status."""
+
+STEP_ACCELERATION = 100
+"""Counts per second squared of one unit of acceleration (STS)."""
+
+FASTEST_COUNTS = 3400
+"""Counts per second of a goal speed of 0 (assumed: the no-load speed of an STS3215)."""
+
+STEEPEST_RAD_PER_S2 = 60.0
+"""Of an acceleration of 0, and of an SCS, which has none (assumed)."""
+
+SET_MIDDLE = 128
+_PROTECTIVE_UNIT_S = 0.01
+
+
+class SimulatedFeetechServo:
+    """One servo; every method is given the time and nothing runs by itself.
+
+    Parameters
+    ----------
+    model
+        A name of `feetech_memory.MODELS`.
+    servo_id
+        Its id at first.
+    axis
+        What it turns.
+    settings
+        Initial values of its memory by name; those of the EEPROM outlast the power switch.
+    time_s
+        When it is switched on.
+
+    Raises
+    ------
+    BadOptions
+        For an unknown model or name, or a value that the memory cannot hold.
+    """
+
+    def __init__(
+        self,
+        model: str,
+        servo_id: int,
+        axis: WireAxis,
+        *,
+        settings: Mapping[str, int] | None = None,
+        time_s: float = 0.0,
+    ) -> None:
+        self.model = model_named(model)
+        self.powered = True
+        self.eeprom_writes: list[str] = []
+        self._axis = axis
+        given = {"id": servo_id, **(settings or {})}
+        for name, value in given.items():
+            cell = self.model.by_name.get(name)
+            if cell is None or not cell.low <= value <= cell.high:
+                raise BadOptions(f"{name} {value} cannot be in the memory of a simulated {self.model.name}")
+        self.memory = {cell.name: cell.initial for cell in self.model.cells}
+        self.memory |= {"model": self.model.number, **given}
+        self._kept = dict(self.memory)
+        self._registered: tuple[int, bytes] | None = None
+        self._raised = 0
+        self._pressing_since_s: float | None = None
+        self._zero = self.model.counts // 2
+        self.memory["goal_position"] = self._position(time_s)
+
+    @property
+    def servo_id(self) -> int:
+        """The id that it answers to."""
+        return self.memory["id"]
+
+    @property
+    def baud(self) -> int:
+        """Bits a second that it talks at."""
+        return BAUDS[self.memory["baud"]]
+
+    @property
+    def return_delay_s(self) -> float:
+        """How long it waits before it answers."""
+        return self.memory["return_delay"] * 2e-6
+
+    @property
+    def answers_writes(self) -> bool:
+        """Whether it answers more than reads and pings."""
+        return self.memory["response_level"] == 1
+
+    def hears(self, time_s: float) -> bool:
+        """Return whether it takes part in the traffic."""
+        return self.powered and not self._axis.silent(time_s)
+
+    def set_power(self, on: bool, time_s: float) -> None:
+        """Switch it off, or on again with what its EEPROM holds."""
+        if on and not self.powered:
+            ram = {c.name: c.initial for c in self.model.cells if c.address >= RAM_FROM}
+            self.memory = self._kept | ram
+            if "torque_limit" in self.memory:
+                self.memory["torque_limit"] = self.memory["max_torque"]
+            self.memory["goal_position"] = self._position(time_s)
+            self._raised = 0
+        elif not on:
+            self.memory["torque_enable"] = 0
+            self._axis.limp(time_s)
+        self.powered = on
+
+    def raise_error(self, bits: int) -> None:
+        """Let a fault of its own happen, for example ``SENSOR``; it stays until the power switch."""
+        self._raised |= bits
+
+    def status(self, time_s: float) -> int:
+        """Return the bits that every answer carries."""
+        memory, bits = self.memory, self._raised
+        tenths = round(10 * self.model.volts * self._axis.supply(time_s))
+        if not memory["min_voltage"] <= tenths <= memory["max_voltage"]:
+            bits |= VOLTAGE
+        if self._axis.temperature_c(time_s) > memory["max_temperature"]:
+            bits |= HEAT
+        since_s = self._pressing_since_s
+        if since_s is not None and time_s - since_s >= memory["protective_time"] * _PROTECTIVE_UNIT_S:
+            bits |= OVERLOAD
+        return bits
+
+    def update(self, time_s: float) -> None:
+        """Let happen what happened by itself: protection unloads the motor."""
+        if not self.memory["torque_enable"] or not self._axis.blocked(time_s):
+            self._pressing_since_s = None
+        elif self._pressing_since_s is None:
+            self._pressing_since_s = time_s
+        if self.memory["torque_enable"] and self.status(time_s) & self.memory["unload_condition"] & ~OVERLOAD:
+            self.memory["torque_enable"] = 0
+            self._axis.limp(time_s)
+
+    def read(self, address: int, length: int, time_s: float) -> bytes:
+        """Return bytes of the memory; zeros where the table has nothing."""
+        self._measure(time_s)
+        data = bytearray(256)
+        order = "big" if self.model.big_end else "little"
+        for cell in self.model.cells:
+            word = self.memory[cell.name].to_bytes(cell.size, order)  # type: ignore[arg-type]
+            data[cell.address : cell.address + cell.size] = word
+        return bytes(data[address : address + length])
+
+    def write(self, address: int, data: bytes, time_s: float) -> None:
+        """Write bytes: whole cells that are writable, values within their bounds; the rest is dropped."""
+        moved = False
+        for cell in self.model.cells:
+            at = cell.address - address
+            if not cell.writable or at < 0 or at + cell.size > len(data):
+                continue
+            word = data[at : at + cell.size]
+            value = int.from_bytes(word, "big" if self.model.big_end else "little")
+            if cell.name == "torque_enable" and value == SET_MIDDLE and "offset" in self.memory:
+                self._set_middle(time_s)
+            elif cell.low <= value <= cell.high:
+                self._put(cell.name, value, cell.address, time_s)
+                moved = moved or cell.name in ("goal_position", "torque_enable")
+        if moved and self.memory["torque_enable"] == 1:
+            self._go(time_s)
+
+    def reg_write(self, address: int, data: bytes) -> None:
+        """Keep a write for `action`."""
+        self._registered, self.memory["async_write"] = (address, data), 1
+
+    def action(self, time_s: float) -> None:
+        """Carry out what `reg_write` kept."""
+        if self._registered is not None:
+            (address, data), self._registered = self._registered, None
+            self.memory["async_write"] = 0
+            self.write(address, data, time_s)
+
+    def _put(self, name: str, value: int, address: int, time_s: float) -> None:
+        if name == "torque_enable" and value != self.memory[name]:
+            if value:
+                self.memory["goal_position"] = self._position(time_s)  # it holds where it stands
+            else:
+                self._axis.limp(time_s)
+        self.memory[name] = value
+        if address < RAM_FROM:
+            self.eeprom_writes.append(name)
+            if not self.memory["lock"]:
+                self._kept[name] = value
+
+    def _set_middle(self, time_s: float) -> None:
+        """Make where it stands the middle, by the offset in the EEPROM."""
+        raw = self._position(time_s) + self._offset()
+        off = raw - self.model.counts // 2
+        self._put("offset", abs(off) | (0x800 if off < 0 else 0), 31, time_s)
+
+    def _offset(self) -> int:
+        """The offset: 11 bits and a sign."""
+        word = self.memory.get("offset", 0)
+        return -(word & 0x7FF) if word & 0x800 else word & 0x7FF
+
+    def _position(self, time_s: float) -> int:
+        angle = self._axis.angle_rad(time_s) / self.model.count_rad
+        return round(max(-32768.0, min(32767.0, angle))) + self._zero - self._offset()
+
+    def _go(self, time_s: float) -> None:
+        """Turn towards the goal, which position control keeps within its limits."""
+        memory, count_rad = self.memory, self.model.count_rad
+        goal = memory["goal_position"]
+        goal = -(goal & 0x7FFF) if goal & 0x8000 else goal
+        if memory["max_angle"] > memory["min_angle"]:
+            goal = min(max(goal, memory["min_angle"]), memory["max_angle"])
+        speed = (memory["goal_speed"] & 0x7FFF) or FASTEST_COUNTS
+        steep = memory.get("acceleration", 0) * STEP_ACCELERATION * count_rad or STEEPEST_RAD_PER_S2
+        angle_rad = (goal - self._zero + self._offset()) * count_rad
+        self._axis.goal(time_s, angle_rad, speed * count_rad, steep)
+
+    def _measure(self, time_s: float) -> None:
+        """Bring what is measured up to date."""
+        memory = self.memory
+        velocity = self._axis.velocity_rad_per_s(time_s) / self.model.count_rad
+        memory["present_position"] = _signed(self._position(time_s), 15)
+        memory["present_speed"] = _signed(round(velocity), 15)
+        load = 300 if self._axis.blocked(time_s) else 50 if velocity else 0
+        memory["present_load"] = _signed(load if velocity >= 0 else -load, 10)
+        memory["present_current"] = load // 5
+        memory["present_voltage"] = min(255, round(10 * self.model.volts * self._axis.supply(time_s)))
+        memory["present_temperature"] = min(255, round(self._axis.temperature_c(time_s)))
+        memory["status"] = self.status(time_s)
+        memory["moving"] = int(self._axis.under_way(time_s) or self._axis.blocked(time_s))
+
+
+def _signed(value: int, bit: int) -> int:
+    """A number as the servo has it: its size, and a bit for minus."""
+    size = min(abs(value), (1 << bit) - 1)
+    return size | (1 << bit) if value < 0 else size
