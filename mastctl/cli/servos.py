@@ -6,7 +6,6 @@ import argparse
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
@@ -99,7 +98,10 @@ def _add_baud(parser: argparse.ArgumentParser) -> None:
 
 def _workshop(args: argparse.Namespace) -> Any:
     """The workshop of a family of servos."""
-    return import_module(f"drivers.{args.family}.workshop")
+    from drivers.dynamixel import workshop as dynamixel
+    from drivers.feetech import workshop as feetech
+
+    return feetech if args.family == "feetech" else dynamixel
 
 
 def _whole(text: str) -> int:

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
-from importlib import import_module
 from typing import Any
 
 from drivers.clock import SystemClock
@@ -18,6 +17,7 @@ from drivers.hardware import CAMERAS as CAMERA_DRIVERS
 from drivers.hardware import HEADS as HEAD_DRIVERS
 from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.interfaces import Camera
+from drivers.servo_bus.settings import CountedModel
 from mastctl.conform.camera_checks import CAMERAS, CameraTrial
 from mastctl.conform.checks import (
     Check,
@@ -195,7 +195,11 @@ def count_of(device: DeviceSettings) -> float | None:
     """Return one count of a head of this repository, radians, the coarser axis; None for another."""
     options = device.options
     if device.driver in ("dynamixel", "feetech"):
-        model_named = import_module(f"drivers.{device.driver}.models").model_named
+        from drivers.dynamixel import models as dynamixel
+        from drivers.feetech import models as feetech
+
+        model_named: Callable[[str], CountedModel]
+        model_named = (feetech if device.driver == "feetech" else dynamixel).model_named
         try:
             return float(max(model_named(options[axis]["model"]).count_rad for axis in ("pan", "tilt")))
         except (LookupError, TypeError):

@@ -45,6 +45,7 @@ from tools.campaigns.servo_rigs import (
     HeadRig,
     as_opened,
     dynamixel,
+    feetech,
     fresh_servos,
     opened_on,
     ptu,
@@ -55,9 +56,12 @@ DRIVERS: dict[str, Callable[[], AbstractContextManager[HeadRig]]] = {
     "dynamixel_pty": partial(dynamixel, watchdog_s=0.3, reply_timeout_s=0.05),
     "ptu_pty": ptu,
     "dynamixel": partial(dynamixel, watchdog_s=0.3, reply_timeout_s=0.05, turned=True),
+    "feetech": partial(feetech, lease_s=0.2, reply_timeout_s=0.05, turned=True),
+    "feetech_echo": partial(feetech, lease_s=0.2, reply_timeout_s=0.05, echoes=True, turned=True),
+    "scs": partial(feetech, "SCS0009", lease_s=0.2, reply_timeout_s=0.05, turned=True),
     "ptu": partial(ptu, turned=True),
 }
-"""The last two on a turned clock, without real time."""
+"""Those without ``_pty`` on a turned clock, without real time."""
 MIXTURE = "mixture"
 WORDS = (*HEAD_WORDS, MIXTURE)
 LYING = ("wrong", "drifting", "garbage")

@@ -225,11 +225,11 @@ def ptu(*, turned: bool = False) -> Iterator[HeadRig]:
 def line_alone(driver: str) -> Iterator[tuple[dict[str, Any], Callable[[float], tuple[float, float]]]]:
     """Simulated servos on a pseudo terminal that nobody has opened: a driver's options, and the truth.
 
-    Dynamixel servos stop by their watchdog 0.4 s after the last packet.
+    Dynamixel servos stop by their watchdog 0.4 s after the last packet, Feetech ones where their lease ends.
     """
     clock = SystemClock()
     panel, axes = _axes(clock)
-    device: DynamixelBus | SimulatedPtu
+    device: DynamixelBus | FeetechBus | SimulatedPtu
     if driver == "dynamixel":
         settings = {"baud_rate": 3, "return_delay_time": 0}
         device = DynamixelBus(
@@ -241,6 +241,13 @@ def line_alone(driver: str) -> Iterator[tuple[dict[str, Any], Callable[[float], 
             "baud": 1_000_000, "watchdog_s": 0.4, "reply_timeout_s": 0.1,
             "acceleration_rad_per_s2": ACCELERATION_RAD_PER_S2,
         }  # fmt: skip
+    elif driver == "feetech":
+        device = FeetechBus(
+            SimulatedFeetechServo("sts3215", number, axis, time_s=clock.now_s())
+            for number, axis in enumerate(axes, start=1)
+        )
+        ends = [{"id": n, "model": "STS3215", "limits_rad": list(LIMITS_RAD[n - 1])} for n in (1, 2)]
+        options = {"reply_timeout_s": 0.1, "acceleration_rad_per_s2": ACCELERATION_RAD_PER_S2}
     else:
         device = SimulatedPtu("d46_70", *axes)
         ends, options = [{"limits_rad": list(limits)} for limits in LIMITS_RAD], {}

@@ -100,7 +100,7 @@ def made(driver: str, folder: Path, watchdog: bool = False) -> Iterator[Bench]:
         yield Bench(driver, folder, config, truth)
 
 
-@pytest.mark.parametrize("bench", ["dynamixel with its watchdog", "flir_ptu"], indirect=True)
+@pytest.mark.parametrize("bench", ["dynamixel with its watchdog", "feetech", "flir_ptu"], indirect=True)
 def test_killed_under_way_the_watchdog_or_halt_stops_the_head(bench: Bench) -> None:
     with daemon_process(bench.folder, bench.config) as daemon, Client(line(daemon)) as client:
         bench.under_way(client)
