@@ -11,6 +11,8 @@ from drivers.approach import ApproachedAxis
 from drivers.dynamixel.models import MODELS
 from drivers.dynamixel.settings import DynamixelAxisSettings, DynamixelSettings, dynamixel_settings
 from drivers.faults import BOUNDS, CAMERA_WORDS, HEAD_WORDS, LOG_WORDS, WHEN
+from drivers.feetech.models import MODELS as FEETECH_MODELS
+from drivers.feetech.settings import FeetechAxisSettings, FeetechSettings, feetech_settings
 from drivers.flir_ptu import options as flir_ptu
 from drivers.recordings.replay import OPTIONS as REPLAY_OPTIONS
 from drivers.servo_bus.settings import ServoAxisSettings
@@ -49,6 +51,21 @@ def dynamixel() -> Schema:
     found = _settings(noted.schema(), DynamixelSettings)
     for name in ("pan", "tilt"):
         _settings(found["properties"][name], ApproachedAxis, ServoAxisSettings, DynamixelAxisSettings)
+    return found
+
+
+def feetech() -> Schema:
+    """Options of a Feetech head, whatever the models."""
+    with watched("options.") as noted:
+        for model in ("STS3215", "SCS0009"):
+            axis = {"id": 1, "model": model, "limits_rad": [-0.1, 0.1]}
+            feetech_settings({"port": "/dev/x", "pan": axis, "tilt": {**axis, "id": 2}})
+    for axis_name in ("pan", "tilt"):
+        noted.at(f"{axis_name}.model").tell({"type": "string", "examples": sorted(FEETECH_MODELS)})
+    noted.at("lease_s").value.pop("default")  # it depends on speed and acceleration
+    found = _settings(noted.schema(), FeetechSettings)
+    for name in ("pan", "tilt"):
+        _settings(found["properties"][name], ApproachedAxis, ServoAxisSettings, FeetechAxisSettings)
     return found
 
 

@@ -20,6 +20,7 @@ from tools.schemas.watched import Schema
 TABLES = {
     "A whole configuration": (),
     "Options of `dynamixel`": ("pan_tilt", "dynamixel"),
+    "Options of `feetech`": ("pan_tilt", "feetech"),
     "Options of `flir_ptu`": ("pan_tilt", "flir_ptu"),
     "Options of `v4l2`": ("cameras", "v4l2"),
     "Simulation": ("simulation",),
@@ -28,6 +29,7 @@ TABLES = {
 AXES_ALIKE = "tilt."
 AUTHORS = (
     "watchdog_s",
+    "lease_s",
     "pan.settle_rad",
     "pan.current_limit_A",
     "cameras.seed",
