@@ -19,7 +19,7 @@ from calib.geometry.rigid import FloatArray
 from calib.targets.board_file import FAMILIES
 from calib.targets.boards import AnyBoard, AprilGrid, Board, Charuco, Checkerboard, Corners, DotBoard
 from calib.targets.dot_grid import fit_plane_map
-from calib.targets.dots import DotsFound, find_dots
+from calib.targets.dots import DotsFound, find_dots, in_8_bits
 from calib.targets.markers import (
     Image,
     MarkerBoard,
@@ -243,7 +243,7 @@ def find_corners(board: AnyBoard, image: Levels) -> Corners | CornersNotFound:
         If the image is none of these.
     """
     levels = _grey(image)
-    eight = _in_8_bits(levels)
+    eight = in_8_bits(levels)
     if isinstance(board, DotBoard):
         return _dots(board, levels)
     pattern = pattern_of(board)
@@ -407,12 +407,3 @@ def _grey(image: Levels) -> Levels:
         return image
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
     return grey.astype(np.uint8) if image.dtype == np.uint8 else grey.astype(np.uint16)
-
-
-def _in_8_bits(levels: Levels) -> Image:
-    """The image in 8 bits: all levels but the darkest and the brightest thousandth, spread over them."""
-    if levels.dtype == np.uint8:
-        return levels.astype(np.uint8, copy=False)
-    dark, bright = np.percentile(levels, (0.1, 99.9))
-    spread = (levels - dark) * (255.0 / max(bright - dark, 1.0))
-    return np.asarray(np.clip(np.rint(spread), 0, 255), dtype=np.uint8)

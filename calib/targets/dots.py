@@ -80,7 +80,7 @@ def find_dots(
     """
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"an image of {image.shape} {image.dtype} where (h, w) uint8 or uint16 is expected")
-    levels, image = image, _in_8_bits(image)
+    levels, image = image, in_8_bits(image)
     steps_px = None
     if isinstance(expected, PredictedBoard):
         no_hope = hopeless(expected)
@@ -112,8 +112,8 @@ def find_dots(
     return failure
 
 
-def _in_8_bits(image: Levels) -> Image:
-    """The image in 8 bits: all levels but the darkest and the brightest thousandth, spread over them."""
+def in_8_bits(image: Levels) -> Image:
+    """Return an image in 8 bits: its levels but the darkest and brightest thousandth, spread over them."""
     if image.dtype == np.uint8:
         return image.astype(np.uint8, copy=False)
     dark, bright = np.percentile(image, (0.1, 99.9))

@@ -59,3 +59,7 @@ def test_no_method_answers_with_a_dictionary_of_anything(of: type) -> None:
     for name, method in vars(of).items():
         told = getattr(method, "__annotations__", {}).get("return", "")
         assert "Any" not in str(told), f"{name} returns {told}"
+
+
+def test_the_client_that_waits_has_every_question_of_the_one_for_asyncio() -> None:
+    assert {name for name in dir(Calls) if name[0] != "_"} == {name for name in dir(Client) if name[0] != "_"}

@@ -26,15 +26,13 @@ from mastctl.client import Client, ClientError
 from mastctl.watch.handoffs import read_log
 from tools.studies import handoff as study
 from tools.studies.handoff_record import (
-    BrickPoints,
     Handed,
     HandoffExperiment,
     HandoffRecord,
-    KnownPoint,
     summarise_handoffs,
 )
 from tools.studies.handoff_report import handoff_table, handoff_targets, view_picture, write_handoff_report
-from tools.studies.handoff_run import run_handoff_experiment
+from tools.studies.handoff_run import KnownPoint, run_handoff_experiment
 
 STEP = "navcam to hazcam"
 FRAME = "hazcam_left-000001-00000000-0000"
@@ -139,7 +137,7 @@ def test_bricks_points_are_seen_only_where_nothing_hides_them(repository: Path) 
         site_from_rover=Rigid.identity(),
         frame_truth=lambda camera, sequence: truth,
     )
-    known = BrickPoints(cast(SimulatedRover, rover))
+    known = study.BrickPoints(cast(SimulatedRover, rover))
     points = known.points()
     assert [point.kind for point in points] == ["corner"] * 4 + ["face"] * 5
     seen = {tuple(point.position_m): known.seen_px(FRAME, point.position_m) for point in points}

@@ -23,6 +23,8 @@ from drivers.clock import Clock, SystemClock
 from mastctl.access.tokens import TOKEN_BYTES, Token, TokenList, digest_of
 from mastctl.errors import NotLetIn, TooMany
 
+log = logging.getLogger(__name__)
+
 WINDOW_S = 60.0
 MOST_OF_ONE = 10  # different wrong tokens from one address in a window
 MOST_OF_ALL = 100  # from all; then no wrong one is heard from any address that gave one
@@ -75,8 +77,6 @@ class Guesses:
             if not digests:
                 del self._wrong[address]
 
-
-log = logging.getLogger(__name__)
 
 REREAD_S = 0.5  # how late a new or a revoked token may be known
 SESSION_S = 12 * 3600.0

@@ -17,6 +17,8 @@ from mastctl.devices.ways import Way
 from mastctl.motion.results import PointingError
 from mastctl.motion.settings import PointingSettings
 
+T = TypeVar("T")
+
 WATCHED_S = 0.05
 """How often a head at rest is read while a moment is waited for; a stop is noticed as soon."""
 
@@ -265,8 +267,6 @@ def reached(
         raise refused
     return min(found, key=lambda candidate: candidate[:2])[2]
 
-
-T = TypeVar("T")
 
 LOOKED_S = 0.02  # how late a stop may be noticed
 

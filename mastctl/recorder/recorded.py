@@ -1,4 +1,4 @@
-"""What a recording tells when it is read again: attached files, operations, hand-offs, frames."""
+"""A recording read again: attached files, operations, hand-offs, frames; and the files that serve it anew."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 MAST_SCHEMA = "mastctl/mast/1"
 CONFIG_SCHEMA = "mastctl/config/1"
+
+SPEED_RAD_PER_S, WHOLE_TURN_RAD = 1.0, 6.2832  # of a replay without the limits of a configuration
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,10 +161,6 @@ class _Reader:
             self.handoffs.append(told)
         elif isinstance(told.get("id"), str):
             self.operations[told["id"]] = told
-
-
-SPEED_RAD_PER_S = 1.0
-WHOLE_TURN_RAD = 6.2832
 
 
 def replay_files(recording: Recording, folder: Path, listen: dict[str, Any]) -> Path:

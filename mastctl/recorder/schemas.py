@@ -95,6 +95,7 @@ _PROPERTIES: Mapping[str, Mapping[str, Any]] = {
         "predicted": {"type": "boolean"}, "position_m": _POINT, "looks": {"type": "integer"},
         "misses": {"type": "integer"},
     },
+    "lease": {"holder": _TEXT, "kind": _TEXT, "until_s": {"type": ["number", "null"]}},
     "mast": {"file": _TEXT, "name": _TEXT, "digest": _TEXT},
     "recorder": {
         "dropped": {"type": "object", "description": "messages that were not written, by topic, so far"},

@@ -36,6 +36,8 @@ from mastctl.as_json import picked
 from mastctl.control.standing import StandingFault
 from mastctl.json_lines import OtherFile, append_line
 
+log = logging.getLogger(__name__)
+
 SCHEMA = "mastctl/handoff/1"
 TOPIC = "/handoff"
 """Of a recording."""
@@ -223,8 +225,6 @@ def _landed(line: Section) -> dict[str, Landed]:
         )
     return landed
 
-
-log = logging.getLogger(__name__)
 
 NAME = "handoff_log"
 KEPT = 2000

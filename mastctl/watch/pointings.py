@@ -22,6 +22,8 @@ from drivers.interfaces import COARSE_COUNT_RAD
 from mastctl.control.records import Operation
 from mastctl.json_lines import append_line, read_lines
 
+log = logging.getLogger(__name__)
+
 DISAGREE = "eyes_disagree"
 
 Pair = tuple[float, float]
@@ -146,8 +148,6 @@ def _numbers(values: object, key: str, size: int) -> tuple[float, ...]:
         raise ValueError(f"{key} is not {size} finite numbers")
     return tuple(float(value) for value in values)
 
-
-log = logging.getLogger(__name__)
 
 FILE = "pointings.jsonl"
 MOST_BYTES = 4 << 20

@@ -33,6 +33,8 @@ from mastctl.control.records import Operation
 from mastctl.watch.evidence import Evidence, Expected, Judge, Sums, expected, sums_of
 from mastctl.watch.pointings import FILE, Journal, Measured, measured_by
 
+log = logging.getLogger(__name__)
+
 DAYS = 7
 DAY_S = 86400.0
 SPAN_S = 6 * 3600.0
@@ -243,8 +245,6 @@ def _what_drifts(evidence: Evidence, since: str) -> str:
         "calibrate again"
     )
 
-
-log = logging.getLogger(__name__)
 
 TOLD = 50
 """Newest pointings that are told one by one."""

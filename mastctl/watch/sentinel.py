@@ -16,6 +16,8 @@ from calib.errors import BadFile
 from calib.geometry.rigid import FloatArray
 from mastctl.watch.reference import LOOKS, REFERENCE, Reference, read_looks, read_reference
 
+log = logging.getLogger(__name__)
+
 CONFIRMED = 2
 """So many looks one after the other must name the same change before it is told."""
 
@@ -228,8 +230,6 @@ def ago(time: str, now: datetime) -> str:
     words = for_long(time, now)
     return f"at {words}" if age is None or age <= -90.0 else f"{words} ago"
 
-
-log = logging.getLogger(__name__)
 
 POLL_S = 2.0
 ANEW_S = 60.0

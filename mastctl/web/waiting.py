@@ -25,6 +25,8 @@ from drivers.clock import Clock, SystemClock
 from mastctl.control.publisher import LoopSubscription, Publisher, Topic
 from mastctl.errors import Unable
 
+T = TypeVar("T")
+
 
 class Turns:
     """What waits to be taken up on one event loop; used on that loop only."""
@@ -52,8 +54,6 @@ class Turns:
             if self._waiting:
                 asyncio.get_running_loop().call_soon(self._next)
 
-
-T = TypeVar("T")
 
 AT_ONCE = 40  # worker threads for everything but pictures
 PICTURES_AT_ONCE = 4  # of one camera

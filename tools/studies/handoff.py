@@ -15,23 +15,62 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from calib.files.mast_file import load_rig
+from calib.geometry.rigid import FloatArray
+from drivers.sim.rover import SimulatedRover
 from mastctl.cli import output
 from mastctl.cli.output import check_folder
 from mastctl.cli.service import add_daemon_options, client_of, refuse_daemon_options
 from mastctl.cli.tasks import refuse_task_options, run_bar, tell_report
 from mastctl.client import Client
 from mastctl.config import load_config
+from mastctl.devices.frames import camera_and_sequence
 from mastctl.experiment.simulated import Rover, SimulationTruth, running_rover
 from tools.command import end, options, run_cases
-from tools.studies.handoff_record import BrickPoints, HandoffExperiment, HandoffRecord, summarise_handoffs
+from tools.studies.handoff_record import HandoffExperiment, HandoffRecord, summarise_handoffs
 from tools.studies.handoff_report import bias_sentences, handoff_table, write_handoff_report
-from tools.studies.handoff_run import STEPS, run_handoff_experiment
+from tools.studies.handoff_run import STEPS, KnownPoint, run_handoff_experiment
 
 PICTURES_PER_STEP = 4
 TARGETS = {"ground": "textured ground", "corner": "bricks' corners", "face": "middles of bricks' faces"}
 MOST_BRICKS = 24  # what a scene takes
 MOST_POINTS = 9  # of one brick: its upper corners and its faces but the bottom
+HIDDEN_M = 0.003
+"""What stands before a point by less does not hide it: a ray at a corner meets the brick there or passes."""
+
+
+class BrickPoints:
+    """Corners and middles of faces of the simulated rover's bricks."""
+
+    def __init__(self, rover: SimulatedRover) -> None:
+        self._rover = rover
+
+    def points(self) -> Sequence[KnownPoint]:
+        """See `tools.studies.handoff_run.KnownPoints`."""
+        rover_from_site = self._rover.site_from_rover.inverse
+        found = []
+        for group, brick in enumerate(self._rover.scene.bricks):
+            # the corners at the bottom are in the ground
+            for kind, places in (("corner", brick.corners_m[:4]), ("face", brick.faces_m)):
+                found += [KnownPoint(kind, group, one) for one in np.asarray(rover_from_site.points(places))]
+        return found
+
+    def seen_px(self, frame_id: str, position_m: FloatArray) -> tuple[float, float] | None:
+        """See `tools.studies.handoff_run.KnownPoints`."""
+        truth = self._rover.frame_truth(*camera_and_sequence(frame_id))
+        camera = truth.camera_in_rover
+        pixel, valid = camera.project(position_m)
+        if not valid or not camera.holds(pixel):
+            return None
+        ray = camera.ray(pixel)
+        met_m = self._rover.scene.cast(
+            truth.site_from_rover.points(ray.origins_m), truth.site_from_rover.vectors(ray.directions)
+        )
+        if float(met_m) < float(np.linalg.norm(position_m - ray.origins_m)) - HIDDEN_M:
+            return None
+        return float(pixel[0]), float(pixel[1])
 
 
 @dataclass(frozen=True)

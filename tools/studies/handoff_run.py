@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from calib.files.mast_file import parse_rig
 from calib.geometry.covariance import RigCovariance, stored_covariance
 from calib.geometry.handoff import Joints, hand_off
 from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray
 from calib.matching.handed_over import matched_handoff
 from calib.matching.handoff import Eye, refine_handoff
 from calib.matching.warp import grey
@@ -30,8 +32,6 @@ from tools.studies.handoff_record import (
     Handed,
     HandoffExperiment,
     HandoffRecord,
-    KnownPoint,
-    KnownPoints,
     summarise_handoffs,
 )
 
@@ -43,6 +43,25 @@ PAN_RANGE_RAD = {"pancam": 1.0, "navcam": 0.35}
 
 KNOWN_SLACK = 0.2
 """Known points count as at a distance within this share of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPoint:
+    """A point (3,) of the rover frame; points of one ``group`` lie near each other."""
+
+    kind: str
+    group: int
+    position_m: FloatArray
+
+
+class KnownPoints(Protocol):
+    """Known points, and where frames truly show them."""
+
+    def points(self) -> Sequence[KnownPoint]:
+        """All of them, group by group."""
+
+    def seen_px(self, frame_id: str, position_m: FloatArray) -> tuple[float, float] | None:
+        """Where a frame shows a point; None if it is hidden or outside."""
 
 
 def run_handoff_experiment(

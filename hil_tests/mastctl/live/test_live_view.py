@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import signal
 import socket
 import sys
@@ -25,9 +26,11 @@ from hil_tests.mastctl.live.foxglove_client import Viewer
 from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.config import Config, Listen, load_config, parse_config
+from mastctl.control.publisher import TOPICS
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Unable
 from mastctl.live.settings import LiveSettings
+from mastctl.recorder.feed import ELSEWHERE
 
 IMAGE = "/camera/navcam_left/image"
 
@@ -68,13 +71,21 @@ def viewer(daemon: tuple[RunningDaemon, int]) -> Iterator[Viewer]:
         yield one
 
 
-def test_every_topic_is_offered_with_its_schema_and_nothing_else_is(viewer: Viewer) -> None:
+def test_every_topic_of_the_page_is_offered_with_its_schema_and_nothing_else_is(
+    viewer: Viewer, repository: Path
+) -> None:
     assert viewer.server["capabilities"] == [] and viewer.server["name"] == "mastctl"
     kinds = {topic: one["schemaName"] for topic, one in viewer.channels.items()}
     assert kinds[IMAGE] == "foxglove.RawImage" and kinds["/tf"] == "foxglove.FrameTransforms"
     assert kinds["/camera/pancam_left/calibration"] == "foxglove.CameraCalibration"
     assert kinds["/target/scene"] == "foxglove.SceneUpdate"
-    assert {"/state", "/fault", "/joints", "/operation", "/residual", "/target"} <= kinds.keys()
+    page = (repository / "docs/how-to/recording.md").read_text()
+    table = page.split("Then, by topic:")[1].split("\nJSON topics")[0]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    documented = {topic for row in rows for topic in re.findall("`(/[^`]+)`", row)}
+    offered = {re.sub("^/camera/[^/]+/", "/camera/NAME/", topic) for topic in kinds}
+    assert offered == documented - {"/handoff", "/recorder"}
+    assert {f"/{topic}" for topic in TOPICS - ELSEWHERE - {"frame"}} <= offered
     for one in viewer.channels.values():
         assert one["encoding"] == ("protobuf" if one["schemaName"].startswith("foxglove.") else "json")
         assert one["schema"]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -93,6 +95,21 @@ def test_the_status_is_told_as_it_is_when_somebody_asks(publisher: Publisher) ->
 
 def operation(name: str, state: str, **more: Any) -> Operation:
     return Operation(name, state, {}, 0.0, **more)  # type: ignore[arg-type]
+
+
+def test_every_metric_has_its_row_on_the_page_and_no_other(publisher: Publisher, repository: Path) -> None:
+    watched: dict[str, Any] = {
+        "calibration": {"verdict": "good", "pointings": 20},
+        "sentinel": {"reference": "a", "level": "good", "age_s": 5.0},
+    }
+    metrics = Metrics(lambda: STATUS | watched, dict, publisher)
+    families = text_string_to_metric_families(metrics.text().decode())
+    told = {one.name for one in families if re.match("mastctl_(?!.*_created$)", one.name)}
+    page = (repository / "docs/how-to/operations.md").read_text()
+    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `mastctl_")]
+    documented = {name.removesuffix("_total") for row in rows for name in re.findall("`(mastctl_\\w+)`", row)}
+    assert told == documented
+    metrics.close()
 
 
 def test_operations_are_counted_once_when_they_have_ended(publisher: Publisher) -> None:
