@@ -15,7 +15,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from xml.sax.saxutils import escape
 
-from mastctl.control.table import CHOICES, EVENTS, HAPPENS, MEANINGS, TABLE, WORDS, Event, Word, leads_to
+from mastctl.answers import Word
+from mastctl.control.table import CHOICES, EVENTS, HAPPENS, MEANINGS, TABLE, WORDS, Event, leads_to
 from tools.command import end
 
 BEGIN, END = "<!-- states: begin -->", "<!-- states: end -->"

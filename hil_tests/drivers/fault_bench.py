@@ -6,7 +6,8 @@ import numpy as np
 
 from drivers.clock import ManualClock
 from drivers.faults import FaultPanel
-from drivers.sim.cameras import CameraSettings, SimulatedCamera
+from drivers.sim.camera_settings import CameraSettings
+from drivers.sim.cameras import SimulatedCamera
 from drivers.sim.heads import PRESETS
 from drivers.sim.pan_tilt import SimulatedPanTilt
 

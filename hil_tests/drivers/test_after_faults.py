@@ -19,7 +19,9 @@ from hil_tests.drivers.turned import Gate, Turned
 from hil_tests.waiting import NET_S
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
-from mastctl.motion.loop import AnglesTarget, PointingError, PointingLoop, PointRequest
+from mastctl.motion.loop import PointingLoop
+from mastctl.motion.requests import AnglesTarget, PointRequest
+from mastctl.motion.results import PointingError
 from tools.campaigns.servo_rigs import dynamixel, ptu
 
 BARE = Rig("bare", Mast(np.zeros(3), np.zeros(3)), {}, {})

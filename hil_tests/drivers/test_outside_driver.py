@@ -23,7 +23,9 @@ from drivers.interfaces import Camera, Frame, PanTilt
 from drivers.open_hardware import open_hardware
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
-from mastctl.motion.loop import AnglesTarget, PixelTarget, PointingError, PointingLoop, PointRequest, Step
+from mastctl.motion.loop import PointingLoop
+from mastctl.motion.requests import AnglesTarget, PixelTarget, PointRequest
+from mastctl.motion.results import PointingError, Step
 from mastctl.setup.machine import examine_drivers
 
 TOO_NEW_S = 1.5

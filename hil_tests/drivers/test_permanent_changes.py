@@ -14,7 +14,7 @@ from drivers.dynamixel.link import Link
 from drivers.faults import FaultPanel
 from drivers.flir_ptu import workshop as ptu_workshop
 from drivers.flir_ptu.head import open_head as open_ptu
-from drivers.sim.heads import AxisSettings
+from drivers.sim.axis import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
 from drivers.sim.wire.memory_line import MemoryLine

@@ -23,8 +23,7 @@ from drivers.flir_ptu import options as flir_ptu
 from drivers.hardware import CAMERAS, HEADS, OURS
 from drivers.recordings.replay import OPTIONS as REPLAY_OPTIONS
 from drivers.sim import settings as simulation
-from drivers.sim.camera_settings import TemperatureSettings
-from drivers.sim.cameras import CameraSettings
+from drivers.sim.camera_settings import CameraSettings, TemperatureSettings
 from drivers.sim.heads import HEAD_KEYS
 from drivers.sim.scene import SceneSettings
 from drivers.v4l2 import options as v4l2

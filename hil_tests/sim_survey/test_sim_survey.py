@@ -23,7 +23,8 @@ from tools.sim_survey.blunders import (
     with_swapped_boards,
     with_wrong_prism,
 )
-from tools.sim_survey.survey import Ring, SurveyPlan, SurveyTruth, simulate_survey
+from tools.sim_survey.plan import Ring, SurveyPlan, SurveyTruth
+from tools.sim_survey.survey import simulate_survey
 
 ROOT = Path(__file__).resolve().parents[2]
 RIG_FILE = ROOT / "configs/sim/rocky8.yaml"

@@ -23,7 +23,7 @@ from calib.survey.records import Sigma, Survey
 from hil_tests.mastctl.calibration.survey_world import RIG_FILE
 from mastctl.calibration.run import FITS
 from mastctl.experiment.tasks import NoExecutor, Work, open_executor
-from tools.sim_survey.survey import SurveyPlan
+from tools.sim_survey.plan import SurveyPlan
 from tools.studies.calibration import main, study_as_json, table_iv, table_v, write_study_report
 from tools.studies.calibration_survey import (
     CalibrationExperiment,

@@ -59,20 +59,6 @@ from mastctl.motion.results import (
 from mastctl.motion.settings import PointingSettings
 from mastctl.motion.steps import DevicesLike, FoundAgain, Steps
 
-__all__ = [
-    "Aim",
-    "AnglesTarget",
-    "PixelTarget",
-    "PointRequest",
-    "Pointing",
-    "PointingError",
-    "PointingLoop",
-    "PointingResult",
-    "PointingSettings",
-    "PositionTarget",
-    "Step",
-]
-
 log = logging.getLogger(__name__)
 
 

@@ -40,7 +40,8 @@ from mastctl.cli.output import not_negative
 from mastctl.packaged import config_folder
 from tools.command import end, held_percent, options, rms, run_cases
 from tools.sim_survey.blunders import with_fewer_dots, with_moved_tape, with_scattered_dots
-from tools.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
+from tools.sim_survey.plan import SurveyPlan, SurveyTruth
+from tools.sim_survey.survey import simulate_survey
 
 DIRECTIONS_RAD = ((-0.8, -0.2), (0.0, -0.4), (0.7, -0.7))
 RANGES_M = (2.0, 6.0, 10.0)

@@ -25,7 +25,7 @@ from dynamixel_sdk import PacketHandler
 from drivers.dynamixel.packets import take_status
 from drivers.flir_ptu import protocol
 from drivers.flir_ptu.protocol import LineSplitter, answer_of, number_of
-from drivers.sim.heads import AxisSettings
+from drivers.sim.axis import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_packets import InstructionParser

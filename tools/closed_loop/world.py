@@ -18,7 +18,8 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
 from drivers.clock import SystemClock
 from drivers.faults import FaultPanel
-from drivers.sim.cameras import CameraSettings, SimulatedCamera
+from drivers.sim.camera_settings import CameraSettings
+from drivers.sim.cameras import SimulatedCamera
 from drivers.sim.heads import PRESETS
 from drivers.sim.render import Renderer, compile_renderer
 from drivers.sim.scene import SceneSettings, build_scene

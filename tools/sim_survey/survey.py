@@ -20,8 +20,6 @@ from calib.survey.records import Purpose, StationKind, StationPoint, Survey, Sur
 from calib.targets.boards import Dots
 from tools.sim_survey.plan import BOARD, PRISMS_IN_ROVER_M, Ring, SurveyPlan, SurveyTruth, rover_from_head
 
-__all__ = ["Ring", "SurveyPlan", "SurveyTruth", "simulate_survey"]
-
 PLACES = ((-1, -1), (1, 1), (1, -1), (-1, 1), (0, 0), (0, 1), (1, 0), (0, -1), (-1, 0))
 """Where the boards of a ring stand in the picture, right and up; further ones stand anywhere."""
 

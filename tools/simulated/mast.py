@@ -38,7 +38,8 @@ from drivers.sim.pan_tilt import SimulatedPanTilt
 from mastctl.calibration.run import Calibrated, calibrate, checked_survey
 from mastctl.cli.output import at_least
 from tools.command import end
-from tools.sim_survey.survey import Ring, SurveyPlan, simulate_survey
+from tools.sim_survey.plan import Ring, SurveyPlan
+from tools.sim_survey.survey import simulate_survey
 
 SIGMA = Sigma(station_m=0.001, dot_px=0.1, joint_rad=3e-5)
 """The joints' is half a step of the packaged rover's head."""

@@ -25,7 +25,8 @@ from drivers.sim.scene import build_scene
 from mastctl.cli.output import at_least, not_negative
 from tools.command import end
 from tools.sim_survey.board import draw_board, photograph
-from tools.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
+from tools.sim_survey.plan import SurveyPlan, SurveyTruth
+from tools.sim_survey.survey import simulate_survey
 
 BLUR_PX, NOISE_DN = 0.7, 2.0
 

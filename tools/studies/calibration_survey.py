@@ -22,7 +22,8 @@ from calib.geometry.rigid import FloatArray
 from calib.survey.records import Sigma
 from mastctl.calibration.landing import click, handoff_errors_px, pointing_error_px, seen
 from mastctl.calibration.run import FITS, Method
-from tools.sim_survey.survey import SurveyPlan, simulate_survey
+from tools.sim_survey.plan import SurveyPlan
+from tools.sim_survey.survey import simulate_survey
 
 METHODS: tuple[Method, ...] = ("paper", "joint")
 PAPER_STATION_M = 0.002

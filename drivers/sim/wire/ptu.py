@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from drivers.errors import BadOptions
 from drivers.faults import nearest
 from drivers.sim.wire.axis import WireAxis
-from drivers.sim.wire.line import Reply
+from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.ptu_axis import MODELS, STEPS, PtuAxis
 from drivers.sim.wire.ptu_unit import CommandRefused, PtuUnit
 

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from calib.geometry.rig import Rig
 from calib.survey.records import Survey
 from calib.targets.boards import Dots
-from tools.sim_survey.plan import PAPER_RINGS, Ring, rover_from_head
-from tools.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
+from tools.sim_survey.plan import PAPER_RINGS, Ring, SurveyPlan, SurveyTruth, rover_from_head
+from tools.sim_survey.survey import simulate_survey
 
 
 def rings(boards: int, *pairs: str) -> tuple[Ring, ...]:

@@ -14,7 +14,8 @@ from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
 from calib.geometry.stereo import triangulate
 from hil_tests.calib.adjust.small_surveys import held, rings, survey_of
-from tools.sim_survey.survey import SurveyPlan, simulate_survey
+from tools.sim_survey.plan import SurveyPlan
+from tools.sim_survey.survey import simulate_survey
 
 SURVEYS = 16
 SMALL = SurveyPlan(rings=rings(2), mast_boards=5, check_boards=0)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from calib.calibrate.scene.drift import ALARM_SIGMAS, VIEW_SIGMA, ViewShift, find_drift, view_change
-from tools.campaigns.sentinel import RESTS, SIZE, ChangedRig, FeatureSite, rig, shown
+from tools.campaigns.sentinel import SIZE, FeatureSite, rig, shown
+from tools.campaigns.sentinel_days import RESTS, ChangedRig
 
 SEED = 11
 

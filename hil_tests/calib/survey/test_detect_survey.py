@@ -17,7 +17,8 @@ from calib.survey.records import Survey
 from calib.targets.dot_order import PredictedBoard, Upright
 from hil_tests.calib.targets.boards import gravel
 from tools.sim_survey.board import draw_board, photograph
-from tools.sim_survey.survey import Ring, SurveyPlan, simulate_survey
+from tools.sim_survey.plan import Ring, SurveyPlan
+from tools.sim_survey.survey import simulate_survey
 
 RMS_PX = 0.03
 PICTURES = 6

@@ -16,7 +16,8 @@ from calib.survey.check import check_survey
 from calib.survey.records import StationPoint, Survey, SurveyFinding, SurveyImage
 from calib.targets.boards import Board
 from tools.sim_survey.blunders import with_moved_tape, with_swapped_boards, with_wrong_prism
-from tools.sim_survey.survey import SurveyPlan, simulate_survey
+from tools.sim_survey.plan import SurveyPlan
+from tools.sim_survey.survey import simulate_survey
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -18,7 +18,7 @@ from drivers.errors import DriverError
 from drivers.faults import FaultPanel
 from drivers.interfaces import PanTilt, Reading
 from drivers.serial_line import OpenLine, SerialLine
-from drivers.sim.heads import AxisSettings
+from drivers.sim.axis import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_packets import Instruction, InstructionParser

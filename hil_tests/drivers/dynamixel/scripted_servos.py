@@ -11,8 +11,9 @@ from contextlib import contextmanager
 from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.link import REPLY_TIMEOUT_S, Link
 from drivers.serial_line import OpenLine, SerialLine
+from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.dynamixel_packets import Instruction, InstructionParser, status_packet
-from drivers.sim.wire.line import PtyLine, Reply
+from drivers.sim.wire.line import PtyLine
 from drivers.sim.wire.memory_line import MemoryLine
 from drivers.simulation_clock import SimulationClock
 from hil_tests.drivers.turned import START_S, Turned

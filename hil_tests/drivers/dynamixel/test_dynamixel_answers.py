@@ -17,12 +17,12 @@ from drivers.dynamixel.head import DynamixelHead, open_head
 from drivers.errors import DriverError
 from drivers.faults import FaultPanel
 from drivers.interfaces import Reading
-from drivers.sim.heads import AxisSettings
+from drivers.sim.axis import AxisSettings
 from drivers.sim.wire.axis import WireAxis
+from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_packets import unstuffed
 from drivers.sim.wire.dynamixel_servo import VOLTAGE, SimulatedServo
-from drivers.sim.wire.line import Reply
 from drivers.sim.wire.memory_line import MemoryLine
 from drivers.simulation_clock import SimulationClock
 from hil_tests.drivers.dynamixel.dynamixel_rig import failed

@@ -27,8 +27,9 @@ from drivers.dynamixel.registers import Register
 from drivers.errors import BadOptions, BadReply, LineLost, NoReply, Refused
 from drivers.serial_line import SerialLine
 from drivers.servo_bus.bus import Bus
+from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.dynamixel_packets import Instruction, fast_status_packets
-from drivers.sim.wire.line import Reply, TcpLine
+from drivers.sim.wire.line import TcpLine
 from hil_tests.drivers.dynamixel.scripted_servos import BAUD_RATE, ScriptedServos, number, says, scripted
 from hil_tests.drivers.turned import turned
 from hil_tests.waiting import NET_S

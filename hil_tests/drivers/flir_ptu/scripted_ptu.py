@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from drivers.sim.wire.line import Reply
+from drivers.sim.wire.carrier import Reply
 
 OPTIONS: dict[str, Any] = {
     "pan": {"limits_rad": [-2.5, 2.5]}, "tilt": {"limits_rad": [-0.7, 0.5]}, "settle_s": 0.0,

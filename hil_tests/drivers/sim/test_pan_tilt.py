@@ -11,7 +11,8 @@ import pytest
 from drivers.clock import ManualClock
 from drivers.errors import BadOptions, DriverError, NoReply
 from drivers.interfaces import PanTilt
-from drivers.sim.heads import PRESETS, AxisSettings, HeadSettings, head_settings
+from drivers.sim.axis import AxisSettings
+from drivers.sim.heads import PRESETS, HeadSettings, head_settings
 from drivers.sim.pan_tilt import SimulatedPanTilt
 
 GAP = 0.004

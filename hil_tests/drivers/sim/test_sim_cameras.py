@@ -11,7 +11,8 @@ from drivers.clock import ManualClock, SystemClock
 from drivers.errors import NoFreshFrame
 from drivers.faults import FaultPanel
 from drivers.interfaces import Camera
-from drivers.sim.cameras import RING_FRAMES, CameraSettings, SimulatedCamera
+from drivers.sim.camera_settings import CameraSettings
+from drivers.sim.cameras import RING_FRAMES, SimulatedCamera
 
 SIZE = (64, 48)
 SETTINGS = CameraSettings(rate_hz=10.0, exposure_s=0.01, readout_s=0.02, seed=3)

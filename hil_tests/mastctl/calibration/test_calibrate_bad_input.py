@@ -30,7 +30,7 @@ from tools.sim_survey.blunders import (
     with_swapped_boards,
     with_wrong_prism,
 )
-from tools.sim_survey.survey import Ring
+from tools.sim_survey.plan import Ring
 
 Cells = dict[str, str]
 IMAGE = "navcam_left-021"

@@ -18,7 +18,8 @@ from calib.survey.records import Sigma, SurveyImage
 from hil_tests.calib.adjust.small_surveys import held
 from hil_tests.mastctl.calibration.survey_world import edit_yaml, navcam_survey, write_folder
 from mastctl.cli.main import main
-from tools.sim_survey.survey import Ring, SurveyPlan, simulate_survey
+from tools.sim_survey.plan import Ring, SurveyPlan
+from tools.sim_survey.survey import simulate_survey
 
 SIGMAS = 4.5
 """How many stated sigmas the truth may be off in one seeded survey."""

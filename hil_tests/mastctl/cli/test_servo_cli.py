@@ -16,7 +16,7 @@ import pytest
 from drivers.dynamixel import registers, workshop
 from drivers.dynamixel.link import Link
 from drivers.errors import HardwareFault, OutOfRange, WrongDevice
-from drivers.sim.heads import AxisSettings
+from drivers.sim.axis import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import OVERLOAD, SimulatedServo

@@ -20,7 +20,8 @@ from drivers.clock import SystemClock
 from drivers.errors import NoFreshFrame, NoReply
 from drivers.faults import FaultPanel
 from drivers.interfaces import Frame
-from drivers.sim.heads import AxisSettings, HeadSettings
+from drivers.sim.axis import AxisSettings
+from drivers.sim.heads import HeadSettings
 from drivers.sim.pan_tilt import SimulatedPanTilt
 from hil_tests.mastctl.service_fakes import CONFIG, SIZE_PX, rig
 from mastctl.config import load_config

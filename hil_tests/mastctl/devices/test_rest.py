@@ -16,7 +16,8 @@ from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from mastctl.devices.devices import Devices
 from mastctl.devices.joint_history import DITHER_RAD, JointHistory, RestWatch, dithers
 from mastctl.devices.limits import Limits
-from mastctl.motion.loop import AnglesTarget, PointingError, PointRequest
+from mastctl.motion.requests import AnglesTarget, PointRequest
+from mastctl.motion.results import PointingError
 
 XM430_RAD = 2 * math.pi / 4096
 """A count of a 12-bit servo."""

@@ -24,7 +24,7 @@ from hil_tests.mastctl.calibration.survey_world import RIG_FILE
 from mastctl.experiment.simulated import PointingTask, Rover, one_pointing
 from mastctl.experiment.tasks import Work, open_executor
 from tools.campaigns import dots, keep_out, life, match_sigma, refine, render_bias
-from tools.sim_survey.survey import SurveyPlan
+from tools.sim_survey.plan import SurveyPlan
 from tools.studies.calibration import main
 from tools.studies.calibration_survey import Variant, one_survey, survey_tasks
 from tools.studies.handoff import HandoffTask, one_handoff

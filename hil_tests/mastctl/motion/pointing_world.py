@@ -25,7 +25,9 @@ from mastctl.devices.keep_out import Pair
 from mastctl.devices.limits import Limits
 from mastctl.devices.ways import Way, duration_s
 from mastctl.errors import NotKnown
-from mastctl.motion.loop import PixelTarget, PointingLoop, PointingResult, PointRequest, Step
+from mastctl.motion.loop import PointingLoop
+from mastctl.motion.requests import PixelTarget, PointRequest
+from mastctl.motion.results import PointingResult, Step
 from mastctl.motion.settings import PointingSettings
 
 SIZE_PX = (300, 240)

@@ -20,7 +20,8 @@ from drivers.errors import NoFreshFrame, NoReply
 from hil_tests.mastctl.motion.pointing_world import SIZE_PX, World, clean, click, moving_world, rig, run
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
-from mastctl.motion.loop import Aim, PointingError, PointingResult, PointRequest, PositionTarget
+from mastctl.motion.requests import Aim, PointRequest, PositionTarget
+from mastctl.motion.results import PointingError, PointingResult
 from mastctl.motion.settings import PointingSettings
 
 MIDDLE_PX = (np.array(SIZE_PX) - 1) / 2

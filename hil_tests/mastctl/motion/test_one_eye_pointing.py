@@ -9,8 +9,8 @@ import pytest
 
 from calib.geometry.rig import Rig
 from hil_tests.mastctl.motion.pointing_world import SIZE_PX, World, click, rig, run, true_camera
-from mastctl.motion.loop import AnglesTarget, PointingError, PointingResult, PointRequest, PositionTarget
-from mastctl.motion.requests import PlaneTarget
+from mastctl.motion.requests import AnglesTarget, PlaneTarget, PointRequest, PositionTarget
+from mastctl.motion.results import PointingError, PointingResult
 
 MIDDLE_PX = ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2)
 EYE = "navcam_left"

@@ -25,15 +25,9 @@ from drivers.open_hardware import open_hardware
 from hil_tests.mastctl.motion.pointing_world import SIZE_PX, World, click, rig, run
 from mastctl.devices.devices import RESTING_PERIOD_S, Devices
 from mastctl.devices.limits import Limits
-from mastctl.motion.loop import (
-    AnglesTarget,
-    PixelTarget,
-    PointingError,
-    PointingLoop,
-    PointingResult,
-    PointRequest,
-    Step,
-)
+from mastctl.motion.loop import PointingLoop
+from mastctl.motion.requests import AnglesTarget, PixelTarget, PointRequest
+from mastctl.motion.results import PointingError, PointingResult, Step
 from mastctl.packaged import config_folder
 
 MIDDLE_PX = ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2)

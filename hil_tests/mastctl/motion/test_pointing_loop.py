@@ -21,17 +21,9 @@ from hil_tests.mastctl.motion.pointing_world import (
     true_camera,
 )
 from mastctl.as_json import as_json
-from mastctl.motion.loop import (
-    Aim,
-    AnglesTarget,
-    PixelTarget,
-    PointingError,
-    PointingLoop,
-    PointRequest,
-    PositionTarget,
-    Step,
-)
-from mastctl.motion.results import Preview
+from mastctl.motion.loop import PointingLoop
+from mastctl.motion.requests import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
+from mastctl.motion.results import PointingError, Preview, Step
 from mastctl.motion.settings import PointingSettings
 
 MIDDLE_PX = ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2)

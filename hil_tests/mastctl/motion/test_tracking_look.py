@@ -20,9 +20,9 @@ from hil_tests.mastctl.motion.pointing_world import LIMITS, SIZE_PX, World, movi
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError
 from mastctl.motion.requests import PixelTarget
-from mastctl.motion.results import PointingError
+from mastctl.motion.results import PointingError, Step
 from mastctl.motion.settings import PointingSettings, TrackingSettings
-from mastctl.motion.steps import Step, Steps
+from mastctl.motion.steps import Steps
 from mastctl.motion.target_look import Looker, NotTrackable
 
 PIXEL = (110.0, 130.0)

@@ -29,7 +29,7 @@ from hil_tests.mastctl.service_fakes import FakeCamera, FakeHead, Hang, rig
 from hil_tests.waiting import NET_S, until
 from mastctl.cli.main import main
 from mastctl.config import load_config
-from mastctl.motion.loop import AnglesTarget, PixelTarget, PointRequest
+from mastctl.motion.requests import AnglesTarget, PixelTarget, PointRequest
 from mastctl.service.service import Service
 
 CAMERAS = ("navcam_left", "navcam_right", "hazcam_left")

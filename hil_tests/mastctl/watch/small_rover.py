@@ -14,8 +14,7 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import rot_y
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
-from tools.campaigns.sentinel import ChangedRig
-from tools.campaigns.sentinel_days import changed, smaller
+from tools.campaigns.sentinel_days import ChangedRig, changed, smaller
 
 BY = 2
 """The Navcams have so many times fewer pixels along each side."""

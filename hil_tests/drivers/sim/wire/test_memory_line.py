@@ -10,7 +10,7 @@ import pytest
 from drivers.errors import LineLost
 from drivers.faults import PAN_TILT, FaultPanel
 from drivers.serial_line import ByteLine, OpenLine, SerialLine
-from drivers.sim.wire.line import Reply
+from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.memory_line import MemoryLine
 from drivers.simulation_clock import SimulationClock
 

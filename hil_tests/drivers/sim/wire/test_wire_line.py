@@ -14,8 +14,8 @@ import serial
 from drivers.clock import ManualClock, SystemClock
 from drivers.errors import BadOptions
 from drivers.faults import PAN_TILT, FaultPanel
-from drivers.sim.wire.carrier import LineFaults
-from drivers.sim.wire.line import PtyLine, Reply, TcpLine
+from drivers.sim.wire.carrier import LineFaults, Reply
+from drivers.sim.wire.line import PtyLine, TcpLine
 from hil_tests.waiting import NET_S, until
 
 
