@@ -21,7 +21,7 @@ from drivers.feetech import workshop
 from drivers.feetech.head import FeetechHead, halt, open_head
 from drivers.feetech.link import open_link
 from drivers.feetech.settings import feetech_settings
-from drivers.sim.heads import AxisSettings
+from drivers.sim.axis import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.feetech_bus import FeetechBus
 from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
