@@ -116,7 +116,7 @@ def _servos(
 ) -> dict[str, Any]:
     family = head.family if head is not None and head.family is not None else FAMILIES[0]
     servos = {one.servo_id: one for one in head.servos} if head is not None else {}
-    baud = next(iter(servos.values())).baud if servos else USUAL_BAUD
+    baud = max((one.baud for one in servos.values()), default=USUAL_BAUD)
     poll_hz = min(FASTEST_POLL_HZ, math.floor(baud / (10 * family.poll_bytes)))
     axes = {}
     for axis, number in (("pan", answers.pan_id), ("tilt", answers.tilt_id)):
