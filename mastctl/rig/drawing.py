@@ -69,7 +69,7 @@ def configuration(
     ends = {"pan": _radians(answers.pan_deg), "tilt": _radians(answers.tilt_deg)}
     if head is not None and head.unit is not None:
         ends = {axis: _within(ends[axis], getattr(head.unit, axis), PTU_SIGNS[axis]) for axis in ends}
-        driver, options, speed = "flir_ptu", _ptu(ends), 0.5
+        driver, options, speed = "flir_ptu", _ptu(head.unit_baud, ends), 0.5
     else:
         driver = FAMILIES[0].driver if head is None or head.family is None else head.family.driver
         options, speed = _servos(head, answers, ends), 0.8
@@ -106,9 +106,9 @@ def _within(ends: tuple[float, float], axis: AxisFacts, sign: int) -> tuple[floa
     return max(ends[0], math.ceil(1e3 * reach[0]) / 1e3), min(ends[1], math.floor(1e3 * reach[1]) / 1e3)
 
 
-def _ptu(ends: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+def _ptu(baud: int, ends: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
     axes = {axis: {"sign": PTU_SIGNS[axis], "limits_rad": list(ends[axis])} for axis in ends}
-    return {"baud": 9600, **axes}
+    return {"baud": baud, **axes}
 
 
 def _servos(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,11 @@ class ServoFamily:
     poll_bytes: int
 
 
+ONE_ID = (
+    "new servos all have the id 1; connect one at a time, and give the second another id "
+    "(mastctl servo set-id PORT 1 2)"
+)
+
 FAMILIES = (
     ServoFamily(
         "dynamixel",
@@ -68,7 +74,8 @@ FAMILIES = (
         feetech_settings.POLL_BYTES,
     ),
 )
-PTU_BAUD = 9600
+PTU_BAUDS = (9600, 38_400)
+"""As units come from the factory, and as docs/how-to/hardware.md has them set up."""
 LEAST_PX, USUAL_HZ = (640, 480), 30.0
 
 
@@ -86,8 +93,8 @@ class PluggedHead:
         Those that the driver turns, by id.
     others
         Models that answered and that it does not drive.
-    unit
-        A PTU's facts.
+    unit, unit_baud
+        A PTU's facts, and the rate at which it told them.
     """
 
     port: str
@@ -95,6 +102,7 @@ class PluggedHead:
     servos: tuple[FoundServo, ...] = ()
     others: tuple[str, ...] = ()
     unit: Facts | None = None
+    unit_baud: int = PTU_BAUDS[0]
 
     @property
     def words(self) -> str:
@@ -155,6 +163,8 @@ def look(ports: Sequence[str], machine: ExaminedMachine, say: Callable[[str], No
         found, why = ask_line(port, machine)
         if found is not None:
             heads.append(found)
+            if len(found.servos) == 1:
+                unused.append(f"{port}: only one servo answers, and a head has two: {ONE_ID}")
         else:
             unused.append(why)
     say("asking the cameras")
@@ -177,10 +187,9 @@ def ask_line(port: str, machine: ExaminedMachine) -> tuple[PluggedHead | None, s
     for finding in examine_port(port, machine):
         if finding.level == "bad" or (finding.what == "port in use" and not pseudo):
             return None, f"{finding.sentence}; {finding.advice}"
-    try:
-        return PluggedHead(port, unit=flir_ptu.facts(path, PTU_BAUD)), ""
-    except DriverError:
-        pass  # no PTU
+    for baud in PTU_BAUDS:
+        with suppress(DriverError):  # no PTU
+            return PluggedHead(port, unit=flir_ptu.facts(path, baud), unit_baud=baud), ""
     noise = ""
     for family in FAMILIES:
         try:
@@ -192,8 +201,8 @@ def ask_line(port: str, machine: ExaminedMachine) -> tuple[PluggedHead | None, s
             others = tuple(one.model for one in found if one.model not in family.models)
             return PluggedHead(port, family, driven, others), ""
         if garbled:
-            noise = f"; at {garbled[0]} baud something answers: two servos of one id?"
-    return None, f"{port}: no servo and no PTU answers{noise}; is its power on?"
+            noise = f"; at {garbled[0]} baud something answers: {ONE_ID}"
+    return None, f"{port}: no servo and no PTU answers{noise or '; is its power on?'}"
 
 
 def _servos(path: str, family: ServoFamily) -> tuple[list[FoundServo], list[int]]:

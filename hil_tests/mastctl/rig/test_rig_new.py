@@ -6,6 +6,7 @@ import io
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +45,11 @@ X = PRESETS["dynamixel_x"]
 class Servos:
     """Two XL330 on a pseudo terminal, at 1 Mbaud."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, ids: tuple[int, int] = (3, 4)) -> None:
         clock = SystemClock()
         self.axes = [WireAxis(axis, number=n, time_s=clock.now_s()) for n, axis in enumerate((X.pan, X.tilt))]
         self.servos = [
-            SimulatedServo("xl330_m288", n + 3, axis, settings={"baud_rate": 3}, time_s=clock.now_s())
+            SimulatedServo("xl330_m288", ids[n], axis, settings={"baud_rate": 3}, time_s=clock.now_s())
             for n, axis in enumerate(self.axes)
         ]
         self.line = PtyLine(DynamixelBus(self.servos), clock, link=folder / "ttyServos")
@@ -110,12 +111,22 @@ def test_two_servos_become_a_rig_that_turns_and_the_scan_changes_nothing(
         assert (joints["pan_rad"], joints["tilt_rad"]) == pytest.approx((0.2, -0.1), abs=3e-3)
 
 
+def test_two_new_servos_of_one_id_are_told_apart_from_no_servo(
+    tmp_path: Path, nothing: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    family = FAMILIES[0]
+    monkeypatch.setattr(plugged, "FAMILIES", (replace(family, bauds=(1_000_000,)),))
+    with Servos(tmp_path, ids=(1, 1)).line as line:
+        told = written(capsys, str(tmp_path / "rig"), "--port", line.path)
+    assert any("new servos all have the id 1; connect one at a time" in words for words in told["unused"])
+
+
 def test_a_ptu_is_known_and_its_own_limits_hold(
     tmp_path: Path, nothing: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clock, head = SystemClock(), PRESETS["ptu_d46_70"]
     axes = [WireAxis(axis, number=n, time_s=clock.now_s()) for n, axis in enumerate((head.pan, head.tilt))]
-    unit = SimulatedPtu("d46_70", *axes)
+    unit = SimulatedPtu("d46_70", *axes, baud=38_400)
     folder = tmp_path / "rig"
     with PtyLine(unit, clock, link=tmp_path / "ttyPtu") as line:
         told = written(capsys, str(folder), "--port", line.path, "--tilt-deg", "-90", "80")
@@ -123,6 +134,7 @@ def test_a_ptu_is_known_and_its_own_limits_hold(
     assert "a FLIR PTU" in told["heads"][0]
     good_by_schema(folder)
     options = options_from(load_config(folder / CONFIG).hardware.pan_tilt.options)
+    assert options.baud == 38_400
     low, high = options.tilt.limits_rad
     assert -math.pi / 2 < low < -1.0 and 0.4 < high < 0.7, "the unit's own ends"
 
