@@ -20,7 +20,6 @@ from drivers.sim import camera_settings, ground, heads, placed, scene
 from drivers.sim.pan_tilt import DEFAULT_HEADS
 from drivers.sim.settings import simulation_settings
 from drivers.v4l2 import options as v4l2
-from drivers.v4l2.exposure import AutoExposureSettings
 from drivers.v4l2.pixels import FORMATS
 from tools.schemas.watched import FLAG, TEXT, Schema, number, settings_schema, vector, watched
 
@@ -97,8 +96,7 @@ def camera_options() -> Schema:
         "type": "object",
         "additionalProperties": {"type": ["integer", "string", "boolean"]},
     }
-    found = _settings(noted.schema(), v4l2.CameraOptions)
-    _settings(inner, AutoExposureSettings)
+    found = noted.schema()
     found["properties"]["auto_exposure"] = {"anyOf": [FLAG, inner], "default": False}
     found["anyOf"] = [{"required": [key]} for key in ("device", "card", "bus")]
     found["dependentSchemas"] = {"device": {"properties": {"card": False, "bus": False}}}

@@ -20,7 +20,7 @@ from calib.targets import board_file
 from mastctl.bench import simulated
 from mastctl.config import CONFIG_SCHEMA, HOST_NAME, LONGEST_SOCKET_PATH, parse_config
 from tools.schemas.drivers import camera_options, dynamixel, fault_list, feetech, ptu, replay, simulation
-from tools.schemas.watched import FLAG, TEXT, Schema, number, vector, watched
+from tools.schemas.watched import FLAG, TEXT, Schema, mapping_in, number, vector, watched
 
 REPOSITORY = Path(__file__).parents[2]
 PAGE = REPOSITORY / "docs" / "reference" / "configuration.md"
@@ -210,9 +210,12 @@ def schema_of(name: str) -> Schema:
     made = FILES[name]
     title = (made.__doc__ or "").strip().rstrip(".")
     found = {"$schema": DIALECT, "title": title, **deepcopy(made())}
-    for heading, of in (("A whole configuration", "config"), ("The mast file", "mast")):
-        if name == of:
-            _describe(found, heading)
+    if name == "mast":
+        _describe(found, "The mast file")
+    if name == "config":
+        _describe(found, "A whole configuration")
+        cases = found["properties"]["cameras"]["additionalProperties"]["allOf"]
+        _describe(cases[0]["then"]["properties"]["options"], "Options of `v4l2`")
     return found
 
 
@@ -225,6 +228,7 @@ def _describe(schema: Schema, heading: str) -> None:
         for key in re.findall(r"`([^`]+)`", keys):
             here: Any = schema
             for step in key.split("."):
+                here = mapping_in(here)
                 here = here["additionalProperties"] if step in NAMES else here["properties"][step]
             if words:
                 here["description"] = words

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from tools.schemas.files import NAMES, schema_of
-from tools.schemas.watched import Schema
+from tools.schemas.watched import Schema, mapping_in
 
 TABLES = {
     "A whole configuration": (),
@@ -83,14 +83,9 @@ def _at(config: Schema, place: tuple[str, ...]) -> Schema:
     return options
 
 
-def _inner(schema: Schema) -> Schema:
-    """The mapping among the kinds that a value may be."""
-    return next((one for one in schema.get("anyOf", ()) if "properties" in one), schema)
-
-
 def _keys(schema: Schema, before: str = "") -> Iterator[str]:
     """Every key path of a mapping; names of one's own are left out."""
-    for key, one in _inner(schema).get("properties", {}).items():
+    for key, one in mapping_in(schema).get("properties", {}).items():
         yield before + key
         yield from _keys(one, f"{before}{key}.")
 
@@ -116,7 +111,7 @@ def _found(schema: Schema, path: str) -> tuple[Schema, bool]:
         if step in NAMES:
             schema, needed = schema["additionalProperties"], False
             continue
-        schema = _inner(schema)
+        schema = mapping_in(schema)
         needed = step in schema.get("required", ())
         schema = schema["properties"][step]
     return schema, needed

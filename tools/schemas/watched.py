@@ -202,6 +202,11 @@ def _put(kind: type, opening: Any, questions: Mapping[str, Any], instead: Any, a
         instead(kind, name, asking(asked))
 
 
+def mapping_in(schema: Schema) -> Schema:
+    """Return the mapping among the kinds that a value may be."""
+    return next((one for one in schema.get("anyOf", ()) if "properties" in one), schema)
+
+
 def settings_schema(
     usual: Any, bounds: Mapping[str, tuple[float, float]], low: float | None = None, prefix: str = ""
 ) -> Schema:
