@@ -18,11 +18,14 @@ from calib.files.yaml_text import parse_mapping
 from drivers.clock import SystemClock
 from drivers.dynamixel.settings import dynamixel_settings
 from drivers.dynamixel.workshop import FoundServo
+from drivers.feetech.settings import feetech_settings
 from drivers.flir_ptu.options import options_from
 from drivers.sim.heads import PRESETS
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
+from drivers.sim.wire.feetech_bus import FeetechBus
+from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
 from drivers.sim.wire.line import PtyLine
 from drivers.sim.wire.ptu import SimulatedPtu
 from drivers.v4l2.options import parse_options
@@ -119,6 +122,26 @@ def test_two_new_servos_of_one_id_are_told_apart_from_no_servo(
     with Servos(tmp_path, ids=(1, 1)).line as line:
         told = written(capsys, str(tmp_path / "rig"), "--port", line.path)
     assert any("new servos all have the id 1; connect one at a time" in words for words in told["unused"])
+
+
+def test_feetech_servos_are_asked_in_their_own_words(
+    tmp_path: Path, nothing: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plugged, "FAMILIES", tuple(replace(one, bauds=(1_000_000,)) for one in FAMILIES))
+    clock = SystemClock()
+    axes = [WireAxis(axis, number=n, time_s=clock.now_s()) for n, axis in enumerate((X.pan, X.tilt))]
+    servos = [
+        SimulatedFeetechServo("sts3215", n, axis, time_s=clock.now_s()) for n, axis in enumerate(axes, 1)
+    ]
+    folder = tmp_path / "rig"
+    with PtyLine(FeetechBus(servos), clock, link=tmp_path / "ttyFeetech") as line:
+        told = written(capsys, str(folder), "--port", line.path)
+    assert [axis.angle_rad(clock.now_s()) for axis in axes] == [0.0, 0.0]
+    assert "STS3215 (id 1, 1000000 baud), STS3215 (id 2, 1000000 baud)" in told["heads"][0]
+    good_by_schema(folder)
+    head = load_config(folder / CONFIG).hardware.pan_tilt
+    assert head.driver == "feetech"
+    assert feetech_settings(head.options).pan.model.name == "STS3215"
 
 
 def test_a_ptu_is_known_and_its_own_limits_hold(
