@@ -59,6 +59,28 @@ def test_a_whole_visit(client: Client, pair: BOTH) -> None:
     assert parse_rig(client.mast_file(), "the daemon's").digest == client.status()["mast"]["digest"]
 
 
+def test_live_pictures_come_with_their_facts_or_a_sentence(client: Client, pair: BOTH) -> None:
+    with client.live_pictures("navcam_left", "navcam_right") as pictures:
+        assert pictures.next(0.01) is None, "none was asked for"
+        pictures.wanted("navcam_right")
+        picture = pictures.next(NET_S)
+        assert picture is not None
+        assert picture.facts["camera"] == "navcam_right"
+        assert picture.jpeg[:2] == b"\xff\xd8"
+        pair[0].close()
+        with pytest.raises(ClientError, match="broke") as gone:
+            pictures.next(NET_S)
+    assert gone.value.code == "no_daemon"
+    with pytest.raises(ClientError, match="no daemon answers"), client.live_pictures("navcam_left"):
+        pass
+
+
+def test_live_pictures_of_no_camera_are_refused(client: Client) -> None:
+    with pytest.raises(ClientError, match=r"no pictures: .*moon") as refused, client.live_pictures("moon"):
+        pass
+    assert refused.value.code == "refused"
+
+
 def test_the_daemons_refusal_keeps_code_sentence_and_detail(client: Client) -> None:
     with pytest.raises(ClientError, match="beyond the soft limit") as refused:
         client.point(pan_rad=0.0, tilt_rad=1.5)

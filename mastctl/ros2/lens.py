@@ -25,6 +25,7 @@ KEPT = {
     "OPENCV_FISHEYE": "equidistant",
 }
 EXACT_PX = 1e-6
+STEPS = 30
 GRID = (25, 19)
 AS_GOOD_PX = 0.01
 """A lens of more numbers has to be nearer by this much."""
@@ -113,7 +114,8 @@ def _fitted(
     numbers: FloatArray = first
     if np.abs(off_px(first)).max() > 1e-9:
         scale = np.concatenate([start[:2], np.array(size_px, dtype=np.float64), np.ones(COUNTS[name])])
-        numbers = np.asarray(least_squares(off_px, first, x_scale=scale, method="lm").x)
+        most = STEPS * (1 + len(first))  # a lens that cannot bend so far would search for ever
+        numbers = np.asarray(least_squares(off_px, first, x_scale=scale, method="lm", max_nfev=most).x)
     return _measured(name, numbers, size_px, directions, pixels)
 
 

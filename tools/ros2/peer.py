@@ -9,6 +9,7 @@ their fields; long arrays are told by their length. Run with the Python of `tool
     ["publish", TOPIC, TYPE, FIELDS]       once somebody listens
     ["call", SERVICE, TYPE, FIELDS]
     ["goal", ACTION, TYPE, FIELDS, CANCEL_AFTER_S or null]
+    ["leave", ACTION, TYPE, FIELDS]        sends a goal and ends, in order, without waiting for it
 """
 
 from __future__ import annotations
@@ -130,6 +131,16 @@ class Peer:
         ended = self._done(taken.get_result_async())
         client.destroy()
         return {"status": ended.status, "result": told(ended.result), "feedback": len(feedback)}
+
+    def leave(self, action: str, kind: str, fields: dict[str, Any]) -> None:
+        """Send a goal, and end when it is taken."""
+        client = ActionClient(self.node, type_of(kind), action)
+        if not client.wait_for_server(NET_S):
+            raise TimeoutError(action)
+        self._done(client.send_goal_async(filled(type_of(kind).Goal(), fields)))
+        client.destroy()
+        time.sleep(MATCHED_S)  # until the others have been told
+        rclpy.shutdown()
 
     def _done(self, future: Any) -> Any:
         self._until(future.done, NET_S)

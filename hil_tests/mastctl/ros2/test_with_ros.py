@@ -235,6 +235,15 @@ def test_actions_end_as_the_head_does(beside: Beside) -> None:
     assert pointing["predicted_px"] == pytest.approx([511.5, 383.5], abs=1.0)
 
 
+def test_a_goal_whose_client_leaves_is_stopped(beside: Beside) -> None:
+    beside.rests()
+    before = beside.newest_operation()["id"]
+    far = {"trajectory": {"joint_names": ["pan"], "points": [{"positions": [-2.4]}]}}
+    with peer(beside.prefix, beside.domain) as other:
+        other.leave("follow_joint_trajectory", "control_msgs/action/FollowJointTrajectory", far)
+    assert beside.ended(before)["state"] == "stopped"
+
+
 def test_camera_info_and_tf_are_those_of_the_mast_file(beside: Beside) -> None:
     from calib.files.mast_file import parse_rig
 

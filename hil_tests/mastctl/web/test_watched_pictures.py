@@ -24,11 +24,15 @@ class FakeCameras:
     def __init__(self) -> None:
         self.held: Counter[str] = Counter()
         self.glances: Counter[str] = Counter()
+        self.after_s: list[float] = []
+        self.given: list[StampedFrame] = []
         self.as_held = lambda: None
 
     def glance(self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float) -> StampedFrame:
         self.glances[camera] += 1
-        return frame(self.glances[camera], np.zeros((4, 4), np.uint8), b"jpeg", camera)
+        self.after_s.append(exposed_after_s)
+        self.given.append(frame(self.glances[camera], np.zeros((4, 4), np.uint8), b"jpeg", camera))
+        return self.given[-1]
 
     def hold(self, frame: StampedFrame, by: str, kept: int) -> None:
         self.as_held()
@@ -103,4 +107,21 @@ def test_a_watcher_whose_second_camera_has_no_thread_is_none(
     again = watched.watch((LEFT, RIGHT), there.set)  # both cameras have their threads now
     until(lambda: {LEFT, RIGHT} <= cameras.glances.keys(), "a picture of each")
     again.end()
+    watched.close()
+
+
+@pytest.mark.parametrize(("every", "apart_s"), [(False, pictures.APART_S), (True, pictures.NEXT_S)])
+def test_who_watches_every_picture_gets_the_next_one(every: bool, apart_s: float) -> None:
+    cameras, there = FakeCameras(), threading.Event()
+    watched = WatchedCameras(cameras, SystemClock())
+    watcher = watched.watch((LEFT,), there.set, every=every)
+    assert there.wait(60.0)
+    watcher.take()
+    watcher.shown(LEFT)
+    until(lambda: len(cameras.after_s) > 1, "the next one is asked for")
+    assert cameras.after_s[1] == pytest.approx(cameras.given[0].exposure_began_s + apart_s)
+    small, large = (frame(1, np.zeros(size, np.uint8), b"", LEFT) for size in ((4, 4), (6000, 4000)))
+    assert watcher.held_of(small) == (32 if every else 4)
+    assert watcher.held_of(large) == 4  # 24 MB each
+    watcher.end()
     watched.close()
