@@ -19,7 +19,7 @@ class BadFile(CalibError):
     place
         Key, row or line inside the file (``cameras.navcam_left.A``, ``row 12``); empty for the whole file.
     reason
-        What is wrong, with the value, and what is expected.
+        The fault, with the value, and the expected one.
     """
 
     def __init__(self, path: str | Path, place: str, reason: str) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))  # Sphinx imports this file from wherever it was started
 
-from tools.site_pages import write_pages  # noqa: E402
+from tools.site_pages import write_notebooks, write_pages  # noqa: E402
 
 project = "mastctl"
 author = "the mastctl developers"
@@ -34,3 +34,4 @@ autodoc_member_order = "bysource"
 napoleon_google_docstring = False
 
 write_pages(HERE / "reference" / "generated")
+write_notebooks(HERE / "tutorials")

@@ -29,15 +29,15 @@ class Signal(Protocol):
         ...
 
     def wait(self, timeout_s: float | None = None, *, idle: bool = False) -> bool:
-        """Let go of the lock, wait, and take it again; return whether somebody has notified.
+        """Let go of the lock, wait, and take it again; return whether it was notified.
 
         Parameters
         ----------
         timeout_s
             How long at most, seconds of the clock; None for as long as it takes.
         idle
-            Whether nobody waits for what follows: pacing, or a thread that waits for work. Such a wait alone
-            makes no time pass on a clock that need not go on.
+            Whether no thread waits for the work that follows: pacing, or a thread that waits for work. Such a
+            wait alone makes no time pass on a clock that need not go on.
         """
         ...
 
@@ -51,12 +51,12 @@ class Clock(Protocol):
 
     @property
     def runs(self) -> bool:
-        """Whether time passes while somebody waits; else waits for other threads run in real time."""
+        """Whether time passes while a thread waits; else waits for other threads run in real time."""
         ...
 
     @property
     def stands_for_work(self) -> bool:
-        """Whether it stands still while a thread that it knows computes: who computes holds up all others."""
+        """Whether it stands still while a thread that it knows computes, and so holds up all others."""
         ...
 
     def now_s(self) -> float:
@@ -130,7 +130,7 @@ class _MachineTime:
 
 
 class ClockLock:
-    """A lock for who waits on a clock inside it; whoever has it may take it again. A context manager."""
+    """A lock for threads that wait on a clock inside it; its holder may take it again. A context manager."""
 
     def __init__(self, clock: Clock) -> None:
         self._free = clock.signal()
@@ -178,9 +178,9 @@ class SystemClock(_MachineTime):
 
 
 class ManualClock(_MachineTime):
-    """A clock that stands still until somebody sleeps on it or advances it: tests turn it by hand.
+    """A clock that stands still until a thread sleeps on it or advances it: tests turn it by hand.
 
-    Signals wait in real time, since nobody would turn the clock for them.
+    Signals wait in real time, since no thread would turn the clock for them.
     """
 
     runs = False

@@ -19,7 +19,7 @@ class DriverError(Exception):
     device
         The device's name, put before the message.
     detail
-        What programs may want to know (port, servo id, register, instruction); must be JSON.
+        Facts for programs (port, servo id, register, instruction); must be JSON.
     """
 
     code = "driver_error"

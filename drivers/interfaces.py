@@ -110,7 +110,7 @@ class AxisReport:
 
     @property
     def left_rad(self) -> float | None:
-        """What the counts leave: measured minus commanded angle."""
+        """The angle that the counts leave: measured minus commanded."""
         return None if self.commanded_rad is None else self.measured_rad - self.commanded_rad
 
     def left_px(self, focal_px: float) -> float | None:
@@ -121,7 +121,7 @@ class AxisReport:
 
 
 COARSE_COUNT_RAD = math.tau / 4096
-"""What a head that does not say its counts is taken to have: those of a 12-bit servo, the coarsest."""
+"""The counts assumed of a head that does not state its own: those of a 12-bit servo, the coarsest."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class StatesMotion(Protocol):
     """A head that says how its axes move; not every head does."""
 
     def axis_motion(self) -> Mapping[str, AxisMotion]:
-        """Return ``pan`` and ``tilt``. Asks nobody, never fails."""
+        """Return ``pan`` and ``tilt``. Asks no device, never fails."""
         ...
 
 
@@ -176,11 +176,11 @@ class StopsBeside(Protocol):
 
 
 class Reporting(ABC):
-    """What a head may be beside a `PanTilt`: one that knows its counts."""
+    """A head may fulfill this beside a `PanTilt`: one that knows its counts."""
 
     @abstractmethod
     def report(self) -> Mapping[str, AxisReport]:
-        """Return ``pan`` and ``tilt`` as they were last read; empty before that. Asks nobody, never fails."""
+        """Return ``pan`` and ``tilt`` as last read; empty before that. Asks no device, never fails."""
 
 
 @runtime_checkable
@@ -245,7 +245,7 @@ class KnowsSize(Protocol):
 
 @runtime_checkable
 class HoldsExposure(Protocol):
-    """A camera with an automatic exposure that can be told to wait; not every camera has this."""
+    """A camera with an automatic exposure that can be made to wait; not every camera has this."""
 
     def exposure_held(self) -> AbstractContextManager[None]:
         """Return a context in which the exposure does not change: a measurement compares its pictures."""

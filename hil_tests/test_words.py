@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 
 import pytest
 
@@ -53,15 +54,61 @@ def test_a_page_is_read_as_its_reader_reads_it(text: str, rules: list[str]) -> N
     assert found == rules
 
 
-def test_messages_and_help_texts_are_read_from_the_code() -> None:
-    source = """
-raise NotNow("leased", f"{name} is held by somebody")
-parser.add_argument("--pair", help="two eyes")
-log.info("nobody reads this here")
-"""
-    found = [
-        (one.line, one.rule)
-        for line, text in words.code_texts(source)
-        for one in words.findings_in(text, "module.py", line, REPLACED)
+def rules(texts: Iterator[tuple[int, str]], file: str) -> list[tuple[int, str]]:
+    return [
+        (one.line, one.rule) for line, text in texts for one in words.findings_in(text, file, line, REPLACED)
     ]
-    assert found == [(2, "word 'somebody'"), (3, "word 'eyes'")]
+
+
+def test_every_string_of_words_and_every_public_docstring_is_read() -> None:
+    source = '''"""Who reads a module reads this first."""
+
+raise NotNow("leased", f"{name} is held by somebody else now")
+parser.add_argument("--pair", help="the two eyes of a pair")
+log.info("what follows is read in the log: %s", words)
+LABELS = ("eye", "what it does")
+TOLD = 3
+"""What a constant means is public too.
+
+`what` is code.
+"""
+_PRIVATE = 3
+"""Nobody reads this in the reference."""
+
+
+class Camera:
+    """One eye of a pair.
+
+    Parameters
+    ----------
+    name
+        What the configuration calls it.
+    """
+
+    def _look(self):
+        """What a private name says is not read."""
+'''
+    assert rules(words.code_texts(source), "module.py") == [
+        (1, "bare who"),
+        (8, "bare what"),
+        (17, "word 'eye'"),
+        (22, "bare what"),
+        (3, "word 'somebody'"),
+        (4, "word 'eyes'"),
+        (5, "bare what"),
+    ]
+
+
+def test_the_pages_elements_titles_and_strings_are_read() -> None:
+    page = """<button title="Stops; nobody moves it">STOP <small>for <b>somebody</b></small></button>
+{# nobody reads this #}<p>{{ number }} pictures of an eye</p><style>.eye { top: 0 }</style>
+"""
+    assert rules(words.page_files_texts(page, ".html"), "page.html") == [
+        (1, "word 'nobody'"),
+        (1, "word 'somebody'"),
+        (2, "word 'eye'"),
+    ]
+    script = """// nobody reads a comment
+say("found in the other eye", `what ${name} shows is old now`, "eye");
+"""
+    assert rules(words.page_files_texts(script, ".js"), "page.js") == [(2, "word 'eye'"), (2, "bare what")]

@@ -31,7 +31,7 @@ def as_json(value: Any) -> Any:
     return text if text.isascii() else text.encode("utf-8", "replace").decode()
 
 
-TOO_DEEP = "nested too deeply to be told"
+TOO_DEEP = "nested too deeply to be shown"
 
 
 def writable(value: Any) -> Any:

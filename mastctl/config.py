@@ -389,7 +389,7 @@ def _live(top: Section) -> LiveSettings | None:
     section = top.section("foxglove", (), ("host", "port"))
     host = section.text("host") if "host" in section else usual.host
     if not is_loopback(host):
-        words = f"'{host[:60]}' where a loopback address is expected: the live view asks nobody who they are"
+        words = f"'{host[:60]}' where a loopback address is expected: the live view requires no token"
         raise section.bad("host", words)
     return LiveSettings(host, section.integer("port", 0, 65535) if "port" in section else usual.port)
 

@@ -141,7 +141,7 @@ class QueuedWriter:
             dropped, self._dropped = self._dropped, 0
         if not dropped:
             return ""
-        return self.own_line(f"{dropped} messages were dropped here while nobody read this output")
+        return self.own_line(f"{dropped} messages were dropped here while this output was not read")
 
     # In the writing thread
 

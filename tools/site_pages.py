@@ -1,6 +1,7 @@
 """Pages of the reference, written from the code at each build: commands, HTTP, error codes, Python names.
 
-`write_pages` fills ``docs/reference/generated``, which git ignores. Nothing here states a fact of its own.
+`write_pages` fills ``docs/reference/generated``, `write_notebooks` ``docs/tutorials/generated``. Git
+ignores both. Nothing here states a fact of its own.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import calib
 from mastctl.cli.main import build_parser
 from mastctl.web.app import api
 from mastctl.web.described import description
-from tools import error_codes
+from tools import error_codes, notebooks
 
 PYTHON = {
     "Pointing, calibration and cameras: `calib`": ["calib"],
@@ -43,6 +44,41 @@ def write_pages(folder: Path) -> None:
         file = folder / name
         if not file.is_file() or file.read_text() != text:
             file.write_text(text)
+
+
+def write_notebooks(folder: Path) -> None:
+    """Write each notebook of a folder as a page, with its figures, into ``generated`` below it."""
+    out = folder / "generated"
+    out.mkdir(exist_ok=True)
+    for path in sorted(folder.glob("*.ipynb")):
+        notebook = notebooks.read(path)
+        figures = [
+            (out / f"{path.stem}-{number}.png", data)
+            for number, data in enumerate(notebooks.figures(notebook))
+        ]
+        page = notebook_page(notebook, path.name, [name.name for name, _ in figures])
+        for file, data in (*figures, (out / f"{path.stem}-notebook.md", page.encode())):
+            if not file.is_file() or file.read_bytes() != data:
+                file.write_bytes(data)
+
+
+def notebook_page(notebook: notebooks.Notebook, name: str, figures: list[str]) -> str:
+    """Return a notebook as Markdown: texts, cells, what each printed, and its figures."""
+    shown = iter(figures)
+    lines = []
+    for cell in notebook["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            lines += [re.sub(r"\]\((?!https?:)", "](../", source), ""]
+            continue
+        lines += ["```python", source, "```", ""]
+        for output in cell["outputs"]:
+            text = "".join(output.get("text") or output["data"].get("text/plain", []))
+            if text:
+                lines += ["```text", text.rstrip("\n"), "```", ""]
+            elif "image/png" in output["data"]:
+                lines += [f"![a figure of the notebook]({next(shown)})", ""]
+    return "\n".join([*lines, f"{{download}}`Download this notebook <../{name}>`", ""])
 
 
 def commands_page() -> str:

@@ -1,12 +1,14 @@
-"""Check pages, help texts and error messages against the rules of docs/contribute/how-we-write.md.
+"""Check all texts that a person reads against the rules of docs/contribute/how-we-write.md.
 
-    .venv/bin/python -m tools.words                  # every finding, and a total for each page and package
+Pages; messages, log lines, help texts, verdicts; docstrings of public names; the operator page; reports.
+
+    .venv/bin/python -m tools.words                  # every finding, and a total for each page and room
     .venv/bin/python -m tools.words docs/index.md    # the findings of these files
     .venv/bin/python -m tools.words --lower          # write the present, smaller counts to the budget
 
 A program can check three rules: no sentence beyond 30 words; no bare "who" or "what" as its subject; none of
 the words that the third column of docs/reference/glossary.md replaces. `BUDGET` holds how many findings each
-page and each package still has. A page without a row must have none.
+page and each room still has. One without a row must have none.
 """
 
 from __future__ import annotations
@@ -26,9 +28,9 @@ REPOSITORY = Path(__file__).parents[1]
 BUDGET = Path("tools/words_budget.csv")
 GLOSSARY = Path("docs/reference/glossary.md")
 PACKAGES = ("calib", "drivers", "mastctl")
+SPEAKING = {".py", ".html", ".js"}
 LONGEST_WORDS = 30
 LABEL_WORDS = 4  # "what it does" over a column has no subject
-HELP = ("help", "description", "epilog")
 
 SENTENCE_END = re.compile(r"(?<!e\.g)(?<!i\.e)(?<!cf)(?<!vs)(?<=[.?!])[*_)\"]*\s+")
 BARE_SUBJECT = re.compile(
@@ -48,8 +50,8 @@ class Finding(NamedTuple):
 
     @property
     def counted_under(self) -> str:
-        """The row of the budget: a page, or the package of a module."""
-        return self.file if self.file.endswith(".md") else self.file.partition("/")[0]
+        """The row of the budget: a page, or the room of a module."""
+        return self.file if self.file.endswith(".md") else "/".join(self.file.split("/")[:2])
 
 
 def replaced_words(glossary: str) -> re.Pattern[str]:
@@ -107,21 +109,59 @@ def _plain(text: str) -> str:
 
 
 def code_texts(source: str) -> Iterator[tuple[int, str]]:
-    """Yield line number and text of the help texts and raised messages of a module."""
-    if "raise " not in source and "help=" not in source:
-        return
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
-            yield from _messages(node.exc)
-        elif isinstance(node, ast.Call):
-            yield from ((k.value.lineno, t) for k in node.keywords if k.arg in HELP and (t := _text(k.value)))
+    """Yield line number and text of a module's docstrings of public names, and of all strings of words.
+
+    The strings are messages, log lines, help texts, verdicts and tables.
+    """
+    tree = ast.parse(source)
+    yield from _docstrings(tree)
+    yield from _strings(tree)
 
 
-def _messages(call: ast.Call) -> Iterator[tuple[int, str]]:
-    for value in (*call.args, *(keyword.value for keyword in call.keywords)):
-        text = _text(value)
-        if " " in text:  # a code is one word
-            yield value.lineno, text
+def _docstrings(scope: ast.Module | ast.ClassDef) -> Iterator[tuple[int, str]]:
+    """The docstrings of a module or class, of its public functions, classes and constants."""
+    for before, node in zip([scope, *scope.body], scope.body, strict=False):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and _is_public(before):
+            yield from paragraphs(str(node.value.value), node.lineno)
+        elif isinstance(node, ast.ClassDef) and _is_public(node):
+            yield from _docstrings(node)
+        elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and _is_public(node):
+            yield from paragraphs(ast.get_docstring(node) or "", node.body[0].lineno)
+
+
+def _is_public(node: ast.AST) -> bool:
+    if isinstance(node, ast.Assign):
+        node = node.targets[0]
+    if isinstance(node, ast.AnnAssign):
+        node = node.target
+    name = getattr(node, "name", getattr(node, "id", ""))
+    return not name.startswith("_")
+
+
+def paragraphs(docstring: str, line: int) -> Iterator[tuple[int, str]]:
+    """Yield the paragraphs of a docstring, each line of other indentation than the one before by itself."""
+    indent, begun, lines = -1, line, list[str]()
+    for number, text in enumerate([*docstring.splitlines(), ""], line):
+        depth = len(text) - len(text.lstrip()) if number > line or not text else indent
+        if lines and (not text.strip() or (depth != indent and number > line + 1)):
+            yield begun, re.sub(r"``[^`]*``|`[^`]*`", "x", " ".join(lines))
+            lines = []
+        if text.strip() and not re.match(r"\s*(-{3,}|>>>)", text):
+            begun = begun if lines else number
+            lines.append(text.strip())
+        indent = depth
+
+
+def _strings(node: ast.AST) -> Iterator[tuple[int, str]]:
+    """Every line of the strings longer than a label, but docstrings; a value filled in counts as one word."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant):
+            continue
+        text = _text(child) if isinstance(child, ast.expr) else ""
+        if len(text.split()) > LABEL_WORDS:
+            yield from ((getattr(child, "lineno", 0), line) for line in text.split("\n"))
+        elif not isinstance(child, (ast.JoinedStr, ast.Constant)):
+            yield from _strings(child)
 
 
 def _text(node: ast.expr) -> str:
@@ -131,8 +171,25 @@ def _text(node: ast.expr) -> str:
     if isinstance(node, ast.JoinedStr):
         return "".join(_text(part) if isinstance(part, ast.Constant) else "x" for part in node.values)
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
-        return _text(node.left) + _text(node.right)
+        return f"{_text(node.left)}{_text(node.right)}"
     return ""
+
+
+def page_files_texts(text: str, suffix: str) -> Iterator[tuple[int, str]]:
+    """Yield line number and text of the elements of an HTML file or template, or of a script's strings."""
+    pattern = r">([^<>]+)<|(?:title|aria-label|placeholder|alt)=\"([^\"]+)\""
+    if suffix == ".js":
+        text = re.sub(r"(?m)^\s*(//|\*|/\*).*$|\s// .*$", "", text)
+        pattern = r"\"((?:[^\"\\\n]|\\.)*)\"|`((?:[^`\\]|\\.)*)`"
+    else:
+        blank = r"(?s)<(script|style)\b.*?</\1>|\{#.*?#\}|\{%.*?%\}|<!--.*?-->"
+        text = re.sub(blank, lambda found: "\n" * found[0].count("\n"), text)
+        text = re.sub(r"\{\{.*?\}\}", "x", text)
+        text = re.sub(r"</?(?:b|i|em|strong|code|a|span|abbr|sub|sup|kbd)\b[^>]*>", "", text)
+    for found in re.finditer(pattern, text):
+        words = re.sub(r"\$\{[^}]*\}", "x", found[1] or found[2] or "")
+        if len(words.split()) > 1:
+            yield text.count("\n", 0, found.start()) + 1, words
 
 
 def findings(files: list[Path], root: Path = REPOSITORY) -> list[Finding]:
@@ -141,7 +198,10 @@ def findings(files: list[Path], root: Path = REPOSITORY) -> list[Finding]:
     found = []
     for file in files:
         text, name = (root / file).read_text(encoding="utf-8"), file.as_posix()
-        places = page_texts(text) if file.suffix == ".md" else code_texts(text)
+        if file.suffix == ".md":
+            places = page_texts(text)
+        else:
+            places = code_texts(text) if file.suffix == ".py" else page_files_texts(text, file.suffix)
         for line, words in places:
             found += findings_in(words, name, line, replaced)
     return found
@@ -150,8 +210,8 @@ def findings(files: list[Path], root: Path = REPOSITORY) -> list[Finding]:
 def checked_files(root: Path = REPOSITORY) -> list[Path]:
     """Return README, every page that is written by hand, and every module of the packages."""
     pages = [page for page in (root / "docs").rglob("*.md") if not {"generated", "_build"} & {*page.parts}]
-    modules = (module for package in PACKAGES for module in (root / package).rglob("*.py"))
-    return [file.relative_to(root) for file in (root / "README.md", *sorted(pages), *sorted(modules))]
+    files = (file for package in PACKAGES for file in (root / package).rglob("*") if file.suffix in SPEAKING)
+    return [file.relative_to(root) for file in (root / "README.md", *sorted(pages), *sorted(files))]
 
 
 def budget(root: Path = REPOSITORY) -> dict[str, int]:
@@ -162,7 +222,7 @@ def budget(root: Path = REPOSITORY) -> dict[str, int]:
 
 def main() -> int:
     """Print the findings; return 1 where a place has more of them than its budget."""
-    parser = argparse.ArgumentParser(description="Check the words of pages, help texts and messages.")
+    parser = argparse.ArgumentParser(description="Check the words of pages, code and reports.")
     parser.add_argument("files", nargs="*", type=Path, help="pages or modules; default: all of them")
     parser.add_argument("--lower", action="store_true", help="write smaller counts to the budget")
     options = parser.parse_args()

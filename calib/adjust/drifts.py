@@ -63,7 +63,7 @@ class BenchDrift:
                 "picture to the last: a mount or an encoder creeps; fasten it and take the pictures again"
             )
         return (
-            f"camera {self.what} drifts from the first picture to the last: its focal length changes by "
+            f"camera {self.what} drifts from the first picture to the last. Its focal length changes by "
             f"{100 * self.step[0]:+.3f} %, and it turns by {1e3 * np.linalg.norm(self.step[1:]):.2f} mrad; "
             "let it warm up, fasten it, and take the pictures again"
         )
@@ -127,7 +127,7 @@ class OtherPlacements:
         return (
             f"placement {self.board[1]} of board {self.board[0]} contradicts the others: its pictures say "
             f"something else of cameras, axes and joints (chi-square {self.chi2:.0f} for {self.freedom} "
-            "numbers); see that it is the same board and that nothing changed in between, and put it up "
+            "numbers). Check that it is the same board and that nothing changed in between, and put it up "
             "there once more"
         )
 

@@ -279,7 +279,7 @@ class _Tests:
                 mine, lambda v: v.picture_columns(self.state.cameras[v.image.camera].size_px, _POWERS)
             ).gain()
             words = (
-                f"what is left over {name}'s image is no noise: its lens is bent otherwise than {model.kind} "
+                f"the rest over {name}'s image is not noise: its lens is bent otherwise than {model.kind} "
             )
             yield self.model(f"lens of {name}", gain, words + "can be, or its dots are off in a pattern")
 
@@ -340,7 +340,7 @@ class _Tests:
         gain = self.scored(self.views, stretch).gain()
         wide, high, aslant = 1e3 * gain.values
         words = (
-            f"the board's dots are not spaced as told: {wide:+.2f} per mille along rows, {high:+.2f} along"
+            f"the board's dots are not spaced as stated: {wide:+.2f} per mille along rows, {high:+.2f} along"
         )
         yield self.model("spacing of the board", gain, f"{words} columns, {aslant:+.2f} aslant")
 

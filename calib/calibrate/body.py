@@ -278,8 +278,8 @@ def _sentence(direction: FloatArray) -> str:
     large = sorted(zip(-np.abs(toward), toward, WORDS, strict=True))
     parts = [f"{weight:+.2f} {word}" for size, weight, word in large if size < -0.3]
     return (
-        f"not told by these hand-offs: {' with '.join(parts)}, in units of {1e3 * PRIOR_SHIFT_M:g} mm and "
-        f"{1e3 * PRIOR_TURN_RAD:g} mrad; only the prior holds it"
+        f"not determined by these hand-offs: {' with '.join(parts)}, in units of {1e3 * PRIOR_SHIFT_M:g} mm "
+        f"and {1e3 * PRIOR_TURN_RAD:g} mrad; only the prior holds it"
     )
 
 

@@ -375,7 +375,7 @@ def _bent_notes(from_here: Start) -> list[str]:
     """Why the images of a board whose tapes cannot be right were left out."""
     return [
         f"the tapes of placement {placement} (set-up {setup}) do not have the board's shape and three cannot "
-        "tell which is wrong: its images were not used"
+        "show which is wrong: its images were not used"
         for setup, placement in sorted(from_here.bent)
     ]
 

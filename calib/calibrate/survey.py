@@ -92,7 +92,7 @@ def _refuse_unsettled(fit: Minimum[Estimate]) -> None:
     if not fit.settled:
         raise SurveyNotFitted(
             f"the fit did not settle: after {fit.steps} steps it was still finding better values, so that "
-            "neither they nor their sigmas are good; take more images, at more joint angles and distances"
+            "neither they nor their sigmas are good. Take more images, at more joint angles and distances"
         )
 
 
@@ -102,7 +102,7 @@ def _refuse_wrong_minimum(problem: Adjustment, state: Estimate, dot_px: float) -
     left_out = sum(not p.keep for p in tapes)
     if left_out > max(3, MANY * len(tapes)) and not problem.upright:
         raise SurveyNotFitted(
-            f"{left_out} of {len(tapes)} tapes do not agree with the images: too many for blunders; check "
+            f"{left_out} of {len(tapes)} tapes do not agree with the images: too many for blunders. Check "
             "the sigmas and the joint angles, and whether the mast's axes meet at a right angle (else fit "
             "eight parameters)"
         )

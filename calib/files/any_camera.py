@@ -1,4 +1,4 @@
-"""One camera out of a file of any known format, told by content; written as one, and what that costs."""
+"""One camera out of a file of any known format, recognized by content; written as one, with the losses."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class CameraFiles:
 def load_any(path: str | Path) -> StoredRig | CameraFile | CameraFiles:
     """Read a mast file, or the camera (or cameras) of a file of any other known format.
 
-    The content tells the format. Where it tells nothing the suffix says which format's refusal helps most.
+    The content shows the format. Where it does not, the suffix decides which format's refusal helps most.
 
     Raises
     ------

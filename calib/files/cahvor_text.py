@@ -1,7 +1,7 @@
 """The ``.cahvor`` text files of JPL's camera-model library and of mrcal.
 
 Lines ``KEY = value`` in any order, ``#`` comments. ``Model`` is ``CAHV``, ``CAHVOR``, ``CAHVORE1``,
-``CAHVORE2`` or ``CAHVORE3,linearity``, each followed by words that nobody reads. ``S`` and ``S internal``
+``CAHVORE2`` or ``CAHVORE3,linearity``, each followed by words that are ignored. ``S`` and ``S internal``
 head matrices, one row a line: the covariance of the vectors' components, and of Hs, Hc, Vs, Vc, Theta (all
 five follow from the vectors). JPL's readers find keys by scanning forward for ``C =`` or ``Hs    =`` with
 exactly these blanks, so this writer keeps JPL's order and blanks; numbers are in shortest round-trip form
@@ -40,7 +40,7 @@ _CAHVORE_WORDS = {1: "perspective, distortion, pupil", 2: "fish-eye", 3: "genera
 
 
 def looks_like_cahvor(data: bytes) -> bool:
-    """Tell whether the bytes begin like a .cahvor file: a line ``Model =`` or ``Dimensions =`` or ``C =``."""
+    """Return whether the bytes begin like a .cahvor file: a line ``Model =``, ``Dimensions =`` or ``C =``."""
     return re.search(rb"^[ \t]*(?:Model|Dimensions|C)[ \t]*=", data[:MAX_BYTES], re.MULTILINE) is not None
 
 

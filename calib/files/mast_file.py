@@ -26,7 +26,7 @@ MAST_SCHEMA = "mastctl/mast/1"
 CAMERA_SCHEMA = "mastctl/camera/1"
 
 CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
-"""``<pair>_left`` and ``<pair>_right`` for the eyes of a pair; a camera alone has a name without a side."""
+"""``<pair>_left`` and ``<pair>_right`` for the cameras of a pair; a single camera has no side."""
 CAMERA_NAME_WORDS = "a camera's name is letters, digits, '_' and '-'"
 _PAIR_NAME = CAMERA_NAME
 _ROUNDED, _NO_ROTATION = 1e-15, 1e-3

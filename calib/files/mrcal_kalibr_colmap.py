@@ -64,7 +64,7 @@ _MRCAL_READ = (
 
 
 def looks_like_mrcal(data: bytes) -> bool:
-    """Tell whether the bytes begin like a .cameramodel."""
+    """Return whether the bytes begin like a .cameramodel."""
     return _BEGINS.match(data[:4096]) is not None and b"lensmodel" in data
 
 
@@ -199,7 +199,7 @@ _KALIBR_READ = (
 
 
 def looks_like_kalibr(document: Mapping[str, object]) -> bool:
-    """Tell whether a YAML file's keys are those of a camchain."""
+    """Return whether a YAML file's keys are those of a camchain."""
     first = document.get("cam0")
     return isinstance(first, dict) and "camera_model" in first
 
@@ -293,7 +293,7 @@ HALF_PX = 0.5
 
 
 def looks_like_colmap(data: bytes) -> bool:
-    """Tell whether the bytes hold a line of a camera as cameras.txt has it."""
+    """Return whether the bytes hold a line of a camera as cameras.txt has it."""
     return _LINE.search(data[:65536]) is not None
 
 

@@ -39,7 +39,7 @@ MOST_BLIND = 0.5
 
 
 class Loose(Section):
-    """A mapping whose unknown keys are told, not refused: other programs write more than they need."""
+    """A mapping whose unknown keys are noted, not refused: other programs write more than they need."""
 
     def __init__(self, path: str | Path, place: str, value: Any) -> None:
         if not isinstance(value, dict):
@@ -188,7 +188,7 @@ _ALSO = ("distortion_model", "binning_x", "binning_y", "roi")
 
 
 def looks_like_camera_info(document: dict[str, object]) -> bool:
-    """Tell whether a YAML file's keys are those of a camera_info."""
+    """Return whether a YAML file's keys are those of a camera_info."""
     return "distortion_model" in document and ("camera_matrix" in document or "height" in document)
 
 
@@ -278,7 +278,7 @@ _HEAD = re.compile(rb"\A\s*%YAML[: ]1\.[0-9]\s*?\n(?:---[^\n]*\n)?")
 
 
 def looks_like_opencv(data: bytes) -> bool:
-    """Tell whether the bytes are of OpenCV's FileStorage in YAML."""
+    """Return whether the bytes are of OpenCV's FileStorage in YAML."""
     return data.startswith(b"%YAML:") or _TAG.search(data) is not None
 
 

@@ -149,7 +149,7 @@ class PdsLabel:
 
 @dataclass(frozen=True, eq=False)
 class PdsProduct:
-    """What a pointing program wants of a label.
+    """The values of a label that a pointing program needs.
 
     Attributes
     ----------
@@ -183,7 +183,7 @@ class PdsProduct:
 
 
 def looks_like_pds3(data: bytes) -> bool:
-    """Tell whether the bytes begin with a PDS3 label."""
+    """Return whether the bytes begin with a PDS3 label."""
     return _FIRST.match(data[:4096]) is not None
 
 
@@ -199,7 +199,7 @@ def read_label(path: str | Path) -> PdsLabel:
 
 
 def read_product(path: str | Path, with_image: bool = True) -> PdsProduct:
-    """Read a label and, unless told not to, the image that it points to.
+    """Read a label and, unless ``image`` is false, the image that it points to.
 
     Parameters
     ----------

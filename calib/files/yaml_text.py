@@ -253,7 +253,7 @@ class Section:
     path, place
         The file, and the key path to this mapping ('' for the whole file).
     value
-        What the file holds there.
+        The value in the file.
     required, optional
         The keys that must and may be there.
 

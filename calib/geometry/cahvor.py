@@ -371,7 +371,7 @@ class CameraModel(ReadOnlyArrays):
 
     @property
     def why_no_ray(self) -> str:
-        """``limit_words`` as what follows "has no ray in this camera"; empty if there is nothing to tell."""
+        """``limit_words`` as what follows "has no ray in this camera"; empty if it has one."""
         return f": {self.limit_words}" if self.limit_words else ""
 
     @property
@@ -393,7 +393,7 @@ class CameraModel(ReadOnlyArrays):
         return ((self.size_px[0] - 1) / 2, (self.size_px[1] - 1) / 2)
 
     def holds(self, pixel_px: ArrayLike, margin_px: float = 0.0) -> bool:
-        """Tell whether a pixel (2,) lies in the image, at least ``margin_px`` inside its outer border.
+        """Return whether a pixel (2,) lies in the image, at least ``margin_px`` inside its outer border.
 
         The border runs half a pixel outside the outer pixels' centres. Not-a-number lies outside.
         """

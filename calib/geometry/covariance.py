@@ -240,7 +240,7 @@ def click_covariance(
     Parameters
     ----------
     rig, cameras, pan_rad, tilt_rad
-        Who sees it, and the true joint angles.
+        The camera that sees it, and the true joint angles.
     position_m
         (3,) the point, rover frame.
     sigma_px, sigma_rad
@@ -317,7 +317,7 @@ def refuse_two_points(gap: RayGap, pair: tuple[str, str], by: str) -> None:
     pair
         The cameras' names, left first.
     by
-        What was taken to explain a gap, in words.
+        The causes of a gap that were considered, in words.
 
     Raises
     ------
@@ -329,7 +329,7 @@ def refuse_two_points(gap: RayGap, pair: tuple[str, str], by: str) -> None:
     raise NoStereoPoint(
         "not_one_point",
         f"the two pixels do not mean one point: their rays pass each other at {1e3 * gap.gap_m:.3g} mm, "
-        f"{gap.sigmas:.1f} sigma; the pixel of {pair[1]} is {gap.across_px:.1f} px off the epipolar line of "
+        f"{gap.sigmas:.1f} sigma. The pixel of {pair[1]} is {gap.across_px:.1f} px off the epipolar line of "
         f"that of {pair[0]}, where {by} explain {MOST_SIGMAS * gap.across_sigma_px:.1f} px at most",
     )
 
@@ -351,7 +351,7 @@ def clicked_point(
     Parameters
     ----------
     rig, pair, pan_rad, tilt_rad
-        Who sees it, left camera first, and the joint readings.
+        The cameras that see it, left one first, and the joint readings.
     left_px, right_px
         (2,) clicks.
     sigma_px, sigma_rad

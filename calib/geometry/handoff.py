@@ -76,7 +76,7 @@ class Handoff:
     Attributes
     ----------
     seen
-        What the source pair gives: position in the rover frame and its covariance from the clicks.
+        The result of the source pair: position in the rover frame and its covariance from the clicks.
     gap
         How far its two rays pass each other, and what explains that.
     covariance_m2
@@ -134,7 +134,7 @@ def hand_off(
     sigma_px
         Sigma of each pixel coordinate of a click.
     calibration
-        Covariance of the rig. When left out, the covariances told count it as exact, and the rays' gap is
+        Covariance of the rig. When left out, the returned covariances count it as exact, and the rays' gap is
         judged by `calib.geometry.covariance.RIG_PX`.
 
     Raises
@@ -195,7 +195,7 @@ def _refuse_range(seen: Triangulation, models: Sequence[CameraModel], pair: tupl
         raise NoHandoff(
             "too_far",
             f"the target is {range_m:.3g} m away and its range uncertain by {sigma_m:.3g} m (one sigma), so "
-            f"that {pair[0]} and {pair[1]} cannot tell it from infinity; use a pair that sees far",
+            f"that {pair[0]} and {pair[1]} cannot distinguish it from infinity. Use a pair that sees far",
         )
 
 

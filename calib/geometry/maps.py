@@ -78,7 +78,7 @@ def model_difference(reference: CameraModel, other: CameraModel) -> ModelDiffere
 
 
 def with_one_lens(models: Sequence[CameraModel], lens: CameraModel) -> tuple[CameraModel, ...]:
-    """Return ``lens`` put where each of the models stands, as told by its C, A and H.
+    """Return ``lens`` put where each of the models stands, as given by its C, A and H.
 
     For models whose lens changes from one to the next (interpolated over temperature): what stays of them is
     position and orientation. It trusts parameters, so it holds within one calibration only: A means the same

@@ -1,4 +1,4 @@
-"""What one camera knows of a target: a line of sight, and how far along it the target may be.
+"""One camera's knowledge of a target: a line of sight, and how far along it the target may be.
 
 Along the line counts the inverse range, 1/m: the pixel of a far target in another view depends on it almost
 linearly, and infinity is 0. What another view of the same thing shows (of the same camera, once the head has
@@ -20,7 +20,7 @@ from calib.geometry.rigid import FloatArray, ReadOnlyArrays, frozen_array
 
 NORMAL_95 = 1.96
 FARTHEST_M = 1e5
-"""What has no range that can be told is taken to be here."""
+"""The assumed range of a target whose range cannot be measured."""
 _STEP_RAD = 1e-5
 _STEP_SIGMA = 1e-2
 _ROUNDS = 6
@@ -35,7 +35,7 @@ class Sight(ReadOnlyArrays):
     camera, joints_rad, pixel_px
         Whose picture, the true (pan, tilt) then, and (2,) the pixel.
     inverse_m, inverse_sigma_m
-        1/range from the ray's origin, and one sigma of it, both 1/m; a sigma of 0: the range was told.
+        1/range from the ray's origin, and one sigma of it, both 1/m; a sigma of 0: the range was given.
     """
 
     camera: str
@@ -129,7 +129,7 @@ def seen_from(
     rig, sight
         The mast file's content, and what is known.
     camera, joints_rad
-        Who looks, and the true (pan, tilt) then.
+        The camera, and the true (pan, tilt) then.
     sigma_px
         Of each coordinate of the sight's pixel.
     sigma_rad
@@ -226,7 +226,9 @@ def shown(
     with_it = float(direction @ other_direction)
     depth = with_it + inverse * float((origin - other_origin) @ other_direction)
     if not (depth > 0.0 and with_it > 0.0):
-        raise CalibError(f"what {sight.camera} sees at {1 / max(inverse, 1e-5):.3g} m is not before {camera}")
+        raise CalibError(
+            f"the target that {sight.camera} sees at {1 / max(inverse, 1e-5):.3g} m is not before {camera}"
+        )
     return replace(there, inverse_m=inverse / depth, inverse_sigma_m=sigma * with_it / depth**2)
 
 

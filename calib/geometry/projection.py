@@ -34,7 +34,7 @@ Rays = tuple[FloatArray, FloatArray, np.ndarray, FloatArray, FloatArray]
 
 
 class PixelMap(Protocol):
-    """What a camera needs of a lens with the plane behind it, wherever the camera stands.
+    """The functions that a camera needs of a lens with the plane behind it, wherever the camera stands.
 
     `Projection` is that of the CAHV family, `calib.geometry.lenses.projection.FreeProjection` that of lenses
     which are not round about O.

@@ -148,8 +148,8 @@ def _surface(
     if np.linalg.norm(apart) > worst:
         return _none(
             "ambiguous",
-            f"in the source pair: the right eye's pixel lies {np.linalg.norm(apart):.1f} px from where the "
-            f"pictures put the left eye's target, at most {worst:.1f} px is expected",
+            f"in the source pair: the right camera's pixel lies {np.linalg.norm(apart):.1f} px from where "
+            f"the pictures put the left camera's target, at most {worst:.1f} px is expected",
         )
     return found.plane
 
@@ -185,7 +185,7 @@ def _looked_up(
     if distance > settings.sigmas + 1.0:
         return _none(
             "occluded",
-            f"what fits best lies {np.linalg.norm(off):.1f} px from the geometric hand-off, {distance:.1f} "
+            f"the best match lies {np.linalg.norm(off):.1f} px from the geometric hand-off, {distance:.1f} "
             "of its standard deviations: something else, or a wrong calibration",
             *scores,
         )

@@ -278,7 +278,7 @@ def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings) -> Tra
     allowed = settings.worst_chi2 if len(good) > 1 else 13.8
     if chi2 > allowed:
         words = (
-            f"what was found does not fit the prediction: weighted misfit {chi2:.0f}, at most "
+            f"the match does not fit the prediction: weighted misfit {chi2:.0f}, at most "
             f"{allowed:g} is expected"
         )
         unsure = against and replace(against, sure=False)
@@ -321,9 +321,9 @@ def _not_confirmed(track: Track, found: Mapping[str, PatchMatch], good: Mapping[
         return words or "no picture was given"
     doubt = next((f"{n}: {m.reason}" for n, m in found.items() if m.verdict in ("weak", "ambiguous")), "")
     if doubt:
-        return f"one eye does not confirm the other: {doubt}"
+        return f"one camera does not confirm the other: {doubt}"
     if len(good) == 1 and track.state == "lost":
-        return "one eye alone does not find a lost target again"
+        return "one camera alone does not find a lost target again"
     return ""
 
 

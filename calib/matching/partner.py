@@ -106,7 +106,7 @@ def find_partner(
     try:
         triangulate(camera, partner, pixel, found.pixel_px)
     except NoStereoPoint as error:
-        return StereoMatch(no_match("weak", f"the two eyes see no point together: {error}", found.pixel_px))
+        return StereoMatch(no_match("weak", f"the two cameras see no common point: {error}", found.pixel_px))
     across, sigma = _across(camera, pixel, partner, plane, found)
     apart = math.inf
     for size in sizes:
@@ -116,7 +116,7 @@ def find_partner(
         if apart <= MATCHED_BACK_PX + abs(across):
             return StereoMatch(replace(found, second=max(found.second, second)), plane, across, sigma, relief)
     told = "nowhere" if math.isinf(apart) else f"{apart:.0f} px from where it came"
-    words = f"matched back from the other eye it lands {told}: probably hidden from one eye"
+    words = f"matched back from the other camera it lands {told}: probably hidden from one camera"
     return StereoMatch(no_match("weak", words, found.predicted_px, found.correlation, second))
 
 
@@ -142,7 +142,7 @@ def _surface(
     half = settings.half_px + AROUND_PX
     seen = surface_seen(image, camera, pixel, partner_image, partner, swept.plane, half, settings.noise_dn)
     if seen is None:
-        words = "the two eyes see no surface together there: an edge, or hidden from one of them"
+        words = "the two cameras see no common surface there: an edge, or hidden from one of them"
         return no_match("weak", words, *facts)
     return *seen, swept.second
 

@@ -74,7 +74,7 @@ def sweep(
         return no_match("border", "the pixel has no ray in this camera")
     inverse, places = _curve(ray, partner, nearest_m, settings.smallest_half_px)
     if len(inverse) == 0:
-        return no_match("border", "nothing that this pixel may show lies in the other eye's picture")
+        return no_match("border", "nothing that this pixel may show lies in the other camera's picture")
     normals = _normals(ray.directions)
     small = np.asarray(cv2.pyrDown(image), np.float32)
     partner_small = np.asarray(cv2.pyrDown(partner_image), np.float32)

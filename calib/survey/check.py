@@ -151,7 +151,7 @@ def check_survey(
             SurveyFinding(
                 "warning",
                 "images.csv",
-                "there is no image of purpose check, so nothing independent tells how good the result is",
+                "there is no image of purpose check, so nothing independent shows how good the result is",
                 "Photograph two to four more placements and mark those images check; they are never fitted",
             )
         )

@@ -111,7 +111,7 @@ def _stood(axis: Axis) -> str:
     if not servo.get("torque_enable"):
         return "has its torque off"
     servo.stand()
-    return "was told to stand where it is, and holds"
+    return "was commanded to stand where it is, and holds"
 
 
 def _see_rest(axis: Axis, clock: Clock) -> None:

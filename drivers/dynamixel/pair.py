@@ -244,7 +244,7 @@ def _stand(pair: Pair) -> None:
             except LineLost:
                 raise
             except DriverError as error:  # told, with what it is, when the servo is made ready
-                log.debug("%s was not told to stand: %s", axis.servo.name, error)
+                log.debug("%s was not commanded to stand: %s", axis.servo.name, error)
             else:
                 waiting.remove(axis)
 

@@ -264,7 +264,7 @@ class Servo(ServoTable):
             if not self._head.torque_off_at_start:
                 raise WrongDevice(
                     f"{self.name} must be set to {told}, which it takes only with torque off, but torque is "
-                    "on and the axis may fall: support it and set torque_off_at_start: true, or switch the "
+                    "on and the axis may fall. Support it and set torque_off_at_start: true, or switch the "
                     "servo off and on"
                 )
             self._dropped = True

@@ -172,7 +172,7 @@ def _watchdog_s(read: OptionReader, speed: float, acceleration: float, poll_hz: 
         left_s = STANDS_WITHIN_S - 1 / poll_hz - SHORTEST_WATCHDOG_S
         raise read.refused(
             "acceleration_rad_per_s2",
-            f" is {acceleration:g}: braking from {speed:g} rad/s takes {brakes_s:.3g} s, so that the bus "
+            f" is {acceleration:g}. Braking from {speed:g} rad/s takes {brakes_s:.3g} s, so that the bus "
             f"watchdog cannot stop the head within {STANDS_WITHIN_S:g} s in all; expected "
             f"{speed / left_s:.3g} or more, a lower speed_rad_per_s, or watchdog_s: 0 to do without",
         )
@@ -181,7 +181,7 @@ def _watchdog_s(read: OptionReader, speed: float, acceleration: float, poll_hz: 
         raise read.refused(
             "watchdog_s",
             f" is {watchdog_s:.3g} s, and the head brakes from {speed:g} rad/s at {acceleration:g} rad/s2 in "
-            f"{brakes_s:.3g} s; expected {SHORTEST_WATCHDOG_S:g} s or more, and {STANDS_WITHIN_S:g} s in "
+            f"{brakes_s:.3g} s. Expected {SHORTEST_WATCHDOG_S:g} s or more, and {STANDS_WITHIN_S:g} s in "
             "all, the last poll's age included; or 0 to do without",
         )
     return watchdog_s

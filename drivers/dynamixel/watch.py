@@ -154,7 +154,7 @@ class Watch:
         self._pair.brake()
         error = axis.servo.get("hardware_error")
         if not error:
-            log.warning("%s told of a hardware error but has none; the head has braked", axis.servo.name)
+            log.warning("%s reported a hardware error but has none; the head has braked", axis.servo.name)
             return
         words = hardware_fault_words(axis.servo.name, error)
         if not axis.servo.get("torque_enable"):
@@ -201,4 +201,4 @@ class Watch:
 
 def _distrust(words: str) -> GivenUp:
     """Something changed the servos that was not this driver."""
-    return GivenUp(BadReply(f"{words}: it restarted, or somebody else set it"))
+    return GivenUp(BadReply(f"{words}: it restarted, or another program set it"))

@@ -36,7 +36,7 @@ HIT = (
     "home it (mastctl ptu home)"
 )
 JUMPED = (
-    "{axis} was at {before:.4f} rad before the unit or its line was away and is at {after:.4f} rad now, "
+    "{axis} was at {before:.4f} rad before the connection was lost and is at {after:.4f} rad now, "
     "so the unit may have lost count; home it (mastctl ptu home)"
 )
 
@@ -88,7 +88,7 @@ class StepAxis:
         if told is not None and abs(resolution_arcsec / told - 1) > SAME_RESOLUTION:
             raise WrongDevice(
                 f"says that a {name} position is {resolution_arcsec:g} seconds of arc, "
-                f"options.{name}.resolution_arcsec {told:g}; either its step mode was changed, "
+                f"options.{name}.resolution_arcsec {told:g}. Either its step mode was changed, "
                 "or it is an E46 that was not homed yet (mastctl ptu home)",
                 device=DEVICE,
             )
@@ -257,7 +257,7 @@ class StepCount:
         if self.doubted:
             return
         if axes and all(one.rests for one in axes.values()):
-            log.warning("%s: a limit hit is told of the %s axis, which stands still", DEVICE, axis)
+            log.warning("%s: the unit reports a limit hit of the %s axis, which stands still", DEVICE, axis)
             self.doubted = {name: one.angle_rad for name, one in axes.items()}
             return
         self.halt_owed = True

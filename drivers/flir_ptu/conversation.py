@@ -348,7 +348,7 @@ class Conversation:
                 answer = self._next_answer(written, until_s, skip=True)
             except NoReply:
                 if refusal:
-                    words = f"does not tell its {axis} resolution: {refusal}"
+                    words = f"does not report its {axis} resolution: {refusal}"
                     raise Refused(words, device=self._device) from None
                 raise
             other = {"pan": "tilt", "tilt": "pan"}[axis]

@@ -163,7 +163,7 @@ class FlirPtu:
             for name, (target, _) in ways.items():
                 talk.tell(f"{name[0].upper()}P{target}")
             if self._count.doubted:
-                words = "told of a limit hit while it stood still; it is checked before it moves"
+                words = "reported a limit hit while it stood still; it is checked before it moves"
                 raise BadReply(words, device=DEVICE)
             if self._stop_asked:
                 raise DriverError("a stop came before the move was started", device=DEVICE)

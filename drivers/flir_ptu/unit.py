@@ -311,5 +311,5 @@ def _supply(talk: Conversation) -> Supply | None:
     try:
         return supply_of(talk.tell("O"))
     except Refused as error:
-        log.info("%s: it does not tell its supply (%s)", DEVICE, error)
+        log.info("%s: it does not report its supply voltage (%s)", DEVICE, error)
         return None

@@ -89,7 +89,7 @@ class Exchange:
     def stray(self, status: Status) -> None:
         """Note a reply to another question; the line is listened to until quiet before the next one."""
         self.port.suspect = True
-        log.debug("%s: dropped a reply of id %d that nobody waits for", self.port.name, status.servo_id)
+        log.debug("%s: dropped a reply of id %d to no pending request", self.port.name, status.servo_id)
 
     def silence(self, servo_id: int, word: str, register: str) -> NoReply:
         """Return the error of a servo that did not answer."""

@@ -279,7 +279,7 @@ class Port:
             self._buffer.clear()
             if self.clock.now_s() > until_s:
                 raise BadReply(
-                    f"{self.name} is never quiet: {dropped} bytes in {longest_s:g} s that nobody wants",
+                    f"{self.name} is never quiet: {dropped} bytes in {longest_s:g} s that answer no request",
                     detail={"port": self.name},
                 )
         self.suspect = False

@@ -226,7 +226,7 @@ def _check_reach(read: OptionReader, axis: ServoAxisSettings) -> None:
             "limits_rad",
             f" are the servo's counts {low} to {high}, but a {model.name} in position mode holds "
             f"{model.low_count} to {model.high_count}, which with zero_counts {axis.zero_counts} is "
-            f"{reach[0]:.4f} to {reach[1]:.4f} rad; mount the horn so that the range does not cross the seam",
+            f"{reach[0]:.4f} to {reach[1]:.4f} rad. Mount the horn so that the range does not cross the seam",
         )
 
 

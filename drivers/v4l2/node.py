@@ -246,7 +246,7 @@ class Node:
             )
         for index in range(request.count):
             buffer = self._buffer(index)
-            self.call(abi.VIDIOC_QUERYBUF, buffer, f"tell where buffer {index} is")
+            self.call(abi.VIDIOC_QUERYBUF, buffer, f"locate buffer {index}")
             try:
                 self._maps.append(
                     mmap.mmap(

@@ -40,6 +40,20 @@ def test_every_command_says_what_it_does() -> None:
     assert [name for _, name, parser in parsers(build_parser([])) if not parser.description] == []
 
 
+def test_every_argument_of_every_command_has_a_help() -> None:
+    everything = [("", "mastctl", build_parser([])), *parsers(build_parser([]))]
+    arguments = [
+        (f"{words} {name}", one)
+        for words, name, parser in everything
+        for one in parser._actions
+        if not isinstance(one, argparse._SubParsersAction)
+    ]
+    assert len(arguments) > 300
+    assert [
+        f"{command}: {one.option_strings or one.dest}" for command, one in arguments if not one.help
+    ] == []
+
+
 def test_every_command_is_in_readme_or_docs(repository: Path) -> None:
     pages = [repository / "README.md", *(repository / "docs").rglob("*.md")]
     text = " ".join(" ".join(page.read_text(encoding="utf-8") for page in pages).split())

@@ -1,4 +1,4 @@
-"""What the daemon tells, key by key: the service makes these records, the web side describes them, and the
+"""The daemon's answers, key by key: the service makes these records, the web side describes them, and the
 event stream, recordings and clients have them.
 
 They are plain dictionaries; a type checker holds whoever makes or reads one to its keys. Each key is there

@@ -1,4 +1,4 @@
-"""What is answered of guided bench calibrations and of reports."""
+"""Answers about guided bench calibrations and reports."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Pair = Annotated[list[float], Len(2, 2)]
 
 
 class PlacementAsked(TypedDict):
-    """Where a board is asked for, from the head's axes; ``waits``: until somebody says that it stands.
+    """Where a board is asked for, from the head's axes; ``waits``: until an operator confirms that it stands.
 
     ``bearing_deg`` to the right of pan zero, ``height_deg`` above the axes, ``turned_deg``: its face, to the
     head's right and upwards.
@@ -61,7 +61,7 @@ class ResidualTold(TypedDict):
 
 
 class BenchResult(TypedDict):
-    """What came of a bench calibration.
+    """The result of a bench calibration.
 
     ``pointing_...``: corners that were pointed at, measured and promised; ``calibrated_px``, ``counts_px``:
     what the calibration, and the encoders' counts alone, leave of a first pointing, rms an axis.
@@ -106,7 +106,7 @@ class BenchRunTold(TypedDict):
     cameras: dict[str, CoverageTold]
     curve: list[Pair]
     sentences: list[str]
-    odd: Count
+    unread_lines: Count
     result: BenchResult | None
     mast_file: str | None
     report: str | None

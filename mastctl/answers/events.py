@@ -1,4 +1,4 @@
-"""What the event stream tells: by the answers of the routes, where a route tells the same."""
+"""The events of the stream: the answers of the routes, where a route gives the same."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class HeadTold(Joints):
 
 
 class StateTold(StandingTold):
-    """What the daemon is doing; ``track`` is the id of the active one."""
+    """The daemon's state; ``track`` is the id of the active one."""
 
     track: str | None
     moving: bool
@@ -156,4 +156,4 @@ Event = (
     | LeaseEvent
     | BenchEvent
 )
-"""One event of ``/events``, told apart by its ``topic``."""
+"""One event of ``/events``, distinguished by its ``topic``."""

@@ -1,4 +1,4 @@
-"""What a daemon keeps and tells of itself: its rig, mast files, health, recordings, places, sessions."""
+"""Answers about the things that a daemon keeps: its rig, mast files, health, recordings, places, sessions."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ class CameraMountTold(TypedDict):
     width_rad: float
     height_rad: float
     pair: str | None
-    eye: Literal["left", "right"] | None
+    side: Literal["left", "right"] | None
     partner: str | None
 
 
 class RigTold(TypedDict):
     """``GET /rig``: the configured cameras by the mast file in use, its date, its neighbours.
 
-    ``made`` as the file's provenance says it; ``written_s``: when the file was, seconds since 1970 (UTC).
+    ``mast_date`` as the file's provenance says it; ``modified_s``: of the file, seconds since 1970 (UTC).
     """
 
     digest: str
-    made: str | None
-    written_s: float | None
+    mast_date: str | None
+    modified_s: float | None
     cameras: dict[str, CameraMountTold]
     mast_files: list[str]
 
@@ -86,7 +86,7 @@ class CalibrationHealthTold(CalibrationTold):
     log10_threshold: float
     false_alarms_per_day: float
     cameras: dict[str, TurnedTold]
-    not_kept: str | None
+    write_error: str | None
     newest: list[MeasuredTold]
     sentinel: SentinelTold | None
 
@@ -101,7 +101,7 @@ class HistoryEvent(TypedDict):
 
 
 class HistoryTold(TypedDict):
-    """``GET /history``: oldest first; one number a sample, of the axes that tell their temperature °C."""
+    """``GET /history``: oldest first; one number a sample, of the axes that report their temperature, °C."""
 
     age_s: list[Seconds]
     pan_rad: list[float]
@@ -177,7 +177,7 @@ class MastsTold(TypedDict):
 
 
 class ChangeTold(TypedDict):
-    """What two configurations say differently: the key, and what was and is there; null for nothing."""
+    """A difference of two configurations: the key, its former and its present value; null where absent."""
 
     key: str
     before: Any
@@ -193,7 +193,7 @@ class ReloadTold(TypedDict):
 
 
 class SessionTold(TypedDict):
-    """``GET /session``: who asks, what it may do, and by which way it came.
+    """``GET /session``: the client, its rights, and the way it came.
 
     ``ends_in_s`` of a page's session; ``needs_token``: whether the daemon asks for one at all.
     """

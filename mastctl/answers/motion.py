@@ -1,4 +1,4 @@
-"""What is answered where the head is sent, turned or stopped: operations, previews, stops, the track."""
+"""Answers where the head is sent, turned or stopped: operations, previews, stops, the track."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class Operations(TypedDict):
 
 
 class Started(TypedDict):
-    """What was started: the id of its operation."""
+    """The id of the operation that was started."""
 
     id: str
 
@@ -165,7 +165,7 @@ class ResetTold(TypedDict):
 
 
 class EyeTold(TypedDict):
-    """What one eye told of the target; pixel and sigma are null without a good verdict."""
+    """One camera's result for the target; pixel and sigma are null without a good verdict."""
 
     frame_id: str
     verdict: str
@@ -185,7 +185,7 @@ class HandoffTold(TypedDict):
 
 
 class OffsetTold(TypedDict):
-    """What hand-offs from ``source`` to ``camera`` tell by more than chance: found less predicted."""
+    """The offset, beyond chance, of hand-offs from ``source`` to ``camera``: found less predicted."""
 
     source: str
     camera: str

@@ -1,4 +1,4 @@
-"""What is answered of a simulated rover: where it truly stands, boards before it, its time, its faults."""
+"""Answers about a simulated rover: where it truly stands, boards before it, its time, its faults."""
 
 from __future__ import annotations
 
@@ -56,17 +56,17 @@ class FaultsSet(TypedDict):
 
 
 class ParameterTold(TypedDict):
-    """A parameter of a fault word: its usual value and its bounds; null for one without an end."""
+    """A parameter of a fault word: its default and its bounds; null for one without an end."""
 
-    usual: float | None
+    default: float | None
     least: float
     most: float | None
 
 
 class WordTold(TypedDict):
-    """A fault word: what it does, in one sentence, and its parameters; the unit is in the name."""
+    """A fault word: its effect, in one sentence, and its parameters; the unit is in the name."""
 
-    does: str
+    effect: str
     parameters: dict[str, ParameterTold]
 
 

@@ -1,4 +1,4 @@
-"""What a daemon is and does at this moment: `Status`, and the parts that others have too."""
+"""The present state of a daemon: `Status`, and the parts that others have too."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Joints(TypedDict):
 
 
 class AxisTold(TypedDict):
-    """How an axis of the head moves; ``count_rad`` null where nobody knows."""
+    """How an axis of the head moves; ``count_rad`` null where unknown."""
 
     count_rad: float | None
     one_sided: bool
@@ -77,7 +77,7 @@ class Sun(TypedDict):
 
 
 class SunTold(TypedDict):
-    """``GET /limits/sun``; null where none was told. ``boxes``: of joints, within its cone while it holds."""
+    """``GET /limits/sun``; null where none was stated. ``boxes``: joint angles within its cone."""
 
     sun: Sun | None
     boxes: list[BoxTold]
@@ -93,7 +93,7 @@ class CameraTold(TypedDict):
 
 
 class FaultTold(TypedDict):
-    """What is wrong with a device, in plain words, for how long, and what takes it back."""
+    """A fault of a device in plain words, since when, and the event that ends it."""
 
     device: str
     code: str
@@ -161,7 +161,7 @@ class LastResidual(TypedDict):
 
 
 class ControlTold(TypedDict):
-    """Who steers, by a lease or by what runs; ``until`` by the wall clock, null for as long as it runs."""
+    """The client that steers, by a lease or an operation; ``until`` by the wall clock, null while it runs."""
 
     holder: str
     kind: Literal["lease", "operation"]
@@ -170,7 +170,7 @@ class ControlTold(TypedDict):
 
 
 class LeaseTold(TypedDict):
-    """``GET /lease``: who steers; null for nobody."""
+    """``GET /lease``: the client that steers, or null."""
 
     control: ControlTold | None
 
@@ -198,7 +198,7 @@ class EstopHeld(TypedDict):
 
 
 class StandingTold(TypedDict):
-    """What the daemon is doing: the state's word, why, for how long, and what it rests on."""
+    """The daemon's state: its word, the reason, since when, and the facts it rests on."""
 
     state: Word
     reason: str

@@ -12,7 +12,7 @@ Role = Literal["view", "operate", "admin"]
 Word = Literal[
     "starting", "ready", "moving", "tracking", "holding", "stopping", "stopped", "fault", "closing"
 ]
-"""What the daemon is doing."""
+"""The daemon's state."""
 WELL: frozenset[Word] = frozenset({"ready", "moving", "tracking", "holding"})
 """States in which a command is carried out."""
 OperationState = Literal["queued", "running", "done", "failed", "stopped"]

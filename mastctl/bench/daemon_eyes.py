@@ -204,7 +204,7 @@ class DaemonEyes:
         if held is not None:
             return f"the head was stopped in the middle of a move by {why}; 'mastctl reset' releases it"
         if why == "a stop was asked for":
-            return "somebody pressed stop in the middle of a move, and the head stands still"
+            return "a stop was requested in the middle of a move, and the head stands still"
         return f"the head was stopped in the middle of a move: {why}"
 
     def _seen(self, shot: Snapshot) -> SeenBoard:
@@ -272,7 +272,7 @@ def _why(image: Any, reason: str) -> str:
 def _sentence(error: ClientError) -> str:
     """What a daemon said, as what somebody has to do about it."""
     if error.code == "leased":
-        return f"somebody else steers the head: {error}"
+        return f"another client steers the head: {error}"
     if error.code == "estopped":
         return f"the emergency stop is latched ('mastctl reset' releases it): {error}"
     if error.code == "lease_over" and "the head was stopped" in str(error):

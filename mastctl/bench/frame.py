@@ -162,7 +162,7 @@ def _by_body(done: BenchCalibration, former: Rig | None) -> tuple[Rigid, str]:
     ]
     if not names:
         raise NoSuchFrame(
-            "no body camera is tied to the head, and so none says where the rover frame is; have the board "
+            "no body camera is tied to the head, and so none shows where the rover frame is. Have the board "
             "placed where one sees it, or say where the mast is (--mast-at)"
         )
     pairs = [(here.cameras[name].model, former.cameras[name].model) for name in names]
@@ -192,7 +192,7 @@ def without_lonely(survey: Survey) -> tuple[Survey, tuple[str, ...]]:
             count = "no placement" if not both else "1 placement"
             notes.append(
                 f"body camera {name} is not tied to the head: it saw the board at {count} that the head saw "
-                f"too, {FEWEST} at least are expected; put the board low, where both see it"
+                f"too, {FEWEST} at least are expected. Put the board low, where both see it"
             )
     if not lonely:
         return survey, ()

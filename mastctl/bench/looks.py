@@ -71,7 +71,7 @@ class BenchGoal:
         slowest = max(picture_s, key=picture_s.__getitem__)
         return (
             f"{fewest} to {self.pictures} looks will take {_minutes(fewest * least_s)} to "
-            f"{_minutes(self.pictures * most_s)} minutes here: one of all {len(picture_s)} cameras "
+            f"{_minutes(self.pictures * most_s)} minutes here. One of all {len(picture_s)} cameras "
             f"{most_s:.1f} s ({slowest} {picture_s[slowest]:.1f} s, the choice of the next "
             f"{choice_s:.1f} s), "
             f"of {', '.join(pointing)} alone {least_s:.1f} s; --cameras leaves others out"
@@ -165,7 +165,7 @@ class Looks:
             if missed >= UNSEEN_IN_A_ROW:
                 raise BoardLost(
                     f"the board of placement {name} was not seen in {missed} looks in a row where it stood "
-                    f"({_whys(look)}); put it back or place it anew, and start the same command again"
+                    f"({_whys(look)}). Put it back or place it anew, and start the same command again"
                 )
         for shot in known.round_others(name):
             if known.pictures() < self._wanted.pictures - self._wanted.checks:
@@ -217,7 +217,7 @@ class Looks:
         if apart_px is not None and apart_px > self._allowed_px():
             self._teller.say(
                 f"placement {name}: its first picture taken again shows the board {apart_px:.1f} px aside: "
-                "the board or the head moved meanwhile; the fit will tell what it was, and when"
+                "the board or the head moved meanwhile; the fit will show which, and when"
             )
             self._known.kept.note(event="moved", name=name, apart_px=round(apart_px, 2))
             self._known.take(name, now)  # one more picture of how it is now

@@ -173,8 +173,8 @@ def _plots(told: BenchPage, differences: list[Any]) -> dict[str, Any]:
         "joints": plots.plot(
             drawn.against_joints(fit, cameras),
             "mean residual of each picture over pan and tilt",
-            "What a joint reads wrong moves whole pictures: pan in x, tilt in y. A wave is a harmonic, "
-            "two levels are backlash; what is left here the model does not have.",
+            "An error of a joint moves whole pictures: pan in x, tilt in y. A wave is a harmonic, "
+            "two levels are backlash. The model has no term for the rest shown here.",
         ),
         "curves": plots.plot(
             drawn.joint_curves(fit, told.survey),

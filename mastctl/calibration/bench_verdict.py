@@ -87,7 +87,7 @@ def _inexact(survey: Survey, calibration: BenchCalibration) -> Iterator[Reason]:
         yield Reason(
             "care" if off_px > LITTLE * survey.sigma.corner_px else "good",
             f"corners are off by some {1e3 * calibration.inexact_m:.2g} mm on the board, more than their own "
-            "sigmas say: an inexact print, or a lens that is only nearly of its model; they count with that, "
+            "sigmas say: an inexact print, or a lens that is only nearly of its model. They count with that, "
             "but it is the same in every picture, and uncertainties are rather too small",
         )
 

@@ -144,7 +144,7 @@ def exchanged_boards(survey: Survey, calibration: Calibration) -> Iterator[str]:
         elif own < other:
             yield (
                 f"the boards of placements {own[1]} and {other[1]} (set-up {own[0]}) seem to be exchanged: "
-                f"{_names([*images, *back])} show the other one; correct the names of the tapes in "
+                f"{_names([*images, *back])} show the other one. Correct the names of the tapes in "
                 "station.csv or the placements in images.csv"
             )
 

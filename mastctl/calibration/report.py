@@ -147,7 +147,7 @@ def _correlations(calibration: Calibration) -> list[Figure]:
         mine = calibration.covariance[np.ix_(mast, mast)]
         made = drawn.correlation([names[i] for i in mast], mine, "mast")
         found.append(plots.plot(made, "correlation of mast parameters", "Mast parameters."))
-    caption = "All parameters. What the prisms leave open turns mast and cameras together."
+    caption = "All parameters. Directions that the prisms leave open turn mast and cameras together."
     made = drawn.correlation(names, calibration.covariance, "mast and cameras")
     return [*found, plots.plot(made, "correlation of all parameters", caption)]
 

@@ -207,7 +207,7 @@ def _wider(calibration: Calibration) -> list[Reason]:
     reasons = [Reason(grade, words)]
     if others:
         names = _some([f"{model.name} ({model.gain:.0f} with {model.numbers})" for model in others])
-        reasons.append(Reason("care", f"what else would gain, perhaps by the same cause: {names}"))
+        reasons.append(Reason("care", f"other terms that would gain, perhaps by the same cause: {names}"))
     return reasons
 
 

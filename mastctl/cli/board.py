@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 USUAL_MM = 25.0
 """Of squares on A4; on other papers in proportion."""
 
+KINDS = ("charuco", "aprilgrid", "dots", "checkerboard")
 DICTIONARIES = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
 
 
@@ -24,7 +25,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     board = subparsers.add_parser("board", help="a board to calibrate with: make one, measure it, find it")
     acts = board.add_subparsers(dest="act", required=True, metavar="ACT")
     make = acts.add_parser("make", help="draw a board to print, and write its BOARD.yaml beside it")
-    make.add_argument("--kind", required=True, choices=("charuco", "aprilgrid", "dots", "checkerboard"))
+    make.add_argument("--kind", required=True, choices=KINDS, help="the pattern")
     make.add_argument("--out", required=True, metavar="FILE", help="board.pdf or board.svg")
     make.add_argument(
         "--paper", default="A4", help="A4 (default), A3, A2, letter, ..., or WxH in mm: 500x700"
@@ -57,12 +58,18 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     )
     make.set_defaults(run=_make)
     measured = acts.add_parser("measured", help="write the lengths of a print's bars into its BOARD.yaml")
-    measured.add_argument("board", metavar="BOARD.yaml")
-    measured.add_argument("--across-mm", required=True, type=finite_number, metavar="MM")
+    measured.add_argument("board", metavar="BOARD.yaml", help="the board's file, which is rewritten")
+    measured.add_argument(
+        "--across-mm",
+        required=True,
+        type=finite_number,
+        metavar="MM",
+        help="the printed bar across, as measured",
+    )
     measured.add_argument("--down-mm", type=finite_number, metavar="MM", help="as across, if left out")
     measured.set_defaults(run=_measured)
     find = acts.add_parser("find", help="find a board's corners in pictures, or say why there are none")
-    find.add_argument("board", metavar="BOARD.yaml")
+    find.add_argument("board", metavar="BOARD.yaml", help="the board's file")
     find.add_argument("pictures", nargs="+", metavar="PICTURE", help="PNG or JPEG")
     find.add_argument("--out", metavar="FILE", help="a CSV of all corners: picture,id,x_px,y_px,sigma_px")
     find.set_defaults(run=_find)

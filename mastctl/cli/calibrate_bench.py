@@ -83,7 +83,7 @@ def add_commands(subparsers: Any) -> None:
         "its answer; the run ends with stdin. Steers under $MASTCTL_LEASE, which the program renews",
     )  # fmt: skip
     where = parser.add_argument_group(
-        "where the rover frame is, which pictures cannot tell (default: where the mast file in use has it; "
+        "where the rover frame is, which pictures cannot show (default: where the mast file in use has it; "
         "of a FOLDER: as its run had it)"
     ).add_mutually_exclusive_group()
     pose = ("X", "Y", "Z", "RX", "RY", "RZ")

@@ -129,8 +129,8 @@ def _show_pose(group: str, pose: BodyPose) -> None:
     if pose.eyes_apart is not None and pose.eyes_apart.sigmas > 3.0:
         x, y = pose.eyes_apart.offset_px
         notes.append(
-            f"right and left eye stay apart by {x:+.2f}, {y:+.2f} px ({pose.eyes_apart.sigmas:.1f} sigma): "
-            "no motion of the pair explains it, one eye or its model is off; survey the pair again"
+            f"right and left camera differ by {x:+.2f}, {y:+.2f} px ({pose.eyes_apart.sigmas:.1f} sigma): "
+            "no motion of the pair explains it. One camera or its model is off; survey the pair again"
         )
     words = f"{pose.sigmas:.1f} sigma ({'' if pose.significant else 'not '}significant)"
     output.print_table(
@@ -222,13 +222,13 @@ def _show_scene(proposal: SceneProposal, saved: StoredRig, told_rad: float) -> N
         notes.append(f"and {len(fit.outliers) - OUTLIERS_SHOWN} more were not used, all named by --json")
     if proposal.other_mast:
         notes.append(
-            f"{proposal.other_mast} pictures were taken with another mast file; what joints read counts"
+            f"{proposal.other_mast} pictures were taken with another mast file; their joint readings count"
         )
     if fit.scale > 1.0:
         notes.append(f"the sigmas are widened by {fit.scale**0.5:.2f}, as the residuals ask")
     notes += [
         f"proposed mast file: {saved.path} ({saved.digest[:12]}); {proposal.mast.path} is as it was",
-        "what pictures cannot tell, where the rover is and the joints' zero, stays as the former file has it",
+        "where the rover is and the joints' zero stay as in the former file: pictures cannot show them",
     ]
     output.print_table("Corrected by the scene", ["number", "added", "sigma", "", ""], rows, notes)
 
@@ -240,4 +240,4 @@ def _unit(name: str) -> str:
 
 def _scatter(fit: SceneFit, told_rad: float) -> str:
     """What is to be said of how rests scatter."""
-    return "" if fit.joint_sigma_rad <= told_rad else f", not to {1e3 * told_rad:.2f} as was told"
+    return "" if fit.joint_sigma_rad <= told_rad else f", not to {1e3 * told_rad:.2f} as was stated"

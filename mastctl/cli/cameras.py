@@ -37,7 +37,7 @@ def add_actions(actions: Any) -> None:
         "grab", help="one fresh picture as PNG, with time, joints and mast digest in it"
     )
     add_camera_options(grab)
-    grab.add_argument("--out", required=True, type=Path, metavar="FILE.png")
+    grab.add_argument("--out", required=True, type=Path, metavar="FILE.png", help="image to write")
     grab.add_argument("--aim", nargs=2, type=finite_number, metavar=("X", "Y"), help="mark this pixel")
     grab.set_defaults(run=camera_grab)
 
@@ -327,7 +327,7 @@ def _print_any_check(told: dict[str, Any]) -> None:
             ("exposure", f"{shortest:.1f} to {longest:.1f} ms"),
             (
                 "mid-exposure known to",
-                "not told; mastctl camera sync measures it"
+                "not known; mastctl camera sync measures it"
                 if uncertainty_s is None
                 else f"+-{1e3 * uncertainty_s:.1f} ms",
             ),

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from calib.geometry.handoff import Handoff, Joints
     from calib.geometry.rig import Rig
 
+MAST_HELP = "the mast file"
+FROM_HELP = "present angle; solutions near it come first (default: 0)"
+SIGMA_HELP = "one sigma of a click, each axis (default: 0.2)"
+
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add solve, triangulate, budget and handoff."""
@@ -26,7 +30,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
 def _add_geometry(subparsers: Any) -> None:
     """Add the commands of this module to the parser's commands."""
     solve = subparsers.add_parser("solve", help="the true joint angles that bring a target onto a pixel")
-    solve.add_argument("mast", type=Path, metavar="MAST.yaml")
+    solve.add_argument("mast", type=Path, metavar="MAST.yaml", help=MAST_HELP)
     solve.add_argument("--camera", required=True, metavar="NAME", help="a camera on the head")
     solve.add_argument(
         "--target", required=True, nargs=3, type=finite_number, metavar=("X", "Y", "Z"), help="rover frame, m"
@@ -34,22 +38,29 @@ def _add_geometry(subparsers: Any) -> None:
     solve.add_argument(
         "--pixel", nargs=2, type=finite_number, metavar=("U", "V"), help="default: the image centre"
     )
-    solve.add_argument("--from-pan", type=finite_number, default=0.0, metavar="RAD")
-    solve.add_argument("--from-tilt", type=finite_number, default=0.0, metavar="RAD")
+    solve.add_argument("--from-pan", type=finite_number, default=0.0, metavar="RAD", help=FROM_HELP)
+    solve.add_argument("--from-tilt", type=finite_number, default=0.0, metavar="RAD", help=FROM_HELP)
     solve.set_defaults(run=solve_pointing)
 
     triangulate = subparsers.add_parser(
         "triangulate", help="the point that a stereo pair sees, with covariance"
     )
-    triangulate.add_argument("mast", type=Path, metavar="MAST.yaml")
+    triangulate.add_argument("mast", type=Path, metavar="MAST.yaml", help=MAST_HELP)
     triangulate.add_argument(
         "--pair", required=True, metavar="NAME", help="a pair of the file's stereo section"
     )
     triangulate.add_argument("--pan", type=finite_number, metavar="RAD", help="true joint angle")
     triangulate.add_argument("--tilt", type=finite_number, metavar="RAD", help="true joint angle")
     for side in ("--left", "--right"):
-        triangulate.add_argument(side, required=True, nargs=2, type=finite_number, metavar=("U", "V"))
-    triangulate.add_argument("--sigma-px", type=positive_number, default=0.2, metavar="PX")
+        triangulate.add_argument(
+            side,
+            required=True,
+            nargs=2,
+            type=finite_number,
+            metavar=("U", "V"),
+            help=f"pixel in the {side[2:]} image",
+        )
+    triangulate.add_argument("--sigma-px", type=positive_number, default=0.2, metavar="PX", help=SIGMA_HELP)
     triangulate.set_defaults(run=triangulate_pair)
 
     budget = subparsers.add_parser("budget", help="the paper's error budget (Table I) from its formulas")
@@ -159,13 +170,20 @@ def _add_handoff(subparsers: Any) -> None:
     handoff = subparsers.add_parser(
         "handoff", help="where a target seen by one stereo pair falls in another, with the ellipse to search"
     )
-    handoff.add_argument("mast", type=Path, metavar="MAST.yaml")
+    handoff.add_argument("mast", type=Path, metavar="MAST.yaml", help=MAST_HELP)
     handoff.add_argument("--from", dest="source", required=True, metavar="PAIR", help="the pair that sees it")
     handoff.add_argument("--to", required=True, metavar="PAIR", help="a pair, or one camera")
     handoff.add_argument("--pan", type=finite_number, metavar="RAD", help="true joint angle")
     handoff.add_argument("--tilt", type=finite_number, metavar="RAD", help="true joint angle")
     for side in ("--left", "--right"):
-        handoff.add_argument(side, required=True, nargs=2, type=finite_number, metavar=("U", "V"))
+        handoff.add_argument(
+            side,
+            required=True,
+            nargs=2,
+            type=finite_number,
+            metavar=("U", "V"),
+            help=f"pixel in the {side[2:]} image",
+        )
     handoff.add_argument("--to-pan", type=finite_number, metavar="RAD", help="default: as --pan")
     handoff.add_argument("--to-tilt", type=finite_number, metavar="RAD", help="default: as --tilt")
     handoff.add_argument(
@@ -173,7 +191,7 @@ def _add_handoff(subparsers: Any) -> None:
         action="store_true",
         help="turn the head first so that the target falls in the middle of --to",
     )
-    handoff.add_argument("--sigma-px", type=positive_number, default=0.2, metavar="PX", help="of a click")
+    handoff.add_argument("--sigma-px", type=positive_number, default=0.2, metavar="PX", help=SIGMA_HELP)
     handoff.add_argument(
         "--sigma-joint", type=positive_number, metavar="RAD", help="of a joint reading; default: exact"
     )

@@ -193,7 +193,7 @@ def _add_mast(subparsers: argparse._SubParsersAction[Any]) -> None:
     begin.add_argument("parameters", nargs="*", metavar="NAME=VALUE", help="how much of it")
     begin.set_defaults(run=_set)
     clear = switches.add_parser("clear", help="switch those of a device off, or all")
-    clear.add_argument("device", nargs="?", metavar="DEVICE")
+    clear.add_argument("device", nargs="?", metavar="DEVICE", help="only its faults (default: all)")
     clear.set_defaults(run=_clear)
     for one in (show, use, back, every, begin, clear):
         add_daemon_options(one)

@@ -80,7 +80,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     point.set_defaults(run=_point)
 
     snapshot = subparsers.add_parser("snapshot", help="take a picture and write it to a file")
-    snapshot.add_argument("camera", metavar="CAMERA")
+    snapshot.add_argument("camera", metavar="CAMERA", help="camera of the configuration")
     snapshot.add_argument("--out", required=True, metavar="FILE", help="where to: .png (lossless), .jpg")
     snapshot.add_argument("--frame-id", metavar="ID", help="a frame that the daemon still keeps")
     snapshot.set_defaults(run=_snapshot)

@@ -50,7 +50,7 @@ def _add_servo(subparsers: argparse._SubParsersAction[Any]) -> None:
 
     info = commands.add_parser("info", help="show everything that a servo says about itself; moves nothing")
     _add_port(info)
-    info.add_argument("id", type=_whole, metavar="ID")
+    info.add_argument("id", type=_whole, metavar="ID", help="as 'mastctl servo scan' finds it")
     _add_baud(info)
     info.set_defaults(run=_info)
 
@@ -69,7 +69,7 @@ def _add_servo(subparsers: argparse._SubParsersAction[Any]) -> None:
         "test", help="turn a servo a few degrees to each side and back, slowly and weakly"
     )
     _add_port(test)
-    test.add_argument("id", type=_whole, metavar="ID")
+    test.add_argument("id", type=_whole, metavar="ID", help="as 'mastctl servo scan' finds it")
     _add_baud(test)
     test.add_argument(
         "--degrees", type=positive_number, default=5.0, metavar="DEG", help="how far (default 5, at most 20)"

@@ -119,7 +119,7 @@ def _add_token(subparsers: argparse._SubParsersAction[Any]) -> None:
     shown = verbs.add_parser("list", help="show names and roles of the tokens")
     shown.set_defaults(run=_list)
     revoke = verbs.add_parser("revoke", help="let a token open nothing any more; sessions by it end too")
-    revoke.add_argument("name", metavar="NAME")
+    revoke.add_argument("name", metavar="NAME", help="as 'mastctl token list' shows it")
     revoke.set_defaults(run=_revoke)
     for one in (new, shown, revoke):
         one.add_argument("--config", metavar="FILE", help="the configuration that the daemon runs with")
@@ -180,7 +180,7 @@ def _add_completion(subparsers: argparse._SubParsersAction[Any]) -> None:
     completion = subparsers.add_parser(
         "completion", help="print what makes a shell complete commands and options, or install it"
     )
-    completion.add_argument("shell", choices=SHELLS)
+    completion.add_argument("shell", choices=SHELLS, help="shell that completes the commands")
     completion.add_argument(
         "--install",
         action="store_true",

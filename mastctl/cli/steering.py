@@ -34,7 +34,9 @@ def _add_lease(subparsers: argparse._SubParsersAction[Any]) -> None:
         "take", help="acquire the lease and print its id, for --lease; with --reason from its holder"
     )
     take.add_argument("--name", help="the holder's name (default: user@host)")
-    take.add_argument("--reason", metavar="WHY", help="take the lease from its holder, who gets the reason")
+    take.add_argument(
+        "--reason", metavar="WHY", help="take the lease from its holder, and show the holder this reason"
+    )
     take.set_defaults(run=_take)
     renew = acts.add_parser("renew", help="have a lease run on from now")
     renew.set_defaults(run=_renew)
@@ -126,7 +128,7 @@ def _add_track(subparsers: argparse._SubParsersAction[Any]) -> None:
     commands = track.add_subparsers(dest="track_command", metavar="WHAT", required=True)
 
     start = commands.add_parser("start", help="start to follow a target")
-    add_target_options(start, "what is seen at a point, metres")
+    add_target_options(start, "the surface seen at a point, meters")
     start.set_defaults(run=_start)
 
     status = commands.add_parser("status", help="show the track, and offsets found by hand-offs")

@@ -116,8 +116,9 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
     ) -> PreviewTold:
         """Return what a pixel (camera, frame id, x, y) shows and where `point` would send the head.
 
-        Nothing moves. ``position_m`` with ``sigma_m``, ``range_m``, the match in the other eye, ``goal_rad``,
-        and ``refused`` where the head would not be sent. ``range_m`` and ``plane`` as for `point`.
+        Nothing moves. ``position_m`` with ``sigma_m``, ``range_m``, the match in the other camera,
+        ``goal_rad``, and ``refused`` where the head would not be sent. ``range_m`` and ``plane`` as for
+        `point`.
         """
         body = _target(pixel, None, None) | _how_far(range_m, plane)
         if aim is not None:

@@ -1,6 +1,6 @@
-"""Questions to a daemon over HTTP; whatever goes wrong is a `ClientError`.
+"""Questions to a daemon over HTTP; every failure is a `ClientError`.
 
-What is asked, how often, and what an answer means stands once, in `DaemonConnection`, which waits for
+Questions, their number, and the meaning of an answer stand once, in `DaemonConnection`, which waits for
 nothing itself. Of the two that send, `DaemonHttp` has the calling thread wait, and `AsyncDaemonHttp` asyncio.
 """
 
@@ -40,9 +40,9 @@ class ClientError(Exception):
     code
         The daemon's word, or the client's own: ``no_daemon``, ``bad_url``, ``timeout``, ``bad_answer``.
     detail
-        What else the daemon told, or None.
+        Further facts from the daemon, or None.
     exit_code
-        What a command ends with: 2 for bad input, 1 for a failure.
+        The exit code of a command: 2 for bad input, 1 for a failure.
     """
 
     def __init__(
@@ -167,7 +167,7 @@ class DaemonConnection(ABC):
     async def heard(
         self, path: str, query: Mapping[str, Any] | None = None, silent_s: float | None = None
     ) -> AsyncGenerator[dict[str, Any] | None]:
-        """Yield what a stream of the daemon tells, and None for each sign of life, until the daemon ends.
+        """Yield a stream's messages, and None for each sign of life, until the daemon ends.
 
         ``timeout`` is raised if it is silent for ``silent_s`` seconds, those of each request by default.
         """
@@ -392,7 +392,7 @@ def _headers_of(key: str | None, deadline_s: float | None) -> dict[str, str]:
 
 
 def program_name() -> str:
-    """Return what this process calls itself where it is told nothing else: ``program@host:pid``."""
+    """Return the name of this process where none is given: ``program@host:pid``."""
     program = Path(sys.argv[0] if sys.argv else "")
     name = program.parent.name if program.stem == "__main__" else program.stem
     return f"{name or 'python'}@{socket.gethostname()}:{os.getpid()}"

@@ -39,7 +39,8 @@ async def followed(
     Raises
     ------
     ClientError
-        What ``ask`` raises: ``no_daemon`` if the daemon is gone, ``operation_unknown`` if it is another one.
+        The error that ``ask`` raises: ``no_daemon`` if the daemon is gone, ``operation_unknown`` if it is
+        another one.
     """
     until_s = time.monotonic() + timeout_s
     pauses: list[float] = []  # a daemon that does not answer at the beginning is told at once

@@ -1,4 +1,4 @@
-"""What a client asks of what a daemon keeps: its configuration, mast files, recordings, places, benches."""
+"""Questions about a daemon's configuration, mast files, recordings, places and benches."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from mastctl.client.connection import DaemonConnection
 
 
 class KeepingCalls:
-    """What is asked of a daemon that moves no head."""
+    """Questions to a daemon that move no head."""
 
     _daemon: DaemonConnection
 
@@ -63,7 +63,7 @@ class KeepingCalls:
         board: str | None = None,
         *,
         board_file: str | None = None,
-        goes_on: str | None = None,
+        resume: str | None = None,
         wanted_px: float | None = None,
         pictures: int | None = None,
         by_hand: bool | None = None,
@@ -72,11 +72,11 @@ class KeepingCalls:
 
         Parameters
         ----------
-        board, board_file, goes_on
+        board, board_file, resume
             One of them: the name of a packaged board, the text of a BOARD.yaml, the name of a run.
         wanted_px, pictures
-            What the calibration may leave of a first pointing, rms an axis, and how many pictures of each
-            camera at most; by default 0.2 and 60, or as the run had them.
+            The error that the calibration may leave of a first pointing, rms an axis, and how many pictures
+            of each camera at most; by default 0.2 and 60, or as the run had them.
         by_hand
             Whether a simulated board waits for `board_stands` too, as a real one does.
 
@@ -85,7 +85,7 @@ class KeepingCalls:
         ClientError
             ``bench_runs``, ``bench_done``, ``bench_unknown``, ``bad_board``, ``unwritable``, ``disk_low``.
         """
-        told: dict[str, Any] = {"board": board, "board_file": board_file, "goes_on": goes_on}
+        told: dict[str, Any] = {"board": board, "board_file": board_file, "resume": resume}
         told |= {"wanted_px": wanted_px, "pictures": pictures, "by_hand": by_hand}
         body = {key: value for key, value in told.items() if value is not None}
         return (await self._daemon.command(BenchBegun, "POST", "/bench", body))["run"]
@@ -95,7 +95,7 @@ class KeepingCalls:
         return (await self._daemon.command(BenchBegun, "POST", "/bench/stands"))["run"]
 
     async def leave_bench(self) -> BenchRunTold:
-        """End the bench calibration; it can go on later (`begin_bench`, ``goes_on``)."""
+        """End the bench calibration; it can go on later (`begin_bench`, ``resume``)."""
         return (await self._daemon.command(BenchBegun, "POST", "/bench/leave"))["run"]
 
     async def forget_bench(self, name: str) -> BenchTold:
@@ -166,7 +166,7 @@ class KeepingCalls:
         return (await self._daemon.command(PlacesTold, "DELETE", f"/places/{quote(name, safe='')}"))["places"]
 
     async def sun(self) -> SunTold:
-        """Return the direction that no head camera looks into: ``sun``, null where none was told."""
+        """Return the direction that no head camera looks into: ``sun``, null where none was stated."""
         return await self._daemon.json(SunTold, "GET", "/limits/sun")
 
     async def keep_off_sun(
@@ -185,7 +185,7 @@ class KeepingCalls:
         half_angle_rad
             How near a head camera's axis may come.
         valid_s
-            How long that holds, seconds; left out, until another is told.
+            How long that holds, seconds; left out, until another is stated.
         """
         body: dict[str, Any] = {"azimuth_rad": azimuth_rad, "elevation_rad": elevation_rad}
         body |= {"half_angle_rad": half_angle_rad, "frame": frame}

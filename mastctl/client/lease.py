@@ -17,12 +17,12 @@ LEAST_TIMEOUT_S = 0.5
 
 
 class HeldLease:
-    """The right to steer, as long as nobody takes over; `LeaseCalls.lease` makes one.
+    """The right to steer, as long as no other client takes over; `LeaseCalls.lease` makes one.
 
     Attributes
     ----------
     id, holder
-        As the daemon told them.
+        As the daemon gave them.
     lost
         Why the lease is no longer held, None while it is; the next command is refused with the same reason.
     """
@@ -77,7 +77,7 @@ class LeaseCalls:
         name: str | None = None,
         for_s: float = 30.0,
         take_over: str | None = None,
-        gives_way: bool = False,
+        preemptible: bool = False,
         ends_with_stop: bool = False,
         stops_when_silent: bool = False,
     ) -> AsyncIterator[HeldLease]:
@@ -90,28 +90,28 @@ class LeaseCalls:
         for_s
             How long it outlives a holder that falls silent, 1 to 3600 s.
         take_over
-            Why it is taken from whoever steers; None waits for nobody and takes nothing away.
-        gives_way
-            Whether it ends as soon as anybody else wants to steer, or stops the head: for what is done when
-            nobody needs the head.
+            The reason for taking it from the client that steers; None neither waits nor takes it away.
+        preemptible
+            Whether it ends as soon as another client wants to steer, or stops the head: for what is done when
+            no other client needs the head.
         ends_with_stop
             Whether it ends as soon as anybody stops the head: for a program that would go on with its next
             move otherwise.
         stops_when_silent
-            Whether the daemon stops what runs when nobody renews it any more: this process has died, or
+            Whether the daemon stops a running operation when the lease is no longer renewed: this process has died, or
             cannot reach the daemon.
 
         Yields
         ------
         lease
-            Whose ``lost`` says if somebody took over meanwhile.
+            Whose ``lost`` says if another client took over meanwhile.
 
         Raises
         ------
         ClientError
-            ``leased`` if somebody else steers.
+            ``leased`` if another client steers.
         """
-        ends = gives_way, ends_with_stop, stops_when_silent
+        ends = preemptible, ends_with_stop, stops_when_silent
         granted = await self.acquire_lease(name, for_s, take_over, *ends)
         before, held = self._daemon.lease_id, HeldLease(self._daemon, granted, for_s)
         self._daemon.lease_id = held.id
@@ -130,11 +130,11 @@ class LeaseCalls:
         name: str | None = None,
         for_s: float = 30.0,
         take_over: str | None = None,
-        gives_way: bool = False,
+        preemptible: bool = False,
         ends_with_stop: bool = False,
         stops_when_silent: bool = False,
     ) -> LeaseGranted:
-        """Acquire or take over a lease that nobody renews; arguments as for `lease`.
+        """Acquire or take over a lease that is not renewed; arguments as for `lease`.
 
         Returns ``lease_id``, ``holder``, ``for_s`` and ``until``; `use_lease` has commands carry it.
         """
@@ -145,8 +145,8 @@ class LeaseCalls:
             return await self._daemon.command(
                 LeaseGranted, "POST", "/lease/take", body | {"reason": take_over}
             )
-        if gives_way:
-            body["gives_way"] = True
+        if preemptible:
+            body["preemptible"] = True
         if ends_with_stop:
             body["ends_with_stop"] = True
         if stops_when_silent:

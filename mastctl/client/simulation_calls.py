@@ -1,4 +1,4 @@
-"""What a client asks of a simulated rover."""
+"""A client's questions to a simulated rover."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class SimulationCalls:
         position_m
             (3,) of its middle in the rover frame as the rover truly stands.
         board
-            What its BOARD.yaml holds; left out, the board of this name is moved that is there already.
+            The contents of its BOARD.yaml; left out, the board of this name is moved that is there already.
         turned_rad
             How it is turned about its own x, y and z after facing the mast upright: the upper edge nearer,
             the right edge nearer, clockwise.
@@ -130,7 +130,7 @@ class SimulationCalls:
         return await self._daemon.json(TruthTold, "GET", "/simulation/truth", params=asked)
 
     async def fault_words(self) -> dict[str, dict[str, WordTold]]:
-        """Return the fault words of each simulated device: what each ``does``, and its ``parameters``."""
+        """Return the fault words of each simulated device: each one's ``effect``, and its ``parameters``."""
         return (await self._daemon.json(WordsTold, "GET", "/simulation/words"))["devices"]
 
     async def faults(self) -> list[FaultSet]:

@@ -113,7 +113,7 @@ def head_under_test(
             try:
                 first = trial.read()
             except (PromiseBroken, SubjectLost, DriverError) as reason:  # the checks have to tell of it
-                trial.unplaced = f"nobody knows from where: {reason}"
+                trial.unplaced = f"it is not known from where: {reason}"
             else:
                 room = head.door.room(at(first))
                 if room is None:

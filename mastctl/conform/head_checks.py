@@ -266,7 +266,7 @@ def fastest_seen(trial: HeadTrial, asked_rad_per_s: float) -> tuple[float, float
 )
 def _limits(trial: HeadTrial) -> None:
     if trial.limits_rad is None:
-        raise NotTried("limits that it may be sent to are not known; --limits tells them")
+        raise NotTried("the limits of its motion are not known; state them by --limits")
     pan, tilt = trial.limits_rad
     home = trial.sent(trial.goal(0.0, 0.0))
     for end, far in ((0, -math.inf), (1, math.inf)) if trial.own_limits else ():

@@ -58,7 +58,7 @@ class RigTrial:
     def joints(self, status: Mapping[str, Any] | None = None) -> Angles:
         """Return the measured angles, radians, of a status or of now."""
         joints = field(self.status() if status is None else status, "joints")
-        expect(isinstance(joints, dict), "GET /status: joints is not told, so no reading came from the head")
+        expect(isinstance(joints, dict), "GET /status: joints is absent, so no reading came from the head")
         return number(joints, "pan_rad"), number(joints, "tilt_rad")
 
     @cached_property

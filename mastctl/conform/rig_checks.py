@@ -52,7 +52,7 @@ def _facts(trial: RigTrial) -> str:
     digest = hashlib.sha256(trial.mast).hexdigest()
     for camera in trial.cameras:
         shot = trial.picture(camera)
-        expect(shot.data.startswith(b"\x89PNG\r\n"), f"{camera}: the picture is told to be PNG and is not")
+        expect(shot.data.startswith(b"\x89PNG\r\n"), f"{camera}: the picture is announced as PNG and is not")
         height, width = shot.image.shape[:2]
         size = field(trial.mast_cameras, camera, "size_px")
         expect(
@@ -142,7 +142,7 @@ def _pointing(trial: RigTrial) -> str:
             off_rad <= ARRIVED_RAD,
             f"sent to ({goal[0]:.4f}, {goal[1]:.4f}) rad the head rests at ({at[0]:.4f}, {at[1]:.4f}) rad",
         )
-        expect(record.get("residual_px") is None, "residual_px is told where no picture was to be compared")
+        expect(record.get("residual_px") is None, "residual_px is given where no picture was to be compared")
         worst_rad = max(worst_rad, off_rad)
     return f"within {worst_rad:.1e} rad, seen {seen} times on the way"
 

@@ -49,7 +49,7 @@ class StopCame:
 class Lease:
     """The right to steer until ``until_s``, seconds of the lease's clock.
 
-    One that ``gives_way`` ends as soon as anybody else wants to steer, or stops the head.
+    A ``preemptible`` one ends as soon as another client wants to steer, or stops the head.
     ``last_stop`` is that of `LeaseTable.last_stop` after which the next one ends it; None: no stop does.
     ``credential`` is what its caller showed, without which it ends; empty: nothing. One that
     ``stops_when_silent`` takes what runs with it when its time runs out.
@@ -60,7 +60,7 @@ class Lease:
     since_s: float
     for_s: float
     until_s: float
-    gives_way: bool = False
+    preemptible: bool = False
     last_stop: StopCame | None = None
     credential: str = field(default="", repr=False)
     stops_when_silent: bool = False
@@ -174,7 +174,7 @@ class LeaseTable:
         caller: Caller,
         name: str | None = None,
         for_s: float = USUAL_S,
-        gives_way: bool = False,
+        preemptible: bool = False,
         ends_with_stop: bool = False,
         stops_when_silent: bool = False,
     ) -> Lease:
@@ -188,7 +188,7 @@ class LeaseTable:
             The holder's name, the caller's by default.
         for_s
             How long, seconds.
-        gives_way
+        preemptible
             Whether it ends as soon as anybody else wants to steer, or stops the head.
         ends_with_stop
             Whether it ends as soon as anybody stops the head, and for that alone.
@@ -207,8 +207,8 @@ class LeaseTable:
         _check_time(for_s)
         with self._changing():
             why = self._check_free(caller)
-            last_stop = self._last_stop if gives_way or ends_with_stop else None
-            lease = self._grant(caller, name, for_s, gives_way, last_stop, stops_when_silent)
+            last_stop = self._last_stop if preemptible or ends_with_stop else None
+            lease = self._grant(caller, name, for_s, preemptible, last_stop, stops_when_silent)
         if stops_when_silent:
             threading.Thread(target=self._watch, args=(lease,), name="silent holder", daemon=True).start()
         if why:
@@ -278,7 +278,7 @@ class LeaseTable:
         """
         _check_time(for_s)
         with self._changing():
-            gave_way = self._lease is not None and self._lease.gives_way and self._running()
+            gave_way = self._lease is not None and self._lease.preemptible and self._running()
             how = f"{name or caller.name} took over: {reason}"
             self._end(how)
             lease = self._grant(caller, name, for_s, last_stop=last_stop)
@@ -354,7 +354,7 @@ class LeaseTable:
         A lease that gives way is ended; returns why what runs under it is to be stopped, '' if nothing does.
         """
         lease = self._lease
-        if lease is not None and lease.gives_way:
+        if lease is not None and lease.preemptible:
             why = f"{caller.name} wants to steer, and {lease.holder} gives way"
             self._end(why)
             return why if self._running() else ""
@@ -378,7 +378,7 @@ class LeaseTable:
         caller: Caller,
         name: str | None,
         for_s: float,
-        gives_way: bool = False,
+        preemptible: bool = False,
         last_stop: StopCame | None = None,
         stops_when_silent: bool = False,
     ) -> Lease:
@@ -388,7 +388,7 @@ class LeaseTable:
             secrets.token_hex(16),
             holder,
             *times_s,
-            gives_way,
+            preemptible,
             last_stop,
             caller.credential,
             stops_when_silent,

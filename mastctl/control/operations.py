@@ -325,7 +325,7 @@ class OperationRunner:
             try:
                 tell(self.get(name))
             except Exception:  # nothing is left that it could be told to
-                log.exception("what follows upon operation %s met a defect of the program", name)
+                log.exception("a step after operation %s met a defect of the program", name)
 
     def _run_to_end(self, name: str, work: Work, cancelled: threading.Event) -> None:
         """Run one operation to its end; whatever happens is in its record afterwards."""
@@ -368,7 +368,7 @@ class OperationRunner:
         try:
             residual = last_residual(result, name)
         except Exception:  # a result that is none must not keep the next operation out
-            log.exception("the result of operation %s tells no residual", name)
+            log.exception("the result of operation %s holds no residual", name)
             residual, result = None, None
         with self._lock:
             if self._current is None or self._current[0] != name:

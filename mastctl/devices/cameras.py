@@ -276,7 +276,7 @@ class Cameras:
             try:
                 self._learned[first, name] = learned(times[first], times[name], before)
             except Exception as error:
-                words = f"the drivers tell no times of {first} and {name}: {type(error).__name__}: {error}"
+                words = f"the drivers give no times of {first} and {name}: {type(error).__name__}: {error}"
                 raise DriverError(words, device=name) from None
         return {name: self._learned[first, name] for name in names[1:]}
 

@@ -259,10 +259,12 @@ class KeepOutJudge:
         found = []
         sun = self._sun
         if sun is not None and sun.until_s is not None and not sun.holds(now_s):
-            words = (
-                "the direction of the sun that was told holds no longer, and nothing keeps the cameras off it"
+            words = "the stated direction of the sun holds no longer, and nothing keeps the cameras off it"
+            found.append(
+                StandingFault(
+                    SUN, "sun_not_known", words, sun.until_s, "another direction is stated, or none"
+                )
             )
-            found.append(StandingFault(SUN, "sun_not_known", words, sun.until_s, "another is told, or none"))
         keep_outs = self._now()
         if reading is None:
             return tuple(found)
@@ -272,7 +274,10 @@ class KeepOutJudge:
         self._inside_s = {box.name: before_s.get(box.name, reading.time_s) for box in holding}
         for name, since_s in self._inside_s.items():
             words = "a head camera looks into the cone around the sun"
-            code, until = "sun_in_view", "the head is moved out of it, or the sun is told elsewhere"
+            code, until = (
+                "sun_in_view",
+                "the head is moved out of it, or another direction of the sun is stated",
+            )
             if name != SUN:
                 words, code = f"the head stands in the keep-out {name}", "in_keep_out"
                 until = "it is moved out, the shortest way along one axis"

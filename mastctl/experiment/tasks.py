@@ -272,7 +272,7 @@ def _plain(value: Any) -> Any:
         return value
     if isinstance(value, date):
         return "date", value.isoformat()
-    raise TypeError(f"a task holds {type(value).__name__}, whose value no name can tell")
+    raise TypeError(f"a task holds {type(value).__name__}, whose value no name can hold")
 
 
 DASK = "dask:"

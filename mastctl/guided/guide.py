@@ -94,7 +94,7 @@ class RunRequest:
     ----------
     board, board_file
         The name of a packaged board, or the text of a BOARD.yaml; neither for a run that goes on.
-    goes_on
+    resume
         The name of a run that was interrupted.
     wanted_px, pictures
         As of the command; None: as usual, or as the run had it.
@@ -104,7 +104,7 @@ class RunRequest:
 
     board: str | None = None
     board_file: str | None = None
-    goes_on: str | None = None
+    resume: str | None = None
     wanted_px: float | None = None
     pictures: int | None = None
     by_hand: bool | None = None
@@ -335,8 +335,8 @@ class Guide:
 
     def _asked(self, wanted: RunRequest, who: str) -> tuple[GuidedFolder, dict[str, Any]]:
         """The run's folder with all that it needs, and what is asked of it."""
-        if wanted.goes_on is not None:
-            folder = self.runs.named(wanted.goes_on)
+        if wanted.resume is not None:
+            folder = self.runs.named(wanted.resume)
             try:
                 before, end = folder.asked(), folder.end()
                 before |= {"begun": str(before["begun"]), "mast_file": str(before["mast_file"])}
@@ -397,7 +397,7 @@ class Guide:
             self._finish(work, outcome.state, outcome.code, outcome.sentence)
             return
         if work.child is not None and work.child.flooded:
-            why = "told more than anybody could read, and was ended"
+            why = "printed more than can be read, and was ended"
         elif code < 0:
             why = f"was ended by {_signal(-code)}"
         else:
@@ -502,7 +502,7 @@ def _who_stopped(news: ThreadSubscription) -> str:
         stopped = next(filter(None, map(_stop_of, news.wait(left_s))), None)
         if stopped is not None:
             return stopped
-    return "somebody pressed stop"
+    return "a stop was requested"
 
 
 def _check_room(masts: Path, state: Path) -> None:

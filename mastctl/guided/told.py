@@ -71,7 +71,7 @@ class GuidedRun:
         Pictures and what was predicted with them.
     sentences
         The newest.
-    odd
+    unread_lines
         Lines that could not be understood.
     result
         The end's figures.
@@ -102,7 +102,7 @@ class GuidedRun:
     cameras: Mapping[str, CameraCells] = field(default_factory=dict)
     curve: tuple[tuple[int, float], ...] = ()
     sentences: tuple[str, ...] = ()
-    odd: int = 0
+    unread_lines: int = 0
     result: Mapping[str, Any] | None = None
     mast_file: str | None = None
     report: str | None = None
@@ -122,7 +122,7 @@ def heard(run: GuidedRun, line: bytes) -> GuidedRun:
     try:
         return _after(run, LINES.validate_json(line))
     except (ValidationError, KeyError):  # KeyError: a camera that was not there as it began
-        return replace(run, odd=run.odd + 1)
+        return replace(run, unread_lines=run.unread_lines + 1)
 
 
 def _after(run: GuidedRun, line: BenchLine) -> GuidedRun:

@@ -256,7 +256,7 @@ def repeated(
             "not_repeated",
             f"{after_s:.2f} s later {camera} shows the target {apart_px[0]:+.2f}, {apart_px[1]:+.2f} px "
             f"elsewhere, at most {allowed_px[0]:.2f}, {allowed_px[1]:.2f} px (3 sigma) is expected of a head "
-            "at rest: the pictures are older than their stamps ('mastctl camera sync' measures by how much), "
+            "at rest. The pictures are older than their stamps ('mastctl camera sync' measures by how much), "
             "the mast still rings, or the target or the rover moves",
         )
     another = not np.array_equal(first.image, later.image)

@@ -327,7 +327,7 @@ class _Run:
                 except PointingError as error:
                     if eye.range_from != "unknown" or not error.code.startswith("target_"):
                         raise
-                    words = f"{error}; how far it is was not known: range_m or a plane would tell"
+                    words = f"{error}; how far it is was not known: give range_m or a plane"
                     raise PointingError(error.code, words) from None
                 detail.update(
                     camera=aim.camera, **match_facts(seen), residual_px=rounded(seen.pixel_px - aim_px)

@@ -135,7 +135,7 @@ class OneCamera:
         if beside_px > most_px:
             raise PointingError(
                 "off_the_line",
-                f"what looks like the target in {now.frame.frame_id} is {beside_px:.1f} px from where its "
+                f"the target's likeness in {now.frame.frame_id} is {beside_px:.1f} px from where its "
                 f"range can put it, at most {most_px:.1f} px is expected",
             )
         return {"beside_px": round(beside_px, 3)}

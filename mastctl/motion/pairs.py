@@ -111,7 +111,7 @@ def choose_pairs(
     found = [choice for _, choice in (*kept, *broken)]
     if not found:
         place = ", ".join(f"{value:.2f}" for value in position_m)
-        words = "; ".join(reasons) or "none is configured with both eyes"
+        words = "; ".join(reasons) or "none is configured with both cameras"
         raise CalibError(f"no stereo pair sees the target at ({place}) m: {words}")
     return found
 
@@ -221,7 +221,9 @@ def record_of(
         Or why there is none, in one sentence.
     """
     if not to or any(name not in found or found[name].verdict != "good" for name in pair):
-        return "one of the pictures did not come, or the former pair did not find the target with both eyes"
+        return (
+            "one of the pictures did not come, or the former pair did not find the target with both cameras"
+        )
     left, right = (views[name] for name in pair)
     clicks = np.array([found[name].pixel_px for name in pair])
     sigma_px = max(LEAST_SIGMA_PX, *(float(found[name].sigma_px.max()) for name in pair))

@@ -196,7 +196,7 @@ def check_pair(camera: str, rig: Rig, mast_file: Rig) -> None:
     for pair, eyes in mast_file.stereo.items():
         if camera in eyes:
             other = eyes[1] if camera == eyes[0] else eyes[0]
-            words = f"the other eye of the stereo pair {pair}, {other}, is not in the configuration"
+            words = f"the other camera of the stereo pair {pair}, {other}, is not in the configuration"
     raise BadRequest("no_stereo", f"{words}, so what its pixels show cannot be followed")
 
 

@@ -175,8 +175,8 @@ class Looker:
         if off_m > allowed_m:
             place = ", ".join(f"{value:.2f}" for value in track.position_m)
             raise NotTrackable(
-                f"what {left} sees in the direction of the position is at ({place}) m, {off_m:.2f} m from "
-                f"it; at most {allowed_m:.2f} m is expected"
+                f"the surface that {left} sees in the direction of the position is at ({place}) m, "
+                f"{off_m:.2f} m from it; at most {allowed_m:.2f} m is expected"
             )
         return track, self._first(choice.pair, track, views[left], views[right], pixel)
 

@@ -78,8 +78,8 @@ def check_follows(pose: RoverPose, before: RoverPose | None) -> None:
             return
         raise BadRequest(
             "pose_without_time",
-            f"time_s is missing; the pose before had one ({before.time_s:g} s), and without it nobody knows "
-            f"which of the two is later; {HELD_UP_S:g} s after that pose it may be left out",
+            f"time_s is missing. The pose before had one ({before.time_s:g} s), and without it the "
+            f"daemon cannot know which is later; {HELD_UP_S:g} s after that pose it may be left out",
         )
     if clock_was_set(pose, before) and before.time_s - pose.time_s + passed_s <= HELD_UP_S:
         raise NotNow(

@@ -199,9 +199,7 @@ class Recorder:
         if busy is None and waits_s > SLOW_S:
             busy = time.monotonic() - waits_s, self._clock.now_s() - waits_s
         if busy is not None and time.monotonic() - busy[0] > SLOW_S:
-            words = (
-                f"{self._shelf.folder} does not answer; what happens meanwhile may be missing in the record"
-            )
+            words = f"{self._shelf.folder} does not answer; the record may lack events of this time"
             found.append(StandingFault(NAME, "slow", words, busy[1], "the disk answers"))
         return tuple(found)
 
@@ -391,7 +389,7 @@ class Recorder:
                 raise
             except Exception:  # a value of a kind that nobody expected must not end the recording
                 self.missed(one.topic, 1)
-                log.exception("what %s %s tells cannot be recorded", one.topic, one.key)
+                log.exception("the message %s %s cannot be recorded", one.topic, one.key)
         if dropped and self._now.file is not None:
             self._entries.tell_dropped(self._now.file, dropped, self._clock.now_s(), time.monotonic())
 

@@ -134,7 +134,7 @@ def seen_in(
         try:
             found += _pointings(name, record, frames)
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            others[name] = f"its record does not tell enough ({type(error).__name__}: {error})"
+            others[name] = f"its record does not hold enough ({type(error).__name__}: {error})"
             continue
         if not any(one.operation == name for one in found):
             words = (record.get("error") or {}).get("message", "")

@@ -130,7 +130,7 @@ class StateFolder:
             StateFile(self.path / DAEMON_FILE, DAEMON_SCHEMA).write(told)
         except BadFile as error:
             self.refused = str(error)
-            log.error("what the daemon is to remember cannot be kept: %s", error)
+            log.error("the state folder cannot be written: %s", error)
 
     def close(self) -> None:
         """Let another daemon have it; does nothing the second time."""

@@ -202,7 +202,7 @@ class _Equations:
             self.legs |= set(leg[seen].tolist())
         if len(self.frames) < LEAST_FRAMES or len(self.legs) < LEAST_LEGS:
             raise CannotTell(
-                f"{len(self.frames)} frames on {len(self.legs)} ways of the head tell something, "
+                f"{len(self.frames)} frames on {len(self.legs)} ways of the head can be used, "
                 f"{LEAST_FRAMES} on {LEAST_LEGS} are needed"
             )
 

@@ -1,7 +1,7 @@
 """A mast for other people's tests: the pytest plug-in, and what its fixtures hand out.
 
-Nothing here is imported by the service; what pytest loads at its start imports pytest and the standard
-library only.
+Nothing here is imported by the service; the part that pytest loads at its start imports pytest and the
+standard library only.
 """
 
 from mastctl.testing.rover import RoverError, SetFault, SimulatedRover

@@ -17,10 +17,10 @@ from typing import Any
 from mastctl.testing.rover import RoverError
 
 ANSWER_S = 120.0
-"""What an answer is given, seconds: closing a daemon whose devices hang is the longest, on a busy machine."""
+"""The time allowed for an answer, seconds: closing a daemon whose devices hang takes longest."""
 
 START_S = 600.0
-"""What a daemon's start is given, seconds: the first one after an installation compiles the renderer."""
+"""The time allowed for a start, seconds: the first one after an installation compiles the renderer."""
 
 END_S = 5.0
 

@@ -11,7 +11,7 @@ Ask = Callable[..., Any]
 
 
 class RoverError(Exception):
-    """What was asked of the simulated rover cannot be: one plain sentence.
+    """The request to the simulated rover cannot be fulfilled: one plain sentence.
 
     Attributes
     ----------
@@ -57,8 +57,8 @@ class SimulatedRover:
     """The rover behind a test's daemon. Angles in radians, lengths in metres; pixels as everywhere: (x, y),
     the centre of the top-left pixel at (0, 0).
 
-    What is named true is what the daemon never reads: the mechanical angles, with backlash and sag, and the
-    true cameras. Every method raises `RoverError` when the daemon's process has ended.
+    Values named true are those that the daemon never reads: the mechanical angles, with backlash and sag, and
+    the true cameras. Every method raises `RoverError` when the daemon's process has ended.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class SimulatedRover:
     def stand(
         self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
     ) -> None:
-        """Put the rover somewhere on its ground, at once; the daemon is not told.
+        """Put the rover somewhere on its ground, at once; the daemon does not learn of it.
 
         Raises
         ------
@@ -127,7 +127,7 @@ class SimulatedRover:
         return float(self._ask("advance", duration_s=float(duration_s)))
 
     def end_daemon(self) -> None:
-        """End the daemon and the rover with it: nobody answers at the address from now on."""
+        """End the daemon and the rover with it: the address does not answer from then on."""
         self._ask("close")
 
     def start_daemon(self) -> None:

@@ -21,7 +21,7 @@ PARENT_LOOKED_FOR_S = 0.25
 
 
 def main() -> None:
-    """Serve until nobody is left to serve."""
+    """Serve until no client is left."""
     parent = int(sys.argv[1])
     threading.Thread(target=_watch, args=(parent,), name="parent watched", daemon=True).start()
     # Whatever a driver or a library prints is not for the line of answers.

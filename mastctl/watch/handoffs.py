@@ -340,7 +340,7 @@ class HandoffCheck:
         try:
             before = read_log(path).handoffs if path.is_file() else ()
         except (BadFile, OSError) as error:
-            words = f"{' '.join(str(error).split())}; what was written down before does not count"
+            words = f"{' '.join(str(error).split())}; earlier records do not count"
             with self._lock:
                 self._unread = StandingFault(
                     NAME, "unreadable", words, self._clock.now_s(), "the file is right at the next start"
@@ -389,4 +389,4 @@ class HandoffCheck:
 
 def _log_news(news: list[HandoffBias]) -> None:
     for one in news:
-        log.warning("hand-offs tell an offset: %s", one.sentence)
+        log.warning("hand-offs show an offset: %s", one.sentence)

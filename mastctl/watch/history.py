@@ -108,7 +108,7 @@ class History:
                     else:
                         self._events.extend(self._told_of(one))
                 except Exception:  # a value that nobody foresaw must not end the history
-                    log.exception("what was published under %s could not be kept", one.topic)
+                    log.exception("a message published under %s could not be kept", one.topic)
 
     def _joints(self, reading: HeadReading) -> None:
         before, self._before = self._before, reading

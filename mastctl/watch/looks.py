@@ -251,7 +251,7 @@ def look_idle(client: Client, reference: Reference) -> SceneDrift:
     LookEnded
         If somebody wanted to steer or stopped the head; as `look_again` else.
     """
-    with client.lease(NAME, for_s=LEASE_S, gives_way=True):
+    with client.lease(NAME, for_s=LEASE_S, preemptible=True):
         try:
             return look_again(client, reference)
         except ClientError as error:

@@ -59,7 +59,9 @@ class Metrics:
         self._operations = self._counter("operations", "Operations that have ended.", "state", "code")
         self._commands = self._counter("commands", "Commands, by what came of them.", "command", "result")
         self._frames = self._counter("frames", "Frames taken.", "camera")
-        self._missed = self._counter("frames_missed", "Frames that a camera counted, nobody got.", "camera")
+        self._missed = self._counter(
+            "frames_missed", "Frames that a camera counted but did not deliver.", "camera"
+        )
         self._residual = self._histogram("residual_pixels", "Residuals, each axis by itself.", RESIDUAL_PX)
         self._sigmas = self._histogram("residual_sigmas", "Residuals over their sigma.", SIGMAS)
         self._step = self._histogram("step_seconds", "Steps of pointings and looks.", STEP_S, "step")
@@ -100,7 +102,7 @@ class Metrics:
                 try:
                     self._counted(one)
                 except Exception:  # a record that nobody foresaw must not end the counting
-                    log.exception("what was published under %s could not be counted", one.topic)
+                    log.exception("a message published under %s could not be counted", one.topic)
 
     def _counted(self, one: Published) -> None:
         if one.topic == "operation":

@@ -230,7 +230,7 @@ def _what_drifts(evidence: Evidence, since: str) -> str:
     if strongest is None or evidence.log_wider >= strongest.log_evidence:
         return (
             f"residuals are {evidence.times:.1f} times as large as the mast file, counts and matches explain "
-            f"({which}), and no one camera accounts for it: look at the head's mount and gears, or calibrate "
+            f"({which}), and no one camera accounts for it. Check the head's mount and gears, or calibrate "
             "again"
         )
     likely = {
@@ -294,7 +294,7 @@ class CalibrationHealth:
     def told(self) -> dict[str, Any]:
         """Return all that is known, as ``GET /calibration/health`` tells it."""
         return self.verdict.told_whole() | {
-            "not_kept": self._not_kept or None,
+            "write_error": self._not_kept or None,
             "newest": [
                 {
                     **one.measured.told(),

@@ -72,13 +72,13 @@ class ResetBody(_Strict):
 class LeaseBody(_Strict):
     """``POST /lease``: how long, and whose it is, if not the caller's.
 
-    ``gives_way``: it ends as soon as anybody else wants to steer, or stops the head; ``ends_with_stop``: with
-    a stop only. ``stops_when_silent``: what runs is stopped when its time runs out.
+    ``preemptible``: it ends as soon as another client wants to steer, or stops the head; ``ends_with_stop``:
+    with a stop only. ``stops_when_silent``: a running operation is stopped when its time runs out.
     """
 
     name: Name | None = None
     for_s: LeaseS = USUAL_S
-    gives_way: bool = False
+    preemptible: bool = False
     ends_with_stop: bool = False
     stops_when_silent: bool = False
 
@@ -385,15 +385,15 @@ class BenchBody(_Strict):
 
     board: Name | None = None
     board_file: Annotated[str, Field(min_length=1, max_length=20000)] | None = None
-    goes_on: Name | None = None
+    resume: Name | None = None
     wanted_px: Annotated[float, Field(ge=0.01, le=20.0)] | None = None
     pictures: Annotated[int, Field(ge=12, le=500)] | None = None
     by_hand: bool | None = None
 
     @model_validator(mode="after")
     def _one(self) -> BenchBody:
-        if sum(one is not None for one in (self.board, self.board_file, self.goes_on)) != 1:
-            raise ValueError("board, board_file or goes_on is expected, and one of them")
+        if sum(one is not None for one in (self.board, self.board_file, self.resume)) != 1:
+            raise ValueError("board, board_file or resume is expected, and one of them")
         return self
 
     def wanted(self) -> RunRequest:

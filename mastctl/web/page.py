@@ -129,8 +129,8 @@ def rig_told(service: Service) -> RigTold:
     found = sorted(one.name for one in folder.glob("*.yaml"))[:MOST_MAST_FILES]
     return {
         "digest": stored.digest,
-        "made": None if made is None else str(made)[:40],
-        "written_s": _written_s(service.masts.in_use.path),
+        "mast_date": None if made is None else str(made)[:40],
+        "modified_s": _modified_s(service.masts.in_use.path),
         "cameras": {
             name: _mount(name, camera, stored.rig.stereo, names)
             for name, camera in stored.rig.cameras.items()
@@ -140,7 +140,7 @@ def rig_told(service: Service) -> RigTold:
     }
 
 
-def _written_s(path: Path) -> float | None:
+def _modified_s(path: Path) -> float | None:
     try:
         return path.stat().st_mtime
     except OSError:  # it was moved since it was read
@@ -152,7 +152,7 @@ def _mount(name: str, camera: RigCamera, stereo: Stereo, names: Collection[str])
     width, height = model.size_px
     x, y = (width - 1) / 2, (height - 1) / 2
     places = [(x, y), (0, y), (width - 1, y), (x, 0), (x, height - 1)]
-    pair, eye, partner = _partners(name, stereo)
+    pair, side, partner = _partners(name, stereo)
     middle, left, right, top, bottom = model.ray(np.array(places, dtype=float)).directions
     return {
         "on": camera.on,
@@ -162,7 +162,7 @@ def _mount(name: str, camera: RigCamera, stereo: Stereo, names: Collection[str])
         "width_rad": _between(left, right),
         "height_rad": _between(top, bottom),
         "pair": pair,
-        "eye": eye,
+        "side": side,
         "partner": partner if partner in names else None,
     }
 
@@ -172,7 +172,7 @@ def _between(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def _partners(name: str, stereo: Stereo) -> tuple[str | None, Literal["left", "right"] | None, str | None]:
-    """The pair of a camera, which eye of it, and the other one."""
+    """The pair of a camera, which side of it, and the other one."""
     for pair, (left, right) in stereo.items():
         if name == left:
             return pair, "left", right

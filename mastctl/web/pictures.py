@@ -175,7 +175,7 @@ class WatchedCameras:
                     made = Picture(frame, frame.jpeg or encoded(frame.image, "jpeg", JPEG_QUALITY))
                     pause_s = 0.0
             except (DriverError, MastctlError) as error:  # its fault tells more
-                log.debug("no picture of %s for who watches it: %s", camera, error)
+                log.debug("no picture of %s for its viewers: %s", camera, error)
                 made, pause_s = None, FAILING_S
             except Exception:  # a defect must not end the thread
                 log.exception("pictures of %s met a defect of the program", camera)

@@ -44,6 +44,9 @@ PAGE = (
 )
 """The Content-Security-Policy of a page: its own files only, no script inside it, in nobody's frame."""
 
+RENAMED = {"gives_way": "preemptible", "goes_on": "resume"}
+"""Keys of bodies by their names before version 0.1."""
+
 Headers = list[tuple[bytes, bytes]]
 
 
@@ -98,6 +101,8 @@ def sentence(problem: Mapping[str, Any], model: object) -> str:
     if kind == "missing":
         return f"{place} is missing" if len(where) > 1 else "the body is missing; a JSON object is expected"
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+        if new := RENAMED.get(where[-1]):
+            return f"{place} is called {new} since version 0.1"
         known = _keys(model, where[1:-1])
         return f"{place}: unknown key; {nearest(where[-1], known)}" if known else f"{place}: unknown key"
     value = _short(problem.get("input"))

@@ -17,7 +17,7 @@ from mastctl.web.parts import Here
 def add_sessions(app: FastAPI) -> None:
     """Log-in, log-out, and who one is."""
 
-    @app.get(f"{PREFIX}/session", summary="Who asks, and what it may do")
+    @app.get(f"{PREFIX}/session", summary="The client's name and rights")
     async def session(request: Request, here: Here) -> SessionTold:
         access = here.entrance.access
         caller: Caller = request.scope["state"]["caller"]

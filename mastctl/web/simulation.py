@@ -117,7 +117,10 @@ def add_simulation(app: FastAPI) -> None:
         here.service.clock.sleep(body.advance_s)
         return _time_told(here.service)
 
-    @app.get(f"{PREFIX}/simulation/truth", summary="What a pixel of a frame truly shows, or where a point is")
+    @app.get(
+        f"{PREFIX}/simulation/truth",
+        summary="The true point at a pixel of a frame, or the true pixel of a point",
+    )
     async def truth(query: Annotated[TruthQuery, Query()], here: Here) -> TruthTold:
         return await here.waiting.run(lambda: _truth(here.service, query))
 
@@ -187,7 +190,7 @@ def _time_told(service: Service) -> TimeTold:
 
 
 def _truth(service: Service, query: TruthQuery) -> TruthTold:
-    """What a pixel of a frame truly shows, or where a point is. Raises NoLonger and as `frame_by_id`."""
+    """The truth asked for. Raises NoLonger and as `frame_by_id`."""
     rover = _rover(service, "truths")
     frame = service.devices.frame_by_id(query.frame_id)
     try:
@@ -218,12 +221,12 @@ def _words_told(panel: FaultPanel) -> dict[str, dict[str, WordTold]]:
 
     def parameter(name: str, usual: float) -> ParameterTold:
         least, most = BOUNDS[name]
-        return {"usual": as_json(usual), "least": least, "most": as_json(most)}
+        return {"default": as_json(usual), "least": least, "most": as_json(most)}
 
     return {
         device: {
             name: {
-                "does": word.does,
+                "effect": word.does,
                 "parameters": {
                     one: parameter(one, usual) for one, usual in {**word.parameters, **WHEN}.items()
                 },

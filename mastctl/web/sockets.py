@@ -90,7 +90,7 @@ class Socket(WebSocketsSansIOProtocol):
             super().handle_text(event)
 
     def _not_taken(self, event: Frame) -> None:
-        self._end(UNSUPPORTED, "this WebSocket tells and takes nothing")
+        self._end(UNSUPPORTED, "this WebSocket sends and takes nothing")
 
     handle_bytes = handle_cont = _not_taken
 

@@ -78,7 +78,7 @@ ANY_BODY = {"anyOf": [EstopBody.model_json_schema(), {}]}  # a stop is refused f
 def add_pointing(app: FastAPI) -> None:
     """State, operations and the stop."""
 
-    @app.get(f"{PREFIX}/status", summary="What is known at this moment")
+    @app.get(f"{PREFIX}/status", summary="The present state of daemon, head, cameras and calibration")
     async def status(here: Here) -> Status:
         return here.service.state().told()
 
@@ -94,7 +94,7 @@ def add_pointing(app: FastAPI) -> None:
         told = body.model_dump(exclude_none=True)
         return {"id": here.service.steering.point(body.request, told).id}
 
-    @app.post(f"{PREFIX}/point/preview", summary="What a pixel shows, before anything moves")
+    @app.post(f"{PREFIX}/point/preview", summary="The point at a pixel, before anything moves")
     async def preview(body: PreviewBody, here: Here) -> PreviewTold:
         service = here.service
         service.check_camera(body.pixel.camera)
@@ -261,10 +261,10 @@ def add_lease(app: FastAPI) -> None:
     async def control(here: Here) -> LeaseTold:
         return {"control": here.service.leases.told()}
 
-    @command(app, "POST /lease", LEASE, "Acquire the lease, if nobody else steers")
+    @command(app, "POST /lease", LEASE, "Acquire the lease, if no other client steers")
     def acquire(body: LeaseBody, here: Here, asked: Asks) -> LeaseGranted:
         leases, name = here.service.leases, None if body.name is None else told_name(body.name)
-        ends = body.gives_way, body.ends_with_stop, body.stops_when_silent
+        ends = body.preemptible, body.ends_with_stop, body.stops_when_silent
         granted = leases.acquire(asked.caller, name, body.for_s, *ends)
         return _granted(leases, granted)
 
@@ -287,7 +287,9 @@ def add_lease(app: FastAPI) -> None:
         leases.release(_lease_of(asked))
         return {"control": leases.told()}
 
-    @command(app, "POST /lease/take", LEASE_TAKE, "Take over, whoever steers; what runs goes on")
+    @command(
+        app, "POST /lease/take", LEASE_TAKE, "Take the lease from its holder; a running operation goes on"
+    )
     def take(body: TakeBody, here: Here, asked: Asks) -> LeaseGranted:
         leases, name = here.service.leases, None if body.name is None else told_name(body.name)
         return _granted(leases, leases.take(asked.caller, body.reason, name, body.for_s))

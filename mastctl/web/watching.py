@@ -59,7 +59,7 @@ def add_watching(app: FastAPI) -> None:
         told = {**service.health.told(), **service.mast_verdict(), "sentinel": service.sentinel.told()}
         return cast(CalibrationHealthTold, told)
 
-    @app.get(f"{PREFIX}/sentinel", summary="What the drift sentinel's looks say, and how old the last one is")
+    @app.get(f"{PREFIX}/sentinel", summary="The findings of the drift sentinel, and the age of its last look")
     async def sentinel(here: Here) -> SentinelTold:
         service = here.service
         folder = service.folder.path / SENTINEL_FOLDER

@@ -101,7 +101,7 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     if not weighed.fit.settled:
         raise BenchNotFitted(
             f"the fit did not settle: after {weighed.fit.steps} steps it was still finding better values, so "
-            "that neither they nor their sigmas are good; take more pictures, at more pan and tilt angles "
+            "that neither they nor their sigmas are good. Take more pictures, at more pan and tilt angles "
             "and distances"
         )
     return told(bench, (problem, fit), weighed, named, chosen, tests, began)
@@ -221,7 +221,7 @@ def _refuse_part(problem: Adjustment) -> None:
         if wrong[cut - 1] <= 0.2 * out.sum():
             raise BenchNotFitted(
                 f"{int(out.sum())} of {len(out)} pictures of {what} contradict the rest, all on one side of "
-                f"picture {shown[cut].name}: something changed before it; fasten board, head and cameras, "
+                f"picture {shown[cut].name}: something changed before it. Fasten board, head and cameras, "
                 "and take the pictures again, or take those out of images.csv"
             )
 
@@ -238,13 +238,13 @@ def _refuse_far(bench: BenchProblem, problem: Adjustment, state: Estimate) -> No
         if len(kept) < max(2, len(mine) // 2):
             raise BenchNotFitted(
                 f"camera {name}: {len(mine) - len(kept)} of its {len(mine)} pictures do not agree with the "
-                "rest; check that pan counts right and tilt up, that each picture's placement is the right "
+                "rest. Check that pan counts right and tilt up, that each picture's placement is the right "
                 "one, and that nothing but the head moved"
             )
         typical, noise_px = typical_length(problem, state, kept, bench.survey.sigma.corner_px)
         if typical > WRONG_MINIMUM:
             raise BenchNotFitted(
                 f"camera {name}: the fit leaves {typical:.1f} times the stated noise of a corner "
-                f"({noise_px:g} px): it ended in a wrong minimum, the lens is none of this model, the "
+                f"({noise_px:g} px). It ended in a wrong minimum, the lens is not of this model, the "
                 "board's measures are wrong, or the sigmas are too small"
             )

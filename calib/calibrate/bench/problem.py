@@ -207,8 +207,8 @@ class BenchProblem:
             first = [shown[i + 1].name for i in changes[:3]]
             raise SomethingChanged(
                 f"board {board[0]} of placement {board[1]} stands at two places, now at one and now at the "
-                f"other (pictures {', '.join(first)} and others): two boards have the same ids, or it was "
-                "moved and put back; leave one board only, or print the other with other ids (first_id)"
+                f"other (pictures {', '.join(first)} and others). Two boards have the same ids, or it was "
+                "moved and put back. Leave one board only, or print the other with other ids (first_id)"
             )
         before, after = shown[cut - 1].name, shown[cut].name
         self.notes.append(
@@ -372,11 +372,11 @@ def _px_per_m(problem: Adjustment, state: Estimate, term: ImageTerm) -> FloatArr
 def _one_sided(term: str, joint: str, sides: set[int]) -> str:
     """Why a joint's backlash is not looked for."""
     if not sides & {-1, 1}:
-        return f"{term} is not looked for: nobody knows from which side {joint} came to rest"
+        return f"{term} is not looked for: it is not known from which side {joint} came to rest"
     side = "smaller" if 1 in sides else "larger"
     return (
         f"{term} is not looked for: {joint} came to rest from {side} angles only, as in a head that "
-        "approaches every goal from one side; its play is then part of its zero, and no error"
+        "approaches every goal from one side. Its play is then part of its zero, and no error"
     )
 
 

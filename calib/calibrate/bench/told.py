@@ -194,19 +194,19 @@ def _gauges(bench: BenchProblem, chosen: Sequence[str]) -> tuple[str, ...]:
     else:
         where = (
             "the rover frame is the mast's at zero angles (z down along the pan axis): where the "
-            "vehicle is, pictures cannot tell"
+            "vehicle is, pictures cannot show"
         )
     told = [
         where,
-        "its origin is where the pan axis is nearest to the tilt axis: pictures tell no other height "
+        "its origin is where the pan axis is nearest to the tilt axis: pictures determine no other height "
         "along it",
-        "pan is zero where the tilt axis points to y, tilt where the head's x lies square to pan: an "
+        "pan is zero where the tilt axis points to y, tilt where the head's x lies square to pan. An "
         "offset of either would turn the frame or all head cameras, and is none",
         "every length is as long as the boards were measured: 0.1 % there is 0.1 % of every range",
     ]
     if "tilt harmonic 1" in chosen:
         told.append(
-            "the first harmonic of tilt is encoder and an arm's sag together: pictures cannot tell them apart"
+            "the first harmonic of tilt is encoder and an arm's sag together: pictures cannot separate them"
         )
     return tuple(told)
 

@@ -133,7 +133,9 @@ class SceneDrift:
         """What is to be told, '' if nothing is."""
         if self.named is None:
             return ""
-        other = f" (or {' or '.join(self.instead)}: these pictures cannot tell)" if self.instead else ""
+        other = (
+            f" (or {' or '.join(self.instead)}: these pictures cannot separate them)" if self.instead else ""
+        )
         return self.named.sentence + other
 
 

@@ -156,7 +156,7 @@ def _refuse_still(name: str, images: Sequence[ImageTerm]) -> None:
         if moved < SEEN_RAD:
             raise BenchNotFitted(
                 f"{axis} moves by {np.degrees(moved):.1f}° at most while camera {name} sees one placement, "
-                f"so that its axis cannot be told: take pictures with {axis} at least "
+                f"so that its axis cannot be determined. Take pictures with {axis} at least "
                 f"{np.degrees(4 * SEEN_RAD):.0f}° apart in which the same placement is in view"
             )
 

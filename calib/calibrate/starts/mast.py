@@ -118,7 +118,7 @@ def fit_mast(
     if best[0] > GROSS * expected_px and not keep_all:
         raise MastNotFitted(
             f"no mast explains the images: the best one leaves {best[0]:.1f} px where some "
-            f"{expected_px:.2g} px are expected; check pan and tilt (radians, right and up positive) and "
+            f"{expected_px:.2g} px are expected. Check pan and tilt (radians, right and up positive) and "
             "each image's placement; "
             "axes that do not meet at a right angle need eight parameters"
         )

@@ -60,7 +60,7 @@ class FreeProjection(ReadOnlyArrays):
     Attributes
     ----------
     lens
-        What it does to points.
+        Its map of points.
     pixel_from_slope, slope_from_pixel
         (3, 3): the camera matrix [[fx, skew, cx], [0, fy, cy], [0, 0, 1]], and its inverse.
     """

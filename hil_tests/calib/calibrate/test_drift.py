@@ -113,4 +113,4 @@ def test_one_eye_at_one_rest_cannot_tell_a_bump_from_a_slip_and_says_so() -> Non
     assert drift.named is not None
     named = {drift.named.what, *drift.instead}
     assert {"tilt slipped"} < named
-    assert "these pictures cannot tell" in drift.sentence
+    assert "these pictures cannot separate them" in drift.sentence

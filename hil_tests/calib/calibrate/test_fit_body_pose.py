@@ -226,7 +226,7 @@ def test_targets_at_one_range_leave_directions_to_the_prior_by_name(rig: Rig) ->
         rig, HAZCAMS, hand_offs(moved_hazcams(rig, Rotation.identity(), SHIFT_M), rig, points, rng)
     )
     assert fit.seen < 6 and len(fit.unseen) == 6 - fit.seen
-    assert all("not told" in sentence and "prior" in sentence for sentence in fit.unseen)
+    assert all("not determined" in sentence and "prior" in sentence for sentence in fit.unseen)
     sigma = np.sqrt(np.diag(fit.covariance))
     assert (sigma <= np.array([PRIOR_TURN_RAD] * 3 + [PRIOR_SHIFT_M] * 3)).all()
 

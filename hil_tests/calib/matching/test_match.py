@@ -244,7 +244,7 @@ def test_a_line_that_leaves_the_other_picture_altogether_has_no_partner() -> Non
     turned = Pinhole(RIGHT.position_m, 1.2, 0.0, FOCAL_PX, SIZE_PX)
     found = find_partner(seen(LEFT, 5), LEFT.model, (200.0, 140.0), seen(RIGHT, 5), turned.model)
     assert found.match.verdict == "border"
-    assert found.match.reason == "nothing that this pixel may show lies in the other eye's picture"
+    assert found.match.reason == "nothing that this pixel may show lies in the other camera's picture"
 
 
 def test_a_line_too_short_for_a_second_place_has_no_rival() -> None:
@@ -293,7 +293,7 @@ def test_a_partner_beyond_infinity_is_no_match() -> None:
     far_px = RIGHT.pixel(LEFT.position_m + 1e6 * (point - LEFT.position_m))
     beyond = np.roll(seen(RIGHT, 5), round(far_px[0] - RIGHT.pixel(point)[0]) + 1, axis=1)
     found = find_partner(seen(LEFT, 5), LEFT.model, pixel, beyond, RIGHT.model)
-    assert found.match.verdict == "weak" and "see no point together" in found.match.reason, found.match
+    assert found.match.verdict == "weak" and "see no common point" in found.match.reason, found.match
 
 
 def test_a_picture_that_is_nothing_but_not_a_number_matches_nowhere() -> None:

@@ -288,7 +288,7 @@ def test_a_missing_frame_of_one_eye_is_borne_while_tracked(begun: Track) -> None
     look = seen_by(begun, {"left": eyes(0.0, seed=3)["left"]})
     assert look.track.state == "tracked"
     lost = replace(begun, state="lost")
-    assert "one eye alone" in seen_by(lost, {"left": eyes(0.0, seed=3)["left"]}).reason
+    assert "one camera alone" in seen_by(lost, {"left": eyes(0.0, seed=3)["left"]}).reason
     assert "no picture" in seen_by(begun, {}).reason
 
 

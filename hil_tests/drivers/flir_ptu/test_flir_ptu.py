@@ -240,7 +240,7 @@ def test_a_unit_in_another_step_mode_than_the_options_say_is_refused(
     unit.resolutions["P"] = told
     with ExitStack() as stack:
         if not right:
-            stack.enter_context(pytest.raises(WrongDevice, match="either its step mode was changed"))
+            stack.enter_context(pytest.raises(WrongDevice, match="Either its step mode was changed"))
         opened(unit, pan={**OPTIONS["pan"], "resolution_arcsec": 185.0})
 
 
@@ -552,11 +552,11 @@ def test_a_unit_that_lost_count_while_the_line_was_down_is_not_moved(opened: Ben
     unit.positions["P"] = 0
     line.come_back()
     unit.heard.clear()
-    words = "pan was at 0.5000 rad before the unit or its line was away and is at 0.0"
+    words = "pan was at 0.5000 rad before the connection was lost and is at 0.0"
     assert answered(opened, head).faults[0].startswith(words)
     assert unit.positions == {"P": 0, "T": round(0.2 / TILT_STEP_RAD)}, "it comes back without moving"
     assert {"LU", "PN", "PR", "H"} <= set(unit.heard), "and is checked again"
-    with pytest.raises(HardwareFault, match="before the unit or its line was away"):
+    with pytest.raises(HardwareFault, match="before the connection was lost"):
         head.move(0.1, 0.1)
 
 

@@ -106,7 +106,7 @@ def test_before_a_run_it_is_told_what_its_pictures_take() -> None:
     took_s = {"navcam_left": 1.0, "navcam_right": 1.0, "pancam_left": 2.0}
     words = BenchGoal(pictures=60).will_take(took_s, ("navcam_left", "navcam_right"), 0.5)
     # 21 looks of 1.5 s to turn, 0.5 s to choose and two pictures; 60 looks with all three
-    assert words.startswith("21 to 60 looks will take 1.4 to 6 minutes here: one of all 3 cameras 6.0 s")
+    assert words.startswith("21 to 60 looks will take 1.4 to 6 minutes here. One of all 3 cameras 6.0 s")
     assert (
         "(pancam_left 2.0 s, the choice of the next 0.5 s), of navcam_left, navcam_right alone 4.0 s" in words
     )
@@ -188,7 +188,7 @@ def test_a_board_that_is_taken_away_ends_the_run_and_loses_nothing(repository: P
         return looked(pan_rad, tilt_rad, approach)
 
     bench.look = look  # type: ignore[method-assign]
-    with pytest.raises(BoardLost, match="put it back or place it anew"):
+    with pytest.raises(BoardLost, match="Put it back or place it anew"):
         run.run()
     assert len(list(looks_of(read_survey(tmp_path / "bench")))) == 5
 

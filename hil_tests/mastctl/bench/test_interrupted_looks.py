@@ -89,7 +89,7 @@ def far_look(url: str, act: Callable[[Client], object]) -> str:
 
 def test_a_stop_and_an_emergency_stop_are_told_apart(url: str) -> None:
     assert far_look(url, lambda ana: ana.stop()) == (
-        "somebody pressed stop in the middle of a move, and the head stands still"
+        "a stop was requested in the middle of a move, and the head stands still"
     )
     told = far_look(url, lambda ana: ana.estop(reason="a hand in the way", name="Ana"))
     assert "an emergency stop: a hand in the way (Ana)" in told and "'mastctl reset' releases it" in told

@@ -274,7 +274,7 @@ def test_a_head_that_tells_nothing_true_from_the_start_fails_and_is_never_moved(
     told = {check["name"]: check for check in json.loads(capsys.readouterr().out)["checks"]}
     assert told["head.reading"]["state"] == "failed"
     assert {check["state"] for check in told.values()} == {"failed", "skipped"}
-    assert "nobody knows from where" in told["head.move"]["message"]
+    assert "not known from where" in told["head.move"]["message"]
     assert sent == []
 
 

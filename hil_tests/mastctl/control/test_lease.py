@@ -205,7 +205,7 @@ def test_an_id_of_any_signs_is_unknown_and_no_defect(world: World) -> None:
 def test_a_lease_that_gives_way_ends_for_whoever_comes_and_what_runs_is_stopped_first(
     world: World, by: str
 ) -> None:
-    lease = world.leases.acquire(BENCH, for_s=60.0, gives_way=True)
+    lease = world.leases.acquire(BENCH, for_s=60.0, preemptible=True)
     world.steer(BENCH, lease, starts=True)
     if by == "command":
         with world.leases.steering(ROVER, None):
@@ -220,14 +220,14 @@ def test_a_lease_that_gives_way_ends_for_whoever_comes_and_what_runs_is_stopped_
 
 
 def test_a_lease_that_gives_way_stops_nothing_where_nothing_runs(world: World) -> None:
-    world.leases.acquire(BENCH, gives_way=True)
+    world.leases.acquire(BENCH, preemptible=True)
     world.steer(ROVER)
     assert world.gave_way == []
     assert world.leases.control() is None
 
 
 def test_a_lease_that_gives_way_is_renewed_and_stands_against_nobody_but_ends_by_time(world: World) -> None:
-    lease = world.leases.acquire(BENCH, for_s=10.0, gives_way=True)
+    lease = world.leases.acquire(BENCH, for_s=10.0, preemptible=True)
     world.clock.advance(9.0)
     world.leases.renew(lease.id)
     world.clock.advance(9.0)
@@ -241,14 +241,14 @@ def test_a_stop_ends_a_lease_that_gives_way_and_no_other(world: World) -> None:
     world.leases.stop_came()
     world.steer(BENCH, lease)
     world.leases.release(lease.id)
-    lease = world.leases.acquire(BENCH, gives_way=True)
+    lease = world.leases.acquire(BENCH, preemptible=True)
     world.steer(BENCH, lease)
     with world.leases._lock:  # whoever holds it, the stop waits for nobody
         world.leases.stop_came()
         assert world.leases.control() is None
     assert "the head was stopped" in refused("lease_over", lambda: world.steer(BENCH, lease))
     assert "the head was stopped" in refused("lease_over", lambda: world.leases.renew(lease.id))
-    world.steer(BENCH, world.leases.acquire(BENCH, gives_way=True))
+    world.steer(BENCH, world.leases.acquire(BENCH, preemptible=True))
 
 
 def test_a_lease_that_ends_with_a_stop_gives_way_to_nobody_and_is_over_when_one_comes(world: World) -> None:

@@ -498,7 +498,7 @@ def test_times_that_cannot_be_true_are_a_typed_error(
     ticking: tuple[Ticking, Ticking], devices: Devices, times: Callable[[], Any]
 ) -> None:
     ticking[1].recent_times = times  # type: ignore[method-assign]
-    with pytest.raises(DriverError, match=r"tell no times of navcam_left and navcam_right|in recent_times"):
+    with pytest.raises(DriverError, match=r"give no times of navcam_left and navcam_right|in recent_times"):
         devices.frames(EYES, now(devices), 2.0)
 
 

@@ -58,7 +58,7 @@ def test_a_run_whose_daemon_is_killed_leaves_nobody_behind_goes_on_with_the_next
     with started(path) as (daemon, port), Client(f"http://127.0.0.1:{port}", name="Ana") as client:
         (kept,) = client.bench()["runs"]
         assert (kept["name"], kept["state"]) == (name, "interrupted") and kept["pictures"] >= 2
-        client.begin_bench(goes_on=name)
+        client.begin_bench(resume=name)
         until(lambda: pictures(client) > kept["pictures"], "more", BOUND_S)
         (program,) = children(daemon.pid)
         run = client.bench()["run"]

@@ -249,7 +249,7 @@ def test_a_live_view_elsewhere_than_on_this_machine_is_refused(tmp_path: Path) -
     plain = Path(load_config().path).read_text()
     for said, words in (
         ("{host: 0.0.0.0}", "foxglove.host: '0.0.0.0' where a loopback address is expected"),
-        ("{host: rover.local, port: 8765}", "asks nobody who they are"),
+        ("{host: rover.local, port: 8765}", "requires no token"),
         ("{port: 70000}", "foxglove.port"),
         ("{ports: 1}", "ports"),
         ("8765", "foxglove"),

@@ -228,7 +228,7 @@ def test_a_pair_that_is_turned_shows_in_the_record_and_takes_over_only_within_wh
     surely = replace(track, covariance_m2=1e-6 * np.eye(3))
     _, seen = looker(world, None, believed).look(surely, "pancam")
     assert (seen.state, seen.pair) == ("tracked", "pancam")
-    assert seen.reason.startswith("navcam does not take over: what was found does not fit the prediction")
+    assert seen.reason.startswith("navcam does not take over: the match does not fit the prediction")
     roughly = replace(track, covariance_m2=2e-2**2 * np.eye(3))  # as after half a metre of driving
     _, taken = looker(world, None, believed).look(roughly, "pancam")
     assert (taken.state, taken.pair) == ("tracked", "navcam")

@@ -57,7 +57,7 @@ def test_on_the_worst_day_a_target_is_kept_and_handed_over(daemon: RunningDaemon
             offs_m.append(off_m(track, drive, target_m))
             sigmas_m.append(math.sqrt(sum(track["covariance_m2"][axis][axis] for axis in range(3))))
         # Warm eyes squint by what no sigma knows: the Hazcams may find it elsewhere, then the Navcams stay.
-        stays = "hazcam does not take over: what was found does not fit the prediction" in track["reason"]
+        stays = "hazcam does not take over: the match does not fit the prediction" in track["reason"]
         pairs = [(one["from_pair"], one["to_pair"]) for one in track["handoffs"]]
         assert pairs == ([] if stays else [("navcam", "hazcam")]), track["reason"]
     told = f"off {np.round(offs_m, 3)} m, told {np.round(sigmas_m, 3)} m"

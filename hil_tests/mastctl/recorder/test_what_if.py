@@ -155,7 +155,7 @@ def test_what_cannot_be_worked_out_is_named() -> None:
     assert seen == []
     assert others["1"] == "it had no picture in which anything could be measured"
     assert others["2"] == "it failed: it was flat"
-    assert others["3"].startswith("its record does not tell enough")
+    assert others["3"].startswith("its record does not hold enough")
 
 
 def test_a_recording_is_served_as_it_was(files: dict[str, Path], tmp_path: Path) -> None:

@@ -175,7 +175,7 @@ def test_halt_stops_servos_that_move_without_a_watchdog(tmp_path: Path) -> None:
         until(lambda: bench.pan_rad > killed_at_rad + 0.02, "it goes on")
         done = bench.halt()
         assert done.returncode == 0, done.stderr
-        assert "told to stand" in json.loads(done.stdout)["said"][0]
+        assert "commanded to stand" in json.loads(done.stdout)["said"][0]
         bench.stopped_on_the_way()
 
 

@@ -125,7 +125,7 @@ def test_one_eye_of_a_pair_is_not_said_to_be_missing_from_the_mast_file(
         for camera, reason in (
             (
                 "navcam_left",
-                "the other eye of the stereo pair navcam, navcam_right, is not in the configuration",
+                "the other camera of the stereo pair navcam, navcam_right, is not in the configuration",
             ),
             ("hazcam_left", "hazcam_left is in no stereo pair of the mast file"),
         ):
@@ -137,4 +137,4 @@ def test_one_eye_of_a_pair_is_not_said_to_be_missing_from_the_mast_file(
             assert reason in error["message"]
             assert outcome(daemon, "point", body).get("code") != "no_stereo", "one camera points alone"
         error = outcome(daemon, "track", {"position_m": [6.0, 0.0, 0.0]})
-        assert "none is configured with both eyes" in error["message"]
+        assert "none is configured with both cameras" in error["message"]

@@ -150,5 +150,5 @@ def test_a_scene_without_patches_is_told() -> None:
 
 
 def test_too_short_a_sweep_is_told() -> None:
-    with pytest.raises(CannotTell, match=r"ways of the head tell something"):
+    with pytest.raises(CannotTell, match=r"ways of the head can be used"):
         measured(Rig(seconds=3.0))

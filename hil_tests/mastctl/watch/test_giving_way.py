@@ -39,7 +39,7 @@ def moving(daemon: RunningDaemon, ana: Client) -> Iterator[tuple[Client, str]]:
     ana.set_fault("pan_tilt", "slow", factor=0.02)
     with (
         Client(daemon.url, name="the sentinel's process") as sentinel,
-        sentinel.lease("sentinel", for_s=60.0, gives_way=True),
+        sentinel.lease("sentinel", for_s=60.0, preemptible=True),
     ):
         operation = sentinel.point(pan_rad=FAR_RAD, tilt_rad=-0.1)
         until(lambda: ana.status()["moving"], "the sentinel's move")

@@ -83,7 +83,7 @@ def test_a_turned_body_pair_is_told_after_enough_hand_offs(
         assert one["sigmas"] > 5.0
         assert f"{one['camera']} sees targets" in one["sentence"]
         assert "px left" in one["sentence"] and "of where navcam puts them" in one["sentence"]
-    assert sum("tell an offset: hazcam_left" in words for words in caplog.messages) == 1, "told once"
+    assert sum("show an offset: hazcam_left" in words for words in caplog.messages) == 1, "told once"
     selfcheck.close()
     assert len(read_log(tmp_path / "h.jsonl").handoffs) == 20
 

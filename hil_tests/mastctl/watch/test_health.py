@@ -104,7 +104,7 @@ def test_a_folder_that_is_no_folder_is_told(tmp_path: Path) -> None:
         Journal(tmp_path / FILE).read()
     health = CalibrationHealth(tmp_path, STORED, lambda: NOON_S)
     health.ended(STORED, ended_pointing())
-    until(lambda: health.told()["not_kept"], "the file is told")
+    until(lambda: health.told()["write_error"], "the file is told")
     health.close()
 
 

@@ -107,16 +107,16 @@ def test_nothing_begins_while_somebody_steers_something_runs_or_an_emergency_sto
     scripted(daemon, lines(BEGUN))
     with bo.lease():
         refused("leased", lambda: ana.begin_bench("charuco_a3"))
-    goes_on = threading.Event()
+    resume = threading.Event()
 
     def waits(request: Any, record: Any, cancelled: threading.Event, devices: Any) -> Any:
-        goes_on.wait(NET_S)
+        resume.wait(NET_S)
         return ScriptedLoop.good(request, record, cancelled, devices)
 
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(waits))
     running = ana.point(pan_rad=0.1, tilt_rad=0.0)
     refused("busy", lambda: ana.begin_bench("charuco_a3"))
-    goes_on.set()
+    resume.set()
     ana.wait(running)
     ana.estop(name="Ana", reason="a hand")
     refused("estopped", lambda: ana.begin_bench("charuco_a3"))
@@ -124,9 +124,7 @@ def test_nothing_begins_while_somebody_steers_something_runs_or_an_emergency_sto
     ana.reset(name="Ana", reason="away")
 
 
-@pytest.mark.parametrize(
-    "body", [{}, {"board": "a", "goes_on": "b"}, {"board": "a", "pictures": 3}, {"x": 1}]
-)
+@pytest.mark.parametrize("body", [{}, {"board": "a", "resume": "b"}, {"board": "a", "pictures": 3}, {"x": 1}])
 def test_a_body_that_makes_no_sense_is_refused_in_a_sentence(standing: Pair, body: dict[str, Any]) -> None:
     answer = HTTP.post(f"{standing[0].url}/api/v1/bench", json=body)
     assert answer.status_code == 422 and answer.json()["error"]["code"] == "bad_request"
@@ -181,12 +179,12 @@ def test_who_takes_over_ends_it_and_it_goes_on_later(pair: Pair, ana: Client, bo
     with bo.lease(take_over="the arm is in the way"):
         run = ended(daemon)
         assert run.code == "taken" and "Bo took over: the arm is in the way" in run.sentence
-        refused("leased", lambda: ana.begin_bench(goes_on=name))
+        refused("leased", lambda: ana.begin_bench(resume=name))
     scripted(daemon, lines(BEGUN, DONE))
-    ana.begin_bench(goes_on=name)
+    ana.begin_bench(resume=name)
     assert ended(daemon).state == "done"
-    refused("bench_done", lambda: ana.begin_bench(goes_on=name))
-    refused("bench_unknown", lambda: ana.begin_bench(goes_on="20010101-000000"))
+    refused("bench_done", lambda: ana.begin_bench(resume=name))
+    refused("bench_unknown", lambda: ana.begin_bench(resume="20010101-000000"))
 
 
 def test_a_board_file_is_judged_and_kept_and_not_written_into_the_record(pair: Pair, ana: Client) -> None:
@@ -308,9 +306,9 @@ def test_the_program_moves_nothing_after_a_stop_however_late_the_guide_hears_of_
     pair: Pair, ana: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     daemon, hardware = pair
-    goes_on = "while True:\n  try: client.wait(client.point(pan_rad=0.1, tilt_rad=0.0))\n"
-    goes_on += "  except ClientError as error: tell(event='said', sentence=error.code)\n  time.sleep(0.02)\n"
-    scripted(daemon, lines(BEGUN) + STEERS + goes_on)
+    resume = "while True:\n  try: client.wait(client.point(pan_rad=0.1, tilt_rad=0.0))\n"
+    resume += "  except ClientError as error: tell(event='said', sentence=error.code)\n  time.sleep(0.02)\n"
+    scripted(daemon, lines(BEGUN) + STEERS + resume)
     monkeypatch.setattr("mastctl.guided.guide._stop_of", lambda one: None)  # nobody tells it
     monkeypatch.setattr("mastctl.guided.guide.TOLD_S", 3.0)
 

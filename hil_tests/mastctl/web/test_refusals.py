@@ -15,6 +15,8 @@ import drivers
 import mastctl
 from calib.errors import CalibError
 from drivers.errors import BadOptions, DriverError, NoFreshFrame, NoReply
+from hil_tests.mastctl.service_fakes import HTTP, FakeHardware
+from mastctl.daemon import RunningDaemon
 from mastctl.errors import (
     BadRequest,
     MastctlError,
@@ -162,3 +164,12 @@ def test_no_code_has_two_statuses(documented: dict[str, set[str]]) -> None:
 )
 def test_a_family_answers_with_one_status(error: Exception, status: int) -> None:
     assert status_of(error) == status
+
+
+def test_a_renamed_key_is_refused_with_its_new_name(
+    standing: tuple[RunningDaemon, FakeHardware],
+) -> None:
+    for path, key, new in (("lease", "gives_way", "preemptible"), ("bench", "goes_on", "resume")):
+        answer = HTTP.post(f"{standing[0].url}/api/v1/{path}", json={key: True})
+        message = answer.json()["error"]["message"]
+        assert (answer.status_code, message) == (422, f"{key} is called {new} since version 0.1")

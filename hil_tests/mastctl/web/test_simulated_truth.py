@@ -60,13 +60,13 @@ def test_the_words_of_each_device_are_told_with_usual_values_and_bounds(mast_cli
     assert set(words["pan_tilt"]) == set(HEAD_WORDS)
     assert set(words["navcam_left"]) == set(CAMERA_WORDS) and set(words["log"]) == {"stalled"}
     wrong = words["pan_tilt"]["wrong"]
-    assert "off by a constant" in wrong["does"]
+    assert "off by a constant" in wrong["effect"]
     offset = wrong["parameters"]["offset_rad"]
-    assert offset == {"usual": 0.0349, "least": -math.pi, "most": math.pi}
-    assert wrong["parameters"]["for_s"] == {"usual": None, "least": 0.0, "most": None}
+    assert offset == {"default": 0.0349, "least": -math.pi, "most": math.pi}
+    assert wrong["parameters"]["for_s"] == {"default": None, "least": 0.0, "most": None}
     for device, its_words in words.items():
         for word, told in its_words.items():
-            given = {name: one["usual"] for name, one in told["parameters"].items()}
+            given = {name: one["default"] for name, one in told["parameters"].items()}
             usual = {name: value for name, value in given.items() if value is not None}
             mast_client.set_fault(device, word, **{**usual, "after_s": 3600.0})
     mast_client.clear_faults()

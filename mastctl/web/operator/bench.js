@@ -29,7 +29,7 @@ export class Bench {
     this.where = h("div", { class: "sketches" });
     this.stands = button("It stands", () => this.act(() => post("/bench/stands", {})), "go stands");
     this.leave = button("End it for now", () => this.act(() => post("/bench/leave", {})));
-    this.goOn = button("Go on", () => this.begin({ goes_on: this.run.name }), "go");
+    this.goOn = button("Go on", () => this.begin({ resume: this.run.name }), "go");
     this.fresh = button("Begin another …", () => { this.closed = this.run?.name; this.anew.open = true; this.draw(); });
     this.asked = h("div", { class: "bench-place" }, h("h3", {}, "Where the board goes"), this.words, this.where, this.stands);
     this.seen = h("div", { class: "coverages" });
@@ -148,7 +148,7 @@ export class Bench {
     this.drawOthers(going);
     if (!shown) return;
     this.goOn.hidden = this.next.hidden = run.state !== "interrupted";
-    say(this.next, `What it saw is kept in ${this.folder ?? ""}/${run.name}: ${run.pictures} pictures a camera. ${this.may ? "" : "Whoever may operate chooses: "}Go on continues from there, with the board where it stands; Begin another starts anew.`);
+    say(this.next, `Its pictures are kept in ${this.folder ?? ""}/${run.name}: ${run.pictures} pictures a camera. ${this.may ? "" : "A client with the role operate chooses: "}Go on continues from there, with the board where it stands; Begin another starts anew.`);
     this.leave.hidden = over;
     this.fresh.hidden = !over;
     this.drawSteps(run);
@@ -234,7 +234,7 @@ export class Bench {
     put(this.others.lastChild, rows.map((one) => h("tr", {},
       h("td", {}, clock(one.begun)), h("td", {}, one.board), h("td", { class: "n" }, `${one.pictures} pictures, ${number(one.size_mb, 0)} MB`),
       h("td", { class: one.grade ? GRADES[one.grade] : "" }, one.state === "done" ? "done" : sentence(one.sentence)),
-      h("td", { class: "n" }, one.state === "interrupted" ? h("button", { type: "button", disabled: !this.may || going || this.busy, onclick: () => this.begin({ goes_on: one.name }) }, "Go on") : one.mast_file, one.report ? [" ", this.link(one.report, "report")] : null),
+      h("td", { class: "n" }, one.state === "interrupted" ? h("button", { type: "button", disabled: !this.may || going || this.busy, onclick: () => this.begin({ resume: one.name }) }, "Go on") : one.mast_file, one.report ? [" ", this.link(one.report, "report")] : null),
       h("td", {}, one.state === "running" ? null : this.remover(one)))));
   }
 

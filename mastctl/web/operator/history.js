@@ -40,7 +40,7 @@ export class History {
     const axes = Object.entries(told.temperatures_c);
     put(this.plots,
       this.over("Joints, °", [["pan", pan, "of-x"], ["tilt", tilt, "of-y"]], events, span, "°"),
-      axes.length ? this.over("Temperatures, °C", axes.map(([name, values], k) => [name, values, k ? "of-y" : "of-x"]), events, span, " °C") : h("p", { class: "quiet" }, "The driver of this head tells no temperatures."));
+      axes.length ? this.over("Temperatures, °C", axes.map(([name, values], k) => [name, values, k ? "of-y" : "of-x"]), events, span, " °C") : h("p", { class: "quiet" }, "The driver of this head reports no temperatures."));
     const newest = events.slice(-SHOWN).reverse();
     say(this.said, events.length ? `${events.length} events, marked below the plots; the newest ${newest.length}:` : "Nothing has happened in this time.");
     put(this.list, newest.map((one) => h("tr", {}, h("td", { class: "n" }, `${forTime(one.age_s)} ago`), h("td", { class: one.well ? "" : "bad" }, person(inDegrees(one.words))))));

@@ -177,10 +177,10 @@ export class MastFile {
   told(status, rig) {
     const { mast, former_mast: former, calibration } = status;
     const verdict = calibration ? { good: "holds", drifts: "drifts", few: "too few pointings yet", unknown: "not known" }[calibration.verdict] : "not known";
-    const [made, from] = rig.made ? [String(rig.made), "as the file says"] : rig.written_s ? [moment(rig.written_s), "the file's own time; it says no date"] : ["", "no date is known"];
-    put(byId("mast"), h("span", { class: "name", title: mast.file }, mast.file), h("span", { class: "verdict" }, h("span", { title: from }, made ? `${rig.made ? "made" : "file of"} ${made.slice(0, 10)}` : "no date"), ", ", h("span", { class: calibration?.verdict ?? "" }, verdict)));
+    const [made, from] = rig.mast_date ? [String(rig.mast_date), "as the file says"] : rig.modified_s ? [moment(rig.modified_s), "the file's own time; it says no date"] : ["", "no date is known"];
+    put(byId("mast"), h("span", { class: "name", title: mast.file }, mast.file), h("span", { class: "verdict" }, h("span", { title: from }, made ? `${rig.mast_date ? "made" : "file of"} ${made.slice(0, 10)}` : "no date"), ", ", h("span", { class: calibration?.verdict ?? "" }, verdict)));
     const row = (name, value) => h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, value));
-    put(this.facts, row("In use", `${mast.file} (${mast.name})`), row(rig.made ? "Made" : "Written", made ? `${made}, ${from}` : from), row("Digest", h("code", {}, mast.digest.slice(0, 12))),
+    put(this.facts, row("In use", `${mast.file} (${mast.name})`), row(rig.mast_date ? "Made" : "Written", made ? `${made}, ${from}` : from), row("Digest", h("code", {}, mast.digest.slice(0, 12))),
       row("Calibration", sentence(calibration?.sentence) || "No verdict"), former ? row("Before it", former.file) : null);
     const offered = [mast.file, ...rig.mast_files].join();
     if (offered !== this.offered) put(this.choice, rig.mast_files.map((name) => h("option", { value: name, selected: name === mast.file }, name)));

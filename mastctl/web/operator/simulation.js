@@ -59,13 +59,13 @@ export class Simulation {
   }
 
   explain() {
-    const { does, parameters } = this.words[this.device.value][this.word.value];
-    say(this.does, `${does[0].toUpperCase()}${does.slice(1)}.`);
+    const { effect, parameters } = this.words[this.device.value][this.word.value];
+    say(this.does, `${effect[0].toUpperCase()}${effect.slice(1)}.`);
     this.inputs = new Map(Object.entries(parameters).map(([name, told]) => [name, this.input(name, told)]));
     put(this.parameters, [...this.inputs].map(([name, input]) => h("label", {}, h("span", {}, named(name)[0]), input, h("span", { class: "unit" }, named(name)[1]))));
   }
 
-  input(name, { usual, least, most }) {
+  input(name, { default: usual, least, most }) {
     const choices = CHOICES[name];
     if (choices) return h("select", {}, choices.map((words, k) => h("option", { value: k, selected: k === usual }, words)));
     const [, unit, scale] = named(name);
@@ -117,7 +117,7 @@ export class Simulation {
   /** The parameters of a fault that are not as usual, in words. */
   unusual(device, word, parameters) {
     const usual = this.words?.[device]?.[word]?.parameters ?? {};
-    const words = Object.entries(parameters).filter(([name, value]) => usual[name]?.usual !== value).map(([name, value]) => {
+    const words = Object.entries(parameters).filter(([name, value]) => usual[name]?.default !== value).map(([name, value]) => {
       const [label, unit, scale] = named(name);
       return `${label} ${CHOICES[name]?.[value] ?? Number((value * scale).toPrecision(4))}${unit === "°" ? unit : unit ? ` ${unit}` : ""}`;
     });

@@ -7,9 +7,9 @@ import { residualPicture } from "./residual.js";
 import { placeIn, shownBy } from "./truth.js";
 
 const STEPS = {
-  rest: "the head rests", frames: "a fresh pair is taken", target: "what was clicked is found again", stereo: "found in the other eye", triangulate: "range",
+  rest: "the head rests", frames: "a fresh pair is taken", target: "the clicked point is found again", stereo: "found in the other camera", triangulate: "range",
   before: "pictures from before the move", solve: "joint angles", limits: "limits", corner: "round a keep-out", move: "the head is sent", settle: "it has arrived and rests",
-  look: "new pictures", measure: "the target is found in them", eyes: "the other eye confirms it", repeat: "a later picture repeats it",
+  look: "new pictures", measure: "the target is found in them", eyes: "the other camera confirms it", repeat: "a later picture repeats it",
 };
 
 const SMALL = matchMedia("(max-width: 599px) and (max-height: 499px)");
@@ -18,11 +18,11 @@ const ENDED = ["done", "failed", "stopped"];
 
 const FROM = {
   given: "The range was given.", plane: "The range is that of a plane.", parallax: "The range comes from two poses of one camera.",
-  unknown: "One camera alone cannot tell the range; after the first pointing its own parallax may.",
+  unknown: "One camera alone cannot measure the range; after the first pointing its own parallax may.",
 };
 
 const HOW = [
-  ["Click", "a point of a fresh image: its range is told before anything moves"],
+  ["Click", "a point of a fresh image: its range is shown before anything moves"],
   ["Drag", "a box round a target, then confirm, to follow it; on a touch screen hold a finger on it"],
   ["← ↑ → ↓", "move the cross-hair of a focused image (Shift: 10 px, Alt: 0.1 px)", "keys"],
   ["Enter, T", "choose its point; follow it", "keys"],
@@ -210,7 +210,7 @@ export class Target {
       none: () => [h("dl", { class: "how" }, HOW.map(([what, words, kind]) => h("div", { class: kind }, h("dt", {}, what), h("dd", {}, words))))],
       asked: () => [this.chosen(), h("p", { class: "busy" }, "Looking for it in fresh images …")],
       preview: () => [this.chosen(), this.seen(), this.way(), this.go()],
-      refused: () => [h("p", { class: "bad" }, this.words), this.code === "no_stereo" ? h("p", { class: "quiet" }, "Without a second eye a pixel has no range; turn the head by angles or by hand.") : null],
+      refused: () => [h("p", { class: "bad" }, this.words), this.code === "no_stereo" ? h("p", { class: "quiet" }, "Without a second camera a pixel has no range; turn the head by angles or by hand.") : null],
       sent: () => [this.seen(), this.progress()],
       ended: () => [this.result(), this.progress()],
     };

@@ -20,7 +20,7 @@ export class Views {
       const key = told.pair ?? name;
       groups.set(key, [...(groups.get(key) ?? []), name]);
     }
-    this.groups = [...groups].map(([key, names]) => [key, names.sort((a, b) => (rig.cameras[a].eye ?? "").localeCompare(rig.cameras[b].eye ?? ""))]);
+    this.groups = [...groups].map(([key, names]) => [key, names.sort((a, b) => (rig.cameras[a].side ?? "").localeCompare(rig.cameras[b].side ?? ""))]);
     const before = kept("mastctl view");
     const first = ["navcam", ...groups.keys()].find((key) => groups.has(key));
     this.choosePair(groups.has(before) ? before : first);
