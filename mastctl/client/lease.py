@@ -98,8 +98,8 @@ class LeaseCalls:
             Whether it ends as soon as anybody stops the head: for a program that would go on with its next
             move otherwise.
         stops_when_silent
-            Whether the daemon stops a running operation when the lease is no longer renewed: this process has died, or
-            cannot reach the daemon.
+            Whether the daemon stops a running operation when the lease is no longer renewed: this process has
+            died, or cannot reach the daemon.
 
         Yields
         ------
