@@ -98,7 +98,7 @@ def write_simulated(folder: Path, plugged: Plugged, answers: RigAnswers) -> NewR
     simulation = {"wire": "dynamixel", "seed": TWIN_SEED}
     write_built(built_rig(numbers, np.random.default_rng(TWIN_SEED)), folder, simulation, TWIN_SEED)
     for name, kind in ((CONFIG, "config"), (MAST, "mast"), (TRUE_RIG, "mast")):
-        save_bytes(folder / name, _first_line(kind) + (folder / name).read_bytes())
+        (folder / name).write_bytes(_first_line(kind) + (folder / name).read_bytes())
     config = f"--config {folder / CONFIG}"
     steps = (
         f"mastctl doctor {config}",
@@ -197,8 +197,9 @@ def _readme(plugged: Plugged, steps: Sequence[str]) -> str:
             *(f"$ {step}" for step in steps),
             "```",
             "",
-            "`mastctl doctor` names what is missing, and the command that mends it. With the daemon running,",
-            "`mastctl point --angles 0.2 0.0` turns the head to 0.2 rad; `mastctl stop` stops it.",
+            "`mastctl doctor` names what is missing, and the command that mends it. `mastctl run` ends with",
+            "Ctrl-C. In another terminal, `mastctl point --angles 0.2 0.0` turns the head and `mastctl stop`",
+            "stops it.",
             "`mastctl calibrate bench` then replaces the drawing (docs/how-to/bench-calibration.md).",
             *_slow(plugged),
             "After an upgrade, `mastctl schema config > schemas/config.json` renews what editors check by.",

@@ -158,7 +158,8 @@ def look(ports: Sequence[str], machine: ExaminedMachine, say: Callable[[str], No
     """
     heads: list[PluggedHead] = []
     unused: list[str] = []
-    for port in ports or serial_lines(machine):
+    named = [port if "://" in port else str(Path(port).absolute()) for port in ports]
+    for port in named or serial_lines(machine):
         say(f"asking {port}")
         found, why = ask_line(port, machine)
         if found is not None:

@@ -90,11 +90,12 @@ def good_by_schema(folder: Path) -> None:
 
 
 def test_two_servos_become_a_rig_that_turns_and_the_scan_changes_nothing(
-    servos: Servos, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    servos: Servos, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "rig"
     before = [dict(servo.table.values) for servo in servos.servos]
-    told = written(capsys, str(folder), "--port", servos.line.path)
+    monkeypatch.chdir(tmp_path)
+    told = written(capsys, str(folder), "--port", "ttyServos")
     after = [dict(servo.table.values) for servo in servos.servos]
     assert before == after
     assert told["heads"] == [
@@ -173,6 +174,7 @@ def test_without_hardware_it_writes_the_twin_that_runs(
     findings = list(doctor.examine(str(folder / CONFIG), lambda url: None))
     assert [one for one in findings if one.level == "bad"] == []
     assert doctor.next_command(str(folder / CONFIG), findings) == f"mastctl run --config {folder / CONFIG}"
+    assert {file.name for file in folder.iterdir()} == {CONFIG, MAST, "true_rig.yaml", README, "schemas"}
     kept = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
     assert main(["rig", "new", str(folder)]) == 2
     assert "exists, and nothing is replaced" in capsys.readouterr().err
