@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from bench_of_corners import CornerBench, SelfPlacing, TrueAxis
 
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
@@ -18,7 +19,6 @@ from mastctl.bench.frame import RoverFrame, fit_in_rover
 from mastctl.bench.looks import BenchGoal
 from mastctl.bench.run import BenchRun
 from mastctl.bench.teller import Teller
-from tools.simulated.bench import CornerBench, SelfPlacing, TrueAxis
 
 BOARD = Charuco(10, 7, 0.055, 0.042)
 PAIR = ("navcam_left", "navcam_right")

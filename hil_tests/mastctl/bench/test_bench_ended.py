@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bench_of_corners import CornerBench
 from bench_world import corner_bench, run_of
 
 from calib.calibrate.starts.bench import BenchNotFitted
@@ -32,7 +33,6 @@ from mastctl.bench.teller import Terminal
 from mastctl.cli import calibrate_bench
 from mastctl.cli.main import main
 from tools.sim_survey.bench import BenchPlan, simulate_bench
-from tools.simulated.bench import CornerBench
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
 KEPT = "everything seen is kept in {folder}: the same command goes on"

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bench_of_corners import CornerBench
 from bench_world import corner_bench, one_camera, run_of
 
 from calib.calibrate.starts.bench import SomethingChanged
@@ -26,7 +27,6 @@ from mastctl.bench.eyes import BenchLook
 from mastctl.bench.folder import looks_of
 from mastctl.bench.looks import BenchGoal, BoardLost
 from mastctl.bench.search import BoardNotFound
-from tools.simulated.bench import CornerBench
 
 
 def test_a_bench_ends_by_itself_with_what_was_wanted_met_on_paper_and_kept(
