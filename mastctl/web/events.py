@@ -15,21 +15,18 @@ from weakref import WeakKeyDictionary
 
 from fastapi import FastAPI, Query, WebSocket
 from fastapi.responses import StreamingResponse
-from pydantic import ValidationError
 from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
 from mastctl.as_json import as_json, writable
 from mastctl.control.publisher import LoopSubscription, Published, Topic
-from mastctl.errors import MastctlError
 from mastctl.service.service import Service
 from mastctl.service.state import fault_told, joints_told, standing_told
 from mastctl.web import PREFIX
 from mastctl.web.connections import EVENTS
 from mastctl.web.models import EventsQuery
 from mastctl.web.parts import Here, Parts
-from mastctl.web.refusals import error_response, sentence
-from mastctl.web.refusals import told as refused
+from mastctl.web.refusals import query_of
 
 ALIVE_S = 2.0  # between signs of life where nothing changes
 GOING_AWAY = 1001  # RFC 6455, 7.4.1
@@ -64,22 +61,9 @@ def add_events(app: FastAPI) -> None:
 
     @app.websocket(EVENTS)
     async def socket(line: WebSocket, here: Here) -> None:
-        try:
-            query = _asked(line)
+        async with query_of(line, EventsQuery, "key") as query:
             with here.streams.listening(query.names, query.keys) as news:
                 await _tell(line, news, here)
-        except ValidationError as error:
-            words = sentence({**error.errors()[0], "loc": ("query", *error.errors()[0]["loc"])}, EventsQuery)
-            await line.send_denial_response(error_response(422, "bad_request", words))
-        except MastctlError as error:
-            await line.send_denial_response(refused(error))
-
-
-def _asked(line: WebSocket) -> EventsQuery:
-    """The query of a WebSocket, read as that of the route. Raises ValidationError."""
-    query = line.query_params
-    told: dict[str, Any] = {name: query[name] for name in query if name != "key"}
-    return EventsQuery.model_validate(told | ({"key": query.getlist("key")} if "key" in query else {}))
 
 
 _texts: WeakKeyDictionary[Published, tuple[str, float]] = WeakKeyDictionary()

@@ -14,11 +14,9 @@ import json
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Query, Response, WebSocket
-from pydantic import ValidationError
 from starlette.websockets import WebSocketDisconnect
 
 from mastctl.as_json import as_json
-from mastctl.errors import MastctlError
 from mastctl.frame_facts import headers_of
 from mastctl.report.pictures import encoded
 from mastctl.service.service import Service
@@ -28,8 +26,7 @@ from mastctl.web.events import GOING_AWAY
 from mastctl.web.models import ImagesQuery, SnapshotQuery
 from mastctl.web.parts import Here
 from mastctl.web.pictures import Picture, WatchedCameras, Watcher
-from mastctl.web.refusals import error_response, sentence
-from mastctl.web.refusals import told as refused
+from mastctl.web.refusals import query_of
 from mastctl.web.sockets import UNSUPPORTED
 
 ASKS = "?"
@@ -61,27 +58,12 @@ def add_images(app: FastAPI) -> None:
 
     @app.websocket(IMAGES)
     async def socket(line: WebSocket, here: Here) -> None:
-        try:
-            query = _asked(line)
+        async with query_of(line, ImagesQuery, "camera") as query:
             for camera in query.camera:
                 here.service.check_camera(camera)
             with here.streams.listening((), frozenset()) as ending:  # counted as a listener, and ended as one
                 await line.accept()
                 await _Line(here.service, here.watched, line, query).run(asyncio.ensure_future(ending.wait()))
-        except ValidationError as error:
-            words = sentence({**error.errors()[0], "loc": ("query", *error.errors()[0]["loc"])}, ImagesQuery)
-            await line.send_denial_response(error_response(422, "bad_request", words))
-        except MastctlError as error:
-            await line.send_denial_response(refused(error))
-
-
-def _asked(line: WebSocket) -> ImagesQuery:
-    """The query of a WebSocket. Raises ValidationError."""
-    query = line.query_params
-    told: dict[str, Any] = {name: query[name] for name in query if name != "camera"}
-    return ImagesQuery.model_validate(
-        told | ({"camera": query.getlist("camera")} if "camera" in query else {})
-    )
 
 
 class _Line:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, get_args
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
+from contextlib import asynccontextmanager
+from typing import Any, TypeVar, get_args
 
-from fastapi import FastAPI, Request
+from fastapi import FastAPI, Request, WebSocket
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
+from pydantic import BaseModel, ValidationError
 from starlette.exceptions import HTTPException
 
 from calib.errors import CalibError
@@ -48,6 +50,7 @@ RENAMED = {"gives_way": "preemptible", "goes_on": "resume"}
 """Keys of bodies by their names before version 0.1."""
 
 Headers = list[tuple[bytes, bytes]]
+Query = TypeVar("Query", bound=BaseModel)
 
 
 class GuardError(Exception):
@@ -69,6 +72,24 @@ def error_response(
     body = {"error": {"code": code, "message": message, "detail": detail}}
     told = {**HEADERS, "content-security-policy": NO_PAGE, **(headers or {})}
     return JSONResponse(body, status_code=status, headers=told)
+
+
+@asynccontextmanager
+async def query_of(line: WebSocket, model: type[Query], listed: str) -> AsyncIterator[Query]:
+    """Yield a WebSocket's query, read as that of a route; ``listed`` may stand in it more than once.
+
+    The line is told of a query that is wrong, and of what the block refuses before it accepts.
+    """
+    given = line.query_params
+    asked: dict[str, Any] = {name: given[name] for name in given if name != listed}
+    try:
+        yield model.model_validate(asked | ({listed: given.getlist(listed)} if listed in given else {}))
+    except ValidationError as error:
+        first = error.errors()[0]
+        words = sentence({**first, "loc": ("query", *first["loc"])}, model)
+        await line.send_denial_response(error_response(422, "bad_request", words))
+    except MastctlError as error:
+        await line.send_denial_response(told(error))
 
 
 def marked(headers: Iterable[tuple[bytes, bytes]]) -> Headers:
