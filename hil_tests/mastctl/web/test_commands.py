@@ -335,6 +335,19 @@ def test_a_key_from_before_a_restart_grants_a_lease_that_holds(
     assert granted[0] != granted[1]
 
 
+def test_what_a_dead_client_began_is_stopped_if_its_lease_says_so(
+    bench: Client, pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(waits))
+    granted = bench.acquire_lease(for_s=1.0, stops_when_silent=True)
+    bench.use_lease(granted["lease_id"])
+    operation = bench.point(**ANGLES)
+    record = bench.wait(operation, NET_S)  # nobody renews the lease
+    assert record["state"] == "stopped"
+    assert record["error"] is not None
+    assert "bench began it and has fallen silent: its 1 s were over" in record["error"]["message"]
+
+
 def test_a_command_sent_twice_with_one_key_is_carried_out_once(web: httpx.Client, pair: Pair) -> None:
     headers = {"Idempotency-Key": "a-key", "Mastctl-Client": "bench"}
     first = web.post("/point", json=ANGLES, headers=headers)
