@@ -57,11 +57,52 @@ def test_grey_of_yuyv_is_its_luma() -> None:
     assert np.array_equal(pixels.grey(picture_format("YUYV"), raw.ravel()), NOISE)
 
 
+def packed(samples: NDArray[np.uint16], bits: int) -> NDArray[np.uint8]:
+    """As the kernel's pages of SRGGB10P and SRGGB12P draw it: upper bytes, then all their low bits."""
+    if bits == 10:
+        a, b, c, d = (samples[:, k::4] for k in range(4))
+        columns = [a >> 2, b >> 2, c >> 2, d >> 2, (d & 3) << 6 | (c & 3) << 4 | (b & 3) << 2 | a & 3]
+    else:
+        a, b = samples[:, 0::2], samples[:, 1::2]
+        columns = [a >> 4, b >> 4, (b & 15) << 4 | a & 15]
+    return np.stack(columns, axis=-1).reshape(len(samples), -1).astype(np.uint8)
+
+
+@pytest.mark.parametrize("padding", [0, 7])
+@pytest.mark.parametrize(("code", "bits"), [("Y10P", 10), ("Y12P", 12)])
+def test_packed_grey_keeps_its_upper_eight_bits(code: str, bits: int, padding: int) -> None:
+    samples = np.random.default_rng(bits).integers(0, 2**bits, (HEIGHT, WIDTH)).astype(np.uint16)
+    rows = np.pad(packed(samples, bits), ((0, 0), (0, padding)), constant_values=77)
+    image = pixels.grey(picture_format(code, rows.shape[1]), rows.ravel())
+    assert np.array_equal(image, samples // 2 ** (bits - 8))
+    assert not np.shares_memory(image, rows)
+    assert np.array_equal(pixels.colour(picture_format(code, rows.shape[1]), rows.ravel())[..., 1], image)
+
+
+def test_packed_rows_end_in_a_group_that_is_not_full() -> None:
+    """Three columns of five bytes a row, by hand: the fourth sample is padding."""
+    raw = np.array([1, 2, 3, 99, 255, 4, 5, 6, 99, 0], np.uint8)
+    form = PictureFormat("Y10P", (3, 2), 0, 10)
+    assert pixels.least_bytes(form) == 10
+    assert pixels.grey(form, raw).tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_uyvy_is_yuyv_with_its_bytes_exchanged() -> None:
+    yuyv = np.random.default_rng(6).integers(0, 256, (HEIGHT, 2 * WIDTH), dtype=np.uint8)
+    uyvy = yuyv.reshape(HEIGHT, WIDTH, 2)[..., ::-1].ravel()
+    for convert in (pixels.grey, pixels.colour):
+        assert np.array_equal(
+            convert(picture_format("UYVY"), uyvy), convert(picture_format("YUYV"), yuyv.ravel())
+        )
+
+
 @pytest.mark.parametrize(("y", "u", "v"), [(16, 128, 128), (235, 128, 128), (81, 90, 240), (120, 200, 60)])
-@pytest.mark.parametrize("code", ["YUYV", "NV12"])
+@pytest.mark.parametrize("code", ["YUYV", "UYVY", "NV12"])
 def test_colour_follows_the_standard(code: str, y: int, u: int, v: int) -> None:
     if code == "YUYV":
         raw = np.tile(np.array([y, u, y, v], np.uint8), WIDTH * HEIGHT // 2)
+    elif code == "UYVY":
+        raw = np.tile(np.array([u, y, v, y], np.uint8), WIDTH * HEIGHT // 2)
     else:
         chroma = np.tile(np.array([u, v], np.uint8), WIDTH * HEIGHT // 4)
         raw = np.concatenate([np.full(WIDTH * HEIGHT, y, np.uint8), chroma])
@@ -79,6 +120,8 @@ def test_an_evenly_coloured_bayer_picture_has_that_colour(code: str) -> None:
     for place, letter in enumerate(layout.order):  # of the kernel: the first row, then the second
         mosaic[place // 2 :: 2, place % 2 :: 2] = colour[letter] << (layout.bits - 8)
     raw = mosaic.astype(np.uint8) if layout.bits == 8 else mosaic.astype("<u2").view(np.uint8)
+    if code in ("pBAA", "pGAA", "pgAA", "pRAA", "pBCC", "pGCC", "pgCC", "pRCC"):
+        raw = packed(mosaic, layout.bits)
     image = pixels.colour(picture_format(code), raw.ravel())
     assert (image == [40, 120, 200]).all()
     grey = pixels.grey(picture_format(code), raw.ravel())
@@ -120,7 +163,17 @@ def test_bytes_that_are_no_jpeg_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("code", "good_bytes"), [("GREY", 768), ("YUYV", 1536), ("Y16", 1536), ("NV12", 1152), ("BA10", 1536)]
+    ("code", "good_bytes"),
+    [
+        ("GREY", 768),
+        ("YUYV", 1536),
+        ("Y16", 1536),
+        ("NV12", 1152),
+        ("BA10", 1536),
+        ("UYVY", 1536),
+        ("Y10P", 960),
+        ("pRCC", 1152),
+    ],
 )
 def test_a_picture_that_is_too_short_is_found(code: str, good_bytes: int) -> None:
     form = picture_format(code, 0, good_bytes + 64)

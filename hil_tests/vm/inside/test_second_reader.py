@@ -54,7 +54,7 @@ def our_bytes(count: int, **more: object) -> list[NDArray[np.uint8]]:
 
 @pytest.mark.parametrize("pattern", ["75% Colorbar", "Gray Ramp"])
 @pytest.mark.parametrize(
-    "code", ["YUYV", "GREY", "Y10", "Y12", "Y16", "NV12", "BA81", "RG10", "GB12", "BYR2"]
+    "code", ["YUYV", "UYVY", "GREY", "Y10", "Y12", "Y16", "NV12", "BA81", "RG10", "GB12", "BYR2"]
 )
 def test_frames_are_the_same_to_the_last_bit(tmp_path: Path, code: str, pattern: str) -> None:
     size_px = (640, 480)
