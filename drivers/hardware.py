@@ -30,6 +30,7 @@ HEADS = {
     "dynamixel": "drivers.dynamixel.head",
     "feetech": "drivers.feetech.head",
     "flir_ptu": "drivers.flir_ptu.head",
+    "visca": "drivers.visca.head",
 }
 """Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them, and whose
 ``halt(options)`` stops a head that no daemon drives any more."""

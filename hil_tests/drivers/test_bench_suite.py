@@ -14,7 +14,7 @@ import pytest
 from drivers.hardware import HEADS
 from mastctl.cli.main import main
 from mastctl.conform.devices import COUNTS
-from tools.campaigns.servo_rigs import LIMITS_RAD, RIGS
+from tools.campaigns.servo_rigs import LIMITS_RAD, RIGS, SPEED_RAD_PER_S, VISCA_COUNT_RAD
 
 MAST = """schema: mastctl/mast/1
 name: bare_head
@@ -74,14 +74,22 @@ def test_a_camera_from_outside_keeps_its_promises(
     assert code == 0 and "conforms: 7 passed, 0 failed, 0 skipped" in told.out, told
 
 
-@pytest.fixture(params=["dynamixel_pty", "ptu_pty"])
+DRIVER_OF = {
+    "dynamixel_pty": "dynamixel",
+    "feetech_pty": "feetech",
+    "ptu_pty": "flir_ptu",
+    "visca_pty": "visca",
+}
+
+
+@pytest.fixture(params=list(DRIVER_OF))
 def simulated_line(request: pytest.FixtureRequest) -> Iterator[tuple[str, str]]:
     """A simulated device at the end of a pseudo terminal, with nobody talking to it: driver and port."""
     with ExitStack() as stack:
         rig = stack.enter_context(RIGS[request.param]())
         assert rig.line is not None
         rig.head.close()
-        yield ("dynamixel" if request.param == "dynamixel_pty" else "flir_ptu"), str(rig.line.path)
+        yield DRIVER_OF[request.param], str(rig.line.path)
 
 
 def test_every_head_of_this_repository_can_go_through_it() -> None:
@@ -99,8 +107,13 @@ def test_a_head_of_this_repository_goes_through_it(
     if driver == "dynamixel":
         ends = [f"id: {n}, model: XM430-W350, {end}" for n, end in enumerate(ends, start=1)]
         more = "reply_timeout_s: 0.2, watchdog_s: 0, "  # the simulator comes late on a busy machine
+    elif driver == "feetech":
+        ends = [f"id: {n}, model: STS3215, {end}" for n, end in enumerate(ends, start=1)]
+        more = "reply_timeout_s: 0.2, lease_s: 0, "
     else:
         more = ""
+    if driver == "visca":
+        ends = [f"count_rad: {VISCA_COUNT_RAD}, fastest_rad_per_s: {SPEED_RAD_PER_S}, {end}" for end in ends]
     options = f"{{port: {port}, {more}pan: {{{ends[0]}}}, tilt: {{{ends[1]}}}}}"
     pan_tilt = f"{{driver: {driver}, options: {options}}}"
     last = bench(repository, configuration(tmp_path, pan_tilt))

@@ -35,10 +35,10 @@ KERNEL = pytest.mark.long(
     2, "in the quick run it is on a turned clock; here each case drives a head for seconds"
 )
 LONG = [pytest.param(name, marks=KERNEL) for name in REAL]
-WIRES = ["dynamixel", "feetech", "ptu"]
+WIRES = ["dynamixel", "feetech", "ptu", "visca"]
 OTHER = pytest.mark.long(2, "its session is that of Dynamixel's, and quick where a line is wanted (feetech)")
-SAME = [pytest.param(name, marks=OTHER) for name in ("feetech", "scs")]
-QUICK = [name for name in TURNED if name not in ("feetech", "scs")]
+SAME = [pytest.param(name, marks=OTHER) for name in ("feetech", "scs", "visca")]
+QUICK = [name for name in TURNED if name not in ("feetech", "scs", "visca")]
 MADE = {**RIGS, **TURNED}
 T = TypeVar("T")
 
@@ -270,8 +270,9 @@ def test_a_late_reply_is_never_taken_for_the_next(wired: HeadRig) -> None:
 
 def test_replies_lost_now_and_then_cost_errors_but_no_wrong_angle(rig: HeadRig) -> None:
     rig.panel.set("pan_tilt", "intermittent", probability=0.1, seed=5)
-    good = 0
-    for index in range(24):
+    good = index = 0
+    while index < 24 or (good <= 5 and index < 1000):  # a head without a number waits for late replies
+        index += 1
         if index % 6 == 0:
             with suppress(DriverError):
                 rig.head.move(0.3 if index % 12 else -0.3, 0.1)
@@ -279,6 +280,7 @@ def test_replies_lost_now_and_then_cost_errors_but_no_wrong_angle(rig: HeadRig) 
         try:
             reading = rig.head.read()
         except DriverError:
+            rig.clock.sleep(0.01)
             continue
         good += 1
         assert true_enough(rig, reading, began_s, rig.clock.now_s())

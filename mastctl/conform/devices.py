@@ -35,7 +35,7 @@ from mastctl.devices.opening import Bounds, head_beside, open_one_camera
 
 log = logging.getLogger(__name__)
 
-COUNTS = {"dynamixel": 3, "feetech": 3, "flir_ptu": 1}
+COUNTS = {"dynamixel": 3, "feetech": 3, "flir_ptu": 1, "visca": 1}
 """How many counts from its goal a head of this repository may stand when it calls itself settled."""
 
 STOPS_WITHIN_S = 3.0
@@ -204,6 +204,11 @@ def count_of(device: DeviceSettings) -> float | None:
             return float(max(model_named(options[axis]["model"]).count_rad for axis in ("pan", "tilt")))
         except (LookupError, TypeError):
             raise BadOptions("pan.model and tilt.model are expected", device=PAN_TILT) from None
+    if device.driver == "visca":
+        from drivers.visca.options import options_from
+
+        read = options_from(options)
+        return max(read.pan.count_rad, read.tilt.count_rad)
     if device.driver == "flir_ptu":
         from drivers.flir_ptu.workshop import facts
 

@@ -49,6 +49,7 @@ from tools.campaigns.servo_rigs import (
     fresh_servos,
     opened_on,
     ptu,
+    visca,
 )
 from tools.command import end, heading, line, new_file, options
 
@@ -60,6 +61,7 @@ DRIVERS: dict[str, Callable[[], AbstractContextManager[HeadRig]]] = {
     "feetech_echo": partial(feetech, lease_s=0.2, reply_timeout_s=0.05, echoes=True, turned=True),
     "scs": partial(feetech, "SCS0009", lease_s=0.2, reply_timeout_s=0.05, turned=True),
     "ptu": partial(ptu, turned=True),
+    "visca": partial(visca, turned=True),
 }
 """Those without ``_pty`` on a turned clock, without real time."""
 MIXTURE = "mixture"

@@ -36,13 +36,16 @@ from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
 from drivers.sim.wire.line import PtyLine, TcpLine
 from drivers.sim.wire.memory_line import MemoryLine
 from drivers.sim.wire.ptu import SimulatedPtu
+from drivers.sim.wire.visca import SimulatedVisca
 from drivers.simulation_clock import SimulationClock
+from drivers.visca.head import open_head as open_visca
 
 LIMITS_RAD = ((-1.0, 1.0), (-0.6, 0.4))
 SPEED_RAD_PER_S, ACCELERATION_RAD_PER_S2 = 1.2, 20.0
 START_S = 1000.0  # of a turned clock
 X_COUNT_RAD = math.tau / 4096  # e-manual, X series
 D46_STEP_RAD = math.radians(324 / 7 / 3600)  # D46-70, half step of 46.2857"
+VISCA_COUNT_RAD = math.radians(0.075)  # EVI-D70: 0x08DB counts for 170 degrees
 D48E_STEP_RAD = math.radians(162 / 7 / 3600)  # eighth step of 23.142857"
 
 
@@ -162,6 +165,25 @@ def feetech(
         stack.callback(head.close)
         count_rad = head.settings.pan.model.count_rad
         yield HeadRig(f"Feetech {model}", head, clock, panel, _truth(axes), count_rad, line, sent)
+
+
+@contextmanager
+def visca(*, turned: bool = False) -> Iterator[HeadRig]:
+    """A head that speaks VISCA behind a serial line."""
+    with ExitStack() as stack:
+        clock = _clock(turned)
+        panel, axes = _axes(clock)
+        sent = [0]
+        device = SimulatedVisca(*axes, count_rad=VISCA_COUNT_RAD, fastest_rad_per_s=SPEED_RAD_PER_S)
+        line, opens = _serial_line(stack, device, clock, panel, sent)
+        own = {"count_rad": VISCA_COUNT_RAD, "fastest_rad_per_s": SPEED_RAD_PER_S}
+        options = {
+            "port": line.path, "pan": {"limits_rad": list(LIMITS_RAD[0]), **own},
+            "tilt": {"limits_rad": list(LIMITS_RAD[1]), **own}, "speed_rad_per_s": SPEED_RAD_PER_S,
+        }  # fmt: skip
+        head = open_visca(options, clock, opens)
+        stack.callback(head.close)
+        yield HeadRig("VISCA", head, clock, panel, _truth(axes), VISCA_COUNT_RAD, line, sent)
 
 
 class CountedServo(SimulatedServo):
@@ -349,6 +371,7 @@ RIGS: dict[str, Callable[[], Any]] = {
     "feetech_pty": feetech,
     "ptu_pty": ptu,
     "ptu_tcp": ptu_tcp,
+    "visca_pty": visca,
 }
 """On the machine's clock."""
 
@@ -358,5 +381,6 @@ TURNED: dict[str, Callable[[], Any]] = {
     "feetech": partial(feetech, lease_s=0.2, reply_timeout_s=0.1, turned=True),
     "scs": partial(feetech, "SCS0009", reply_timeout_s=0.1, echoes=True, turned=True),
     "ptu": partial(ptu, turned=True),
+    "visca": partial(visca, turned=True),
 }
 """On a turned clock."""

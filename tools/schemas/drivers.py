@@ -21,6 +21,7 @@ from drivers.sim.pan_tilt import DEFAULT_HEADS
 from drivers.sim.settings import simulation_settings
 from drivers.v4l2 import options as v4l2
 from drivers.v4l2.pixels import FORMATS
+from drivers.visca import options as visca_options
 from tools.schemas.watched import FLAG, TEXT, Schema, number, settings_schema, vector, watched
 
 NUMBER: Schema = {"type": "number"}
@@ -79,6 +80,19 @@ def ptu() -> Schema:
     found = _settings(noted.schema(), flir_ptu.Options)
     for name in ("pan", "tilt"):
         _settings(found["properties"][name], ApproachedAxis, flir_ptu.AxisOptions)
+    return found
+
+
+def visca() -> Schema:
+    """Options of a head that speaks VISCA."""
+    axis = {"limits_rad": [-0.5, 0.5], "count_rad": 0.001, "fastest_rad_per_s": 1.0}
+    with watched("options.") as noted:
+        visca_options.options_from({"port": "/dev/x", "pan": axis, "tilt": axis})
+    for name in ("pan", "tilt"):
+        noted.at(f"{name}.limits_rad").value["items"] = number(-math.tau, math.tau)
+    found = _settings(noted.schema(), visca_options.ViscaOptions)
+    for name in ("pan", "tilt"):
+        _settings(found["properties"][name], visca_options.AxisOptions)
     return found
 
 

@@ -19,7 +19,16 @@ from calib.survey.reader import read_survey
 from calib.targets import board_file
 from mastctl.bench import simulated
 from mastctl.config import CONFIG_SCHEMA, HOST_NAME, LONGEST_SOCKET_PATH, parse_config
-from tools.schemas.drivers import camera_options, dynamixel, fault_list, feetech, ptu, replay, simulation
+from tools.schemas.drivers import (
+    camera_options,
+    dynamixel,
+    fault_list,
+    feetech,
+    ptu,
+    replay,
+    simulation,
+    visca,
+)
 from tools.schemas.watched import FLAG, TEXT, Schema, mapping_in, number, vector, watched
 
 REPOSITORY = Path(__file__).parents[2]
@@ -57,9 +66,10 @@ def config() -> Schema:
         "pattern": IDENTIFIER,
         "not": {"const": "sun"},
     }
-    drivers = {"dynamixel": dynamixel(), "feetech": feetech(), "flir_ptu": ptu(), "replay": replay()}
+    drivers = {"dynamixel": dynamixel(), "feetech": feetech(), "flir_ptu": ptu(), "visca": visca()}
+    drivers |= {"replay": replay()}
     _by(inner["pan_tilt"], "driver", {name: {"options": one} for name, one in drivers.items()})
-    for name in ("dynamixel", "feetech", "flir_ptu"):
+    for name in ("dynamixel", "feetech", "flir_ptu", "visca"):
         inner["pan_tilt"]["allOf"][list(drivers).index(name)]["then"]["required"] = ["options"]
     camera = inner["cameras"]["additionalProperties"]
     _by(camera, "driver", {"v4l2": {"options": camera_options()}, "replay": {"options": replay()}})
