@@ -1,11 +1,10 @@
 """Driver ``visca``: a pan/tilt head that speaks VISCA, as a `drivers.interfaces.PanTilt`.
 
-It has no thread. Whoever calls waits for the head, never longer than a few reply times.
+It has no thread: a call waits for the head, never longer than a few reply times.
 
-VISCA proves little, and what it proves is used in full. A reply has neither a checksum nor a number. So a
-position counts when two answers in a row fit one another, and after a reply that was lost, or that nobody had
-asked for, nothing is asked for `LATE_S`: no reply may be later than that. Over UDP frames have numbers, which
-prove more, and nothing is waited out (`drivers.visca.udp`). A head without power is silent; one
+A reply has neither a checksum nor a number. So a position counts when two answers in a row fit one another.
+After a reply that was lost, or had not been requested, nothing is asked for `LATE_S`; no reply may be later.
+Over UDP frames have numbers, which prove more, and the driver waits for nothing (`drivers.visca.udp`). A head
 whose host is gone goes to the end of its move.
 """
 
@@ -127,7 +126,7 @@ class ViscaHead:
         Refused
             If the head will not, in its own words.
         NoReply, BadReply, LineLost
-            If it did not confirm; it was told to stop then.
+            If it did not confirm; a stop was sent then.
         """
         speed = self._options.speed_rad_per_s if speed_rad_per_s is None else speed_rad_per_s
         if not speed > 0:

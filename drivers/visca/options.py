@@ -17,7 +17,7 @@ SCHEMES = ("udp://", "socket://", "rfc2217://")
 
 @dataclass(frozen=True)
 class AxisOptions:
-    """One axis. The protocol tells neither its counts nor its speed: they are of the head's data sheet.
+    """One axis. Its counts and speed are those of the head's data sheet; the protocol has neither.
 
     Attributes
     ----------
@@ -59,11 +59,11 @@ class ViscaOptions:
     speed_rad_per_s
         Of moves that name no speed.
     acceleration_rad_per_s2
-        What is assumed of its axes, for keep-outs.
+        Assumed of its axes, for keep-outs.
     settle_s
         How long both axes must stand in position to count as settled.
     reply_timeout_s
-        What a reply may take beyond its time on the wire.
+        The patience with a reply, beyond its time on the wire.
     """
 
     port: str

@@ -23,7 +23,7 @@ ERROR_WORDS = {
 
 
 class Kind(Enum):
-    """What a frame of a head is."""
+    """The kind of a frame of a head."""
 
     ACK = "acknowledgement"
     DONE = "completion"

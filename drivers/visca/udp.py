@@ -17,7 +17,7 @@ RESET_NUMBER = b"\x01"
 class UdpLine:
     """An open way to a head, a `drivers.serial_line.ByteLine` of whole frames; closing twice does no harm.
 
-    What comes without the number of what was sent last is dropped: a late answer, or a completion.
+    A datagram without the number of the last one sent is dropped: a late answer, or a completion.
 
     Parameters
     ----------
