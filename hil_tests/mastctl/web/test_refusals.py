@@ -45,6 +45,9 @@ NO_ANSWER = {
 """Of commands that ask no daemon."""
 
 
+NEEDS_ROS = "mastctl.ros2."  # modules that import rclpy, which is not installed everywhere
+
+
 def below(kind: type[Exception]) -> Iterator[type[Exception]]:
     for one in kind.__subclasses__():
         yield one
@@ -55,7 +58,7 @@ def below(kind: type[Exception]) -> Iterator[type[Exception]]:
 def _every_module() -> None:
     for package in (mastctl, drivers):
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            if not module.name.endswith("__main__"):
+            if not module.name.endswith("__main__") and not module.name.startswith(NEEDS_ROS):
                 importlib.import_module(module.name)
 
 
