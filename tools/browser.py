@@ -5,11 +5,10 @@
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import sys
 
-from tools.command import end
+from tools.command import end, options
 from tools.virtual_machine.apt import Busy, apt_get
 
 NAMES = ("chromium", "chromium-browser")
@@ -22,9 +21,7 @@ def chromium() -> str | None:
 
 def main() -> int:
     """Install it, and print where it is."""
-    argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    ).parse_args()
+    options(__doc__, seed=None, tasks=False).parse_args()
     if chromium() is None:
         if shutil.which("apt-get") is None:
             print("no chromium, and no apt-get to install it by", file=sys.stderr)

@@ -40,7 +40,7 @@ def options(
     as_json: bool = False,
     tasks: bool = True,
 ) -> argparse.ArgumentParser:
-    """Return a campaign's parser.
+    """Return a tool's parser; by default a campaign's.
 
     Parameters
     ----------
@@ -57,7 +57,12 @@ def options(
     tasks
         Whether its cases are tasks (docs/how-to/campaigns.md).
     """
-    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    started = getattr(sys.modules["__main__"].__spec__, "name", "").removesuffix(".__main__")
+    parser = argparse.ArgumentParser(
+        prog=f"python -m {started}" if started.startswith("tools.") else None,
+        description=doc,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     if cases is not None:
         words = f"{of or 'how many'} (default {cases})"
         parser.add_argument("--cases", type=at_least(1), default=cases, metavar="N", help=words)

@@ -8,12 +8,11 @@ Read from the markers ``pytest.mark.long(part, why)`` in the text of hil_tests; 
 
 from __future__ import annotations
 
-import argparse
 import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-from tools.command import end
+from tools.command import end, options
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 BEGIN, END = "<!-- long tests: begin -->", "<!-- long tests: end -->"
@@ -64,11 +63,7 @@ def with_table(page: str) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m tools.long_tests",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("--page", type=Path, metavar="FILE", help="renew the table in this page")
     args = parser.parse_args()
     if args.page:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from mastctl.client import Client
 from mastctl.packaged import config_folder
 from tools.browser import chromium
-from tools.command import end
+from tools.command import end, options
 from tools.living_daemon import simulated, started, written
 
 CAMERAS = ("pancam_left", "pancam_right", "navcam_left", "navcam_right", "hazcam_left", "hazcam_right")
@@ -36,7 +35,7 @@ ROCK = (
 
 def main() -> int:
     """Take them all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("--out", type=Path, default=Path("docs/img"))
     parser.add_argument("--only", choices=("rover", "bench"), help="those of one of both")
     args = parser.parse_args()

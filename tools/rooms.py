@@ -10,7 +10,6 @@ checkers too.
 
 from __future__ import annotations
 
-import argparse
 import ast
 import textwrap
 from collections.abc import Mapping
@@ -18,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import escape
 
-from tools.command import end, new_file
+from tools.command import end, new_file, options
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGES = ("mastctl", "drivers", "calib")
@@ -201,11 +200,7 @@ def _box(room: str, words: str, left_px: float, top_px: float, width_px: float) 
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m tools.rooms",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("--svg", type=new_file, metavar="FILE", help="draw them")
     args = parser.parse_args()
     packages = [read_package(name) for name in PACKAGES]

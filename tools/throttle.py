@@ -5,14 +5,13 @@
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import socket
 import threading
 from collections.abc import Iterator
 
-from tools.command import end
+from tools.command import end, options
 
 PIECE = 1460  # bytes, as in a packet
 QUEUE = 1 << 22  # bytes that wait for the link in each direction, as in a modem that drops nothing
@@ -105,7 +104,7 @@ def throttled(port: int, bytes_per_s: float, delay_s: float) -> Iterator[int]:
 
 def main() -> int:
     """Serve until Ctrl-C."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("port", type=int, help="where the daemon listens")
     parser.add_argument("--kb-per-s", type=float, default=50.0, help="each way, 1000 bytes")
     parser.add_argument("--delay-s", type=float, default=0.4, help="each way")

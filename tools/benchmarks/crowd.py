@@ -8,7 +8,6 @@ A crowd's clients each ask again as soon as they have been answered; at the end 
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import signal
@@ -16,7 +15,7 @@ import socket
 from collections import Counter
 from collections.abc import Awaitable, Callable
 
-from tools.command import end
+from tools.command import end, options
 from tools.living_daemon import Asker
 
 CAMERA = "navcam_left"
@@ -29,7 +28,7 @@ ANSWERED: Counter[str] = Counter()
 
 def main() -> int:
     """Be a crowd."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("load", choices=sorted(LOADS), help="which crowd")
     parser.add_argument("port", type=int, help="the daemon's")
     args = parser.parse_args()

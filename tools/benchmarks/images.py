@@ -8,7 +8,6 @@ head, and a picture of each camera.
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import threading
@@ -22,7 +21,7 @@ import yaml
 from websockets.sync.client import connect
 
 from mastctl.client import Client
-from tools.command import end
+from tools.command import end, options
 from tools.living_daemon import Asker, simulated, started, vitals, written
 
 PAIR = ("navcam_left", "navcam_right")
@@ -31,7 +30,7 @@ TURNS = 5
 
 def main() -> int:
     """Watch, and print a line for each camera and one for the daemon."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--rate", type=float, default=30.0, help="of the cameras, Hz")
     parser.add_argument("--rounds", type=int, default=4, help="of operations, unwatched and watched in turns")

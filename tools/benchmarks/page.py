@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -17,7 +16,7 @@ from playwright.sync_api import Page, sync_playwright
 
 from mastctl.client import Client
 from tools.browser import chromium
-from tools.command import end
+from tools.command import end, options
 from tools.living_daemon import simulated, started, vitals, written
 from tools.throttle import throttled
 
@@ -70,7 +69,7 @@ PRESSED = """() => new Promise(done => {
 
 def main() -> int:
     """Print a line for each."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--rate", type=float, default=30.0, help="of the cameras, Hz")
     parser.add_argument(

@@ -10,7 +10,6 @@ the processor time of all at rest, at the same time. In brackets: as a part of t
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import statistics
@@ -28,7 +27,7 @@ import yaml
 from mastctl.cli.output import at_least, positive_number
 from mastctl.client import Client
 from mastctl.packaged import default_config
-from tools.command import end
+from tools.command import end, options
 
 PLAIN, NO_RING = "plain", {"ring_s": 0.0}
 DAEMONS = {
@@ -63,7 +62,7 @@ class RecordedPointing:
 
 def main() -> int:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("--rounds", type=at_least(1), default=20, metavar="N", help="default 20")
     parser.add_argument("--rest", type=positive_number, default=30.0, metavar="S", help="default 30 s")
     args = parser.parse_args()

@@ -7,7 +7,6 @@ Two Navcams (1024 x 768) look round in rows; the left one is turned by 2 mrad, t
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -20,7 +19,7 @@ from calib.calibrate.scene.fit import fit_scene
 from calib.calibrate.scene.terms import corrected
 from mastctl.cli.output import at_least
 from tools.campaigns.scene import navcams, pictures, rests
-from tools.command import end
+from tools.command import end, options
 
 REPEAT_RAD = 1e-4
 TURN = (["cameras.navcam_left.turn.y", "cameras.navcam_left.turn.z"], np.array([1.5e-3, -1.3e-3]))
@@ -29,9 +28,7 @@ Result = TypeVar("Result")
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("--pictures", type=at_least(8), default=36)
     args = parser.parse_args()
     cv2.setNumThreads(1)

@@ -8,7 +8,6 @@ daemon of a process makes the routes for all that follow.
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
 import subprocess
@@ -23,7 +22,7 @@ from urllib.request import urlopen
 from mastctl.cli.output import at_least
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
-from tools.command import end
+from tools.command import end, options
 from tools.living_daemon import simulated
 
 Spent = dict[str, list[tuple[float, float]]]
@@ -31,7 +30,7 @@ Spent = dict[str, list[tuple[float, float]]]
 
 def main() -> None:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("--repeats", type=at_least(1), default=10, metavar="N", help="default 10")
     args = parser.parse_args()
     spent: Spent = {}

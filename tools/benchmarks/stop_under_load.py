@@ -18,7 +18,6 @@ compared, in turn in each round; the last column but one is how often a second t
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import http.client
 import json
@@ -40,7 +39,7 @@ from mastctl.config import load_config
 from mastctl.packaged import default_config
 from mastctl.safety.stop_line import ask
 from tools.benchmarks.crowd import LOADS
-from tools.command import end
+from tools.command import end, options
 
 HEADS = {"memory": None, "ptu": "flir_ptu", "dynamixel": "dynamixel"}
 STREAMS = 4
@@ -64,7 +63,7 @@ while True:
 
 def main() -> int:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument(
         "--stops", type=at_least(1), default=100, metavar="N", help="of each kind (default 100)"
     )

@@ -12,7 +12,6 @@ pair: from its rests' scatter alone, were the correction exact, and from the cor
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,7 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.matching.warp import grey
 from drivers.recordings.frames import read_products
-from tools.command import end
+from tools.command import end, options
 from tools.flight import mer
 
 TOLD_RAD = (5e-5, 2e-4, 1.3e-3)
@@ -38,9 +37,7 @@ DRAWS = 200
 
 def main() -> int:
     """Fit, predict, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("folder", type=Path)
     args = parser.parse_args()
     products = mer.labels(args.folder)

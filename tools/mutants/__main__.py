@@ -34,7 +34,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mastctl.cli.output import at_least
-from tools.command import end, new_file
+from tools.command import end, new_file, options
 from tools.mutants.sites import TESTS, MutantSite, imports, nearest, sites
 from tools.mutants.trial import MutantEnded, end_with_tests, run, run_change, warm
 
@@ -177,11 +177,7 @@ def _all_tried(chosen: list[MutantSite], args: argparse.Namespace, copies: list[
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m tools.mutants",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = options(__doc__, seed=None, tasks=False)
     number = at_least(1)
     parser.add_argument("places", nargs="+", metavar="PLACE", help="folders or modules of this checkout")
     parser.add_argument("--mutants", type=number, default=40, metavar="N", help="from each place")
