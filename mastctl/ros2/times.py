@@ -96,10 +96,11 @@ class RosTime:
         if old is not None:
             off_s = abs(new.offset_ns - old.offset_ns) / NS
             if off_s > STEP_S + new.half_s + old.half_s:
+                if self.steady:  # a clock that runs otherwise than real time is reported once
+                    log.warning("the offset of ROS time from the daemon's clock changed by %.6f s", off_s)
                 self.steps += 1
                 self._since_step = 0
                 self._kept.clear()
-                log.warning("the offset of ROS time from the daemon's clock changed by %.6f s", off_s)
         self._kept.append(new)
         self.exchange = new if new.here else min(self._kept, key=lambda one: one.half_s)
         return old is None or old.offset_ns != self.exchange.offset_ns
