@@ -12,8 +12,13 @@ REAL = pytest.mark.long(
 )
 
 
+OTHER = pytest.mark.long(3, "the same of other heads; the bus and session of Feetech's are Dynamixel's")
+LATER = [pytest.param(name, marks=OTHER) for name in ("feetech", "feetech_echo", "scs", "visca")]
+
+
 @pytest.mark.parametrize(
-    "driver", ["dynamixel", "ptu", *(pytest.param(name, marks=REAL) for name in ("dynamixel_pty", "ptu_pty"))]
+    "driver",
+    ["dynamixel", "ptu", *LATER, *(pytest.param(name, marks=REAL) for name in ("dynamixel_pty", "ptu_pty"))],
 )
 @pytest.mark.parametrize("word", ["corrupt", "swapped", "hang_up", "mixture"])
 def test_no_fault_makes_a_driver_tell_a_wrong_angle_or_leave_anything_behind(driver: str, word: str) -> None:

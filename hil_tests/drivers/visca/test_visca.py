@@ -1,7 +1,7 @@
 """What is a VISCA head's own: frames, refusals, late and damaged replies, and the way over UDP.
 
 What every head has to do is in test_head_contract.py. The frames are those of the package visca-over-ip
-0.5.2.
+0.5.2, but for the stop, whose speeds are 0 there.
 """
 
 from __future__ import annotations
