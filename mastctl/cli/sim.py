@@ -1,4 +1,4 @@
-"""Simulated servos behind real bytes, for any driver: `mastctl sim dynamixel` and `mastctl sim ptu`.
+"""Simulated servos behind real bytes, for any driver: `mastctl sim dynamixel|feetech|ptu`.
 
 Each runs until SIGTERM, SIGINT (Ctrl-C) or, with --until-eof, the end of its standard input. JSON
 lines on standard input switch faults on and off while it runs.
@@ -38,7 +38,7 @@ _PAN_TILT: tuple[Literal[0], Literal[1]] = (0, 1)
 
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add sim dynamixel, sim ptu and sim new."""
+    """Add sim dynamixel, sim feetech, sim ptu and sim new."""
     sim = subparsers.add_parser(
         "sim", help="simulated servos behind a serial line or a TCP port; a new simulated rover"
     )
@@ -65,6 +65,14 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     )
     dynamixel.set_defaults(run=_dynamixel)
 
+    feetech = kinds.add_parser(
+        "feetech", help="a bus of two Feetech servos, ids 1 and 2", epilog=_LIVE, formatter_class=shape
+    )
+    feetech.add_argument("--model", default="sts3215", help="of both (default sts3215)")
+    feetech.add_argument("--baud", type=int, default=1_000_000, help="of both (default 1000000)")
+    feetech.add_argument("--echo", action="store_true", help="the adapter gives back what is sent")
+    feetech.set_defaults(run=_feetech)
+
     ptu = kinds.add_parser(
         "ptu", help="a FLIR / Directed Perception pan/tilt unit", epilog=_LIVE, formatter_class=shape
     )
@@ -73,7 +81,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     ptu.add_argument("--baud", type=int, default=9600, help="of the serial line (default 9600)")
     ptu.set_defaults(run=_ptu)
 
-    for kind in (dynamixel, ptu):
+    for kind in (dynamixel, feetech, ptu):
         where = kind.add_mutually_exclusive_group(required=True)
         where.add_argument("--pty", action="store_true", help="a serial line as a pseudo terminal")
         if kind is ptu:
@@ -113,6 +121,30 @@ def _dynamixel(args: argparse.Namespace) -> int:
             raise WrongUse(f"--servo {model}:{servo_id}: {error}") from None
     facts = {"servos": [{"model": model, "id": servo_id} for model, servo_id in wanted], "baud": args.baud}
     return _serve(args, DynamixelBus(servos), panel, clock, facts)
+
+
+def _feetech(args: argparse.Namespace) -> int:
+    from drivers.errors import BadOptions
+    from drivers.sim.wire.axis import WireAxis
+    from drivers.sim.wire.feetech_bus import FeetechBus
+    from drivers.sim.wire.feetech_memory import BAUDS
+    from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
+
+    if args.baud not in BAUDS:
+        raise WrongUse(f"--baud is {args.baud}, expected one of {', '.join(str(b) for b in BAUDS)}")
+    panel, clock = _panel()
+    now_s, registers = clock.now_s(), {"baud": BAUDS.index(args.baud)}
+    servos = []
+    for place in _PAN_TILT:
+        axis = WireAxis(_axis_settings("dynamixel_x", place), panel, number=place, time_s=now_s)
+        try:
+            servos.append(
+                SimulatedFeetechServo(args.model, place + 1, axis, settings=registers, time_s=now_s)
+            )
+        except BadOptions as error:
+            raise WrongUse(f"--model: {error}") from None
+    facts = {"servos": [{"model": args.model, "id": place + 1} for place in _PAN_TILT], "baud": args.baud}
+    return _serve(args, FeetechBus(servos, echoes=args.echo), panel, clock, facts)
 
 
 def _ptu(args: argparse.Namespace) -> int:

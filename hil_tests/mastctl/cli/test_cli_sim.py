@@ -92,6 +92,18 @@ def test_servos_of_two_models_answer_the_plain_sdk(repository: Path) -> None:
         assert running.end(signal.SIGTERM)[:2] == (0, "")
 
 
+def test_feetech_servos_behind_an_echoing_adapter_are_found_by_the_scan(
+    repository: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with sim(repository, "feetech", "--pty", "--echo", "--json") as running:
+        facts = json.loads(running.first)
+        words = ["servo", "scan", facts["port"], "--family", "feetech", "--baud", "1000000", "--json"]
+        assert main(words) == 0
+        found = json.loads(capsys.readouterr().out)["servos"]
+        assert [(one["id"], one["model"]) for one in found] == [(1, "STS3215"), (2, "STS3215")]
+        assert running.end(signal.SIGTERM)[:2] == (0, "")
+
+
 def test_a_ptu_behind_tcp_greets_as_an_e_series_unit_does(repository: Path) -> None:
     with sim(repository, "ptu", "--tcp", "0", "--model", "d48e") as running:
         assert running.first.startswith("socket://127.0.0.1:")
@@ -153,6 +165,8 @@ def test_the_end_of_standard_input_ends_it_only_when_asked_to(repository: Path) 
         (["dynamixel", "--pty", "--servo", "xm43_w350:1"], "did you mean 'xm430_w350'?"),
         (["dynamixel", "--pty", "--baud", "1234"], "--baud is 1234, expected one of"),
         (["dynamixel", "--pty", "--return-delay", "255"], "expected 0 to 254"),
+        (["feetech", "--pty", "--model", "sts3251"], "did you mean 'sts3250'?"),
+        (["feetech", "--pty", "--baud", "9600"], "--baud is 9600, expected one of 1000000"),
     ],
 )
 def test_wrong_use_is_one_line_and_exit_code_2(
