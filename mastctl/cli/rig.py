@@ -7,7 +7,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.output import WrongUse, at_least, check_folder, finite_number, positive_number
+from mastctl.cli.output import CommandError, WrongUse, at_least, check_folder, finite_number, positive_number
 from mastctl.cli.sim_new import folder_name
 
 if TYPE_CHECKING:
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from mastctl.rig.questions import Questions
 
 
+NOTHING = "no head and no camera is plugged in; write a simulated twin, which runs"
 LEAST_DEG = 15.0
 """Between the ends of an axis: both keep a margin (`mastctl.rig.drawing.MARGIN_RAD`)."""
 
@@ -71,8 +72,14 @@ def _new(args: argparse.Namespace) -> int:
     for words in found.unused:
         output.tell(words)
     head = _head(found, questions)
+    if args.port and head is None:
+        raise CommandError("no_head", f"no head: {'; '.join(found.unused)}; nothing is written")
+    none = head is None and not found.cameras
+    if none and questions.one_of(NOTHING, ("yes", "no"), "yes") == "no":
+        output.tell("nothing is written; plug the head in and try again")
+        return 0
     answers = _answers(args, found, head, questions)
-    if head is None and not found.cameras:
+    if none:
         output.tell("no head and no camera is plugged in: this is the simulated twin, which runs")
         made = write_simulated(args.folder, found, answers)
     else:

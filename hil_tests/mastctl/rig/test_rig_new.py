@@ -6,8 +6,11 @@ import io
 import json
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jsonschema_rs
@@ -20,14 +23,17 @@ from drivers.dynamixel.settings import dynamixel_settings
 from drivers.dynamixel.workshop import FoundServo
 from drivers.feetech.settings import feetech_settings
 from drivers.flir_ptu.options import options_from
-from drivers.sim.heads import PRESETS
+from drivers.flir_ptu.workshop import facts as ptu_facts
+from drivers.sim.heads import PRESETS, HeadSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
 from drivers.sim.wire.feetech_bus import FeetechBus
 from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
-from drivers.sim.wire.line import PtyLine
+from drivers.sim.wire.line import PtyLine, WireDevice
+from drivers.sim.wire.memory_line import MemoryLine
 from drivers.sim.wire.ptu import SimulatedPtu
+from drivers.simulation_clock import SimulationClock
 from drivers.v4l2.options import parse_options
 from mastctl.cli.main import main
 from mastctl.client import Client
@@ -45,17 +51,37 @@ from mastctl.setup.machine import ExaminedMachine
 X = PRESETS["dynamixel_x"]
 
 
-class Servos:
-    """Two XL330 on a pseudo terminal, at 1 Mbaud."""
+class Bench:
+    """Devices on one line in memory, on a turned clock, asked by what asks a true one."""
 
-    def __init__(self, folder: Path, ids: tuple[int, int] = (3, 4)) -> None:
-        clock = SystemClock()
-        self.axes = [WireAxis(axis, number=n, time_s=clock.now_s()) for n, axis in enumerate((X.pan, X.tilt))]
-        self.servos = [
-            SimulatedServo("xl330_m288", ids[n], axis, settings={"baud_rate": 3}, time_s=clock.now_s())
-            for n, axis in enumerate(self.axes)
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.clock = SimulationClock(start_s=1000.0)
+        self._patch = monkeypatch
+
+    def axes(self, head: HeadSettings = X) -> list[WireAxis]:
+        """A head's two axes."""
+        now_s = self.clock.now_s()
+        return [WireAxis(axis, number=n, time_s=now_s) for n, axis in enumerate((head.pan, head.tilt))]
+
+    def servos(self, ids: tuple[int, int]) -> list[SimulatedServo]:
+        """Two XL330 at 1 Mbaud."""
+        now_s, settings = self.clock.now_s(), {"baud_rate": 3}
+        return [
+            SimulatedServo("xl330_m288", number, axis, settings=settings, time_s=now_s)
+            for number, axis in zip(ids, self.axes(), strict=True)
         ]
-        self.line = PtyLine(DynamixelBus(self.servos), clock, link=folder / "ttyServos")
+
+    @contextmanager
+    def line(self, device: WireDevice) -> Iterator[str]:
+        """The line's name, while the device is on it."""
+        line = MemoryLine(device, self.clock)
+        asked = {"clock": self.clock, "open_line": lambda port, *rest: line.open(line.path, *rest)}
+        families = tuple(replace(one, scan=partial(one.scan, **asked)) for one in FAMILIES)
+        self._patch.setattr(plugged, "FAMILIES", families)
+        self._patch.setattr(plugged, "flir_ptu", SimpleNamespace(facts=partial(ptu_facts, **asked)))
+        self._patch.setattr(plugged, "examine_port", lambda port, machine: ())
+        with self.clock.at_work(), line:
+            yield "/dev/ttyMemory"
 
 
 @pytest.fixture
@@ -66,10 +92,8 @@ def nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def servos(tmp_path: Path, nothing: None) -> Iterator[Servos]:
-    it = Servos(tmp_path)
-    with it.line:
-        yield it
+def bench(monkeypatch: pytest.MonkeyPatch, nothing: None) -> Bench:
+    return Bench(monkeypatch)
 
 
 def written(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
@@ -89,55 +113,60 @@ def good_by_schema(folder: Path) -> None:
         jsonschema_rs.validator_for(schema).validate(parse_mapping(text.encode(), name))
 
 
-def test_two_servos_become_a_rig_that_turns_and_the_scan_changes_nothing(
-    servos: Servos, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+def test_two_servos_become_a_rig_and_the_scan_changes_nothing(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = tmp_path / "rig"
-    before = [dict(servo.table.values) for servo in servos.servos]
-    monkeypatch.chdir(tmp_path)
-    told = written(capsys, str(folder), "--port", "ttyServos")
-    after = [dict(servo.table.values) for servo in servos.servos]
-    assert before == after
-    assert told["heads"] == [
-        f"{servos.line.path}: XL330-M288-T (id 3, 1000000 baud), XL330-M288-T (id 4, 1000000 baud)"
-    ]
+    folder, servos = tmp_path / "rig", bench.servos((3, 4))
+    before = [dict(servo.table.values) for servo in servos]
+    with bench.line(DynamixelBus(servos)) as port:
+        told = written(capsys, str(folder), "--port", port)
+    assert [dict(servo.table.values) for servo in servos] == before
+    assert told["heads"] == [f"{port}: XL330-M288-T (id 3, 1000000 baud), XL330-M288-T (id 4, 1000000 baud)"]
     assert told["next"][0] == f"mastctl doctor --config {folder / CONFIG}"
     good_by_schema(folder)
-    config = load_config(folder / CONFIG)
-    settings = dynamixel_settings(config.hardware.pan_tilt.options)
+    settings = dynamixel_settings(load_config(folder / CONFIG).hardware.pan_tilt.options)
     assert (settings.pan.servo_id, settings.tilt.servo_id) == (3, 4)
-    assert [one for one in doctor.examine(str(folder / CONFIG), lambda url: None) if one.level == "bad"] == []
-    text = (folder / CONFIG).read_text()
-    (folder / CONFIG).write_text(text.replace("port: 8420", "port: 0"))
-    with RunningDaemon(load_config(folder / CONFIG)) as daemon, Client(daemon.url) as mast:
-        assert mast.wait(mast.point(pan_rad=0.2, tilt_rad=-0.1))["state"] == "done"
-        joints = mast.status()["joints"]
-        assert (joints["pan_rad"], joints["tilt_rad"]) == pytest.approx((0.2, -0.1), abs=3e-3)
 
 
-def test_two_new_servos_of_one_id_are_told_apart_from_no_servo(
-    tmp_path: Path, nothing: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.long(2, "a daemon drives servos behind a pseudo terminal in real time")
+def test_what_is_written_for_servos_behind_a_pseudo_terminal_turns_them(
+    nothing: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    family = FAMILIES[0]
-    monkeypatch.setattr(plugged, "FAMILIES", (replace(family, bauds=(1_000_000,)),))
-    with Servos(tmp_path, ids=(1, 1)).line as line:
-        told = written(capsys, str(tmp_path / "rig"), "--port", line.path)
-    assert any("new servos all have the id 1; connect one at a time" in words for words in told["unused"])
-
-
-def test_feetech_servos_are_asked_in_their_own_words(
-    tmp_path: Path, nothing: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(plugged, "FAMILIES", tuple(replace(one, bauds=(1_000_000,)) for one in FAMILIES))
     clock = SystemClock()
     axes = [WireAxis(axis, number=n, time_s=clock.now_s()) for n, axis in enumerate((X.pan, X.tilt))]
     servos = [
-        SimulatedFeetechServo("sts3215", n, axis, time_s=clock.now_s()) for n, axis in enumerate(axes, 1)
+        SimulatedServo("xl330_m288", n, axis, settings={"baud_rate": 3}, time_s=clock.now_s())
+        for n, axis in enumerate(axes, 1)
     ]
-    folder = tmp_path / "rig"
-    with PtyLine(FeetechBus(servos), clock, link=tmp_path / "ttyFeetech") as line:
-        told = written(capsys, str(folder), "--port", line.path)
-    assert [axis.angle_rad(clock.now_s()) for axis in axes] == [0.0, 0.0]
+    monkeypatch.chdir(tmp_path)
+    config = tmp_path / "rig" / CONFIG
+    with PtyLine(DynamixelBus(servos), clock, link=tmp_path / "ttyServos"):
+        written(capsys, "rig", "--port", "ttyServos")
+        assert [one for one in doctor.examine(str(config), lambda url: None) if one.level == "bad"] == []
+        config.write_text(config.read_text().replace("port: 8420", "port: 0"))
+        with RunningDaemon(load_config(config)) as daemon, Client(daemon.url) as mast:
+            assert mast.wait(mast.point(pan_rad=0.2, tilt_rad=-0.1))["state"] == "done"
+            joints = mast.status()["joints"]
+    assert (joints["pan_rad"], joints["tilt_rad"]) == pytest.approx((0.2, -0.1), abs=3e-3)
+
+
+def test_one_servo_or_two_of_one_id_are_told_to_be_given_ids(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with bench.line(DynamixelBus(bench.servos((1, 1)))) as port:
+        main(["rig", "new", str(tmp_path / "rig"), "--port", port])
+    assert "new servos all have the id 1; connect one at a time" in capsys.readouterr().err
+
+
+def test_feetech_servos_are_asked_in_their_own_words(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    axes, folder = bench.axes(), tmp_path / "rig"
+    now_s = bench.clock.now_s()
+    servos = [SimulatedFeetechServo("sts3215", n, axis, time_s=now_s) for n, axis in enumerate(axes, 1)]
+    with bench.line(FeetechBus(servos)) as port:
+        told = written(capsys, str(folder), "--port", port)
+    assert [axis.angle_rad(bench.clock.now_s()) for axis in axes] == [0.0, 0.0]
     assert "STS3215 (id 1, 1000000 baud), STS3215 (id 2, 1000000 baud)" in told["heads"][0]
     good_by_schema(folder)
     head = load_config(folder / CONFIG).hardware.pan_tilt
@@ -146,15 +175,12 @@ def test_feetech_servos_are_asked_in_their_own_words(
 
 
 def test_a_ptu_is_known_and_its_own_limits_hold(
-    tmp_path: Path, nothing: None, capsys: pytest.CaptureFixture[str]
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    clock, head = SystemClock(), PRESETS["ptu_d46_70"]
-    axes = [WireAxis(axis, number=n, time_s=clock.now_s()) for n, axis in enumerate((head.pan, head.tilt))]
-    unit = SimulatedPtu("d46_70", *axes, baud=38_400)
-    folder = tmp_path / "rig"
-    with PtyLine(unit, clock, link=tmp_path / "ttyPtu") as line:
-        told = written(capsys, str(folder), "--port", line.path, "--tilt-deg", "-90", "80")
-    assert [axis.angle_rad(clock.now_s()) for axis in axes] == [0.0, 0.0]
+    axes, folder = bench.axes(PRESETS["ptu_d46_70"]), tmp_path / "rig"
+    with bench.line(SimulatedPtu("d46_70", *axes, baud=38_400)) as port:
+        told = written(capsys, str(folder), "--port", port, "--tilt-deg", "-90", "80")
+    assert [axis.angle_rad(bench.clock.now_s()) for axis in axes] == [0.0, 0.0]
     assert "a FLIR PTU" in told["heads"][0]
     good_by_schema(folder)
     options = options_from(load_config(folder / CONFIG).hardware.pan_tilt.options)
@@ -181,11 +207,13 @@ def test_without_hardware_it_writes_the_twin_that_runs(
     assert {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()} == kept
 
 
-def test_a_line_on_which_nothing_answers_is_told(
+def test_a_named_line_on_which_nothing_answers_is_a_failure_and_nothing_is_written(
     tmp_path: Path, nothing: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = written(capsys, str(tmp_path / "rig"), "--port", str(tmp_path / "ttyNone"))
-    assert told["simulated"] and "ttyNone does not exist" in told["unused"][0]
+    assert main(["rig", "new", str(tmp_path / "rig"), "--port", str(tmp_path / "ttyNone"), "--json"]) == 1
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert error["code"] == "no_head" and "ttyNone does not exist" in error["message"]
+    assert not (tmp_path / "rig").exists()
 
 
 CAMERAS = tuple(
