@@ -51,6 +51,9 @@ class Line:
     def poll(self, time_s: float) -> Sequence[Reply]:
         return self.bus.poll(time_s)
 
+    def renamed(self, data: bytes, servo_id: int) -> bytes:
+        return self.bus.renamed(data, servo_id)
+
     def change(self, replies: list[Reply], time_s: float) -> list[Reply]:
         return replies
 
