@@ -123,8 +123,7 @@ class LineFaults:
     def _damaged(self, panel: FaultPanel, reply: Reply, time_s: float) -> Sent:
         """A reply of another sender, with a wrong byte, cut short, with garbage in front, or late."""
         data, late_s = reply.data, 0.0
-        fault = panel.takes(PAN_TILT, "misnamed", time_s, reply.sender) if self._names else None
-        if fault and self._names:
+        if (fault := panel.takes(PAN_TILT, "misnamed", time_s, reply.sender)) and self._names:
             data = self._names.renamed(data, int(fault.number("as_id")))
         if data and (fault := panel.takes(PAN_TILT, "corrupt", time_s, reply.sender)):
             place = _below(panel, fault, len(data))
