@@ -25,6 +25,7 @@ DESK = {"width": 1500, "height": 1000}
 TABLET = {"width": 820, "height": 1180}
 TALL = {"width": 1500, "height": 1240}
 STONE = (0.5, 0.62)  # beside the larger rock, as the head looks then
+PATIENCE_MS = 600_000.0  # a step of a bench takes minutes on a machine with much else to do
 STEPS_M = (0.3, 0.6, 0.9, 1.2, 1.5)
 FRESH = ".eye[data-camera=navcam_left]:not([data-stale])", ".eye[data-camera=navcam_right]:not([data-stale])"
 ROCK = (
@@ -142,6 +143,7 @@ def on_a_tablet(page: Page, url: str, client: Client, out: Path) -> None:
 def bench(browser: Browser, folder: Path, out: Path) -> None:
     """A bench calibration that asks for its second placement."""
     page = browser.new_context(viewport=DESK, color_scheme="light").new_page()
+    page.set_default_timeout(PATIENCE_MS)
     with started(bench_config(folder)) as (_, port):
         url = f"http://127.0.0.1:{port}"
         opened(page, url)
