@@ -114,9 +114,11 @@ class Actions:
             over.set()
 
         wish = self._asked.ask(what, request, end)
-        withdrawn = False
+        withdrawn = seen = False
         while not over.wait(FEEDBACK_S):
-            if not withdrawn and (goal.is_cancel_requested or not self._waited_for(what)):
+            waited = self._waited_for(what)
+            seen = seen or waited  # ROS may tell of a client later than of its goal
+            if not withdrawn and (goal.is_cancel_requested or (seen and not waited)):
                 withdrawn = True
                 self._asked.steering.withdraw(wish)
             told = progress()

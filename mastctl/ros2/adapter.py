@@ -68,7 +68,7 @@ def run(
     from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
 
-    from mastctl.ros2.messages import Names
+    from mastctl.ros2.names import Names
     from mastctl.ros2.node import MastNode
 
     try:

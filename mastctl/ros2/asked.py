@@ -13,7 +13,8 @@ from calib.files.twin import even_axes
 from calib.geometry.cahvor import CameraModel
 from mastctl.client import Client
 from mastctl.ros2.known import FRAMES, Known
-from mastctl.ros2.messages import Names, stamp_ns
+from mastctl.ros2.messages import stamp_ns
+from mastctl.ros2.names import Names
 from mastctl.ros2.steering import Outcome, Steering, Wish
 from mastctl.ros2.tf_tree import NoTransform
 from mastctl.ros2.times import NS

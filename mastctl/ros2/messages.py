@@ -17,29 +17,11 @@ from calib.files.twin import even_axes
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid, quaternion_of, rot_x, rot_y, rot_z, rotation_of
 from mastctl.ros2.lens import RosLens
+from mastctl.ros2.names import Names
 from mastctl.ros2.times import NS, RosTime
 
 OK, WARN, ERROR = 0, 1, 2
 LEVELS = {"fault": ERROR} | dict.fromkeys(("stopped", "stopping", "holding", "starting", "closing"), WARN)
-
-
-class Names:
-    """The names of joints and frames, each with the prefix that the user gave."""
-
-    def __init__(self, prefix: str = "", base: str = "base_link") -> None:
-        self.base = base
-        self.pan, self.tilt = f"{prefix}pan", f"{prefix}tilt"
-        self.rover, self.mast = f"{prefix}rover", f"{prefix}mast"
-        self.pan_link, self.head = f"{prefix}pan_link", f"{prefix}head"
-        self._prefix = prefix
-
-    def optical(self, camera: str) -> str:
-        """The frame of a camera: x right, y down, z ahead."""
-        return f"{self._prefix}{camera}_optical_frame"
-
-    def camera_of(self, frame: str, rig: Rig) -> str | None:
-        """The camera whose optical frame this is."""
-        return next((name for name in rig.cameras if self.optical(name) == frame), None)
 
 
 def stamp(ns: int) -> Time:

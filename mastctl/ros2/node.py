@@ -28,7 +28,7 @@ from mastctl.ros2.asked import Asked
 from mastctl.ros2.follow import Following
 from mastctl.ros2.known import Known
 from mastctl.ros2.lens import nearest_lens
-from mastctl.ros2.messages import Names
+from mastctl.ros2.names import Names
 from mastctl.ros2.steering import Outcome, Steering
 from mastctl.ros2.times import NS, Exchange
 
@@ -81,11 +81,12 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
             self._ended = {one["id"] for one in client.operations() if one["state"] in ENDED}
         self.known.expect_images(self._cameras)
         for name in self._cameras:
+            topic = self.names.topic(name)
             self._images[name] = (
                 self.create_publisher(
-                    CompressedImage, f"{name}/image_raw/compressed", qos_profile_sensor_data
+                    CompressedImage, f"{topic}/image_raw/compressed", qos_profile_sensor_data
                 ),
-                self.create_publisher(CameraInfo, f"{name}/camera_info", qos_profile_sensor_data),
+                self.create_publisher(CameraInfo, f"{topic}/camera_info", qos_profile_sensor_data),
             )
         self.following.status(self._tell_status, self._tell_loss)
         self.following.events(self._tell_event)
@@ -237,7 +238,7 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
                 continue
             log.info("%s: %s, at most %.4f px off", name, lens.name, lens.worst_px)
             if name not in self._latched:
-                topic = f"{name}/camera_info_error_px"
+                topic = f"{self.names.topic(name)}/camera_info_error_px"
                 self._latched[name] = self.create_publisher(Float64, topic, LATCHED)
             self._latched[name].publish(Float64(data=lens.worst_px))
             self._infos[name] = messages.camera_info(lens)

@@ -20,6 +20,7 @@ from mastctl.cli.main import main
 from mastctl.client import ClientError
 from mastctl.packaged import config_folder
 from mastctl.ros2.lens import GRID, nearest_lens
+from mastctl.ros2.names import Names
 from mastctl.ros2.steering import Outcome, Steering, Wish
 from mastctl.ros2.tf_tree import NoTransform, TfTree
 from mastctl.ros2.times import CALM, Exchange, RosTime
@@ -138,6 +139,15 @@ def test_what_tf_does_not_know_is_told(target: str, source: str, stamp_s: int, s
     tree.put("sea", "island", 0, Rigid.identity(), static=True)
     with pytest.raises(NoTransform, match=said):
         tree.transform(target, source, stamp_s * NS)
+
+
+def test_names_are_such_that_ros_takes_them() -> None:
+    names = Names("mast_", "base_footprint")
+    assert (names.pan, names.base, names.head) == ("mast_pan", "base_footprint", "mast_head")
+    assert [names.topic(one) for one in ("navcam_left", "rear-cam", "3d")] == [
+        "navcam_left", "rear_cam", "camera_3d",
+    ]  # fmt: skip
+    assert names.optical("rear-cam") == "mast_rear_cam_optical_frame"
 
 
 class _Daemon:
