@@ -23,6 +23,8 @@ from mastctl.ros2.steering import Outcome
 log = logging.getLogger(__name__)
 
 FEEDBACK_S = 0.1
+UNSEEN_S = 2.0
+"""ROS may tell of a client later than of its goal: so long is one waited for that was not seen yet."""
 TRAJECTORY, POINT_HEAD = "follow_joint_trajectory", "point_head"
 
 
@@ -114,11 +116,13 @@ class Actions:
             over.set()
 
         wish = self._asked.ask(what, request, end)
-        withdrawn = seen = False
+        withdrawn, missed, most = False, 0, round(UNSEEN_S / FEEDBACK_S)
         while not over.wait(FEEDBACK_S):
-            waited = self._waited_for(what)
-            seen = seen or waited  # ROS may tell of a client later than of its goal
-            if not withdrawn and (goal.is_cancel_requested or (seen and not waited)):
+            if self._waited_for(what):
+                missed, most = 0, 1
+            else:
+                missed += 1
+            if not withdrawn and (goal.is_cancel_requested or missed > most):
                 withdrawn = True
                 self._asked.steering.withdraw(wish)
             told = progress()

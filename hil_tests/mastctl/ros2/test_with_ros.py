@@ -236,7 +236,7 @@ def test_actions_end_as_the_head_does(beside: Beside) -> None:
 
 
 def test_a_goal_whose_client_leaves_is_stopped(beside: Beside) -> None:
-    beside.rests()
+    beside.rests(2.4, 0.0)
     before = beside.newest_operation()["id"]
     far = {"trajectory": {"joint_names": ["pan"], "points": [{"positions": [-2.4]}]}}
     with peer(beside.prefix, beside.domain) as other:
