@@ -23,7 +23,7 @@ from mastctl.ros2.steering import Outcome
 log = logging.getLogger(__name__)
 
 FEEDBACK_S = 0.1
-UNSEEN_S = 2.0
+UNSEEN_S = 10.0
 """ROS may tell of a client later than of its goal: so long is one waited for that was not seen yet."""
 TRAJECTORY, POINT_HEAD = "follow_joint_trajectory", "point_head"
 

@@ -34,7 +34,7 @@ QOS = {
 }
 KEPT = 100_000
 LONG = 100
-NET_S = 30.0
+NET_S = 60.0
 LOOK_S = 0.005
 MATCHED_S = 0.5
 """A subscriber that is known here already may not know this publisher yet, and nobody tells that."""
@@ -138,6 +138,7 @@ class Peer:
         if not client.wait_for_server(NET_S):
             raise TimeoutError(action)
         self._done(client.send_goal_async(filled(type_of(kind).Goal(), fields)))
+        time.sleep(3.0 * MATCHED_S)  # until the server has seen the client
         client.destroy()
         time.sleep(MATCHED_S)  # until the others have been told
         rclpy.shutdown()

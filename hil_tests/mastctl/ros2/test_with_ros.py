@@ -102,7 +102,7 @@ def beside(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
             ros.listen("navcam_left/camera_info_error_px", "std_msgs/msg/Float64", "latched")
             ros.listen("/tf", "tf2_msgs/msg/TFMessage", "reliable")
             ros.listen("/tf_static", "tf2_msgs/msg/TFMessage", "latched")
-            ros.heard("joint_states", 1, 30.0)
+            ros.heard("joint_states", 1, 60.0)
             yield Beside(client, ros, url, prefix, domain, folder)
 
 
@@ -113,14 +113,14 @@ def test_a_program_that_knows_only_ros_sees_a_rocks_residual_and_stops_the_head(
     rests_s = time.time()
 
     def picture_at_rest() -> Any:
-        [(_, told)] = ros.fresh("navcam_left/image_raw/compressed", 30.0)
+        [(_, told)] = ros.fresh("navcam_left/image_raw/compressed", 60.0)
         return told if seconds(told["header"]) > rests_s + 0.1 else None
 
     picture = until(picture_at_rest, "an image of the head at rest")
     rock = {"header": picture["header"], "point": {"x": ROCK_PX[0], "y": ROCK_PX[1], "z": 0.0}}
     ros.publish("point_at_pixel", POINT, rock)
-    [(_, told)] = ros.fresh("residual", 30.0)
-    [(_, sigma)] = ros.heard("residual_sigma", 1, 30.0)
+    [(_, told)] = ros.fresh("residual", 60.0)
+    [(_, sigma)] = ros.heard("residual_sigma", 1, 60.0)
     record = beside.ended(before)
     assert [told["vector"]["x"], told["vector"]["y"]] == record["residual_px"]
     assert [sigma["vector"]["x"], sigma["vector"]["y"]] == record["residual_sigma_px"]
@@ -132,34 +132,34 @@ def test_a_program_that_knows_only_ros_sees_a_rocks_residual_and_stops_the_head(
     ros.publish("joint_trajectory", TRAJECTORY, far)
 
     def turning() -> bool:
-        return bool(ros.fresh("joint_states", 30.0)[0][1]["position"][0] > 0.3)
+        return bool(ros.fresh("joint_states", 60.0)[0][1]["position"][0] > 0.3)
 
     until(turning, "the head turns")
     assert ros.call("/mastctl/stop", TRIGGER, {})["success"]
     stopped = beside.ended(record["id"])
     assert stopped["state"] == "stopped"
     until(lambda: not beside.client.status()["moving"], "the head rests")
-    assert ros.fresh("joint_states", 30.0)[0][1]["position"][0] < 2.0
+    assert ros.fresh("joint_states", 60.0)[0][1]["position"][0] < 2.0
     assert beside.client.control() is None
 
 
 def test_stamps_are_the_daemons_own(beside: Beside) -> None:
     ros, offset_s = beside.ros, beside.real_less_monotonic_s
-    assert ros.heard("clock_offset", 1, 30.0)[0][1]["data"] == pytest.approx(offset_s, abs=STAMP_S)
+    assert ros.heard("clock_offset", 1, 60.0)[0][1]["data"] == pytest.approx(offset_s, abs=STAMP_S)
     measured: set[float] = set()
     for event in beside.client.events("joints"):
         measured.add(event["value"]["measured_s"])
         if len(measured) >= 20:
             break
-    told = np.array([seconds(one["header"]) - offset_s for _, one in ros.heard("joint_states", 100, 30.0)])
+    told = np.array([seconds(one["header"]) - offset_s for _, one in ros.heard("joint_states", 100, 60.0)])
     off_s = [np.abs(told - one).min() for one in measured if told[0] + STAMP_S < one < told[-1] - STAMP_S]
     assert len(off_s) > 5
     assert max(off_s) < STAMP_S
-    [(at_s, image)] = ros.fresh("navcam_left/image_raw/compressed", 30.0)
+    [(at_s, image)] = ros.fresh("navcam_left/image_raw/compressed", 60.0)
     assert 0.0 < at_s - seconds(image["header"]) < 60.0
 
     def info_of_the_image() -> bool:
-        infos = ros.heard("navcam_left/camera_info", 0, 30.0)
+        infos = ros.heard("navcam_left/camera_info", 0, 60.0)
         return any(one["header"] == image["header"] for _, one in infos)
 
     until(info_of_the_image, "camera_info of the image's own stamp")
@@ -201,7 +201,7 @@ def test_a_point_of_a_frame_that_others_publish(beside: Beside) -> None:
     assert record["state"] == "done"
     assert record["position_m"] == pytest.approx([6.0, -1.0, 0.1], abs=1e-9)
     ros.publish("point_at", POINT, told | {"header": {"frame_id": "moon"}})
-    [(_, refused)] = ros.fresh("pointings", 30.0)
+    [(_, refused)] = ros.fresh("pointings", 60.0)
     assert refused["status"][0]["message"] == "tf does not know the frame 'moon'"
 
 
@@ -248,13 +248,13 @@ def test_camera_info_and_tf_are_those_of_the_mast_file(beside: Beside) -> None:
     from calib.files.mast_file import parse_rig
 
     ros, rig = beside.ros, parse_rig(beside.client.mast_file(), "mast").rig
-    told = ros.heard("navcam_left/camera_info", 1, 30.0)[0][1]
+    told = ros.heard("navcam_left/camera_info", 1, 60.0)[0][1]
     assert told["distortion_model"] == "plumb_bob"
     assert told["header"]["frame_id"] == "navcam_left_optical_frame"
-    assert 0.0 < ros.heard("navcam_left/camera_info_error_px", 1, 30.0)[0][1]["data"] < 0.25
+    assert 0.0 < ros.heard("navcam_left/camera_info_error_px", 1, 60.0)[0][1]["data"] < 0.25
     beside.rests(0.5, -0.3)
-    moving = ros.fresh("/tf", 30.0)[0][1]["transforms"]
-    fixed = ros.heard("/tf_static", 0, 30.0)
+    moving = ros.fresh("/tf", 60.0)[0][1]["transforms"]
+    fixed = ros.heard("/tf_static", 0, 60.0)
     parts = {one["child_frame_id"]: one for _, told in fixed for one in told["transforms"]} | {
         one["child_frame_id"]: one for one in moving
     }
