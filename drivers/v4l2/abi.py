@@ -1,15 +1,17 @@
 """The kernel's interface to cameras, as C lays it out: structures, request numbers, constants.
 
 Source: include/uapi/linux/videodev2.h and v4l2-controls.h, which the kernel promises not to change. Only what
-single-planar capture needs. Layouts are those of 64-bit Linux (x86-64 and aarch64 agree).
+capture needs, in one plane or several. Layouts are those of 64-bit Linux (x86-64 and aarch64 agree).
 """
 
 from __future__ import annotations
 
 import ctypes
-from ctypes import Structure, Union, c_char, c_int32, c_int64, c_uint8, c_uint32, c_uint64, c_void_p
+from ctypes import Structure, Union, c_char, c_int32, c_int64, c_uint8, c_uint16, c_uint32, c_uint64, c_void_p
 
 BUF_TYPE_VIDEO_CAPTURE = 1
+BUF_TYPE_VIDEO_CAPTURE_MPLANE = 9
+MAX_PLANES = 8
 MEMORY_MMAP = 1
 FIELD_ANY, FIELD_NONE = 0, 1
 
@@ -137,9 +139,36 @@ class PixFormat(Structure):
     )
 
 
+class PlanePixFormat(Structure):
+    """struct v4l2_plane_pix_format, which is packed."""
+
+    _pack_ = 1
+    _fields_ = (("sizeimage", c_uint32), ("bytesperline", c_uint32), ("reserved", c_uint16 * 6))
+
+
+class PixFormatMplane(Structure):
+    """struct v4l2_pix_format_mplane, which is packed."""
+
+    _pack_ = 1
+    _fields_ = (
+        ("width", c_uint32),
+        ("height", c_uint32),
+        ("pixelformat", c_uint32),
+        ("field", c_uint32),
+        ("colorspace", c_uint32),
+        ("plane_fmt", PlanePixFormat * MAX_PLANES),
+        ("num_planes", c_uint8),
+        ("flags", c_uint8),
+        ("ycbcr_enc", c_uint8),
+        ("quantization", c_uint8),
+        ("xfer_func", c_uint8),
+        ("reserved", c_uint8 * 7),
+    )
+
+
 class _FormatUnion(Union):
     # v4l2_window holds pointers, which align the union to 8.
-    _fields_ = (("pix", PixFormat), ("raw", c_uint8 * 200), ("align", c_uint64))
+    _fields_ = (("pix", PixFormat), ("pix_mp", PixFormatMplane), ("raw", c_uint8 * 200), ("align", c_uint64))
 
 
 class Format(Structure):
@@ -206,6 +235,22 @@ class Timecode(Structure):
 
 class _BufferMemory(Union):
     _fields_ = (("offset", c_uint32), ("userptr", c_uint64), ("planes", c_void_p), ("fd", c_int32))
+
+
+class _PlaneMemory(Union):
+    _fields_ = (("mem_offset", c_uint32), ("userptr", c_uint64), ("fd", c_int32))
+
+
+class Plane(Structure):
+    """struct v4l2_plane."""
+
+    _fields_ = (
+        ("bytesused", c_uint32),
+        ("length", c_uint32),
+        ("m", _PlaneMemory),
+        ("data_offset", c_uint32),
+        ("reserved", c_uint32 * 11),
+    )
 
 
 class Buffer(Structure):

@@ -12,6 +12,7 @@ import os
 import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ _quick_ioctl = ctypes.PyDLL(None, use_errno=True).ioctl
 lock may get it back only after 5 ms."""
 _quick_ioctl.argtypes = (ctypes.c_int, ctypes.c_ulong, ctypes.c_void_p)
 
+_CAPTURES = abi.CAP_VIDEO_CAPTURE | abi.CAP_VIDEO_CAPTURE_MPLANE
 _MOST_ENTRIES = 1024  # of any enumeration: a driver that never ends one must not hang us
 
 
@@ -85,9 +87,11 @@ class PictureFormat:
     stride_bytes
         From one row to the next, of the first plane; 0 for compressed formats.
     length_bytes
-        The most that one picture takes.
+        The most that one picture takes, of all planes together.
     field
         1 for whole pictures; other values are interlaced.
+    planes_bytes
+        The most that each plane takes, where the camera captures in planes of their own; empty elsewhere.
     """
 
     code: str
@@ -95,20 +99,27 @@ class PictureFormat:
     stride_bytes: int
     length_bytes: int
     field: int = abi.FIELD_NONE
+    planes_bytes: tuple[int, ...] = ()
 
 
 class Dequeued(NamedTuple):
-    """A filled buffer, still ours until it is queued again."""
+    """A filled buffer, still ours until it is queued again.
+
+    ``planes`` has, of a camera that captures in planes, from which byte to which each plane is filled.
+    """
 
     number: int
     used_bytes: int
     flags: int
     sequence: int
     stamp_s: float
+    planes: tuple[tuple[int, int], ...] = ()
 
 
 class Node:
-    """An open video node. A context manager; closing it stops the stream and gives everything back.
+    """An open video node, of either capture interface of the kernel: single-planar or multi-planar.
+
+    A context manager; closing it stops the stream and gives everything back.
 
     Parameters
     ----------
@@ -126,16 +137,19 @@ class Node:
     def __init__(self, path: str | Path, name: str = "") -> None:
         self.path = Path(path)
         self.name = "" if name == str(path) else name  # messages name the path themselves
-        self._maps: list[mmap.mmap] = []
+        self._maps: list[tuple[mmap.mmap, ...]] = []  # of each buffer, one a plane
         self._streaming = False
-        self._exchanged = self._buffer(0)  # for the requests made for every frame; made once, as each costs
-        self._exchanged_at = ctypes.addressof(self._exchanged)
         self._fd = _open(self.path, self.name)
         try:
             self.identity = self._identify()
         except BaseException:
             os.close(self._fd)
             raise
+        self._in_planes = not self.identity.capabilities & abi.CAP_VIDEO_CAPTURE
+        self._type = abi.BUF_TYPE_VIDEO_CAPTURE_MPLANE if self._in_planes else abi.BUF_TYPE_VIDEO_CAPTURE
+        self._planes = (abi.Plane * abi.MAX_PLANES)()
+        self._exchanged = self._buffer(0)  # for the requests made for every frame; made once, as each costs
+        self._exchanged_at = ctypes.addressof(self._exchanged)
 
     def fileno(self) -> int:
         """Return the descriptor, for poll."""
@@ -148,7 +162,7 @@ class Node:
         fd, self._fd = self._fd, -1
         try:
             if self._streaming:
-                fcntl.ioctl(fd, abi.VIDIOC_STREAMOFF, ctypes.c_int32(abi.BUF_TYPE_VIDEO_CAPTURE))
+                fcntl.ioctl(fd, abi.VIDIOC_STREAMOFF, ctypes.c_int32(self._type))
         except OSError:
             pass  # a camera that is gone has no stream to stop
         finally:
@@ -167,7 +181,7 @@ class Node:
         """Return the codes of the formats that it offers, in the driver's order."""
         found = []
         for index in range(_MOST_ENTRIES):
-            entry = abi.FmtDesc(index=index, type=abi.BUF_TYPE_VIDEO_CAPTURE)
+            entry = abi.FmtDesc(index=index, type=self._type)
             if not self._next(abi.VIDIOC_ENUM_FMT, entry):
                 break
             found.append(abi.fourcc_text(entry.pixelformat))
@@ -204,8 +218,8 @@ class Node:
 
     def set_format(self, code: str, size_px: tuple[int, int]) -> PictureFormat:
         """Ask for a format and return the driver's, which may be another. Raises DriverError."""
-        wanted = abi.Format(type=abi.BUF_TYPE_VIDEO_CAPTURE)
-        pix = wanted.fmt.pix
+        wanted = abi.Format(type=self._type)
+        pix = wanted.fmt.pix_mp if self._in_planes else wanted.fmt.pix
         pix.width, pix.height = size_px
         pix.pixelformat, pix.field = abi.fourcc(code), abi.FIELD_NONE
         self.call(abi.VIDIOC_S_FMT, wanted, f"set the format {code} {size_px[0]}x{size_px[1]}")
@@ -213,13 +227,13 @@ class Node:
 
     def current_format(self) -> PictureFormat:
         """Return the format that is set now. Raises DriverError."""
-        found = abi.Format(type=abi.BUF_TYPE_VIDEO_CAPTURE)
+        found = abi.Format(type=self._type)
         self.call(abi.VIDIOC_G_FMT, found, "tell its format")
         return _picture_format(found)
 
     def set_rate(self, rate_hz: float) -> float | None:
         """Ask for a frame rate and return the driver's, None if it has no say in it. Raises DriverError."""
-        parm = abi.StreamParm(type=abi.BUF_TYPE_VIDEO_CAPTURE)
+        parm = abi.StreamParm(type=self._type)
         parm.parm.capture.timeperframe = abi.Fract(1000, round(rate_hz * 1000))
         try:
             fcntl.ioctl(self._fd, abi.VIDIOC_S_PARM, parm)
@@ -231,14 +245,14 @@ class Node:
 
     def current_rate(self) -> float | None:
         """Return the frame rate that is set now, None where the driver does not tell."""
-        parm = abi.StreamParm(type=abi.BUF_TYPE_VIDEO_CAPTURE)
+        parm = abi.StreamParm(type=self._type)
         return _rate(parm) if self._next(abi.VIDIOC_G_PARM, parm) else None
 
     # The stream
 
     def start(self, buffers: int) -> None:
         """Get buffers, queue them all, start. Raises DriverError; `close` gives back what was got."""
-        request = abi.RequestBuffers(count=buffers, type=abi.BUF_TYPE_VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+        request = abi.RequestBuffers(count=buffers, type=self._type, memory=abi.MEMORY_MMAP)
         self.call(abi.VIDIOC_REQBUFS, request, f"give {buffers} buffers")
         if request.count < 2:
             raise StreamFailed(
@@ -247,16 +261,20 @@ class Node:
         for index in range(request.count):
             buffer = self._buffer(index)
             self.call(abi.VIDIOC_QUERYBUF, buffer, f"locate buffer {index}")
+            planes = [(buffer.length, buffer.m.offset)]
+            if self._in_planes:
+                planes = [(plane.length, plane.m.mem_offset) for plane in self._planes[: buffer.length]]
             try:
                 self._maps.append(
-                    mmap.mmap(
-                        self._fd, buffer.length, mmap.MAP_SHARED, mmap.PROT_READ, offset=buffer.m.offset
+                    tuple(
+                        mmap.mmap(self._fd, length, mmap.MAP_SHARED, mmap.PROT_READ, offset=offset)
+                        for length, offset in planes
                     )
                 )
             except OSError as error:
                 raise self.failure(error, f"map buffer {index}") from None
             self.queue(index)
-        on = ctypes.c_int32(abi.BUF_TYPE_VIDEO_CAPTURE)
+        on = ctypes.c_int32(self._type)
         self.call(abi.VIDIOC_STREAMON, on, "start the stream")
         self._streaming = True
 
@@ -275,11 +293,24 @@ class Node:
             raise self.failure(OSError(number, ""), "give a frame")
         stamp = buffer.timestamp
         stamp_s = stamp.tv_sec + stamp.tv_usec * 1e-6
+        if self._in_planes:
+            planes = tuple(
+                (p.data_offset, p.bytesused) for p in self._planes[: len(self._maps[buffer.index])]
+            )
+            used_bytes = sum(end - begin for begin, end in planes)
+            return Dequeued(buffer.index, used_bytes, buffer.flags, buffer.sequence, stamp_s, planes)
         return Dequeued(buffer.index, buffer.bytesused, buffer.flags, buffer.sequence, stamp_s)
 
     def bytes_of(self, buffer: Dequeued) -> memoryview:
-        """Return a dequeued buffer's bytes, in the driver's own memory: good until it is queued again."""
-        return memoryview(self._maps[buffer.number])[: buffer.used_bytes]
+        """Return a dequeued buffer's bytes, in the driver's own memory: good until it is queued again.
+
+        Of several planes they are joined, one after the other, in memory of their own.
+        """
+        maps = self._maps[buffer.number]
+        if not buffer.planes:
+            return memoryview(maps[0])[: buffer.used_bytes]
+        parts = [memoryview(m)[begin:end] for m, (begin, end) in zip(maps, buffer.planes, strict=True)]
+        return parts[0] if len(parts) == 1 else memoryview(b"".join(parts))
 
     def check_there(self) -> None:
         """Raise NoCamera if the camera was unplugged."""
@@ -293,7 +324,10 @@ class Node:
             raise self.failure(error, what) from None
 
     def _buffer(self, index: int) -> abi.Buffer:
-        return abi.Buffer(index=index, type=abi.BUF_TYPE_VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+        buffer = abi.Buffer(index=index, type=self._type, memory=abi.MEMORY_MMAP)
+        if self._in_planes:
+            buffer.m.planes, buffer.length = ctypes.addressof(self._planes), abi.MAX_PLANES
+        return buffer
 
     def _next(self, request: int, entry: ctypes.Structure) -> bool:
         """Fill one entry of an enumeration; False at its end."""
@@ -316,7 +350,7 @@ class Node:
         flags = found.capabilities
         flags = found.device_caps if flags & abi.CAP_DEVICE_CAPS else flags
         driver, card, bus = (f.decode(errors="replace") for f in (found.driver, found.card, found.bus_info))
-        if not flags & abi.CAP_VIDEO_CAPTURE or not flags & abi.CAP_STREAMING:
+        if not flags & _CAPTURES or not flags & abi.CAP_STREAMING:
             raise NotACamera(f"{self.path} ({card}) {_what_else(flags)}", device=self.name)
         return Identity(driver, card, bus, flags)
 
@@ -329,7 +363,7 @@ class Node:
         return StreamFailed(f"{self.path} does not {what}: {os.strerror(error.errno or 0)}", device=self.name)
 
     def _unmap(self) -> None:
-        for mapping in self._maps:
+        for mapping in chain.from_iterable(self._maps):
             with contextlib.suppress(BufferError):  # somebody still looks at a frame: it goes with that
                 mapping.close()
         self._maps = []
@@ -379,16 +413,20 @@ def _what_else(flags: int) -> str:
     """What a node is that gives no pictures."""
     if flags & abi.CAP_META_CAPTURE:
         return "is a metadata node; the pictures come from the camera's other node"
-    if flags & abi.CAP_VIDEO_CAPTURE_MPLANE:
-        return "captures in several planes, which this driver does not read"
     if flags & abi.CAP_VIDEO_OUTPUT:
         return "is a video output, it gives no pictures"
-    if flags & abi.CAP_VIDEO_CAPTURE:
+    if flags & _CAPTURES:
         return "cannot stream"
     return "is no camera: it captures no video"
 
 
 def _picture_format(answer: abi.Format) -> PictureFormat:
+    if answer.type == abi.BUF_TYPE_VIDEO_CAPTURE_MPLANE:
+        several = answer.fmt.pix_mp
+        lengths = tuple(plane.sizeimage for plane in several.plane_fmt[: several.num_planes])
+        size_px, stride_bytes = (several.width, several.height), several.plane_fmt[0].bytesperline
+        code = abi.fourcc_text(several.pixelformat)
+        return PictureFormat(code, size_px, stride_bytes, sum(lengths), several.field, lengths)
     pix = answer.fmt.pix
     code = abi.fourcc_text(pix.pixelformat)
     return PictureFormat(code, (pix.width, pix.height), pix.bytesperline, pix.sizeimage, pix.field)

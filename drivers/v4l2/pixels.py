@@ -53,6 +53,7 @@ FORMATS = MappingProxyType(
         "YUYV": Layout("yuyv"),
         "UYVY": Layout("uyvy"),
         "NV12": Layout("nv12"),
+        "NM12": Layout("nv12"),  # luma and chroma in planes of their own
         "MJPG": Layout("jpeg"),
         "JPEG": Layout("jpeg"),
         "BA81": Layout("bayer", 8, "BGGR"),
@@ -158,10 +159,15 @@ def colour(format: PictureFormat, raw: NDArray[np.uint8]) -> Image:
         code = cv2.COLOR_YUV2BGR_UYVY if layout.kind == "uyvy" else cv2.COLOR_YUV2BGR_YUY2
         return _image(cv2.cvtColor(_rows(format, raw, 2), code))
     if layout.kind == "nv12":
-        width = format.size_px[0]
+        width, height = format.size_px
         stride = _stride(format, width)
-        planes = raw[: least_bytes(format)].reshape(-1, stride)[:, :width]
-        return _image(cv2.cvtColor(np.ascontiguousarray(planes), cv2.COLOR_YUV2BGR_NV12))
+        least = stride * height
+        # The first plane of several may be padded at its end, as `whole_lengths` allows.
+        padded = len(format.planes_bytes) > 1 and len(raw) == format.length_bytes
+        luma, chroma = raw[:least], raw[format.planes_bytes[0] if padded else least :]
+        chroma = chroma[: stride * ((height + 1) // 2)].reshape(-1, stride // 2, 2)[:, : width // 2]
+        luma = luma.reshape(height, stride)[:, :width]
+        return _image(cv2.cvtColorTwoPlane(luma, chroma, cv2.COLOR_YUV2BGR_NV12))
     samples = _samples(format, layout, raw)
     if layout.kind == "bayer":
         return _image(cv2.cvtColor(samples, getattr(cv2, f"COLOR_Bayer{layout.order}2BGR")))

@@ -18,12 +18,13 @@ from pathlib import Path
 INIT = Path(__file__).resolve().parents[2] / "hil_tests" / "vm" / "init"
 
 CAMERAS = {
-    "webcams": "n_devs=2 node_types=0x20001,0x1 num_inputs=1,1 input_types=0x0,0x0",
+    "webcams": "n_devs=2 node_types=0x20001,0x1 num_inputs=1,1 input_types=0x0,0x0 multiplanar=1,2",
     "hdmi": "n_devs=2 node_types=0x101,0x101 num_inputs=1,1 input_types=0x3,0x3 "
     "num_outputs=1,1 output_types=0x1,0x1",
     "three": "n_devs=3 node_types=0x1,0x1,0x1 num_inputs=1,1,1 input_types=0x3,0x3,0x3",
 }
-"""Layouts of the virtual cameras, as options of vivid: two webcams, the first with a metadata node; two HDMI
+"""Layouts of the virtual cameras, as options of vivid: two webcams, the first with a metadata
+node, the second multi-planar; two HDMI
 inputs, each with an output that can be looped into it; or three HDMI inputs."""
 
 

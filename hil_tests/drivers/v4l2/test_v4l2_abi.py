@@ -14,6 +14,9 @@ SIZES = {
     "FrmSizeEnum": 44,
     "FrmIvalEnum": 52,
     "PixFormat": 48,
+    "PlanePixFormat": 20,
+    "PixFormatMplane": 192,
+    "Plane": 64,
     "Format": 208,
     "CaptureParm": 40,
     "StreamParm": 204,
@@ -70,6 +73,8 @@ def test_fields_lie_where_c_puts_them() -> None:
         72,
     )
     assert abi.Format.fmt.offset == 8
+    assert (abi.PixFormatMplane.plane_fmt.offset, abi.PixFormatMplane.num_planes.offset) == (20, 180)
+    assert abi.Plane.data_offset.offset == 16
 
 
 def test_format_codes_are_the_kernels() -> None:

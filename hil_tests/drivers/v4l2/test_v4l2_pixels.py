@@ -112,6 +112,22 @@ def test_colour_follows_the_standard(code: str, y: int, u: int, v: int) -> None:
     assert (pixels.grey(picture_format(code), raw) == y).all()
 
 
+@pytest.mark.parametrize("padding", [0, 64])
+@pytest.mark.parametrize("stride", [WIDTH, WIDTH + 8])
+def test_planes_of_their_own_show_what_one_plane_shows(stride: int, padding: int) -> None:
+    random = np.random.default_rng(7)
+    rows = random.integers(0, 256, (HEIGHT * 3 // 2, stride), dtype=np.uint8)
+    ends = [rows[:HEIGHT].ravel(), rows[HEIGHT:].ravel()]
+    lengths = tuple(len(plane) + padding for plane in ends)
+    form = PictureFormat("NM12", (WIDTH, HEIGHT), stride, sum(lengths), planes_bytes=lengths)
+    bare = np.ascontiguousarray(rows[:, :WIDTH])
+    for raw in (np.concatenate(ends), np.concatenate([np.pad(plane, (0, padding)) for plane in ends])):
+        assert pixels.wrong_length(form, memoryview(raw)) == ""
+        assert np.array_equal(pixels.grey(form, raw), bare[:HEIGHT])
+        assert np.array_equal(pixels.colour(form, raw), cv2.cvtColor(bare, cv2.COLOR_YUV2BGR_NV12))
+    assert pixels.wrong_length(form, memoryview(raw[:-1])) != ""
+
+
 @pytest.mark.parametrize("code", [c for c, layout in pixels.FORMATS.items() if layout.kind == "bayer"])
 def test_an_evenly_coloured_bayer_picture_has_that_colour(code: str) -> None:
     colour = {"R": 200, "G": 120, "B": 40}

@@ -28,6 +28,14 @@ def frame_of(camera: V4l2Camera) -> np.ndarray:
     return camera.next_frame(time.monotonic(), 5.0).image
 
 
+def picture(code: str, index: int, **more: object) -> np.ndarray:
+    camera = open_camera(options(index, format=code, **{"colour": True, **more}), name="left")
+    try:
+        return frame_of(camera)
+    finally:
+        camera.close()
+
+
 @pytest.mark.parametrize("size_px", SIZES)
 @pytest.mark.parametrize("code", ["YUYV", "GREY"])
 def test_sizes_come_as_asked(code: str, size_px: tuple[int, int]) -> None:
@@ -40,11 +48,7 @@ def test_sizes_come_as_asked(code: str, size_px: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("code", UNCOMPRESSED)
 def test_every_format_shows_the_colour_bars(code: str) -> None:
-    camera = open_camera(options(format=code, colour=True), name="left")
-    try:
-        image = frame_of(camera)
-    finally:
-        camera.close()
+    image = picture(code, index=1 if code == "NM12" else 0)
     assert image.shape == (480, 640, 3)
     bars = image[240, 40::80].astype(int)  # the middles of eight bars: white, yellow, cyan ... black
     grey = pixels.FORMATS[code].kind == "grey"
@@ -80,6 +84,13 @@ def test_luma_is_the_same_to_the_last_bit_as_opencv_reads_it() -> None:
     opened.release()
     assert good
     assert np.array_equal(ours, np.asarray(theirs).reshape(480, 640, 2)[..., 0])
+
+
+@pytest.mark.parametrize("colour", [False, True])
+def test_two_planes_show_what_one_shows(colour: bool) -> None:
+    pictures = [picture(code, 1, colour=colour, size_px=[640, 360]) for code in ("NV12", "NM12")]
+    assert np.array_equal(*pictures)
+    assert pictures[0].std() > 40  # bars, not an empty buffer
 
 
 def test_a_format_that_the_camera_lacks_is_told_with_those_it_has() -> None:

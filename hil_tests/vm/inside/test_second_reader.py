@@ -22,23 +22,23 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def by_v4l2_ctl(file: Path, code: str, size_px: tuple[int, int]) -> NDArray[np.uint8]:
+def by_v4l2_ctl(file: Path, code: str, size_px: tuple[int, int], index: int = 0) -> NDArray[np.uint8]:
     """The bytes of the tenth frame of a stream that v4l2-ctl takes, in the size and format set by it."""
-    node = next(camera.node for camera in find.list_cameras() if camera.bus == BUS[0])
+    node = next(camera.node for camera in find.list_cameras() if camera.bus == BUS[index])
     size = f"width={size_px[0]},height={size_px[1]}"
     done = subprocess.run(
         ["v4l2-ctl", "-d", str(node), f"--set-fmt-video={size},pixelformat={code.ljust(4)}",
-         "--set-parm=25", "--stream-mmap=4", "--stream-skip=9", "--stream-count=1", f"--stream-to={file}"],
+         "--stream-mmap=4", "--stream-skip=9", "--stream-count=1", f"--stream-to={file}"],
         capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return np.fromfile(file, np.uint8)
 
 
-def our_bytes(count: int, **more: object) -> list[NDArray[np.uint8]]:
+def our_bytes(count: int, index: int = 0, **more: object) -> list[NDArray[np.uint8]]:
     """The bytes of some frames one after the other, as our capture thread holds them."""
     capture = Capture(
-        parse_options(options(**more), "left"), "left", SystemClock(), lambda format, data: data.copy()
+        parse_options(options(index, **more), "left"), "left", SystemClock(), lambda format, data: data.copy()
     )
     after_s, found = time.monotonic(), []
     try:
@@ -61,6 +61,16 @@ def test_frames_are_the_same_to_the_last_bit(tmp_path: Path, code: str, pattern:
     ours = our_bytes(1, format=code, size_px=list(size_px), controls={"test_pattern": pattern})[0]
     theirs = by_v4l2_ctl(tmp_path / "frame", code, size_px)
     assert len(np.unique(theirs)) > 1  # a picture, not an empty buffer
+    assert np.array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("code", ["YUYV", "NV12", "NM12"])
+def test_multi_planar_frames_are_the_same_to_the_last_bit(tmp_path: Path, code: str) -> None:
+    size_px = (640, 360)
+    controls = {"test_pattern": "75% Colorbar"}
+    ours = our_bytes(1, 1, format=code, size_px=list(size_px), controls=controls)[0]
+    theirs = by_v4l2_ctl(tmp_path / "frame", code, size_px, 1)
+    assert len(np.unique(theirs)) > 1
     assert np.array_equal(ours, theirs)
 
 
