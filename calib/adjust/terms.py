@@ -186,7 +186,7 @@ def lens_knowledge(model: CameraModel) -> tuple[FloatArray, FloatArray]:
         rows = np.zeros((len(sigma), size))
         if len(sigma):
             rows[:, parameter_part(kind, "D")] = np.diag(1 / sigma)
-        return model.distortion / sigma, rows
+        return (model.distortion / sigma if len(sigma) else sigma), rows
     aside = np.zeros((3, size))
     aside[:, parameter_part(kind, "O")] = tangents(model.O).T / O_SIGMA_RAD
     aside[:, parameter_part(kind, "A")] = -tangents(model.A).T / O_SIGMA_RAD

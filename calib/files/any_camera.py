@@ -48,7 +48,7 @@ from calib.files.twin import (
     twin_error,
 )
 from calib.files.yaml_text import parse_mapping
-from calib.geometry.cahvor import COEFFICIENTS, CameraModel, Kind
+from calib.geometry.cahvor import FREE, SPLINED, CameraModel, Kind
 
 KNOWN_FORMATS = (
     "a mast file, a camera file, a .cahvor file, a PDS3 label, OpenCV's or ROS's YAML, Kalibr's camchain, "
@@ -257,7 +257,7 @@ def _as_cahvor(
     name: str, camera: CameraFile, path: str | Path, limit_px: float
 ) -> tuple[CameraFile, tuple[TwinError, ...]]:
     """The camera, or its nearest twin of the CAHV family and how near that is."""
-    if camera.model.kind not in COEFFICIENTS:
+    if camera.model.kind not in FREE:
         return camera, ()
     try:
         with np.errstate(all="ignore"):
@@ -317,6 +317,8 @@ def _save_twins(
 def _nearest(model: CameraModel, to: str, lens: str, path: str | Path) -> tuple[str, CameraModel, TwinError]:
     """Lens, twin and error: the camera itself where the format holds it, else the plainest lens that is good
     enough, else the nearest of them."""
+    if model.kind == SPLINED and to == "mrcal" and not lens and abs(model.camera_matrix[0, 1]) < 1e-9:
+        return "splined", model, twin_error(model, model)
     for name in (lens,) if lens else _HELD[to]:
         if name in LENSES and model.kind != "CAHV" and (same := held_as(model, LENSES[name])) is not None:
             return name, same, twin_error(model, same)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -19,7 +19,8 @@ from calib.errors import BadFile
 from calib.files import LARGEST_IMAGE_PX, TOLD_SHIFT_PX, CameraFile, build_model, digest_of, read_bytes
 from calib.files.atomic import save_bytes
 from calib.files.yaml_text import MAX_BYTES, Section, dump_mapping, kind_of, parse_mapping
-from calib.geometry.cahvor import COEFFICIENTS, KINDS, CameraModel, Kind
+from calib.geometry.cahvor import COEFFICIENTS, FREE, KINDS, SPLINED, CameraModel, Kind
+from calib.geometry.lenses.spline import SplineGrid
 from calib.geometry.rig import MOST_HARMONICS, AxisJoint, JointErrors, Mast, Rig, RigCamera
 
 MAST_SCHEMA = "mastctl/mast/1"
@@ -33,7 +34,7 @@ _ROUNDED, _NO_ROTATION = 1e-15, 1e-3
 _MODEL_KEYS = ("size_px", "model", "C")
 CAHVORE_KEYS = ("A", "H", "V", "O", "R", "E", "type", "linearity")
 OPENCV_KEYS = ("camera_matrix", "distortion", "rotation")
-_MODEL_OPTIONS = (*CAHVORE_KEYS, *OPENCV_KEYS)
+_MODEL_OPTIONS = (*CAHVORE_KEYS, *OPENCV_KEYS, "spline")
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,8 +173,8 @@ def _model(section: Section) -> tuple[CameraModel, tuple[str, ...]]:
     """Read the keys of one camera model."""
     kind = cast(Kind, section.choice("model", KINDS))
     size = section.integers("size_px", 2, 1, LARGEST_IMAGE_PX)
-    opencv = kind in COEFFICIENTS
-    for key in CAHVORE_KEYS if opencv else OPENCV_KEYS:
+    opencv = kind in FREE
+    for key in (*(CAHVORE_KEYS if opencv else OPENCV_KEYS), *(("spline",) if kind != SPLINED else ())):
         if key in section:
             raise section.bad(key, f"{kind} has no '{key}'; another 'model' has it")
     if opencv:
@@ -216,12 +217,14 @@ def build_opencv(
     BadFile
         If a key is missing or the numbers are no camera.
     """
-    for key in OPENCV_KEYS:
+    for key in (*OPENCV_KEYS, *(("spline",) if kind == SPLINED else ())):
         if key not in section:
             raise section.bad(key, f"the key is missing; {kind} has it")
     matrix = section.rows("camera_matrix", 3, 3)
     given = section.rows("rotation", 3, 3, 1.001)
-    distortion = section.vector("distortion", 1e6, COEFFICIENTS[kind])
+    grid = _spline(section) if kind == SPLINED else None
+    count = COEFFICIENTS[kind] if grid is None else 2 * grid.columns * grid.rows
+    distortion = section.vector("distortion", 1e6, count)
     rotation, notes = given, tuple[str, ...]()
     if np.abs(given @ given.T - np.eye(3)).max() > _ROUNDED:
         turn, _, other = np.linalg.svd(given)
@@ -230,7 +233,7 @@ def build_opencv(
     if not off < _NO_ROTATION or np.linalg.det(rotation) < 0.0:
         raise section.bad("rotation", f"{given.tolist()} where a rotation is expected")
     try:
-        model = CameraModel.of_matrix(kind, size_px, matrix, distortion, rotation, section.vector("C"))
+        model = CameraModel.of_matrix(kind, size_px, matrix, distortion, rotation, section.vector("C"), grid)
     except (ValueError, ArithmeticError) as error:
         raise section.bad("", f"is no usable camera: {error}") from None
     if not model.project(model.C + model.A)[1]:
@@ -241,10 +244,22 @@ def build_opencv(
     return model, notes
 
 
+def _spline(section: Section) -> SplineGrid:
+    """Read how a camera's control points stand."""
+    inner = section.section("spline", ("order", "columns", "rows", "fov_x_deg"))
+    columns, rows = (inner.integer(key, 3, 1000) for key in ("columns", "rows"))
+    try:
+        return SplineGrid(inner.integer("order", 2, 3), columns, rows, inner.number("fov_x_deg", 360.0))
+    except ValueError as error:
+        raise section.bad("spline", str(error)) from None
+
+
 def _model_keys(model: CameraModel) -> dict[str, Any]:
     """Return one camera model's keys in the order of docs/reference/configuration.md."""
     keys: dict[str, Any] = {"size_px": list(model.size_px), "model": model.kind}
-    if model.kind in COEFFICIENTS:
+    if model.spline is not None:
+        keys["spline"] = asdict(model.spline)
+    if model.kind in FREE:
         return keys | {"C": model.C, **{key: getattr(model, key) for key in OPENCV_KEYS}}
     keys.update({letter: getattr(model, letter) for letter in model.letters})
     if model.kind == "CAHVORE":

@@ -45,13 +45,17 @@ from calib.files.opencv_ros import (
 )
 from calib.files.twin import FISHEYE, LensFamily
 from calib.files.yaml_text import kind_of, parse_mapping
-from calib.geometry.cahvor import COEFFICIENTS, CameraModel, Kind
+from calib.geometry.cahvor import FREE, SPLINED, CameraModel, Kind
+from calib.geometry.lenses.spline import SplineGrid
 from calib.geometry.rigid import Rigid
 
 UNKNOWN_FRAME = "unknown"
 _INPUTS = re.compile(rb"""['"]optimization_inputs['"]\s*:\s*b(?:'[^']*'|"[^"]*")\s*,?""")
 _BEGINS = re.compile(rb"(?:\s|#[^\n]*\n)*\{")
 _CAHVORE = re.compile(r"LENSMODEL_CAHVORE_linearity=([-+0-9.eE]+)")
+_SPLINED = re.compile(
+    r"LENSMODEL_SPLINED_STEREOGRAPHIC_order=([0-9]{1,2})_Nx=([0-9]{1,4})_Ny=([0-9]{1,4})_fov_x_deg=([0-9.]{1,12})"
+)
 _OPENCV = {"LENSMODEL_PINHOLE": 0} | {f"LENSMODEL_OPENCV{count}": count for count in (4, 5, 8, 12)}
 _MRCAL_READ = (
     "lensmodel",
@@ -93,8 +97,26 @@ def parse_mrcal(data: bytes, path: str | Path) -> CameraFile:
             top, "pinhole", (width, height), matrix_of(numbers[:4]), numbers[4:], frame_from_camera
         )
         return as_camera_file(camera, top, UNKNOWN_FRAME, digest_of(data), notes)
+    if (spline := _SPLINED.fullmatch(name)) is not None:
+        model = _splined(top, spline, (width, height), frame_from_camera)
+        return as_camera_file(model, top, UNKNOWN_FRAME, digest_of(data), notes)
     model, model_notes = _cahvor(top, name, (width, height), frame_from_camera)
     return CameraFile(model, UNKNOWN_FRAME, {}, {}, (*notes, *model_notes), Path(path), digest_of(data))
+
+
+def _splined(
+    top: Loose, match: re.Match[str], size_px: tuple[int, int], frame_from_camera: Rigid
+) -> CameraModel:
+    """The camera of LENSMODEL_SPLINED_STEREOGRAPHIC."""
+    try:
+        grid = SplineGrid(int(match[1]), int(match[2]), int(match[3]), float(match[4]))
+        numbers = top.vector("intrinsics", count=4 + 2 * grid.columns * grid.rows)
+        pose = frame_from_camera
+        return CameraModel.of_matrix(
+            SPLINED, size_px, matrix_of(numbers[:4]), numbers[4:], pose.rotation.T, pose.translation_m, grid
+        )
+    except ValueError as error:
+        raise top.bad("lensmodel", str(error)) from None
 
 
 def _cahvor(
@@ -104,7 +126,8 @@ def _cahvor(
     match = _CAHVORE.fullmatch(name)
     if name != "LENSMODEL_CAHVOR" and match is None:
         expected = (
-            "PINHOLE, OPENCV4, 5, 8 or 12, CAHVOR or CAHVORE (mrcal-convert-lensmodel makes one of others)"
+            "PINHOLE, OPENCV4, 5, 8 or 12, SPLINED_STEREOGRAPHIC, CAHVOR or CAHVORE "
+            "(mrcal-convert-lensmodel makes one of others)"
         )
         raise top.bad("lensmodel", f"{kind_of(name)} where LENSMODEL_{expected} is expected")
     numbers = top.vector("intrinsics", count=12 if match else 9)
@@ -139,8 +162,11 @@ def _cahvor(
 
 def format_mrcal(camera: CameraModel, frame: str) -> bytes:
     """Return a camera as a .cameramodel; its H and V are at right angles."""
-    if camera.kind in COEFFICIENTS:
+    if camera.kind in FREE:
         name, pose = f"LENSMODEL_{camera.kind}", lens_pose(camera)
+        if camera.spline is not None:
+            grid = camera.spline
+            name += f"_order={grid.order}_Nx={grid.columns}_Ny={grid.rows}_fov_x_deg={grid.fov_x_deg:g}"
         numbers = [*camera.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *camera.distortion]
     else:
         name, numbers, pose = _numbers_of(camera)

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.geometry.cahvor import COEFFICIENTS, CameraModel, Kind
+from calib.geometry.cahvor import COEFFICIENTS, FREE, SPLINED, CameraModel, Kind
 from calib.geometry.parameters import parameter_names, parameter_part, predict, stepped
 from calib.geometry.rigid import FloatArray, Rigid, moved_rigid, tangents
 
@@ -201,12 +201,12 @@ def nearest_opencv(model: CameraModel, kind: Kind) -> CameraModel:
 
 def _plain_start(model: CameraModel, kind: Kind) -> CameraModel:
     """A camera of the kind to begin with: axes, focal lengths and the first coefficients of the model."""
-    free = model.kind in COEFFICIENTS
+    free = model.kind in FREE
     axes = even_axes(model) if free else lens_axes(model)
     focal = np.array([model.H @ axes[:, 0], model.V @ axes[:, 1]]) * (1.0 + model.R[0]) / (model.A @ model.O)
     center = np.array([model.H @ model.O, model.V @ model.O]) / (model.A @ model.O)
     distortion = np.zeros(COEFFICIENTS[kind])
-    if free and (model.kind == FISHEYE) == (kind == FISHEYE):
+    if free and model.kind != SPLINED and (model.kind == FISHEYE) == (kind == FISHEYE):
         count = min(len(distortion), len(model.distortion))
         distortion[:count] = model.distortion[:count]
     elif not free and (kind == FISHEYE) == (model.cahvore_type == 2):
@@ -244,11 +244,11 @@ def nearest_cahvor(camera: CameraModel) -> CameraModel:
     ValueError
         If fewer than half of the image's pixels have a ray.
     """
-    if camera.kind not in COEFFICIENTS:
+    if camera.kind not in FREE:
         return camera
     pixels, points = _what_it_sees(camera)
     fisheye = camera.kind == FISHEYE
-    r = np.array([0.0, *camera.distortion[:2]])
+    r = np.zeros(3) if camera.kind == SPLINED else np.array([0.0, *camera.distortion[:2]])
     tries: list[tuple[Kind, int]] = (
         [("CAHVORE", 2), ("CAHVORE", 3)] if fisheye else [("CAHVOR", 0), ("CAHVORE", 3)]
     )

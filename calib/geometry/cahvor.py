@@ -25,6 +25,7 @@ from calib.geometry.lens import Lens
 from calib.geometry.lenses.fisheye import FisheyeLens
 from calib.geometry.lenses.opencv import OpencvLens
 from calib.geometry.lenses.projection import FreeLens, FreeProjection
+from calib.geometry.lenses.spline import SplineGrid, SplineLens
 from calib.geometry.projection import PixelMap, Place, Projection, project_as_published
 from calib.geometry.rigid import FloatArray, ReadOnlyArrays, Rigid, frozen_array, tangents, turning
 
@@ -38,12 +39,19 @@ Kind = Literal[
     "OPENCV12",
     "OPENCV14",
     "OPENCV_FISHEYE",
+    "SPLINED_STEREOGRAPHIC",
 ]
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
+SPLINED: Kind = "SPLINED_STEREOGRAPHIC"
+FITTED: tuple[Kind, ...] = tuple(kind for kind in KINDS if kind != SPLINED)
+"""Kinds that pictures are fitted with; splines are read only."""
 
 COEFFICIENTS: dict[str, int] = {f"OPENCV{n}": n for n in (4, 5, 8, 12, 14)} | {"OPENCV_FISHEYE": 4}
 """How many coefficients each of OpenCV's families has."""
+
+FREE: tuple[str, ...] = (*COEFFICIENTS, SPLINED)
+"""Kinds that are a camera matrix with a lens in front."""
 
 _UNIT = 1e-9
 """How far the length of A and O may be from 1."""
@@ -72,7 +80,7 @@ WIDE: tuple[str, ...] = ("CAHVORE", "OPENCV_FISHEYE")
 
 def letters_of(kind: str) -> str:
     """Return the letters of what a kind has numbers for; D stands for OpenCV's coefficients."""
-    return "CAHVD" if kind in COEFFICIENTS else kind
+    return "CAHV" if kind == SPLINED else "CAHVD" if kind in COEFFICIENTS else kind
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +100,10 @@ class CameraModel(ReadOnlyArrays):
         1 (perspective, linearity 1), 2 (fisheye, linearity 0) or 3 (``linearity`` as given); 0 for CAHV
         and CAHVOR.
     distortion
-        (n,) OpenCV's coefficients in its order, 4 to 14 as the kind says; none of the CAHV family.
+        (n,) OpenCV's coefficients in its order, 4 to 14 as the kind says; none of the CAHV family. Of splines
+        the control points' x, y, row after row.
+    spline
+        How the control points stand; None but for SPLINED_STEREOGRAPHIC.
 
     Raises
     ------
@@ -129,6 +140,7 @@ class CameraModel(ReadOnlyArrays):
     cahvore_type: int = 0
     linearity: float = 1.0
     distortion: FloatArray = None  # type: ignore[assignment]  # 0 if not given
+    spline: SplineGrid | None = None
     _rows: FloatArray = field(init=False, repr=False)  # C, H, V, A, and the lens frame's x, y, z = O
     _projection: PixelMap = field(init=False, repr=False)
 
@@ -152,7 +164,7 @@ class CameraModel(ReadOnlyArrays):
         lengths = np.sqrt(np.einsum("ij,ij->i", hva, hva))
         if not lengths.all() or not abs(np.linalg.det(hva / lengths[:, None])) > _FLAT:
             raise ValueError("H, V and A lie in one plane where three directions are expected")
-        free = self.kind in COEFFICIENTS
+        free = self.kind in FREE
         axes = _axes_of(self.A, self.V) if free else np.array([*tangents(self.O), self.O])
         self._set("_rows", np.array([self.C, *hva, *axes]))
         self._rows.setflags(write=False)
@@ -186,6 +198,10 @@ class CameraModel(ReadOnlyArrays):
             raise ValueError(f"the linearity is {linearity} where a finite number is expected")
         self._set("linearity", linearity)
         count = COEFFICIENTS.get(self.kind, 0)
+        if (self.kind == SPLINED) != (self.spline is not None):
+            raise ValueError(f"{SPLINED} has a grid of splines, and no other kind has one")
+        if self.spline is not None:
+            count = 2 * self.spline.columns * self.spline.rows
         given = np.zeros(count) if self.distortion is None else self.distortion
         self._set("distortion", _vector("distortion", given, count))
 
@@ -197,8 +213,11 @@ class CameraModel(ReadOnlyArrays):
         )
         lens: FreeLens
         told, image_slope = tuple(self.distortion.tolist()), _largest_slope(self.size_px, back)
-        fisheye = self.kind == "OPENCV_FISHEYE"
-        lens = FisheyeLens(told, image_slope) if fisheye else OpencvLens(told, image_slope)
+        if self.spline is not None:
+            lens = SplineLens(self.spline, told, image_slope)
+        else:
+            fisheye = self.kind == "OPENCV_FISHEYE"
+            lens = FisheyeLens(told, image_slope) if fisheye else OpencvLens(told, image_slope)
         for matrix in (camera_matrix, back):
             matrix.setflags(write=False)
         self._set("_projection", FreeProjection(lens, camera_matrix, back))
@@ -258,7 +277,7 @@ class CameraModel(ReadOnlyArrays):
             stretched |= not is_unit
         vectors = {"C": C, "H": H, "V": V, "O": None, "R": R, "E": E} | units
         model = cls(kind, size_px, cahvore_type=cahvore_type, linearity=linearity, **vectors)  # type: ignore[arg-type]
-        if not stretched or kind in COEFFICIENTS:
+        if not stretched or kind in FREE:
             return model, 0.0
         x, y = np.meshgrid(*(np.linspace(-0.5, n - 0.5, 17) for n in model.size_px))
         pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
@@ -284,6 +303,7 @@ class CameraModel(ReadOnlyArrays):
         distortion: ArrayLike,
         rotation: ArrayLike,
         C: ArrayLike,
+        spline: SplineGrid | None = None,
     ) -> CameraModel:
         """Return a camera of OpenCV's numbers; they come back from it to the last bit.
 
@@ -301,6 +321,8 @@ class CameraModel(ReadOnlyArrays):
             (3, 3) OpenCV's R: rows are the camera's x right, y down and z ahead in the frame of C.
         C
             (3,) where the camera is, metres: -R^T t of OpenCV's t.
+        spline
+            Of SPLINED_STEREOGRAPHIC: how its control points stand, which are ``distortion``.
 
         Raises
         ------
@@ -323,9 +345,8 @@ class CameraModel(ReadOnlyArrays):
         h, v = matrix[:2] @ axes
         if kind == "CAHV":
             return cls(kind, size_px, _vector("C", C), axes[2], h, v)
-        model = cls(
-            kind, size_px, _vector("C", C), axes[2], h, v, distortion=_vector("distortion", distortion, -1)
-        )
+        numbers = _vector("distortion", distortion, -1)
+        model = cls(kind, size_px, _vector("C", C), axes[2], h, v, distortion=numbers, spline=spline)
         rows = model._rows.copy()
         rows[4:] = axes
         rows.setflags(write=False)
@@ -385,7 +406,7 @@ class CameraModel(ReadOnlyArrays):
     @property
     def rotation(self) -> FloatArray:
         """(3, 3) OpenCV's R: rows are x right, y down (as V says) and z along A, in the model's frame."""
-        return self._axes if self.kind in COEFFICIENTS else _axes_of(self.A, self.V)
+        return self._axes if self.kind in FREE else _axes_of(self.A, self.V)
 
     @property
     def image_center_px(self) -> tuple[float, float]:
@@ -426,9 +447,11 @@ class CameraModel(ReadOnlyArrays):
         """Return the camera whose lens bends otherwise: R1 or R2, OpenCV's k1 or k2, larger by ``by``.
 
         ``place`` is 0 for the term that grows with the square of the slope, 1 for that of its fourth power.
-        A CAHV camera stays what it is.
+        A CAHV camera and one of splines stay what they are.
         """
-        if self.kind in COEFFICIENTS:
+        if self.kind == SPLINED:
+            return self
+        if self.kind in FREE:
             return replace(self, distortion=self.distortion + by * np.eye(len(self.distortion))[place])
         return replace(self, R=self.R + by * np.eye(3)[place + 1])
 
@@ -441,7 +464,7 @@ class CameraModel(ReadOnlyArrays):
     @property
     def axes(self) -> FloatArray:
         """(3, 3): columns are x right, y down and z along A, in the model's frame."""
-        if self.kind in COEFFICIENTS:
+        if self.kind in FREE:
             return self._axes.T
         across = self.H - (self.H @ self.A) * self.A
         x = across / np.linalg.norm(across)

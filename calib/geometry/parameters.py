@@ -178,9 +178,10 @@ def _predict_free(model: CameraModel, lens: FreeLens, points_m: FloatArray) -> P
         d_step[:, 0, parameter_part(kind, "H")] = q
         d_step[..., parameter_part(kind, "V")] = (d_turn @ z)[..., None] * (-x / fy)
         d_step[:, 1, parameter_part(kind, "V")] += q
-        d_step[..., parameter_part(kind, "D")] = np.einsum(
-            "ij,jkn->nik", matrix[:2, :2], lens.coefficient_rates(local)
-        )
+        if "D" in model.letters:
+            d_step[..., parameter_part(kind, "D")] = np.einsum(
+                "ij,jkn->nik", matrix[:2, :2], lens.coefficient_rates(local)
+            )
     if not valid.all():
         for array in (pixels, d_step, d_points):
             array[~valid] = np.nan

@@ -21,7 +21,7 @@ from calib.files import LARGEST_IMAGE_PX, digest_of, read_bytes
 from calib.files.mast_file import CAMERA_NAME, CAMERA_NAME_WORDS
 from calib.files.tables import NUMBER, check_header
 from calib.files.yaml_text import MAX_BYTES, Section, nearest, parse_mapping
-from calib.geometry.cahvor import KINDS, Kind
+from calib.geometry.cahvor import FITTED, Kind
 from calib.geometry.rigid import FloatArray
 from calib.survey.records import Sigma, SurveyCamera, SurveyImage
 from calib.targets.boards import Board
@@ -394,7 +394,7 @@ def cameras_of(top: Section) -> dict[str, SurveyCamera]:
             name=name,
             on=cast(Literal["head", "rover"], section.choice("on", ("head", "rover"))),
             size_px=(width, height),
-            kind=cast(Kind, section.choice("model", KINDS)),
+            kind=cast(Kind, section.choice("model", FITTED)),
             focal_px=section.positive("focal_px", FURTHEST_M),
             **camera,
         )

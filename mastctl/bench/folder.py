@@ -13,6 +13,7 @@ from typing import Any, cast
 from calib.errors import BadFile
 from calib.files.atomic import replace_bytes
 from calib.files.mast_file import load_rig
+from calib.geometry.cahvor import SPLINED
 from calib.geometry.rig import Rig
 from calib.plan.placements import Placement
 from calib.survey.records import Approach, Sigma, Survey, SurveyCamera, SurveyImage
@@ -191,7 +192,7 @@ def survey_cameras(rig: Rig, names: Mapping[str, tuple[int, int]]) -> dict[str, 
         held = rig.cameras[name]
         model = held.model
         focal_px = model.focal_px[0]
-        kind = "CAHVOR" if model.kind == "CAHV" else model.kind
+        kind = {"CAHV": "CAHVOR", SPLINED: "OPENCV8"}.get(model.kind, model.kind)
         cameras[name] = SurveyCamera(name, held.on, size_px, cast(Any, kind), round(focal_px, 1))
     return cameras
 

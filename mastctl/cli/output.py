@@ -205,10 +205,10 @@ def add_model(parser: Any) -> None:
 
 def _model_kind(text: str) -> str:
     """Return a camera model's name as files have it; argparse tells the refusal."""
-    from calib.geometry.cahvor import KINDS
+    from calib.geometry.cahvor import FITTED
 
-    if text.upper() not in KINDS:
-        known = ", ".join(kind.lower() for kind in KINDS)
+    if text.upper() not in FITTED:
+        known = ", ".join(kind.lower() for kind in FITTED)
         raise argparse.ArgumentTypeError(f"'{text}' is not a camera model; known are {known}")
     return text.upper()
 

@@ -13,7 +13,7 @@ from typing import Any
 from calib.errors import BadFile
 from calib.files import mast_file
 from calib.files.yaml_text import dump_mapping, parse_mapping
-from calib.geometry.cahvor import COEFFICIENTS
+from calib.geometry.cahvor import COEFFICIENTS, SPLINED
 from calib.survey.folder import SCHEMA as SURVEY_SCHEMA
 from calib.survey.reader import read_survey
 from calib.targets import board_file
@@ -259,7 +259,7 @@ def _by(holder: Schema, key: str, cases: Mapping[str, Mapping[str, Schema]]) -> 
 def _model(found: Schema) -> Schema:
     """Which keys a camera model has."""
     zero = vector({"const": 0}, 3)
-    others = dict.fromkeys(mast_file.OPENCV_KEYS, False)
+    others = dict.fromkeys((*mast_file.OPENCV_KEYS, "spline"), False)
     fixed = {"type": False, "linearity": False}
     cases: list[tuple[str, list[str], Schema]] = [
         ("CAHV", list("AHV"), {"R": zero, "E": zero, **fixed, **others}),
@@ -268,8 +268,10 @@ def _model(found: Schema) -> Schema:
     ]
     for kind, count in COEFFICIENTS.items():
         lens = {"distortion": {"minItems": count, "maxItems": count}}
-        own = {**dict.fromkeys(mast_file.CAHVORE_KEYS, False), **lens}
+        own = {**dict.fromkeys((*mast_file.CAHVORE_KEYS, "spline"), False), **lens}
         cases.append((kind, list(mast_file.OPENCV_KEYS), own))
+    own = dict.fromkeys(mast_file.CAHVORE_KEYS, False)
+    cases.append((SPLINED, [*mast_file.OPENCV_KEYS, "spline"], own))
     _by(found, "model", {kind: then for kind, _, then in cases})
     for case, (_, needed, _) in zip(found["allOf"], cases, strict=True):
         case["then"]["required"] = needed

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.geometry.cahvor import CameraModel
+from calib.geometry.cahvor import SPLINED, CameraModel
 from calib.geometry.rig import JOINTS_NAMES, UNKNOWN, Approach, Rig, RigCamera, joints_of
 from calib.geometry.rig import joint_numbers_of as joint_numbers
 from calib.geometry.rigid import FloatArray
@@ -127,7 +127,7 @@ def terms_of(rig: Rig, views: Sequence[SceneView]) -> tuple[Term, ...]:
         camera = f"cameras.{name}"
         found.append(Term(tuple(f"{camera}.turn.{axis}" for axis in "xyz"), f"{name} turned in the head"))
         found.append(Term((f"{camera}.scale",), f"{name} has another focal length"))
-        if rig.cameras[name].model.kind != "CAHV":
+        if rig.cameras[name].model.kind not in ("CAHV", SPLINED):
             found.append(Term((f"{camera}.r1",), f"{name}'s lens bends otherwise"))
     found.append(Term(("mast.axis_twist_rad",), "the tilt axis leans against the pan axis"))
     rests = {view.pose: (view.pan_rad, view.tilt_rad, *view.approach) for view in views}

@@ -113,6 +113,22 @@ def test_a_camera_of_mrcal_projects_as_mrcal_does(case: dict[str, Any]) -> None:
     np.testing.assert_allclose(pixels, case["pixels_px"], atol=MRCAL_PX)
 
 
+@pytest.mark.parametrize("case", VECTORS["lenses"], ids=lambda case: case["name"])
+def test_a_lens_of_mrcal_is_kept_as_it_is_in_every_file(case: dict[str, Any], tmp_path: Path) -> None:
+    camera = parse_mrcal(case["text"].encode(), "x.cameramodel")
+    assert case["name"].startswith(camera.model.kind)
+    pixels = np.array(case["pixels_px"])
+    np.testing.assert_allclose(camera.model.project(np.array(case["points_m"]))[0], pixels, atol=1e-9)
+    for name in ("x.yaml", "y.cameramodel"):
+        assert save_any(camera, tmp_path / name).worst_px < 1e-9
+        again = load_any(tmp_path / name)
+        assert isinstance(again, CameraFile) and again.model.kind == camera.model.kind
+        rays = again.model.ray(pixels)
+        assert rays.valid.all()
+        seen, _ = camera.model.project(rays.origins_m + 5.0 * rays.directions)
+        np.testing.assert_allclose(seen, pixels, atol=1e-9)
+
+
 @pytest.mark.parametrize("case", VECTORS["written"], ids=lambda case: case["camera"] + case["lens"])
 def test_mrcal_reads_what_is_written_for_it(case: dict[str, Any], tmp_path: Path) -> None:
     """The numbers of the text may differ in the last digit; what they project to may not."""

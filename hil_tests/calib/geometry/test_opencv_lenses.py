@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.errors import Unreachable
-from calib.geometry.cahvor import CameraModel, Kind
+from calib.geometry.cahvor import SPLINED, CameraModel, Kind
+from calib.geometry.lenses.spline import SplineGrid
 from calib.geometry.parameters import parameter_names, predict, stepped
 from calib.geometry.pointing import solve
 from calib.geometry.rig import Mast
@@ -188,6 +189,34 @@ def test_pointing_brings_a_target_onto_the_pixel_by_cv2(kind: Kind) -> None:
         rover_from_head = mast.rover_from_mast @ mast.mast_from_head(best.pan_rad, best.tilt_rad)
         in_rover = model.moved(rover_from_head)
         np.testing.assert_allclose(cv2_pixels(in_rover, target[None])[0], pixel, atol=1e-8)
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_splines_have_the_derivatives_of_small_steps_and_come_back(order: int) -> None:
+    """mrcal's own numbers are in hil_tests/calib/files/mrcal_vectors.json."""
+    grid = SplineGrid(order, 9, 7, 130.0)
+    control = 0.02 * np.random.default_rng(order).normal(size=2 * 9 * 7)
+    model = CameraModel.of_matrix(SPLINED, SIZE, MATRIX, control, np.eye(3), np.zeros(3), grid)
+    model = model.moved(Rigid(Rotation.from_rotvec([0.3, -1.1, 0.4]).as_matrix(), np.array([0.3, -0.2, 1.1])))
+    pixels = pixels_over(count=200)
+    rays, d_directions, _ = model.ray_jacobian(pixels)
+    assert rays.valid.all()
+    points = rays.origins_m + 4.0 * rays.directions
+    seen, jacobian, _ = model.project_jacobian(points)
+    np.testing.assert_allclose(seen, pixels, atol=EXACT_PX)
+    for axis, bit in enumerate(1e-6 * np.eye(3)):
+        rate = (model.project(points + bit)[0] - model.project(points - bit)[0]) / 2e-6
+        np.testing.assert_allclose(jacobian[..., axis], rate, atol=1e-4)
+    for axis, bit in enumerate(1e-3 * np.eye(2)):
+        rate = (model.ray(pixels + bit).directions - model.ray(pixels - bit).directions) / 2e-3
+        np.testing.assert_allclose(d_directions[..., axis], rate, atol=1e-7)
+    steps = predict(model, points).d_step
+    for at, bit in enumerate(1e-6 * np.eye(len(parameter_names(SPLINED)))):
+        rate = (stepped(model, bit).project(points)[0] - stepped(model, -bit).project(points)[0]) / 2e-6
+        np.testing.assert_allclose(steps[..., at], rate, atol=1e-3)
+    edge = model.C + model.moved(Rigid.identity()).rotation.T @ [3.0, 0.0, 1.0]
+    assert not model.project(edge)[1]
+    assert "the splines end 65.0 degrees" in model.why_no_ray
 
 
 @pytest.mark.parametrize("count", [1, 3, 6, 9, 20])
