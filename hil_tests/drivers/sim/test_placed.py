@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig
-from calib.geometry.cahvor import CameraModel
+from calib.geometry.cahvor import CameraModel, Kind
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Mast
 from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions
 from drivers.sim.placed import check_clear_of
@@ -73,8 +75,8 @@ def picture(placed: Scene) -> np.ndarray:
         renderer.close()
 
 
-def seen_px(board: dict[str, Any], ground_z_m: float, flat_m: np.ndarray) -> np.ndarray:
-    """Pixels (n, 2) of points (n, 2) of a face, right of and above its lower edge's middle; by OpenCV.
+def on_board_m(board: dict[str, Any], ground_z_m: float, flat_m: np.ndarray) -> np.ndarray:
+    """Points (n, 3) of points (n, 2) of a face, right of and above its lower edge's middle; by OpenCV.
 
     The board lies face up with its top to the north, is raised about its lower edge, then turned.
     """
@@ -84,6 +86,12 @@ def seen_px(board: dict[str, Any], ground_z_m: float, flat_m: np.ndarray) -> np.
     turn = board["heading_rad"] - math.pi
     points = points @ cv2.Rodrigues(np.array([0.0, 0.0, turn]))[0].T
     points += [board["x_m"], board["y_m"], ground_z_m - board["raised_m"]]
+    return points
+
+
+def seen_px(board: dict[str, Any], ground_z_m: float, flat_m: np.ndarray) -> np.ndarray:
+    """Pixels (n, 2) of such points in ``picture``, by OpenCV."""
+    points = on_board_m(board, ground_z_m, flat_m)
     in_camera = (points - EYE_M)[:, [1, 2, 0]]  # right, down, ahead
     matrix = np.array([[FOCAL_PX, 0, (SIZE_PX[0] - 1) / 2], [0, FOCAL_PX, (SIZE_PX[1] - 1) / 2], [0, 0, 1]])
     return cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), matrix, None)[0].reshape(-1, 2)
@@ -91,15 +99,69 @@ def seen_px(board: dict[str, Any], ground_z_m: float, flat_m: np.ndarray) -> np.
 
 def test_a_boards_dots_are_where_exact_geometry_puts_them(placed: Scene, picture: np.ndarray) -> None:
     """Centroids of ink against centroids of the projected rims."""
-    spacing, margin, radius = 0.08, 0.08, 0.02
+    reach = int(1.5 * RADIUS_M * FOCAL_PX / 3.7)
+    rims = [seen_px(DOTS, placed.ground_z_m(3.5, -0.9), rim) for rim in dot_rims()]
+    apart = dots_off(picture, rims, reach)
+    assert np.abs(apart).max() < TOLERANCE_PX, np.abs(apart).max(axis=0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "distortion"),
+    [
+        ("OPENCV8", [0.5, 0.1, 0.001, -0.0005, 0.01, 0.8, 0.2, 0.03]),
+        ("OPENCV14", [-0.3, 0.1, 0.002, -0.001, 0.0, 0.0, 0.0, 0.0, 1e-3, -2e-3, 5e-4, 1e-3, 0.02, -0.03]),
+        ("OPENCV_FISHEYE", [-0.02, 0.01, -0.004, 0.0005]),
+    ],
+)
+def test_a_head_camera_with_opencvs_lens_points_and_is_drawn_as_opencv_says(
+    placed: Scene, kind: Kind, distortion: list[float]
+) -> None:
+    """A dot pointed onto a pixel off the middle: where cv2 projects it, and where the picture has its ink."""
+    matrix = np.array([[640.0, 0.0, 405.0], [0.0, 642.0, 296.0], [0.0, 0.0, 1.0]])
+    rotation = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    model = CameraModel.of_matrix(kind, SIZE_PX, matrix, distortion, rotation, [0.06, -0.1, -0.05])
+    mast = Mast(np.array([0.2, 0.0, -1.1]), np.array([-0.009, -0.018, 0.003]), 0.02, 0.01)
+    ground_z_m = placed.ground_z_m(3.5, -0.9)
+    target = on_board_m(DOTS, ground_z_m, np.array([[0.0, 0.32]]))[0]
+    aim = np.array([230.0, 170.0])
+    best = solve(mast, model, target, aim)[0]
+    rover_from_head = mast.rover_from_head(best.pan_rad, best.tilt_rad)
+    seen = model.moved(rover_from_head)
+    turn, move = cv2.Rodrigues(seen.rotation)[0], -seen.rotation @ seen.C
+
+    def by_cv2(points: np.ndarray) -> np.ndarray:
+        project = cv2.fisheye.projectPoints if kind == "OPENCV_FISHEYE" else cv2.projectPoints
+        return project(points[:, None], turn, move, matrix, np.array(distortion))[0].reshape(-1, 2)
+
+    np.testing.assert_allclose(by_cv2(target[None])[0], aim, atol=1e-8)
+    renderer = Renderer(placed)
+    try:
+        picture = renderer.image(model, rover_from_head, 8)
+    finally:
+        renderer.close()
+    rims = [by_cv2(on_board_m(DOTS, ground_z_m, rim)) for rim in dot_rims()]
+    assert all((rim > 8).all() and (rim < np.array(SIZE_PX) - 8).all() for rim in rims)
+    apart = dots_off(picture, rims, int(1.5 * RADIUS_M * 640.0 / 3.7))
+    assert np.abs(apart).max() < 1.5 * TOLERANCE_PX, np.abs(apart).max(axis=0)
+
+
+RADIUS_M = 0.02
+
+
+def dot_rims() -> list[np.ndarray]:
+    """The rims (400, 2) of all dots of ``DOTS``, on its face."""
+    spacing, margin = 0.08, 0.08
     row, column = (part.ravel() for part in np.mgrid[0:6, 0:7])
     flat = np.column_stack([(column - 3) * spacing, margin + (5 - row) * spacing])
     turn = np.linspace(0.0, 2 * np.pi, 400, endpoint=False)
-    reach = int(1.5 * radius * FOCAL_PX / 3.7)
+    return [middle + RADIUS_M * np.column_stack([np.cos(turn), np.sin(turn)]) for middle in flat]
+
+
+def dots_off(picture: np.ndarray, rims: list[np.ndarray], reach: int) -> np.ndarray:
+    """How far the ink of each dot is from the middle of its projected rim (n, 2)."""
     apart = []
-    for middle in flat:
-        rim = middle + radius * np.column_stack([np.cos(turn), np.sin(turn)])
-        moments = cv2.moments(seen_px(DOTS, placed.ground_z_m(3.5, -0.9), rim).astype(np.float32)[:, None])
+    for rim in rims:
+        moments = cv2.moments(rim.astype(np.float32)[:, None])
         x, y = moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
         x0, y0 = round(x) - reach, round(y) - reach
         window = picture[y0 : y0 + 2 * reach + 1, x0 : x0 + 2 * reach + 1].astype(float)
@@ -108,7 +170,7 @@ def test_a_boards_dots_are_where_exact_geometry_puts_them(placed: Scene, picture
         assert ink.max() > 0.7 * paper
         v, u = np.mgrid[0 : 2 * reach + 1, 0 : 2 * reach + 1]
         apart.append([(ink * u).sum() / ink.sum() + x0 - x, (ink * v).sum() / ink.sum() + y0 - y])
-    assert np.abs(apart).max() < TOLERANCE_PX, np.abs(apart).max(axis=0)
+    return np.array(apart)
 
 
 def test_a_charuco_board_is_where_exact_geometry_puts_it(placed: Scene, picture: np.ndarray) -> None:
