@@ -161,7 +161,7 @@ def bench_camera(name: str, kind: str, e: tuple[float, float, float]) -> TimedCa
 def opencv_camera(kind: str) -> TimedCamera:
     """Return a camera with one of OpenCV's lenses; mrcal has those of up to 12 coefficients."""
     lens, size = KINDS[kind], (1280, 960)
-    focal = 400.0 if kind == "OPENCV_FISHEYE" else 900.0
+    focal = 560.0 if kind == "OPENCV_FISHEYE" else 900.0
     matrix = [[focal, 0.0, 645.3], [0.0, focal + 2.0, 472.9], [0.0, 0.0, 1.0]]
     model = CameraModel.of_matrix(kind, size, matrix, lens, np.eye(3), np.zeros(3))  # type: ignore[arg-type]
     known = kind in ("OPENCV4", "OPENCV5", "OPENCV8", "OPENCV12")

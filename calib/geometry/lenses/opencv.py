@@ -38,8 +38,11 @@ _DIRECTIONS, _RADII, _STEEPEST = 48, 256, 100.0
 _START_ERROR, _MOST_TERMS = 2e-6, 12
 """The inverse begins with a polynomial this near, or of so many terms."""
 
-_SAME_RATES = 1e-5
+_SAME_RATES = 1e-4
 """After a step below this the derivatives of the step before are good enough."""
+
+_LEFT = 3e-14
+"""What such a step leaves is some product of the two steps; this little is enough."""
 
 _PATH = 48
 """Steps from the axis out to a pixel where Newton's own way does not lead to it."""
@@ -415,8 +418,8 @@ class OpencvLens:
     def _undistorted(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, np.ndarray]:
         """Undistorted slopes of distorted ones, and which exist."""
         x, y = self._begin(u, v)
-        largest = inf
-        for _ in range(5):
+        largest = before = inf
+        for _ in range(6):
             if largest > _SAME_RATES:
                 now_u, now_v, tau, ux, uy, vx, vy = self._flat_rates(x, y)
                 per = 1.0 / (ux * vy - uy * vx)
@@ -436,8 +439,8 @@ class OpencvLens:
             y += off_v
             size = np.abs(step_x, out=step_x)
             size += np.abs(off_v, out=off_v)
-            largest = float(size.max(initial=0.0))
-            if largest < SETTLED:
+            before, largest = largest, float(size.max(initial=0.0))
+            if largest < SETTLED and largest * min(before, 1.0) < _LEFT:
                 break
         valid = (
             tau < min(self.near * self.near, 1e300)

@@ -100,15 +100,15 @@ class FreeProjection(ReadOnlyArrays):
         k = self.pixel_from_slope
         local = axes @ np.subtract(points.T, center[:, None], order="C")
         bent = self.lens.bend(local, len(jacobian) > 0)
-        seen = k[:2, :2] @ bent.slopes
-        seen += k[:2, 2:]
-        pixels[...] = seen.T
+        np.matmul(bent.slopes.T, k[:2, :2].T, out=pixels)
+        pixels += k[:2, 2]
         valid[...] = bent.valid
         if not isfinite(np.vdot(pixels, pixels)):
             valid &= np.isfinite(pixels).all(axis=1)
         if bent.rates is not None:
-            rows = (k[:2, :2] @ bent.rates.reshape(2, -1)).reshape(bent.rates.shape)
-            jacobian[...] = (axes.T @ rows).transpose(2, 0, 1)
+            # d slope / d local, by the matrix from the left and the axes from the right, as one product
+            both = (k[:2, :2].T[:, None, :, None] * axes[:, None]).reshape(6, 6)
+            np.matmul(bent.rates.reshape(6, -1).T, both, out=jacobian.reshape(-1, 6))
         if not valid.all():
             pixels[~valid] = nan
             jacobian[~valid[: len(jacobian)]] = nan
