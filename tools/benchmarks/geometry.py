@@ -46,7 +46,7 @@ from calib.geometry.rigid import Rigid, rot_x, rot_y, rot_z
 from mastctl.cli.output import at_least
 from tools.command import end
 
-COUNTS = (1_000, 100_000)
+COUNTS = (1_000, 100_000, 1_000_000)
 SAME = {"forward": 1e-6, "gradient": 1e-3, "inverse": 1e-7}
 SAME_RAD = 1e-6
 WANTED = {("CAHVOR", "forward"): 4.0, ("CAHVOR", "gradient"): 2.5, ("CAHVOR", "inverse"): 10.0}
