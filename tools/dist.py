@@ -7,7 +7,6 @@ of the tag vVERSION there; without it, pictures are left out and links become pl
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import shutil
@@ -17,7 +16,7 @@ import tempfile
 import tomllib
 from pathlib import Path
 
-from tools.command import end
+from tools.command import end, options
 
 ROOT = Path(__file__).resolve().parent.parent
 CLIENT = Path("tools") / "mastctl-client"
@@ -82,11 +81,7 @@ def _said(*command: str) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m tools.dist",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("--at", metavar="URL", help="the repository's address, for README's links")
     parser.add_argument("out", type=Path, metavar="FOLDER", help="where to")
     args = parser.parse_args()
