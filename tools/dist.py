@@ -1,8 +1,9 @@
 """Builds what an index of packages takes: sdist and wheel of mastctl, and the wheel of mastctl-client.
 
-The same commit gives the same bytes: files that git knows are copied, and every time stamp is the commit's
-(or SOURCE_DATE_EPOCH). README's relative links and pictures work on no index. With --at they become addresses
-of the tag vVERSION there; without it, pictures are left out and links become plain words.
+The same commit gives the same bytes: files that git knows are copied, with the site where tools/docs built
+it, and every time stamp is the commit's (or SOURCE_DATE_EPOCH). README's relative links and pictures work on
+no index. With --at they become addresses of the tag vVERSION there; without it, pictures are left out and
+links become plain words.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from tools.command import end, options
 
 ROOT = Path(__file__).resolve().parent.parent
 CLIENT = Path("tools") / "mastctl-client"
+SITE = Path("docs/_build/html")
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
 
 
@@ -58,7 +60,8 @@ def build(out: Path, at: str | None = None) -> list[Path]:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     with tempfile.TemporaryDirectory(prefix="mastctl-dist-") as name:
         copy = Path(name) / "mastctl"
-        for file in _said("git", "ls-files", "-z").split("\0"):
+        site = (str(file.relative_to(ROOT)) for file in (ROOT / SITE).rglob("*"))
+        for file in (*_said("git", "ls-files", "-z").split("\0"), *site):
             if file and (ROOT / file).is_file():
                 (copy / file).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy(ROOT / file, copy / file)
