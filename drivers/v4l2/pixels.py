@@ -147,7 +147,7 @@ def grey(format: PictureFormat, raw: NDArray[np.uint8]) -> Image:
     samples = _samples(format, layout, raw)
     if layout.kind == "bayer":
         return _image(cv2.cvtColor(samples, getattr(cv2, f"COLOR_Bayer{layout.order}2GRAY")))
-    return samples if samples.base is None else samples.copy()
+    return samples.copy() if layout.bits == 8 else samples  # wider ones are in memory of their own
 
 
 def colour(format: PictureFormat, raw: NDArray[np.uint8]) -> Image:
