@@ -74,6 +74,12 @@ def test_the_head_takes_its_time_on_the_rovers_clock_only() -> None:
         began_s = service.clock.now_s()
         told = ended(service, service.steering.point(PointRequest(AnglesTarget(2.0, -0.5)), {}).id)
         assert told["state"] == "done"
+        assert told["steps"]
+        times_s = [began_s, told["created_s"], told["started_s"]]
+        for step in told["steps"]:
+            times_s += [step["started_s"], step["started_s"] + step["duration_s"]]
+        times_s += [told["ended_s"], service.clock.now_s()]
+        assert np.diff(times_s).min() > -2e-3, f"times out of order: {times_s}"  # rounded to a millisecond
         took_s = told["ended_s"] - told["started_s"]
         assert took_s > 2.0  # 2 rad at 1 rad/s
         assert service.clock.now_s() >= began_s + took_s

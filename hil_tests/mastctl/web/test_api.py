@@ -97,6 +97,13 @@ def test_status_tells_what_the_contract_asks(
     assert 0.0 < status["uptime_s"] < NET_S
 
 
+def test_the_time_of_real_hardware_is_this_machines(web: httpx.Client) -> None:
+    for _ in range(3):
+        before_s = time.monotonic()
+        told_s = web.get("/status").json()["now_s"]
+        assert before_s - 1e-3 <= told_s <= time.monotonic() + 1e-3  # it is rounded
+
+
 def test_a_head_that_fails_shows_as_fault_in_plain_words(web: httpx.Client, hardware: FakeHardware) -> None:
     def fail(name: str) -> None:
         raise NoReply("no answer on the bus", device="pan_tilt")
