@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -123,11 +124,25 @@ def _from_survey(args: argparse.Namespace) -> int:
     with output.waiting(args.json, f"fitting {len(survey.images)} images ({args.method})"):
         done = calibrate(survey, args.out, args.method, args.mast, warnings, undetected)
     page = _report(args, done, in_use)
+    told, lines = _families(args, survey)
     if args.json:
-        output.print_json(_document(done, in_use, page))
+        output.print_json(_document(done, in_use, page) | told)
     else:
         _show(done, in_use, page)
+        for line in lines:
+            sys.stdout.write(output.one_line(line) + "\n")
     return 0
+
+
+def _families(args: argparse.Namespace, survey: Survey) -> tuple[dict[str, Any], list[str]]:
+    """What ``--compare-models`` adds for programs and for people."""
+    if not args.compare_models:
+        return {}, []
+    from mastctl.calibration import families
+
+    with output.waiting(args.json, "comparing camera models"):
+        found = families.compared(survey)
+    return {"models": families.families_told(survey, found)}, families.families_lines(survey, found)
 
 
 def _check_out(out: Path, survey: Survey) -> None:

@@ -115,8 +115,8 @@ def run(args: argparse.Namespace) -> int:
                 name = option.replace("_", "-")
                 raise WrongUse(f"--{name} drives a head; with FOLDER nothing is driven")
         return _again(args)
-    if args.model is not None:
-        raise WrongUse("--model is for fitting a folder again; name a bench's FOLDER")
+    if args.model is not None or args.compare_models:
+        raise WrongUse("--model and --compare-models are for fitting a folder again; name a bench's FOLDER")
     if args.board is None:
         raise WrongUse("--board is missing; the BOARD.yaml that 'mastctl board make' wrote is expected")
     return _drive_in_lines(args) if args.lines else _drive(args)
@@ -147,7 +147,16 @@ def _again(args: argparse.Namespace) -> int:
     with output.waiting(args.json, f"fitting {len(survey.images)} images"):
         former, moved = former_rig(args.folder), kept_moved(args.folder)
         done = save_bench(survey, args.out, args.report, options, frame, former, moved)
-    _tell(args, done.told(), done.lines())
+    told, lines = done.told(), list(done.lines())
+    if args.compare_models:
+        from mastctl.calibration import families
+
+        survey = survey if args.model is None else survey.as_model(args.model)
+        with output.waiting(args.json, "comparing camera models"):
+            found = families.compared(survey)
+        told |= {"models": families.families_told(survey, found)}
+        lines += families.families_lines(survey, found)
+    _tell(args, told, lines)
     return 0
 
 

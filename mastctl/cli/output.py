@@ -202,6 +202,13 @@ def add_model(parser: Any) -> None:
         "opencv14 or opencv_fisheye (default: as survey.yaml says)",
     )
 
+    parser.add_argument(
+        "--compare-models",
+        action="store_true",
+        help="also fit each camera as other models, compare them by pictures left out of the fit, and name "
+        "the one that earns its parameters",
+    )
+
 
 def _model_kind(text: str) -> str:
     """Return a camera model's name as files have it; argparse tells the refusal."""

@@ -104,7 +104,7 @@ def view_poses(
     model = best[1]
     poses, off = {}, {}
     for term in clean:
-        found_poses = _poses(model, term)
+        found_poses = poses_of(model, term)
         if found_poses:
             poses[term.name] = tuple(pose for _, pose in found_poses)
             off[term.name] = found_poses[0][0]
@@ -177,7 +177,7 @@ def _lens(images: Sequence[ImageTerm], start: CameraModel, most: int) -> tuple[f
     chosen = _spread(images, most)
     terms, poses, size = [], {}, []
     for term in chosen:
-        found = _poses(start, term)
+        found = poses_of(start, term)
         if found:
             key = (term.name, "")
             terms.append(replace(term, board=key, attitude=None))
@@ -228,8 +228,8 @@ def _look(term: ImageTerm) -> FloatArray:
     return np.asarray(np.linalg.lstsq(points, term.pixels_px[keep], rcond=None)[0].ravel())
 
 
-def _poses(model: CameraModel, term: ImageTerm) -> list[tuple[float, Rigid]]:
-    """Poses camera_from_board and how many sigmas their median corner is off, the best first."""
+def poses_of(model: CameraModel, term: ImageTerm) -> list[tuple[float, Rigid]]:
+    """Return poses camera_from_board and how many sigmas their median corner is off, the best first."""
     keep = term.keep
     ahead = model.ray(term.pixels_px[keep]).directions
     some = np.isfinite(ahead).all(axis=1) & (ahead[:, 2] > 0.1)
