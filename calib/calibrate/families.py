@@ -94,10 +94,13 @@ def compare_families(
 
 
 def earned(scores: Sequence[FamilyScore], now: Kind) -> FamilyScore:
-    """Return the family of fewest parameters that none of more predicts better than; ``now`` of equals."""
-    ordered = sorted(scores, key=lambda one: (one.parameters, one.kind != now))
-    best = ordered[0]
-    for other in ordered[1:]:
+    """Return the family that predicts better than ``now`` by more than chance, of fewest parameters; else ``now``.
+
+    Without a score of ``now``, the comparison begins at the family of fewest parameters.
+    """
+    ordered = sorted(scores, key=lambda one: one.parameters)
+    best = next((one for one in ordered if one.kind == now), ordered[0])
+    for other in ordered:
         gain = np.log(np.array(best.by_image_px2)) - np.log(np.array(other.by_image_px2))
         gain = gain[np.isfinite(gain)]
         if len(gain) < 2 or other.left_out_px > (1.0 - LEAST_PART) * best.left_out_px:
