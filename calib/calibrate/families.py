@@ -94,7 +94,7 @@ def compare_families(
 
 
 def earned(scores: Sequence[FamilyScore], now: Kind) -> FamilyScore:
-    """Return the family that predicts better than ``now`` by more than chance, of fewest parameters; else ``now``.
+    """Return the family that predicts better than ``now`` by more than chance, the smallest; else ``now``.
 
     Without a score of ``now``, the comparison begins at the family of fewest parameters.
     """
