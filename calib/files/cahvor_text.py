@@ -107,6 +107,8 @@ def save_cahvor(camera: CameraFile, path: str | Path) -> tuple[str, ...]:
 def format_cahvor(camera: CameraFile) -> tuple[str, tuple[str, ...]]:
     """Return the .cahvor text of a camera, and what of the camera the format cannot hold."""
     model = camera.model
+    if model.kind not in (*_MODEL_WORDS, "CAHVORE"):
+        raise ValueError(f".cahvor text holds CAHV, CAHVOR and CAHVORE, not {model.kind}; use save_any")
     lines = [
         "# camera model in CAHVOR vectors, metres and pixels; the centre of the first pixel is (0, 0)",
         "",

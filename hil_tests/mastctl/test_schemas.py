@@ -82,7 +82,9 @@ def test_every_shipped_file_is_good_by_its_schema(file: Path, schemas: dict[str,
     if named:
         assert (file.parent / named[1]).resolve() == schema_files()[kind].resolve()
     else:
-        assert kind == "board" or "simulated" in file.name, "its first line names no schema"
+        # A mast file that a program wrote names the true rig by the digest of its bytes.
+        by_digest = "simulated" in file.name or file.parent.name == "sim"
+        assert kind == "board" or by_digest, "its first line names no schema"
 
 
 def test_the_examples_of_the_page_are_good(schemas: dict[str, Any]) -> None:

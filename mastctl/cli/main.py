@@ -314,6 +314,7 @@ sim new twin --height 1.9 --baseline 0.42
 rig new rig --pan-deg -90 90 --tilt-deg -40 30
 sim dynamixel --servo xl330_m288:1 --servo xl330_m288:2 --pty
 sim ptu --pty
+sim feetech --pty
 servo scan /dev/ttyUSB0
 servo info /dev/ttyUSB0 1
 servo set-id /dev/ttyUSB0 1 2
@@ -325,7 +326,7 @@ ros2 --url http://127.0.0.1:8420
 _GROUPS = frozenset(
     (
         *("lease", "token", "track", "operations", "mast", "fault", "camera", "experiment", "record"),
-        *("sim", "servo", "ptu", "board", "sentinel"),
+        *("sim", "servo", "ptu", "board", "sentinel", "rig"),
     )
 )
 

@@ -28,12 +28,13 @@ import numpy as np
 from calib.errors import BadFile
 from calib.files import CameraFile
 from calib.files.cahvor_text import format_cahvor, parse_cahvor
-from calib.files.mast_file import StoredRig, parse_camera, parse_rig
+from calib.files.mast_file import StoredRig, parse_camera, parse_rig, save_camera
 from calib.files.mrcal_kalibr_colmap import parse_colmap, parse_kalibr, parse_mrcal
 from calib.files.odl import parse_label
 from calib.files.opencv_ros import parse_camera_info, parse_opencv
 from calib.files.pds3 import load_pds3_camera, read_product
 from calib.files.tables import parse_table
+from calib.geometry.cahvor import FREE
 from calib.survey.check import check_survey
 from calib.survey.reader import read_survey
 from calib.targets.board_file import parse_board
@@ -286,7 +287,11 @@ def _use_model(camera: CameraFile) -> None:
     camera.model.ray(np.array([[0.0, 0.0], [320.0, 240.0], [1e9, np.inf]]))
     if not np.isfinite(camera.model.C).all():
         raise AssertionError("a camera that is not finite was accepted")
-    format_cahvor(camera)
+    if camera.model.kind in FREE:
+        with tempfile.TemporaryDirectory() as folder:
+            save_camera(camera, Path(folder) / "camera.yaml")
+    else:
+        format_cahvor(camera)
 
 
 def _use_rig(stored: StoredRig) -> None:

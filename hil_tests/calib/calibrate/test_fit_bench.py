@@ -223,7 +223,7 @@ def test_gross_corners_and_a_picture_of_something_else_are_left_out_and_named() 
         (Mishap("tilt", 14, 0.004), "tilt slipped by about 4.0 mrad"),
         (Mishap("focus", 16, 0.01), "camera navcam_left was refocused"),
         (Mishap("knock", 16, 0.004), r"camera navcam_left was knocked .* by about (3\.9|4\.0|4\.1) mrad"),
-        (Mishap("twin", 0, 0.4), "two boards have the same ids"),
+        (Mishap("twin", 0, 0.4), "Two boards have the same ids"),
     ],
 )
 def test_what_changed_half_way_is_named_and_not_averaged(mishap: Mishap, words: str) -> None:

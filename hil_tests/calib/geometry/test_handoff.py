@@ -267,7 +267,7 @@ def test_clicks_whose_rays_pass_each_other_are_refused_with_gap_and_pixels(
             calibration=uncertain if calibrated else None,
         )  # fmt: skip
     assert refused.value.code == "not_one_point"
-    words = re.search(r"([\d.]+) sigma; the pixel of navcam_right is ([\d.]+) px off", str(refused.value))
+    words = re.search(r"([\d.]+) sigma. The pixel of navcam_right is ([\d.]+) px off", str(refused.value))
     assert words is not None and float(words[1]) > 5.0
     # The eyes look nearly along the same line: 30 px down are 30 px across to a few per cent.
     assert float(words[2]) == pytest.approx(30.0, abs=0.6)

@@ -180,7 +180,7 @@ def test_clicks_on_two_things_are_ambiguous(good: Case) -> None:
     clicks = good.clicks_px + np.array([[0.0, 0.0], [7.0, 0.0]])
     done = hand_off(RIG, SOURCE, NEXT, Joints(0.0, 0.0), *clicks)
     refined = replace(good, handoff=done, clicks_px=clicks).refined()
-    assert all(one.verdict == "ambiguous" and "right eye" in one.reason for one in refined.values())
+    assert all(one.verdict == "ambiguous" and "right camera" in one.reason for one in refined.values())
 
 
 def test_a_camera_that_the_hand_off_does_not_reach_says_why(good: Case) -> None:

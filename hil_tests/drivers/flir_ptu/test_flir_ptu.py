@@ -471,7 +471,7 @@ def test_an_e46_has_to_be_told_its_resolution(opened: Bench) -> None:
         "pan": {**OPTIONS["pan"], "resolution_arcsec": 46.2857},
         "tilt": {**OPTIONS["tilt"], "resolution_arcsec": 46.2857},
     }
-    with pytest.raises(WrongDevice, match=r"pan position is 185.143 .*resolution_arcsec 46.2857; either"):
+    with pytest.raises(WrongDevice, match=r"pan position is 185.143 .*resolution_arcsec 46.2857. Either"):
         opened(unit, **right)
     unit.resolutions["P"], unit.limits["P"] = "46.285714", (-12366, 12366)
     opened(unit, **right)

@@ -83,7 +83,7 @@ def test_what_is_told_is_what_the_daemon_understands_also_numbers_that_are_none(
     run = GuidedRun("a", "b", "c")
     for line in out.getvalue().splitlines():
         run = heard(run, line.encode())
-    assert run.odd == 0 and run.curve == ((3, 3.5),) and run.expected_px is None
+    assert run.unread_lines == 0 and run.curve == ((3, 3.5),) and run.expected_px is None
     assert run.cameras["navcam_left"].cells == cells["navcam_left"] and run.board_m == (0.55, 0.33)
     lines.failed("board_lost", "the board was not seen in 4 looks")
     assert heard(run, out.getvalue().splitlines()[-1].encode()).code == "board_lost"

@@ -135,7 +135,7 @@ def test_stop_ends_it_says_so_and_it_goes_on_from_there(pair: BOTH, visit: Visit
         os.kill(work.child.pid, 0)
     (kept,) = daemon.service.guide.runs.all()
     next_words = one.page.locator(".bench-next").inner_text()
-    assert f"is kept in {kept.path}: 3 pictures a camera" in next_words
+    assert f"are kept in {kept.path}: 3 pictures a camera" in next_words
     assert "Go on continues" in next_words and "Begin another starts anew" in next_words
     assert not one.page.locator(".bench-place").is_visible(), "no board is asked for"
     assert not one.page.locator(".bench-steps").is_visible(), "no step is ticked that was not taken"
