@@ -120,7 +120,9 @@ def test_campaigns_of_pictures(places: tuple[Executor, Executor]) -> None:
     works = works_of(
         {
             dots.run_cell: [dots.Cell(1290.0, 3.0, tilt, 1, 1, stress, True) for tilt in (0.0, 30.0)],
-            render_bias.run_row: [render_bias.Row("flat", "hazcam turned", 2.0, n, 1, 2, 1) for n in (1, 2)],
+            render_bias.run_row: [
+                render_bias.BiasRow("flat", "hazcam turned", 2.0, n, 1, 2, 1) for n in (1, 2)
+            ],
             match_sigma.run_look: [match_sigma.MatchLook(rig, 0.5, 1, number, 1) for number in (0, 1)],
         }
     )
