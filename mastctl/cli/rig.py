@@ -74,6 +74,12 @@ def _new(args: argparse.Namespace) -> int:
     head = _head(found, questions)
     if args.port and head is None:
         raise CommandError("no_head", f"no head: {'; '.join(found.unused)}; nothing is written")
+    rates = sorted({one.baud for one in head.servos}) if head is not None else []
+    if len(rates) > 1:
+        told = " and ".join(map(str, rates))
+        change = "`mastctl servo set-id` with --new-baud changes a servo's"
+        words = f"servos answer at {told} baud, where one rate is expected ({change}); nothing is written"
+        raise CommandError("rates", words)
     none = head is None and not found.cameras
     if none and questions.one_of(NOTHING, ("yes", "no"), "yes") == "no":
         output.tell("nothing is written; plug the head in and try again")
@@ -118,7 +124,7 @@ def _answers(
     from mastctl.rig.drawing import RigAnswers
 
     usual = RigAnswers()
-    ids = [one.servo_id for one in head.servos] if head is not None else []
+    ids = list(dict.fromkeys(one.servo_id for one in head.servos)) if head is not None else []
     pan_id, tilt_id = _axes(args, ids, questions)
     ask = questions.number
 

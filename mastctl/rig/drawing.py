@@ -120,8 +120,9 @@ def _servos(
     poll_hz = min(FASTEST_POLL_HZ, math.floor(baud / (10 * family.poll_bytes)))
     axes = {}
     for axis, number in (("pan", answers.pan_id), ("tilt", answers.tilt_id)):
-        name = servos[number].model if number in servos else USUAL_MODEL
-        backlash_rad = family.models[name].backlash_rad if number in servos else None
+        like = servos.get(number) or next(iter(servos.values()), None)
+        name = USUAL_MODEL if like is None else like.model
+        backlash_rad = None if like is None else family.models[name].backlash_rad
         axes[axis] = {
             "id": number,
             "model": name,

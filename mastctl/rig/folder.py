@@ -9,6 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -99,7 +100,7 @@ def write_simulated(folder: Path, plugged: Plugged, answers: RigAnswers) -> NewR
     write_built(built_rig(numbers, np.random.default_rng(TWIN_SEED)), folder, simulation, TWIN_SEED)
     for name, kind in ((CONFIG, "config"), (MAST, "mast"), (TRUE_RIG, "mast")):
         (folder / name).write_bytes(_first_line(kind) + (folder / name).read_bytes())
-    config = f"--config {folder / CONFIG}"
+    config = f"--config {quote(str(folder / CONFIG))}"
     steps = (
         f"mastctl doctor {config}",
         f"mastctl run {config}",
@@ -120,8 +121,14 @@ def _written(
         names.append(f"{SCHEMAS}/{kind}.json")
     for name, data in files.items():
         save_bytes(folder / name, data)
-    config = load_config(folder / CONFIG)
-    check_cameras(config, load_rig(config.mast_file).rig)
+    try:
+        config = load_config(folder / CONFIG)
+        check_cameras(config, load_rig(config.mast_file).rig)
+    except Exception:
+        for name in names:  # a second try, with other answers, finds no file in its way
+            (folder / name).unlink(missing_ok=True)
+        (folder / SCHEMAS).rmdir()
+        raise
     return NewRigFolder(folder, tuple(names), simulated, steps)
 
 
@@ -170,8 +177,8 @@ def _rule(about: str, matches: Sequence[tuple[str, str]], name: str) -> list[str
 
 def _steps(folder: Path, head: PluggedHead | None, cameras: int) -> tuple[str, ...]:
     """The next three commands."""
-    config = f"--config {folder / CONFIG}"
-    rules = f"sudo cp {folder / RULES} /etc/udev/rules.d/ && sudo udevadm control --reload"
+    config = f"--config {quote(str(folder / CONFIG))}"
+    rules = f"sudo cp {quote(str(folder / RULES))} /etc/udev/rules.d/ && sudo udevadm control --reload"
     doctor, run = f"mastctl doctor {config}", f"mastctl run {config}"
     if head is None:
         return f"{rules} && sudo udevadm trigger", "mastctl servo scan PORT", doctor

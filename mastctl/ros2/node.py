@@ -264,7 +264,10 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
             self.create_service(Trigger, f"~/{name}", answer, callback_group=group)
 
     def _stop(self, request: Any, answer: Any) -> Any:
-        return self._answered(answer, lambda client: "stopped" if client.stop() else "")
+        try:
+            return self._answered(answer, lambda client: "stopped" if client.stop() else "")
+        finally:
+            self.steering.stop()  # what waits for its turn or for tf must not begin after the stop
 
     def _estop(self, request: Any, answer: Any) -> Any:
         def estop(client: Client) -> str:

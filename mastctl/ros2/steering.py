@@ -152,6 +152,9 @@ class Steering:
             return Outcome("refused", "bad_request", str(error))
         except ClientError as error:
             return Outcome("refused", error.code, str(error))
+        except Exception:  # the thread goes on: the next wish, and the stop at the end, need it
+            log.exception("'%s' met a defect of the program", wish.what)
+            return Outcome("failed", "defect", "a defect of the program; the log has it")
 
     def _carried_out(self, client: Client, wish: Wish, asked: Mapping[str, Any]) -> Outcome:
         if self._superseded(wish):

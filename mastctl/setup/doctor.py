@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from calib.errors import BadFile
@@ -80,7 +81,7 @@ def examine(
 
 def next_command(config: str | None, found: Sequence[DoctorFinding]) -> str:
     """Return what comes next: the first thing to mend, else to start the daemon, else to point."""
-    named = "" if config is None else f" --config {config}"
+    named = "" if config is None else f" --config {quote(config)}"
     bad = next((finding for finding in found if finding.level == "bad"), None)
     if bad is not None:
         return f"{bad.advice or bad.sentence}; then mastctl doctor{named}"

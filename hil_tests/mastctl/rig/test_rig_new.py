@@ -189,6 +189,19 @@ def test_a_ptu_is_known_and_its_own_limits_hold(
     assert -math.pi / 2 < low < -1.0 and 0.4 < high < 0.7, "the unit's own ends"
 
 
+def test_answers_that_make_no_rig_leave_nothing_in_the_way_of_the_next_try(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    axes, folder = bench.axes(PRESETS["ptu_d46_70"]), tmp_path / "my rig"
+    with bench.line(SimulatedPtu("d46_70", *axes)) as port:
+        beyond = ("--tilt-deg", "40", "60")  # the unit's own end is at 25 degrees
+        assert main(["rig", "new", str(folder), "--port", port, *beyond]) != 0
+        assert not any(folder.iterdir())
+        capsys.readouterr()
+        told = written(capsys, str(folder), "--port", port)
+    assert f"'{folder / CONFIG}'" in told["next"][0], "a shell takes the folder as one word"
+
+
 def test_without_hardware_it_writes_the_twin_that_runs(
     tmp_path: Path, nothing: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
