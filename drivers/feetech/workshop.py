@@ -209,10 +209,17 @@ def try_out(link: FeetechLink, servo_id: int, amplitude_rad: float, torque_perce
                 steps.append(_step(link, servo_id, model, goal, fence))
         except BaseException:
             with suppress(DriverError):  # what went wrong first is told
-                here = link.proven(servo_id, model.registers["present_position"], model)
-                link.write(servo_id, model.registers["goal_position"], here, model)
+                _stand(link, servo_id, model, (start - 2 * reach, start + 2 * reach))
             raise
     return Trial(servo_id, model.name, model.count_rad, start, tuple(steps), speed_unit)
+
+
+def _stand(link: FeetechLink, servo_id: int, model: FeetechModel, fence: tuple[int, int]) -> None:
+    """Make where the servo is its goal, by one look: under way, no two answers are alike."""
+    register = model.registers["present_position"]
+    data = again(link, lambda: link.exchange.read(servo_id, register.address, register.size, register.name))
+    here = min(max(register.decode(data, model.order), fence[0]), fence[1])
+    again(link, lambda: link.write(servo_id, model.registers["goal_position"], here, model))
 
 
 def _set(link: FeetechLink, servo_id: int, model: FeetechModel, name: str, value: int) -> None:

@@ -285,6 +285,27 @@ def test_scan_and_info_find_and_read_feetech_servos_and_move_none(
     assert cli.pan_rad() == 0.0 and cli.servos[0].eeprom_writes == []
 
 
+def test_a_trial_that_a_fault_ends_stops_the_servo_under_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    with bench() as it:
+        it.servos[0].memory["torque_enable"] = 1
+        link = open_link(it.line.path, 1_000_000, 0.05, clock=it.clock, open_line=it.line.open)
+        look, looks = link.look, []
+
+        def faulty(servo_id: int, model: Any) -> Any:
+            looks.append(look(servo_id, model))
+            if len(looks) == 8:
+                it.servos[0].raise_error(2)
+            return looks[-1]
+
+        monkeypatch.setattr(link, "look", faulty)
+        with pytest.raises(HardwareFault, match="the trial is ended"):
+            workshop.try_out(link, 1, 0.3, 50.0)
+        link.close()
+        ended_rad = it.pan_rad()
+        it.clock.sleep(2.0)
+        assert abs(it.pan_rad() - ended_rad) < 0.03 and it.pan_rad() < 0.15, "0.3 rad was its goal"
+
+
 def test_set_id_and_test_work_on_feetech_servos(cli: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     code, told, _ = run(capsys, "set-id", cli.line.path, "1", "2")
     assert code == 1 and "id 2 is taken" in told["error"]["message"]
