@@ -300,7 +300,15 @@ def parse_opencv(data: bytes, path: str | Path) -> CameraFile:
     shapes = [shape for count in counts for shape in ((1, count), (count, 1))]
     distortion = top.matrix(distortion_key, shapes).ravel()
     frame, pose = CAMERA_FRAME, None
-    known = [matrix_key, distortion_key, width_key, height_key, "fisheye_model", "camera_model"]
+    known = [
+        matrix_key,
+        distortion_key,
+        width_key,
+        height_key,
+        "fisheye_model",
+        "camera_model",
+        "distortion_model",
+    ]
     if "camera_from_frame" in top:
         pose = pose_of(top, "camera_from_frame", top.matrix("camera_from_frame", ((4, 4),))).inverse
         frame = top.text(top.need("frame"))
@@ -309,10 +317,16 @@ def parse_opencv(data: bytes, path: str | Path) -> CameraFile:
     return as_camera_file(camera, top, frame, digest_of(data), top.unread(known))
 
 
+_FISHEYE_WORDS = ("equidistant", "fisheye")
+
+
 def _is_fisheye(top: Loose) -> bool:
     """Whether the file says that its lens is cv2.fisheye's."""
     if "camera_model" in top:
         return top.choice("camera_model", ("pinhole", "fisheye")) == "fisheye"
+    if "distortion_model" in top:  # OpenCV writes none, but calibrators with ROS's words do
+        words = ("plumb_bob", "rational_polynomial", *_FISHEYE_WORDS)
+        return top.choice("distortion_model", words) in _FISHEYE_WORDS
     return bool(top.integer("fisheye_model", 0, 1)) if "fisheye_model" in top else False
 
 

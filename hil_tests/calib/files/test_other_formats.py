@@ -236,6 +236,23 @@ def test_a_calibration_that_opencv_wrote_is_read(tmp_path: Path) -> None:
     assert camera.frame == "camera"
 
 
+@pytest.mark.parametrize(("word", "kind"), [("equidistant", "OPENCV_FISHEYE"), ("plumb_bob", "OPENCV4")])
+def test_an_opencv_file_that_names_its_lens_is_read_as_that_lens(
+    word: str, kind: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "camera.yaml"
+    matrix = "!!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: {}\n"
+    text = "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\n"
+    text += "camera_matrix: " + matrix.format(3, 3, [400.0, 0, 320, 0, 400, 240, 0, 0, 1])
+    text += "distortion_coefficients: " + matrix.format(1, 4, [-0.03, 0.01, 0.001, 0.0005])
+    file.write_text(f"{text}distortion_model: {word}\n")
+    read = load_any(file)
+    assert isinstance(read, CameraFile) and read.model.kind == kind
+    file.write_text(f"{text}distortion_model: fisheye62\n")
+    with pytest.raises(BadFile, match="'fisheye62' where one of plumb_bob"):
+        load_any(file)
+
+
 def test_ros_finds_the_keys_that_its_parser_looks_for(tmp_path: Path) -> None:
     done = save_any({"navcam_left": reference("navcam_left")}, tmp_path / "left.ros.yaml")
     read_back = yaml.safe_load((tmp_path / "left.ros.yaml").read_text())
