@@ -94,13 +94,15 @@ def halt(
 
 def _stood(axis: FeetechAxis, clock: Clock) -> str:
     """Tell one axis to stand and see that it does. Raises DriverError."""
-    axis.servo.stand()
+    goal = axis.servo.stand()
     until_s = clock.now_s() + HALT_REST_S
     while True:
         sample = axis.servo.sample()
         if not sample.values["torque_enable"]:
             return "has its torque off"
         if abs(sample.values["present_velocity"]) <= 1:
+            if (held := axis.servo.get("goal_position")) != goal:  # nobody answers the packet that says so
+                raise NoReply(f"{axis.servo.name} did not take the command to stand, its goal is {held}")
             return "was told to stand where it is, and holds"
         if clock.now_s() > until_s:
             raise NoReply(f"{axis.servo.name} got the command to stand, but still moves")

@@ -54,7 +54,7 @@ class FeetechServo:
     ) -> None:
         self.name = f"{axis} (servo {settings.servo_id})"
         self.servo_id = settings.servo_id
-        self.torque_limit = settings.torque_limit or 1000
+        self.torque_limit = 0
         self._link = link
         self._settings = settings
         self._head = head
@@ -124,6 +124,8 @@ class FeetechServo:
 
     def sample(self) -> ServoSample:
         """Return what the servo says about its motion, asked one time; raises as `FeetechLink.samples`."""
+        if not self.torque_limit:  # each question writes it: it must never rise above the servo's own
+            self._bound_torque()
         asked = {self.servo_id: (self._settings.model, self.torque_limit)}
         sample = self._link.samples(asked)[self.servo_id]
         self.truth.check(sample)
@@ -133,17 +135,30 @@ class FeetechServo:
         """Return the same; what was lost is asked for again."""
         return again(self._link, self.sample)
 
-    def stand(self) -> None:
-        """Make where the servo is its goal, if its torque is on. Raises as `sample`."""
+    def stand(self) -> int | None:
+        """Make where the servo is its goal, if its torque is on; returns the goal. Raises as `sample`."""
         sample = self.sample()
-        if sample.values["torque_enable"]:
-            low, high = self._settings.limit_counts
-            self.send({self.servo_id: min(max(sample.counts, low), high)})
+        if not sample.values["torque_enable"]:
+            return None
+        low, high = self._settings.limit_counts
+        goal = min(max(sample.counts, low), high)
+        self.send({self.servo_id: goal})
+        return goal
 
     def send(self, goal: Mapping[int, int]) -> None:
         """Write the goal alone, and nobody answers. Raises LineLost, BadReply."""
         entry, order = self._registers["goal_position"], self._settings.model.order
         self._link.group_write(entry.address, {one: entry.encode(g, order) for one, g in goal.items()})
+
+    def _bound_torque(self) -> int:
+        """Take the torque limit from the servo's EEPROM and the options; returns that bound, 0.1 %."""
+        if "torque_limit" not in self._registers:  # SCS: its questions write nothing
+            self.torque_limit = 1000
+            return self.torque_limit
+        most = self.get("max_torque")
+        bound = min(self._settings.torque_limit or most, most)
+        self.torque_limit = max(bound, LEAST_TORQUE)
+        return bound
 
     def check_place(self) -> int:
         """See that the axis stands within its limits, droop aside; returns the count that may be its goal.
@@ -171,14 +186,11 @@ class FeetechServo:
         WrongDevice
             If a setting must change while torque may not be dropped, or the torque limit has no room.
         """
-        if "torque_limit" in self._registers:
-            most = self.get("max_torque")
-            self.torque_limit = min(self._settings.torque_limit or most, most)
-            if self.torque_limit < LEAST_TORQUE:
-                raise WrongDevice(
-                    f"{self.name} has the torque limit {self.torque_limit / 10:g} % in its EEPROM; expected "
-                    f"{LEAST_TORQUE / 10:g} % or more (max_torque)"
-                )
+        if "torque_limit" in self._registers and (bound := self._bound_torque()) < LEAST_TORQUE:
+            raise WrongDevice(
+                f"{self.name} has the torque limit {bound / 10:g} % in its EEPROM; expected "
+                f"{LEAST_TORQUE / 10:g} % or more (max_torque)"
+            )
         low, high = self._settings.limit_counts
         wanted = {"return_delay": 0, "min_angle_limit": low, "max_angle_limit": high}
         if "operating_mode" in self._registers:

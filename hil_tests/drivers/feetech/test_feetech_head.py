@@ -15,11 +15,12 @@ from typing import Any
 import pytest
 
 from drivers.clock import SystemClock
-from drivers.errors import BadOptions, DriverError, HardwareFault, WatchdogTripped, WrongDevice
+from drivers.errors import BadOptions, DriverError, HardwareFault, NoReply, WatchdogTripped, WrongDevice
 from drivers.faults import FaultPanel
 from drivers.feetech import workshop
 from drivers.feetech.head import FeetechHead, halt, open_head
 from drivers.feetech.link import open_link
+from drivers.feetech.servo import FeetechServo
 from drivers.feetech.settings import feetech_settings
 from drivers.sim.axis import AxisSettings
 from drivers.sim.wire.axis import WireAxis
@@ -283,6 +284,25 @@ def test_scan_and_info_find_and_read_feetech_servos_and_move_none(
     assert told["registers"]["present_position"] == 2048 + 7
     assert told["registers"]["offset"] == -7 and "never writes it" in told["words"]["offset"]
     assert cli.pan_rad() == 0.0 and cli.servos[0].eeprom_writes == []
+
+
+def test_no_question_raises_the_torque_above_the_servos_own_bound() -> None:
+    with bench() as it:
+        for servo in it.servos:
+            servo.memory.update(max_torque=300, torque_limit=300, torque_enable=1)
+        halt(it.options(), it.clock, it.line.open)
+        assert all(280 < servo.memory["torque_limit"] <= 300 for servo in it.servos)
+
+
+def test_halt_does_not_take_a_servo_for_stopped_that_missed_the_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with bench() as it:
+        servo = it.servos[0]
+        servo.memory.update(torque_enable=1, goal_position=2700)
+        monkeypatch.setattr(FeetechServo, "send", lambda self, goal: None)  # lost on the line
+        with pytest.raises(NoReply, match="did not take the command to stand, its goal is 2700"):
+            halt(it.options(), it.clock, it.line.open)
 
 
 def test_a_trial_that_a_fault_ends_stops_the_servo_under_way(monkeypatch: pytest.MonkeyPatch) -> None:
