@@ -25,7 +25,7 @@ from drivers.dynamixel.servo_table import ServoTable, identified
 from drivers.dynamixel.settings import DynamixelAxisSettings, DynamixelSettings
 from drivers.errors import BadReply, DriverError, HardwareFault, NoReply, Refused, WrongDevice
 from drivers.servo_bus.course import ServoSample, Truth
-from drivers.servo_bus.exchange import again
+from drivers.servo_bus.exchange import again, come_to_rest
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +35,6 @@ FULL_STATUS_RETURN = 2
 REVERSE_BIT, SLAVE_BIT = 0x01, 0x02
 HOMING_LIMIT = 1024  # what position mode honours of an X servo's homing offset, counts
 REBOOT_S = 2.0  # how long a servo may be deaf after a reboot
-COME_TO_REST_S = 0.5
 
 
 def motion_blocks(settings: DynamixelAxisSettings) -> tuple[RegisterBlock, ...]:
@@ -338,7 +337,7 @@ class Servo(ServoTable):
                     f"{self.name} does not switch its torque on; it may be shut down by a hardware error"
                 ) from None
         self._dropped = False
-        return self._come_to_rest()
+        return come_to_rest(self.look, self.set, self._settings.limit_counts, self._link.clock)
 
     @property
     def profile(self) -> tuple[int, int]:
@@ -380,18 +379,6 @@ class Servo(ServoTable):
                 100 * found / max(limit, 1),
             )
             self.set("goal_pwm", limit)
-
-    def _come_to_rest(self) -> int:
-        """Wait until the axis stands (it may have been falling) and hold it there; returns the goal."""
-        until_s = self._link.clock.now_s() + COME_TO_REST_S
-        sample = self.look()
-        while abs(sample.values["present_velocity"]) > 1 and self._link.clock.now_s() < until_s:
-            sample = self.look()
-        low, high = self._settings.limit_counts
-        goal = min(max(sample.counts, low), high)
-        if sample.values["goal_position"] != goal:
-            self.set("goal_position", goal)
-        return goal
 
     def release(self) -> None:
         """Switch the watchdog off, and torque too if the configuration says so; for the end."""

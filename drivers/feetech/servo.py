@@ -14,11 +14,10 @@ from drivers.feetech.link import FeetechLink
 from drivers.feetech.models import LOCKED, MODELS_BY_NUMBER, POSITION_MODE, UNLOCKED, status_words
 from drivers.feetech.settings import FeetechAxisSettings, FeetechSettings
 from drivers.servo_bus.course import ServoSample, Truth
-from drivers.servo_bus.exchange import ATTEMPTS, again
+from drivers.servo_bus.exchange import ATTEMPTS, again, come_to_rest
 
 log = logging.getLogger(__name__)
 
-COME_TO_REST_S = 0.5
 LEAST_TORQUE = 20  # room below a torque limit for the tokens of the questions
 
 
@@ -278,19 +277,7 @@ class FeetechServo:
             except WrongDevice:
                 raise HardwareFault(f"{self.name} does not switch its torque on") from None
         self._dropped = False
-        return self._come_to_rest()
-
-    def _come_to_rest(self) -> int:
-        """Wait until the axis stands (it may have been falling) and hold it there; returns the goal."""
-        until_s = self._link.clock.now_s() + COME_TO_REST_S
-        sample = self.look()
-        while abs(sample.values["present_velocity"]) > 1 and self._link.clock.now_s() < until_s:
-            sample = self.look()
-        low, high = self._settings.limit_counts
-        goal = min(max(sample.counts, low), high)
-        if sample.values["goal_position"] != goal:
-            self.set("goal_position", goal)
-        return goal
+        return come_to_rest(self.look, self.set, self._settings.limit_counts, self._link.clock)
 
     def release(self) -> None:
         """Switch the torque off if the configuration says so, and lift the questions' tokens; for the end."""

@@ -24,9 +24,9 @@ from hil_tests.waiting import until
 from tools.virtual_machine import apt
 
 PROGRAMS = {"debootstrap": "debootstrap", "systemd-nspawn": "systemd-container"}
-SUITE, MIRROR = "bookworm", "http://deb.debian.org/debian"
+SUITE = "bookworm"
 TIMEOUT_S = 900.0
-CERTIFICATES = "/root/certificates.pem"
+CERTIFICATES = "/etc/certificates_of_this_network.pem"  # inside the container
 CLONE_NEWNET = 0x40000000
 # systemd-nspawn wants a /run of its own, whether systemd runs on this machine or not.
 APART = 'mount -t tmpfs tmpfs /run && exec systemd-nspawn "$@"'
@@ -42,7 +42,7 @@ def bare(folder: Path) -> Path:
     quick.parent.mkdir(parents=True)
     quick.write_text("force-unsafe-io\n")
     done = subprocess.run(
-        ["debootstrap", "--variant=minbase", SUITE, folder, MIRROR],
+        ["debootstrap", "--variant=minbase", SUITE, folder],
         capture_output=True, text=True, timeout=TIMEOUT_S,
     )  # fmt: skip
     if done.returncode != 0:
