@@ -465,11 +465,8 @@ def _unix_socket(path: Path) -> socket.socket:
     try:
         if path.is_socket() and not _answers(path):
             path.unlink()
-        before = os.umask(0o177)
-        try:
-            listener.bind(str(path))
-        finally:
-            os.umask(before)
+        os.fchmod(listener.fileno(), 0o600)  # bind takes it over; a umask would be every thread's
+        listener.bind(str(path))
         listener.listen()
     except OSError as error:
         listener.close()

@@ -270,11 +270,8 @@ def _listener(path: Path) -> socket.socket:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         path.unlink(missing_ok=True)  # the folder is this daemon's alone
-        before = os.umask(0o177)
-        try:
-            listener.bind(str(path))
-        finally:
-            os.umask(before)
+        os.fchmod(listener.fileno(), 0o600)  # bind takes it over; a umask would be every thread's
+        listener.bind(str(path))
         listener.listen(WAITING_IN_KERNEL)
         listener.setblocking(False)
     except OSError as error:
