@@ -127,8 +127,8 @@ def test_it_leaves_the_umask_alone_which_is_every_threads(
     # Two that changed it at once left 0o177 behind: /dev/null of a container made later was root's alone.
     monkeypatch.setattr(os, "umask", lambda mask: pytest.fail(f"umask {mask:#o}"))
     made = StopSocket(tmp_path / "stop.sock", stops)
-    made.close()
     assert stat.S_IMODE(made.path.stat().st_mode) == 0o600
+    made.close()
 
 
 def test_a_stop_that_fails_is_told(door: StopSocket, stops: Stops, monkeypatch: pytest.MonkeyPatch) -> None:
