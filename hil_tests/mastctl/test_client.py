@@ -162,6 +162,8 @@ def something_else(answer: bytes) -> Iterator[str]:
     [
         (b"HTTP/1.1 200 OK\r\nContent-Length: 5\r\n\r\nhello", "bad_answer"),
         (b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\n[]", "bad_answer"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\n{}", "bad_answer"),
+        (b'HTTP/1.1 200 OK\r\nContent-Length: 18\r\n\r\n{"state": "ready"}', "bad_answer"),
         (b"HTTP/1.1 404 Not Found\r\nContent-Length: 2\r\n\r\n{}", "bad_answer"),
         (b'HTTP/1.1 500 Oh\r\nContent-Length: 14\r\n\r\n{"error": "no"}', "bad_answer"),
         (b"SSH-2.0-OpenSSH_9.2p1\r\n", "no_daemon"),

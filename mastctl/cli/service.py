@@ -190,7 +190,7 @@ def _ready(client: Client, wait_s: float) -> Status:
     until_s = time.monotonic() + wait_s
     while True:
         try:
-            status = client.status()
+            status = client.status(max(until_s - time.monotonic(), LOOK_S))
             if status["state"] in WELL:
                 return status
             reason = status.get("reason")

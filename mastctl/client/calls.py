@@ -52,9 +52,18 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
     def __init__(self, daemon: DaemonConnection) -> None:
         self._daemon = daemon
 
-    async def status(self) -> Status:
-        """Return what the daemon knows at this moment."""
-        return await self._daemon.json(Status, "GET", "/status")
+    async def status(self, timeout_s: float | None = None) -> Status:
+        """Return what the daemon knows at this moment.
+
+        ``timeout_s`` shortens the longest time of this request, seconds. Another program's answer is
+        ``bad_answer``.
+        """
+        longest_s = self._daemon.timeout_s
+        timeout_s = longest_s if timeout_s is None else min(timeout_s, longest_s)
+        status = await self._daemon.json(Status, "GET", "/status", timeout=timeout_s)
+        if not isinstance(status.get("state"), str) or "mast" not in status:
+            raise self._daemon.bad_answer("its status tells no state and no mast")
+        return status
 
     async def point(
         self,

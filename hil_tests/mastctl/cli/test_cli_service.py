@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +81,29 @@ def test_status_waits_for_a_daemon_that_is_not_there_yet(capsys: pytest.CaptureF
     error = json.loads(capsys.readouterr().out)["error"]
     assert error["code"] == "not_ready" and "no daemon answers" in error["message"]
     assert main(["status", "--wait", "9", "--url", "mars"]) == 2, "what no waiting mends is told at once"
+
+
+def test_the_wait_for_a_daemon_that_hangs_ends_with_its_time(capsys: pytest.CaptureFixture[str]) -> None:
+    ended, ready = threading.Event(), b'{"state": "ready", "mast": {}}'
+
+    def hang(listener: socket.socket) -> None:
+        line, _ = listener.accept()
+        with line:
+            line.recv(65536)
+            ended.wait(NET_S / 3)  # less than the usual patience with one request
+            with suppress(OSError):
+                line.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%s" % (len(ready), ready))
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=hang, args=(listener,))
+        thread.start()
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        code = main(["status", "--wait", "0.2", "--json", "--url", url])
+        ended.set()
+        thread.join(NET_S)
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert code == 1 and error["code"] == "not_ready"
+    assert "not ready after 0.2 s" in error["message"] and "did not answer" in error["message"]
 
 
 def test_status_tells_faults(run: Run, pair: BOTH) -> None:
