@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 
 NOTHING = "no head and no camera is plugged in; write a simulated twin, which runs"
+TWIN_DEG = {"pan": 175.0, "tilt": 90.0}
+"""What the simulated head reaches to each side."""
 LEAST_DEG = 15.0
 """Between the ends of an axis: both keep a margin (`mastctl.rig.drawing.MARGIN_RAD`)."""
 
@@ -32,7 +34,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     )
     new.add_argument("folder", type=folder_name, metavar="FOLDER", help="where the files go")
     new.add_argument(
-        "--port", action="append", default=[], metavar="PORT",
+        "--port", action="append", default=[], type=_port, metavar="PORT",
         help="ask this line only, a device or URL; may be repeated (default: all USB adapters)",
     )  # fmt: skip
     number = at_least(0)
@@ -53,6 +55,13 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
         "--view-deg", type=positive_number, metavar="DEG", help="the cameras' view across (default 60)"
     )
     new.set_defaults(run=_new)
+
+
+def _port(text: str) -> str:
+    """Read a line's name; an empty one (a variable that is not set) would be the current folder."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("the name is empty, a device or URL is expected")
+    return text
 
 
 def _new(args: argparse.Namespace) -> int:
@@ -84,6 +93,10 @@ def _new(args: argparse.Namespace) -> int:
     if none and questions.one_of(NOTHING, ("yes", "no"), "yes") == "no":
         output.tell("nothing is written; plug the head in and try again")
         return 0
+    if none and (args.pan_id is not None or args.tilt_id is not None):
+        output.tell(
+            "--pan-id and --tilt-id are not used: the simulated twin's servos are 1 and 2"
+        )
     answers = _answers(args, found, head, questions)
     if none:
         output.tell("no head and no camera is plugged in: this is the simulated twin, which runs")
@@ -96,12 +109,15 @@ def _new(args: argparse.Namespace) -> int:
                 "heads": [one.words for one in found.heads],
                 "cameras": [one.words for one in found.cameras],
                 "unused": list(found.unused),
+                "notes": list(made.notes),
                 "simulated": made.simulated,
                 "written": [str(made.folder / name) for name in made.files],
                 "next": list(made.next),
             }
         )
         return 0
+    for words in made.notes:
+        output.tell(words)
     sys.stdout.write(output.one_line(f"written in {made.folder}: {', '.join(made.files)}") + "\n")
     sys.stdout.write("next:\n" + "".join(f"  {step}\n" for step in made.next))
     return 0
@@ -109,7 +125,7 @@ def _new(args: argparse.Namespace) -> int:
 
 def _head(found: Plugged, questions: Questions) -> PluggedHead | None:
     """The head of the rig, of those that can be one."""
-    heads = [one for one in found.heads if one.unit is not None or one.servos]
+    heads = found.heads
     if len(heads) < 2:
         return heads[0] if heads else None
     ports = [one.port for one in heads]
@@ -135,15 +151,16 @@ def _answers(
             raise WrongUse(f"{question}: {option:g} where {low:g} to {high:g} is expected")
         return option
 
+    none = head is None and not found.cameras
     ends = {}
     for axis, (low, high) in {"pan": usual.pan_deg, "tilt": usual.tilt_deg}.items():
         given = getattr(args, f"{axis}_deg")
         least, most = given if given is not None else (None, None)
-        from_deg = number(least, f"{axis} may turn from, degrees", low, -175.0, 175.0 - LEAST_DEG)
+        end = TWIN_DEG[axis] if none else 175.0
+        from_deg = number(least, f"{axis} may turn from, degrees", low, -end, end - LEAST_DEG)
         lowest_deg = from_deg + LEAST_DEG
-        to_deg = number(most, f"{axis} may turn to, degrees", max(high, lowest_deg), lowest_deg, 175.0)
+        to_deg = number(most, f"{axis} may turn to, degrees", max(high, lowest_deg), lowest_deg, end)
         ends[axis] = from_deg, to_deg
-    none = head is None and not found.cameras
     return RigAnswers(
         height_m=number(args.height, "height of the axes over the ground, m", usual.height_m, 0.3, 5.0),
         baseline_m=number(args.baseline, "distance of the two cameras, m", usual.baseline_m, 0.02, 1.0)

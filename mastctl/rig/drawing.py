@@ -55,7 +55,7 @@ class RigAnswers:
 
 
 def camera_names(count: int) -> list[str]:
-    """Return the names of a rig's cameras: a pair, or one; those beyond a pair are left out."""
+    """Return the names of a rig's cameras: a pair, or one."""
     return ["cam_left", "cam_right"] if count > 1 else ["cam"][:count]
 
 
@@ -84,10 +84,7 @@ def configuration(
             for name, camera in zip(names, cameras, strict=False)
         },
         "limits": {
-            **{
-                f"{axis}_rad": [round(low + MARGIN_RAD, 3), round(high - MARGIN_RAD, 3)]
-                for axis, (low, high) in ends.items()
-            },
+            **{f"{axis}_rad": _soft(of_axis) for axis, of_axis in ends.items()},
             "speed_rad_per_s": speed,
         },
     }
@@ -95,6 +92,16 @@ def configuration(
 
 def _radians(ends_deg: tuple[float, float]) -> tuple[float, float]:
     return round(math.radians(ends_deg[0]), 3), round(math.radians(ends_deg[1]), 3)
+
+
+def _soft(ends: tuple[float, float]) -> list[float]:
+    """Soft limits of an axis within what its driver holds."""
+    return [round(ends[0] + MARGIN_RAD, 3), round(ends[1] - MARGIN_RAD, 3)]
+
+
+def soft_limits(answers: RigAnswers) -> tuple[list[float], list[float]]:
+    """Return the soft limits of pan and tilt by the answers alone, radians."""
+    return _soft(_radians(answers.pan_deg)), _soft(_radians(answers.tilt_deg))
 
 
 def _within(ends: tuple[float, float], axis: AxisFacts, sign: int) -> tuple[float, float]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -19,8 +19,8 @@ from calib.files.mast_file import load_rig
 from calib.files.yaml_text import dump_mapping
 from mastctl.config import check_cameras, load_config
 from mastctl.packaged import config_folder, schema_files
-from mastctl.rig.drawing import USUAL_BAUD, RigAnswers, camera_names, configuration, drawing
-from mastctl.rig.plugged import Plugged, PluggedHead, usb_of
+from mastctl.rig.drawing import USUAL_BAUD, RigAnswers, camera_names, configuration, drawing, soft_limits
+from mastctl.rig.plugged import Plugged, PluggedCamera, PluggedHead, set_id, usb_of
 from mastctl.setup.machine import ExaminedMachine
 from mastctl.setup.new_rig import RigNumbers, built_rig, focal_of
 from mastctl.setup.rig_folder import CONFIG, MAST, TRUE_RIG, InTheWay, write_built
@@ -28,6 +28,14 @@ from mastctl.setup.rig_folder import CONFIG, MAST, TRUE_RIG, InTheWay, write_bui
 RULES, README, SCHEMAS = "60-mastctl.rules", "README.md", "schemas"
 LINE = "/dev/mast"
 """What the rules call the head's line."""
+NO_HEAD = (
+    f"no head answered: {LINE} in {CONFIG} stands for its line. Plug the head in and run mastctl rig new "
+    "with another folder, or write the line's name there"
+)
+SAME_SERIAL = (
+    "have the same serial number: the udev rules and the configuration tell them by their USB sockets, so "
+    "leave each in its socket"
+)
 TWIN_SIZE_PX, TWIN_SEED = (640, 480), 1
 _NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
 _USB = re.compile(rf"{_NUMBERED.pattern}|/dev/serial/by-.*")
@@ -45,12 +53,15 @@ class NewRigFolder:
         Whether it is the twin, since no head and no camera is plugged in.
     next
         The three commands.
+    notes
+        A sentence for each thing that a person must know of these files.
     """
 
     folder: Path
     files: tuple[str, ...]
     simulated: bool
     next: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 def check_free(folder: Path) -> None:
@@ -80,11 +91,16 @@ def write_rig(
     files = {
         CONFIG: _commented("config", _CONFIG_WORDS, configuration(head, cameras, answers, port)),
         MAST: _commented("mast", _MAST_WORDS, drawing(name, cameras, answers)),
-        RULES: rules(head, plugged, machine).encode(),
     }
+    names = camera_names(len(cameras))
+    known = [tuple(usb_of(_device(camera, machine), machine)) for camera in cameras]
+    alike = [name for name, one in zip(names, known, strict=True) if one and known.count(one) > 1]
+    files[RULES] = rules(head, plugged, machine, alike).encode()
+    notes = [f"{' and '.join(alike)} {SAME_SERIAL}"] if alike else []
+    notes += [NO_HEAD] if head is None else []
     steps = _steps(folder, head, len(cameras))
-    files[README] = _readme(plugged, steps).encode()
-    return _written(folder, files, steps, simulated=False)
+    files[README] = _readme(plugged, steps, notes).encode()
+    return replace(_written(folder, files, steps, simulated=False), notes=tuple(notes))
 
 
 def write_simulated(folder: Path, plugged: Plugged, answers: RigAnswers) -> NewRigFolder:
@@ -97,7 +113,8 @@ def write_simulated(folder: Path, plugged: Plugged, answers: RigAnswers) -> NewR
         size_px=TWIN_SIZE_PX,
     )
     simulation = {"wire": "dynamixel", "seed": TWIN_SEED}
-    write_built(built_rig(numbers, np.random.default_rng(TWIN_SEED)), folder, simulation, TWIN_SEED)
+    rig = built_rig(numbers, np.random.default_rng(TWIN_SEED))
+    write_built(rig, folder, simulation, TWIN_SEED, soft_limits(answers))
     for name, kind in ((CONFIG, "config"), (MAST, "mast"), (TRUE_RIG, "mast")):
         (folder / name).write_bytes(_first_line(kind) + (folder / name).read_bytes())
     config = f"--config {quote(str(folder / CONFIG))}"
@@ -153,17 +170,27 @@ def _first_line(kind: str) -> bytes:
     return f"# yaml-language-server: $schema={SCHEMAS}/{kind}.json\n".encode()
 
 
-def rules(head: PluggedHead | None, plugged: Plugged, machine: ExaminedMachine) -> str:
-    """Return the packaged udev rules, and a stable name for each device of this rig."""
+def _device(camera: PluggedCamera, machine: ExaminedMachine) -> Path:
+    """A camera's folder in sysfs."""
+    return machine.at("/sys/class/video4linux") / camera.node.name / "device"
+
+
+def rules(
+    head: PluggedHead | None, plugged: Plugged, machine: ExaminedMachine, alike: Sequence[str] = ()
+) -> str:
+    """Return the packaged udev rules, and a stable name for each device of this rig.
+
+    ``alike`` are cameras that their serial numbers do not tell from each other.
+    """
     text = (config_folder() / "udev" / RULES).read_text(encoding="utf-8")
     lines = ["", "# This rig:"]
     if head is not None and "://" not in head.port:
         device = machine.at("/sys/class/tty") / machine.at(head.port).resolve().name / "device"
         lines += _rule('SUBSYSTEM=="tty", SUBSYSTEMS=="usb"', list(usb_of(device, machine)), LINE[5:])
     for name, camera in zip(camera_names(len(plugged.cameras)), plugged.cameras, strict=False):
-        device = machine.at("/sys/class/video4linux") / camera.node.name / "device"
         about = 'SUBSYSTEM=="video4linux", ATTR{index}=="0"'
-        lines += _rule(about, list(usb_of(device, machine)), f"v4l/by-id/mast-{name.replace('_', '-')}")
+        matches = list(usb_of(_device(camera, machine), machine, by_socket=name in alike))
+        lines += _rule(about, matches, f"v4l/by-id/mast-{name.replace('_', '-')}")
     return text + "\n".join(lines) + "\n" if len(lines) > 2 else text
 
 
@@ -182,15 +209,18 @@ def _steps(folder: Path, head: PluggedHead | None, cameras: int) -> tuple[str, .
     doctor, run = f"mastctl doctor {config}", f"mastctl run {config}"
     if head is None:
         return f"{rules} && sudo udevadm trigger", "mastctl servo scan PORT", doctor
+    if head.family is not None and head.lacks and head.servos[0].servo_id == 1:
+        return set_id(head.port, head.family, head.servos[0].baud), f"{rules} && sudo udevadm trigger", doctor
     if _USB.fullmatch(head.port) or cameras:
         return f"{rules} && sudo udevadm trigger", doctor, run
     return doctor, run, f"mastctl point {config} --angles 0.2 0.0"
 
 
-def _readme(plugged: Plugged, steps: Sequence[str]) -> str:
+def _readme(plugged: Plugged, steps: Sequence[str], notes: Sequence[str] = ()) -> str:
     """What was found, the next three commands, and what comes after them."""
     found = [f"- {words}" for words in plugged.words]
     found += [f"- not used: {words}" for words in plugged.unused]
+    found += [f"- {words}" for words in notes]
     return "\n".join(
         [
             "# A rig of your own",

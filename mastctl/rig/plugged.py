@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from drivers.dynamixel import workshop as dynamixel
@@ -53,10 +54,19 @@ class ServoFamily:
     poll_bytes: int
 
 
-ONE_ID = (
-    "new servos all have the id 1; connect one at a time, and give the second another id "
-    "(mastctl servo set-id PORT 1 2)"
-)
+def set_id(port: str, family: ServoFamily, baud: int) -> str:
+    """Return the command that gives a new servo, alone on a line, the second id."""
+    named = "" if family.driver == "dynamixel" else f" --family {family.driver}"
+    return f"mastctl servo set-id {quote(port)} 1 2 --baud {baud}{named}"
+
+
+def one_id(port: str, family: ServoFamily, baud: int) -> str:
+    """Return what to do where one id is all that answers."""
+    return (
+        f"new servos all have the id 1; connect one at a time, and give the second another id: "
+        f"{set_id(port, family, baud)}"
+    )
+
 
 FAMILIES = (
     ServoFamily(
@@ -77,6 +87,8 @@ FAMILIES = (
 PTU_BAUDS = (9600, 38_400)
 """As units come from the factory, and as docs/how-to/hardware.md has them set up."""
 LEAST_PX, USUAL_HZ = (640, 480), 30.0
+MOST_CAMERAS, BY_ID = 2, "by-id"
+BY_HAND = "write it into configuration and mast file by hand (configs/rigs/rover.yaml has six)"
 
 
 @dataclass(frozen=True)
@@ -112,6 +124,17 @@ class PluggedHead:
         servos = [f"{one.model} (id {one.servo_id}, {one.baud} baud)" for one in self.servos]
         others = [f"{name}, which mastctl does not drive" for name in self.others]
         return f"{self.port}: {', '.join([*servos, *others])}"
+
+    @property
+    def lacks(self) -> str:
+        """What to do about a servo that is missing, in one sentence; empty if none is."""
+        if self.family is None or len(self.servos) != 1:
+            return ""
+        (servo,) = self.servos
+        told = f"{self.port}: only one servo answers (id {servo.servo_id}), and a head has two"
+        if servo.servo_id != 1:
+            return f"{told}; is the other one connected, with power and the same rate?"
+        return f"{told}: {one_id(self.port, self.family, servo.baud)}"
 
 
 @dataclass(frozen=True)
@@ -162,15 +185,18 @@ def look(ports: Sequence[str], machine: ExaminedMachine, say: Callable[[str], No
     for port in named or serial_lines(machine):
         say(f"asking {port}")
         found, why = ask_line(port, machine)
-        if found is not None:
-            heads.append(found)
-            if len(found.servos) == 1:
-                unused.append(f"{port}: only one servo answers, and a head has two: {ONE_ID}")
-        else:
+        if found is None:
             unused.append(why)
+        elif found.unit is None and not found.servos:
+            unused.append(found.words)
+        else:
+            heads.append(found)
+            unused += [words] if (words := found.lacks) else []
     say("asking the cameras")
     cameras, no_cameras = ask_cameras()
-    return Plugged(tuple(heads), tuple(cameras), (*unused, *no_cameras))
+    for one in cameras[MOST_CAMERAS:]:
+        unused.append(f"{one.words}: a head has {MOST_CAMERAS} cameras at most here; {BY_HAND}")
+    return Plugged(tuple(heads), tuple(cameras[:MOST_CAMERAS]), (*unused, *no_cameras))
 
 
 def serial_lines(machine: ExaminedMachine) -> list[str]:
@@ -202,7 +228,7 @@ def ask_line(port: str, machine: ExaminedMachine) -> tuple[PluggedHead | None, s
             others = tuple(one.model for one in found if one.model not in family.models)
             return PluggedHead(port, family, driven, others), ""
         if garbled:
-            noise = f"; at {garbled[0]} baud something answers: {ONE_ID}"
+            noise = f"; at {garbled[0]} baud something answers: {one_id(port, family, garbled[0])}"
     return None, f"{port}: no servo and no PTU answers{noise or '; is its power on?'}"
 
 
@@ -226,9 +252,10 @@ def ask_cameras() -> tuple[list[PluggedCamera], list[str]]:
     """Return the cameras with a format that is read, and a sentence for each of the others."""
     cameras: list[PluggedCamera] = []
     others = list(find.refused_nodes(capture_nodes()))
-    for one in find.list_cameras():
+    found = find.list_cameras()
+    for one in found:
         try:
-            options = _options(one)
+            options = _options(one, _by_id(one, found))
         except DriverError as error:
             others.append(f"{one.card} at {one.bus}: {error}")
             continue
@@ -236,31 +263,42 @@ def ask_cameras() -> tuple[list[PluggedCamera], list[str]]:
     return cameras, others
 
 
-def _options(camera: find.FoundCamera) -> dict[str, Any]:
+def _by_id(camera: find.FoundCamera, found: Sequence[find.FoundCamera]) -> bool:
+    """Whether a link by-id can tell a camera: cameras with one serial number have one such link together."""
+    alike = [one for one in found if one.card == camera.card]
+    return len({link.name for one in alike for link in one.links if link.parent.name == BY_ID}) >= len(alike)
+
+
+def _options(camera: find.FoundCamera, by_id: bool) -> dict[str, Any]:
     """A camera's options: its stable link, or card and bus; its format, size and rate, of now or usual."""
     now = find.options_for(str(camera.node), None, None, None, {})
     code, size_px = now["format"], tuple(now["size_px"])
     with Node(camera.node) as node:
-        if size_px < LEAST_PX and LEAST_PX in node.sizes(code)[0]:
+        small = any(side < least for side, least in zip(size_px, LEAST_PX, strict=True))
+        if small and LEAST_PX in node.sizes(code)[0]:
             size_px = LEAST_PX
         rates_hz = node.rates_hz(code, size_px)
     slow_hz = [rate for rate in rates_hz if rate <= USUAL_HZ + 1e-3]
     rate = {"rate_hz": round(max(slow_hz or rates_hz), 3)} if rates_hz else {}
-    address = {"device": str(camera.links[0])} if camera.links else {"card": camera.card, "bus": camera.bus}
+    links = [link for link in camera.links if by_id or link.parent.name != BY_ID]
+    address = {"device": str(links[0])} if links else {"card": camera.card, "bus": camera.bus}
     return {**address, "format": code, "size_px": list(size_px), **rate}
 
 
-def usb_of(device: Path, machine: ExaminedMachine) -> Iterator[tuple[str, str]]:
+def usb_of(device: Path, machine: ExaminedMachine, by_socket: bool = False) -> Iterator[tuple[str, str]]:
     """Yield the udev matches that tell a USB device from all others: by its serial number, else its socket.
 
-    ``device`` is its folder in sysfs; nothing is yielded for what is not on USB.
+    ``device`` is its folder in sysfs; nothing is yielded for what is not on USB. ``by_socket``: where others
+    have the same serial number.
     """
     place = device.resolve()
     for folder in (place, *place.parents):
         if (folder / "idVendor").is_file():
-            yield "ATTRS{idVendor}", (folder / "idVendor").read_text().strip()
+            for name in ("idVendor", "idProduct"):
+                if (folder / name).is_file():
+                    yield f"ATTRS{{{name}}}", (folder / name).read_text().strip()
             serial = folder / "serial"
-            if serial.is_file():
+            if serial.is_file() and not by_socket:
                 yield "ATTRS{serial}", serial.read_text().strip()
             else:
                 yield "KERNELS", folder.name

@@ -136,11 +136,25 @@ def _head_line(config: Config, machine: ExaminedMachine) -> Iterator[DoctorFindi
     port = head.options.get("port")
     if head.driver in HEADS and isinstance(port, str):
         yield from examine_port(port, machine)
+        yield from _servos(head.driver, head.options, port)
     elif head.driver in HEADS:
         words = f"driver {head.driver} has no 'port' in its options"
         yield DoctorFinding("port", "bad", words, "name the serial device; docs/reference/configuration.md")
     elif head.driver not in OURS:
         yield DoctorFinding("head", "unsure", f"{head.driver} is from outside; it is not looked at", "")
+
+
+def _servos(driver: str, options: Mapping[str, Any], port: str) -> Iterator[DoctorFinding]:
+    """Which servo is which axis, and how a new one gets its id: no servo is asked here."""
+    axes = (options.get("pan"), options.get("tilt"))
+    ids = [axis["id"] for axis in axes if isinstance(axis, Mapping) and isinstance(axis.get("id"), int)]
+    if len(ids) != 2:
+        return
+    at = quote(port) + ("" if driver == "dynamixel" else f" --family {driver}")
+    words = f"pan is servo {ids[0]} and tilt servo {ids[1]}; 'mastctl servo scan {at}' asks which answer"
+    new = next((number for number in ids if number != 1), 2)
+    advice = f"a new servo has the id 1: connect it alone, then mastctl servo set-id {at} 1 {new}"
+    yield DoctorFinding("servos", "good", words, advice)
 
 
 def _simulation(config: Config) -> Iterator[DoctorFinding]:
@@ -185,7 +199,7 @@ def examine_camera(name: str, options: Mapping[str, Any], *, in_use: bool) -> Do
             what, "bad", str(error), "plug it in; mastctl camera list shows what is connected"
         )
     except NoPermission as error:
-        return DoctorFinding(what, "bad", str(error), 'sudo usermod -aG video "$USER", then log in again')
+        return DoctorFinding(what, "bad", str(error))  # it names the group, and how to join it
     except CameraBusy as error:
         if in_use:
             return DoctorFinding(what, "good", str(error))

@@ -202,6 +202,13 @@ def _permission(port: str, path: Path) -> Iterator[DoctorFinding]:
     about = path.stat()
     group = _group(about.st_gid)
     words = f"{port} may not be opened by this user; it is of group {group}, {stat.filemode(about.st_mode)}"
+    if about.st_gid == 0 or about.st_mode & 0o060 != 0o060:
+        advice = (
+            "install the udev rules (docs/how-to/hardware.md), which give it to dialout; for now: "
+            f"sudo chgrp dialout {port} && sudo chmod g+rw {port}"
+        )
+        yield DoctorFinding("port permission", "bad", words, advice)
+        return
     yield DoctorFinding(
         "port permission", "bad", words, f'sudo usermod -aG {group} "$USER", then log in again'
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -72,8 +72,17 @@ def check_empty(folder: Path, force: bool) -> None:
             raise InTheWay(f"{folder / name} exists; another folder, or --force to replace it, is expected")
 
 
-def write_built(rig: Rig, folder: Path, simulation: Mapping[str, Any], seed: int) -> NewRig:
-    """Write a rig made of numbers, believed as a usual calibration leaves it. Raises as `write_twin`."""
+def write_built(
+    rig: Rig,
+    folder: Path,
+    simulation: Mapping[str, Any],
+    seed: int,
+    limits_rad: Sequence[Sequence[float]] = USUAL_LIMITS_RAD,
+) -> NewRig:
+    """Write a rig made of numbers, believed as a usual calibration leaves it. Raises as `write_twin`.
+
+    ``limits_rad`` are the soft limits of pan and tilt that are wanted, within what the head reaches.
+    """
     known = usual_covariance(rig)
     fit = {
         "method": "stated",
@@ -85,7 +94,7 @@ def write_built(rig: Rig, folder: Path, simulation: Mapping[str, Any], seed: int
     believed = replace(rig, fit=fit, provenance=source)
     folder.mkdir(parents=True, exist_ok=True)
     save_rig(believed, folder / MAST)
-    return _write(believed, folder, simulation, seed)
+    return _write(believed, folder, simulation, seed, limits_rad)
 
 
 def write_twin(file: Path, folder: Path, simulation: Mapping[str, Any], seed: int) -> NewRig:
@@ -108,7 +117,13 @@ def write_twin(file: Path, folder: Path, simulation: Mapping[str, Any], seed: in
     return _write(believed.rig, folder, simulation, seed)
 
 
-def _write(believed: Rig, folder: Path, simulation: Mapping[str, Any], seed: int) -> NewRig:
+def _write(
+    believed: Rig,
+    folder: Path,
+    simulation: Mapping[str, Any],
+    seed: int,
+    limits_rad: Sequence[Sequence[float]] = USUAL_LIMITS_RAD,
+) -> NewRig:
     """Write the true rig and the configuration, and read all of it as the daemon does."""
     from drivers.sim.settings import simulation_settings
 
@@ -121,19 +136,21 @@ def _write(believed: Rig, folder: Path, simulation: Mapping[str, Any], seed: int
     }
     true_rig = replace(twin.true_rig, name=f"{believed.name}_true", fit={}, provenance=provenance)
     save_rig(true_rig, folder / TRUE_RIG)
-    save_bytes(folder / CONFIG, dump_mapping(_configuration(believed, simulation)))
+    save_bytes(folder / CONFIG, dump_mapping(_configuration(believed, simulation, limits_rad)))
     config = load_config(folder / CONFIG)
     check_cameras(config, load_rig(config.mast_file).rig)
     simulation_settings(config.hardware.simulation, config.hardware.folder)
     return NewRig(folder, believed, twin)
 
 
-def _configuration(rig: Rig, simulation: Mapping[str, Any]) -> dict[str, Any]:
+def _configuration(
+    rig: Rig, simulation: Mapping[str, Any], limits_rad: Sequence[Sequence[float]]
+) -> dict[str, Any]:
     """The configuration that runs the rig: every camera simulated, soft limits inside the head's range."""
     wire = simulation.get("wire")
     head = PRESETS[simulation.get("head", DEFAULT_HEADS.get(str(wire), "ptu_d46_70"))]
     pan_rad, tilt_rad = (
-        _limits(axis, usual) for axis, usual in zip((head.pan, head.tilt), USUAL_LIMITS_RAD, strict=True)
+        _limits(axis, usual) for axis, usual in zip((head.pan, head.tilt), limits_rad, strict=True)
     )
     speed = min(1.0, head.pan.speed_rad_per_s, head.tilt.speed_rad_per_s)
     return {
@@ -147,7 +164,7 @@ def _configuration(rig: Rig, simulation: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _limits(axis: AxisSettings, usual: tuple[float, float]) -> list[float]:
+def _limits(axis: AxisSettings, usual: Sequence[float]) -> list[float]:
     """Soft limits of an axis."""
     margin_rad = MARGIN_RAD + axis.approach_rad
     return [

@@ -6,7 +6,7 @@ import io
 import json
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -34,6 +34,7 @@ from drivers.sim.wire.line import PtyLine, WireDevice
 from drivers.sim.wire.memory_line import MemoryLine
 from drivers.sim.wire.ptu import SimulatedPtu
 from drivers.simulation_clock import SimulationClock
+from drivers.v4l2 import find
 from drivers.v4l2.options import parse_options
 from mastctl.cli.main import main
 from mastctl.client import Client
@@ -158,6 +159,31 @@ def test_one_servo_or_two_of_one_id_are_told_to_be_given_ids(
     assert "new servos all have the id 1; connect one at a time" in capsys.readouterr().err
 
 
+def test_a_new_servo_alone_leads_to_the_command_that_gives_it_another_id(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = SimulatedServo("xl330_m288", 1, bench.axes()[0], time_s=bench.clock.now_s())
+    with bench.line(DynamixelBus([new])) as port:
+        told = written(capsys, str(tmp_path / "rig"), "--port", port)
+    command = f"mastctl servo set-id {port} 1 2 --baud 57600"
+    assert command in told["unused"][0]
+    assert told["next"][0] == command and told["next"][2].startswith("mastctl doctor")
+    options = load_config(tmp_path / "rig" / CONFIG).hardware.pan_tilt.options
+    found = {one.what: one for one in doctor._servos("dynamixel", options, port)}
+    assert f"mastctl servo set-id {port} 1 2" in found["servos"].advice
+
+
+def test_servos_that_are_not_driven_are_named_where_no_head_is_found(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with bench.line(DynamixelBus(bench.servos((1, 2)))) as port:
+        unknown = tuple(replace(one, models={}) for one in plugged.FAMILIES)
+        monkeypatch.setattr(plugged, "FAMILIES", unknown)
+        assert main(["rig", "new", str(tmp_path / "rig"), "--port", port]) == 1
+    told = capsys.readouterr().err
+    assert f"no head: {port}: XL330-M288-T, which mastctl does not drive, XL330-M288-T, which" in told
+
+
 def test_feetech_servos_are_asked_in_their_own_words(
     bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -229,6 +255,21 @@ def test_a_named_line_on_which_nothing_answers_is_a_failure_and_nothing_is_writt
     assert not (tmp_path / "rig").exists()
 
 
+def test_the_twin_has_the_limits_that_are_asked_for(
+    tmp_path: Path, nothing: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ("--pan-deg", "-30", "50", "--tilt-deg", "-20", "10", "--pan-id", "7")
+    assert main(["rig", "new", str(tmp_path / "rig"), *asked]) == 0
+    limits = load_config(tmp_path / "rig" / CONFIG).limits
+    ends = [math.radians(one) for one in (-30, 50, -20, 10)]
+    margin_rad = [0.1, -0.1, 0.1, -0.1]
+    found = [*limits.pan_rad, *limits.tilt_rad]
+    assert found == pytest.approx(
+        [end + inside for end, inside in zip(ends, margin_rad, strict=True)], abs=2e-3
+    )
+    assert "--pan-id and --tilt-id are not used" in capsys.readouterr().err
+
+
 CAMERAS = tuple(
     PluggedCamera(
         card="C270",
@@ -242,11 +283,13 @@ SERVOS = tuple(FoundServo(1_000_000, number, 1020, "XM430-W350", 45, ()) for num
 
 
 def machine_with(tmp_path: Path, serial: str | None) -> ExaminedMachine:
-    """A machine with an adapter at ttyUSB0 and a camera at video0, in a folder."""
-    for place, kind, node in (("1-2", "tty", "ttyUSB0"), ("1-3", "video4linux", "video0")):
+    """A machine with an adapter at ttyUSB0 and cameras at video0 and video2, in a folder."""
+    cameras = (("1-3", "video4linux", "video0"), ("1-4", "video4linux", "video2"))
+    for place, kind, node in (("1-2", "tty", "ttyUSB0"), *cameras):
         device = tmp_path / "sys/devices" / place / f"{place}:1.0"
         device.mkdir(parents=True)
         (device.parent / "idVendor").write_text("0403\n")
+        (device.parent / "idProduct").write_text("6014\n")
         if serial is not None:
             (device.parent / "serial").write_text(f"{serial}\n")
         of_class = tmp_path / "sys/class" / kind / node
@@ -267,12 +310,66 @@ def test_an_adapter_without_a_stable_name_gets_one_by_a_rule(
     made = write_rig(folder, Plugged((head,), CAMERAS), head, RigAnswers(), machine)
     lines = (folder / RULES).read_text().splitlines()
     line = next(one for one in lines if one.endswith('SYMLINK+="mast"') and not one.startswith("#"))
-    assert line.startswith('SUBSYSTEM=="tty", SUBSYSTEMS=="usb", ATTRS{idVendor}=="0403", ')
+    known = 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6014"'
+    assert line.startswith(f'SUBSYSTEM=="tty", SUBSYSTEMS=="usb", {known}, ')
     assert told in line
     assert 'SYMLINK+="v4l/by-id/mast-cam-left"' in (folder / RULES).read_text()
     assert load_config(folder / CONFIG).hardware.pan_tilt.options["port"] == "/dev/mast"
     assert made.next[0].startswith("sudo cp ") and str(folder / RULES) in made.next[0]
     assert all(step in (folder / README).read_text() for step in made.next)
+
+
+def test_two_webcams_of_one_serial_number_are_told_by_their_sockets(tmp_path: Path) -> None:
+    machine, folder = machine_with(tmp_path / "machine", "200901010001"), tmp_path / "rig"
+    head = PluggedHead("/dev/ttyUSB0", FAMILIES[0], SERVOS)
+    made = write_rig(folder, Plugged((head,), CAMERAS), head, RigAnswers(), machine)
+    rules = [line for line in (folder / RULES).read_text().splitlines() if "mast-cam-" in line]
+    for line, socket, side in zip(rules, ("1-3", "1-4"), ("left", "right"), strict=True):
+        known = 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6014"'
+        assert f'{known}, KERNELS=="{socket}", SYMLINK+="v4l/by-id/mast-cam-{side}"' in line
+    told = "cam_left and cam_right have the same serial number"
+    assert made.notes[0].startswith(told) and told in (folder / README).read_text()
+
+
+def connected(monkeypatch: pytest.MonkeyPatch, *links: str, size_px: tuple[int, int] = (640, 480)) -> None:
+    """Cameras of one card with these links, each now at a size, that offer two sizes more."""
+    found = [
+        find.FoundCamera(
+            Path(f"/dev/video{n}"), "uvcvideo", "C270", f"usb-{n}", tuple(map(Path, one.split()))
+        )
+        for n, one in enumerate(links)
+    ]
+    sizes = ({(640, 480), (800, 300), size_px}, False)
+    node = SimpleNamespace(sizes=lambda code: sizes, rates_hz=lambda code, size: [30.0])
+    monkeypatch.setattr(plugged, "capture_nodes", list)
+    monkeypatch.setattr(plugged, "Node", lambda path: nullcontext(node))
+    monkeypatch.setattr(find, "list_cameras", lambda: found)
+    monkeypatch.setattr(find, "options_for", lambda *_: {"format": "YUYV", "size_px": list(size_px)})
+
+
+def test_a_link_that_two_cameras_share_names_neither(monkeypatch: pytest.MonkeyPatch) -> None:
+    by_id, by_path = "/dev/v4l/by-id/c270", "/dev/v4l/by-path/socket1"
+    connected(monkeypatch, f"{by_id} {by_path}", "")
+    first, second = (one.options for one in plugged.ask_cameras()[0])
+    assert first["device"] == by_path and (second["card"], second["bus"]) == ("C270", "usb-1")
+    connected(monkeypatch, f"{by_id}_1", f"{by_id}_2")
+    assert [one.options["device"] for one in plugged.ask_cameras()[0]] == [f"{by_id}_1", f"{by_id}_2"]
+
+
+@pytest.mark.parametrize("now", [(320, 240), (800, 300), (480, 640)])
+def test_a_camera_that_stands_at_a_small_size_is_opened_at_the_usual_one(
+    now: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    connected(monkeypatch, "/dev/v4l/by-id/c270", size_px=now)
+    assert plugged.ask_cameras()[0][0].options["size_px"] == [640, 480]
+
+
+def test_a_third_camera_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    connected(monkeypatch, *(f"/dev/v4l/by-id/c270_{n}" for n in range(3)))
+    monkeypatch.setattr(plugged, "serial_lines", lambda machine: [])
+    found = plugged.look((), ExaminedMachine(), lambda words: None)
+    assert len(found.cameras) == 2
+    assert "usb-2" in found.unused[0] and "2 cameras at most" in found.unused[0]
 
 
 def test_a_pair_of_cameras_is_drawn_and_its_options_are_those_of_the_driver(tmp_path: Path) -> None:
@@ -309,6 +406,8 @@ def test_cameras_alone_lack_a_head_and_doctor_names_what_to_do(tmp_path: Path) -
     assert bad == {"port", "camera cam"}
     assert doctor.next_command(None, findings).startswith("plug the adapter in")
     assert "mastctl servo scan PORT" in made.next
+    assert "no head answered: /dev/mast" in made.notes[0]
+    assert made.notes[0] in (made.folder / README).read_text()
 
 
 def test_answers_are_asked_again_until_they_fit_and_never_without_a_terminal() -> None:
@@ -327,8 +426,10 @@ def test_answers_are_asked_again_until_they_fit_and_never_without_a_terminal() -
 @pytest.mark.parametrize(
     ("words", "told"),
     [
+        (("--port", ""), "--port: the name is empty, a device or URL is expected"),
         (("--height", "9"), "height of the axes over the ground, m: 9 where 0.3 to 5 is expected"),
         (("--pan-deg", "10", "5"), "pan may turn to, degrees: 5 where 25 to 175 is expected"),
+        (("--tilt-deg", "-100", "0"), "tilt may turn from, degrees: -100 where -90 to 75 is expected"),
         (("--pan-id", "2", "--tilt-id", "2"), "--pan-id and --tilt-id are both 2"),
     ],
 )

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import stat
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -83,7 +85,11 @@ def test_who_may_not_open_the_port_is_told_the_group(
     monkeypatch.setattr(os, "access", lambda *_: False)  # root may everything
     found = by_name(list(this_machine.examine_port(PORT, machine)))
     assert found["port permission"].level == "bad"
-    assert "usermod -aG" in found["port permission"].advice
+    assert "sudo chgrp dialout" in found["port permission"].advice, "the group root is nobody's to join"
+    of_dialout = SimpleNamespace(st_gid=20, st_mode=stat.S_IFCHR | 0o660)
+    monkeypatch.setattr(Path, "stat", lambda *_, **__: of_dialout)
+    (finding,) = this_machine._permission(PORT, machine.at(PORT))
+    assert 'usermod -aG dialout "$USER"' in finding.advice
 
 
 def test_another_program_that_has_the_port_open_is_named(machine: ExaminedMachine) -> None:
