@@ -163,6 +163,7 @@ BAD: list[tuple[str, Any, str, str]] = [
     ("limits/tild_rad", [0, 1], "limits.tild_rad", "the nearest known is 'tilt_rad'"),
     ("listen/port", 65536, "listen.port", "65535"),
     ("listen/port", "8420", "listen.port", "integer"),
+    ("listen/port", 8420.0, "listen.port", "integer"),
     ("listen/port", True, "listen.port", "integer"),
     ("listen/hosts", "rover.local", "listen.hosts", "list of names"),
     ("listen/hosts", [7], "listen.hosts", "list of names"),

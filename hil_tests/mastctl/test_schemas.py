@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,12 @@ import pytest
 
 from calib.errors import BadFile
 from calib.files.yaml_text import parse_mapping
+from drivers.dynamixel.settings import dynamixel_settings
+from drivers.errors import BadOptions
+from drivers.feetech.settings import feetech_settings
+from drivers.flir_ptu import options as flir_ptu
 from drivers.hardware import CAMERAS, HEADS
+from drivers.visca import options as visca
 from hil_tests.calib.files import test_store
 from hil_tests.calib.survey import test_survey
 from hil_tests.calib.survey.survey_case import FILES as FILES_OF_A_SURVEY
@@ -36,6 +41,7 @@ CANNOT = {
     "config": {
         "limits/pan_rad=[1.0, 1.0]": "one value against another",
         "limits/pan_rad=[2.0, 1.0]": "one value against another",
+        "listen/port=8420.0": "a whole number with a point, which JSON counts as an integer",
         "pan_tilt/options={'x': nan}": "not a number, in options of a driver from outside",
     },
     "mast": {
@@ -117,6 +123,100 @@ def test_a_broken_file_is_refused_by_the_schema_as_by_the_program(schemas: dict[
             passed[kind].add(name)
     assert count > 90
     assert passed == {kind: set(names) for kind, names in CANNOT.items()}
+
+
+AXIS = {"id": 1, "model": "XM430-W350", "limits_rad": [-1.0, 1.0]}
+FEETECH, XL430, XC330 = {"model": "STS3215"}, {"model": "XL430-W250"}, {"model": "xc330_t181"}
+COUNTED = {"count_rad": 0.001, "fastest_rad_per_s": 1.0}
+READERS: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "dynamixel": dynamixel_settings,
+    "feetech": feetech_settings,
+    "flir_ptu": flir_ptu.options_from,
+    "visca": visca.options_from,
+}
+
+
+def options_of(driver: str, pan: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """Good options of a driver with these in their place."""
+    if driver in ("flir_ptu", "visca"):
+        own = COUNTED if driver == "visca" else {}
+        axes = {axis: {**own, "limits_rad": [-0.5, 0.5]} for axis in ("pan", "tilt")}
+    else:
+        own = FEETECH if driver == "feetech" else {}
+        axes = {axis: {**AXIS, **own, "id": number} for number, axis in enumerate(("pan", "tilt"), 1)}
+    return {"port": "/dev/mast", **axes, "pan": {**axes["pan"], **pan}, **more}
+
+
+BROKEN_OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
+    "no such model": ("dynamixel", options_of("dynamixel", {"model": "XL999"})),
+    "a model of another family": ("dynamixel", options_of("dynamixel", FEETECH)),
+    "Dynamixel under feetech": ("feetech", options_of("feetech", XL430)),
+    "a number for a model": ("dynamixel", options_of("dynamixel", {"model": 1020})),
+    "a side without a stretch": ("dynamixel", options_of("dynamixel", {"approach": "positive"})),
+    "a stretch without a side": ("feetech", options_of("feetech", {"approach_rad": 0.02})),
+    "gravity without a stretch": ("flir_ptu", options_of("flir_ptu", {"approach": "gravity"})),
+    "another scheme": ("flir_ptu", options_of("flir_ptu", {}, port="http://bench")),
+    "a scheme of no head": ("visca", options_of("visca", {}, port="http://bench")),
+    "one id for both": ("dynamixel", options_of("dynamixel", {"id": 2})),
+    "limits turned round": ("feetech", options_of("feetech", {"limits_rad": [1.0, -1.0]})),
+    "beyond the servo": ("dynamixel", options_of("dynamixel", {"limits_rad": [-4.0, 4.0]})),
+    "no current to limit": ("dynamixel", options_of("dynamixel", {**XL430, "current_limit_A": 1.0})),
+    "less than the backlash": (
+        "dynamixel",
+        options_of("dynamixel", {"approach": "positive", "approach_rad": 1e-4}),
+    ),
+    "two series": ("feetech", options_of("feetech", {"model": "SCS0009"})),
+    "too slow a line": ("dynamixel", options_of("dynamixel", {}, baud=9600)),
+    "too short a watchdog": ("dynamixel", options_of("dynamixel", {}, watchdog_s=0.001)),
+    "too late a reply": ("dynamixel", options_of("dynamixel", {}, reply_timeout_s=0.3)),
+    "slow brakes": ("feetech", options_of("feetech", {}, acceleration_rad_per_s2=0.4)),
+    "more counts than VISCA has": ("visca", options_of("visca", {"count_rad": 1e-5})),
+}
+OPTIONS_CANNOT = {
+    "one id for both": "one value against another",
+    "limits turned round": "one value against another",
+    "beyond the servo": "what a model reaches",
+    "no current to limit": "what a model has",
+    "less than the backlash": "what a model has",
+    "two series": "one value against another",
+    "too slow a line": "one value against another",
+    "too short a watchdog": "one value against another",
+    "too late a reply": "one value against another",
+    "slow brakes": "one value against another",
+    "more counts than VISCA has": "one value against another",
+}
+"""What a schema cannot say of options, and why; the driver says it when it is opened."""
+
+
+def test_broken_options_are_refused_by_the_schema_as_by_the_driver(schemas: dict[str, Any]) -> None:
+    passed = set()
+    for name, (driver, options) in BROKEN_OPTIONS.items():
+        with pytest.raises(BadOptions):
+            READERS[driver](options)
+        if schemas["config"].is_valid(
+            {**test_config.GOOD, "pan_tilt": {"driver": driver, "options": options}}
+        ):
+            passed.add(name)
+    assert passed == set(OPTIONS_CANNOT)
+
+
+@pytest.mark.parametrize(
+    ("driver", "options"),
+    [
+        ("dynamixel", options_of("dynamixel", XC330)),
+        ("dynamixel", options_of("dynamixel", {"model": "XL330-M288-R"})),
+        ("dynamixel", options_of("dynamixel", {"approach": "positive", "approach_rad": 0.02})),
+        ("feetech", options_of("feetech", {"model": "sts3215"})),
+        ("flir_ptu", options_of("flir_ptu", {"approach": "none"}, port="socket://bench:4000")),
+        ("visca", options_of("visca", {}, port="/dev/serial/by-id/usb-x")),
+    ],
+)
+def test_what_a_driver_takes_its_schema_takes(
+    driver: str, options: dict[str, Any], schemas: dict[str, Any]
+) -> None:
+    READERS[driver](options)
+    head = {"driver": driver, "options": options}
+    assert schemas["config"].is_valid({**test_config.GOOD, "pan_tilt": head})
 
 
 HEAD = {"id": 1, "model": "XM430-W350", "limits_rad": [-1.0, 1.0]}

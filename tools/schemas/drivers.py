@@ -5,7 +5,9 @@ from __future__ import annotations
 import inspect
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
+from string import ascii_uppercase
 
 from drivers.approach import ApproachedAxis
 from drivers.dynamixel.models import MODELS
@@ -38,6 +40,28 @@ def _settings(found: Schema, *kinds: type) -> Schema:
     return found
 
 
+def _model(names: Iterable[str], gear: str = "") -> Schema:
+    """A servo model: completed by its name, and taken in the letters that the driver takes."""
+    signs = {"-": "[-_]", **{sign: f"[{sign}{sign.lower()}]" for sign in ascii_uppercase}}
+    known = sorted(names)
+    alike = ("".join(signs.get(sign, sign) for sign in name.removesuffix(gear or "?")) for name in known)
+    gears = "([-_][Tt])?([-_][Rr])?" if gear else ""
+    return {"type": "string", "pattern": f"^({'|'.join(alike)}){gears}$", "examples": known}
+
+
+def _approach(axis: Schema) -> None:
+    """A side has a stretch above zero, and no side has none."""
+    axis["if"] = {"required": ["approach"], "properties": {"approach": {"not": {"const": "none"}}}}
+    axis["then"] = {"required": ["approach_rad"], "properties": {"approach_rad": {"exclusiveMinimum": 0}}}
+    axis["else"] = {"properties": {"approach_rad": {"const": 0}}}
+
+
+def _port(schemes: Iterable[str]) -> Schema:
+    """A device, or an address of these kinds."""
+    kinds = "|".join(one.removesuffix("://") for one in schemes)
+    return {"type": "string", "pattern": rf"^(?:(?:{kinds})://|(?!.*://)).*\S"}
+
+
 def dynamixel() -> Schema:
     """Options of a Dynamixel head, whatever the models."""
     with watched("options.") as noted:
@@ -46,11 +70,13 @@ def dynamixel() -> Schema:
             axis |= {"approach": "positive", "approach_rad": 0.1}
             dynamixel_settings({"port": "/dev/x", "pan": axis, "tilt": {**axis, "id": 2}})
     for axis_name in ("pan", "tilt"):
-        noted.at(f"{axis_name}.model").tell({"type": "string", "examples": sorted(MODELS)})
+        noted.at(f"{axis_name}.model").tell(_model(MODELS, "-T"))
     noted.at("watchdog_s").value.pop("default")  # it depends on speed and acceleration
     found = _settings(noted.schema(), DynamixelSettings)
     for name in ("pan", "tilt"):
-        _settings(found["properties"][name], ApproachedAxis, ServoAxisSettings, DynamixelAxisSettings)
+        _approach(
+            _settings(found["properties"][name], ApproachedAxis, ServoAxisSettings, DynamixelAxisSettings)
+        )
     return found
 
 
@@ -61,11 +87,13 @@ def feetech() -> Schema:
             axis = {"id": 1, "model": model, "limits_rad": [-0.1, 0.1]}
             feetech_settings({"port": "/dev/x", "pan": axis, "tilt": {**axis, "id": 2}})
     for axis_name in ("pan", "tilt"):
-        noted.at(f"{axis_name}.model").tell({"type": "string", "examples": sorted(FEETECH_MODELS)})
+        noted.at(f"{axis_name}.model").tell(_model(FEETECH_MODELS))
     noted.at("lease_s").value.pop("default")  # it depends on speed and acceleration
     found = _settings(noted.schema(), FeetechSettings)
     for name in ("pan", "tilt"):
-        _settings(found["properties"][name], ApproachedAxis, ServoAxisSettings, FeetechAxisSettings)
+        _approach(
+            _settings(found["properties"][name], ApproachedAxis, ServoAxisSettings, FeetechAxisSettings)
+        )
     return found
 
 
@@ -74,12 +102,13 @@ def ptu() -> Schema:
     axis = {"limits_rad": [-0.5, 0.5]}
     with watched("options.") as noted:
         flir_ptu.options_from({"port": "/dev/x", "pan": axis, "tilt": axis, "supply_V": [10.0, 30.0]})
+    noted.at("port").value = _port(("socket", "rfc2217"))
     noted.at("supply_V").value = {**noted.at("supply_V").value, "type": ["array", "null"]}
     for name in ("pan", "tilt"):
         noted.at(f"{name}.limits_rad").value["items"] = number(-math.tau, math.tau)
     found = _settings(noted.schema(), flir_ptu.Options)
     for name in ("pan", "tilt"):
-        _settings(found["properties"][name], ApproachedAxis, flir_ptu.AxisOptions)
+        _approach(_settings(found["properties"][name], ApproachedAxis, flir_ptu.AxisOptions))
     return found
 
 
@@ -88,6 +117,7 @@ def visca() -> Schema:
     axis = {"limits_rad": [-0.5, 0.5], "count_rad": 0.001, "fastest_rad_per_s": 1.0}
     with watched("options.") as noted:
         visca_options.options_from({"port": "/dev/x", "pan": axis, "tilt": axis})
+    noted.at("port").value = _port(visca_options.SCHEMES)
     for name in ("pan", "tilt"):
         noted.at(f"{name}.limits_rad").value["items"] = number(-math.tau, math.tau)
     found = _settings(noted.schema(), visca_options.ViscaOptions)
