@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+SCHEMAS = "schemas"
+NAMES_SCHEMA = "# yaml-language-server: $schema="
+
 
 def config_folder() -> Path:
     """Return the folder of packaged configurations: inside the installed package, or beside it in a checkout.
@@ -31,6 +34,26 @@ def default_config() -> Path:
 def schema_files() -> dict[str, Path]:
     """Return the JSON Schemas of the files that a person writes, by name."""
     return {file.stem: file for file in sorted((config_folder() / "schemas").glob("*.json"))}
+
+
+def name_schema(file: Path, kind: str) -> Path:
+    """Let a YAML file's first line name its schema for editors; return that schema, put into a folder beside.
+
+    Raises
+    ------
+    BadFile
+        If the file system refuses.
+    """
+    from calib.files.atomic import replace_bytes
+
+    schema = file.parent / SCHEMAS / f"{kind}.json"
+    schema.parent.mkdir(exist_ok=True)
+    mode = file.stat().st_mode & 0o777
+    replace_bytes(schema, schema_files()[kind].read_bytes(), mode)
+    line, data = f"{NAMES_SCHEMA}{SCHEMAS}/{kind}.json\n".encode(), file.read_bytes()
+    if not data.startswith(line):
+        replace_bytes(file, line + data, mode)
+    return schema
 
 
 def site_folder() -> Path:

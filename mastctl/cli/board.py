@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
 from mastctl.cli.output import WrongUse, finite_number
+from mastctl.packaged import NAMES_SCHEMA, name_schema
 
 if TYPE_CHECKING:
     from calib.targets.boards import AnyBoard
@@ -91,7 +92,7 @@ def _make(args: argparse.Namespace) -> int:
     _check_free(yaml, measured is not None)
     save_bytes(out, pdf_of(sheet) if out.suffix == ".pdf" else svg_of(sheet))
     save_board(yaml, board, sheet.bar_m, out.stem, measured)
-    _tell(args, yaml, [out, yaml], sheet.bar_m)
+    _tell(args, yaml, [out, yaml, name_schema(yaml, "board")], sheet.bar_m)
     return 0
 
 
@@ -102,8 +103,12 @@ def _measured(args: argparse.Namespace) -> int:
         0.0,
         None,
     )
-    bar_m = measure(args.board, across_m, down_m)
-    _tell(args, Path(args.board), [Path(args.board)], bar_m)
+    board = Path(args.board)
+    named = board.is_file() and board.read_bytes().startswith(NAMES_SCHEMA.encode())
+    bar_m = measure(board, across_m, down_m)
+    if named:
+        name_schema(board, "board")
+    _tell(args, board, [board], bar_m)
     return 0
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 NOTHING = "no head and no camera is plugged in; write a simulated twin, which runs"
 TWIN_DEG = {"pan": 175.0, "tilt": 90.0}
-"""What the simulated head reaches to each side."""
+"""The reach of the simulated head to each side."""
 LEAST_DEG = 15.0
 """Between the ends of an axis: both keep a margin (`mastctl.rig.drawing.MARGIN_RAD`)."""
 
@@ -94,9 +94,7 @@ def _new(args: argparse.Namespace) -> int:
         output.tell("nothing is written; plug the head in and try again")
         return 0
     if none and (args.pan_id is not None or args.tilt_id is not None):
-        output.tell(
-            "--pan-id and --tilt-id are not used: the simulated twin's servos are 1 and 2"
-        )
+        output.tell("--pan-id and --tilt-id are not used: the simulated twin's servos are 1 and 2")
     answers = _answers(args, found, head, questions)
     if none:
         output.tell("no head and no camera is plugged in: this is the simulated twin, which runs")

@@ -235,11 +235,13 @@ def _man(args: argparse.Namespace) -> int:
     from mastctl.cli.man import man_pages
 
     folder = args.to if args.to is not None else Path(sys.prefix) / "share" / "man" / "man1"
+    output.check_folder(folder, "--to")
     pages = man_pages(build_parser([]))
     for name, text in pages.items():
         _write(folder / name, text)
     if args.json:
         output.print_json({"written": [str(folder / name) for name in pages]})
     else:
-        sys.stdout.write(output.one_line(f"{len(pages)} pages in {folder}; try: man mastctl-point") + "\n")
+        named = "mastctl-point" if args.to is None else str(folder / "mastctl-point.1")
+        sys.stdout.write(output.one_line(f"{len(pages)} pages in {folder}; try: man {named}") + "\n")
     return 0

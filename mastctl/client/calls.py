@@ -62,7 +62,7 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
         timeout_s = longest_s if timeout_s is None else min(timeout_s, longest_s)
         status = await self._daemon.json(Status, "GET", "/status", timeout=timeout_s)
         if not isinstance(status.get("state"), str) or "mast" not in status:
-            raise self._daemon.bad_answer("its status tells no state and no mast")
+            raise self._daemon.bad_answer("its status has no state, or no mast")
         return status
 
     async def point(

@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
-from typing import Any
 
 import numpy as np
 
@@ -18,14 +17,14 @@ from calib.files.atomic import save_bytes
 from calib.files.mast_file import load_rig
 from calib.files.yaml_text import dump_mapping
 from mastctl.config import check_cameras, load_config
-from mastctl.packaged import config_folder, schema_files
+from mastctl.packaged import SCHEMAS, config_folder, name_schema
 from mastctl.rig.drawing import USUAL_BAUD, RigAnswers, camera_names, configuration, drawing, soft_limits
 from mastctl.rig.plugged import Plugged, PluggedCamera, PluggedHead, set_id, usb_of
 from mastctl.setup.machine import ExaminedMachine
 from mastctl.setup.new_rig import RigNumbers, built_rig, focal_of
 from mastctl.setup.rig_folder import CONFIG, MAST, TRUE_RIG, InTheWay, write_built
 
-RULES, README, SCHEMAS = "60-mastctl.rules", "README.md", "schemas"
+RULES, README = "60-mastctl.rules", "README.md"
 LINE = "/dev/mast"
 """What the rules call the head's line."""
 NO_HEAD = (
@@ -33,7 +32,7 @@ NO_HEAD = (
     "with another folder, or write the line's name there"
 )
 SAME_SERIAL = (
-    "have the same serial number: the udev rules and the configuration tell them by their USB sockets, so "
+    "have the same serial number: the udev rules and the configuration know them by their USB sockets, so "
     "leave each in its socket"
 )
 TWIN_SIZE_PX, TWIN_SEED = (640, 480), 1
@@ -89,8 +88,8 @@ def write_rig(
     port = LINE if head is None or _NUMBERED.fullmatch(head.port) else head.port
     name = re.sub(r"\W+", "_", folder.resolve().name) or "rig"
     files = {
-        CONFIG: _commented("config", _CONFIG_WORDS, configuration(head, cameras, answers, port)),
-        MAST: _commented("mast", _MAST_WORDS, drawing(name, cameras, answers)),
+        CONFIG: _CONFIG_WORDS.encode() + dump_mapping(configuration(head, cameras, answers, port)),
+        MAST: _MAST_WORDS.encode() + dump_mapping(drawing(name, cameras, answers)),
     }
     names = camera_names(len(cameras))
     known = [tuple(usb_of(_device(camera, machine), machine)) for camera in cameras]
@@ -115,8 +114,6 @@ def write_simulated(folder: Path, plugged: Plugged, answers: RigAnswers) -> NewR
     simulation = {"wire": "dynamixel", "seed": TWIN_SEED}
     rig = built_rig(numbers, np.random.default_rng(TWIN_SEED))
     write_built(rig, folder, simulation, TWIN_SEED, soft_limits(answers))
-    for name, kind in ((CONFIG, "config"), (MAST, "mast"), (TRUE_RIG, "mast")):
-        (folder / name).write_bytes(_first_line(kind) + (folder / name).read_bytes())
     config = f"--config {quote(str(folder / CONFIG))}"
     steps = (
         f"mastctl doctor {config}",
@@ -131,13 +128,10 @@ def _written(
     folder: Path, files: Mapping[str, bytes], steps: tuple[str, ...], simulated: bool
 ) -> NewRigFolder:
     """Write the files and the schemas that their first lines name, and read configuration and drawing."""
-    names = [*files]
-    for kind in ("config", "mast"):
-        (folder / SCHEMAS).mkdir(exist_ok=True)
-        save_bytes(folder / SCHEMAS / f"{kind}.json", schema_files()[kind].read_bytes())
-        names.append(f"{SCHEMAS}/{kind}.json")
     for name, data in files.items():
         save_bytes(folder / name, data)
+    kinds = ((CONFIG, "config"), (MAST, "mast"))
+    names = [*files, *(f"{SCHEMAS}/{name_schema(folder / name, kind).name}" for name, kind in kinds)]
     try:
         config = load_config(folder / CONFIG)
         check_cameras(config, load_rig(config.mast_file).rig)
@@ -161,15 +155,6 @@ _MAST_WORDS = """\
 """
 
 
-def _commented(kind: str, words: str, document: Mapping[str, Any]) -> bytes:
-    """A YAML file whose first line names its schema for editors."""
-    return _first_line(kind) + words.encode() + dump_mapping(document)
-
-
-def _first_line(kind: str) -> bytes:
-    return f"# yaml-language-server: $schema={SCHEMAS}/{kind}.json\n".encode()
-
-
 def _device(camera: PluggedCamera, machine: ExaminedMachine) -> Path:
     """A camera's folder in sysfs."""
     return machine.at("/sys/class/video4linux") / camera.node.name / "device"
@@ -180,7 +165,7 @@ def rules(
 ) -> str:
     """Return the packaged udev rules, and a stable name for each device of this rig.
 
-    ``alike`` are cameras that their serial numbers do not tell from each other.
+    ``alike`` are cameras of one serial number.
     """
     text = (config_folder() / "udev" / RULES).read_text(encoding="utf-8")
     lines = ["", "# This rig:"]

@@ -127,7 +127,7 @@ class PluggedHead:
 
     @property
     def lacks(self) -> str:
-        """What to do about a servo that is missing, in one sentence; empty if none is."""
+        """The advice about a servo that is missing, in one sentence; empty if none is."""
         if self.family is None or len(self.servos) != 1:
             return ""
         (servo,) = self.servos
@@ -286,7 +286,7 @@ def _options(camera: find.FoundCamera, by_id: bool) -> dict[str, Any]:
 
 
 def usb_of(device: Path, machine: ExaminedMachine, by_socket: bool = False) -> Iterator[tuple[str, str]]:
-    """Yield the udev matches that tell a USB device from all others: by its serial number, else its socket.
+    """Yield the udev matches that single out a USB device: by its serial number, else its socket.
 
     ``device`` is its folder in sysfs; nothing is yielded for what is not on USB. ``by_socket``: where others
     have the same serial number.

@@ -20,6 +20,7 @@ from drivers.sim.pan_tilt import DEFAULT_HEADS
 from mastctl.calibration.mast_file import rounded_matrix
 from mastctl.config import CONFIG_SCHEMA, check_cameras, load_config
 from mastctl.errors import MastctlError
+from mastctl.packaged import name_schema
 from mastctl.setup.new_rig import STATED, Twin, true_twin, usual_covariance
 
 CONFIG, MAST, TRUE_RIG = "config.yaml", "mast.yaml", "true_rig.yaml"
@@ -94,6 +95,7 @@ def write_built(
     believed = replace(rig, fit=fit, provenance=source)
     folder.mkdir(parents=True, exist_ok=True)
     save_rig(believed, folder / MAST)
+    name_schema(folder / MAST, "mast")
     return _write(believed, folder, simulation, seed, limits_rad)
 
 
@@ -137,6 +139,8 @@ def _write(
     true_rig = replace(twin.true_rig, name=f"{believed.name}_true", fit={}, provenance=provenance)
     save_rig(true_rig, folder / TRUE_RIG)
     save_bytes(folder / CONFIG, dump_mapping(_configuration(believed, simulation, limits_rad)))
+    for name, kind in ((TRUE_RIG, "mast"), (CONFIG, "config")):
+        name_schema(folder / name, kind)
     config = load_config(folder / CONFIG)
     check_cameras(config, load_rig(config.mast_file).rig)
     simulation_settings(config.hardware.simulation, config.hardware.folder)

@@ -8,10 +8,12 @@ import subprocess
 from pathlib import Path
 
 import cv2
+import jsonschema_rs
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calib.files.yaml_text import parse_mapping
 from calib.targets.board_file import load_board
 from calib.targets.boards import Charuco
 from mastctl.cli.main import main
@@ -88,6 +90,15 @@ def test_aprilgrid_and_dots_are_on_paper_where_their_files_say(tmp_path: Path) -
             stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
             off = cv2.cornerSubPix(image, start.copy(), (9, 9), (-1, -1), stop) - start
             assert float(np.sqrt(np.mean(off**2))) < PRINTED_PX
+
+
+def test_the_file_names_its_schema_also_after_the_print_is_measured(tmp_path: Path) -> None:
+    _, yaml = made(tmp_path, "--kind", "charuco")
+    schema = json.loads((tmp_path / "schemas" / "board.json").read_bytes())
+    for _ in range(2):
+        assert yaml.read_text().startswith("# yaml-language-server: $schema=schemas/board.json\n")
+        jsonschema_rs.validator_for(schema).validate(parse_mapping(yaml.read_bytes(), yaml))
+        assert main(["board", "measured", str(yaml), "--across-mm", "149.4"]) == 0
 
 
 def test_the_bars_are_as_long_as_they_say(tmp_path: Path) -> None:

@@ -91,6 +91,15 @@ def test_the_man_pages_have_every_command_and_option_and_nothing_that_man_does_n
 
 def test_man_writes_the_pages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["man", "--to", str(tmp_path / "man1")]) == 0
-    assert "try: man mastctl-point" in capsys.readouterr().out
+    assert f"try: man {tmp_path / 'man1' / 'mastctl-point.1'}" in capsys.readouterr().out
     assert (tmp_path / "man1" / "mastctl-point.1").read_text().startswith(".TH MASTCTL-POINT 1")
     assert (tmp_path / "man1" / "mastctl-calibrate-bench.1").is_file()
+
+
+def test_man_refuses_a_file_where_a_folder_belongs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "notes").write_text("mine")
+    assert main(["man", "--to", str(tmp_path / "notes")]) == 2
+    assert f"{tmp_path / 'notes'} is a file; a folder is expected" in capsys.readouterr().err
+    assert (tmp_path / "notes").read_text() == "mine"

@@ -6,12 +6,14 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import jsonschema_rs
 import numpy as np
 import pytest
 import yaml
 from scipy import stats
 
 from calib.files.mast_file import load_rig, save_rig
+from calib.files.yaml_text import parse_mapping
 from calib.geometry.rigid import tangents
 from drivers.sim.placed import check_clear_of
 from drivers.sim.settings import simulation_settings
@@ -55,6 +57,15 @@ def test_all_that_is_drawn_comes_from_the_seed(tmp_path: Path) -> None:
     other = made(tmp_path / "c", "--seed", "4")
     assert first == again
     assert first["mast.yaml"] != other["mast.yaml"] and first["true_rig.yaml"] != other["true_rig.yaml"]
+
+
+def test_each_file_names_its_schema_and_is_good_by_it(tmp_path: Path) -> None:
+    assert main(["sim", "new", str(tmp_path / "rig")]) == 0
+    for name, kind in (("config.yaml", "config"), ("mast.yaml", "mast"), ("true_rig.yaml", "mast")):
+        file = tmp_path / "rig" / name
+        assert file.read_text().startswith(f"# yaml-language-server: $schema=schemas/{kind}.json\n")
+        schema = json.loads((file.parent / "schemas" / f"{kind}.json").read_bytes())
+        jsonschema_rs.validator_for(schema).validate(parse_mapping(file.read_bytes(), file))
 
 
 def test_the_numbers_asked_for_are_those_of_the_rig(tmp_path: Path) -> None:
