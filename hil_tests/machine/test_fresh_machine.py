@@ -50,8 +50,11 @@ def root(
     listed = subprocess.run(
         ["git", "ls-files", "-zco", "--exclude-standard"], cwd=repository, capture_output=True, text=True
     )
+    # the list that Docker and buildah both read beside the Containerfile
+    left_out = (repository / f"{CONTAINERFILE}.dockerignore").read_text().split()
+    assert {".git", ".venv", "hil_tests"} <= set(left_out)
     for name in filter(None, listed.stdout.split("\0")):
-        if not name.startswith("hil_tests/") and (repository / name).is_file():
+        if name.split("/")[0] not in left_out and (repository / name).is_file():
             (folder / "src" / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(repository / name, folder / "src" / name)
     for step in steps["RUN"]:
