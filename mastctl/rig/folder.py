@@ -194,11 +194,12 @@ def _steps(folder: Path, head: PluggedHead | None, cameras: int) -> tuple[str, .
     doctor, run = f"mastctl doctor {config}", f"mastctl run {config}"
     if head is None:
         return f"{rules} && sudo udevadm trigger", "mastctl servo scan PORT", doctor
+    point = f"mastctl point {config} --angles 0.2 0.0"
+    by_rule = _USB.fullmatch(head.port) or cameras
+    steps = (f"{rules} && sudo udevadm trigger", doctor, run) if by_rule else (doctor, run, point)
     if head.family is not None and head.lacks and head.servos[0].servo_id == 1:
-        return set_id(head.port, head.family, head.servos[0].baud), f"{rules} && sudo udevadm trigger", doctor
-    if _USB.fullmatch(head.port) or cameras:
-        return f"{rules} && sudo udevadm trigger", doctor, run
-    return doctor, run, f"mastctl point {config} --angles 0.2 0.0"
+        return set_id(head.port, head.family, head.servos[0].baud), *steps[:2]
+    return steps
 
 
 def _readme(plugged: Plugged, steps: Sequence[str], notes: Sequence[str] = ()) -> str:
@@ -233,7 +234,7 @@ def _readme(plugged: Plugged, steps: Sequence[str], notes: Sequence[str] = ()) -
 def _slow(plugged: Plugged) -> list[str]:
     """How to raise the rate of servos as they come from the factory."""
     for head in plugged.heads:
-        slow = [one for one in head.servos if one.baud < USUAL_BAUD]
+        slow = [one for one in head.servos if one.baud < USUAL_BAUD and not head.lacks]
         if slow and head.family is not None and head.family.driver == "dynamixel":
             number, baud = slow[0].servo_id, slow[0].baud
             set_id = (

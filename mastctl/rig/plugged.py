@@ -64,7 +64,7 @@ def one_id(port: str, family: ServoFamily, baud: int) -> str:
     """Return what to do where one id is all that answers."""
     return (
         f"new servos all have the id 1; connect one at a time, and give the second another id: "
-        f"{set_id(port, family, baud)}"
+        f"{set_id(port, family, baud)}; then connect both"
     )
 
 

@@ -167,7 +167,8 @@ def test_a_new_servo_alone_leads_to_the_command_that_gives_it_another_id(
         told = written(capsys, str(tmp_path / "rig"), "--port", port)
     command = f"mastctl servo set-id {port} 1 2 --baud 57600"
     assert command in told["unused"][0]
-    assert told["next"][0] == command and told["next"][2].startswith("mastctl doctor")
+    assert told["next"][0] == command and told["next"][1].startswith("mastctl doctor")
+    assert "--new-baud" not in (tmp_path / "rig" / README).read_text(), "one thing at a time"
     options = load_config(tmp_path / "rig" / CONFIG).hardware.pan_tilt.options
     found = {one.what: one for one in doctor._servos("dynamixel", options, port)}
     assert f"mastctl servo set-id {port} 1 2" in found["servos"].advice
