@@ -94,3 +94,33 @@ class BadFrame(DriverError):
     """A frame came but cannot be used: dark, frozen, damaged, of another size."""
 
     code = "bad_frame"
+
+
+class NoCamera(DriverError):
+    """The camera is not connected, or went away while it was in use."""
+
+    code = "no_camera"
+
+
+class CameraBusy(DriverError):
+    """Another program has the camera."""
+
+    code = "camera_busy"
+
+
+class NoPermission(DriverError):
+    """This user may not open the device; the message says which group may."""
+
+    code = "no_permission"
+
+
+class StreamFailed(DriverError):
+    """The camera is there but its driver cannot deliver frames."""
+
+    code = "stream_failed"
+
+
+class UnsupportedFormat(BadOptions):
+    """The camera does not offer the format, size or rate; the message says what it offers."""
+
+    code = "unsupported_format"

@@ -8,14 +8,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+from drivers import pixels
 from drivers.clock import Clock, SystemClock
-from drivers.errors import NoFreshFrame
+from drivers.errors import NoCamera, NoFreshFrame, StreamFailed
 from drivers.interfaces import Frame, FrameTime
-from drivers.v4l2 import find, pixels
+from drivers.v4l2 import find
 from drivers.v4l2.capture import Bytes, Capture, Counters
 from drivers.v4l2.controls import get_value, list_controls
 from drivers.v4l2.exposure import GROUPS, ExposureControl
-from drivers.v4l2.node import NoCamera, StreamFailed
 from drivers.v4l2.options import CameraOptions, parse_options
 from drivers.v4l2.stamps import Arrived
 from drivers.v4l2.stream import Stream, sizes_text

@@ -20,11 +20,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers import pixels
 from drivers.clock import Clock
-from drivers.errors import BadFrame, DriverError
+from drivers.errors import BadFrame, DriverError, NoCamera, StreamFailed
 from drivers.interfaces import Image
-from drivers.v4l2 import abi, pixels
-from drivers.v4l2.node import Dequeued, NoCamera, Node, PictureFormat, StreamFailed
+from drivers.pixels import PictureFormat
+from drivers.v4l2 import abi
+from drivers.v4l2.node import Dequeued, Node
 from drivers.v4l2.options import CameraOptions
 from drivers.v4l2.stamps import Arrived, Spacing, StampCheck, Timing, exposure_window
 from drivers.v4l2.stream import Stream

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import BadOptions, DriverError
+from drivers.errors import BadOptions, DriverError, NoCamera, NoPermission, UnsupportedFormat
+from drivers.pixels import FORMATS
 from drivers.v4l2.controls import Value
-from drivers.v4l2.node import NoCamera, Node, NoPermission, UnsupportedFormat, capture_nodes
-from drivers.v4l2.pixels import FORMATS
+from drivers.v4l2.node import Node, capture_nodes
 
 LINKS = Path("/dev/v4l")
 SYSFS = Path("/sys/class/video4linux")

@@ -16,7 +16,15 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-from drivers.errors import BadOptions, DriverError
+from drivers.errors import (
+    BadOptions,
+    CameraBusy,
+    DriverError,
+    NoCamera,
+    NoPermission,
+    StreamFailed,
+)
+from drivers.pixels import PictureFormat
 from drivers.v4l2 import abi
 
 _quick_ioctl = ctypes.PyDLL(None, use_errno=True).ioctl
@@ -28,40 +36,10 @@ _CAPTURES = abi.CAP_VIDEO_CAPTURE | abi.CAP_VIDEO_CAPTURE_MPLANE
 _MOST_ENTRIES = 1024  # of any enumeration: a driver that never ends one must not hang us
 
 
-class NoCamera(DriverError):
-    """The camera is not connected, or went away while it was in use."""
-
-    code = "no_camera"
-
-
-class CameraBusy(DriverError):
-    """Another program has the camera."""
-
-    code = "camera_busy"
-
-
-class NoPermission(DriverError):
-    """This user may not open the device; the message says which group may."""
-
-    code = "no_permission"
-
-
-class StreamFailed(DriverError):
-    """The camera is there but its driver cannot deliver frames."""
-
-    code = "stream_failed"
-
-
 class NotACamera(BadOptions):
     """The path leads to something that gives no pictures."""
 
     code = "not_a_camera"
-
-
-class UnsupportedFormat(BadOptions):
-    """The camera does not offer the format, size or rate; the message says what it offers."""
-
-    code = "unsupported_format"
 
 
 @dataclass(frozen=True)
@@ -72,34 +50,6 @@ class Identity:
     card: str
     bus: str
     capabilities: int
-
-
-@dataclass(frozen=True)
-class PictureFormat:
-    """A format as the driver set it.
-
-    Attributes
-    ----------
-    code
-        Four-character code.
-    size_px
-        (width, height).
-    stride_bytes
-        From one row to the next, of the first plane; 0 for compressed formats.
-    length_bytes
-        The most that one picture takes, of all planes together.
-    field
-        1 for whole pictures; other values are interlaced.
-    planes_bytes
-        The most that each plane takes, where the camera captures in planes of their own; empty elsewhere.
-    """
-
-    code: str
-    size_px: tuple[int, int]
-    stride_bytes: int
-    length_bytes: int
-    field: int = abi.FIELD_NONE
-    planes_bytes: tuple[int, ...] = ()
 
 
 class Dequeued(NamedTuple):

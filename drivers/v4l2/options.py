@@ -9,10 +9,10 @@ from typing import Any
 
 from drivers.faults import nearest
 from drivers.options import OptionReader, is_whole
+from drivers.pixels import FORMATS
 from drivers.v4l2.controls import Value
 from drivers.v4l2.exposure import AutoExposureSettings
 from drivers.v4l2.find import Address, check_address
-from drivers.v4l2.pixels import FORMATS
 
 OPTIONS = (
     "device", "card", "bus", "format", "size_px", "rate_hz", "colour", "controls", "exposure_s", "gain",

@@ -10,8 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from drivers.pixels import PictureFormat
 from drivers.v4l2 import abi
-from drivers.v4l2.node import Dequeued, PictureFormat
+from drivers.v4l2.node import Dequeued
 
 AHEAD_S = 0.005
 """How far ahead of the clock a stamp may be: rounding, and drivers that estimate."""

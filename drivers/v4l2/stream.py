@@ -6,6 +6,8 @@ import logging
 from collections.abc import Sequence
 
 from drivers.clock import Clock
+from drivers.errors import UnsupportedFormat
+from drivers.pixels import FORMATS, PictureFormat
 from drivers.v4l2 import abi, find
 from drivers.v4l2.controls import (
     CameraControl,
@@ -16,9 +18,8 @@ from drivers.v4l2.controls import (
     set_by_name,
     set_value,
 )
-from drivers.v4l2.node import Node, PictureFormat, UnsupportedFormat
+from drivers.v4l2.node import Node
 from drivers.v4l2.options import CameraOptions
-from drivers.v4l2.pixels import FORMATS
 from drivers.v4l2.stamps import ExposuresSet, StampRule
 
 log = logging.getLogger(__name__)

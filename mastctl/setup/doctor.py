@@ -10,10 +10,9 @@ from typing import Any
 
 from calib.errors import BadFile
 from calib.files.mast_file import load_rig
-from drivers.errors import BadOptions, DriverError
+from drivers.errors import BadOptions, CameraBusy, DriverError, NoCamera, NoPermission
 from drivers.hardware import CAMERAS, HEADS, OURS, clock_for, installed_drivers
 from drivers.v4l2 import find
-from drivers.v4l2.node import CameraBusy, NoCamera, NoPermission
 from drivers.v4l2.options import parse_options
 from mastctl.config import Config, check_cameras, load_config
 from mastctl.safety.state_folder import usual_folder

@@ -16,13 +16,13 @@ from drivers.faults import BOUNDS, CAMERA_WORDS, HEAD_WORDS, LOG_WORDS, WHEN
 from drivers.feetech.models import MODELS as FEETECH_MODELS
 from drivers.feetech.settings import FeetechAxisSettings, FeetechSettings, feetech_settings
 from drivers.flir_ptu import options as flir_ptu
+from drivers.pixels import FORMATS
 from drivers.recordings.replay import OPTIONS as REPLAY_OPTIONS
 from drivers.servo_bus.settings import ServoAxisSettings
 from drivers.sim import camera_settings, ground, heads, placed, scene
 from drivers.sim.pan_tilt import DEFAULT_HEADS
 from drivers.sim.settings import simulation_settings
 from drivers.v4l2 import options as v4l2
-from drivers.v4l2.pixels import FORMATS
 from drivers.visca import options as visca_options
 from tools.schemas.watched import FLAG, TEXT, Schema, number, settings_schema, vector, watched
 

@@ -18,12 +18,14 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.errors import BadOptions, DriverError, NoFreshFrame
+from drivers import pixels
+from drivers.errors import BadOptions, DriverError, NoCamera, NoFreshFrame, StreamFailed
 from drivers.interfaces import Camera
-from drivers.v4l2 import abi, capture, find, pixels
+from drivers.pixels import PictureFormat
+from drivers.v4l2 import abi, capture, find
 from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.capture import Capture
-from drivers.v4l2.node import Dequeued, Identity, NoCamera, PictureFormat, StreamFailed
+from drivers.v4l2.node import Dequeued, Identity
 from drivers.v4l2.options import parse_options
 from drivers.v4l2.stamps import ExposuresSet, StampRule
 from hil_tests.waiting import NET_S, until

@@ -15,12 +15,11 @@ from dataclasses import dataclass
 
 import pytest
 
-from drivers.errors import BadOptions, NoFreshFrame
+from drivers.errors import BadOptions, NoFreshFrame, StreamFailed, UnsupportedFormat
 from drivers.v4l2 import camera as camera_module
 from drivers.v4l2 import exposure, stream
 from drivers.v4l2.camera import V4l2Camera
 from drivers.v4l2.controls import CameraControl
-from drivers.v4l2.node import StreamFailed, UnsupportedFormat
 from drivers.v4l2.options import parse_options
 from hil_tests.drivers.v4l2.v4l2_sensor import AUTO, EXPOSURE, Sensor, SensorNode, Shot, use
 from hil_tests.waiting import NET_S, until

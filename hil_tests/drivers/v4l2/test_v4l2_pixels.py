@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
+from drivers import pixels
 from drivers.errors import BadFrame
-from drivers.v4l2 import pixels
-from drivers.v4l2.node import PictureFormat
+from drivers.pixels import PictureFormat
 
 WIDTH, HEIGHT = 32, 24
 ROUNDING_DN = 2  # two 8-bit roundings and a fixed-point matrix

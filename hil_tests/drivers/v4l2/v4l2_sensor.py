@@ -15,9 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from drivers.pixels import PictureFormat
 from drivers.v4l2 import abi, find, stream
 from drivers.v4l2.controls import CameraControl, ControlProblem
-from drivers.v4l2.node import Dequeued, Identity, PictureFormat
+from drivers.v4l2.node import Dequeued, Identity
 
 SIZE_PX = (16, 8)
 EXPOSURE = CameraControl(abi.CID_EXPOSURE_ABSOLUTE, "exposure", "integer", 1, 10000, 1, 100, True, {})

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from drivers.errors import CameraBusy, NoCamera, NoPermission, StreamFailed
 from drivers.v4l2 import find
 from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.controls import get_value, list_controls, set_by_name
 from drivers.v4l2.find import Address, open_node
-from drivers.v4l2.node import CameraBusy, NoCamera, Node, NoPermission, NotACamera, StreamFailed
+from drivers.v4l2.node import Node, NotACamera
 from hil_tests.waiting import NET_S, until
 
 from .conftest import BUS, VIVID, inject, options

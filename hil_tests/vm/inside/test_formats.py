@@ -9,11 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.v4l2 import find, pixels
+from drivers import pixels
+from drivers.errors import UnsupportedFormat
+from drivers.v4l2 import find
 from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.controls import get_value, list_controls, set_by_name
 from drivers.v4l2.find import Address, open_node
-from drivers.v4l2.node import UnsupportedFormat
 
 from .conftest import BUS, STEADY, options
 

@@ -17,7 +17,35 @@ from numpy.typing import NDArray
 
 from drivers.errors import BadFrame
 from drivers.interfaces import Image
-from drivers.v4l2.node import PictureFormat
+
+
+@dataclass(frozen=True)
+class PictureFormat:
+    """A picture's format, as the camera's driver set it.
+
+    Attributes
+    ----------
+    code
+        Of `FORMATS`.
+    size_px
+        (width, height).
+    stride_bytes
+        From one row to the next, of the first plane; 0 for compressed formats.
+    length_bytes
+        The most that one picture takes, of all planes together.
+    field
+        1 for whole pictures; other values are interlaced.
+    planes_bytes
+        The most that each plane takes, where the camera captures in planes of their own; empty elsewhere.
+    """
+
+    code: str
+    size_px: tuple[int, int]
+    stride_bytes: int
+    length_bytes: int
+    field: int = 1
+    planes_bytes: tuple[int, ...] = ()
+
 
 Kind = Literal["grey", "bayer", "yuyv", "uyvy", "nv12", "jpeg"]
 
