@@ -35,7 +35,7 @@ HEADS = {
 """Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them, and whose
 ``halt(options)`` stops a head that no daemon drives any more."""
 
-CAMERAS = {"v4l2": "drivers.v4l2.camera"}
+CAMERAS = {"aravis": "drivers.aravis.camera", "v4l2": "drivers.v4l2.camera"}
 """Camera drivers of this repository: the module whose ``open_camera(options, clock, name)`` opens one."""
 
 OURS = ("sim", "replay")

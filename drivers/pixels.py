@@ -1,8 +1,9 @@
-"""What a format's bytes mean: how many there must be, the grey picture, and the colour picture.
+"""Formats of pictures: how many bytes there must be, the grey picture, and the colour picture.
 
 Formats of more than 8 bits keep their upper 8. Bayer formats are demosaiced by OpenCV; raw 16-bit words are
-little-endian with the value in the low bits, as the kernel defines them. In packed formats (MIPI CSI-2 RAW10
-and RAW12) the upper 8 bits of four or two samples stand first, then one byte with the rest of them all.
+little-endian with the value in the low bits, as the kernel and GenICam define them. Packed formats are of
+three kinds. In MIPI CSI-2 RAW10 and RAW12 the upper 8 bits of four or two samples stand first, then one byte
+with the rest of them all. GigE Vision puts the rests of two samples between them. GenICam's are one stream.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class PictureFormat:
     Attributes
     ----------
     code
-        Of `FORMATS`.
+        Of `FORMATS` or `GENICAM`.
     size_px
         (width, height).
     stride_bytes
@@ -47,7 +48,8 @@ class PictureFormat:
     planes_bytes: tuple[int, ...] = ()
 
 
-Kind = Literal["grey", "bayer", "yuyv", "uyvy", "nv12", "jpeg"]
+Kind = Literal["grey", "bayer", "yuyv", "uyvy", "nv12", "jpeg", "rgb", "bgr"]
+Packing = Literal["mipi", "gige", "stream"]
 
 
 @dataclass(frozen=True)
@@ -61,13 +63,16 @@ class Layout:
     order
         Of a Bayer format: the colours of the first two by two samples.
     packed
-        The samples with one more byte behind them; 0 for samples that stand in whole bytes.
+        The samples that share one byte more than they are; 0 for samples that stand in whole bytes.
+    packing
+        Where the bits of those samples are.
     """
 
     kind: Kind
     bits: int = 8
     order: str = ""
     packed: int = 0
+    packing: Packing = "mipi"
 
 
 FORMATS = MappingProxyType(
@@ -111,13 +116,38 @@ FORMATS = MappingProxyType(
     }
 )
 
+"""Of V4L2, by four-character code."""
+
+
+def _genicam() -> dict[str, Layout]:
+    """The formats by their names in GenICam's Pixel Format Naming Convention, and in GigE Vision 1."""
+    found = {
+        "RGB8": Layout("rgb"), "RGB8Packed": Layout("rgb"),
+        "BGR8": Layout("bgr"), "BGR8Packed": Layout("bgr"),
+        "YUV422_8": Layout("yuyv"), "YCbCr422_8": Layout("yuyv"),
+        "YUV422_8_UYVY": Layout("uyvy"), "YUV422Packed": Layout("uyvy"),
+    }  # fmt: skip
+    orders = {"BayerBG": "BGGR", "BayerGB": "GBRG", "BayerGR": "GRBG", "BayerRG": "RGGB"}
+    for name, order in {"Mono": "", **orders}.items():
+        kind: Kind = "bayer" if order else "grey"
+        for bits in (8, 10, 12, 14, 16):
+            found[f"{name}{bits}"] = Layout(kind, bits, order)
+        for bits, samples in ((10, 4), (12, 2)):
+            found[f"{name}{bits}p"] = Layout(kind, bits, order, samples, "stream")
+            found[f"{name}{bits}Packed"] = Layout(kind, bits, order, 2, "gige")
+    return found
+
+
+GENICAM = MappingProxyType(_genicam())
+_LAYOUTS = MappingProxyType({**FORMATS, **GENICAM})
+
 _JPEG_BEGIN, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
 
 def least_bytes(format: PictureFormat) -> int:
     """Return the bytes of the picture itself, without padding at its end; 0 for compressed formats."""
     width, height = format.size_px
-    layout = FORMATS[format.code]
+    layout = _LAYOUTS[format.code]
     if layout.kind == "jpeg":
         return 0
     if layout.kind == "nv12":
@@ -126,7 +156,7 @@ def least_bytes(format: PictureFormat) -> int:
 
 
 def whole_lengths(format: PictureFormat) -> tuple[int, ...]:
-    """Return the lengths in bytes that a whole picture may have; none where only its content tells."""
+    """Return the lengths in bytes that a whole picture may have; none where only its content shows it."""
     least = least_bytes(format)
     return (least, format.length_bytes) if least else ()
 
@@ -143,7 +173,7 @@ def wrong_length(format: PictureFormat, data: memoryview) -> str:
 
 def jpeg_of(format: PictureFormat, raw: NDArray[np.uint8]) -> bytes:
     """Return the JPEG that a picture's bytes are, without what fills them up; empty for other formats."""
-    if FORMATS[format.code].kind != "jpeg":
+    if _LAYOUTS[format.code].kind != "jpeg":
         return b""
     return raw.tobytes().rstrip(b"\0")
 
@@ -154,11 +184,11 @@ def grey(format: PictureFormat, raw: NDArray[np.uint8]) -> Image:
     Parameters
     ----------
     format
-        As the driver set it; its code must be among `FORMATS`.
+        As the driver set it; its code must be among `FORMATS` or `GENICAM`.
     raw
         The bytes of one picture, uint8 (n,).
     """
-    layout = FORMATS[format.code]
+    layout = _LAYOUTS[format.code]
     if layout.kind == "jpeg":
         return _decoded(format, raw, cv2.IMREAD_GRAYSCALE)
     if layout.kind in ("yuyv", "uyvy"):
@@ -172,6 +202,8 @@ def grey(format: PictureFormat, raw: NDArray[np.uint8]) -> Image:
         width, height = format.size_px
         stride = _stride(format, width)
         return raw[: stride * height].reshape(height, stride)[:, :width].copy()
+    if layout.kind in ("rgb", "bgr"):
+        return _image(cv2.cvtColor(_rows(format, raw, 3), getattr(cv2, f"COLOR_{layout.kind.upper()}2GRAY")))
     samples = _samples(format, layout, raw)
     if layout.kind == "bayer":
         return _image(cv2.cvtColor(samples, getattr(cv2, f"COLOR_Bayer{layout.order}2GRAY")))
@@ -180,7 +212,7 @@ def grey(format: PictureFormat, raw: NDArray[np.uint8]) -> Image:
 
 def colour(format: PictureFormat, raw: NDArray[np.uint8]) -> Image:
     """Return the colour picture, uint8 (h, w, 3) BGR; of a grey format the grey three times. Like `grey`."""
-    layout = FORMATS[format.code]
+    layout = _LAYOUTS[format.code]
     if layout.kind == "jpeg":
         return _decoded(format, raw, cv2.IMREAD_COLOR)
     if layout.kind in ("yuyv", "uyvy"):
@@ -196,6 +228,10 @@ def colour(format: PictureFormat, raw: NDArray[np.uint8]) -> Image:
         chroma = chroma[: stride * ((height + 1) // 2)].reshape(-1, stride // 2, 2)[:, : width // 2]
         luma = luma.reshape(height, stride)[:, :width]
         return _image(cv2.cvtColorTwoPlane(luma, chroma, cv2.COLOR_YUV2BGR_NV12))
+    if layout.kind == "bgr":
+        return _rows(format, raw, 3).copy()
+    if layout.kind == "rgb":
+        return _image(cv2.cvtColor(_rows(format, raw, 3), cv2.COLOR_RGB2BGR))
     samples = _samples(format, layout, raw)
     if layout.kind == "bayer":
         return _image(cv2.cvtColor(samples, getattr(cv2, f"COLOR_Bayer{layout.order}2BGR")))
@@ -220,6 +256,9 @@ def _samples(format: PictureFormat, layout: Layout, raw: NDArray[np.uint8]) -> N
     width, height = format.size_px
     stride = _stride(format, _row_bytes(layout, width))
     rows = raw[: stride * height].reshape(height, stride)[:, : _row_bytes(layout, width)]
+    if layout.packing != "mipi":
+        groups = rows.reshape(height, -1, layout.packed + 1)
+        return np.ascontiguousarray(_upper(layout, groups).reshape(height, -1)[:, :width])
     if layout.packed:
         # The upper bytes of a group as one number: thirty times as fast as a slice of three dimensions.
         group = np.dtype([("upper", f"<u{layout.packed}"), ("rests", "u1")])
@@ -231,6 +270,19 @@ def _samples(format: PictureFormat, layout: Layout, raw: NDArray[np.uint8]) -> N
         return rows[:, 1::2].copy()
     words = rows.view("<u2") >> (layout.bits - 8)
     return _image(np.minimum(words, 255, out=words).astype(np.uint8))
+
+
+def _upper(layout: Layout, groups: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The upper 8 bits of the samples of packed groups, (h, groups, samples)."""
+    if layout.packing == "gige":
+        return groups[:, :, ::2]
+    upper = np.empty((*groups.shape[:2], layout.packed), np.uint8)
+    for index in range(layout.packed):
+        byte, shift = divmod(index * layout.bits + layout.bits - 8, 8)
+        upper[:, :, index] = groups[:, :, byte] >> shift
+        if shift:
+            upper[:, :, index] |= groups[:, :, byte + 1] << (8 - shift)
+    return upper
 
 
 def _decoded(format: PictureFormat, raw: NDArray[np.uint8], flags: int) -> Image:
@@ -247,6 +299,8 @@ def _row_bytes(layout: Layout, width: int) -> int:
     """Bytes of a row without padding."""
     if layout.packed:
         return -(-width // layout.packed) * (layout.packed + 1)
+    if layout.kind in ("rgb", "bgr"):
+        return 3 * width
     return 2 * width if layout.kind in ("yuyv", "uyvy") or layout.bits > 8 else width
 
 

@@ -16,6 +16,7 @@ from calib.errors import BadFile
 from calib.files import mast_file as store
 from calib.files.yaml_text import Section
 from drivers import options as driver_options
+from drivers.aravis import options as aravis
 from drivers.dynamixel import settings as dynamixel
 from drivers.errors import BadOptions
 from drivers.feetech import settings as feetech
@@ -150,6 +151,10 @@ def v4l2_options() -> dict[str, Any]:
     return {"device": "/dev/v4l/by-id/x", "exposure_s": 0.01, "auto_exposure": {}}
 
 
+def aravis_options() -> dict[str, Any]:
+    return {"serial": "1", "exposure_s": 0.01}
+
+
 def options_known(read: Callable[[dict[str, Any]], Any], options: dict[str, Any]) -> set[str]:
     """Every option that a driver knows, as it asks for them."""
     known: set[str] = set()
@@ -181,6 +186,8 @@ def known_of(driver: str) -> set[str]:
         return options_known(flir_ptu.options_from, ptu_options())
     if driver == "visca":
         return options_known(visca.options_from, visca_options())
+    if driver == "aravis":
+        return set(aravis.OPTIONS)
     assert driver == "v4l2", f"say here how the options of {driver} are read"
     inner = {f"auto_exposure.{key}" for key in v4l2.AUTO_EXPOSURE_OPTIONS}
     return {*v4l2.OPTIONS, *inner}
@@ -246,6 +253,11 @@ SOURCES: dict[str, tuple[str, Callable[[dict[str, Any]], Any], Callable[[], dict
     "flir_ptu": ("Options of `flir_ptu`", flir_ptu.options_from, ptu_options),
     "visca": ("Options of `visca`", visca.options_from, visca_options),
     "v4l2": ("Options of `v4l2`", lambda values: v4l2.parse_options(values, "cam_left"), v4l2_options),
+    "aravis": (
+        "Options of `aravis`",
+        lambda values: aravis.parse_options(values, "cam_left"),
+        aravis_options,
+    ),
     "simulation": ("Simulation", simulated, lambda: {"rover": "true.yaml"}),
 }
 

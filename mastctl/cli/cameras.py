@@ -52,10 +52,13 @@ def add_actions(actions: Any) -> None:
 
 def camera_list(args: argparse.Namespace) -> int:
     """Show the connected cameras."""
+    from dataclasses import asdict
+
+    from drivers.aravis.find import list_cameras as list_genicam
     from drivers.v4l2 import find
     from drivers.v4l2.node import capture_nodes
 
-    found = find.list_cameras()
+    found, genicam = find.list_cameras(), list_genicam()
     told: list[dict[str, Any]] = [
         {
             "node": str(c.node), "driver": c.driver, "card": c.card, "bus": c.bus,
@@ -65,13 +68,17 @@ def camera_list(args: argparse.Namespace) -> int:
     ]  # fmt: skip
     refused = list(find.refused_nodes(capture_nodes()))
     if args.json:
-        output.print_json({"cameras": told, "refused": refused})
+        output.print_json({"cameras": told, "genicam": [asdict(one) for one in genicam], "refused": refused})
         return 0
-    if not found:
+    if not found and not genicam:
         sys.stdout.write("no camera is connected\n")
-    else:
+    if found:
         rows = [(c["card"], c["bus"], c["driver"], c["node"], "\n".join(c["links"]) or "-") for c in told]
         output.print_table("cameras", ("card", "bus", "driver", "node now", "stable links"), rows)
+    if genicam:
+        titles = ("id", "serial", "address", "vendor", "model", "protocol")
+        rows = [tuple(getattr(one, title) for title in titles) for one in genicam]
+        output.print_table("cameras of GigE Vision and USB3 Vision (driver aravis)", titles, rows)
     for line in refused:
         output.tell(line)
     return 0

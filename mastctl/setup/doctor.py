@@ -10,6 +10,9 @@ from typing import Any
 
 from calib.errors import BadFile
 from calib.files.mast_file import load_rig
+from drivers.aravis import find as genicam
+from drivers.aravis import library as genicam_library
+from drivers.aravis import options as genicam_options
 from drivers.errors import BadOptions, CameraBusy, DriverError, NoCamera, NoPermission
 from drivers.hardware import CAMERAS, HEADS, OURS, clock_for, installed_drivers
 from drivers.v4l2 import find
@@ -65,7 +68,9 @@ def examine(
     yield from _head_line(config, machine)
     yield from examine_drivers(installed_drivers())
     for name, camera in config.hardware.cameras.items():
-        if camera.driver in CAMERAS:
+        if camera.driver == "aravis":
+            yield examine_genicam(name, camera.options, in_use=status is not None)
+        elif camera.driver in CAMERAS:
             yield examine_camera(name, camera.options, in_use=status is not None)
     yield from _simulation(config)
     yield from examine_folder(
@@ -209,6 +214,28 @@ def examine_camera(name: str, options: Mapping[str, Any], *, in_use: bool) -> Do
         words = f"{who.card} at {who.bus} offers {', '.join(offered)} where {asked.format} is configured"
         return DoctorFinding(what, "bad", words, "configure one of these")
     return DoctorFinding(what, "good", f"{who.card} at {who.bus}, {asked.format}")
+
+
+def examine_genicam(name: str, options: Mapping[str, Any], *, in_use: bool) -> DoctorFinding:
+    """Look whether a GigE Vision or USB3 Vision camera answers; it is not opened. As `examine_camera`."""
+    what = f"camera {name}"
+    try:
+        asked = genicam_options.parse_options(options, name)
+        genicam_library.library(name)
+    except BadOptions as error:
+        needs = not genicam_library.installed()
+        advice = genicam_library.INSTALL if needs else "correct the configuration"
+        return DoctorFinding(what, "bad", str(error), advice)
+    found = [one for one in genicam.list_cameras() if genicam.is_meant(asked, one)]
+    if len(found) == 1:
+        return DoctorFinding(what, "good", found[0].words)
+    if found:
+        words = f"several cameras have {asked.words}: {', '.join(one.id for one in found)}"
+        return DoctorFinding(what, "bad", words, "give its id")
+    words = f"no camera with {asked.words} answers"
+    if in_use or asked.address:  # one beyond a router does not answer to a search
+        return DoctorFinding(what, "unsure", f"{words} to a search", "mastctl camera check says more")
+    return DoctorFinding(what, "bad", words, "plug it in; mastctl camera list shows what is connected")
 
 
 OLD_DAYS = 180

@@ -10,13 +10,14 @@ from pathlib import Path
 from string import ascii_uppercase
 
 from drivers.approach import ApproachedAxis
+from drivers.aravis import options as aravis_options
 from drivers.dynamixel.models import MODELS
 from drivers.dynamixel.settings import DynamixelAxisSettings, DynamixelSettings, dynamixel_settings
 from drivers.faults import BOUNDS, CAMERA_WORDS, HEAD_WORDS, LOG_WORDS, WHEN
 from drivers.feetech.models import MODELS as FEETECH_MODELS
 from drivers.feetech.settings import FeetechAxisSettings, FeetechSettings, feetech_settings
 from drivers.flir_ptu import options as flir_ptu
-from drivers.pixels import FORMATS
+from drivers.pixels import FORMATS, GENICAM
 from drivers.recordings.replay import OPTIONS as REPLAY_OPTIONS
 from drivers.servo_bus.settings import ServoAxisSettings
 from drivers.sim import camera_settings, ground, heads, placed, scene
@@ -144,6 +145,25 @@ def camera_options() -> Schema:
     found["properties"]["auto_exposure"] = {"anyOf": [FLAG, inner], "default": False}
     found["anyOf"] = [{"required": [key]} for key in ("device", "card", "bus")]
     found["dependentSchemas"] = {"device": {"properties": {"card": False, "bus": False}}}
+    return found
+
+
+def genicam_options() -> Schema:
+    """Options of a GigE Vision or USB3 Vision camera."""
+    with watched("options.") as noted:
+        aravis_options.parse_options({"serial": "1", "exposure_s": 0.01}, "cam")
+    for name in ("serial", "address", "id"):
+        noted.at(name).value = dict(TEXT)
+    noted.at("format").value = {"enum": sorted(GENICAM), "default": "Mono8"}
+    noted.at("rate_hz").value["type"] = ["number", "null"]
+    for name, low, usual in (("size_px", 1, [640, 480]), ("offset_px", 0, [0, 0])):
+        noted.at(name).value = {**vector(number(low, 32768, kind="integer"), 2), "default": usual}
+    noted.at("features").value = {
+        "type": "object",
+        "additionalProperties": {"type": ["number", "string", "boolean"]},
+    }
+    found = _settings(noted.schema(), aravis_options.AravisOptions)
+    found["anyOf"] = [{"required": [key]} for key in ("serial", "address", "id")]
     return found
 
 

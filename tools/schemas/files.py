@@ -24,6 +24,7 @@ from tools.schemas.drivers import (
     dynamixel,
     fault_list,
     feetech,
+    genicam_options,
     ptu,
     replay,
     simulation,
@@ -72,8 +73,10 @@ def config() -> Schema:
     for name in ("dynamixel", "feetech", "flir_ptu", "visca"):
         inner["pan_tilt"]["allOf"][list(drivers).index(name)]["then"]["required"] = ["options"]
     camera = inner["cameras"]["additionalProperties"]
-    _by(camera, "driver", {"v4l2": {"options": camera_options()}, "replay": {"options": replay()}})
-    camera["allOf"][0]["then"]["required"] = ["options"]
+    drivers = {"v4l2": camera_options(), "aravis": genicam_options(), "replay": replay()}
+    _by(camera, "driver", {name: {"options": one} for name, one in drivers.items()})
+    for name in ("v4l2", "aravis"):
+        camera["allOf"][list(drivers).index(name)]["then"]["required"] = ["options"]
     inner["listen"]["dependentSchemas"] = {
         "socket": {"properties": dict.fromkeys(("host", "port", "tls"), False)},
     }

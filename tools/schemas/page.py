@@ -24,6 +24,7 @@ TABLES = {
     "Options of `flir_ptu`": ("pan_tilt", "flir_ptu"),
     "Options of `visca`": ("pan_tilt", "visca"),
     "Options of `v4l2`": ("cameras", "v4l2"),
+    "Options of `aravis`": ("cameras", "aravis"),
     "Simulation": ("simulation",),
 }
 """Headings, and where their keys stand in the schema of a configuration: a key, a driver of it."""

@@ -38,6 +38,8 @@ BUILD_PROGRAMS |= {"patch": "patch", "strip": "binutils", "dpkg-deb": "dpkg", "t
 
 SECOND_READER = {"v4l2-ctl": "v4l-utils"}
 """The camera tests compare our reader with this one."""
+ARAVIS = {"arv-tool-0.8": "aravis-tools-cli"}
+"""Brings the library of GigE Vision cameras, and with it the fake camera of its tests."""
 
 
 class CannotBuild(Exception):

@@ -1,0 +1,150 @@
+"""The driver ``aravis``: a GigE Vision or USB3 Vision camera whose frames are never older than asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from drivers import pixels
+from drivers.aravis.capture import GenicamCapture
+from drivers.aravis.options import AravisOptions, parse_options
+from drivers.clock import Clock
+from drivers.errors import NoCamera, NoFreshFrame
+from drivers.interfaces import Frame, FrameTime
+from drivers.newest import Counters
+
+
+@dataclass(frozen=True, eq=False)
+class GenicamFrame(Frame):
+    """A frame with what is known of its time.
+
+    ``exposure_s`` of `Frame` is here the window in which the exposure of all rows surely lay, and
+    ``mid_exposure_s`` is its middle.
+
+    Attributes
+    ----------
+    mid_uncertainty_s
+        The most that the true mid-exposure may be away from ``mid_exposure_s``.
+    set_exposure_s
+        The camera's own exposure time: with the frame where it sends chunk data, else as it was set; None if
+        not known.
+    stamp_s, received_s
+        The stamp of the camera's own clock, and when the frame was whole, seconds of CLOCK_MONOTONIC.
+    camera_sequence, stream
+        The camera's own count, and the stream's number.
+    """
+
+    mid_uncertainty_s: float
+    set_exposure_s: float | None
+    stamp_s: float
+    received_s: float
+    camera_sequence: int
+    stream: int
+
+
+def open_camera(options: Mapping[str, Any], clock: Clock | None = None, name: str = "aravis") -> AravisCamera:
+    """Open a camera by a configuration's options (docs/how-to/cameras.md).
+
+    ``clock`` is not used: the camera's clock is tied to the machine's.
+
+    Raises
+    ------
+    BadOptions
+        For options that it refuses, and without the library Aravis.
+    DriverError
+        If the camera does not answer or another program has it.
+    """
+    return AravisCamera(parse_options(options, name), name)
+
+
+class AravisCamera:
+    """One camera, an instance of ``drivers.interfaces.Camera``; safe from any thread."""
+
+    def __init__(self, options: AravisOptions, name: str) -> None:
+        self.name = name
+        self._options = options
+        self.capture = GenicamCapture(options, name, pixels.colour if options.colour else pixels.grey)
+        self._last: GenicamFrame | None = None
+
+    @property
+    def counters(self) -> Counters:
+        """The counts of good, damaged and missing frames so far."""
+        return self.capture.newest.counters
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height) of every picture."""
+        return self.capture.format.size_px
+
+    @property
+    def period_s(self) -> float:
+        """From frame to frame, seconds, by the camera's word; of a triggered one, between its last frames."""
+        if self.capture.period_s is not None:
+            return self.capture.period_s
+        times = self.recent_times()
+        if len(times) < 2:
+            return 1.0
+        span_s = times[-1].exposure_began_s - times[0].exposure_began_s
+        return max(1e-3, span_s / max(1, times[-1].sequence - times[0].sequence))
+
+    @property
+    def trigger(self) -> str:
+        """The name of the hardware trigger that exposes it; empty for others."""
+        return self._options.trigger
+
+    def recent_times(self) -> list[FrameTime]:
+        """Return the times of the last good frames of this stream, oldest first."""
+        return [FrameTime(frame.sequence, frame.window.begin_s) for frame in self.capture.newest.recent()]
+
+    def next_frame(self, exposed_after_s: float, timeout_s: float) -> GenicamFrame:
+        """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.
+
+        Raises
+        ------
+        NoFreshFrame
+            If none came within ``timeout_s`` seconds; the message says what came instead.
+        NoCamera
+            At once, if the camera is gone.
+        """
+        newest = self.capture.newest
+        damaged = newest.damaged
+        taken = self.capture.take(exposed_after_s, timeout_s)
+        if taken is None:
+            if lost := newest.lost:
+                raise NoCamera(lost)
+            raise NoFreshFrame(self._instead(exposed_after_s, timeout_s, damaged), device=self.name)
+        arrived, image, _ = taken
+        last = self._last
+        if last is not None and last.image is image:
+            return last
+        window, exposure_s = arrived.window, arrived.exposure_s
+        self._last = GenicamFrame(
+            image=image,
+            sequence=arrived.sequence,
+            mid_exposure_s=window.mid_s,
+            exposure_s=window.length_s,
+            mid_uncertainty_s=max(0.0, window.length_s - (exposure_s or 0.0)) / 2,
+            set_exposure_s=exposure_s,
+            stamp_s=arrived.filled.stamp_s,
+            received_s=arrived.received_s,
+            camera_sequence=arrived.filled.number,
+            stream=arrived.stream,
+        )
+        return self._last
+
+    def close(self) -> None:
+        """Let go of the camera; a waiting call ends with NoFreshFrame."""
+        self.capture.close()
+
+    def _instead(self, exposed_after_s: float, timeout_s: float, damaged_before: int) -> str:
+        """What to say when no fresh frame came."""
+        counters = self.counters
+        message = f"no frame exposed after the asked moment came within {timeout_s:.3g} s"
+        if damaged := counters.damaged - damaged_before:
+            message += f"; {damaged} came damaged ({counters.last_damage})"
+        last = self.capture.newest.frame
+        if last is None:
+            return message if damaged else f"{message}; none came at all"
+        age_s = exposed_after_s - last.window.begin_s
+        return f"{message}; the last good one is frame {last.sequence}, exposed {age_s:.3f} s before"

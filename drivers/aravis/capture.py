@@ -1,0 +1,293 @@
+"""The thread of one camera: takes and checks every frame, keeps the newest good one, reopens what went."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.aravis.camera_clock import CameraClock, ClockStepped, GenicamWindow
+from drivers.aravis.device import Device, Filled
+from drivers.aravis.options import SOFTWARE, AravisOptions
+from drivers.errors import DriverError, NoCamera, StreamFailed
+from drivers.interfaces import Image
+from drivers.newest import Newest
+from drivers.pixels import PictureFormat
+
+log = logging.getLogger(__name__)
+
+WAIT_S = 0.1  # for a frame: so long after the last one a loss or the end is looked for
+SILENT_S, SILENT_PERIODS = 1.0, 5  # a free-running camera that gives nothing for so long is opened again
+READ_CLOCK_EVERY_S = 1.0
+LEARNING_FRAMES = 4  # where a clock cannot be read, these show how soon a frame may come
+DELAYED_S, DELAYED_FRAMES = 1.0, 5  # so many frames that come so late: the camera's clock was set back
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0  # between tries to open a camera that is there and fails
+CLOSE_PATIENCE_S, CLOSING_S = 2.0, 1.0
+LATE_S = 0.005
+
+Convert = Callable[[PictureFormat, NDArray[np.uint8]], Image]
+
+
+class ArrivedGenicam(NamedTuple):
+    """A good frame, without its picture.
+
+    Attributes
+    ----------
+    filled, window
+        The buffer with the camera's own count and stamp, and in which the whole exposure lay.
+    exposure_s
+        Its exposure time by the camera's own word; None if it is not known.
+    sequence, stream
+        Our own count, which grows over every reopening, and the number of the stream.
+    received_s
+        When it was whole, seconds of CLOCK_MONOTONIC.
+    """
+
+    filled: Filled
+    window: GenicamWindow
+    exposure_s: float | None
+    sequence: int
+    stream: int
+    received_s: float
+
+
+class GenicamCapture:
+    """Streams from one camera until it is closed; safe from any thread.
+
+    Raises
+    ------
+    DriverError
+        If the camera cannot be opened now. Once it was, it is opened again whenever it comes back.
+    """
+
+    def __init__(self, options: AravisOptions, name: str, convert: Convert) -> None:
+        self._options, self._name, self._convert = options, name, convert
+        self.newest: Newest[ArrivedGenicam] = Newest()
+        self._over = threading.Event()
+        self._triggering = threading.Lock()
+        self._asked: list[float] = []  # moments of triggers that no frame answered yet; under the lock below
+        self._asking = threading.Lock()
+        self._streams = 0
+        self._last_sequence = -1
+        self._last_number: int | None = None
+        self._held: int | None = None
+        self._delayed = 0
+        self._pause_s = FIRST_PAUSE_S
+        self._device: Device | None = self._open()
+        self.format, self.period_s = self._device.format, self._device.period_s
+        self.problems, self.words = tuple(self._device.problems), self._device.words
+        self._thread = threading.Thread(
+            target=self._serve, args=(self._device,), name=f"capture {name}", daemon=True
+        )
+        self._thread.start()
+
+    def take(self, exposed_after_s: float, timeout_s: float) -> tuple[ArrivedGenicam, Image, bytes] | None:
+        """Return the newest frame exposed after that moment, as `drivers.newest.Newest.take`; a camera with
+        the trigger ``Software`` exposes it now.
+        """
+        if self._options.trigger_source != SOFTWARE:
+            return self.newest.take(exposed_after_s, timeout_s, self._is_young)
+        until_s = time.monotonic() + timeout_s
+        if not self._triggering.acquire(timeout=timeout_s):
+            return None
+        try:
+            if found := self.newest.take(exposed_after_s, 0.0, lambda frame: True):
+                return found
+            if not self._fire():
+                return None
+            return self.newest.take(exposed_after_s, until_s - time.monotonic(), lambda frame: True)
+        finally:
+            self._triggering.release()
+
+    def _fire(self) -> bool:
+        """Send the software trigger, and note when; False if there is no camera."""
+        with self._asking:
+            device = self._device
+            if device is None:
+                return False
+            self._asked.append(time.monotonic())
+            try:
+                device.trigger()
+            except StreamFailed:
+                self._asked.pop()
+                raise
+        return True
+
+    def _is_young(self, frame: ArrivedGenicam) -> bool:
+        """Whether no newer one should be here: a triggered camera's stays young."""
+        if self.period_s is None or not self._options.free_running:
+            return True
+        return time.monotonic() - frame.received_s <= self.period_s + LATE_S
+
+    def close(self) -> None:
+        """End the thread and let go of the camera; one that is gone is left behind after 2 s."""
+        if not self.newest.close():
+            return
+        self._over.set()
+        self._thread.join(CLOSE_PATIENCE_S)
+        if self._thread.is_alive():
+            log.warning("%s: it does not answer; Aravis lets go of it when it gives up", self._name)
+
+    # In the capture thread
+
+    def _serve(self, device: Device | None) -> None:
+        """Stream, and open again after every failure, until closed."""
+        while True:
+            if device is not None:
+                try:
+                    self._stream(device)
+                    return
+                except DriverError as error:
+                    self._lose(str(error))
+                except Exception as error:  # a defect here must not end in a thread that is silently gone
+                    log.exception("%s: the capture failed", self._name)
+                    self._lose(f"{self._name}: the capture failed: {type(error).__name__}: {error}")
+                finally:
+                    self._let_go(device)
+            if self._over.wait(self._pause_s):
+                return
+            self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
+            device = self._reopened()
+
+    def _lose(self, why: str) -> None:
+        if self.newest.lose(why):
+            log.warning("%s; it is opened again when it is back", why)
+
+    def _let_go(self, device: Device) -> None:
+        """Close a stream before it is opened again; wait only a second for a camera that is gone."""
+        with self._asking:
+            self._device = None
+            self._asked.clear()
+        self.newest.forget()
+        self._held = None
+        closing = threading.Thread(target=device.close, name=f"closing {self._name}", daemon=True)
+        closing.start()
+        closing.join(CLOSE_PATIENCE_S if self._over.is_set() else CLOSING_S)
+
+    def _reopened(self) -> Device | None:
+        """Try to open the camera again; None if it is not back."""
+        try:
+            device = self._open()
+        except Exception as error:
+            if not isinstance(error, DriverError):
+                log.exception("%s: opening again failed", self._name)
+            self.newest.lose(str(error) or type(error).__name__)
+            return None
+        self.newest.come_back()
+        log.warning("%s is back", self._name)
+        with self._asking:
+            self._device = device
+        return device
+
+    def _open(self) -> Device:
+        device = Device(self._options, self._name)
+        self._longest_s = device.exposure_s or device.period_s or 1.0
+        least_delay_s = self._options.margin_s + (0.0 if self._options.stamp == "end" else self._longest_s)
+        self._clock = CameraClock(least_delay_s)
+        self._streams += 1
+        self._last_number, self._delayed, self._learned = None, 0, 0
+        return device
+
+    def _stream(self, device: Device) -> None:
+        """Take frames until closed. Raises DriverError when the camera fails."""
+        heard_s = time.monotonic()
+        silent_s = max(SILENT_S, SILENT_PERIODS * (device.period_s or 0.0))
+        read_next_s = self._read_clock(device, heard_s)
+        while not self._over.is_set():
+            filled = device.wait(WAIT_S)
+            now_s = time.monotonic()
+            if device.lost.is_set():
+                words = "it no longer answers: unplugged, without power, or taken over"
+                raise NoCamera(words, device=self._name)
+            if filled is not None:
+                heard_s = now_s
+                self._take(device, filled, now_s)
+                if now_s >= read_next_s:
+                    read_next_s = self._read_clock(device, now_s)
+            elif self._options.free_running and now_s - heard_s > silent_s:
+                raise StreamFailed(
+                    f"it gave no frame for {now_s - heard_s:.1f} s (its cable, its power?)",
+                    device=self._name,
+                )
+
+    def _read_clock(self, device: Device, now_s: float) -> float:
+        """Read the camera's clock, where it can be; return when to do it next."""
+        if (reading := device.read_clock()) is None:
+            return math.inf
+        try:
+            self._clock.read(*reading)
+        except ClockStepped as error:
+            raise StreamFailed(str(error), device=self._name) from None
+        return now_s + READ_CLOCK_EVERY_S
+
+    def _take(self, device: Device, filled: Filled, received_s: float) -> None:
+        """Check one buffer; publish it if it is good, and give the last one back, else itself."""
+        dropped = self._count(filled)
+        triggered_s, wrong = self._triggered_s(), filled.wrong
+        if not wrong:
+            try:
+                self._clock.arrived(filled.stamp_s, filled.arrived_s)
+            except ClockStepped as error:
+                raise StreamFailed(str(error), device=self._name) from None
+            wrong = self._wrong_delay(filled)
+        self._learned += not wrong
+        learning = not self._clock.readings and self._learned <= LEARNING_FRAMES and triggered_s == -math.inf
+        if wrong or learning:
+            self.newest.refuse(dropped, wrong)
+            device.queue(filled.handle)
+            return
+        exposure_s = device.exposure_s if filled.exposure_s is None else filled.exposure_s
+        window = self._clock.window(
+            filled.stamp_s, self._options.stamp, exposure_s or self._longest_s, triggered_s, filled.arrived_s
+        )
+        frame = ArrivedGenicam(filled, window, exposure_s, self._last_sequence, self._streams, received_s)
+        self.newest.publish(frame, partial(self._made, device, filled.handle), dropped=dropped, late=False)
+        held, self._held = self._held, filled.handle
+        if held is not None:
+            device.queue(held)
+        self._pause_s = FIRST_PAUSE_S
+
+    def _made(self, device: Device, handle: int) -> tuple[Image, bytes]:
+        """The picture of a buffer."""
+        data, format = device.bytes_of(handle)
+        return self._convert(format, data), b""
+
+    def _triggered_s(self) -> float:
+        """When the trigger was sent that this frame answers; -inf where that is not known."""
+        if self._options.trigger_source != SOFTWARE:
+            return -math.inf
+        with self._asking:
+            asked, self._asked = self._asked, self._asked[1:]
+        return asked[0] if asked else -math.inf
+
+    def _count(self, filled: Filled) -> int:
+        """Count a frame; return how many are missing before it."""
+        step = 1
+        if self._last_number is not None:
+            step = filled.number - self._last_number
+            if step <= 0 and self._last_number < 2**16:
+                step += 2**16 - 1  # the count of 16 bits leaves out 0
+            if not 0 < step < 2**15:  # it began again: nothing says how many that cost
+                step = 1
+        self._last_number = filled.number
+        self._last_sequence += step
+        return step - 1
+
+    def _wrong_delay(self, filled: Filled) -> str:
+        """Why a frame comes too late to be believed; empty if it does not. Raises StreamFailed for many."""
+        delay_s = filled.arrived_s - filled.stamp_s - self._clock.high_s
+        if delay_s <= DELAYED_S:
+            self._delayed = 0
+            return ""
+        self._delayed += 1
+        words = f"it came {delay_s:.3g} s later after its stamp than others"
+        if self._delayed >= DELAYED_FRAMES:
+            raise StreamFailed(f"{words}, as {self._delayed} before; was its clock set?", device=self._name)
+        return words

@@ -1,0 +1,366 @@
+"""One opened camera: its features set as asked and checked, its buffers, and its clock read."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import threading
+import time
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.aravis import find
+from drivers.aravis.library import CONTROL_LOST, GenicamError, library
+from drivers.aravis.options import SOFTWARE, AravisOptions
+from drivers.errors import CameraBusy, DriverError, StreamFailed, UnsupportedFormat
+from drivers.pixels import GENICAM, PictureFormat
+
+log = logging.getLogger(__name__)
+
+RATE_TOLERANCE = 0.02
+_OFF, _CONTINUOUS = 0, 0  # ARV_AUTO_OFF, ARV_ACQUISITION_MODE_CONTINUOUS
+_EXPOSURE_CHUNK = "ExposureTime"
+_LATCHES = (("TimestampLatch", "TimestampLatchValue"), ("GevTimestampControlLatch", "GevTimestampValue"))
+_TICKS = "GevTimestampTickFrequency"
+
+STATUS = {
+    1: "it was not filled",
+    2: "not all of its packets came in time",
+    3: "packets of it were lost",
+    4: "a packet of it has a wrong number",
+    5: "it does not fit its buffer",
+    7: "its filling was broken off",
+    8: "it is no image",
+}
+"""Meanings of ArvBufferStatus, for a frame that is not whole."""
+
+
+class Filled(NamedTuple):
+    """A buffer that came back, still ours until it is queued again.
+
+    Attributes
+    ----------
+    handle
+        Aravis's buffer.
+    wrong
+        Why it is no good frame; empty if it is.
+    number
+        The camera's count: 16 bits that leave out 0, or 64 bits.
+    stamp_s, arrived_s
+        The camera's stamp by its own clock, and when its first packet came, seconds of CLOCK_MONOTONIC.
+    exposure_s
+        The exposure time that the camera sent with it (chunk data); None if it sends none.
+    """
+
+    handle: int
+    wrong: str
+    number: int
+    stamp_s: float
+    arrived_s: float
+    exposure_s: float | None
+
+
+class Device:
+    """A camera that streams. Closing it gives everything back.
+
+    Attributes
+    ----------
+    format, period_s, exposure_s
+        As the camera answered; a triggered camera has a period of None, one without exposure control None.
+    problems
+        Sentences about controls that are missing or not as asked.
+    lost
+        Set when the camera no longer obeys: it was unplugged, or another program took it.
+
+    Raises
+    ------
+    UnsupportedFormat
+        If format, size or rate are not to be had; the message says what is.
+    DriverError
+        If the camera cannot be opened or does not start.
+    """
+
+    def __init__(self, options: AravisOptions, name: str) -> None:
+        self._arv = library(name)
+        self._options, self._name = options, name
+        self.lost = threading.Event()
+        self.problems: list[str] = []
+        self._parser: int | None = None
+        self._stream: int | None = None
+        self._latch: tuple[str, str] | None = None
+        self._control_lost = CONTROL_LOST(
+            lambda device, data: self.lost.set()
+        )  # kept as long as it may be called
+        self._camera: int = find.open_camera(options, name)
+        try:
+            self._arv.on_control_lost(self._arv("camera_get_device", self._camera), self._control_lost)
+            self._is_gige = bool(self._arv("camera_is_gv_device", self._camera))
+            self._set_up()
+            self._begin()
+        except GenicamError as error:
+            self.close()
+            raise self._told(error) from None
+        except BaseException:
+            self.close()
+            raise
+
+    def _set_up(self) -> None:
+        """Set everything that is asked for, and check the answers."""
+        arv, camera, options = self._arv, self._camera, self._options
+        device = arv("camera_get_device", camera)
+        for name, value in options.features.items():
+            text = str(value).lower() if isinstance(value, bool) else str(value)
+            try:
+                arv("device_set_features_from_string", device, f"{name}={text}")
+            except GenicamError as error:
+                self.problems.append(f"feature {name} is not set to {text}: {error}")
+        arv("camera_set_acquisition_mode", camera, _CONTINUOUS)
+        self._set_format()
+        self._set_region()
+        self.period_s = self._set_pace()
+        self.exposure_s = self._set_exposure()
+        if options.gain is not None and self._has("gain"):
+            arv("camera_set_gain", camera, options.gain)
+            self.gain: float | None = arv("camera_get_gain", camera)
+        else:
+            self.gain = None
+        if self._is_gige and options.packet_bytes is not None:
+            arv("camera_gv_set_packet_size", camera, options.packet_bytes)
+        self._ask_chunks()
+        self._find_latch()
+        for problem in self.problems:
+            log.warning("%s: %s", self._name, problem)
+
+    def _set_format(self) -> None:
+        code = self._options.format
+        offered = self._arv.texts("camera_dup_available_pixel_formats_as_strings", self._camera)
+        if code not in offered:
+            read = ", ".join(one for one in offered if one in GENICAM) or "none that this driver reads"
+            raise UnsupportedFormat(f"the camera has no format {code}; it has {read}", device=self._name)
+        self._arv("camera_set_pixel_format_from_string", self._camera, code)
+
+    def _set_region(self) -> None:
+        """Set size and offset, and check what the camera made of them."""
+        arv, camera, options = self._arv, self._camera, self._options
+        asked = (*options.offset_px, *options.size_px)
+        bounds = {side: self._bounds(f"camera_get_{side}_bounds") for side in ("width", "height")}
+        offered = " and ".join(f"{side} {low} to {high}" for side, (low, high) in bounds.items())
+        told = f"the camera does not take {asked[2]}x{asked[3]} px at ({asked[0]}, {asked[1]})"
+        # Aravis writes what it is told, and not every camera refuses what it cannot do.
+        for side, (low, high) in zip(options.size_px, bounds.values(), strict=True):
+            if not low <= side <= high:
+                raise UnsupportedFormat(f"{told}; it has {offered}", device=self._name)
+        got = [ctypes.c_int() for _ in range(4)]
+        reason = ""
+        try:
+            arv("camera_set_region", camera, *asked)
+        except GenicamError as error:
+            reason = f" ({error})"
+        arv("camera_get_region", camera, *(ctypes.byref(one) for one in got))
+        x, y, width, height = (one.value for one in got)
+        if (x, y, width, height) != asked:
+            made = f"it made {width}x{height} at ({x}, {y}) of it"
+            raise UnsupportedFormat(f"{told}{reason}; {made} and has {offered}", device=self._name)
+
+    def _bounds(self, name: str) -> tuple[int, int]:
+        low, high = ctypes.c_int(), ctypes.c_int()
+        self._arv(name, self._camera, ctypes.byref(low), ctypes.byref(high))
+        return low.value, high.value
+
+    def _set_pace(self) -> float | None:
+        """Set rate or trigger; return the period of a free-running camera, None where there is none."""
+        arv, camera, options = self._arv, self._camera, self._options
+        if not options.free_running:
+            try:
+                arv("camera_set_trigger", camera, options.trigger_source)
+            except GenicamError as error:
+                offered = ", ".join(arv.texts("camera_dup_available_trigger_sources", camera)) or "none"
+                raise UnsupportedFormat(
+                    f"the camera has no trigger source {options.trigger_source} ({error}); it has {offered}",
+                    device=self._name,
+                ) from None
+            return None
+        arv("camera_clear_triggers", camera)
+        if not arv("camera_is_frame_rate_available", camera):
+            return None if options.rate_hz is None else 1 / options.rate_hz
+        if options.rate_hz is not None:
+            arv("camera_set_frame_rate", camera, options.rate_hz)
+        rate_hz: float = arv("camera_get_frame_rate", camera)
+        if options.rate_hz is not None and abs(rate_hz - options.rate_hz) > RATE_TOLERANCE * options.rate_hz:
+            raise UnsupportedFormat(
+                f"the camera has no {options.rate_hz:g} Hz here; its nearest is {rate_hz:.4g}",
+                device=self._name,
+            )
+        return 1 / rate_hz if rate_hz > 0 else None
+
+    def _set_exposure(self) -> float | None:
+        """Set the exposure time; return the camera's own word, None where an automatic has it."""
+        arv, camera, asked_s = self._arv, self._camera, self._options.exposure_s
+        if not self._has("exposure_time", asked_s is not None):
+            return None
+        automatic = bool(arv("camera_is_exposure_auto_available", camera))
+        if asked_s is not None:
+            if automatic:
+                arv("camera_set_exposure_time_auto", camera, _OFF)
+            arv("camera_set_exposure_time", camera, 1e6 * asked_s)
+        elif automatic:
+            return None
+        return float(arv("camera_get_exposure_time", camera)) / 1e6
+
+    def _has(self, what: str, needed: bool = True) -> bool:
+        """Whether the camera has a control; one that is asked for in vain is a problem."""
+        found = bool(self._arv(f"camera_is_{what}_available", self._camera))
+        if found and what == "gain" and self._arv("camera_is_gain_auto_available", self._camera):
+            self._arv("camera_set_gain_auto", self._camera, _OFF)
+        if not found and needed:
+            self.problems.append(f"the camera has no control for {what.replace('_', ' ')}; it stays as it is")
+        return found
+
+    def _ask_chunks(self) -> None:
+        """Have each frame bring its own exposure time, where the camera can."""
+        arv, camera = self._arv, self._camera
+        if "ChunkModeActive" in self._options.features:
+            return
+        try:
+            if arv("camera_are_chunks_available", camera):
+                arv("camera_set_chunk_mode", camera, 1)
+                arv("camera_set_chunk_state", camera, _EXPOSURE_CHUNK, 1)
+                self._parser = arv("camera_create_chunk_parser", camera)
+        except GenicamError as error:
+            log.info("%s: no exposure time with each frame: %s", self._name, error)
+
+    def _find_latch(self) -> None:
+        """See how the camera's clock is read, if it can be."""
+        for command, value in _LATCHES:
+            if all(self._arv("camera_is_feature_available", self._camera, one) for one in (command, value)):
+                self._latch = command, value
+                break
+        self._ticks_hz = 1e9
+        if self._latch == _LATCHES[1] and self._arv("camera_is_feature_available", self._camera, _TICKS):
+            self._ticks_hz = float(self._arv("camera_get_integer", self._camera, _TICKS)) or 1e9
+
+    def _begin(self) -> None:
+        """Make the buffers and start."""
+        arv, camera = self._arv, self._camera
+        payload = arv("camera_get_payload", camera)
+        self.format = PictureFormat(self._options.format, self._options.size_px, 0, payload)
+        self._stream = arv("camera_create_stream", camera, None, None, None)
+        if not self._stream:
+            raise StreamFailed("Aravis made no stream", device=self._name)
+        for _ in range(self._options.buffers):
+            arv("stream_push_buffer", self._stream, arv("buffer_new_allocate", payload))
+        arv("camera_start_acquisition", camera)
+
+    @property
+    def words(self) -> str:
+        """Maker, model and serial number."""
+        names = ("vendor_name", "model_name", "device_serial_number")
+        return " ".join(self._arv(f"camera_get_{name}", self._camera) or "?" for name in names)
+
+    def read_clock(self) -> tuple[float, float, float] | None:
+        """Return our time before, the camera's, ours after, seconds; None if its clock cannot be read.
+
+        Raises
+        ------
+        StreamFailed
+            If the camera does not answer.
+        """
+        if self._latch is None:
+            return None
+        command, value = self._latch
+        try:
+            before_s = time.monotonic()
+            self._arv("camera_execute_command", self._camera, command)
+            after_s = time.monotonic()
+            ticks = self._arv("camera_get_integer", self._camera, value)
+        except GenicamError as error:
+            raise StreamFailed(f"its clock cannot be read: {error}", device=self._name) from None
+        return before_s, ticks / self._ticks_hz, after_s
+
+    def trigger(self) -> None:
+        """Have one frame exposed. Raises StreamFailed if the camera does not answer."""
+        try:
+            self._arv("camera_software_trigger", self._camera)
+        except GenicamError as error:
+            raise StreamFailed(
+                f"it did not take the {SOFTWARE.lower()} trigger: {error}", device=self._name
+            ) from None
+
+    def wait(self, timeout_s: float) -> Filled | None:
+        """Wait for the next buffer; None if none came."""
+        arv = self._arv
+        handle = arv("stream_timeout_pop_buffer", self._stream, max(0, int(1e6 * timeout_s)))
+        if not handle:
+            return None
+        now_s, wall_s = time.monotonic(), time.time()
+        status = arv("buffer_get_status", handle)
+        # Aravis stamps the first packet by the wall clock, which may have been set meanwhile.
+        ago_s = min(max(0.0, wall_s - 1e-9 * arv("buffer_get_system_timestamp", handle)), 1.0)
+        wrong = "" if status == 0 else STATUS.get(status, f"Aravis says status {status}")
+        return Filled(
+            handle,
+            wrong or self._wrong_picture(handle),
+            arv("buffer_get_frame_id", handle),
+            1e-9 * arv("buffer_get_timestamp", handle),
+            now_s - ago_s,
+            None if wrong else self._chunk_exposure_s(handle),
+        )
+
+    def _wrong_picture(self, handle: int) -> str:
+        """What is wrong with a whole frame's size or format; empty if nothing."""
+        width, height = self.format.size_px
+        if self._arv("buffer_get_n_parts", handle) != 1:
+            return "it comes in another form than one image"
+        got = self._arv("buffer_get_image_width", handle), self._arv("buffer_get_image_height", handle)
+        return (
+            "" if got == (width, height) else f"it has {got[0]}x{got[1]} px where {width}x{height} were set"
+        )
+
+    def _chunk_exposure_s(self, handle: int) -> float | None:
+        if self._parser is None:
+            return None
+        try:
+            chunk_us = self._arv(
+                "chunk_parser_get_float_value", self._parser, handle, f"Chunk{_EXPOSURE_CHUNK}"
+            )
+        except GenicamError:
+            return None
+        return float(chunk_us) / 1e6
+
+    def bytes_of(self, handle: int) -> tuple[NDArray[np.uint8], PictureFormat]:
+        """Return a buffer's picture, uint8 (n,), which is Aravis's memory, and how it is laid out.
+
+        Chunk data, which a camera appends to the picture, may stand behind it.
+        """
+        size = ctypes.c_size_t()
+        data = self._arv("buffer_get_image_data", handle, ctypes.byref(size))
+        if not data or not size.value:
+            return np.empty(0, np.uint8), self.format
+        memory = memoryview((ctypes.c_uint8 * size.value).from_address(data))
+        return np.frombuffer(memory, np.uint8), self.format
+
+    def queue(self, handle: int) -> None:
+        """Give a buffer back to be filled."""
+        self._arv("stream_push_buffer", self._stream, handle)
+
+    def close(self) -> None:
+        """Stop and let go; never raises. It takes seconds for a camera that is gone: Aravis asks it again."""
+        if self._stream is not None:
+            try:
+                self._arv("camera_stop_acquisition", self._camera)
+            except GenicamError as error:
+                log.info("%s: stopping: %s", self._name, error)
+        for handle in (self._parser, self._stream, self._camera):
+            if handle:
+                self._arv.unref(handle)
+        self._parser = self._stream = None
+        self._camera = 0
+
+    def _told(self, error: GenicamError) -> DriverError:
+        """A refusal of Aravis while opening, as one of ours."""
+        words = str(error)
+        if ("ccess" in words and "denied" in words) or "controller" in words.lower():
+            return CameraBusy(f"another program has it ({words})", device=self._name)
+        return StreamFailed(f"it cannot be set up: {words}", device=self._name)

@@ -1,0 +1,93 @@
+"""Which camera is which: by serial number, IP address, or the name that Aravis gives it."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Any
+
+from drivers.aravis.library import GenicamError, Library, installed, library
+from drivers.aravis.options import AravisOptions
+from drivers.errors import BadOptions, CameraBusy, NoCamera
+
+_LISTING = threading.Lock()
+"""Aravis has one list of devices, which each search makes anew."""
+
+
+@dataclass(frozen=True)
+class FoundGenicam:
+    """One camera that answered: its names, where it is, and by which protocol."""
+
+    id: str
+    vendor: str
+    model: str
+    serial: str
+    address: str
+    protocol: str
+
+    @property
+    def words(self) -> str:
+        """Maker, model, serial number and place, in one sentence."""
+        return f"{self.vendor} {self.model}, serial number {self.serial}, at {self.address} ({self.protocol})"
+
+
+def list_cameras() -> list[FoundGenicam]:
+    """Return the cameras on network and USB, which takes a second; none if Aravis is not installed."""
+    return _listed(library()) if installed() else []
+
+
+def is_meant(options: AravisOptions, found: FoundGenicam) -> bool:
+    """Return whether the options name a camera that was found."""
+    asked = ((options.serial, found.serial), (options.address, found.address), (options.id, found.id))
+    return all(wanted in ("", got) for wanted, got in asked)
+
+
+def _listed(arv: Library) -> list[FoundGenicam]:
+    asked = ("id", "vendor", "model", "serial_nbr", "address", "protocol")
+    with _LISTING:
+        arv("update_device_list")
+        count = arv("get_n_devices")
+        return [FoundGenicam(*(arv(f"get_device_{one}", i) or "" for one in asked)) for i in range(count)]
+
+
+def open_camera(options: AravisOptions, name: str) -> int:
+    """Open the camera that the options name and return Aravis's handle.
+
+    Raises
+    ------
+    NoCamera
+        If it does not answer.
+    CameraBusy
+        If another program controls it.
+    BadOptions
+        If several cameras bear the serial number.
+    """
+    arv = library(name)
+    key = options.address or options.id
+    if options.serial:
+        found = _listed(arv)
+        named = [one for one in found if is_meant(options, one)]
+        if len(named) > 1:
+            raise BadOptions(
+                f"several cameras have {options.words}: {', '.join(one.id for one in named)}; give 'id'",
+                device=name,
+            )
+        if not named:
+            raise _absent(options, name, found)
+        key = named[0].id
+    try:
+        handle: Any = arv("camera_new", key)
+    except GenicamError as error:
+        words = str(error)
+        if "control" in words.lower() or "access" in words.lower():
+            raise CameraBusy(f"another program has it ({words})", device=name) from None
+        raise _absent(options, name, _listed(arv), words) from None
+    if not handle:
+        raise _absent(options, name, _listed(arv))
+    return int(handle)
+
+
+def _absent(options: AravisOptions, name: str, found: list[FoundGenicam], why: str = "") -> NoCamera:
+    connected = "; ".join(one.words for one in found) or "none"
+    said = f" ({why})" if why else ""
+    return NoCamera(f"no camera with {options.words} answers{said}; there are: {connected}", device=name)

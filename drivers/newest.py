@@ -1,0 +1,198 @@
+"""The newest good frame of a camera, between the thread that captures and those that ask for frames.
+
+The frame stays where the driver put it until the next one is there. Its picture is made from there when a
+caller first asks, once for all that ask: a frame without a request is not converted and not copied.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Generic, Protocol, TypeVar
+
+from drivers.errors import BadFrame
+from drivers.interfaces import Image
+
+RECENT_FRAMES = 30  # a second's: from their times the offset between two cameras is learned
+ROUNDING_S = 1e-9  # a frame told by its middle and length is not newer than itself
+
+
+class Window(Protocol):
+    """In which stretch of time a frame was exposed."""
+
+    @property
+    def begin_s(self) -> float: ...
+
+
+class Kept(Protocol):
+    """A frame, as far as this module needs it."""
+
+    @property
+    def window(self) -> Window: ...
+
+
+@dataclass
+class Counters:
+    """Counts of a camera's frames since it was opened.
+
+    Attributes
+    ----------
+    good, damaged
+        Frames that were published, and frames that were refused (error flag, lost packets, length, stamp).
+        The first ones of a stream are neither, where nothing shows yet when their exposure began.
+    dropped
+        Frames that never came, by gaps in the camera's count.
+    late
+        Good frames that came more than a period and 5 ms after their stamp.
+    reopened
+        How often the camera was lost and opened again.
+    last_damage
+        Why the last one was refused.
+    """
+
+    good: int = 0
+    damaged: int = 0
+    dropped: int = 0
+    late: int = 0
+    reopened: int = 0
+    last_damage: str = ""
+
+
+Arrived = TypeVar("Arrived", bound=Kept)
+
+
+class Newest(Generic[Arrived]):
+    """Holds one frame; safe from any thread."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition(threading.Lock())
+        self._frame: Arrived | None = None
+        self._make: Callable[[], tuple[Image, bytes]] | None = None
+        self._picture: tuple[Image, bytes] | None = None
+        self._recent: deque[Arrived] = deque(maxlen=RECENT_FRAMES)  # of this stream
+        self._counters = Counters()
+        self._lost = ""
+        self._closed = False
+
+    @property
+    def counters(self) -> Counters:
+        """The counts so far."""
+        with self._changed:
+            return replace(self._counters)
+
+    @property
+    def damaged(self) -> int:
+        """How many frames were refused so far."""
+        return self._counters.damaged
+
+    @property
+    def lost(self) -> str:
+        """Why there are no frames now; empty while there are."""
+        return self._lost
+
+    @property
+    def frame(self) -> Arrived | None:
+        """The newest good frame, however old; None if there is none."""
+        return self._frame
+
+    def recent(self) -> list[Arrived]:
+        """Return the last good frames of this stream, oldest first."""
+        with self._changed:
+            return list(self._recent)
+
+    def take(
+        self, exposed_after_s: float, timeout_s: float, is_young: Callable[[Arrived], bool]
+    ) -> tuple[Arrived, Image, bytes] | None:
+        """Return the newest frame, once its exposure began after that moment, and its read-only picture, with
+        the JPEG that it was made of (empty where the camera gives none).
+
+        A frame that was there before is given only while it ``is_young``. None after ``timeout_s``, and at
+        once when the camera is lost or closed.
+        """
+        until_s = time.monotonic() + timeout_s
+        with self._changed:
+            first = self._frame
+            while True:
+                newest = self._frame
+                if (
+                    newest is not None
+                    and newest.window.begin_s > exposed_after_s + ROUNDING_S
+                    and (newest is not first or is_young(newest))
+                    and (picture := self._converted()) is not None
+                ):
+                    return newest, *picture
+                left_s = until_s - time.monotonic()
+                if self._closed or self._lost or left_s <= 0:
+                    return None
+                self._changed.wait(left_s)
+
+    def _converted(self) -> tuple[Image, bytes] | None:
+        """The newest frame's picture; None if making it finds it damaged.
+
+        It is made under the lock: the frame's buffer does not go back meanwhile.
+        """
+        if self._picture is None and self._make is not None:
+            try:
+                self._picture = self._make()
+                self._picture[0].setflags(write=False)
+            except BadFrame as error:
+                self._frame = None
+                self._counters.good -= 1
+                self._counters.damaged += 1
+                self._counters.last_damage = str(error)
+        return self._picture
+
+    # Called by the thread that captures
+
+    def publish(
+        self, frame: Arrived, make: Callable[[], tuple[Image, bytes]], *, dropped: int, late: bool
+    ) -> None:
+        """Put a good frame in the place of the last one, whose memory may be filled again."""
+        with self._changed:
+            self._counters.dropped += dropped
+            self._counters.good += 1
+            self._counters.late += late
+            self._frame, self._make, self._picture = frame, make, None
+            self._recent.append(frame)
+            self._changed.notify_all()
+
+    def refuse(self, dropped: int, wrong: str = "") -> None:
+        """Count a frame that is not published; ``wrong`` says why it is damaged, if it is."""
+        with self._changed:
+            self._counters.dropped += dropped
+            if wrong:
+                self._counters.damaged += 1
+                self._counters.last_damage = wrong
+
+    def lose(self, why: str) -> bool:
+        """Say that there are no frames for now, and forget the last one; return whether there were any."""
+        with self._changed:
+            had, self._lost = not self._lost, why
+            self._forget()
+            self._changed.notify_all()
+        return had
+
+    def forget(self) -> None:
+        """Forget the last frame: what it lies in goes away."""
+        with self._changed:
+            self._forget()
+
+    def come_back(self) -> None:
+        """Say that the camera was opened again."""
+        with self._changed:
+            self._lost = ""
+            self._counters.reopened += 1
+
+    def close(self) -> bool:
+        """End every call that waits; return whether it was open."""
+        with self._changed:
+            was_open, self._closed = not self._closed, True
+            self._changed.notify_all()
+        return was_open
+
+    def _forget(self) -> None:
+        self._frame = self._make = self._picture = None
+        self._recent.clear()

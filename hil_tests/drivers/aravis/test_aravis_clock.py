@@ -1,0 +1,87 @@
+"""The camera's clock tied to ours, by hand-worked cases: the bounds, and the window that follows."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from drivers.aravis.camera_clock import DRIFT, CameraClock, ClockStepped
+
+AHEAD_S = 1000.0  # the camera's clock before ours
+NONE_S = -math.inf
+ROUNDING_S = 1e-9
+
+
+def read(clock: CameraClock, before_s: float, after_s: float, latched_s: float) -> None:
+    clock.read(before_s, latched_s + AHEAD_S, after_s)
+
+
+def test_a_reading_bounds_the_difference_by_its_round_trip() -> None:
+    clock = CameraClock(0.02)
+    read(clock, 50.0, 50.002, 50.001)
+    assert clock.low_s == pytest.approx(-AHEAD_S - 0.001, abs=ROUNDING_S)
+    assert clock.high_s == pytest.approx(-AHEAD_S + 0.001, abs=ROUNDING_S)
+
+
+def test_bounds_widen_by_the_drift_until_they_are_narrowed_again() -> None:
+    clock = CameraClock(0.02)
+    read(clock, 50.0, 50.0, 50.0)
+    read(clock, 60.0, 60.1, 60.05)  # a slow answer tells less than ten seconds of drift lose
+    assert clock.high_s - clock.low_s == pytest.approx(2 * 10.1 * DRIFT, abs=1e-6)
+    read(clock, 61.0, 61.0002, 61.0001)
+    assert clock.high_s - clock.low_s == pytest.approx(0.0002, abs=1e-6)
+
+
+def test_without_readings_the_quickest_arrival_is_the_upper_bound() -> None:
+    clock = CameraClock(0.015)
+    for stamp_s, delay_s in ((1.0, 0.030), (1.04, 0.011), (1.08, 0.020)):
+        clock.arrived(stamp_s + AHEAD_S, stamp_s + delay_s)
+    drifted_s = 0.05 * DRIFT
+    assert clock.high_s == pytest.approx(-AHEAD_S + 0.011, abs=drifted_s)
+    assert clock.low_s == pytest.approx(-AHEAD_S + 0.011 - 0.015, abs=drifted_s)
+    clock.arrived(3600.0 + AHEAD_S, 3600.02)  # an hour later: the old bound has grown beyond it
+    assert clock.high_s == pytest.approx(-AHEAD_S + 0.02, abs=ROUNDING_S)
+
+
+def test_a_clock_that_was_set_is_noticed_by_reading_it() -> None:
+    clock = CameraClock(0.02)
+    read(clock, 50.0, 50.001, 50.0005)
+    with pytest.raises(ClockStepped, match=r"off by 0\.4"):
+        read(clock, 51.0, 51.001, 51.0005 - 0.5)
+
+
+def test_a_frame_that_comes_before_its_stamp_shows_a_clock_that_was_set() -> None:
+    clock = CameraClock(0.02)
+    read(clock, 50.0, 50.001, 50.0005)
+    with pytest.raises(ClockStepped):
+        clock.arrived(51.0 + AHEAD_S, 50.9)
+
+
+def tied() -> CameraClock:
+    clock = CameraClock(0.02)
+    read(clock, 50.0, 50.002, 50.001)
+    return clock
+
+
+@pytest.mark.parametrize(
+    ("stamped", "begin_s", "end_s"),
+    [("start", 0.0, 0.01), ("end", -0.01, 0.0), ("either", -0.01, 0.01)],
+)
+def test_a_window_holds_the_exposure_by_what_is_stamped(stamped: str, begin_s: float, end_s: float) -> None:
+    window = tied().window(50.5 + AHEAD_S, stamped, 0.01, NONE_S, 51.0)  # type: ignore[arg-type]
+    assert window.begin_s == pytest.approx(50.5 + begin_s - 0.001, abs=ROUNDING_S)
+    assert window.end_s == pytest.approx(50.5 + end_s + 0.001, abs=ROUNDING_S)
+
+
+def test_a_window_ends_when_the_frame_comes_and_begins_with_its_trigger() -> None:
+    window = tied().window(50.5 + AHEAD_S, "either", 0.01, 50.4995, 50.506)
+    assert window == (50.4995, 50.506)
+    early = tied().window(50.5 + AHEAD_S, "start", 0.01, 50.4, 51.0)
+    assert early.begin_s == pytest.approx(50.499, abs=ROUNDING_S)  # the clock knows better than the trigger
+
+
+def test_without_readings_only_the_trigger_says_when_an_exposure_began() -> None:
+    clock = CameraClock(0.015)
+    clock.arrived(50.5 + AHEAD_S, 50.52)
+    assert clock.window(50.5 + AHEAD_S, "start", 0.01, 50.49, 50.52).begin_s == 50.49
