@@ -24,6 +24,9 @@ TOLD_SHIFT_PX = 0.01
 #: No component of a camera model or a mast is larger; beyond it the arithmetic would overflow.
 LARGEST_COMPONENT = 1e9
 LARGEST_IMAGE_PX = 65536
+BLIND_GRID = (38, 31)
+#: A lens with no ray in more than this part of its image is refused; a fisheye's corners often have none.
+MOST_BLIND = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,3 +157,26 @@ def build_model(
         moved = f"by up to {shift_px:.2g} px" if shift_px < LARGEST_IMAGE_PX else "out of the image"
         notes.append(f"{where}{sizes} made 1, which moves pixels {moved}")
     return model, tuple(notes)
+
+
+def blind_notes(model: CameraModel, path: str | Path, place: str) -> tuple[str, ...]:
+    """Return a note of the part of the image that has no ray, and why; none if every pixel has one.
+
+    Raises
+    ------
+    BadFile
+        If more than half of the image has no ray, or the lens folds at its axis.
+    """
+    x, y = (
+        np.linspace(-0.5, size - 0.5, count) for size, count in zip(model.size_px, BLIND_GRID, strict=True)
+    )
+    try:
+        seen = model.ray(np.stack(np.meshgrid(x, y), axis=-1)).valid
+    except ValueError as problem:
+        raise BadFile(path, place, f"is no usable camera: {problem}") from None
+    blind = float(1.0 - seen.mean())
+    why = model.limit_words or "the lens looks sideways"
+    if blind > MOST_BLIND:
+        raise BadFile(path, place, f"{100 * blind:.0f} %, more than half of the image has no ray: {why}")
+    where = f"{place}: " if place else ""
+    return (f"{where}{100 * blind:.2g} % of the image has no ray: {why}",) if blind else ()

@@ -16,7 +16,15 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from calib.errors import BadFile
-from calib.files import LARGEST_IMAGE_PX, TOLD_SHIFT_PX, CameraFile, build_model, digest_of, read_bytes
+from calib.files import (
+    LARGEST_IMAGE_PX,
+    TOLD_SHIFT_PX,
+    CameraFile,
+    blind_notes,
+    build_model,
+    digest_of,
+    read_bytes,
+)
 from calib.files.atomic import save_bytes
 from calib.files.yaml_text import MAX_BYTES, Section, dump_mapping, kind_of, parse_mapping
 from calib.geometry.cahvor import COEFFICIENTS, FREE, KINDS, SPLINED, CameraModel, Kind
@@ -178,7 +186,8 @@ def _model(section: Section) -> tuple[CameraModel, tuple[str, ...]]:
         if key in section:
             raise section.bad(key, f"{kind} has no '{key}'; another 'model' has it")
     if opencv:
-        return build_opencv(section, kind, (size[0], size[1]))
+        model, notes = build_opencv(section, kind, (size[0], size[1]))
+        return model, (*notes, *blind_notes(model, section.path, section.place))
     letters = str(kind)
     for letter in letters:
         if letter not in section:

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from calib.errors import BadFile
-from calib.files import LARGEST_COMPONENT, LARGEST_IMAGE_PX, CameraFile, digest_of
-from calib.files.twin import FISHEYE, ODD, LensFamily, grid_px, kind_of_lens
+from calib.files import LARGEST_COMPONENT, LARGEST_IMAGE_PX, CameraFile, blind_notes, digest_of
+from calib.files.twin import FISHEYE, ODD, LensFamily, kind_of_lens
 from calib.files.yaml_text import Section, dump_mapping, kind_of, parse_mapping
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.lenses import opencv
@@ -33,9 +33,6 @@ CAMERA_FRAME = "camera"
 """The frame of a file that holds no pose: the camera's own, x right, y down, z ahead."""
 
 LARGEST_COEFFICIENT = 1e6
-BLIND_GRID = (38, 31)
-MOST_BLIND = 0.5
-"""A lens with no ray in more than this part of its image is refused; a fisheye's corners often have none."""
 
 
 class Loose(Section):
@@ -143,17 +140,8 @@ def as_camera_file(
     BadFile
         If more than half of the image has no ray, or the lens folds at its axis.
     """
-    try:
-        blind = float(1.0 - camera.ray(grid_px(camera.size_px, BLIND_GRID, 0.5)).valid.mean())
-    except ValueError as problem:
-        raise section.bad("", f"is no usable camera: {problem}") from None
-    why = camera.limit_words or "the lens looks sideways"
-    if blind > MOST_BLIND:
-        raise section.bad("", f"{100 * blind:.0f} %, more than half of the image has no ray: {why}")
-    where = f"{section.place}: " if section.place else ""
-    if blind:
-        notes = (*notes, f"{where}{100 * blind:.2g} % of the image has no ray: {why}")
-    return CameraFile(camera, frame, {}, {}, tuple(notes), Path(section.path), digest)
+    notes = (*notes, *blind_notes(camera, section.path, section.place))
+    return CameraFile(camera, frame, {}, {}, notes, Path(section.path), digest)
 
 
 def row(values: Any) -> str:

@@ -375,6 +375,13 @@ def clicked_point(
         rig, pair, pan_rad, tilt_rad, seen.position_m,
         sigma_px=sigma_px, sigma_rad=sigma_rad, calibration=calibration,
     )  # fmt: skip
+    for name, model in zip(pair, (left, right), strict=True):
+        if not model.project(seen.position_m)[1]:
+            raise NoStereoPoint(
+                "not_one_point",
+                f"the two pixels do not mean one point: their rays pass each other at "
+                f"{1e3 * seen.ray_gap_m:.3g} mm, where {name} sees nothing{model.why_no_ray}",
+            )
     unknown = silent_cameras(pair, calibration)
     allowed += np.diag(np.repeat([RIG_PX**2 if name in unknown else 0.0 for name in pair], 2))
     gap = ray_gap(seen, allowed)

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 _SOURCES = "mast or camera file, .cahvor, PDS3 label, OpenCV's, ROS's, Kalibr's, mrcal's or COLMAP's"
 
+MOST_EMPTY_TOLD = 20
+"""Rows without a pixel or a ray, each told in a sentence of its own."""
+
 
 def add_commands(subparsers: Any) -> None:
     """Add ``camera`` with all its actions."""
@@ -116,8 +119,10 @@ def camera_project(args: argparse.Namespace) -> int:
     from calib.files.tables import read_table, write_table
 
     model = _chosen_model(args)
-    pixels, _ = model.project(read_table(args.points, ("x_m", "y_m", "z_m")))
+    points = read_table(args.points, ("x_m", "y_m", "z_m"))
+    pixels, valid = model.project(points)
     write_table(sys.stdout, ("x_px", "y_px"), pixels)
+    _tell_empty(model, args.points, points, valid)
     return 0
 
 
@@ -128,10 +133,36 @@ def camera_ray(args: argparse.Namespace) -> int:
     from calib.files.tables import read_table, write_table
 
     model = _chosen_model(args)
-    rays = model.ray(read_table(args.pixels, ("x_px", "y_px")))
+    pixels = read_table(args.pixels, ("x_px", "y_px"))
+    rays = model.ray(pixels)
     columns = ("ox_m", "oy_m", "oz_m", "dx", "dy", "dz")
     write_table(sys.stdout, columns, np.hstack([rays.origins_m, rays.directions]))
+    _tell_empty(model, args.pixels, pixels, rays.valid)
     return 0
+
+
+def _tell_empty(model: CameraModel, path: Path, rows: np.ndarray, valid: np.ndarray) -> None:
+    """Tell on stderr why the cells of points (n, 3) or pixels (n, 2) that are not valid are empty."""
+    import numpy as np
+
+    empty = np.flatnonzero(~valid)
+    for at in empty[:MOST_EMPTY_TOLD].tolist():
+        row = rows[at]
+        told = f"({', '.join(f'{value:g}' for value in row)})"
+        if not np.isfinite(row).all():
+            words = "is not finite"
+        elif len(row) == 2:
+            words = f"px has no ray in this {model.kind} camera{model.why_no_ray}"
+        else:
+            away = row - model.C
+            angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(away, model.A)), away @ model.A))
+            words = (
+                f"m is {angle:.1f} degrees from the axis of this {model.kind} camera, which does not see it"
+            )
+            words += model.why_no_ray
+        output.tell(f"{path}: row {at + 1}: {told} {words}")
+    if (more := len(empty) - MOST_EMPTY_TOLD) > 0:
+        output.tell(f"{path}: {more} more rows are empty, the last is row {empty[-1] + 1}")
 
 
 def camera_convert(args: argparse.Namespace) -> int:

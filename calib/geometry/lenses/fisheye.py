@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 
 from calib.geometry.lens import NEAREST_M, SETTLED, TINY
-from calib.geometry.lenses.opencv import Bent, Unbent, first_root
+from calib.geometry.lenses.opencv import Bent, Unbent, first_root, start_polynomial
 from calib.geometry.rigid import FloatArray
 
 NAMES = ("k1", "k2", "k3", "k4")
 
-_START_ERROR, _MOST_TERMS = 2e-6, 14
+_MOST_TERMS = 14
 _HALVINGS = 60
 
 
@@ -152,13 +152,14 @@ class FisheyeLens:
                 break
         valid = (size <= SETTLED) & (theta < self.far_rad) & (theta >= 0.0)
         if not valid.all():
-            rows = np.flatnonzero(~valid & (t < self._bent(self.far_rad)))
+            edge = self._bent(self.far_rad)
+            rows = np.flatnonzero(~valid & (t <= edge + 4e-15 * abs(edge)))
             low, high = np.zeros(len(rows)), np.full(len(rows), self.far_rad)
             for _ in range(_HALVINGS):
                 middle = 0.5 * (low + high)
                 beyond = self._bent(middle) > t[rows]
                 low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
-            theta[rows], valid[rows] = low, True
+            theta[rows], valid[rows] = np.minimum(low, (1.0 - 1e-15) * self.far_rad), True
         return theta, valid
 
     def bend_point(self, a: float, b: float, w: float) -> tuple[float, float]:
@@ -201,9 +202,9 @@ class FisheyeLens:
 
     @property
     def limit_words(self) -> str:
-        """Where the lens ends, as the end of a sentence; empty if it has no end."""
+        """Where the lens ends, as the end of a sentence."""
         if self.far_rad >= pi:
-            return ""
+            return "the lens ends 180 degrees from its axis"
         return f"the lens folds at {degrees(self.far_rad):.1f} degrees from its axis"
 
     @cached_property
@@ -214,16 +215,10 @@ class FisheyeLens:
         return min(pi, float(np.sqrt(first_root(growth))))
 
     @cached_property
+    @np.errstate(all="ignore")
     def _start(self) -> tuple[tuple[float, ...], float]:
         """Polynomial of theta / t by t^2, highest first, and the t^2 up to which it holds."""
-        theta = np.linspace(0.0, self.far_rad, 1025)[1:-1]
-        bent = self._bent(theta)
-        last = max(int(np.searchsorted(bent, 1.1 * self.image_slope)), 8)
-        theta, bent = theta[:last], bent[:last]
-        square, ratio = bent * bent, theta / bent
-        for terms in (3, 5, 7, 9, 11, _MOST_TERMS):
-            fit = np.polynomial.Chebyshev.fit(square, ratio, terms - 1)
-            if np.abs(fit(square) - ratio).max() < _START_ERROR:
-                break
-        power = fit.convert(kind=np.polynomial.Polynomial, domain=[-1, 1]).coef
-        return tuple(power[::-1].tolist()), float(square[-1])
+        terms = (3, 5, 7, 9, 11, _MOST_TERMS)
+        return start_polynomial(
+            lambda theta: (theta, self._bent(theta)), self.far_rad, self.image_slope, terms
+        )

@@ -16,6 +16,7 @@ time, inside the image. Its domain is what the axis reaches before the first fol
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import atan, degrees, inf, isfinite, nan, sqrt
@@ -35,14 +36,17 @@ MOST_TURN_RAD = 1.5
 _DIRECTIONS, _RADII, _STEEPEST = 48, 256, 100.0
 """Where the fold of a lens that is not round is looked for: directions, radii, and the largest slope."""
 
-_START_ERROR, _MOST_TERMS = 2e-6, 12
-"""The inverse begins with a polynomial this near, or of so many terms."""
+_START_ERROR, _MOST_TERMS, _NARROWINGS = 2e-6, 12, 8
+"""The inverse begins with a polynomial this near, or of so many terms; its range is narrowed so often."""
 
 _SAME_RATES = 1e-4
 """After a step below this the derivatives of the step before are good enough."""
 
-_LEFT = 3e-14
-"""What such a step leaves is some product of the two steps; this little is enough."""
+_LEFT = 1e-15
+"""A pixel's slopes are settled with a residual this small. Others take Newton's way by themselves."""
+
+_ROUNDING, _NEWTON = 1e-15, 40
+"""What Newton's way may leave, by the size of the numbers it is the difference of; and most of its steps."""
 
 _PATH = 48
 """Steps from the axis out to a pixel where Newton's own way does not lead to it."""
@@ -248,9 +252,11 @@ class OpencvLens:
         if not w > 0.0 or not isfinite(a + b + w) or (per_w := 1.0 / w) == inf:
             return nan, nan
         x, y = a * per_w, b * per_w
-        u, v, tau = self._flat(x, y)
-        if not tau < self.near * self.near and not bool(self._reached_far(x, y, tau)):
-            return nan, nan
+        if not x * x + y * y < self.near * self.near:
+            with np.errstate(all="ignore"):
+                if not self._reached_far(*np.array([[x], [y], [x * x + y * y]]))[0]:
+                    return nan, nan
+        u, v, _ = self._flat(x, y)
         if self._tilt is None:  # type: ignore[attr-defined]
             return u, v
         p, q, s = (self._tilt @ (u, v, 1.0)).tolist()  # type: ignore[attr-defined]
@@ -267,9 +273,11 @@ class OpencvLens:
             u, v = p / s, q / s
         x, y = self._begin(u, v)
         for _ in range(6):
-            now_u, now_v, tau, ux, uy, vx, vy = self._flat_rates(x, y)
+            if not x * x + y * y < self.near * self.near:
+                break
+            now_u, now_v, _, ux, uy, vx, vy = self._flat_rates(x, y)
             det = ux * vy - uy * vx
-            if not det > 0.0 or not tau < self.near * self.near:
+            if not det > 0.0:
                 break
             off_u, off_v = u - now_u, v - now_v
             step_x, step_y = (vy * off_u - uy * off_v) / det, (ux * off_v - vx * off_u) / det
@@ -288,12 +296,26 @@ class OpencvLens:
 
     @property
     def limit_words(self) -> str:
-        """Where the lens ends, as the end of a sentence; empty if it has no end before a right angle."""
+        """Where the lens ends, as the end of a sentence."""
+        edge = self._plane_edge
+        if edge < self.near:
+            return f"the turned image plane ends {degrees(atan(edge)):.1f} degrees from the axis, on one side"
         if self.near >= _STEEPEST:
-            return ""
+            return "the lens ends 90 degrees from its axis"
         return (
             f"the lens folds at {degrees(atan(self.near)):.1f} degrees from its axis (slope {self.near:.3g})"
         )
+
+    @property
+    def _plane_edge(self) -> float:
+        """The slope at which a turned image plane first runs along the rays; infinite if nowhere."""
+        if self._tilt is None:  # type: ignore[attr-defined]
+            return inf
+        p, q, s = self._tilt[2].tolist()  # type: ignore[attr-defined]
+        per = -s / (p * p + q * q)
+        with np.errstate(all="ignore"):
+            x, y, valid = self._undistorted(np.array([per * p]), np.array([per * q]))
+        return float(np.hypot(x, y)[0]) if valid[0] else inf
 
     @property
     def near(self) -> float:
@@ -306,6 +328,7 @@ class OpencvLens:
         return self._folds[1]
 
     @cached_property
+    @np.errstate(all="ignore")
     def _folds(self) -> tuple[float, float]:
         round_fold = self._round_fold()
         if self._beside is None:  # type: ignore[attr-defined]
@@ -369,19 +392,16 @@ class OpencvLens:
         return np.asarray(np.linalg.inv(self._tilt))  # type: ignore[attr-defined]
 
     @cached_property
+    @np.errstate(all="ignore")
     def _start(self) -> tuple[tuple[float, ...], float, float]:
         """Polynomial of chi / t by t^2, highest first, the t^2 it holds up to, and the largest t seen."""
-        end = min(max(self.near, 1e-3), _STEEPEST)
-        rho = np.tan(np.linspace(0.0, atan(end), 1025))[:-1]
-        bent = rho * self._radial(rho * rho)[0]
-        last = max(int(np.searchsorted(bent, 1.1 * self.image_slope)), 8)
-        rho, bent = rho[1 : last + 1], bent[1 : last + 1]
-        square, ratio = bent * bent, rho / bent
-        for terms in (3, 5, 7, 9, _MOST_TERMS):
-            fit = np.polynomial.Chebyshev.fit(square, ratio, terms - 1)
-            if np.abs(fit(square) - ratio).max() < _START_ERROR:
-                break
-        power = fit.convert(kind=np.polynomial.Polynomial, domain=[-1, 1]).coef
+
+        def bent(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
+            rho = np.tan(angle)
+            return rho, rho * self._radial(rho * rho)[0]
+
+        end = atan(min(max(self.near, 1e-3), _STEEPEST))
+        powers, largest = start_polynomial(bent, end, self.image_slope, (3, 5, 7, 9, _MOST_TERMS))
         farthest = inf
         if self.far < inf:
             around = np.linspace(0.0, 2.0 * np.pi, 4 * _DIRECTIONS)
@@ -389,7 +409,7 @@ class OpencvLens:
                 float(np.hypot(*self._flat(rho * np.cos(around), rho * np.sin(around))[:2]).max())
                 for rho in (self.near, self.far)
             )
-        return tuple(power[::-1].tolist()), float(square[-1]), farthest if isfinite(farthest) else inf
+        return powers, largest, farthest if isfinite(farthest) else inf
 
     def _begin(self, u: Any, v: Any) -> tuple[Any, Any]:
         """Undistorted slopes to begin with."""
@@ -418,7 +438,7 @@ class OpencvLens:
     def _undistorted(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, np.ndarray]:
         """Undistorted slopes of distorted ones, and which exist."""
         x, y = self._begin(u, v)
-        largest = before = inf
+        largest, before = inf, np.full_like(x, inf)
         for _ in range(6):
             if largest > _SAME_RATES:
                 now_u, now_v, tau, ux, uy, vx, vy = self._flat_rates(x, y)
@@ -430,29 +450,51 @@ class OpencvLens:
             else:
                 now_u, now_v, tau = self._flat(x, y)
             off_u, off_v = np.subtract(u, now_u, out=now_u), np.subtract(v, now_v, out=now_v)
-            step_x = vy * off_u
-            step_x -= uy * off_v
-            off_v *= ux
-            off_u *= vx
-            off_v -= off_u
+            step_x = vy * off_u - uy * off_v
+            step_y = ux * off_v - vx * off_u
             x += step_x
-            y += off_v
+            y += step_y
             size = np.abs(step_x, out=step_x)
-            size += np.abs(off_v, out=off_v)
-            before, largest = largest, float(size.max(initial=0.0))
-            if largest < SETTLED and largest * min(before, 1.0) < _LEFT:
+            size += np.abs(step_y, out=step_y)
+            largest = float(size.max(initial=0.0))
+            if largest < SETTLED:
                 break
-        valid = (
-            tau < min(self.near * self.near, 1e300)
-            if largest < SETTLED
-            else ((size < SETTLED) & (tau < min(self.near * self.near, 1e300)))
-        )
+            before = size
+        # Of what a step took away, about the same part again is left as the step is of the one before.
+        left = np.abs(off_u, out=off_u)
+        left += np.abs(off_v, out=off_v)
+        left *= size
+        before += TINY
+        left /= before
+        valid = (left < _LEFT) & (tau < min(self.near * self.near, 1e300))
         if not valid.all():
             rows = np.flatnonzero(~valid)
-            near = np.hypot(u[rows], v[rows]) < self._start[2]
-            rows = rows[near]
+            rows = rows[np.hypot(u[rows], v[rows]) < self._start[2]]
+            x[rows], y[rows], valid[rows] = self._newton(u[rows], v[rows], x[rows], y[rows])
+            rows = rows[~valid[rows]]
             x[rows], y[rows], valid[rows] = self._follow(u[rows], v[rows])
         return x, y, valid
+
+    def _newton(
+        self, u: FloatArray, v: FloatArray, x: FloatArray, y: FloatArray
+    ) -> tuple[FloatArray, FloatArray, np.ndarray]:
+        """The same from slopes near by, as exactly as they can be had."""
+        with np.errstate(all="ignore"):
+            for _ in range(_NEWTON):
+                now_u, now_v, tau, ux, uy, vx, vy = self._flat_rates(x, y)
+                per = 1.0 / (ux * vy - uy * vx)
+                off_u, off_v = u - now_u, v - now_v
+                left = np.abs(off_u) + np.abs(off_v)
+                rounding = 1.0 + np.abs(u) + np.abs(v)
+                rounding += np.sqrt(tau) * (np.abs(ux) + np.abs(uy) + np.abs(vx) + np.abs(vy))
+                settled = left < 0.25 * _ROUNDING * rounding
+                if settled.all():
+                    break
+                step_x, step_y = (vy * off_u - uy * off_v) * per, (ux * off_v - vx * off_u) * per
+                short = np.minimum(1.0, 0.2 * (0.05 + np.sqrt(tau)) / (np.hypot(step_x, step_y) + TINY))
+                short[settled] = 0.0
+                x, y = x + short * step_x, y + short * step_y
+        return x, y, (left < _ROUNDING * rounding) & self._reached(x, y, tau)
 
     def _follow(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, np.ndarray]:
         """The same for pixels near a fold: step by step from the axis, never across it."""
@@ -460,20 +502,44 @@ class OpencvLens:
         lost = ~np.isfinite(u + v)
         with np.errstate(all="ignore"):
             for part in np.arange(1, _PATH + 1) / _PATH:
-                for _ in range(3 if part < 1.0 else 40):
+                for _ in range(3):
                     now_u, now_v, tau, ux, uy, vx, vy = self._flat_rates(x, y)
                     per = 1.0 / (ux * vy - uy * vx)
                     off_u, off_v = part * u - now_u, part * v - now_v
                     step_x, step_y = (vy * off_u - uy * off_v) * per, (ux * off_v - vx * off_u) * per
                     short = np.minimum(1.0, 0.2 * (0.05 + np.sqrt(tau)) / (np.hypot(step_x, step_y) + TINY))
                     x, y = x + short * step_x, y + short * step_y
-                size = np.hypot(step_x, step_y)
                 lost |= ~(per > 0.0)
-            tau = x * x + y * y
-            found = ~lost & (size < 1e-7 * (1.0 + tau)) & self._reached(x, y, tau)
-            now_u, now_v, _ = self._flat(x, y)
-            found &= np.hypot(now_u - u, now_v - v) < 1e-13 * (1.0 + np.hypot(u, v))
-        return x, y, found
+        x, y, found = self._newton(u, v, x, y)
+        return x, y, found & ~lost
+
+
+def start_polynomial(
+    bent: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    end_rad: float,
+    image_slope: float,
+    terms: Sequence[int],
+) -> tuple[tuple[float, ...], float]:
+    """Return the polynomial that an inverse begins with, and the t^2 up to which it holds.
+
+    ``bent`` gives of angles (n,) up to ``end_rad`` what is sought and the slope t. The polynomial, highest
+    power first, is of what is sought over t, by t^2; it has as many of ``terms`` as it takes.
+    """
+    for _ in range(_NARROWINGS):
+        angles = np.linspace(0.0, end_rad, 1025)[1:-1]
+        sought, t = bent(angles)
+        last = int(np.searchsorted(t, 1.1 * image_slope))
+        if last >= 64:
+            break
+        end_rad = float(angles[last])
+    last = max(last, 64)
+    square, ratio = t[:last] ** 2, sought[:last] / t[:last]
+    for count in terms:
+        fit = np.polynomial.Chebyshev.fit(square, ratio, count - 1)
+        if np.abs(fit(square) - ratio).max() < _START_ERROR:
+            break
+    power = fit.convert(kind=np.polynomial.Polynomial, domain=[-1, 1]).coef
+    return tuple(power[::-1].tolist()), float(square[-1])
 
 
 def first_root(polynomial: np.polynomial.Polynomial) -> float:

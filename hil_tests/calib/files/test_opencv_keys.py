@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -78,3 +79,16 @@ def test_what_is_no_such_camera_is_refused_by_key(old: str, new: str, words: str
     with pytest.raises(BadFile) as refused:
         load_rig(written(tmp_path, TEXT.replace(old, new, 1)))
     assert words in str(refused.value)
+
+
+def test_a_lens_that_sees_next_to_nothing_of_its_image_is_refused_by_where_it_folds(tmp_path: Path) -> None:
+    numbers = "[0.5, 0.1, 0.001, -0.0005, 0.01, 0.8, 0.2, 0.03]"
+    narrow = TEXT.replace("OPENCV8", "OPENCV4")
+    with pytest.raises(BadFile) as refused:
+        load_rig(written(tmp_path, narrow.replace(numbers, "[-1100.0, 0.0, 0.0, 0.0]")))
+    assert "cameras.navcam: 100 %, more than half of the image has no ray" in str(refused.value)
+    assert "the lens folds at 1.0 degrees from its axis" in str(refused.value)
+    (note,) = load_rig(written(tmp_path, narrow.replace(numbers, "[-0.2, 0.0, 0.0, 0.0]"))).notes
+    assert re.fullmatch(
+        r"cameras.navcam: [0-9.]+ % of the image has no ray: the lens folds at 52.2 degrees .*", note
+    )

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import Unreachable
 from calib.geometry.cahvor import SPLINED, CameraModel, Kind
+from calib.geometry.lenses.fisheye import FisheyeLens
 from calib.geometry.lenses.spline import SplineGrid
 from calib.geometry.parameters import parameter_names, predict, stepped
 from calib.geometry.pointing import solve
@@ -161,6 +162,34 @@ def test_no_ray_lies_beyond_the_fold_and_the_fold_is_told(kind: Kind, distortion
         np.testing.assert_allclose(
             model.project(model.C + reached.directions)[0], pixels[: last - 20], atol=EXACT_PX
         )
+
+
+def test_steep_and_turned_lenses_come_back_to_their_pixels_up_to_the_edge() -> None:
+    """Random lenses, points up to a billionth of the fold: as exactly as 64 bits hold a direction."""
+    rng = np.random.default_rng(29)
+    spread = np.array([0.8, 0.4, 3e-3, 3e-3, 0.05, 0.8, 0.4, 0.1, *[3e-3] * 4, 0.1, 0.1])
+    steep = 0
+    for number in range(24):
+        kind: Kind = ("OPENCV8", "OPENCV12", "OPENCV14", "OPENCV_FISHEYE")[number % 4]
+        fisheye = kind == "OPENCV_FISHEYE"
+        some = rng.normal(size=4) * [0.1, 0.05, 0.02, 0.005] if fisheye else rng.normal(size=14) * spread
+        model = camera(kind, some[: len(LENSES[kind])].tolist())
+        lens = model.free_lens
+        edge_rad = lens.far_rad if isinstance(lens, FisheyeLens) else np.arctan(lens.near)  # type: ignore[union-attr]
+        angle = edge_rad * np.sqrt(rng.uniform(size=800))
+        angle[:200] = edge_rad * (1.0 - 10.0 ** rng.uniform(-9.0, -2.0, 200))
+        around = rng.uniform(0.0, 2.0 * np.pi, 800)
+        local = np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], 1)
+        pixels, seen = model.project(model.C + local @ model.rotation)
+        pixels = pixels[seen & (np.abs(pixels) < 3000.0).all(axis=1)]
+        rays = model.ray(pixels)
+        again, jacobian, _ = model.project_jacobian(model.C + rays.directions)
+        held_px = np.maximum(EXACT_PX, 2e-15 * np.abs(jacobian).sum(axis=(1, 2)))
+        steep += int(np.count_nonzero(held_px > EXACT_PX))
+        found = rays.valid.mean()
+        assert found > (0.9 if kind == "OPENCV14" else 0.999), f"lens {number}: {found}"
+        assert (np.abs(again - pixels).max(axis=1) <= held_px)[rays.valid].all(), f"lens {number}"
+    assert steep < 200
 
 
 def test_a_pixel_beyond_the_fold_is_refused_by_the_angle_of_the_fold() -> None:

@@ -73,9 +73,100 @@ def test_project_gives_a_row_for_every_point_and_empty_cells_for_those_without_a
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = Run("camera project camera.yaml --points points.csv", capsys)
-    assert (run.code, run.err) == (0, "")
+    assert run.code == 0
     assert run.rows() == [["x_px", "y_px"], ["420.0", "40.0"], ["", ""], ["", ""], ["10320.0", "240.0"]]
+    behind, no_number = run.err.splitlines()
+    assert behind.endswith(
+        "row 2: (-1, 0, 0) m is 180.0 degrees from the axis of this CAHV camera, which does not see it"
+    )
+    assert no_number.endswith("points.csv: row 3: (nan, 0, 0) is not finite")
     assert Run("camera project camera.yaml --points points.csv --json", capsys).out == run.out
+
+
+def opencv_mast(kind: str, distortion: str) -> None:
+    """A mast file with a pair of one of OpenCV's lenses in the place of the folder's."""
+    lens = f"""on: head
+    size_px: [1280, 960]
+    model: {kind}
+    camera_matrix: [[900, 0, 640], [0, 900, 480], [0, 0, 1]]
+    distortion: {distortion}
+    rotation: [[0, 1, 0], [0, 0, 1], [1, 0, 0]]
+"""
+    Path("mast.yaml").write_text(
+        "schema: mastctl/mast/1\nname: lenses\nmast: {translation_m: [0, 0, 0], rotation_rad: [0, 0, 0]}\n"
+        f"cameras:\n  eye_left:\n    {lens}    C: [0, -0.1, 0]\n  eye_right:\n    {lens}    C: [0, 0.1, 0]\n"
+        "stereo: {eye: [eye_left, eye_right]}\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("kind", "distortion", "pixel", "ends"),
+    [
+        (
+            "OPENCV5",
+            "[-0.31, 0.12, 0.001, -0.0007, -0.02]",
+            "5000,480",
+            "the lens folds at 59.0 degrees from its axis",
+        ),
+        ("OPENCV8", "[0, 0, 0, 0, 0, -2, 0, 0]", "", "the lens folds at 35.3 degrees from its axis"),
+        (
+            "OPENCV14",
+            "[0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1.45, 0]",
+            "640,-3000",
+            "plane ends 6.9 degrees from the axis",
+        ),
+        ("OPENCV_FISHEYE", "[-0.2, 0, 0, 0]", "5000,480", "the lens folds at 74.0 degrees from its axis"),
+        ("OPENCV_FISHEYE", "[1e6, -1e6, 1e6, 1e6]", "", ""),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_a_row_that_the_lens_does_not_see_is_empty_with_a_sentence_of_where_the_lens_ends(
+    folder: Path, capsys: pytest.CaptureFixture[str], kind: str, distortion: str, pixel: str, ends: str
+) -> None:
+    opencv_mast(kind, distortion)
+    where = "mast.yaml --camera eye_left --pan 0 --tilt 0"
+    # 0.5, 0.5 is the pole of the rational lens
+    Path("points.csv").write_text("x_m,y_m,z_m\n5,0,0\n0.1,0.2,5\n1,0.4,0.5\n")
+    Path("pixels.csv").write_text(f"x_px,y_px\n640,480\n{pixel or '600,400'}\n")
+    project = Run(f"camera project {where} --points points.csv", capsys)
+    ray = Run(f"camera ray {where} --pixels pixels.csv", capsys)
+    assert (project.code, ray.code) == (0, 0)
+    if ends:
+        told = [line for line in project.err.splitlines() if "points.csv: row" in line]
+        assert (
+            f"points.csv: row 2: (0.1, 0.2, 5) m is 88.9 degrees from the axis of this {kind} camera, which"
+            in told[0]
+        )
+        assert ends in told[0]
+        assert len(told) == sum(row == ["", ""] for row in project.rows())
+    assert bool(pixel) == ("pixels.csv: row" in ray.err)
+    if pixel:
+        assert (
+            f"pixels.csv: row 2: ({pixel.replace(',', ', ')}) px has no ray in this {kind} camera: "
+            in ray.err
+        )
+        assert ends in ray.err
+
+
+def test_of_many_empty_rows_some_are_told_and_the_rest_counted(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("points.csv").write_text("x_m,y_m,z_m\n" + "-1,0,0\n" * 50)
+    lines = Run("camera project camera.yaml --points points.csv", capsys).err.splitlines()
+    assert len(lines) == 21
+    assert lines[-1].endswith("points.csv: 30 more rows are empty, the last is row 50")
+
+
+@pytest.mark.parametrize("distortion", ["[0, 0, 0, 0, 0, -2, 0, 0]", "[0, 0, 0, 0, 0, -0.3, 0, 0]"])
+@pytest.mark.filterwarnings("error")
+def test_two_clicks_that_meet_where_the_lens_sees_nothing_are_refused_without_nan(
+    folder: Path, capsys: pytest.CaptureFixture[str], distortion: str
+) -> None:
+    opencv_mast("OPENCV8", distortion)
+    run = Run("triangulate mast.yaml --pair eye --pan 0 --tilt 0 --left 640 480 --right 620 200", capsys)
+    assert run.code == 1
+    assert "the two pixels do not mean one point: their rays pass each other at 1" in run.err
+    assert "where eye_left sees nothing: the lens folds at" in run.err
 
 
 def test_project_with_a_mast_file_is_in_the_rover_frame_at_the_joint_angles(
