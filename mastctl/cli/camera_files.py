@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _SOURCES = "mast or camera file, .cahvor, PDS3 label, OpenCV's, ROS's, Kalibr's, mrcal's or COLMAP's"
 
 MOST_EMPTY_TOLD = 20
-"""Rows without a pixel or a ray, each told in a sentence of its own."""
+"""So many rows without a pixel or a ray get a sentence each; the others are counted."""
 
 
 def add_commands(subparsers: Any) -> None:
