@@ -46,7 +46,7 @@ _LEFT = 1e-15
 """A pixel's slopes are settled with a residual this small. Others take Newton's way by themselves."""
 
 _ROUNDING, _NEWTON = 1e-15, 40
-"""Newton's way ends with a residual this small beside the numbers it comes from, after so many steps at most."""
+"""Newton's way ends with a residual this small beside its numbers, after so many steps at most."""
 
 _PATH = 48
 """Steps from the axis out to a pixel where Newton's own way does not lead to it."""
