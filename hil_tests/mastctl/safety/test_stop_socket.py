@@ -124,7 +124,7 @@ def test_only_its_user_may_connect(door: StopSocket) -> None:
 def test_it_leaves_the_umask_alone_which_is_every_threads(
     tmp_path: Path, stops: Stops, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Two that changed it at once left 0o177 behind: /dev/null of a container made later was root's alone.
+    # Two threads that change it at once and back can leave 0o177 behind.
     monkeypatch.setattr(os, "umask", lambda mask: pytest.fail(f"umask {mask:#o}"))
     made = StopSocket(tmp_path / "stop.sock", stops)
     assert stat.S_IMODE(made.path.stat().st_mode) == 0o600
