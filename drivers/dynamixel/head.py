@@ -22,13 +22,9 @@ from drivers.dynamixel.pair import Axis, Pair, head_axes, ready_pair
 from drivers.dynamixel.servo import Reboots
 from drivers.dynamixel.settings import DynamixelSettings, dynamixel_settings
 from drivers.dynamixel.watch import Watch
-from drivers.errors import DriverError, NoReply
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.head import BusHead
-
-HALT_TRIES = 5
-HALT_REST_S = 2.0
-HALT_SLOW = 1  # counts of speed that a holding servo may show
+from drivers.servo_bus.rest import halt_axes
 
 
 def open_head(
@@ -76,31 +72,14 @@ def halt(
     LineLost
         If there is no line.
     NoReply
-        If an axis did not confirm; the other was told all the same.
+        If an axis did not confirm or still moves; the other was told all the same.
     """
     head = dynamixel_settings(options)
     link = Link(head.port, head.baud, head.reply_timeout_s, clock=clock, open_line=open_line)
     try:
-        axes = head_axes(link, head)
-        told: dict[str, str] = {}
-        failed: dict[str, DriverError] = {}
-        for _ in range(HALT_TRIES):  # each once before any of them again
-            for axis in axes:
-                if axis.servo.name not in told:
-                    try:
-                        told[axis.servo.name] = _stood(axis)
-                    except DriverError as error:
-                        failed[axis.servo.name] = error
-        missing = {name: error for name, error in failed.items() if name not in told}
-        for axis in axes:
-            if axis.servo.name in told:
-                _see_rest(axis, link.clock)
+        return halt_axes(head_axes(link, head), _stood, link.clock)
     finally:
         link.close()
-    if missing:
-        words = "; ".join(f"{name}: {error}" for name, error in missing.items())
-        raise NoReply(f"not halted, it may still move: {words}")
-    return [f"{name} {words}" for name, words in told.items()]
 
 
 def _stood(axis: Axis) -> str:
@@ -112,11 +91,3 @@ def _stood(axis: Axis) -> str:
         return "has its torque off"
     servo.stand()
     return "was commanded to stand where it is, and holds"
-
-
-def _see_rest(axis: Axis, clock: Clock) -> None:
-    """Wait until an axis stands. Raises NoReply."""
-    until_s = clock.now_s() + HALT_REST_S
-    while abs(axis.servo.look().values["present_velocity"]) > HALT_SLOW:
-        if clock.now_s() > until_s:
-            raise NoReply(f"{axis.servo.name} got the command to stand, but still moves")

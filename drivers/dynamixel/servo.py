@@ -25,7 +25,8 @@ from drivers.dynamixel.servo_table import ServoTable, identified
 from drivers.dynamixel.settings import DynamixelAxisSettings, DynamixelSettings
 from drivers.errors import BadReply, DriverError, HardwareFault, NoReply, Refused, WrongDevice
 from drivers.servo_bus.course import ServoSample, Truth
-from drivers.servo_bus.exchange import again, come_to_rest
+from drivers.servo_bus.exchange import again
+from drivers.servo_bus.rest import come_to_rest
 
 log = logging.getLogger(__name__)
 

@@ -29,7 +29,9 @@ from drivers.dynamixel.servo_table import ServoTable, identified
 from drivers.errors import BadOptions, DriverError, HardwareFault, NoReply, OutOfRange, Refused, WrongDevice
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.bench import FoundServo, Scan, ServoFacts, Trial, TrialStep
+from drivers.servo_bus.course import PROFILE_BIT
 from drivers.servo_bus.exchange import again
+from drivers.servo_bus.rest import STEP_RESTS_S, Rest
 
 HIGHEST_ID = 252
 
@@ -333,9 +335,9 @@ def _step(link: Link, table: ServoTable, model: ServoModel, goal: int, fence: tu
     """Watch one short move to its end."""
     block = RegisterBlock(model.registers, "goal_velocity", "present_temperature")
     began_s = link.clock.now_s()
-    most = 0
-    still = 0
+    most, rest = 0, Rest(STEP_RESTS_S)
     while True:
+        sent_s = link.clock.now_s()
         # what is late shows by its counter; to wait for it would trip the watchdog
         (status,) = again(link, lambda: table.block(block), late_s=0.0).statuses.values()
         if status.alert:
@@ -347,9 +349,9 @@ def _step(link: Link, table: ServoTable, model: ServoModel, goal: int, fence: tu
                 f"{table.name} left the fence of the trial at {values['present_position']} counts "
                 f"(allowed {fence[0]} to {fence[1]}); it is stopped"
             )
-        still = still + 1 if abs(values["present_velocity"]) <= 1 and not values["moving_status"] & 2 else 0
-        elapsed_s = link.clock.now_s() - began_s
-        if (still >= 5 and elapsed_s > 0.2) or elapsed_s > 10.0:
+        now_s = link.clock.now_s()
+        stands, elapsed_s = rest.take(values, sent_s, now_s), now_s - began_s
+        if (stands and not values["moving_status"] & PROFILE_BIT) or elapsed_s > 10.0:
             break
         link.clock.sleep(TRIAL_POLL_S)
     left = abs(values["present_position"] - goal)

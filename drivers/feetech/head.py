@@ -10,15 +10,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from drivers.clock import Clock
-from drivers.errors import DriverError, NoReply
+from drivers.errors import NoReply
 from drivers.feetech.link import Questions, open_link
 from drivers.feetech.pair import FeetechAxis, FeetechPair, ready_pair
 from drivers.feetech.settings import FeetechSettings, feetech_settings
 from drivers.feetech.watch import FeetechWatch
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.head import BusHead
-
-HALT_TRIES, HALT_REST_S = 5, 2.0
+from drivers.servo_bus.rest import halt_axes
 
 
 def open_head(
@@ -69,40 +68,22 @@ def halt(
     LineLost
         If there is no line.
     NoReply
-        If an axis did not confirm; the other was told all the same.
+        If an axis did not confirm or still moves; the other was told all the same.
     """
     head = feetech_settings(options)
     link = open_link(head.port, head.baud, head.reply_timeout_s, clock=clock, open_line=open_line)
     try:
-        pair = FeetechPair(link, head, {})
-        told: dict[str, str] = {}
-        failed: dict[str, DriverError] = {}
-        for _ in range(HALT_TRIES):  # each once before any of them again
-            for axis in pair.axes:
-                if axis.servo.name not in told:
-                    try:
-                        told[axis.servo.name] = _stood(axis, link.clock)
-                    except DriverError as error:
-                        failed[axis.servo.name] = error
+        return halt_axes(FeetechPair(link, head, {}).axes, _stood, link.clock)
     finally:
         link.close()
-    missing = [f"{name}: {error}" for name, error in failed.items() if name not in told]
-    if missing:
-        raise NoReply(f"not halted, it may still move: {'; '.join(missing)}")
-    return [f"{name} {words}" for name, words in told.items()]
 
 
-def _stood(axis: FeetechAxis, clock: Clock) -> str:
-    """Tell one axis to stand and see that it does. Raises DriverError."""
-    goal = axis.servo.stand()
-    until_s = clock.now_s() + HALT_REST_S
-    while True:
-        sample = axis.servo.sample()
-        if not sample.values["torque_enable"]:
-            return "has its torque off"
-        if abs(sample.values["present_velocity"]) <= 1:
-            if (held := axis.servo.get("goal_position")) != goal:  # nobody answers the packet that says so
-                raise NoReply(f"{axis.servo.name} did not take the command to stand, its goal is {held}")
-            return "was told to stand where it is, and holds"
-        if clock.now_s() > until_s:
-            raise NoReply(f"{axis.servo.name} got the command to stand, but still moves")
+def _stood(axis: FeetechAxis) -> str:
+    """Tell one axis to stand and see that it took that. Raises DriverError."""
+    servo = axis.servo
+    goal = servo.stand()
+    if goal is None:
+        return "has its torque off"
+    if (held := servo.get("goal_position")) != goal:  # nobody answers the packet that says so
+        raise NoReply(f"{servo.name} did not take the command to stand, its goal is {held}")
+    return "was told to stand where it is, and holds"

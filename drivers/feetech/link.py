@@ -280,7 +280,7 @@ class FeetechLink:
                 before, next_start = found, FIRST_START + next(self._questions.numbers) % STARTS
                 found = self._round(servos, next_start)
                 for one, sample in found.items():
-                    self._see_same(one, before[one], sample)
+                    self._see_same(one, servos[one][0].speed_unit_counts, before[one], sample)
         except LineLost:
             raise
         except DriverError:
@@ -300,9 +300,10 @@ class FeetechLink:
                 raise BadReply(f"{self.name}: more came than was asked for")
         return found
 
-    def _see_same(self, one: int, before: ServoSample, after: ServoSample) -> None:
+    def _see_same(self, one: int, unit: int, before: ServoSample, after: ServoSample) -> None:
         """See that two samples can follow one another. Raises BadReply."""
-        speed = max(abs(sample.values["present_velocity"]) for sample in (before, after))
+        told = max(abs(sample.values["present_velocity"]) for sample in (before, after))
+        speed = unit * (told + (unit > 1))  # less than one unit more is not told
         most = SAME_COUNTS + speed * (after.received_s - before.sent_s)
         if abs(after.counts - before.counts) > most:
             raise BadReply(

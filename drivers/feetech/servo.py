@@ -14,7 +14,8 @@ from drivers.feetech.link import FeetechLink
 from drivers.feetech.models import LOCKED, MODELS_BY_NUMBER, POSITION_MODE, UNLOCKED, status_words
 from drivers.feetech.settings import FeetechAxisSettings, FeetechSettings
 from drivers.servo_bus.course import ServoSample, Truth
-from drivers.servo_bus.exchange import ATTEMPTS, again, come_to_rest
+from drivers.servo_bus.exchange import ATTEMPTS, again
+from drivers.servo_bus.rest import come_to_rest
 
 log = logging.getLogger(__name__)
 

@@ -28,12 +28,13 @@ from drivers.feetech.packets import HIGHEST_ID
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.bench import FoundServo, Scan, ServoFacts, Trial, TrialStep
 from drivers.servo_bus.exchange import ATTEMPTS, again
+from drivers.servo_bus.rest import STEP_RESTS_S, Rest
 
 TRIAL_SPEED_RAD_PER_S, TRIAL_ACCELERATION_RAD_PER_S2 = 0.2, 1.0
 TRIAL_POLL_S, LONGEST_STEP_S = 0.02, 10.0
 WARM_MARGIN_C = 10
-PROBE_SPEED, PROBE_S = 3, 1.0
-"""What a servo is told to find out the unit of its speed: 3 counts a second, or 150."""
+PROBE_SPEED, PROBE_S, PROBE_COUNTS = 3, 1.0, 6
+"""What a servo is told to find out the unit of its speed: 3 counts a second, or 150; more than 6 are many."""
 
 
 def scan(
@@ -201,8 +202,10 @@ def try_out(link: FeetechLink, servo_id: int, amplitude_rad: float, torque_perce
         _set(link, servo_id, model, "torque_enable", 1)
         try:
             speed_unit = _speed_unit(link, servo_id, model, start + reach)
-            model = replace(model, speed_unit_counts=speed_unit)
-            speed = max(1, round(TRIAL_SPEED_RAD_PER_S / model.velocity_unit_rad_per_s))
+            speed = PROBE_SPEED
+            if speed_unit is not None:
+                model = replace(model, speed_unit_counts=speed_unit)
+                speed = max(1, round(TRIAL_SPEED_RAD_PER_S / model.velocity_unit_rad_per_s))
             _set(link, servo_id, model, "goal_speed", speed)
             fence = start - 2 * reach, start + 2 * reach
             for goal in (start + reach, start - reach, start):
@@ -270,15 +273,33 @@ def _restored(
             raise WrongDevice(f"servo {servo_id} is not left as it was found in {' and '.join(left)}")
 
 
-def _speed_unit(link: FeetechLink, servo_id: int, model: FeetechModel, goal: int) -> int:
-    """Return how many counts a second a speed of 1 is, by a move that is slow, or very slow."""
+def _speed_unit(link: FeetechLink, servo_id: int, model: FeetechModel, goal: int) -> int | None:
+    """Return how many counts a second a speed of 1 is, by a move that is slow, or very slow.
+
+    None where the way is too short to tell. How far it went is asked when it stands: under way no two answers
+    are alike.
+    """
     position = model.registers["present_position"]
     before = link.proven(servo_id, position, model)
     link.write(servo_id, model.registers["goal_position"], goal, model)
     link.clock.sleep(PROBE_S)
+    _stand(link, servo_id, model, (min(before, goal), max(before, goal)))
+    until_s, rest = link.clock.now_s() + LONGEST_STEP_S, Rest()
+    while not _look(link, servo_id, model, rest)[1] and link.clock.now_s() < until_s:
+        link.clock.sleep(TRIAL_POLL_S)
     after = link.proven(servo_id, position, model)
-    link.write(servo_id, model.registers["goal_position"], after, model)
-    return 50 if abs(after - before) > 5 * PROBE_SPEED * PROBE_S else 1
+    if abs(after - before) > PROBE_COUNTS:
+        return 50
+    return 1 if abs(goal - before) > PROBE_COUNTS + 2 else None
+
+
+def _look(
+    link: FeetechLink, servo_id: int, model: FeetechModel, rest: Rest
+) -> tuple[Mapping[str, int], bool]:
+    """Return what a servo says about its motion, and whether it stands. Raises DriverError."""
+    sent_s = link.clock.now_s()
+    values = again(link, lambda: link.look(servo_id, model))
+    return values, rest.take(values, sent_s, link.clock.now_s())
 
 
 def _step(
@@ -287,9 +308,9 @@ def _step(
     """Watch one short move to its end."""
     began_s = link.clock.now_s()
     again(link, lambda: link.write(servo_id, model.registers["goal_position"], goal, model))
-    most = still = 0
+    most, rest = 0, Rest(STEP_RESTS_S)
     while True:
-        values = again(link, lambda: link.look(servo_id, model))
+        values, stands = _look(link, servo_id, model, rest)
         if values["status"]:
             raise HardwareFault(
                 f"servo {servo_id} reports {status_words(values['status'])}; the trial is ended"
@@ -300,9 +321,8 @@ def _step(
                 f"(allowed {fence[0]} to {fence[1]}); it is stopped"
             )
         most = max(most, abs(values.get("present_current", 0)))
-        still = still + 1 if abs(values["present_velocity"]) <= 1 and not values["moving"] else 0
         elapsed_s = link.clock.now_s() - began_s
-        if (still >= 5 and elapsed_s > 0.2) or elapsed_s > LONGEST_STEP_S:
+        if (stands and not values["moving"]) or elapsed_s > LONGEST_STEP_S:
             break
         link.clock.sleep(TRIAL_POLL_S)
     left = abs(values["present_position"] - goal)

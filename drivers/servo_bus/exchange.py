@@ -9,9 +9,7 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import Protocol, TypeVar
 
-from drivers.clock import Clock
 from drivers.errors import BadReply, LineLost, NoReply, Refused
-from drivers.servo_bus.course import ServoSample
 from drivers.servo_bus.port import PacketFormat, Port, Status
 
 log = logging.getLogger(__name__)
@@ -21,7 +19,6 @@ READ = 2
 """The instruction that reads, of every family."""
 
 ATTEMPTS = 3
-COME_TO_REST_S = 0.5
 LATE_S = 0.1  # a reply that did not come is waited out this long before the next question
 
 
@@ -41,20 +38,6 @@ def again(link: Quiets, ask: Callable[[], T], late_s: float = LATE_S) -> T:
         except (NoReply, BadReply):
             link.quiet(late_s)
     return ask()
-
-
-def come_to_rest(
-    look: Callable[[], ServoSample], set_: Callable[[str, int], None], limits: tuple[int, int], clock: Clock
-) -> int:
-    """Wait until an axis stands (it may have been falling) and hold it there; returns the goal, in counts."""
-    until_s = clock.now_s() + COME_TO_REST_S
-    sample = look()
-    while abs(sample.values["present_velocity"]) > 1 and clock.now_s() < until_s:
-        sample = look()
-    goal = min(max(sample.counts, limits[0]), limits[1])
-    if sample.values["goal_position"] != goal:
-        set_("goal_position", goal)
-    return goal
 
 
 class Exchange:

@@ -41,6 +41,9 @@ log = logging.getLogger(__name__)
 LATE_S = 0.7
 LISTENS_S = 0.02  # at a time, while late replies are waited out
 STUCK_S = 1.0
+STANDS_S = 0.2  # for so long it says one place: the slowest code turns by counts meanwhile
+LOOK_S = 0.05
+BRAKES_WITHIN_S, STOP_TRIES = 2.0, 2
 AXES = ("pan", "tilt")
 
 
@@ -163,10 +166,10 @@ class ViscaHead:
                 self._forget_targets()
 
     def stop(self) -> None:
-        """Stop both axes; they hold where they come to rest.
+        """Stop both axes and see that they stand; they hold there.
 
         If another call is under way the command goes out at once, and again in its turn. Raises NoReply,
-        BadReply, LineLost if the head did not confirm.
+        BadReply, LineLost if the head did not confirm, or still moves.
         """
         self._stops += 1
         if not self._turn.acquire(blocking=False):
@@ -174,8 +177,7 @@ class ViscaHead:
             self._turn.acquire()
         try:
             with self._talking(held=True):
-                self._forget_targets()
-                self._order(stop_command(self._options.address))
+                self._stand()
         finally:
             self._turn.release()
 
@@ -186,7 +188,7 @@ class ViscaHead:
                 return
             try:
                 if self._line is not None:
-                    self._order(stop_command(self._options.address))
+                    self._stand()
             except DriverError as error:
                 log.warning("the last stop was not confirmed: %s", error)
             self._closed = True
@@ -282,6 +284,23 @@ class ViscaHead:
         """Send a command and wait for its acknowledgement. Raises NoReply, Refused, LineLost."""
         self._ask(command, Kind.ACK, patient=True)
 
+    def _stand(self) -> None:
+        """Stop, and look whether the head stands: an acknowledgement may be that of an order before.
+
+        Raises NoReply, Refused, LineLost.
+        """
+        for _ in range(STOP_TRIES):
+            self._order(stop_command(self._options.address))
+            self._forget_targets()
+            until_s = self._time.now_s() + BRAKES_WITHIN_S
+            while (asked_s := self._time.now_s()) < until_s:
+                with suppress(NoReply, BadReply):  # late replies are waited out here
+                    self._look()
+                    if all(asked_s - axis.since_s >= STANDS_S for axis in self._axes):
+                        return
+                    self._time.sleep(LOOK_S)
+        raise NoReply("the head acknowledged the stop, and still moves or does not say", device=DEVICE)
+
     def _ask(self, frame: bytes, wanted: Kind, patient: bool = False) -> bytes:
         """Send a frame and return the reply; ``patient`` where a late one of another kind does no harm."""
         line = self._line
@@ -334,7 +353,7 @@ class ViscaHead:
 def halt(
     options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
 ) -> list[str]:
-    """Stop both axes, and see that the head took it; it holds where that ends.
+    """Stop both axes, and see that they stand; the head holds where that ends.
 
     Raises
     ------
@@ -343,5 +362,9 @@ def halt(
     LineLost, NoReply, BadReply, Refused, WrongDevice
         If it was not confirmed; the command has been sent all the same, unless the line is lost.
     """
-    ViscaHead(options_from(options), clock or SystemClock(), open_line).close()
+    head = ViscaHead(options_from(options), clock or SystemClock(), open_line)
+    try:
+        head.stop()
+    finally:
+        head.close()
     return ["pan and tilt stopped, confirmed"]

@@ -37,6 +37,8 @@ class SimulatedFeetechServo:
         What it turns.
     settings
         Initial values of its memory by name; those of the EEPROM outlast the power switch.
+    speed_unit_counts
+        Counts a second of one unit of its speed: 1, or 50 in some firmware.
     time_s
         When it is switched on.
 
@@ -53,9 +55,11 @@ class SimulatedFeetechServo:
         axis: WireAxis,
         *,
         settings: Mapping[str, int] | None = None,
+        speed_unit_counts: int = 1,
         time_s: float = 0.0,
     ) -> None:
         self.model = model_named(model)
+        self._speed_unit_counts = speed_unit_counts
         self.powered = True
         self.eeprom_writes: list[str] = []
         self._axis = axis
@@ -210,7 +214,7 @@ class SimulatedFeetechServo:
         goal = -(goal & 0x7FFF) if goal & 0x8000 else goal
         if memory["max_angle"] > memory["min_angle"]:
             goal = min(max(goal, memory["min_angle"]), memory["max_angle"])
-        speed = (memory["goal_speed"] & 0x7FFF) or FASTEST_COUNTS
+        speed = (memory["goal_speed"] & 0x7FFF) * self._speed_unit_counts or FASTEST_COUNTS
         steep = memory.get("acceleration", 0) * STEP_ACCELERATION * count_rad or STEEPEST_RAD_PER_S2
         angle_rad = (goal - self._zero + self._offset()) * count_rad
         self._axis.goal(time_s, angle_rad, speed * count_rad, steep)
@@ -220,7 +224,7 @@ class SimulatedFeetechServo:
         memory = self.memory
         velocity = self._axis.velocity_rad_per_s(time_s) / self.model.count_rad
         memory["present_position"] = _signed(self._position(time_s), 15)
-        memory["present_speed"] = _signed(round(velocity), 15)
+        memory["present_speed"] = _signed(round(velocity / self._speed_unit_counts), 15)
         load = 300 if self._axis.blocked(time_s) else 50 if velocity else 0
         memory["present_load"] = _signed(load if velocity >= 0 else -load, 10)
         memory["present_current"] = load // 5

@@ -41,13 +41,15 @@ EVERYTHING_SET = {"return_delay": 0, "min_angle": 1400, "max_angle": 2700}
 class Bench(Turned):
     """Two servos on a line in memory."""
 
-    def __init__(self, model: str = "sts3215", echoes: bool = False, **settings: int) -> None:
+    def __init__(self, model: str = "sts3215", echoes: bool = False, unit: int = 1, **settings: int) -> None:
         self.clock = SimulationClock(start_s=START_S)
         now_s = self.clock.now_s()
         self.panel = FaultPanel(self.clock.now_s, ())
         self.axes = [WireAxis(PLAIN, self.panel, number=n, time_s=now_s) for n in (0, 1)]
         self.servos = [
-            SimulatedFeetechServo(model, n, axis, settings=settings if n == 1 else None, time_s=now_s)
+            SimulatedFeetechServo(
+                model, n, axis, settings=settings if n == 1 else None, speed_unit_counts=unit, time_s=now_s
+            )
             for n, axis in enumerate(self.axes, start=1)
         ]
         self.model = model
@@ -200,17 +202,8 @@ def test_an_adapter_that_echoes_is_found_out_and_costs_nothing(model: str) -> No
         assert it.now_s() - began_s < 0.006, "no silence between one question and the next"
 
 
-def test_a_servo_with_another_unit_of_speed_is_stopped_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    true_go = SimulatedFeetechServo._go
-
-    def go(servo: SimulatedFeetechServo, time_s: float) -> None:
-        told = servo.memory["goal_speed"]
-        servo.memory["goal_speed"] = min(3400, 50 * told)
-        true_go(servo, time_s)
-        servo.memory["goal_speed"] = told
-
-    monkeypatch.setattr(SimulatedFeetechServo, "_go", go)
-    with opened(options={"lease_s": 0.2, "speed_rad_per_s": 0.2}) as (it, head):
+def test_a_servo_with_another_unit_of_speed_is_stopped_and_told() -> None:
+    with opened(unit=50, options={"lease_s": 0.2, "speed_rad_per_s": 0.2}) as (it, head):
         head.move(0.9, 0.0)
         it.until(lambda: head.read().faults, "a fault")
         with pytest.raises(HardwareFault, match="set speed_unit_counts: 50"):
@@ -303,6 +296,41 @@ def test_halt_does_not_take_a_servo_for_stopped_that_missed_the_command(
         monkeypatch.setattr(FeetechServo, "send", lambda self, goal: None)  # lost on the line
         with pytest.raises(NoReply, match="did not take the command to stand, its goal is 2700"):
             halt(it.options(), it.clock, it.line.open)
+
+
+@pytest.mark.parametrize("amplitude_rad", [0.05, 0.3])
+@pytest.mark.parametrize(("model", "unit"), [("sts3215", 1), ("sts3215", 50), ("scs0009", 50)])
+def test_a_trial_finds_the_unit_of_speed_and_comes_back(model: str, unit: int, amplitude_rad: float) -> None:
+    with bench(model, unit=unit) as it:
+        link = open_link(it.line.path, 1_000_000, 0.05, clock=it.clock, open_line=it.line.open)
+        trial = workshop.try_out(link, 1, amplitude_rad, 50.0)
+        link.close()
+        assert trial.speed_unit_counts == unit
+        assert [step.left_counts for step in trial.steps] == [0, 0, 0]
+        assert it.pan_rad() == 0.0
+
+
+def test_a_trial_of_few_counts_does_not_guess_the_unit_of_speed() -> None:
+    with bench("scs0009", unit=50) as it:
+        link = open_link(it.line.path, 1_000_000, 0.05, clock=it.clock, open_line=it.line.open)
+        trial = workshop.try_out(link, 1, 0.02, 50.0)
+        link.close()
+        assert (trial.speed_unit_counts, [step.left_counts for step in trial.steps]) == (None, [0, 0, 0])
+
+
+def test_halt_does_not_take_one_unit_of_speed_for_rest() -> None:
+    with bench(unit=50) as it:
+        servo, axis = it.servos[0], it.axes[0]
+        servo.write(41, bytes((2,)), it.now_s())  # 200 counts/s2: it brakes for half a second
+        servo.write(46, bytes((2, 0)), it.now_s())  # 100 counts/s
+        servo.write(40, bytes((1,)), it.now_s())
+        servo.write(42, (2700).to_bytes(2, "little"), it.now_s())
+        it.clock.sleep(1.0)
+        assert axis.velocity_rad_per_s(it.now_s()) == pytest.approx(100 * math.tau / 4096)
+        options = it.options()
+        options["pan"] |= {"speed_unit_counts": 50}
+        halt(options, it.clock, it.line.open)
+        assert axis.velocity_rad_per_s(it.now_s()) == 0.0
 
 
 def test_a_trial_that_a_fault_ends_stops_the_servo_under_way(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -117,6 +117,30 @@ def test_after_a_lost_reply_it_listens_until_no_late_one_can_come() -> None:
         assert it.now_s() - lost_s > 0.7
 
 
+def test_a_stop_takes_no_late_answer_to_the_move_before_it_for_its_own() -> None:
+    with opened() as (it, head):
+        plain, lost = it.device._drive, iter(range(3))
+
+        def drive(body: bytes, time_s: float) -> Any:  # the line loses two stops of the move, and the next
+            return [] if next(lost, None) is not None else plain(body, time_s)
+
+        it.device._drive = drive  # type: ignore[method-assign]
+        it.panel.set("pan_tilt", "late", replies=1, delay_s=0.15)
+        with pytest.raises(NoReply, match="no acknowledgement within"):
+            head.move(0.9, 0.0, 0.2)
+        head.stop()
+        assert it.axes[0].velocity_rad_per_s(it.now_s()) == 0.0
+        assert 0.0 < it.axes[0].angle_rad(it.now_s()) < 0.5
+
+
+def test_a_head_that_does_not_obey_a_stop_is_told() -> None:
+    with opened() as (it, head):
+        head.move(0.9, 0.0, 0.1)
+        it.device._drive = lambda body, time_s: [(0x41,), (0x51,)]  # type: ignore[method-assign]
+        with pytest.raises(NoReply, match="acknowledged the stop, and still moves"):
+            head.stop()
+
+
 def test_a_digit_that_the_line_changed_is_seen_by_the_second_answer() -> None:
     with opened() as (it, head):
         plain, changed = it.device._answer, []

@@ -1,0 +1,108 @@
+"""Axes that are to stand: when one does, waiting for that, and what ``mastctl halt`` does to a head."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from drivers.clock import Clock
+from drivers.errors import DriverError, NoReply
+from drivers.servo_bus.axis import ServoAxis
+from drivers.servo_bus.course import ServoSample
+
+REST_S = 0.5
+STEP_RESTS_S = 0.2  # where the servo has said besides that its move is over
+LOOK_S = 0.01  # between one look and the next
+COME_TO_REST_S, HOLDS_S = 0.5, 0.05  # of an axis that is to hold, at most, and at least
+HALT_TRIES, HALT_REST_S = 5, 2.5
+A = TypeVar("A", bound=ServoAxis[Any, Any])
+
+
+class Rest:
+    """Whether an axis stands, by the places that it tells within ``span_s``, beside its speed.
+
+    Speed alone does not tell: one unit of it is up to 50 counts a second, of which it may tell 0 or 1. An
+    axis that turns by two counts or more in ``span_s`` is never taken to stand. In `REST_S` the slowest that
+    a servo can be told does, and one that turns back by the smallest acceleration.
+    """
+
+    def __init__(self, span_s: float = REST_S) -> None:
+        self._span_s = span_s
+        self._counts = 0
+        self._since_s = float("inf")
+
+    def take(self, values: Mapping[str, int], sent_s: float, received_s: float) -> bool:
+        """Take a fresh answer, asked for and received at these times; returns whether the axis stands."""
+        counts, speed = values["present_position"], abs(values["present_velocity"])
+        if received_s < self._since_s or speed > 1 or abs(counts - self._counts) > 1:
+            self._counts, self._since_s = counts, received_s
+        return sent_s - self._since_s >= self._span_s
+
+
+def rests(
+    look: Callable[[], ServoSample], clock: Clock, within_s: float, rest: Rest
+) -> tuple[bool, ServoSample]:
+    """Look again and again until an axis stands; returns whether it does, and the last sample."""
+    until_s = clock.now_s() + within_s
+    while True:
+        sample = look()
+        stands = rest.take(sample.values, sample.sent_s, sample.received_s)
+        if stands or clock.now_s() > until_s:
+            return stands, sample
+        clock.sleep(LOOK_S)
+
+
+def come_to_rest(
+    look: Callable[[], ServoSample], set_: Callable[[str, int], None], limits: tuple[int, int], clock: Clock
+) -> int:
+    """Wait until an axis stands (it may have been falling) and hold it there; returns the goal, in counts.
+
+    It holds already: that it does not fall on shows sooner than that it stands.
+    """
+    _, sample = rests(look, clock, COME_TO_REST_S, Rest(HOLDS_S))
+    goal = min(max(sample.counts, limits[0]), limits[1])
+    if sample.values["goal_position"] != goal:
+        set_("goal_position", goal)
+    return goal
+
+
+def halt_axes(axes: Sequence[A], tell: Callable[[A], str], clock: Clock) -> list[str]:
+    """Tell each axis to stand, by itself, then see that those that hold do.
+
+    Parameters
+    ----------
+    axes
+        Pan and tilt.
+    tell
+        Tells one and returns in words what it does. Raises DriverError.
+    clock
+        Of the line.
+
+    Raises
+    ------
+    NoReply
+        If an axis did not confirm, or still moves; the other was told all the same.
+    """
+    told: dict[str, str] = {}
+    failed: dict[str, object] = {}
+    for _ in range(HALT_TRIES):  # each once before any of them again
+        for axis in axes:
+            if axis.servo.name not in told:
+                try:
+                    told[axis.servo.name] = tell(axis)
+                except DriverError as error:
+                    failed[axis.servo.name] = error
+    missing = {name: error for name, error in failed.items() if name not in told}
+    for axis in axes:
+        name = axis.servo.name
+        if name in told:
+            try:
+                stands, sample = rests(axis.servo.look, clock, HALT_REST_S, Rest())
+                if not stands and sample.values.get("torque_enable", True):
+                    missing[name] = "it got the command to stand, but still moves"
+            except DriverError as error:
+                missing[name] = error
+    if missing:
+        words = "; ".join(f"{name}: {error}" for name, error in missing.items())
+        raise NoReply(f"not halted, it may still move: {words}")
+    return [f"{name} {words}" for name, words in told.items()]
