@@ -19,11 +19,11 @@ A = TypeVar("A", bound=ServoAxis[Any, Any])
 
 
 class Rest:
-    """Whether an axis stands, by the places that it tells within ``span_s``, beside its speed.
+    """Whether an axis stands, by its positions within ``span_s`` and its speed.
 
-    Speed alone does not tell: one unit of it is up to 50 counts a second, of which it may tell 0 or 1. An
-    axis that turns by two counts or more in ``span_s`` is never taken to stand. In `REST_S` the slowest that
-    a servo can be told does, and one that turns back by the smallest acceleration.
+    The speed alone is no proof: one unit of it is up to 50 counts a second, and the servo may report 0 or 1.
+    An axis that turns by two counts or more in ``span_s`` is never taken to stand. In `REST_S` each speed
+    that a servo can be set to does, and a reversal by the smallest acceleration.
     """
 
     def __init__(self, span_s: float = REST_S) -> None:
@@ -66,22 +66,22 @@ def come_to_rest(
     return goal
 
 
-def halt_axes(axes: Sequence[A], tell: Callable[[A], str], clock: Clock) -> list[str]:
-    """Tell each axis to stand, by itself, then see that those that hold do.
+def halt_axes(axes: Sequence[A], command: Callable[[A], str], clock: Clock) -> list[str]:
+    """Command each axis to stand, by itself, then see that those that hold do.
 
     Parameters
     ----------
     axes
         Pan and tilt.
-    tell
-        Tells one and returns in words what it does. Raises DriverError.
+    command
+        Commands one and returns its state in words. Raises DriverError.
     clock
         Of the line.
 
     Raises
     ------
     NoReply
-        If an axis did not confirm, or still moves; the other was told all the same.
+        If an axis did not confirm, or still moves; the other was commanded all the same.
     """
     told: dict[str, str] = {}
     failed: dict[str, object] = {}
@@ -89,7 +89,7 @@ def halt_axes(axes: Sequence[A], tell: Callable[[A], str], clock: Clock) -> list
         for axis in axes:
             if axis.servo.name not in told:
                 try:
-                    told[axis.servo.name] = tell(axis)
+                    told[axis.servo.name] = command(axis)
                 except DriverError as error:
                     failed[axis.servo.name] = error
     missing = {name: error for name, error in failed.items() if name not in told}
