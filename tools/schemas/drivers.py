@@ -28,6 +28,8 @@ from drivers.visca import options as visca_options
 from tools.schemas.watched import FLAG, TEXT, Schema, number, settings_schema, vector, watched
 
 NUMBER: Schema = {"type": "number"}
+PATTERN_WORDS = "patternErrorMessage"
+"""The key by which editors show a sentence in place of a pattern."""
 
 
 def _settings(found: Schema, *kinds: type) -> Schema:
@@ -47,7 +49,9 @@ def _model(names: Iterable[str], gear: str = "") -> Schema:
     known = sorted(names)
     alike = ("".join(signs.get(sign, sign) for sign in name.removesuffix(gear or "?")) for name in known)
     gears = "([-_][Tt])?([-_][Rr])?" if gear else ""
-    return {"type": "string", "pattern": f"^({'|'.join(alike)}){gears}$", "examples": known}
+    pattern = f"^({'|'.join(alike)}){gears}$"
+    words = "The driver knows no servo of this name; Ctrl-Space lists those that it knows."
+    return {"type": "string", "pattern": pattern, PATTERN_WORDS: words, "examples": known}
 
 
 def _approach(axis: Schema) -> None:
@@ -60,7 +64,8 @@ def _approach(axis: Schema) -> None:
 def _port(schemes: Iterable[str]) -> Schema:
     """A device, or an address of these kinds."""
     kinds = "|".join(one.removesuffix("://") for one in schemes)
-    return {"type": "string", "pattern": rf"^(?:(?:{kinds})://|(?!.*://)).*\S"}
+    words = f"A serial device or an address with {kinds.replace('|', '://, ')}:// is expected."
+    return {"type": "string", "pattern": rf"^(?:(?:{kinds})://|(?!.*://)).*\S", PATTERN_WORDS: words}
 
 
 def dynamixel() -> Schema:
