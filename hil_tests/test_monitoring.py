@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import socket
 import subprocess
 import sys
@@ -235,9 +236,19 @@ def found(message: Any, fields: list[str]) -> bool:
     return message is not None
 
 
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the recording is kept for all that read it."""
+    return tmp_path_factory.mktemp("recorded") / "watched.mcap"
+
+
 @pytest.fixture
-def recording(mast_client: Client, fault: Callable[..., Any]) -> Path:
-    """A run of a pointing and of a fault."""
+def recording(request: pytest.FixtureRequest, kept: Path) -> Path:
+    """A run of a pointing and of a fault, recorded once."""
+    if kept.exists():
+        return kept
+    mast_client: Client = request.getfixturevalue("mast_client")
+    fault: Callable[..., Any] = request.getfixturevalue("fault")
     mast_client.start_recording("watched")
     shot = mast_client.snapshot("navcam_left")
     assert (
@@ -247,7 +258,8 @@ def recording(mast_client: Client, fault: Callable[..., Any]) -> Path:
     until(lambda: mast_client.status()["faults"], "the fault is known")
     mute.clear()
     until(lambda: not mast_client.status()["faults"], "the fault is over")
-    return Path(mast_client.stop_recording()["file"])
+    shutil.copy(mast_client.stop_recording()["file"], kept)
+    return kept
 
 
 READ_BACK = """
