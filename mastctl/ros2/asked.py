@@ -145,7 +145,9 @@ class Asked:
             )
         frame = told.header.frame_id.lstrip("/")
         rig = self.known.rig
-        camera = None if rig is None else self.names.camera_of(frame, rig)
+        if rig is None:
+            raise ValueError("the daemon's mast file cannot be read, so that its cameras are not known")
+        camera = self.names.camera_of(frame, rig)
         if camera is None:
             raise ValueError(f"the frame '{frame}' is no camera's; one ends with _optical_frame")
         frame_id = self.known.frame_at(camera, at_ns)

@@ -64,6 +64,7 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         self._ended: set[str] = set()
         self._own: set[str] = set()
         self._infos: dict[str, CameraInfo] = {}
+        self._mast_file = b""
         self._images: dict[str, tuple[Any, Any]] = {}
         self._latched: dict[str, Any] = {}
         self._make_publishers()
@@ -88,6 +89,7 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
                 ),
                 self.create_publisher(CameraInfo, f"{topic}/camera_info", qos_profile_sensor_data),
             )
+        self._read_rig()  # before the first image: its frame is then a camera's for whoever points at it
         self.following.status(self._tell_status, self._tell_loss)
         self.following.events(self._tell_event)
         if self._cameras:
@@ -224,6 +226,9 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         """Take the mast file in use: fixed transforms, and each camera's lens with its worst error."""
         with self._connect() as client:
             data = client.mast_file()
+        if data == self._mast_file:
+            return
+        self._mast_file = data
         try:
             rig = parse_rig(data, "the daemon's mast file").rig
         except BadFile as error:
