@@ -159,6 +159,14 @@ def build_model(
     return model, tuple(notes)
 
 
+def blind_part(model: CameraModel) -> float:
+    """Return the part of the image, to its outer border, that has no ray."""
+    x, y = (
+        np.linspace(-0.5, size - 0.5, count) for size, count in zip(model.size_px, BLIND_GRID, strict=True)
+    )
+    return float(1.0 - model.ray(np.stack(np.meshgrid(x, y), axis=-1)).valid.mean())
+
+
 def blind_notes(model: CameraModel, path: str | Path, place: str) -> tuple[str, ...]:
     """Return a note of the part of the image that has no ray, and why; none if every pixel has one.
 
@@ -167,14 +175,10 @@ def blind_notes(model: CameraModel, path: str | Path, place: str) -> tuple[str, 
     BadFile
         If more than half of the image has no ray, or the lens folds at its axis.
     """
-    x, y = (
-        np.linspace(-0.5, size - 0.5, count) for size, count in zip(model.size_px, BLIND_GRID, strict=True)
-    )
     try:
-        seen = model.ray(np.stack(np.meshgrid(x, y), axis=-1)).valid
+        blind = blind_part(model)
     except ValueError as problem:
         raise BadFile(path, place, f"is no usable camera: {problem}") from None
-    blind = float(1.0 - seen.mean())
     why = model.limit_words or "the lens looks sideways"
     if blind > MOST_BLIND:
         raise BadFile(path, place, f"{100 * blind:.0f} %, more than half of the image has no ray: {why}")

@@ -1,0 +1,255 @@
+"""Fit OpenCV's families of lenses with this project, OpenCV and mrcal to the same corners, in one run.
+
+    .venv/bin/python -m tools.against_others.families [--data ../shared/data/opencv_stereo]
+    .venv/bin/python -m tools.against_others.families --board BOARD.yaml PICTURES
+
+Without ``--board`` the corners are those of OpenCV's stereo sample; with it, of a folder with pictures of one
+camera. The boards' poses are free. Ours and OpenCV's fit know no focal length; mrcal, which needs a start and
+a whole grid, gets a rough one, and the sample only. Rms is over points, x and y together. *image* is the part
+of the picture in which OpenCV's lens has rays at all. Its fit holds no number back, and so can end with a
+pole or a fold inside the picture; mrcal and this project hold the numbers near those of usual lenses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.adjust.adjustment import Adjustment
+from calib.adjust.solver import minimise
+from calib.adjust.terms import ImageTerm
+from calib.adjust.unknowns import Estimate
+from calib.calibrate.starts.views import view_poses
+from calib.errors import CalibError
+from calib.files import blind_part
+from calib.geometry.cahvor import COEFFICIENTS, CameraModel, Kind
+from calib.targets.board_file import load_board
+from calib.targets.boards import Corners
+from calib.targets.corners import find_corners
+from tools.against_others.calibration import (
+    ROUGH_FOCAL,
+    boards_problem,
+    boards_residuals,
+    find_mrcal,
+    mrcal_row,
+    rms,
+)
+from tools.against_others.points import (
+    COLUMNS,
+    NOISE_PX,
+    REPOSITORY,
+    ROWS,
+    SETTLED,
+    SQUARE_M,
+    BoardViews,
+    read_views,
+)
+from tools.command import end
+
+RATIONAL = cv2.CALIB_RATIONAL_MODEL
+FLAGS: dict[Kind, int] = {
+    "OPENCV4": cv2.CALIB_FIX_K3,
+    "OPENCV5": 0,
+    "OPENCV8": RATIONAL,
+    "OPENCV12": RATIONAL | cv2.CALIB_THIN_PRISM_MODEL,
+    "OPENCV14": RATIONAL | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL,
+    "OPENCV_FISHEYE": cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW,
+}
+IN_MRCAL = ("OPENCV4", "OPENCV5", "OPENCV8", "OPENCV12")
+WANTED = 1.01
+"""Our rms over the others', at most."""
+SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp"}
+FEWEST = 8
+
+
+@dataclass(frozen=True)
+class FamilyRow:
+    """One family: rms of each in pixels, None where there is none, and where OpenCV's lens has rays."""
+
+    pictures: str
+    kind: str
+    ours_px: float | None
+    opencv_px: float
+    opencv_image: float
+    mrcal_px: float | None
+    ours_s: float
+    note: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """Whether our rms is within 1 % of OpenCV's, if its lens serves the whole picture, and of mrcal's."""
+        beside = [self.mrcal_px] + ([self.opencv_px] if self.opencv_image == 1.0 else [])
+        told = [one for one in beside if one]
+        if not told or self.ours_px is None:
+            return ""
+        return "met" if all(self.ours_px <= WANTED * one for one in told) else "NOT MET"
+
+
+def fit_ours(kind: Kind, size_px: tuple[int, int], terms: Sequence[ImageTerm]) -> tuple[float, str]:
+    """Return the rms of our camera and boards, and a note if the fit did not settle; or CalibError."""
+    found = view_poses(terms, kind, size_px, None)
+    terms = [term for term in terms if term.name in found.poses]
+    boards = {term.board: found.poses[term.name][0] for term in terms}
+    start = Estimate({"camera": found.model}, np.zeros(8), {}, boards, {}, np.zeros((0, 2)))
+    problem = Adjustment(terms, (), start, mast_parameters=0)
+    fit = minimise(problem, start, weak=problem.weak)
+    left = boards_residuals(problem, fit.state)
+    lost = int((~np.isfinite(left).all(axis=1)).sum())
+    note = ("" if fit.settled else "ours not settled") + (f" {lost} corners unseen" if lost else "")
+    return rms(left[np.isfinite(left).all(axis=1)]), note
+
+
+def fit_opencv(kind: Kind, size_px: tuple[int, int], terms: Sequence[ImageTerm]) -> tuple[float, CameraModel]:
+    """Return the rms of OpenCV's fit, and its camera."""
+    points = [term.in_board_m.astype(np.float32) for term in terms]
+    pixels = [term.pixels_px.astype(np.float32) for term in terms]
+    if kind == "OPENCV_FISHEYE":
+        matrix = np.array(
+            [[0.8 * size_px[0], 0, size_px[0] / 2], [0, 0.8 * size_px[0], size_px[1] / 2], [0, 0, 1]]
+        )
+        found, matrix, lens, *_ = cv2.fisheye.calibrate(
+            [one[:, None].astype(float) for one in points], [one[:, None].astype(float) for one in pixels],
+            size_px, matrix, np.zeros(4), flags=FLAGS[kind] | cv2.fisheye.CALIB_USE_INTRINSIC_GUESS,
+            criteria=SETTLED,
+        )  # fmt: skip
+    else:
+        found, matrix, lens, *_ = cv2.calibrateCamera(
+            points, pixels, size_px, None, None, flags=FLAGS[kind], criteria=SETTLED
+        )
+    numbers = lens.ravel()[: COEFFICIENTS[kind]]
+    return float(found), CameraModel.of_matrix(kind, size_px, matrix, numbers, np.eye(3), np.zeros(3))
+
+
+def fit_mrcal(
+    kind: Kind, views: BoardViews, focal_px: float, interpreter: str | None
+) -> tuple[float | None, str]:
+    """Return the rms of mrcal's fit, or why there is none."""
+    start = boards_problem(views, focal_px)[1]
+    poses = [
+        [*Rotation.from_matrix(p.rotation).as_rotvec(), *p.translation_m]
+        for p in start.rover_from_board.values()
+    ]
+    middle = ((np.array(views.size_px) - 1) / 2).tolist()
+    request = {
+        "lens": f"LENSMODEL_{kind}", "size_px": views.size_px, "boards": poses,
+        "pixels": views.pixels_px.tolist(),
+        "intrinsics": [focal_px, focal_px, *middle, *[0] * COEFFICIENTS[kind]],
+        "columns": COLUMNS, "rows": ROWS, "spacing_m": SQUARE_M, "rounds": 1,
+    }  # fmt: skip
+    row = mrcal_row("", kind, 0, interpreter, request, views.pixels_px.reshape(-1, 2))
+    return row.rms_px, row.note
+
+
+def sample_terms(views: BoardViews) -> list[ImageTerm]:
+    """Return the sample's corners as the bench has them: about the board's centre."""
+    centred_m = views.in_board_m - views.in_board_m[[0, -1]].mean(axis=0)
+    return [
+        replace(term, in_board_m=centred_m)
+        for term in boards_problem(views, float(max(views.size_px)))[0].images
+    ]
+
+
+def folder_terms(board_file: Path, folder: Path) -> tuple[tuple[int, int], list[ImageTerm]]:
+    """Return the pictures' size, and our corners of the board in each that shows enough of it."""
+    board, terms, size_px = load_board(board_file), [], (0, 0)
+    for path in sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES):
+        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if grey is None:
+            continue
+        size_px = (grey.shape[1], grey.shape[0])
+        found = find_corners(board, grey)
+        if not isinstance(found, Corners) or len(found.ids) < FEWEST:
+            continue
+        rows, columns = board.cells(found.ids)
+        places, count = board.in_board_m(found.ids), len(found.ids)
+        terms.append(
+            ImageTerm(
+                path.name, "camera", ("", path.name), None, 0.0, 0.0, rows, columns, places,
+                found.pixels_px, np.full(count, NOISE_PX), np.ones(count, dtype=bool),
+            )
+        )  # fmt: skip
+    return size_px, terms
+
+
+def compare(
+    name: str, size_px: tuple[int, int], terms: Sequence[ImageTerm], views: BoardViews | None
+) -> list[FamilyRow]:
+    """Fit every family."""
+    interpreter = find_mrcal() if views is not None else None
+    rows = []
+    for kind in FLAGS:
+        opencv_px, camera = fit_opencv(kind, size_px, terms)
+        start_s = time.thread_time()
+        try:
+            ours_px, note = fit_ours(kind, size_px, terms)
+        except CalibError as reason:
+            ours_px, note = None, str(reason)
+        taken_s = time.thread_time() - start_s
+        mrcal_px = None
+        if views is not None and kind in IN_MRCAL:
+            mrcal_px, why = fit_mrcal(
+                kind, views, ROUGH_FOCAL * float(camera.camera_matrix[0, 0]), interpreter
+            )
+            note = " ".join(filter(None, (note, why)))
+        seen = 1.0 - blind_part(camera)
+        rows.append(FamilyRow(name, kind, ours_px, opencv_px, seen, mrcal_px, taken_s, note))
+    return rows
+
+
+def main() -> int:
+    """Compare and print; exit code 1 if our rms is more than 1 % above another's."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    sample = REPOSITORY.parent / "shared" / "data" / "opencv_stereo"
+    parser.add_argument(
+        "--data", type=Path, default=sample, help="OpenCV's stereo sample, left*.jpg and right*.jpg"
+    )
+    parser.add_argument("--board", type=Path, help="BOARD.yaml of the pictures in FOLDER")
+    parser.add_argument("folder", type=Path, nargs="?", help="pictures of one camera and one board")
+    parser.add_argument("--json", action="store_true", help="print one JSON document instead of a table")
+    arguments = parser.parse_args()
+    if (arguments.board is None) != (arguments.folder is None):
+        parser.error("--board and FOLDER go together")
+    cv2.setNumThreads(1)
+    rows: list[FamilyRow] = []
+    if arguments.board is not None:
+        size_px, terms = folder_terms(arguments.board, arguments.folder)
+        rows += compare(arguments.folder.name, size_px, terms, None)
+    else:
+        for side in ("left", "right"):
+            try:
+                views = read_views(arguments.data, side)
+            except FileNotFoundError as error:
+                parser.error(str(error))
+            rows += compare(side, views.size_px, sample_terms(views), views)
+    if arguments.json:
+        print(json.dumps([asdict(row) | {"verdict": row.verdict} for row in rows], indent=1))
+    else:
+        print(
+            f"{'pictures':10} {'family':15} {'ours px':>8} {'OpenCV':>8} {'ratio':>6} {'image':>6} "
+            f"{'mrcal':>8} {'ratio':>6} {'s':>6}"
+        )
+        for row in rows:
+            ours = row.ours_px or np.nan
+            mrcal = (
+                (f"{row.mrcal_px:8.4f}", f"{ours / row.mrcal_px:6.3f}")
+                if row.mrcal_px
+                else ("       -", "     -")
+            )
+            end_of_row = f"{mrcal[0]} {mrcal[1]} {row.ours_s:6.2f}  {row.verdict} {row.note}"
+            print(
+                f"{row.pictures:10} {row.kind:15} {ours:8.4f} {row.opencv_px:8.4f} "
+                f"{ours / row.opencv_px:6.3f} {row.opencv_image:6.0%} {end_of_row}"
+            )
+    return 0 if all(row.verdict != "NOT MET" for row in rows) else 1
+
+
+if __name__ == "__main__":
+    end(main)
