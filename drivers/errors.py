@@ -36,6 +36,12 @@ class BadOptions(DriverError):
     code = "bad_options"
 
 
+class BadSetting(BadOptions):
+    """A setting of a camera that it does not have, cannot change now, or that is out of its bounds."""
+
+    code = "bad_setting"
+
+
 class NoReply(DriverError):
     """The device did not answer within its deadline."""
 

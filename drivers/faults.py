@@ -132,7 +132,7 @@ CAMERA_WORDS: Mapping[str, Word] = MappingProxyType(
         "frozen": Word("the picture before the fault again and again, with new sequence and time", {}),
         "hang": Word(
             "the call does not return until the fault is over: 0 any, 1 next_frame, 2 close, 3 recent_times, "
-            "4 size_px, 5 exposure_held",
+            "4 size_px, 5 exposure_held, 6 settings",
             {"call": 0},
         ),
     }
@@ -154,7 +154,7 @@ BOUNDS = {
     "delay_s": (0.0, 3600.0),
     "factor": (1e-4, 1.0),
     "probability": (0.0, 1.0),
-    "call": (0.0, 5.0),
+    "call": (0.0, 6.0),
     "moving": (0.0, 1.0),
     "axis": (0.0, 2.0),
     "angle_rad": (-math.pi, math.pi),

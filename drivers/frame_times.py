@@ -18,7 +18,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from drivers.interfaces import Camera, Frame, FrameTime, HoldsExposure, KnowsSize, Paced
+from drivers.interfaces import (
+    Adjustable,
+    Camera,
+    CameraSetting,
+    Frame,
+    FrameTime,
+    HoldsExposure,
+    KnowsSize,
+    Paced,
+)
 
 MOST_OFFSET_S = 1.0
 """No camera's stamps are further off than a fault of its driver."""
@@ -34,11 +43,16 @@ COUNTED_FROM = 5
 def corrected(camera: Camera, offset_s: float) -> Camera:
     """Return a camera whose frames' ``mid_exposure_s`` are later by ``offset_s``; itself for 0.
 
-    It is `KnowsSize`, `HoldsExposure` and `Paced` if the camera is.
+    It is `KnowsSize`, `HoldsExposure`, `Adjustable` and `Paced` if the camera is.
     """
     if offset_s == 0.0:
         return camera
-    can = ((KnowsSize, _KnowingSize), (HoldsExposure, _HoldingExposure), (Paced, _Pacing))
+    can = (
+        (KnowsSize, _KnowingSize),
+        (HoldsExposure, _HoldingExposure),
+        (Adjustable, _Adjusting),
+        (Paced, _Pacing),
+    )
     abilities = [ours for protocol, ours in can if isinstance(camera, protocol)]
     kind: type[CorrectedCamera] = type("CorrectedCamera", (*abilities, CorrectedCamera), {})
     return kind(camera, offset_s)
@@ -97,6 +111,18 @@ class _HoldingExposure(CorrectedCamera):
         """Return a context in which the exposure does not change."""
         held: AbstractContextManager[None] = self._camera.exposure_held()
         return held
+
+
+class _Adjusting(CorrectedCamera):
+    def settings(self) -> Sequence[CameraSetting]:
+        """Return the camera's settings."""
+        told: Sequence[CameraSetting] = self._camera.settings()
+        return told
+
+    def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
+        """Change some of them."""
+        notes: Sequence[str] = self._camera.adjust(wanted)
+        return notes
 
 
 class _Pacing(CorrectedCamera):

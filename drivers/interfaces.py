@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -57,6 +58,9 @@ class Frame:
         Exposure time, seconds: it began at ``mid_exposure_s - exposure_s / 2``.
     jpeg
         The camera's own JPEG that the image was made of; empty where it gave none.
+    settings
+        Exposure, gain, ... of this frame, by the names of `SETTINGS`; None for one that is not known of it,
+        as while it is being changed.
     """
 
     image: Image
@@ -64,6 +68,7 @@ class Frame:
     mid_exposure_s: float
     exposure_s: float
     jpeg: bytes = field(default=b"", kw_only=True, repr=False)
+    settings: Mapping[str, float | None] = field(default_factory=dict, kw_only=True)
 
     @property
     def exposure_began_s(self) -> float:
@@ -249,6 +254,61 @@ class HoldsExposure(Protocol):
 
     def exposure_held(self) -> AbstractContextManager[None]:
         """Return a context in which the exposure does not change: a measurement compares its pictures."""
+        ...
+
+
+SETTINGS: Mapping[str, str] = MappingProxyType(
+    {"exposure_s": "s", "gain": "", "white_balance_k": "K", "focus": ""}
+)
+"""The settings that may change while a camera runs, with their units; empty for the device's own."""
+
+
+@dataclass(frozen=True)
+class CameraSetting:
+    """One setting of a camera as it is now.
+
+    Attributes
+    ----------
+    name
+        One of `SETTINGS`, which also has its unit.
+    value
+        None if it is not known: its automatic is on, or the camera does not say.
+    minimum, maximum, step
+        Its bounds; a step of 0: any value between them.
+    automatic
+        Whether the camera's own automatic sets it.
+    refusal
+        Why it cannot be changed, in words that follow its name; empty if it can.
+    """
+
+    name: str
+    value: float | None
+    minimum: float
+    maximum: float
+    step: float = 0.0
+    automatic: bool = False
+    refusal: str = ""
+
+
+@runtime_checkable
+class Adjustable(Protocol):
+    """A camera whose settings can be changed while it runs; not every camera's can."""
+
+    def settings(self) -> Sequence[CameraSetting]:
+        """Return those that it has. Raises DriverError."""
+        ...
+
+    def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
+        """Change some, each with its automatic turned off; return a sentence for each that became another.
+
+        They are within their bounds. Frames exposed from the return on have them, or None for them.
+        A camera that went away and came back has them still.
+
+        Raises
+        ------
+        BadSetting, DriverError
+            If the camera refuses one; those before it have changed.
+        """
         ...
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -29,6 +30,9 @@ class FrameFacts:
     pan_approach, tilt_approach
         From which side each axis had come: 1 from smaller readings, -1 from larger, 0 not known, between
         them where it had not gone through all of its play.
+    settings
+        Exposure time, gain, ... that it was taken with, by the names of `drivers.interfaces.SETTINGS`; None
+        for what is not known of this picture, as while it was being changed.
     """
 
     frame_id: str
@@ -44,6 +48,7 @@ class FrameFacts:
     true_tilt_rad: float = field(kw_only=True)
     pan_approach: float = field(kw_only=True, default=0.0)
     tilt_approach: float = field(kw_only=True, default=0.0)
+    settings: Mapping[str, float | None] = field(kw_only=True, default_factory=dict)
 
     @property
     def true_rad(self) -> tuple[float, float]:
@@ -72,9 +77,21 @@ def described_headers() -> dict[str, Any]:
     """Return how OpenAPI describes these headers."""
     kinds = {"str": "string", "int": "integer", "float": "number", "bool": "boolean"}
     return {
-        _HEADERS[one.name]: {"required": True, "schema": {"type": kinds[str(one.type)]}}
+        _HEADERS[one.name]: {"required": True, "schema": {"type": kinds.get(str(one.type), "string")}}
         for one in fields(FrameFacts)
     }
+
+
+def _settings_in(text: str) -> dict[str, float | None]:
+    """What a picture was taken with, from JSON. Raises ValueError."""
+    told = json.loads(text)
+    if not isinstance(told, dict) or not all(value is None or _is_number(value) for value in told.values()):
+        raise ValueError("an object of numbers is expected")
+    return {name: None if value is None else float(value) for name, value in told.items()}
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 _HEADERS = {one.name: "X-Mastctl-" + one.name.replace("_", "-").title() for one in fields(FrameFacts)}
@@ -83,4 +100,5 @@ _READ: Mapping[str, Callable[[str], Any]] = {
     "int": int,
     "float": float,
     "bool": {"true": True, "false": False}.__getitem__,
+    "Mapping[str, float | None]": _settings_in,
 }

@@ -9,7 +9,7 @@ capture ring would.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.clock import Clock
-from drivers.errors import NoFreshFrame, NoReply
+from drivers.errors import BadSetting, NoFreshFrame, NoReply
 from drivers.faults import Fault, FaultPanel
-from drivers.interfaces import Frame, FrameTime, HoldsExposure, Image
+from drivers.interfaces import CameraSetting, Frame, FrameTime, HoldsExposure, Image
 from drivers.sim.camera_settings import CameraClock, CameraSettings, ClockSettings
 from drivers.sim.optics.exposure import AutoExposure, FixedExposure, FrameExposure
 from drivers.sim.optics.readout import Noise, Readout
@@ -29,8 +29,13 @@ from drivers.sim.optics.readout import Noise, Readout
 RING_FRAMES = 4
 """Finished frames that can still be fetched, as in a capture ring of four buffers."""
 
-ANY, NEXT_FRAME, CLOSE, RECENT_TIMES, SIZE_PX, EXPOSURE_HELD = range(6)
+ANY, NEXT_FRAME, CLOSE, RECENT_TIMES, SIZE_PX, EXPOSURE_HELD, SETTINGS = range(7)
 """What the parameter ``call`` names."""
+
+SHORTEST_S, LONGEST_SHARE = 1e-5, 0.99
+"""Bounds of an exposure set at run time: the longest is a share of what a frame has room for."""
+
+GAINS = 1.0, 64.0
 
 LOOKED_AGAIN_S = 0.5
 """For a clock that is turned by hand: it wakes nobody."""
@@ -152,6 +157,35 @@ class SimulatedCamera:
             self._clock.sleep(min(min(ready_s, deadline_s) - now_s, 0.5))
         raise NoFreshFrame(self._instead(exposed_after_s, timeout_s), device=self.name)
 
+    def settings(self) -> list[CameraSetting]:
+        """Return exposure and gain; its focus stands fixed."""
+        fixed = isinstance(self._exposure, FixedExposure)
+        exposure_s, gain = self._exposure.now if isinstance(self._exposure, FixedExposure) else (None, None)
+        refusal = "" if fixed else "is set by simulation.cameras.exposure.auto"
+        longest_s = LONGEST_SHARE * (1 / self._settings.rate_hz - self._rolling_s)
+        return [
+            CameraSetting("exposure_s", exposure_s, SHORTEST_S, longest_s, 0.0, not fixed, refusal),
+            CameraSetting("gain", gain, *GAINS, 0.0, not fixed, refusal),
+        ]
+
+    def adjust(self, wanted: Mapping[str, float]) -> list[str]:
+        """Expose frames that begin from now on otherwise; nothing becomes another than wanted.
+
+        Raises
+        ------
+        BadSetting
+            For a camera that sets its exposure itself, and for a setting that it lacks.
+        """
+        lacks = set(wanted) - {"exposure_s", "gain"}
+        if lacks or not isinstance(self._exposure, FixedExposure):
+            words = f"the simulated camera has no {min(lacks)}" if lacks else "it sets its exposure itself"
+            raise BadSetting(words, device=self.name)
+        exposure_s, gain = self._exposure.now
+        self._exposure.change(
+            wanted.get("exposure_s", exposure_s), wanted.get("gain", gain), self._clock.now_s()
+        )
+        return []
+
     @property
     def period_s(self) -> float:
         """From frame to frame, seconds, at the rate of now."""
@@ -199,7 +233,7 @@ class SimulatedCamera:
         """How long after its exposure begins a frame can be had."""
         delayed = self._faults.find(self.name, "delayed", now_s)
         late_s = delayed.number("delay_s") if delayed else 0.0
-        return self._rolling_s + self._exposure.longest_s + self._settings.readout_s + late_s
+        return self._rolling_s + self._exposure.longest_s(now_s) + self._settings.readout_s + late_s
 
     def _is_missing(self, sequence: int, epoch: _Epoch) -> bool:
         """Whether a fault keeps this frame from coming at all."""
@@ -221,7 +255,8 @@ class SimulatedCamera:
                 image.setflags(write=False)
                 begin_s, all_rows_s = epoch.begin_s(sequence), shot.exposure_s + self._rolling_s
                 stamp_s = self._own.stamp_s(begin_s) + all_rows_s / 2
-                self._last = Frame(image, sequence, stamp_s, all_rows_s)
+                told = {"exposure_s": shot.exposure_s, "gain": shot.gain}
+                self._last = Frame(image, sequence, stamp_s, all_rows_s, settings=told)
                 self._taken(sequence, begin_s + all_rows_s / 2)
             return self._last
 
@@ -335,6 +370,18 @@ class HangingCamera:
         """Let go."""
         self._hang(CLOSE)
         self._camera.close()
+
+    def settings(self) -> Sequence[CameraSetting]:
+        """Return its settings, as the camera behind it."""
+        self._hang(SETTINGS)
+        told: Sequence[CameraSetting] = self._camera.settings()
+        return told
+
+    def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
+        """Change some of them, as the camera behind it."""
+        self._hang(SETTINGS)
+        notes: Sequence[str] = self._camera.adjust(wanted)
+        return notes
 
     @property
     def size_px(self) -> tuple[int, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 from drivers import pixels
 from drivers.clock import Clock, SystemClock
 from drivers.errors import NoCamera, NoFreshFrame, StreamFailed
-from drivers.interfaces import Frame, FrameTime
+from drivers.interfaces import CameraSetting, Frame, FrameTime
 from drivers.v4l2 import find
 from drivers.v4l2.capture import Bytes, Capture, Counters
 from drivers.v4l2.controls import get_value, list_controls
@@ -131,6 +131,7 @@ class V4l2Camera:
         self._last = V4l2Frame(
             image=image,
             jpeg=jpeg,
+            settings=arrived.settings,
             sequence=arrived.sequence,
             mid_exposure_s=window.mid_s,
             exposure_s=window.length_s,
@@ -175,12 +176,21 @@ class V4l2Camera:
                 ],
             }  # fmt: skip
 
+    def settings(self) -> list[CameraSetting]:
+        """Return exposure, gain, white balance and focus, as far as it has them. Raises DriverError."""
+        return self.capture.settings()
+
+    def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
+        """Change some of them, as `drivers.interfaces.Adjustable.adjust`."""
+        return self.capture.adjust(wanted)
+
     @contextmanager
     def exposure_held(self) -> Iterator[None]:
         """Keep the exposure as it is inside the block: for a measurement that compares pictures.
 
         A change that this camera's group decided on before is first made, and waited for until it shows, for
-        eight periods (1 s) at most. What was not made by then is made after the block.
+        eight periods (1 s) at most. What was not made by then is made after the block. A change of settings
+        that was made before is waited for likewise.
 
         Raises
         ------
@@ -189,10 +199,12 @@ class V4l2Camera:
         """
         control = self._exposure
         if control is None:
+            self._await_settings()
             yield
             return
         control.hold()
         try:
+            self._await_settings()
             self._await_change(control)
             try:
                 yield
@@ -201,6 +213,10 @@ class V4l2Camera:
                     self._holds -= 1
         finally:
             control.release()
+
+    def _await_settings(self) -> None:
+        """Wait until what was set before a hold shows."""
+        self.capture.await_settled(min(HOLD_MOST_S, HOLD_PERIODS * self.capture.period_s))
 
     def _await_change(self, control: ExposureControl) -> None:
         """Count a hold in, once the exposure is the group's and shows, or no frame comes to say so."""

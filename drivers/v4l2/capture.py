@@ -13,7 +13,7 @@ import select
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 
@@ -23,12 +23,13 @@ from numpy.typing import NDArray
 from drivers import pixels
 from drivers.clock import Clock
 from drivers.errors import BadFrame, DriverError, NoCamera, StreamFailed
-from drivers.interfaces import Image
+from drivers.interfaces import CameraSetting, Image
 from drivers.pixels import PictureFormat
-from drivers.v4l2 import abi
+from drivers.v4l2 import abi, find
 from drivers.v4l2.node import Dequeued, Node
 from drivers.v4l2.options import CameraOptions
-from drivers.v4l2.stamps import Arrived, Spacing, StampCheck, Timing, exposure_window
+from drivers.v4l2.settings import EXPOSURE, change, settings_of, with_settings
+from drivers.v4l2.stamps import Arrived, Spacing, StampCheck, Timing, ValuesSet, exposure_window
 from drivers.v4l2.stream import Stream
 
 log = logging.getLogger(__name__)
@@ -126,6 +127,8 @@ class Capture:
         self._between = between
         self._exposure_s = exposure_s
         self._shared = _Shared()
+        self._opening = threading.Lock()
+        self._in_force: Mapping[str, ValuesSet] = {}  # of the stream that was opened last
         self._pause_s = FIRST_PAUSE_S
         self._streams = 0
         self._offset: int | None = 0  # from the driver's count to ours; None until a new stream's first frame
@@ -138,6 +141,7 @@ class Capture:
             opened.callback(stream.close)
             self.format = stream.format
             self.period_s = stream.period_s
+            self._rate_told = stream.rate_told
             self.problems = tuple(stream.problems)
             self.identity = stream.node.identity
             self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -222,6 +226,39 @@ class Capture:
                 shared.counters.damaged += 1
                 shared.counters.last_damage = str(error)
         return shared.picture
+
+    def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
+        """Change settings; a stream that is opened later has them too.
+
+        Raises
+        ------
+        BadSetting, DriverError
+            As `drivers.interfaces.Adjustable.adjust`.
+        """
+        with self._opening, find.open_node(self._options.address, self._name) as node:
+            became, notes, refused = change(node, wanted, self._in_force, self._clock, self._name)
+            self._options = with_settings(self._options, became)
+        if refused is not None:
+            raise refused
+        return notes
+
+    def settings(self) -> list[CameraSetting]:
+        """Return what may be changed, as the camera has it now. Raises DriverError."""
+        with find.open_node(self._options.address, self._name) as node:
+            return settings_of(node, self._options, self.period_s if self._rate_told else None)
+
+    def await_settled(self, timeout_s: float) -> None:
+        """Wait until a frame came that shows no setting of before, or none will, for so long at most."""
+        shared = self._shared
+        with shared.changed:
+            shared.changed.wait_for(
+                lambda: (
+                    shared.closed
+                    or bool(shared.lost)
+                    or all(values.settled for values in self._in_force.values())
+                ),
+                timeout_s,
+            )
 
     def close(self) -> None:
         """End the thread and let go of the camera.
@@ -326,16 +363,18 @@ class Capture:
                 shared.counters.last_damage = wrong
             stream.node.queue(buffer.number)
             return
-        timing = Timing(
-            *stream.exposures.of(sequence, buffer.stamp_s), *self._spacing.see(sequence, buffer.stamp_s)
-        )
+        told = {name: values.of(sequence, buffer.stamp_s) for name, values in stream.in_force.items()}
+        timing = Timing(*told[EXPOSURE.name], *self._spacing.see(sequence, buffer.stamp_s))
         window = exposure_window(stream.rule, timing, buffer.flags, buffer.stamp_s, received_s)
         if window is None:
             with self._shared.changed:
                 self._shared.counters.dropped += dropped
             stream.node.queue(buffer.number)
             return
-        arrived = Arrived(buffer, stream.format, timing, window, sequence, self._streams, received_s)
+        settings = {name: value for name, (value, _) in told.items()}
+        arrived = Arrived(
+            buffer, stream.format, timing, window, sequence, self._streams, received_s, settings
+        )
         with (shared := self._shared).changed:
             shared.counters.dropped += dropped
             shared.counters.good += 1
@@ -396,8 +435,10 @@ class Capture:
         return stream
 
     def _open(self) -> Stream:
-        exposure_s = None if self._exposure_s is None else self._exposure_s()
-        stream = Stream(self._options, self._name, self._clock, exposure_s)
+        with self._opening:
+            exposure_s = None if self._exposure_s is None else self._exposure_s()
+            stream = Stream(self._options, self._name, self._clock, exposure_s)
+            self._in_force = stream.in_force
         self._check = StampCheck()
         self._spacing = Spacing(stream.period_s if stream.rate_told else None, stream.rule.margin_s)
         self._lengths = pixels.whole_lengths(stream.format)

@@ -69,10 +69,14 @@ class CameraControl:
 
 @dataclass(frozen=True)
 class ControlProblem:
-    """A control that is not as it was asked for, in one plain sentence."""
+    """A control that is not as it was asked for, in one plain sentence.
+
+    ``became``: what it is instead; None if the camera did not take it.
+    """
 
     control: str
     message: str
+    became: int | None = None
 
 
 def list_controls(node: Node) -> list[CameraControl]:
@@ -123,9 +127,8 @@ def set_value(node: Node, control: CameraControl, value: Value) -> ControlProble
         return ControlProblem(control.name, f"{control.name} does not take {value!r}: {refused}")
     became = get_value(node, control)
     if became is not None and became != number:
-        return ControlProblem(
-            control.name, f"{control.name} is {became} where {number} was set{_range(control)}"
-        )
+        words = f"{control.name} is {became} where {number} was set{_range(control)}"
+        return ControlProblem(control.name, words, became)
     return None
 
 

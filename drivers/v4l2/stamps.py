@@ -7,6 +7,8 @@ late enough, so every uncertainty makes the window longer and never lets an old 
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -95,6 +97,8 @@ class Arrived(NamedTuple):
         Our own count, which grows over every reopening, and the number of the stream.
     received_s
         When it was dequeued, seconds of CLOCK_MONOTONIC.
+    settings
+        Exposure, gain, ... of it, as `drivers.interfaces.Frame` has them.
     """
 
     buffer: Dequeued
@@ -104,6 +108,7 @@ class Arrived(NamedTuple):
     sequence: int
     stream: int
     received_s: float
+    settings: Mapping[str, float | None]
 
 
 def exposure_window(
@@ -221,46 +226,74 @@ class StampCheck:
 
 @dataclass
 class _Setting:
-    """An exposure time and when it was in force; ``over_at`` is the first count that cannot show it."""
+    """A value and when it was in force; ``over_at`` is the first count that cannot show it."""
 
-    exposure_s: float | None
+    value: float | None
     since_s: float
     until_s: float | None = None
     over_at: int | None = None
 
 
-class ExposuresSet:
-    """The exposure times that were set on one stream, as long as a frame may show them.
+class ValuesSet:
+    """The values of one setting on one stream, as long as a frame may show them; safe from any thread.
 
     Parameters
     ----------
-    exposure_s
-        What is in force from the first frame on, seconds; None if that is not known.
+    value
+        The one in force from the first frame on; None if that is not known.
     """
 
-    def __init__(self, exposure_s: float | None) -> None:
-        self._settings = [_Setting(exposure_s, float("-inf"))]
+    def __init__(self, value: float | None) -> None:
+        self._settings = [_Setting(value, float("-inf"))]
+        self._lock = threading.Lock()
 
-    def change(self, exposure_s: float | None, began_s: float, ended_s: float) -> None:
+    @property
+    def newest(self) -> float | None:
+        """The value that was set last; None if that is not known."""
+        return self._settings[-1].value
+
+    @property
+    def settled(self) -> bool:
+        """Whether the last frame could show nothing but the newest value."""
+        return len(self._settings) == 1
+
+    def begin(self, began_s: float) -> None:
+        """Take in that another one is being set from a moment of CLOCK_MONOTONIC on."""
+        with self._lock:
+            self._settings.append(_Setting(None, began_s))
+
+    def end(self, value: float | None, ended_s: float) -> None:
+        """Take in which one it has become."""
+        with self._lock:
+            self._settings[-2].until_s = ended_s
+            self._settings[-1].value = value
+
+    def change(self, value: float | None, began_s: float, ended_s: float) -> None:
         """Take in that another one was set, between two moments of CLOCK_MONOTONIC."""
-        self._settings[-1].until_s = ended_s
-        self._settings.append(_Setting(exposure_s, began_s))
+        self.begin(began_s)
+        self.end(value, ended_s)
 
     def of(self, sequence: int, stamp_s: float) -> tuple[float | None, float | None]:
-        """Return a frame's exposure time and the longest that it may have; None for what is not known.
+        """Return a frame's value and the highest that it may have; None for what is not known.
 
         Frames are asked for in their order; one that was stamped before a change knows nothing of it.
         """
+        if len(self._settings) == 1:
+            return self._settings[0].value, self._settings[0].value
+        with self._lock:
+            return self._of(sequence, stamp_s)
+
+    def _of(self, sequence: int, stamp_s: float) -> tuple[float | None, float | None]:
         found: list[float | None] = []
         for setting in self._settings:
             if setting.until_s is not None and setting.over_at is None and stamp_s > setting.until_s:
                 setting.over_at = sequence + SETTLE_FRAMES
             if setting.since_s <= stamp_s and (setting.over_at is None or sequence < setting.over_at):
-                found.append(setting.exposure_s)
+                found.append(setting.value)
         while self._settings[0].over_at is not None and sequence >= self._settings[0].over_at:
             del self._settings[0]
-        known = [exposure_s for exposure_s in found if exposure_s is not None]
+        known = [value for value in found if value is not None]
         if len(known) < len(found):
             return None, None
-        longest_s = max(known)
-        return (longest_s if min(known) == longest_s else None), longest_s
+        highest = max(known)
+        return (highest if min(known) == highest else None), highest

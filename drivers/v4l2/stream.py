@@ -20,11 +20,11 @@ from drivers.v4l2.controls import (
 )
 from drivers.v4l2.node import Node
 from drivers.v4l2.options import CameraOptions
-from drivers.v4l2.stamps import ExposuresSet, StampRule
+from drivers.v4l2.settings import EXPOSURE, EXPOSURE_UNIT_S, MEANINGS, value_of
+from drivers.v4l2.stamps import StampRule, ValuesSet
 
 log = logging.getLogger(__name__)
 
-EXPOSURE_UNIT_S = 1e-4  # of V4L2_CID_EXPOSURE_ABSOLUTE
 RATE_TOLERANCE = 0.02  # 30 Hz is often 30000/1001
 UNKNOWN_RATE_HZ = 5.0  # a period longer than any that a camera without a rate is likely to have
 
@@ -42,8 +42,8 @@ class Stream:
         Whether the camera itself told that rate.
     rule
         How the time stamps are to be read.
-    exposures
-        With which exposure times a frame may have been taken.
+    in_force
+        With which exposure time, gain, ... a frame may have been taken, of those that it has.
     exposure_s
         The exposure time by the camera's own word, None if unknown: also where its automatic stayed on.
     asked_exposure_s
@@ -69,7 +69,7 @@ class Stream:
         self.exposure_s: float | None = None
         self.asked_exposure_s: float | None = None
         self.problems: list[ControlProblem] = []
-        self.exposures = ExposuresSet(None)
+        self.in_force = {EXPOSURE.name: ValuesSet(None)}
         self._exposure: CameraControl | None = None
         self._automatic_stays = False
         self.node = find.open_node(options.address, name)
@@ -102,7 +102,7 @@ class Stream:
         became = get_value(self.node, self._exposure)
         known = became is not None and not self._automatic_stays
         self.exposure_s = became * EXPOSURE_UNIT_S if became is not None and known else None
-        self.exposures.change(self.exposure_s, began_s, self._clock.now_s())
+        self.in_force[EXPOSURE.name].change(self.exposure_s, began_s, self._clock.now_s())
 
     def _check_exposure(self, exposure_s: float | None, words: str) -> None:
         """Refuse an exposure time that is longer than a frame. Raises UnsupportedFormat."""
@@ -122,29 +122,26 @@ class Stream:
         self.problems += set_by_name(self.node, options.controls)
         controls = list_controls(self.node)
         if exposure_s is not None:
-            self._automatic_stays = not self._turn_off(controls, abi.CID_EXPOSURE_AUTO, abi.EXPOSURE_MANUAL)
+            self._automatic_stays = not self._turn_off(controls, EXPOSURE.automatic, EXPOSURE.off)
             self._turn_off(controls, abi.CID_EXPOSURE_AUTO_PRIORITY, 0)
-            self._exposure = first_of(controls, (abi.CID_EXPOSURE_ABSOLUTE,))
+            self._exposure = first_of(controls, (EXPOSURE.control,))
             if self._exposure is None:
                 self._missing("exposure", "exposure_s")
             self.set_exposure(exposure_s)
-        for word, auto, which, value in (
-            ("gain", abi.CID_AUTOGAIN, abi.CID_GAIN, options.gain),
-            (
-                "white balance",
-                abi.CID_AUTO_WHITE_BALANCE,
-                abi.CID_WHITE_BALANCE_TEMPERATURE,
-                options.white_balance_k,
-            ),
-            ("focus", abi.CID_FOCUS_AUTO, abi.CID_FOCUS_ABSOLUTE, options.focus),
-        ):
-            if value is None:
-                continue
-            self._turn_off(controls, auto, 0)
-            if (control := first_of(controls, (which,))) is None:
-                self._missing(word, word)
-            elif problem := set_value(self.node, control, value):
-                self.problems.append(problem)
+        for one in MEANINGS[1:]:
+            control, value = first_of(controls, (one.control,)), getattr(options, one.name)
+            began_s = self._clock.now_s()
+            if value is not None:
+                self._turn_off(controls, one.automatic, one.off)
+                if control is None:
+                    self._missing(one.word, one.word)
+                elif problem := set_value(self.node, control, value):
+                    self.problems.append(problem)
+            if control is not None:
+                now = value_of(self.node, controls, one)
+                self.in_force[one.name] = ValuesSet(now if value is None else None)
+                if value is not None:
+                    self.in_force[one.name].change(now, began_s, self._clock.now_s())
         for problem in self.problems:
             log.warning("%s: %s", self._name, problem.message)
 

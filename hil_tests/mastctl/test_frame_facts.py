@@ -22,6 +22,7 @@ FACTS = FrameFacts(
     true_tilt_rad=0.1 + 1e-9,
     pan_approach=-1.0,
     tilt_approach=1 / 3,
+    settings={"exposure_s": 1 / 7, "gain": None},
 )
 
 
@@ -33,7 +34,14 @@ def test_every_fact_comes_back_to_the_last_bit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("header", "value"), [("Moving", "1"), ("Sequence", "7.0"), ("Pan-Rad", "left"), ("Camera", None)]
+    ("header", "value"),
+    [
+        ("Moving", "1"),
+        ("Sequence", "7.0"),
+        ("Pan-Rad", "left"),
+        ("Camera", None),
+        ("Settings", '{"gain": true}'),
+    ],
 )
 def test_a_fact_that_is_missing_or_of_another_kind_is_refused(header: str, value: str | None) -> None:
     headers = headers_of(FACTS)

@@ -100,7 +100,7 @@ def test_every_route_has_its_row_and_no_other(routes: set[tuple[str, str]], repo
 
 def test_the_client_asks_for_every_route(routes: set[tuple[str, str]]) -> None:
     source = "".join(map(inspect.getsource, (calls, jog, keeping_calls, lease, simulation_calls)))
-    asked = re.findall(r'"(GET|POST|DELETE)", f?"([^"]+)"', source)
+    asked = re.findall(r'"(GET|POST|PATCH|DELETE)", f?"([^"]+)"', source)
     asked += [("GET", path) for path in re.findall(r'heard\("([^"]+)"', source)]
     monitors = {("GET", path) for path in ("/metrics", "/health/live", "/health/ready")}
     assert {(method, plain(path)) for method, path in asked} == routes - monitors

@@ -41,6 +41,7 @@ class FrameTold(TypedDict):
     true_tilt_rad: float
     pan_approach: float
     tilt_approach: float
+    settings: dict[str, float | None]
     age_s: Seconds
 
 

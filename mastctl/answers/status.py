@@ -92,6 +92,32 @@ class CameraTold(TypedDict):
     age_s: Seconds | None
 
 
+class CameraSettingTold(TypedDict):
+    """A setting of a camera: ``value`` null if not known, ``step`` 0 for any value between the bounds,
+    ``refusal`` why it cannot be changed, null if it can."""
+
+    name: str
+    value: float | None
+    minimum: float
+    maximum: float
+    step: float
+    unit: str
+    automatic: bool
+    refusal: str | None
+
+
+class CameraSettingsTold(TypedDict):
+    """The settings of a camera that can change; ``held``: an operation keeps them as they are.
+
+    ``notes``: a sentence for each setting that became another than asked for.
+    """
+
+    camera: str
+    settings: list[CameraSettingTold]
+    held: bool
+    notes: list[str]
+
+
 class FaultTold(TypedDict):
     """A fault of a device in plain words, since when, and the event that ends it."""
 

@@ -1,4 +1,4 @@
-"""Commands on connected cameras: camera list, grab, focus; check and sync are in modules of their own."""
+"""Commands on cameras: camera list, grab, focus, settings; sync is in a module of its own."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from drivers.interfaces import SETTINGS
 from mastctl.cli import camera_sync, output
 from mastctl.cli.camera_sync import (
     FRAME_TIMEOUT_S,
@@ -17,6 +18,7 @@ from mastctl.cli.camera_sync import (
     with_cameras,
 )
 from mastctl.cli.output import finite_number, positive_number
+from mastctl.cli.service import add_daemon_options, client_of
 
 if TYPE_CHECKING:
     from drivers.v4l2.camera import V4l2Camera
@@ -48,6 +50,54 @@ def add_actions(actions: Any) -> None:
     )
     focus.add_argument("--seconds", type=positive_number, default=60.0, metavar="S", help="default 60")
     focus.set_defaults(run=camera_focus)
+
+    settings = actions.add_parser(
+        "settings", help="show a daemon's camera's exposure, gain, white balance and focus, or change them"
+    )
+    settings.add_argument("camera", metavar="CAMERA", help="the camera's name in the configuration")
+    settings.add_argument(
+        "changes", nargs="*", type=_change, metavar="NAME=VALUE", help="as exposure_s=0.004 or gain=20"
+    )
+    settings.set_defaults(run=camera_settings)
+    add_daemon_options(settings)
+
+
+def _change(text: str) -> tuple[str, float]:
+    """A change as it is typed. Raises ArgumentTypeError."""
+    name, sign, value = text.partition("=")
+    if not sign or name not in SETTINGS:
+        words = f"{text!r} where NAME=VALUE is expected, with the name one of {', '.join(SETTINGS)}"
+        raise argparse.ArgumentTypeError(words)
+    return name, finite_number(value)
+
+
+def camera_settings(args: argparse.Namespace) -> int:
+    """Show what a camera is set to, after changing it if that is asked for."""
+    with client_of(args) as client:
+        if args.changes:
+            told = client.set_camera(args.camera, **dict(args.changes))
+        else:
+            told = client.camera_settings(args.camera)
+    if args.json:
+        output.print_json(told)
+        return 0
+    rows = [
+        (
+            one["name"],
+            "automatic" if one["automatic"] else "not known" if one["value"] is None else f"{one['value']:g}",
+            f"{one['minimum']:g} to {one['maximum']:g}" + (f", step {one['step']:g}" if one["step"] else ""),
+            one["unit"],
+            one["refusal"] or "",
+        )
+        for one in told["settings"]
+    ]
+    if not rows:
+        sys.stdout.write(f"nothing of {told['camera']} can be changed while it runs\n")
+        return 0
+    output.print_table(told["camera"], ("setting", "value", "bounds", "unit", "cannot change: it"), rows)
+    for note in [*told["notes"], *(["an operation holds them"] if told["held"] else [])]:
+        output.tell(note)
+    return 0
 
 
 def camera_list(args: argparse.Namespace) -> int:

@@ -132,6 +132,8 @@ class Client:
     calibration_health = waits(Calls.calibration_health)
     sentinel = waits(Calls.sentinel)
     rig = waits(Calls.rig)
+    camera_settings = waits(Calls.camera_settings)
+    set_camera = waits(Calls.set_camera)
     bench = waits(Calls.bench)
     begin_bench = waits(Calls.begin_bench)
     board_stands = waits(Calls.board_stands)

@@ -10,6 +10,7 @@ from mastctl.answers import (
     BenchRunTold,
     BenchTold,
     CalibrationHealthTold,
+    CameraSettingsTold,
     HistoryTold,
     LoggedOut,
     MastsTold,
@@ -53,6 +54,33 @@ class KeepingCalls:
     async def rig(self) -> RigTold:
         """Return the configured cameras by the mast file in use: where each looks and how much it sees."""
         return await self._daemon.json(RigTold, "GET", "/rig")
+
+    async def camera_settings(self, camera: str) -> CameraSettingsTold:
+        """Return what of a camera can be changed: ``settings`` with bounds, and whether they are ``held``."""
+        return await self._daemon.json(
+            CameraSettingsTold, "GET", f"/cameras/{quote(camera, safe='')}/settings"
+        )
+
+    async def set_camera(
+        self,
+        camera: str,
+        *,
+        exposure_s: float | None = None,
+        gain: float | None = None,
+        white_balance_k: float | None = None,
+        focus: float | None = None,
+    ) -> CameraSettingsTold:
+        """Change some of a camera's settings and return all as they are then.
+
+        The automatic of each is turned off. ``notes`` has a sentence for each that became another than asked
+        for. They hold until the daemon ends, also for a camera that is unplugged meanwhile. Each picture's
+        facts have those that it was taken with.
+        """
+        given = {"exposure_s": exposure_s, "gain": gain, "white_balance_k": white_balance_k, "focus": focus}
+        body = {name: value for name, value in given.items() if value is not None}
+        return await self._daemon.command(
+            CameraSettingsTold, "PATCH", f"/cameras/{quote(camera, safe='')}/settings", body
+        )
 
     async def bench(self) -> BenchTold:
         """Return the bench calibration at work or the last one (``run``), and those that are kept."""

@@ -72,6 +72,7 @@ TRACK_STOP = Command("track.stop", steers=True)
 MAST = Command("mast", steers=True)  # the service asks whether the head rests, after reading it
 MAST_BACK = Command("mast.back", steers=True)
 RELOAD = Command("reload", "admin", steers=True)  # asked as a mast file is
+CAMERA_SETTINGS = Command("camera.settings", steers=True, need="idle")
 POSE = Command(
     "pose"
 )  # a fact about the rover, told by who knows it; the track that looks has its own holder

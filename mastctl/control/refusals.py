@@ -8,7 +8,7 @@ from mastctl.control.standing import CLOSING, Standing, latched_sentence
 from mastctl.control.table import TABLE, Event
 from mastctl.errors import MastctlError, NotNow, Unable
 
-Need = Literal["motion", "track", "rest", "latch"]
+Need = Literal["motion", "track", "rest", "idle", "latch"]
 
 
 def refusal_of(now: Standing, need: Need) -> MastctlError | None:
@@ -21,6 +21,7 @@ def refusal_of(now: Standing, need: Need) -> MastctlError | None:
     need
         ``motion``: no operation runs, no stop is under way, nothing is latched, the service is not closing.
         ``track``: that, and no track is active. ``rest``: no operation runs and the head does not move.
+        ``idle``: no operation runs, and no stop is under way; the head may move, or be latched.
         ``latch``: an emergency stop is latched, and its stop is over.
 
     Returns
@@ -38,7 +39,7 @@ def refusal_of(now: Standing, need: Need) -> MastctlError | None:
         return NotNow("not_estopped", "no emergency stop is latched; there is nothing to reset")
     if to == "refused: stopping":
         return NotNow("stopping", f"{now.reason}; ask again when that is over")
-    if to == "refused: estopped" and need != "rest":
+    if to == "refused: estopped" and need not in ("rest", "idle"):
         return NotNow("estopped", now.reason if now.latch is None else latched_sentence(now.latched))
     if need == "latch":
         return None

@@ -25,7 +25,7 @@ from drivers.frame_times import Offset, Pairing, learned
 from drivers.interfaces import Camera, Frame, FrameTime, KnowsSize, Paced, Reading
 from mastctl.control.standing import StandingFault
 from mastctl.devices import frames as frame_checks
-from mastctl.devices.exposure_hold import ExposureHold
+from mastctl.devices.camera_settings import CameraSettings
 from mastctl.devices.fault_watch import FaultWords
 from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import JointHistory
@@ -66,6 +66,11 @@ class Cameras:
     grace_s
         How long past its time a camera may take before it counts as hanging, seconds; 3 by default.
 
+    Attributes
+    ----------
+    settings
+        The settings of each.
+
     Raises
     ------
     BadFrame
@@ -85,6 +90,8 @@ class Cameras:
         grace_s: float | None,
     ) -> None:
         self._cameras = dict(cameras)
+        self._threads: dict[str, DeviceThread] = {}
+        self.settings = CameraSettings(self._cameras, self._threads, clock)
         self._store = store
         self._history = history
         self._read = read
@@ -105,7 +112,7 @@ class Cameras:
         self._people = SystemClock()  # who only watches lives in real time
         self._row: list[object] = []  # where a glance holds up the clock: one after the other as they came
         self._glance_from_s = 0.0  # and not before this moment
-        self._threads = {name: self._thread_of(name) for name in self._cameras}
+        self._threads.update({name: self._thread_of(name) for name in self._cameras})
         if rig is not None:
             self._check_sizes()
 
@@ -343,12 +350,9 @@ class Cameras:
     def exposure_held(self) -> Iterator[None]:
         """Keep every camera's exposure as it is inside the block: a measurement compares its pictures.
 
-        Nothing is waited for; see `mastctl.devices.exposure_hold`.
+        Nothing is waited for; see `mastctl.devices.camera_settings`.
         """
-        holds = [
-            ExposureHold(thread, partial(self._cameras.__getitem__, name))
-            for name, thread in self._threads.items()
-        ]
+        holds = [self.settings.hold(name) for name in self._threads]
         begun = [hold for hold in holds if hold.begin()]
         try:
             yield
@@ -360,10 +364,12 @@ class Cameras:
         """Judge pictures by another mast file's sizes and mounts from now on."""
         self._sizes_px = {name: camera.model.size_px for name, camera in rig.cameras.items()}
         self._on_head = {name for name, camera in rig.cameras.items() if camera.on == "head"}
+        self.settings.calibrated()
 
     def faults(self) -> list[StandingFault]:
         """Return what is wrong with any camera now."""
-        return [fault for thread in self._threads.values() for fault in thread.faults()]
+        own = [fault for thread in self._threads.values() for fault in thread.faults()]
+        return own + self.settings.faults()
 
     def errors(self) -> dict[tuple[str, str, str], int]:
         """Return how often calls have failed since the start: by camera, call, and the error's code."""
@@ -484,6 +490,7 @@ class Cameras:
             true_tilt_rad=joints.true_rad[1],
             pan_approach=joints.approach[0],
             tilt_approach=joints.approach[1],
+            settings=frame.settings,
         )
         with self._stamping[camera]:
             self._check_alive(stamped)

@@ -18,13 +18,21 @@ from typing import Protocol
 from calib.geometry.rig import AxisJoint, JointErrors, Rig
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import BadReply, DriverError, LineLost, NoReply
-from drivers.interfaces import COARSE_COUNT_RAD, AxisReport, Camera, PanTilt, Reporting, StopsBeside
+from drivers.interfaces import (
+    COARSE_COUNT_RAD,
+    AxisReport,
+    Camera,
+    CameraSetting,
+    PanTilt,
+    Reporting,
+    StopsBeside,
+)
 from mastctl.control.machine import StateMachine
 from mastctl.control.standing import StandingFault
 from mastctl.devices import joint_history
 from mastctl.devices.cameras import Cameras
 from mastctl.devices.fault_watch import FaultWatch, FaultWords
-from mastctl.devices.frames import ASKED, KEPT_FRAMES, FrameStore, StampedFrame
+from mastctl.devices.frames import ASKED, KEPT_FRAMES, FrameStore, StampedFrame, check_known
 from mastctl.devices.joint_history import HeadReading, JointHistory
 from mastctl.devices.judge import REST_S, KeepOutJudge
 from mastctl.devices.keep_out import Pair
@@ -340,6 +348,16 @@ class Devices:
     def exposure_held(self) -> AbstractContextManager[None]:
         """Return a context in which every camera keeps its exposure, for a measurement."""
         return self._cameras.exposure_held()
+
+    def camera_settings(self, camera: str) -> tuple[list[CameraSetting], bool]:
+        """Return what a camera is set to, as `mastctl.devices.camera_settings.CameraSettings.told`."""
+        check_known(camera, self._cameras.newest_frames())
+        return self._cameras.settings.told(camera)
+
+    def set_camera(self, camera: str, wanted: Mapping[str, float]) -> list[str]:
+        """Change it, as `mastctl.devices.camera_settings.CameraSettings.change`."""
+        check_known(camera, self._cameras.newest_frames())
+        return self._cameras.settings.change(camera, wanted)
 
     # All
 

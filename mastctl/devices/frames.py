@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from drivers.errors import BadFrame, NoFreshFrame
-from drivers.interfaces import Frame, Image
+from drivers.interfaces import SETTINGS, Frame, Image
 from mastctl.errors import NoLonger, NotKnown, NotNow
 from mastctl.frame_facts import FrameFacts
 
@@ -126,7 +126,8 @@ def checked(
         image = image.copy()
         image.setflags(write=False)
     jpeg = getattr(answer, "jpeg", b"")
-    return Frame(image, sequence, mid_s, exposure_s, jpeg=jpeg if isinstance(jpeg, bytes) else b"")
+    told = jpeg if isinstance(jpeg, bytes) else b""
+    return Frame(image, sequence, mid_s, exposure_s, jpeg=told, settings=_settings(answer))
 
 
 def random_run() -> str:
@@ -299,6 +300,19 @@ def camera_and_sequence(frame_id: str) -> tuple[str, int]:
     if named is None:
         raise ValueError(f"'{frame_id[:120]}' is no frame id")
     return named[1], int(named[2])
+
+
+def _settings(answer: object) -> dict[str, float | None]:
+    """What a driver says that a frame was taken with; None for what is no number."""
+    told = getattr(answer, "settings", None)
+    known: dict[str, float | None] = {}
+    for name in SETTINGS:
+        if isinstance(told, Mapping) and name in told:
+            try:
+                known[name] = _number(told[name])
+            except (TypeError, ValueError):
+                known[name] = None
+    return known
 
 
 def _number(value: object) -> float:

@@ -46,6 +46,7 @@ _PROPERTIES: Mapping[str, Mapping[str, Any]] = {
         "exposure_s": _NUMBER, "pan_rad": _ANGLE, "tilt_rad": _ANGLE, "moving": {"type": "boolean"},
         "mast_digest": {"type": "string", "description": "SHA-256 of the mast file in use"},
         **_TRULY,
+        "settings": {"type": "object", "description": "exposure, gain, ... that it had; null: not known"},
         "colour": {"type": "boolean", "description": "whether the daemon used the picture in colour"},
     },
     "cahvor": {

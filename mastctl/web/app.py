@@ -23,7 +23,7 @@ from mastctl.service.service import Service
 from mastctl.web.entrance import Entrance
 from mastctl.web.events import add_events
 from mastctl.web.guard import Guard
-from mastctl.web.images import add_images
+from mastctl.web.images import add_cameras, add_images
 from mastctl.web.keeping import add_bench, add_masts, add_places, add_recordings
 from mastctl.web.page import add_page, text_answer
 from mastctl.web.parts import Here, Parts
@@ -115,7 +115,7 @@ def api() -> FastAPI:
     for add in (
         *(add_sessions, add_pointing, add_estop, add_lease, add_tracking, add_limits, add_masts, add_places),
         *(add_recordings, add_bench, add_simulation, add_watching, add_events, add_images, add_page),
-        add_site,
+        *(add_cameras, add_site),
     ):
         add(app)
 

@@ -1,4 +1,5 @@
-"""Pictures with their facts: one at a time, or through a WebSocket at the pace at which they are shown.
+"""Pictures with their facts, one at a time or through a WebSocket at the pace at which they are shown, and
+what the cameras are set to.
 
 A message is 4 bytes (the length of what follows, little-endian), the picture's facts as JSON, and the
 picture as JPEG. Whoever has shown one sends ``CAMERA`` or ``CAMERA MOST_BYTES`` back, and is sent another one
@@ -16,15 +17,19 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Query, Response, WebSocket
 from starlette.websockets import WebSocketDisconnect
 
+from drivers.interfaces import SETTINGS
+from mastctl.answers import CameraSettingsTold
 from mastctl.as_json import as_json
+from mastctl.control.entry import CAMERA_SETTINGS
 from mastctl.frame_facts import headers_of
 from mastctl.report.pictures import encoded
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
+from mastctl.web.commands import command
 from mastctl.web.connections import IMAGES
 from mastctl.web.events import GOING_AWAY
-from mastctl.web.models import ImagesQuery, SnapshotQuery
-from mastctl.web.parts import Here
+from mastctl.web.models import CameraSettingsBody, ImagesQuery, SnapshotQuery
+from mastctl.web.parts import Here, Parts
 from mastctl.web.pictures import Picture, WatchedCameras, Watcher
 from mastctl.web.refusals import query_of
 from mastctl.web.sockets import UNSUPPORTED
@@ -64,6 +69,46 @@ def add_images(app: FastAPI) -> None:
             with here.streams.listening((), frozenset()) as ending:  # counted as a listener, and ended as one
                 await line.accept()
                 await _Line(here.service, here.watched, line, query).run(asyncio.ensure_future(ending.wait()))
+
+
+def add_cameras(app: FastAPI) -> None:
+    """The settings of a camera."""
+
+    @app.get(f"{PREFIX}/cameras/{{camera}}/settings", summary="The settings of a camera, with their bounds")
+    async def settings(camera: str, here: Here) -> CameraSettingsTold:
+        here.service.check_camera(camera)
+        return await here.waiting.run(lambda: _told(here, camera, []))
+
+    @command(
+        app,
+        "PATCH /cameras/{camera}/settings",
+        CAMERA_SETTINGS,
+        "Change some of a camera's settings, each with its automatic turned off",
+    )
+    def change(camera: str, body: CameraSettingsBody, here: Here) -> CameraSettingsTold:
+        return _told(here, camera, here.service.devices.set_camera(camera, body.wanted))
+
+
+def _told(here: Parts, camera: str, notes: list[str]) -> CameraSettingsTold:
+    found, held = here.service.devices.camera_settings(camera)
+    return {
+        "camera": camera,
+        "settings": [
+            {
+                "name": one.name,
+                "value": one.value,
+                "minimum": one.minimum,
+                "maximum": one.maximum,
+                "step": one.step,
+                "unit": SETTINGS[one.name],
+                "automatic": one.automatic,
+                "refusal": one.refusal or None,
+            }
+            for one in found
+        ],
+        "held": held,
+        "notes": notes,
+    }
 
 
 class _Line:

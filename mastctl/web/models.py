@@ -99,6 +99,26 @@ class TakeBody(_Strict):
     ]
 
 
+class CameraSettingsBody(_Strict):
+    """``PATCH /cameras/{camera}/settings``: what is to change; one at least."""
+
+    exposure_s: float | None = None
+    gain: float | None = None
+    white_balance_k: float | None = None
+    focus: float | None = None
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        if not self.wanted:
+            raise ValueError(f"one of {', '.join(type(self).model_fields)} at least is expected")
+        return self
+
+    @property
+    def wanted(self) -> dict[str, float]:
+        """The changes, by name."""
+        return self.model_dump(exclude_none=True)
+
+
 class RecordBody(_Strict):
     """``POST /recordings/start``: a word for the file's name."""
 

@@ -19,6 +19,9 @@ from drivers.sim.optics.lens import Float32
 FRAMES_KEPT = 64
 """So many frames are metered at most to catch up with the present."""
 
+CHANGES_S = 5.0
+"""So old may a frame be that is asked for after a change."""
+
 MOST_STEP = 4.0
 """A loop changes by no more than this factor a frame."""
 
@@ -81,20 +84,44 @@ class FrameExposure:
 
 
 class FixedExposure:
-    """The same for every frame but for daylight."""
+    """The same for every frame but for daylight, until it is changed; safe from any thread.
+
+    Without a ``reference_s`` the scene has its own brightness at what it begins with.
+    """
 
     def __init__(self, settings: ExposureSettings, exposure_s: float, start_s: float) -> None:
         self._settings = settings
         self._start_s = start_s
-        self.longest_s = exposure_s
-        on = settings.reference_s > 0
-        self._gain = settings.gain if on else 1.0
-        self._factor = exposure_s * settings.gain / settings.reference_s if on else 1.0
+        self._amount_s = settings.reference_s or exposure_s
+        gain = settings.gain if settings.reference_s > 0 else 1.0
+        # (since_s, exposure_s, gain), replaced as a whole
+        self._set: tuple[tuple[float, float, float], ...] = ((-math.inf, exposure_s, gain),)
+
+    @property
+    def now(self) -> tuple[float, float]:
+        """The newest exposure time and gain."""
+        return self._set[-1][1:]
+
+    def longest_s(self, now_s: float) -> float:
+        """Return the longest exposure time of frames that are asked for at a moment."""
+        return max(exposure_s for _, exposure_s, _ in self._recent(now_s))
+
+    def change(self, exposure_s: float, gain: float, now_s: float) -> None:
+        """Expose frames that begin after a moment otherwise."""
+        self._set = (*self._recent(now_s), (now_s, exposure_s, gain))
 
     def shot(self, _sequence: int, begin_s: float, _period_s: float) -> FrameExposure:
         """Return time and gain of the frame whose exposure begins at a moment."""
         daylight = self._settings.daylight(begin_s - self._start_s)
-        return FrameExposure(self.longest_s, self._gain, self._factor * daylight)
+        changes = self._set
+        _, exposure_s, gain = next((one for one in reversed(changes) if one[0] < begin_s), changes[0])
+        return FrameExposure(exposure_s, gain, exposure_s * gain / self._amount_s * daylight)
+
+    def _recent(self, now_s: float) -> tuple[tuple[float, float, float], ...]:
+        """What a frame may have been taken with that is asked for at a moment."""
+        changes = self._set
+        first = max(i for i, one in enumerate(changes) if i == 0 or one[0] < now_s - CHANGES_S)
+        return changes[first:]
 
 
 @dataclass
@@ -135,7 +162,6 @@ class AutoExposure:
         self._start_s = start_s
         self._metered = metered
         self._now_s = now_s
-        self.longest_s = settings.longest_s
         self._decided = _Decided()
         self._holds: list[tuple[float, float]] = []
         self._held = 0
@@ -156,6 +182,10 @@ class AutoExposure:
                 self._held -= 1
                 if self._held == 0:
                     self._holds = [*self._holds[-50:], (self._held_since_s, self._now_s())]
+
+    def longest_s(self, _now_s: float) -> float:
+        """Return the longest exposure time that a frame may have."""
+        return self._settings.longest_s
 
     def shot(self, sequence: int, begin_s: float, period_s: float) -> FrameExposure:
         """Return time and gain of a frame; those before it are metered first, where they were not yet."""

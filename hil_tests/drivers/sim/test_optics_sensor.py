@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drivers.clock import ManualClock
-from drivers.errors import BadFrame
+from drivers.errors import BadFrame, BadSetting
 from drivers.faults import FaultPanel
 from drivers.interfaces import HoldsExposure
 from drivers.sim.camera_settings import CameraSettings
@@ -210,3 +210,35 @@ def test_everything_off_is_the_picture_of_before() -> None:
     noise = device._readout.noise
     light = Scene(100.0).light(0)
     np.testing.assert_array_equal(image, noise.levels(light, noise.sigma_dn(light), 1))
+
+
+def test_a_changed_exposure_and_gain_change_brightness_and_noise_of_frames_that_begin_after_it() -> None:
+    device, clock = camera(Scene(40.0))
+    first = device.next_frame(clock.now_s(), 1.0)
+    assert first.settings == {"exposure_s": 0.008, "gain": 1.0}
+    changed_s = clock.now_s()
+    assert device.adjust({"exposure_s": 0.016, "gain": 2.0}) == []
+    before = device.next_frame(first.exposure_began_s - 1e-6, 1.0)
+    after = device.next_frame(changed_s, 1.0)
+    assert before.sequence == first.sequence and before.settings == first.settings
+    assert after.exposure_began_s > changed_s
+    assert after.settings == {"exposure_s": 0.016, "gain": 2.0} and after.exposure_s == 0.016
+    assert after.image.mean() == pytest.approx(4 * first.image.mean(), rel=0.02)
+    device.adjust({"exposure_s": 0.008})
+    gained = device.next_frame(clock.now_s(), 1.0)
+    device.adjust({"exposure_s": 0.016, "gain": 1.0})
+    exposed = device.next_frame(clock.now_s(), 1.0)
+    assert gained.image.mean() == pytest.approx(exposed.image.mean(), abs=0.5)
+    noise = [(one.image - one.image.mean(axis=0)).std() for one in (gained, exposed)]
+    assert noise[0] > 1.3 * noise[1], "the same brightness by gain is noisier"
+
+
+def test_what_a_simulated_camera_cannot_change_it_says() -> None:
+    device, _ = camera(Scene(40.0))
+    assert {one.name: one.refusal for one in device.settings()} == {"exposure_s": "", "gain": ""}
+    with pytest.raises(BadSetting, match="the simulated camera has no focus"):
+        device.adjust({"focus": 3.0})
+    itself, _ = automatic(Scene(40.0))
+    assert all(one.automatic and "exposure.auto" in one.refusal for one in itself.settings())
+    with pytest.raises(BadSetting, match="it sets its exposure itself"):
+        itself.adjust({"gain": 2.0})

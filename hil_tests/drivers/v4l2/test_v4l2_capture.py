@@ -27,7 +27,7 @@ from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.capture import Capture
 from drivers.v4l2.node import Dequeued, Identity
 from drivers.v4l2.options import parse_options
-from drivers.v4l2.stamps import ExposuresSet, StampRule
+from drivers.v4l2.stamps import StampRule, ValuesSet
 from hil_tests.waiting import NET_S, until
 
 SIZE_PX = (16, 8)
@@ -103,7 +103,7 @@ class FakeStream:
         self.problems: list[object] = []
         self.rate_told = True
         self.rule = StampRule(0.0)
-        self.exposures = ExposuresSet(0.01)
+        self.in_force = {"exposure_s": ValuesSet(0.01)}
         self.closed = False
 
     def close(self) -> None:

@@ -10,8 +10,9 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import pytest
 
@@ -103,9 +104,11 @@ def bench(
     kind: str,
     told_hz: float | None = 25.0,
     controls: tuple[CameraControl, ...] = (),
+    values: Mapping[int, int] = MappingProxyType({}),
     **options: object,
 ) -> Iterator[Bench]:
     node = SensorNode(kind, told_hz, controls)
+    node.values |= values
     use(monkeypatch, node)
     clock = TurnedClock()
     chosen = {"card": "Made up", "format": "GREY", "size_px": [16, 8], "rate_hz": 25.0, "margin_s": MARGIN_S}

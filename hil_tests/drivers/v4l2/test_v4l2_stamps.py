@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from drivers.v4l2 import abi
-from drivers.v4l2.stamps import ExposuresSet, Spacing, StampCheck, StampRule, Timing, Window, exposure_window
+from drivers.v4l2.stamps import Spacing, StampCheck, StampRule, Timing, ValuesSet, Window, exposure_window
 
 START = abi.BUF_FLAG_TIMESTAMP_MONOTONIC | 0x10000
 END = abi.BUF_FLAG_TIMESTAMP_MONOTONIC
@@ -72,7 +72,7 @@ def test_a_period_that_was_neither_promised_nor_seen_is_taken_off_nothing() -> N
 
 
 def test_a_change_of_exposure_shows_in_frames_stamped_after_it_and_surely_from_the_fifth_on() -> None:
-    exposures = ExposuresSet(0.030)
+    exposures = ValuesSet(0.030)
     assert exposures.of(0, 10.00) == (0.030, 0.030)
     exposures.change(0.002, 10.50, 10.51)
     assert exposures.of(1, 10.40) == (0.030, 0.030)  # it waited while the change was made
@@ -82,7 +82,7 @@ def test_a_change_of_exposure_shows_in_frames_stamped_after_it_and_surely_from_t
 
 
 def test_changes_one_after_the_other_leave_the_longest_that_may_still_show() -> None:
-    exposures = ExposuresSet(0.030)
+    exposures = ValuesSet(0.030)
     exposures.change(0.002, 1.0, 1.0)
     exposures.change(0.010, 1.1, 1.1)
     assert exposures.of(0, 1.05) == (None, 0.030)

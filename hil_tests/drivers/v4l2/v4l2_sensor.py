@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.pixels import PictureFormat
-from drivers.v4l2 import abi, find, stream
+from drivers.v4l2 import abi, find, settings, stream
 from drivers.v4l2.controls import CameraControl, ControlProblem
 from drivers.v4l2.node import Dequeued, Identity
 
@@ -125,6 +125,12 @@ class SensorNode:
     def close(self) -> None:
         self.closed = True
 
+    def __enter__(self) -> SensorNode:
+        return self
+
+    def __exit__(self, *ignored: object) -> None:
+        """A second opening is let go; the first streams on."""
+
 
 def use(monkeypatch: object, node: SensorNode) -> None:
     """Have the driver open this node and speak with its controls."""
@@ -139,6 +145,7 @@ def use(monkeypatch: object, node: SensorNode) -> None:
     patch = monkeypatch.setattr  # type: ignore[attr-defined]
     patch(find, "open_node", lambda address, name: node)
     patch(stream, "set_by_name", lambda opened, wanted: [])
-    patch(stream, "list_controls", lambda opened: list(opened.controls))
-    patch(stream, "set_value", set_value)
-    patch(stream, "get_value", lambda opened, control: opened.values[control.id])
+    for place in (stream, settings):
+        patch(place, "list_controls", lambda opened: list(opened.controls))
+        patch(place, "set_value", set_value)
+        patch(place, "get_value", lambda opened, control: opened.values[control.id])

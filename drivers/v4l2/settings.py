@@ -1,0 +1,186 @@
+"""The settings that go by meaning: exposure, gain, white balance and focus, at the opening and at run time.
+
+Each is a control in the device's own units with an automatic beside it that has to be off. At run time they
+are changed through a second opening of the node, so the thread that takes the frames is not in the way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from drivers.clock import Clock
+from drivers.errors import BadSetting
+from drivers.interfaces import CameraSetting
+from drivers.v4l2 import abi
+from drivers.v4l2.controls import CameraControl, first_of, get_value, list_controls, set_value
+from drivers.v4l2.node import Node
+from drivers.v4l2.options import CameraOptions
+from drivers.v4l2.stamps import ValuesSet
+
+EXPOSURE_UNIT_S = 1e-4  # of V4L2_CID_EXPOSURE_ABSOLUTE
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """Which controls a setting is.
+
+    Attributes
+    ----------
+    name, word
+        As in `drivers.interfaces.SETTINGS`, and in words.
+    automatic, off
+        The control of its automatic, and that control's value for off.
+    control, unit
+        The control of its value, and what one of that is worth.
+    """
+
+    name: str
+    word: str
+    automatic: int
+    off: int
+    control: int
+    unit: float = 1.0
+
+    def counts(self, value: float) -> int:
+        """Return a value in the device's own counts."""
+        return round(value / self.unit)
+
+
+EXPOSURE = Meaning(
+    "exposure_s",
+    "exposure",
+    abi.CID_EXPOSURE_AUTO,
+    abi.EXPOSURE_MANUAL,
+    abi.CID_EXPOSURE_ABSOLUTE,
+    EXPOSURE_UNIT_S,
+)
+MEANINGS = (
+    EXPOSURE,
+    Meaning("gain", "gain", abi.CID_AUTOGAIN, 0, abi.CID_GAIN),
+    Meaning(
+        "white_balance_k", "white balance", abi.CID_AUTO_WHITE_BALANCE, 0, abi.CID_WHITE_BALANCE_TEMPERATURE
+    ),
+    Meaning("focus", "focus", abi.CID_FOCUS_AUTO, 0, abi.CID_FOCUS_ABSOLUTE),
+)
+
+
+def is_automatic(node: Node, controls: Sequence[CameraControl], one: Meaning) -> bool:
+    """Return whether the camera itself sets it now."""
+    automatic = first_of(controls, (one.automatic,))
+    return automatic is not None and get_value(node, automatic) not in (one.off, None)
+
+
+def value_of(node: Node, controls: Sequence[CameraControl], one: Meaning) -> float | None:
+    """Return what is set now; None if the camera has no such control, or sets it itself."""
+    control = first_of(controls, (one.control,))
+    if control is None or is_automatic(node, controls, one):
+        return None
+    counts = get_value(node, control)
+    return None if counts is None else counts * one.unit
+
+
+def settings_of(node: Node, options: CameraOptions, period_s: float | None) -> list[CameraSetting]:
+    """Return what of a camera may be changed, as it is now.
+
+    Parameters
+    ----------
+    node
+        The opened node.
+    options
+        Those it was opened with.
+    period_s
+        From frame to frame, which bounds an exposure; None if the camera does not say.
+    """
+    controls, found = list_controls(node), []
+    for one in MEANINGS:
+        if (control := first_of(controls, (one.control,))) is None:
+            continue
+        highest = control.maximum * one.unit
+        if one is EXPOSURE and period_s is not None:
+            highest = min(highest, period_s)
+        found.append(
+            CameraSetting(
+                one.name,
+                value_of(node, controls, one),
+                control.minimum * one.unit,
+                highest,
+                control.step * one.unit,
+                is_automatic(node, controls, one),
+                _refusal(one, options),
+            )
+        )
+    return found
+
+
+def _refusal(one: Meaning, options: CameraOptions) -> str:
+    """Why a setting is not to be changed at run time."""
+    if one is EXPOSURE and options.auto_exposure is not None:
+        return "is set by 'auto_exposure' of the camera's options"
+    if one.name == "focus" and options.focus is None:
+        return "is not in the camera's options, so no restart could come back to the calibrated one"
+    return ""
+
+
+def change(
+    node: Node,
+    wanted: Mapping[str, float],
+    in_force: Mapping[str, ValuesSet],
+    clock: Clock,
+    device: str,
+) -> tuple[dict[str, float], list[str], BadSetting | None]:
+    """Change settings one after the other, and note from which frame on each is in force.
+
+    Returns
+    -------
+    became
+        The new value of each that was changed, as the camera has it.
+    notes
+        A sentence for each that became another than asked for.
+    refused
+        The error of one that the camera did not take; those behind it were left alone.
+    """
+    controls = list_controls(node)
+    became: dict[str, float] = {}
+    notes: list[str] = []
+    for one in MEANINGS:
+        if one.name not in wanted:
+            continue
+        control = first_of(controls, (one.control,))
+        if control is None:
+            return became, notes, BadSetting(f"it has no control for {one.word}", device=device)
+        counts = min(max(one.counts(wanted[one.name]), control.minimum), control.maximum)
+        values = in_force[one.name]
+        values.begin(clock.now_s())
+        value = None
+        try:
+            problem = None
+            if (automatic := first_of(controls, (one.automatic,))) is not None:
+                problem = set_value(node, automatic, one.off)
+            problem = problem or set_value(node, control, counts)
+            value = value_of(node, controls, one)
+        finally:
+            values.end(value, clock.now_s())
+        if value is None or (problem is not None and problem.became is None):
+            words = "its automatic stays on" if problem is None else problem.message
+            return became, notes, BadSetting(f"{one.name} was not changed: {words}", device=device)
+        became[one.name] = value
+        if not math.isclose(value, wanted[one.name], rel_tol=1e-9, abs_tol=1e-12):
+            notes.append(
+                f"{device}: {one.name} is {value:.6g} where {wanted[one.name]:.6g} was asked for; "
+                f"the camera has steps of {control.step * one.unit:g}"
+            )
+    return became, notes, None
+
+
+def with_settings(options: CameraOptions, became: Mapping[str, float]) -> CameraOptions:
+    """Return the options that open the camera as it is now."""
+    whole = {name: round(value) for name, value in became.items() if name != EXPOSURE.name}
+    return replace(
+        options,
+        exposure_s=became.get(EXPOSURE.name, options.exposure_s),
+        gain=whole.get("gain", options.gain),
+        white_balance_k=whole.get("white_balance_k", options.white_balance_k),
+        focus=whole.get("focus", options.focus),
+    )

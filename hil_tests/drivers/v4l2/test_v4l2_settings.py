@@ -1,0 +1,113 @@
+"""Exposure, gain and focus of a V4L2 camera changed while it streams: what each frame is told to have."""
+
+from __future__ import annotations
+
+import pytest
+
+from drivers.errors import BadSetting
+from drivers.interfaces import Adjustable
+from drivers.v4l2 import abi, settings
+from drivers.v4l2.controls import CameraControl, ControlProblem
+from drivers.v4l2.stamps import SETTLE_FRAMES, ValuesSet
+from hil_tests.drivers.v4l2.test_v4l2_never_old import bench
+from hil_tests.drivers.v4l2.v4l2_sensor import AUTO, EXPOSURE, Sensor
+
+GAIN = CameraControl(abi.CID_GAIN, "gain", "integer", 0, 255, 1, 100, True, {})
+AUTOGAIN = CameraControl(abi.CID_AUTOGAIN, "gain_automatic", "boolean", 0, 1, 1, 1, True, {})
+FOCUS = CameraControl(abi.CID_FOCUS_ABSOLUTE, "focus", "integer", 0, 250, 5, 0, True, {})
+ALL = (AUTO, EXPOSURE, AUTOGAIN, GAIN, FOCUS)
+VALUES = {AUTOGAIN.id: 1, GAIN.id: 16, FOCUS.id: 30}
+PERIOD_S = 0.04
+
+
+def test_a_frame_stamped_before_a_change_has_the_old_one_and_none_is_told_a_value_that_it_may_not_have(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sensor = Sensor("uvc", readout_s=0.030, late_s=0.0, seed=6)
+    with bench(monkeypatch, "uvc", controls=ALL, values=VALUES, exposure_s=0.036, gain=16) as seen:
+        camera = seen.camera
+        assert isinstance(camera, Adjustable)
+
+        def told(exposure_s: float = 0.036) -> dict[str, float | None]:
+            seen.arrive(sensor.shoot(PERIOD_S, exposure_s))
+            newest = camera.capture.newest
+            return {} if newest is None else dict(newest.settings)
+
+        for _ in range(SETTLE_FRAMES + 1):
+            told()
+        assert told() == {"exposure_s": pytest.approx(0.036), "gain": 16.0, "focus": 30.0}
+        stamped_before = sensor.shoot(PERIOD_S, 0.036)
+        seen.clock.time_s = stamped_before.received_s + 0.001
+        assert camera.adjust({"gain": 200.0}) == []
+        seen.arrive(stamped_before)  # it had been stamped before the change and comes after it
+        assert camera.next_frame(0.0, 0.0).settings["gain"] == 16.0
+        gains = [told()["gain"] for _ in range(SETTLE_FRAMES + 1)]
+        assert gains == [None] * SETTLE_FRAMES + [200.0]
+        assert told()["exposure_s"] == pytest.approx(0.036), "of the others nothing became unknown"
+        with camera.exposure_held():
+            assert told()["gain"] == 200.0
+
+
+def test_a_hold_waits_until_a_change_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = ValuesSet(1.0)
+    values.begin(10.0)
+    assert not values.settled and values.of(0, 9.9) == (1.0, 1.0) and values.of(1, 10.0) == (None, None)
+    values.end(2.0, 10.1)
+    assert [values.of(n, 10.2 + n)[0] for n in range(2, 2 + SETTLE_FRAMES)] == [None] * SETTLE_FRAMES
+    assert not values.settled and values.newest == 2.0
+    assert values.of(2 + SETTLE_FRAMES, 20.0) == (2.0, 2.0) and values.settled
+
+
+def test_bounds_are_the_cameras_and_the_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    with bench(monkeypatch, "uvc", controls=ALL, values=VALUES, focus=30) as seen:
+        exposure, gain, focus = seen.camera.settings()
+        assert (exposure.minimum, exposure.maximum, exposure.step) == pytest.approx((1e-4, 0.04, 1e-4))
+        assert exposure.automatic and exposure.value is None
+        assert gain.automatic and (gain.minimum, gain.maximum) == (0.0, 255.0)
+        assert not focus.automatic and focus.value == 30.0 and not focus.refusal
+
+
+def test_a_focus_that_no_restart_could_come_back_to_and_an_exposure_of_a_group_stand_fixed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    options = {"exposure_s": 0.01, "auto_exposure": True}
+    with bench(monkeypatch, "uvc", controls=ALL, values=VALUES, **options) as seen:
+        refusals = {one.name: one.refusal for one in seen.camera.settings()}
+        assert refusals["exposure_s"] == "is set by 'auto_exposure' of the camera's options"
+        assert refusals["focus"].endswith("so no restart could come back to the calibrated one")
+        assert refusals["gain"] == ""
+
+
+def test_what_was_changed_is_set_again_when_the_camera_is_opened_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with bench(monkeypatch, "uvc", controls=ALL, values=VALUES, exposure_s=0.036, focus=30) as seen:
+        seen.camera.adjust({"gain": 200.0, "exposure_s": 0.02, "focus": 35.0})
+        options = seen.camera.capture._options
+        assert (options.gain, options.exposure_s, options.focus) == (200, pytest.approx(0.02), 35)
+        before = len(seen.node.sets)
+        seen.camera.capture._open()
+        assert {(GAIN.id, 200), (EXPOSURE.id, 200), (FOCUS.id, 35)} <= set(seen.node.sets[before:])
+
+
+def test_a_camera_that_makes_another_of_it_is_told_and_one_that_refuses_is_not_believed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with bench(monkeypatch, "uvc", controls=ALL, values=VALUES, focus=30) as seen:
+        real = settings.set_value
+
+        def clamps(node: object, control: CameraControl, value: int) -> ControlProblem | None:
+            if control.id == GAIN.id:
+                value = min(value, 64)
+                real(node, control, value)  # type: ignore[arg-type]
+                return ControlProblem("gain", "gain is 64 where 200 was set", 64)
+            return real(node, control, value)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(settings, "set_value", clamps)
+        (note,) = seen.camera.adjust({"gain": 200.0})
+        assert "gain is 64 where 200 was asked for" in note
+        assert seen.camera.capture._options.gain == 64
+        seen.node.refused = (FOCUS.id,)
+        with pytest.raises(BadSetting, match="focus was not changed: focus does not take 40"):
+            seen.camera.adjust({"gain": 10.0, "focus": 40.0})
+        assert seen.camera.capture._options.focus == 30

@@ -1,0 +1,213 @@
+"""The cameras' settings: changed between operations, and kept as they are while one compares its pictures."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import partial
+
+from drivers.clock import Clock
+from drivers.errors import BadReply, BadSetting, DriverError
+from drivers.interfaces import SETTINGS, Adjustable, Camera, CameraSetting, HoldsExposure
+from mastctl.control.standing import StandingFault
+from mastctl.devices.thread import DeviceThread
+from mastctl.errors import NotNow
+
+HOLD_TIMEOUT_S = 1.0
+SET_TIMEOUT_S = 2.0
+
+
+class CameraSettings:
+    """The settings of all cameras; safe from any thread.
+
+    Parameters
+    ----------
+    cameras, threads
+        By name; both may get other entries later.
+    clock
+        Stamps the faults.
+    """
+
+    def __init__(
+        self, cameras: Mapping[str, Camera], threads: Mapping[str, DeviceThread], clock: Clock
+    ) -> None:
+        self._cameras = cameras
+        self._threads = threads
+        self._clock = clock
+        self._holds = Counter[str]()  # of each camera, counted in its own thread
+        self._refocused: Mapping[str, _Refocused] = {}  # replaced, never edited
+
+    def told(self, name: str) -> tuple[list[CameraSetting], bool]:
+        """Return what a camera is set to, and whether an operation holds it; empty if nothing can be changed.
+
+        Raises
+        ------
+        NoReply, BadReply, DriverError
+            If the camera does not answer within 2 s.
+        """
+        return self._threads[name].call("settings", lambda: self._told(name), SET_TIMEOUT_S, told=False)
+
+    def change(self, name: str, wanted: Mapping[str, float]) -> list[str]:
+        """Change some of a camera's settings; return a sentence for each that became another than wanted.
+
+        Raises
+        ------
+        BadSetting
+            For one that it lacks, cannot change, or that is out of its bounds; nothing has changed then, but
+            what the sentence names.
+        NotNow
+            ``busy`` if an operation holds them.
+        NoReply, BadReply, DriverError
+            If the camera does not answer within 2 s.
+        """
+
+        def change() -> list[str]:
+            if self._holds[name]:
+                words = "an operation compares its pictures and holds its settings; wait for it or stop it"
+                raise NotNow("busy", f"{name}: {words}")
+            before, _ = self._told(name)
+            check_wanted(before, wanted, name)
+            camera = self._cameras[name]
+            assert isinstance(camera, Adjustable)
+            try:
+                return [str(note) for note in camera.adjust(wanted)]
+            finally:
+                if "focus" in wanted:
+                    self._note_focus(name, before)
+
+        return self._threads[name].call("adjust", change, SET_TIMEOUT_S, told=False)
+
+    def hold(self, name: str) -> ExposureHold:
+        """Return a hold of one camera, which nothing but its begin and end changes."""
+        return ExposureHold(
+            self._threads[name],
+            partial(self._cameras.__getitem__, name),
+            lambda holds: self._holds.update({name: holds}),
+        )
+
+    def calibrated(self) -> None:
+        """Take in that another mast file is in use: it is of the focus that each camera has now."""
+        self._refocused = {}
+
+    def faults(self) -> list[StandingFault]:
+        """Return a fault for each camera that has another focus than it was calibrated with."""
+        return [
+            StandingFault(
+                name,
+                "refocused",
+                f"{name}: its focus is {one.now:g} and was {one.calibrated:g} when the mast file came into "
+                "use; the calibration is not of this focus",
+                one.since_s,
+                f"its focus is {one.calibrated:g} again, or another mast file is in use",
+            )
+            for name, one in self._refocused.items()
+        ]
+
+    def _told(self, name: str) -> tuple[list[CameraSetting], bool]:
+        """In the camera's thread: what it says, if that can be."""
+        camera = self._cameras[name]
+        if not isinstance(camera, Adjustable):
+            return [], self._holds[name] > 0
+        told = list(camera.settings())
+        for one in told:
+            if not isinstance(one, CameraSetting) or one.name not in SETTINGS:
+                words = f"settings returned {getattr(one, 'name', type(one).__name__)!r}"
+                raise BadReply(f"{words} where one of {', '.join(SETTINGS)} is expected", device=name)
+        return told, self._holds[name] > 0
+
+    def _note_focus(self, name: str, before: Sequence[CameraSetting]) -> None:
+        """Compare a camera's focus with that of before its first change."""
+        had = next((one.value for one in before if one.name == "focus"), None)
+        now = next((one.value for one in self._told(name)[0] if one.name == "focus"), None)
+        former = self._refocused.get(name)
+        calibrated = former.calibrated if former is not None else had
+        others = {key: one for key, one in self._refocused.items() if key != name}
+        if calibrated is None or now is None or now == calibrated:
+            self._refocused = others
+        else:
+            since_s = self._clock.now_s() if former is None else former.since_s
+            self._refocused = {**others, name: _Refocused(calibrated, now, since_s)}
+
+
+@dataclass(frozen=True)
+class _Refocused:
+    """The focus that a camera was calibrated with, the one that it has, and since when it is not that."""
+
+    calibrated: float
+    now: float
+    since_s: float
+
+
+def check_wanted(known: Sequence[CameraSetting], wanted: Mapping[str, float], camera: str) -> None:
+    """Pass settings that a camera has, can change, and that are within its bounds. Raises BadSetting."""
+    has = {one.name: one for one in known}
+    for name, value in wanted.items():
+        if name not in has:
+            words = f"it has {', '.join(has)}" if has else "nothing of it can be changed while it runs"
+            raise BadSetting(f"it has no {name}; {words}", device=camera)
+        one, unit = has[name], SETTINGS[name] and f" {SETTINGS[name]}"
+        if one.refusal:
+            raise BadSetting(f"{name} {one.refusal}", device=camera)
+        if not (math.isfinite(value) and one.minimum <= value <= one.maximum):
+            words = f"{one.minimum:g} to {one.maximum:g}{unit} is expected"
+            raise BadSetting(f"{name} is to be {value:g}{unit}, {words}", device=camera)
+
+
+class ExposureHold:
+    """One hold of one camera's exposure and settings.
+
+    Both ends are queued in the camera's own thread, and no caller waits for them. The beginning comes before
+    every picture that is asked for after it, the end after the beginning, however late that is. So a camera
+    that hangs or refuses keeps no operation waiting; its fault says so.
+
+    Parameters
+    ----------
+    thread
+        The camera's own thread.
+    camera
+        Returns the camera; one that has no exposure to hold is left alone.
+    count
+        Takes, in that thread, 1 for the beginning and -1 for its end.
+    """
+
+    def __init__(
+        self, thread: DeviceThread, camera: Callable[[], Camera], count: Callable[[int], None]
+    ) -> None:
+        self._thread = thread
+        self._camera = camera
+        self._count = count
+        self._holds = 0
+        self._context: AbstractContextManager[None] | None = None
+
+    def begin(self) -> bool:
+        """Ask for the hold; return whether there is something to `end`."""
+        try:
+            self._thread.submit("hold_exposure", self._enter, HOLD_TIMEOUT_S)
+        except DriverError:  # overdue or closed: its fault says so already, and it takes no pictures
+            return False
+        return True
+
+    def end(self) -> None:
+        """Ask for the release."""
+        try:
+            self._thread.submit("release_exposure", self._leave, HOLD_TIMEOUT_S, anyway=True)
+        except DriverError:  # closed, and with it the camera
+            return
+
+    def _enter(self) -> None:
+        self._holds = 1
+        self._count(1)
+        camera = self._camera()
+        if isinstance(camera, HoldsExposure):
+            context = camera.exposure_held()
+            context.__enter__()
+            self._context = context
+
+    def _leave(self) -> None:
+        self._count(-self._holds)
+        self._holds = 0
+        if self._context is not None:
+            self._context.__exit__(None, None, None)
