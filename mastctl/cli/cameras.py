@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivers.interfaces import SETTINGS
-from mastctl.cli import camera_sync, output
+from mastctl.cli import camera_mode, camera_sync, output
 from mastctl.cli.camera_sync import (
     FRAME_TIMEOUT_S,
     add_camera_options,
@@ -32,6 +32,7 @@ def add_actions(actions: Any) -> None:
     listing.set_defaults(run=camera_list)
 
     camera_sync.add_action(actions)
+    camera_mode.add_action(actions)
 
     _add_check(actions)
 

@@ -63,7 +63,8 @@ def check_size(camera: str, size_px: tuple[int, int], wanted_px: tuple[int, int]
     """Raise BadFrame if a camera's pictures, (width, height), are not of the mast file's size."""
     if size_px != wanted_px:
         words = "the image is {}x{} px where the mast file has {}x{} px".format(*size_px, *wanted_px)
-        raise BadFrame(words, device=camera)
+        remedy = "for a crop or binning of the calibrated picture 'mastctl camera mode' writes a mast file"
+        raise BadFrame(f"{words}; {remedy}", device=camera)
 
 
 def checked(

@@ -1,0 +1,171 @@
+"""A calibration in another mode of its camera: beside OpenCV, beside rendered pictures, and refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.covariance import pixel_rates, stored_covariance
+from calib.geometry.lenses import opencv
+from calib.geometry.mode import BadMode, Mode, in_mode, pixel_change, rig_in_mode
+from calib.geometry.parameters import parameter_names
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Mast, Rig, RigCamera
+
+SIZE = (640, 480)
+SAME_PX = 1e-9
+CROP = (96, 40, 512, 400)
+MODES = [
+    Mode(crop_px=crop, binning=binning, flip=flip)
+    for crop, binning, flip in product(
+        (None, CROP), ((1, 1), (2, 2), (2, 4)), ((False, False), (True, False), (False, True), (True, True))
+    )
+]
+DISTORTION = [-0.21, 0.09, 0.003, -0.002, 0.01, 0.05, -0.02, 0.004, 0.002, -0.001, 0.003, 0.0005, 0.02, -0.03]
+
+
+def opencv_camera(count: int) -> tuple[CameraModel, np.ndarray, np.ndarray]:
+    """A camera of OpenCV's with its axes along ours, its matrix, and its coefficients."""
+    matrix = np.array([[520.0, 0.0, 310.5], [0.0, 505.0, 251.25], [0.0, 0.0, 1.0]])
+    coefficients = np.array(DISTORTION[:count])
+    kind: Any = f"OPENCV{count}"
+    made = CameraModel(
+        kind, SIZE, C=np.zeros(3), A=[0, 0, 1], H=matrix[0], V=matrix[1], distortion=coefficients
+    )
+    return made, matrix, coefficients
+
+
+def points(count: int = 400) -> np.ndarray:
+    random = np.random.default_rng(5)
+    return np.column_stack([random.uniform(-0.5, 0.5, (count, 2)), np.ones(count)]) * 3.0
+
+
+def cahvor() -> CameraModel:
+    axis = np.array([0.98, 0.1, 0.12])
+    axis /= np.linalg.norm(axis)
+    optical = np.array([0.981, 0.103, 0.118])
+    optical /= np.linalg.norm(optical)
+    return CameraModel(
+        "CAHVOR", SIZE, C=[0.2, -0.1, 0.05], A=axis, H=310 * axis + [-60.0, 500.0, 3.0],
+        V=235 * axis + [-50.0, 4.0, 498.0], O=optical, R=[0.0, -0.11, 0.03],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("count", opencv.COUNTS)
+def test_pixels_of_every_mode_are_those_of_opencv_with_a_scaled_matrix(count: int) -> None:
+    """cv2.projectPoints with the matrix that the pixel rule makes, also with negative focal lengths."""
+    camera, matrix, coefficients = opencv_camera(count)
+    for mode in MODES:
+        x, y, width, height = mode.crop_px or (0, 0, *SIZE)
+        changed = matrix.copy()
+        for row, (begin, by, length, flip) in enumerate(
+            zip((x, y), mode.binning, (width, height), mode.flip, strict=True)
+        ):
+            changed[row, row] /= by
+            changed[row, 2] = (changed[row, 2] - begin + 0.5) / by - 0.5
+            if flip:
+                changed[row, row] *= -1
+                changed[row, 2] = length // by - 1 - changed[row, 2]
+        expected = cv2.projectPoints(points(), np.zeros(3), np.zeros(3), changed, coefficients)[0][:, 0]
+        seen, valid = in_mode(camera, mode).project(points())
+        assert valid.sum() > 300, mode
+        assert np.abs(seen - expected)[valid].max() < SAME_PX, mode
+
+
+@pytest.mark.parametrize("kind", ["CAHV", "CAHVOR", "CAHVORE", "OPENCV_FISHEYE"])
+def test_rays_and_pixels_of_other_models_agree_with_the_full_picture(kind: str) -> None:
+    camera = cahvor()
+    if kind == "CAHVORE":
+        camera = replace(camera, kind="CAHVORE", E=[1e-4, -2e-5, 3e-5], cahvore_type=3, linearity=0.4)
+    elif kind == "OPENCV_FISHEYE":
+        camera = replace(
+            camera, kind="OPENCV_FISHEYE", O=None, R=None, distortion=[0.02, -0.01, 0.003, -0.001]
+        )
+    elif kind == "CAHV":
+        camera = replace(camera, kind="CAHV", O=None, R=None)
+    pixels = np.stack(np.meshgrid(np.linspace(100, 600, 7), np.linspace(45, 435, 6)), axis=-1).reshape(-1, 2)
+    full = camera.ray(pixels)
+    assert full.valid.all()
+    for mode in MODES:
+        there = pixel_change(SIZE, mode).pixels(pixels)
+        rays = in_mode(camera, mode).ray(there)
+        assert rays.valid.all(), mode
+        assert np.abs(rays.directions - full.directions).max() < 1e-12
+        assert np.abs(rays.origins_m - full.origins_m).max() < 1e-12
+
+
+def test_the_middle_of_the_picture_and_its_corners_go_where_the_rule_says() -> None:
+    change = pixel_change((640, 480), Mode(binning=(2, 2)))
+    assert change.pixels(np.array([[319.5, 239.5], [0.5, 0.5], [639, 479]])).tolist() == [
+        [159.5, 119.5], [0.0, 0.0], [319.25, 239.25],
+    ]  # fmt: skip
+    change = pixel_change((640, 480), Mode(crop_px=(10, 20, 300, 200), flip=(True, False)))
+    assert change.size_px == (300, 200)
+    assert change.pixels(np.array([[10, 20], [309, 219]])).tolist() == [[299.0, 0.0], [0.0, 199.0]]
+
+
+def rig(model: CameraModel) -> Rig:
+    names = [f"cameras.eye.{name}" for name in parameter_names(model.kind)] + ["mast.translation_m.x"]
+    root = np.random.default_rng(3).normal(size=(len(names), len(names))) * 1e-4
+    fit = {"parameters": names, "covariance": (root @ root.T).tolist(), "rms_px": 0.1}
+    mast = Mast(np.array([0.3, 0.0, -1.4]), np.zeros(3))
+    return Rig("little", mast, {"eye": RigCamera("head", model)}, fit=fit)
+
+
+@pytest.mark.parametrize("model", [cahvor(), opencv_camera(14)[0]], ids=["CAHVOR", "OPENCV14"])
+def test_the_covariance_of_a_pixel_is_that_of_the_full_picture_scaled(model: CameraModel) -> None:
+    point = model.C + 4.0 * model.ray(np.array([350.0, 260.0])).directions
+    known = stored_covariance(rig(model))
+    assert known is not None
+    for mode in MODES:
+        changed = rig_in_mode(rig(model), "eye", mode)
+        assert "rms_px" not in changed.fit
+        carried = stored_covariance(changed)
+        assert carried is not None
+        spread = []
+        for one, covariance in ((rig(model), known), (changed, carried)):
+            seen = one.mast.rover_from_head(0.0, 0.0).points(point[None])
+            rates = pixel_rates(one, covariance.names, "eye", 0.0, 0.0, seen)[1][0]
+            spread.append(rates @ covariance.covariance @ rates.T)
+        scale = np.diag(pixel_change(SIZE, mode).scale)
+        assert np.allclose(spread[1], scale @ spread[0] @ scale, rtol=1e-7, atol=1e-12)
+
+
+def test_pointing_at_a_carried_over_pixel_is_pointing_at_the_full_ones() -> None:
+    mast, target, pixel = (
+        Mast(np.array([0.3, 0.0, -1.4]), np.zeros(3)),
+        np.array([6.0, 1.0, 0.2]),
+        (400.0, 200.0),
+    )
+    full = solve(mast, cahvor(), target, pixel)
+    assert full
+    for mode in MODES:
+        there = pixel_change(SIZE, mode).pixels(np.array(pixel))
+        found = solve(mast, in_mode(cahvor(), mode), target, there)
+        angles = [np.array([[one.pan_rad, one.tilt_rad] for one in some]) for some in (found, full)]
+        assert np.abs(angles[0] - angles[1]).max() < 1e-12, mode
+
+
+@pytest.mark.parametrize(
+    ("mode", "words"),
+    [
+        (
+            Mode(crop_px=(200, 0, 500, 480)),
+            "the crop of 500x480 px from (200, 0) is not inside the calibrated",
+        ),
+        (Mode(crop_px=(-1, 0, 10, 10)), "is not inside"),
+        (Mode(binning=(3, 3)), "binning by 3 does not divide a picture 640 px wide"),
+        (Mode(binning=(1, 7)), "binning by 7 does not divide a picture 480 px high"),
+        (Mode(binning=(0, 1)), "binning by 0"),
+    ],
+)
+def test_a_mode_that_is_not_one_is_refused_in_a_sentence(mode: Mode, words: str) -> None:
+    with pytest.raises(BadMode) as refusal:
+        in_mode(cahvor(), mode)
+    assert words in str(refusal.value)
