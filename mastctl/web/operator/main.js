@@ -12,6 +12,7 @@ import { Jog } from "./jog.js";
 import { OperationList } from "./operations.js";
 import { Reports } from "./reports.js";
 import { Residuals } from "./residuals.js";
+import { Settings } from "./settings.js";
 import { Simulation } from "./simulation.js";
 import { Target } from "./target.js";
 import { TrackPanel } from "./track.js";
@@ -100,6 +101,7 @@ const recording = new Recording(alarm);
 const mastFile = new MastFile(alarm);
 const residuals = new Residuals();
 const simulation = new Simulation();
+const settings = new Settings();
 new Faults(events, announce);
 new Failure(events, announce);
 new OperationList(events);
@@ -152,9 +154,11 @@ events.addEventListener("command", (event) => {
   refresh();
   if (kind.startsWith("record")) recording.look();
   if (kind.startsWith("place")) jog.look();
+  if (kind === "camera.settings") settings.look();
 });
 events.addEventListener("operation", (event) => {
   const record = event.detail.value;
+  if (record.state !== "running") settings.look();
   if (record.residual_px && record.state === "done") residuals.after(record.id);
   const going = record.state === "running" ? record.steps.findLast((step) => step.name === "limits") : null;
   head.goal(going ? [going.detail.pan_rad, going.detail.tilt_rad] : undefined);
@@ -210,14 +214,14 @@ function show(status) {
   head.use(status, rig, views);
   jog.use(status.limits);
   mastFile.told(status, rig);
-  for (const part of [simulation, track, target]) part.use(status, rig);
+  for (const part of [simulation, settings, track, target]) part.use(status, rig);
   set(document.body, "data-simulated", simulated);
 }
 
 function allow(role) {
   may = role !== "view";
   set(document.body, "data-role", role);
-  for (const part of [target, track, jog, control, recording, mastFile, simulation, bench]) part.allow(may, role);
+  for (const part of [target, track, jog, control, recording, mastFile, simulation, settings, bench]) part.allow(may, role);
 }
 
 // Who one is
