@@ -54,6 +54,8 @@ def picture(frame: StampedFrame, time_ns: int) -> Message:
 def calibration(name: str, model: CameraModel, time_ns: int) -> tuple[Message | None, dict[str, Any]]:
     """Return the nearest ``plumb_bob`` camera (None if there is none) and the camera itself, as JSON."""
     told: dict[str, Any] = {"camera": name, "model": _model_told(model)}
+    if np.linalg.det([model.H, model.V, model.A]) < 0.0:
+        return None, told | {"plumb_bob": {"none": "the picture is mirrored, and no camera of this kind is"}}
     try:
         near, error_px = _nearest(model)
     except ValueError as error:

@@ -16,6 +16,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 
+from calib.geometry.mode import Mode, in_mode
 from drivers.recordings.mcap_file import BadRecording, McapContents, McapEntry, read_items
 from hil_tests.mastctl.recorder.recorder_world import (
     CONFIG,
@@ -28,6 +29,8 @@ from hil_tests.mastctl.recorder.recorder_world import (
     recorder,
     told,
 )  # fmt: skip
+from hil_tests.mastctl.service_fakes import rig
+from mastctl.recorder.messages import calibration
 from mastctl.recorder.repair import repair
 from mastctl.recorder.writer import Attached, Clocks, RecordFile
 
@@ -226,3 +229,13 @@ def test_the_same_file_attached_again_stands_there_once_and_another_beside_it(tm
     file.finish()
     with (tmp_path / "a.mcap").open("rb") as opened:
         assert [one.name for one in make_reader(opened).iter_attachments()] == [CONFIG.name, "other.yaml"]
+
+
+def test_a_camera_whose_picture_is_mirrored_has_no_calibration_that_others_know() -> None:
+    model = rig().cameras["navcam_left"].model
+    told = {}
+    for flip in ((True, False), (True, True)):
+        message, about = calibration("eye", in_mode(model, Mode(flip=flip)), 0)
+        told[flip] = message is None, about["plumb_bob"]
+    assert told[True, False] == (True, {"none": "the picture is mirrored, and no camera of this kind is"})
+    assert not told[True, True][0] and told[True, True][1]["worst_px"] < 1e-6, "upside down it is only turned"
