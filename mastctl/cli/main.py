@@ -284,6 +284,8 @@ camera sync navcam_left navcam_right --config rover.yaml
 camera check /dev/video0 --rate 30
 camera grab /dev/video0 --out picture.png
 camera focus /dev/video0 --seconds 30
+camera settings navcam_left exposure_s=0.004 gain=20
+camera mode mast.yaml --camera navcam_left --bin 2 --flip both --out binned.yaml
 solve mast.yaml --camera navcam_left --target 6 1 0
 triangulate mast.yaml --pair navcam --pan 0.3 --tilt -0.2 --left 300 420 --right 271 420
 budget
