@@ -157,6 +157,7 @@ WORDS = {
     "camera check": [CAMERA, "--with-head", "--seconds", "0.3"],
     "camera grab": [CAMERA, "--out", "out.png"],
     "camera focus": [CAMERA, "--seconds", "0.3"],
+    "camera settings": [CAMERA],
     "camera sync": ["--seconds", "3"],
     "conform": ["--head", "--motion", "--reach", "0.2"],
     "experiment pointing": ["--targets", "1", "--out", "out"],
