@@ -13,7 +13,6 @@ is of its question:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 
@@ -39,10 +38,8 @@ from drivers.dynamixel.packets import (
 from drivers.dynamixel.registers import Register
 from drivers.errors import BadReply, DriverError, LineLost, Refused
 from drivers.serial_line import OpenLine, SerialLine
-from drivers.servo_bus.exchange import Exchange
-from drivers.servo_bus.port import QUIET_S, PacketFormat, Port, Status
-
-REPLY_TIMEOUT_S = 0.05  # USB adapters hold bytes back for up to 16 ms, the servo for up to 0.5 ms
+from drivers.servo_bus.link import REPLY_TIMEOUT_S, BusLink
+from drivers.servo_bus.port import QUIET_S, PacketFormat, Status
 
 PING_REPLY_BYTES = 14
 FORMAT = PacketFormat(
@@ -66,34 +63,8 @@ class Pinged:
     alert: bool
 
 
-class Link:
-    """One open line and its transactions.
-
-    Parameters
-    ----------
-    port
-        A serial device or a URL that pyserial understands.
-    baud
-        Bits per second.
-    reply_timeout_s
-        How long a reply may take beyond its time on the wire.
-    urgent
-        As of `Port`, whose ``Overtaken`` every method may raise but `shout`.
-    clock, open_line
-        As of `Port`.
-
-    Attributes
-    ----------
-    clock
-        That of its deadlines.
-    exchange
-        Asks one servo; its answers are proven by nothing.
-
-    Raises
-    ------
-    LineLost, BadOptions
-        As `Port`.
-    """
+class Link(BusLink):
+    """One open line and its transactions; parameters, attributes and errors as of `BusLink`."""
 
     def __init__(
         self,
@@ -105,29 +76,9 @@ class Link:
         clock: Clock | None = None,
         open_line: OpenLine = SerialLine,
     ) -> None:
-        self.name = port
-        self._port = Port(port, baud, reply_timeout_s, take_status, urgent, clock=clock, open_line=open_line)
-        self.clock = self._port.clock
-        self.exchange = Exchange(self._port, FORMAT)
+        super().__init__(port, baud, reply_timeout_s, FORMAT, urgent, clock, open_line)
         self._counters = TickCounters(self.exchange)
         self._group_questions: dict[tuple[bool, tuple[Part, ...]], GroupQuestion] = {}
-
-    @property
-    def baud(self) -> int:
-        """Bits per second."""
-        return self._port.baud
-
-    def set_baud(self, baud: int) -> None:
-        """Open the line anew at another speed. Raises LineLost, BadOptions."""
-        self._port.set_baud(baud)
-
-    def close(self) -> None:
-        """Let go of the line; never raises."""
-        self._port.close()
-
-    def undisturbed(self) -> AbstractContextManager[None]:
-        """Within it nothing urgent breaks off what is said; for what must not be left half done."""
-        return self._port.undisturbed()
 
     def ping(self, servo_id: int) -> Pinged:
         """Ask one servo who it is. Raises NoReply, BadReply, LineLost."""
@@ -235,10 +186,6 @@ class Link:
         data = register.address.to_bytes(2, "little") + register.encode(value)
         self._port.send(instruction_packet(servo_id, WRITE, data), 0)
         self._port.drain()
-
-    def quiet(self, quiet_s: float) -> None:
-        """Drop what comes until nothing has come for ``quiet_s``: late replies. Raises LineLost, BadReply."""
-        self.exchange.quiet(quiet_s)
 
     def reboot(self, servo_id: int) -> None:
         """Restart a servo: torque drops. Raises NoReply, BadReply, Refused, LineLost."""

@@ -15,16 +15,15 @@ from drivers.dynamixel.packets import GroupAnswer, Part
 from drivers.dynamixel.registers import RegisterBlock
 from drivers.dynamixel.servo import Reboots, Servo, motion_blocks
 from drivers.dynamixel.settings import DynamixelAxisSettings, DynamixelSettings
-from drivers.errors import DriverError, LineLost
+from drivers.errors import DriverError
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.axis import ServoAxis
 from drivers.servo_bus.course import ServoSample
+from drivers.servo_bus.pair import BRAKE_COPIES, ServoPair
 
 log = logging.getLogger(__name__)
 
 FAST_TRIALS = 10
-STAND_ROUNDS = 2
-BRAKE_COPIES = 3  # more than a reply of 54 bytes can collide with
 
 
 Axis = ServoAxis[Servo, DynamixelAxisSettings]
@@ -39,7 +38,7 @@ def head_axes(link: Link, head: DynamixelSettings) -> tuple[Axis, Axis]:
     return pan, tilt
 
 
-class Pair:
+class Pair(ServoPair[Link, Axis]):
     """Pan and tilt on one open line.
 
     Parameters
@@ -51,15 +50,12 @@ class Pair:
 
     Attributes
     ----------
-    axes
-        Pan and tilt.
     fast
         Whether both servos are read by the fast group read.
     """
 
     def __init__(self, link: Link, head: DynamixelSettings) -> None:
-        self.axes = head_axes(link, head)
-        self.link = link
+        super().__init__(link, head_axes(link, head))
         self.fast = False
         self._head = head
         self._ids = [axis.settings.servo_id for axis in self.axes]
@@ -69,11 +65,6 @@ class Pair:
     def _parts(self, blocks: Sequence[RegisterBlock]) -> tuple[Part, ...]:
         """A block of each servo."""
         return tuple(Part(i, b.address, b.length) for i, b in zip(self._ids, blocks, strict=True))
-
-    @property
-    def clock(self) -> Clock:
-        """Of the line's deadlines."""
-        return self.link.clock
 
     def samples(self) -> list[ServoSample]:
         """Return what both servos say about their motion now, pan first, in one transaction.
@@ -98,14 +89,11 @@ class Pair:
         return samples
 
     def sample(self, axis: Axis) -> ServoSample:
-        """Return what one servo says about its motion now, asking it alone; raises as `samples`."""
+        """Return one servo's present motion, asking it alone; raises as `samples`."""
         return axis.servo.look_once()
 
     def brake(self) -> None:
-        """Tell each axis that holds to brake, whatever the line or the other axis does.
-
-        Nothing is asked and nobody answers: see that it was taken by `sample`. Raises LineLost.
-        """
+        """Command each axis that holds to brake, as `ServoPair.brake`. Raises LineLost."""
         parts = []
         for axis in self.axes:
             goal = axis.halt()
@@ -194,10 +182,6 @@ class Pair:
                 return False
         return True
 
-    def close(self) -> None:
-        """Close the line."""
-        self.link.close()
-
 
 def ready_pair(
     head: DynamixelSettings,
@@ -225,7 +209,7 @@ def ready_pair(
     try:
         pair = Pair(link, head)
         if not head.watchdog_counts:
-            _stand(pair)
+            pair.stand()
         _make_ready(pair, reboots)
         pair.fast = head.fast_read and pair.prove_fast_read()
     except BaseException:
@@ -234,25 +218,10 @@ def ready_pair(
     return pair
 
 
-def _stand(pair: Pair) -> None:
-    """Tell each axis that is under way to stand, as far as it answers. Raises LineLost."""
-    waiting = list(pair.axes)
-    for _ in range(STAND_ROUNDS):
-        for axis in tuple(waiting):
-            try:
-                axis.servo.stand()
-            except LineLost:
-                raise
-            except DriverError as error:  # told, with what it is, when the servo is made ready
-                log.debug("%s was not commanded to stand: %s", axis.servo.name, error)
-            else:
-                waiting.remove(axis)
-
-
 def _make_ready(pair: Pair, reboots: Reboots) -> None:
     """Make both servos ready; raises as `ready_pair`."""
     servos = [axis.servo for axis in pair.axes]
-    try:
+    with pair.holding_in_the_end():
         for servo in servos:
             servo.check_identity()
         for servo in servos:
@@ -264,8 +233,3 @@ def _make_ready(pair: Pair, reboots: Reboots) -> None:
         for axis in pair.axes:
             axis.take_hold()
         pair.arm()
-    except BaseException:  # a stop or a closing that broke it off too: what hangs on an axis is not to fall
-        with pair.link.undisturbed():
-            for servo in servos:
-                servo.hold_again()
-        raise

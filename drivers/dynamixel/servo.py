@@ -101,7 +101,7 @@ class Servo(ServoTable):
         self._settings = settings
         self._head = head
         self.truth = Truth(name, settings)
-        self._dropped = False  # its torque, by us, and not yet taken hold again
+        self.dropped = False  # its torque, by us, and not yet taken hold again
         self._blocks = itertools.cycle(motion_blocks(settings))
 
     def check_identity(self) -> None:
@@ -219,32 +219,13 @@ class Servo(ServoTable):
         return sample
 
     def check_place(self) -> int:
-        """See that the axis stands within its limits; returns the nearest count that may be its goal.
-
-        A few counts beyond a limit are passed (`ServoAxisSettings.slack_counts`): an axis that holds at its
-        limit droops, and would be locked out for good.
-
-        Raises
-        ------
-        WrongDevice
-            If it stands outside: moving from there could go the wrong way round.
-        """
-        counts = self.look().counts
-        settings = self._settings
-        low, high = settings.limit_counts
-        slack = settings.slack_counts
-        if not low - slack <= counts <= high + slack:
-            raise WrongDevice(
-                f"{self.name} stands at {counts} counts ({settings.angle_rad(counts):.4f} rad), outside its "
-                f"limits {low} to {high} ({settings.limits_rad[0]:.4f} to {settings.limits_rad[1]:.4f} rad): "
-                "with torque off turn it inside by hand, or correct zero_counts or limits_rad"
-            )
-        return min(max(counts, low), high)
+        """Return the count that may be the axis' goal where it stands, as `ServoAxisSettings.held_counts`."""
+        return self._settings.held_counts(self.name, self.look().counts)
 
     def set_up(self) -> None:
         """Bring the servo's permanent settings to what the configuration says.
 
-        The torque may be off then: `take_hold` follows, or `hold_again` if that is not to be.
+        The torque may be off then: `take_hold` follows, or the pair has it hold again.
 
         Raises
         ------
@@ -267,22 +248,11 @@ class Servo(ServoTable):
                     "on and the axis may fall. Support it and set torque_off_at_start: true, or switch the "
                     "servo off and on"
                 )
-            self._dropped = True
+            self.dropped = True
             self.set("torque_enable", 0)
         log.info("%s: setting %s", self.name, told)
         for name in sorted(different, key=lambda n: n != "operating_mode"):  # a new mode resets others
             self.set(name, different[name])
-
-    def hold_again(self) -> None:
-        """Switch on the torque that `set_up` has dropped, if nothing has since; never raises."""
-        if not self._dropped:
-            return
-        try:
-            self.set("goal_position", self.look().counts)
-            self.set("torque_enable", 1)
-        except DriverError as error:
-            log.warning("%s: its torque is off and could not be switched on again: %s", self.name, error)
-        self._dropped = False
 
     def _wanted(self) -> dict[str, int]:
         """The permanent settings, by register."""
@@ -337,7 +307,7 @@ class Servo(ServoTable):
                 raise HardwareFault(
                     f"{self.name} does not switch its torque on; it may be shut down by a hardware error"
                 ) from None
-        self._dropped = False
+        self.dropped = False
         return come_to_rest(self.look, self.set, self._settings.limit_counts, self._link.clock)
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from drivers.dynamixel.models import ServoModel, model_named
@@ -12,11 +12,13 @@ from drivers.options import OptionReader
 from drivers.servo_bus.port import QUIET_S
 from drivers.servo_bus.settings import (
     RESTING_POLL_S,
-    STANDS_WITHIN_S,
+    HeadSettings,
     ServoAxisSettings,
     axis_values,
     check_axis,
-    checked_pair,
+    check_polling,
+    head_values,
+    patience_s,
 )
 
 OnHardwareError = Literal["report", "reboot"]
@@ -47,42 +49,20 @@ class DynamixelAxisSettings(ServoAxisSettings):
     current_limit_A: float | None = None
 
 
-@dataclass(frozen=True)
-class DynamixelSettings:
-    """A head of two servos on one bus.
+@dataclass(frozen=True, kw_only=True)
+class DynamixelSettings(HeadSettings[DynamixelAxisSettings]):
+    """A head of two servos on one bus, as of `HeadSettings`; a lost reply must not trip the watchdog.
 
     Attributes
     ----------
-    port, baud
-        The line: a serial device or a pyserial URL, and its bits per second.
-    speed_rad_per_s, acceleration_rad_per_s2
-        Of the profile inside the servos; the speed is also the cap of every move.
     watchdog_s
         After this silence the servos stop by themselves; 0 switches that off. Left out: 0.3 s, or as much
         less as it takes to stand 0.5 s after the last poll, braking included.
-    poll_hz
-        How often the servos are read when nobody asks, while they move.
-    reply_timeout_s
-        What a reply may take beyond its time on the wire; a lost one must not trip the watchdog.
-    settle_s
-        How long both axes must stand in position to count as settled.
-    torque_off_at_start
-        Whether torque may be dropped at start-up where permanent settings must be changed.
     fast_read
         Try the servos' fast group read at start-up and use it if it proves itself.
     """
 
-    port: str
-    pan: DynamixelAxisSettings
-    tilt: DynamixelAxisSettings
-    baud: int = 1_000_000
-    speed_rad_per_s: float = 1.0
-    acceleration_rad_per_s2: float = 4.0
-    watchdog_s: float = 0.3
-    poll_hz: float = 50.0
-    reply_timeout_s: float = 0.05
-    settle_s: float = 0.1
-    torque_off_at_start: bool = False
+    watchdog_s: float = USUAL_WATCHDOG_S
     fast_read: bool = False
     name: str = field(default="dynamixel", init=False)
 
@@ -121,70 +101,19 @@ def dynamixel_settings(options: Mapping[str, Any]) -> DynamixelSettings:
     BadOptions
         For an unknown or missing key or a value that cannot be: which, what it is, what would be right.
     """
-    known = (
-        "port", "baud", "pan", "tilt", "speed_rad_per_s", "acceleration_rad_per_s2", "watchdog_s", "poll_hz",
-        "reply_timeout_s", "settle_s", "torque_off_at_start", "fast_read",
-    )  # fmt: skip
+    known = tuple(one.name for one in fields(DynamixelSettings) if one.init)
     read = OptionReader(options, known, ("port", "pan", "tilt"))
-    port = read.text("port", "a serial device such as /dev/ttyUSB0 or a URL")
-    pan, tilt = (_axis(read, name) for name in ("pan", "tilt"))
-    checked_pair(pan, tilt)
-    poll_hz = read.number("poll_hz", 50.0, 10.0, 500.0)
-    baud = _baud(read, poll_hz)
-    speed = read.number("speed_rad_per_s", 1.0, 0.03, 10.0)
-    acceleration = read.number("acceleration_rad_per_s2", 4.0, 0.4, 1000.0)
-    watchdog_s = _watchdog_s(read, speed, acceleration, poll_hz)
+    values = head_values(read, _axis, 500.0, 1000.0)
+    baud: int = read.whole("baud", 1_000_000, 9600, 10_500_000)
+    check_polling(read, baud, values["poll_hz"], POLL_BYTES)
+    watchdog_s = patience_s(read, values, "watchdog_s", USUAL_WATCHDOG_S, SHORTEST_WATCHDOG_S)
     return DynamixelSettings(
-        port=port,
-        pan=pan,
-        tilt=tilt,
+        **values,
         baud=baud,
-        speed_rad_per_s=speed,
-        acceleration_rad_per_s2=acceleration,
         watchdog_s=watchdog_s,
-        poll_hz=poll_hz,
-        reply_timeout_s=_reply_timeout_s(read, watchdog_s, poll_hz),
-        settle_s=read.number("settle_s", 0.1, 0.0, 5.0),
-        torque_off_at_start=read.flag("torque_off_at_start", False),
+        reply_timeout_s=_reply_timeout_s(read, watchdog_s, values["poll_hz"]),
         fast_read=read.flag("fast_read", False),
     )
-
-
-def _baud(read: OptionReader, poll_hz: float) -> int:
-    """The bits per second, enough to read both servos as often as is asked."""
-    baud: int = read.whole("baud", 1_000_000, 9600, 10_500_000)
-    wire_s = POLL_BYTES * 10 / baud
-    if wire_s > 1 / poll_hz:
-        raise read.refused(
-            "baud",
-            f" {baud}: reading both servos takes {1000 * wire_s:.1f} ms, too long for "
-            f"poll_hz {poll_hz:g}; expected {math.ceil(POLL_BYTES * 10 * poll_hz)} baud or more "
-            "(mastctl servo set-id has --new-baud)",
-        )
-    return baud
-
-
-def _watchdog_s(read: OptionReader, speed: float, acceleration: float, poll_hz: float) -> float:
-    """The watchdog, short enough for the head to stand in time after the last poll."""
-    brakes_s = speed / acceleration
-    longest_s = round(STANDS_WITHIN_S - 1 / poll_hz - brakes_s, 9)
-    if longest_s < SHORTEST_WATCHDOG_S and read.values.get("watchdog_s") != 0:
-        left_s = STANDS_WITHIN_S - 1 / poll_hz - SHORTEST_WATCHDOG_S
-        raise read.refused(
-            "acceleration_rad_per_s2",
-            f" is {acceleration:g}. Braking from {speed:g} rad/s takes {brakes_s:.3g} s, so that the bus "
-            f"watchdog cannot stop the head within {STANDS_WITHIN_S:g} s in all; expected "
-            f"{speed / left_s:.3g} or more, a lower speed_rad_per_s, or watchdog_s: 0 to do without",
-        )
-    watchdog_s: float = read.number("watchdog_s", min(USUAL_WATCHDOG_S, longest_s), 0.0, STANDS_WITHIN_S)
-    if watchdog_s and not SHORTEST_WATCHDOG_S <= watchdog_s <= longest_s:
-        raise read.refused(
-            "watchdog_s",
-            f" is {watchdog_s:.3g} s, and the head brakes from {speed:g} rad/s at {acceleration:g} rad/s2 in "
-            f"{brakes_s:.3g} s. Expected {SHORTEST_WATCHDOG_S:g} s or more, and {STANDS_WITHIN_S:g} s in "
-            "all, the last poll's age included; or 0 to do without",
-        )
-    return watchdog_s
 
 
 def _reply_timeout_s(read: OptionReader, watchdog_s: float, poll_hz: float) -> float:

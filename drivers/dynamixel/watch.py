@@ -13,7 +13,8 @@ from drivers.dynamixel.models import WATCHDOG_TRIPPED
 from drivers.dynamixel.pair import Axis, Pair
 from drivers.dynamixel.servo import Reboots, hardware_fault_words
 from drivers.dynamixel.settings import DynamixelSettings
-from drivers.errors import BadReply, HardwareFault, Refused, WatchdogTripped
+from drivers.errors import BadReply, HardwareFault, Refused
+from drivers.servo_bus.pair import SessionWatch
 from drivers.servo_bus.session import GivenUp
 
 log = logging.getLogger(__name__)
@@ -21,7 +22,7 @@ log = logging.getLogger(__name__)
 WATCH_S = 0.2  # how often torque and watchdog registers are looked at while all goes well
 
 
-class Watch:
+class Watch(SessionWatch[Axis]):
     """The watch over two servos, from when they were made ready until the line is given up.
 
     Parameters
@@ -39,8 +40,14 @@ class Watch:
         Whether a watchdog has stopped a motion; latched until `end_trip`.
     """
 
+    trip_words = (
+        "the servos' bus watchdog has stopped the head since this process was silent for too long; "
+        "stop arms it anew"
+    )
+    trip_refusal = "the servos' bus watchdog has stopped the head; stop arms it anew, then move again"
+
     def __init__(self, pair: Pair, head: DynamixelSettings, reboots: Reboots) -> None:
-        self.tripped = False
+        super().__init__(pair.axes)
         self._pair = pair
         self._head = head
         self._reboots = reboots
@@ -135,7 +142,7 @@ class Watch:
 
     def end_trip(self) -> None:
         """Forget a trip: both axes stand where they were stopped, with their old goals void."""
-        self.tripped = False
+        super().end_trip()
         self.look_soon()
         log.warning("the head is armed anew after its watchdog had stopped it")
 
@@ -170,33 +177,6 @@ class Watch:
         log.error("%s", words)
         if axis.settings.on_hardware_error == "reboot" and self._reboots.left(self._clock.now_s()):
             raise GivenUp(HardwareFault(words, detail={"hardware_error": error}))
-
-    def check_free(self) -> None:
-        """See that nothing forbids a move.
-
-        Raises
-        ------
-        HardwareFault, WatchdogTripped
-            If a servo reports a hardware error, or the watchdog has stopped the head.
-        """
-        for axis in self._pair.axes:
-            if axis.hardware_error:
-                raise HardwareFault(axis.hardware_error)
-        if self.tripped:
-            raise WatchdogTripped(
-                "the servos' bus watchdog has stopped the head; stop arms it anew, then move again"
-            )
-
-    def faults(self, now_s: float) -> tuple[str, ...]:
-        """Return what is wrong, in plain words."""
-        words = [axis.hardware_error for axis in self._pair.axes]
-        if self.tripped:
-            words.append(
-                "the servos' bus watchdog has stopped the head since this process was silent for too long; "
-                "stop arms it anew"
-            )
-        words += [axis.motion.stuck_words(now_s) for axis in self._pair.axes]
-        return tuple(word for word in words if word)
 
 
 def _distrust(words: str) -> GivenUp:

@@ -7,8 +7,8 @@ little, slowly, weakly, watches it all the time, and leaves it as it was.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 
 from drivers.clock import Clock
@@ -26,20 +26,26 @@ from drivers.dynamixel.models import (
 )
 from drivers.dynamixel.registers import RegisterBlock, vendor_names, vendor_registers
 from drivers.dynamixel.servo_table import ServoTable, identified
-from drivers.errors import BadOptions, DriverError, HardwareFault, NoReply, OutOfRange, Refused, WrongDevice
+from drivers.errors import DriverError, HardwareFault, NoReply, Refused, WrongDevice
 from drivers.serial_line import OpenLine, SerialLine
-from drivers.servo_bus.bench import FoundServo, Scan, ServoFacts, Trial, TrialStep
-from drivers.servo_bus.course import PROFILE_BIT
+from drivers.servo_bus.bench import (
+    FoundServo,
+    Scan,
+    ServoFacts,
+    Trial,
+    TrialStep,
+    check_change,
+    check_trial,
+    restored,
+    scanned,
+    watched_step,
+)
+from drivers.servo_bus.course import ServoSample
 from drivers.servo_bus.exchange import again
-from drivers.servo_bus.rest import STEP_RESTS_S, Rest
-
-HIGHEST_ID = 252
 
 TRIAL_SPEED_RAD_PER_S = 0.2
 TRIAL_ACCELERATION_RAD_PER_S2 = 1.0
 TRIAL_WATCHDOG = 15  # times 20 ms
-TRIAL_POLL_S = 0.02
-TRIAL_WARM_MARGIN_C = 10  # below the servo's own limit
 
 
 def scan(
@@ -49,25 +55,14 @@ def scan(
     clock: Clock | None = None,
     open_line: OpenLine = SerialLine,
 ) -> Scan:
-    """Ask at every baud rate who is there; ``clock`` and ``open_line`` are those of `Link`.
+    """Ask at every baud rate who is there, as `scanned`; the rest as of `Link`."""
+    opened = partial(Link, port, reply_timeout_s=reply_timeout_s, clock=clock, open_line=open_line)
+    return scanned(bauds, opened, _there)
 
-    Raises
-    ------
-    LineLost, BadOptions
-        If the line cannot be opened at all, or the adapter cannot do a rate.
-    """
-    found: list[FoundServo] = []
-    garbled: list[int] = []
-    for baud in bauds:
-        link = Link(port, baud, reply_timeout_s, clock=clock, open_line=open_line)
-        try:
-            pings, noise = link.ping_all()
-            if noise:
-                garbled.append(baud)
-            found += [_found(link, ping) for ping in pings]
-        finally:
-            link.close()
-    return Scan(tuple(found), tuple(bauds), tuple(garbled))
+
+def _there(link: Link) -> tuple[list[FoundServo], int]:
+    pings, noise = link.ping_all()
+    return [_found(link, ping) for ping in pings], noise
 
 
 def _found(link: Link, ping: Pinged) -> FoundServo:
@@ -152,14 +147,8 @@ def set_id(link: Link, old: int, new: int, new_baud: int | None = None, *, torqu
     NoReply, BadReply, Refused, LineLost
         If it cannot be reached.
     """
-    for name, value in (("old", old), ("new", new)):
-        if not 0 <= value <= HIGHEST_ID:
-            raise BadOptions(f"the {name} id {value} cannot be; an id is 0 to {HIGHEST_ID}")
     codes = {rate: code for code, rate in BAUD_RATES.items()}
-    if new_baud is not None and new_baud not in codes:
-        raise BadOptions(f"{new_baud} baud cannot be; there is {', '.join(str(rate) for rate in codes)}")
-    if old == new and new_baud in (None, link.baud):
-        raise BadOptions(f"servo {old} already has this id and baud rate; there is nothing to do")
+    check_change(link, old, new, new_baud, codes)
     model, _ = identify(link, old)
     if old != new:
         try:
@@ -238,7 +227,7 @@ def try_out(link: Link, servo_id: int, amplitude_rad: float, torque_percent: flo
     table = table_of(link, servo_id, model)
     fence = start - 2 * reach, start + 2 * reach
     steps: list[TrialStep] = []
-    with _restored(table, values):
+    with restored(table.name, table.set, _found_so(values)):
         _make_weak_and_slow(table, model, values, torque_percent)
         table.set("torque_enable", 1)
         if firmware >= model.watchdog_firmware:
@@ -275,91 +264,30 @@ def _check_fit(servo_id: int, model: ServoModel, values: Mapping[str, int], reac
     if values["hardware_error"]:
         words = ", ".join(hardware_error_words(values["hardware_error"]))
         raise HardwareFault(f"servo {servo_id} reports {words}; find the cause, then switch it off and on")
-    if values["present_temperature"] > values["temperature_limit"] - TRIAL_WARM_MARGIN_C:
-        raise HardwareFault(
-            f"servo {servo_id} is at {values['present_temperature']} C, near its limit of "
-            f"{values['temperature_limit']} C; let it cool"
-        )
-    voltage, low, high = (
-        values[f"{name}"] for name in ("present_voltage", "min_voltage_limit", "max_voltage_limit")
-    )
-    if not low <= voltage <= high:
-        raise HardwareFault(
-            f"servo {servo_id} gets {voltage / 10:.1f} V, expected {low / 10:.1f} to {high / 10:.1f} V"
-        )
-    start = values["present_position"]
-    least, most = values["min_position_limit"], values["max_position_limit"]
-    if not least + reach <= start <= most - reach:
-        raise OutOfRange(
-            f"servo {servo_id} stands at {start} counts; a move of {reach} counts to each side leaves its "
-            f"position limits {least} to {most}"
-        )
+    limits = values["min_position_limit"], values["max_position_limit"]
+    check_trial(f"servo {servo_id}", values, limits, reach)
 
 
-@contextmanager
-def _restored(table: ServoTable, values: Mapping[str, int]) -> Iterator[None]:
-    """Leave the servo as it was found: torque first, then all the rest, whatever of it fails."""
-    wrong: BaseException | None = None
-    try:
-        yield
-    except BaseException as error:  # goes on to the caller when the servo is as it was
-        wrong = error
+def _found_so(values: Mapping[str, int]) -> list[tuple[str, int]]:
+    """The registers that a trial changes as they were found: torque first, then all the rest."""
     wanted = [] if values["torque_enable"] else [("torque_enable", 0)]
     wanted += [("bus_watchdog", 0)]  # one that trips would refuse goal_pwm
     wanted += [(name, values[name]) for name in ("profile_acceleration", "profile_velocity", "goal_pwm")]
     if values["bus_watchdog"] != WATCHDOG_TRIPPED:
         wanted += [("bus_watchdog", values["bus_watchdog"])]
-    left: dict[str, DriverError] = {}
-    while wanted:
-        name, value = wanted[0]
-        try:
-            table.set(name, value)
-        except DriverError as error:
-            left[name] = error
-        except KeyboardInterrupt as error:  # Ctrl-C again: it is tried once more, and the rest too
-            wrong = wrong or error
-            continue
-        del wanted[0]
-    if left:
-        names = " and ".join(left)
-        limp = "its torque may be on; " if "torque_enable" in left else ""
-        words = f"{table.name} is not left as it was found in {names}: {limp}{next(iter(left.values()))}"
-        raise WrongDevice(
-            words if wrong is None else f"{str(wrong) or 'interrupted'}; and {words}"
-        ) from wrong
-    if wrong is not None:
-        raise wrong
+    return wanted
 
 
 def _step(link: Link, table: ServoTable, model: ServoModel, goal: int, fence: tuple[int, int]) -> TrialStep:
     """Watch one short move to its end."""
     block = RegisterBlock(model.registers, "goal_velocity", "present_temperature")
-    began_s = link.clock.now_s()
-    most, rest = 0, Rest(STEP_RESTS_S)
-    while True:
+
+    def look() -> ServoSample:
         sent_s = link.clock.now_s()
         # what is late shows by its counter; to wait for it would trip the watchdog
         (status,) = again(link, lambda: table.block(block), late_s=0.0).statuses.values()
         if status.alert:
             raise HardwareFault(f"{table.name} reports a hardware error; the trial is ended")
-        values = block.decode(status.data)
-        most = max(most, abs(values["present_current"]))
-        if not fence[0] <= values["present_position"] <= fence[1]:
-            raise OutOfRange(
-                f"{table.name} left the fence of the trial at {values['present_position']} counts "
-                f"(allowed {fence[0]} to {fence[1]}); it is stopped"
-            )
-        now_s = link.clock.now_s()
-        stands, elapsed_s = rest.take(values, sent_s, now_s), now_s - began_s
-        if (stands and not values["moving_status"] & PROFILE_BIT) or elapsed_s > 10.0:
-            break
-        link.clock.sleep(TRIAL_POLL_S)
-    left = abs(values["present_position"] - goal)
-    if left > max(abs(fence[1] - fence[0]) / 16, 4):
-        raise HardwareFault(
-            f"{table.name} stands {left} counts from its goal: blocked, or too weak with this bound "
-            "of its drive; it is stopped"
-        )
-    current = None if model.current_unit_A is None else most * model.current_unit_A
-    voltage, temperature = values["present_voltage"] / 10, values["present_temperature"]
-    return TrialStep(goal, values["present_position"], elapsed_s, current, voltage, temperature)
+        return ServoSample(block.decode(status.data), False, sent_s, link.clock.now_s())
+
+    return watched_step(table.name, look, link.clock, link.clock.now_s(), goal, fence, model.current_unit_A)

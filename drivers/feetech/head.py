@@ -7,6 +7,7 @@ both axes stand soon after this process has died (``lease_s``). Nothing here mov
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import closing
 from typing import Any
 
 from drivers.clock import Clock
@@ -57,25 +58,14 @@ class FeetechHead(BusHead):
 def halt(
     options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
 ) -> list[str]:
-    """Tell each axis that holds to stand where it is, by itself, and see that it does. Torque stays as it is.
+    """Command each axis that holds to stand, as `halt_axes`; its torque stays as it is.
 
-    ``clock`` and ``open_line`` are as of `FeetechLink`.
-
-    Raises
-    ------
-    BadOptions
-        For options that cannot be.
-    LineLost
-        If there is no line.
-    NoReply
-        If an axis did not confirm or still moves; the other was told all the same.
+    ``clock`` and ``open_line`` are those of `FeetechLink`. Raises BadOptions, LineLost, NoReply.
     """
     head = feetech_settings(options)
     link = open_link(head.port, head.baud, head.reply_timeout_s, clock=clock, open_line=open_line)
-    try:
+    with closing(link):
         return halt_axes(FeetechPair(link, head, {}).axes, _stood, link.clock)
-    finally:
-        link.close()
 
 
 def _stood(axis: FeetechAxis) -> str:

@@ -19,7 +19,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 
 from drivers.clock import Clock
@@ -35,14 +34,12 @@ from drivers.feetech.packets import (
     instruction_packet,
     sync_read_packet,
     sync_write_packet,
-    take_status,
 )
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.course import ServoSample
-from drivers.servo_bus.exchange import Exchange
-from drivers.servo_bus.port import QUIET_S, Port, Status
+from drivers.servo_bus.link import REPLY_TIMEOUT_S, BusLink
+from drivers.servo_bus.port import QUIET_S, Status
 
-REPLY_TIMEOUT_S = 0.05
 STARTS, TOKENS = 17, 16
 FIRST_START = 24  # of what is read, up to torque_enable
 LATE_S = 1.0
@@ -60,20 +57,15 @@ class Questions:
     doubted_until_s: float = -math.inf
 
 
-class FeetechLink:
-    """One open line and its transactions; for one thread at a time.
+class FeetechLink(BusLink):
+    """One open line and its transactions, as of `BusLink`.
 
     Parameters
     ----------
     port, baud, reply_timeout_s, urgent, clock, open_line
-        As of `Port`; `Overtaken` may come from every method but `shout`.
+        As of `BusLink`.
     questions
         Of the head, over all its lines.
-
-    Raises
-    ------
-    LineLost, BadOptions
-        As `Port`.
     """
 
     def __init__(
@@ -87,32 +79,8 @@ class FeetechLink:
         clock: Clock | None = None,
         open_line: OpenLine = SerialLine,
     ) -> None:
-        self.name = port
-        self._port = Port(port, baud, reply_timeout_s, take_status, urgent, clock=clock, open_line=open_line)
-        self.clock = self._port.clock
-        self.exchange = Exchange(self._port, FORMAT)
+        super().__init__(port, baud, reply_timeout_s, FORMAT, urgent, clock, open_line)
         self._questions = questions or Questions()
-
-    @property
-    def baud(self) -> int:
-        """Bits per second."""
-        return self._port.baud
-
-    def set_baud(self, baud: int) -> None:
-        """Open the line anew at another speed. Raises LineLost, BadOptions."""
-        self._port.set_baud(baud)
-
-    def close(self) -> None:
-        """Let go of the line; never raises."""
-        self._port.close()
-
-    def undisturbed(self) -> AbstractContextManager[None]:
-        """Within it nothing urgent breaks off what is said."""
-        return self._port.undisturbed()
-
-    def quiet(self, quiet_s: float) -> None:
-        """Drop what comes until nothing has come for ``quiet_s``. Raises LineLost, BadReply."""
-        self.exchange.quiet(quiet_s)
 
     def find_echo(self) -> bool:
         """Find out whether the adapter gives back what is sent, and drop that from now on.
@@ -152,9 +120,11 @@ class FeetechLink:
         noise = port.received_bytes - before - 6 * (len(found) + port.echoes)
         return sorted(set(found)), max(0, noise)
 
-    def look(self, servo_id: int, model: FeetechModel) -> dict[str, int]:
-        """Return one servo's motion by register, asked one time after a silence. Raises as `proven`."""
-        return _values(model, 40, self.block(servo_id, 40, 31))
+    def look(self, servo_id: int, model: FeetechModel) -> ServoSample:
+        """Return one servo's motion, asked one time after a silence. Raises as `proven`."""
+        sent_s = self.clock.now_s()
+        values = _values(model, 40, self.block(servo_id, 40, 31))
+        return ServoSample(values, values["status"] != 0, sent_s, self.clock.now_s())
 
     def proven(self, servo_id: int, register: Register, model: FeetechModel) -> int:
         """Return a register's value, said twice around a silence by replies of two lengths.

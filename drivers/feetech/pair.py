@@ -6,21 +6,16 @@ sends more of it. A servo has no watchdog; when its host is gone it comes to the
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 
 from drivers.clock import Clock
-from drivers.errors import DriverError, LineLost
 from drivers.feetech.link import FeetechLink, Questions
 from drivers.feetech.servo import FeetechServo
 from drivers.feetech.settings import FeetechAxisSettings, FeetechSettings
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.axis import ServoAxis
 from drivers.servo_bus.course import ServoSample
-
-log = logging.getLogger(__name__)
-
-BRAKE_COPIES = 3
+from drivers.servo_bus.pair import BRAKE_COPIES, ServoPair
 
 
 class FeetechAxis(ServoAxis[FeetechServo, FeetechAxisSettings]):
@@ -50,26 +45,18 @@ class FeetechAxis(ServoAxis[FeetechServo, FeetechAxisSettings]):
             motion.lent(goal)
 
 
-class FeetechPair:
-    """Pan and tilt on one open line.
-
-    Attributes
-    ----------
-    axes
-        Pan and tilt.
-    """
+class FeetechPair(ServoPair[FeetechLink, FeetechAxis]):
+    """Pan and tilt on one open line, as `ServoPair`."""
 
     def __init__(self, link: FeetechLink, head: FeetechSettings, offsets: dict[int, int]) -> None:
-        self.link = link
-        self.axes = tuple(
-            FeetechAxis(FeetechServo(link, name, axis, head, offsets), link.clock, axis, head)
-            for name, axis in (("pan", head.pan), ("tilt", head.tilt))
+        axes = (("pan", head.pan), ("tilt", head.tilt))
+        super().__init__(
+            link,
+            [
+                FeetechAxis(FeetechServo(link, name, axis, head, offsets), link.clock, axis, head)
+                for name, axis in axes
+            ],
         )
-
-    @property
-    def clock(self) -> Clock:
-        """Of the line's deadlines."""
-        return self.link.clock
 
     def samples(self) -> list[ServoSample]:
         """Return what both servos say about their motion now; raises as `FeetechLink.samples`."""
@@ -111,10 +98,6 @@ class FeetechPair:
         if data:
             self.link.shout(address, data, BRAKE_COPIES)
 
-    def close(self) -> None:
-        """Close the line."""
-        self.link.close()
-
 
 def ready_pair(
     head: FeetechSettings,
@@ -146,8 +129,8 @@ def ready_pair(
         pair = FeetechPair(link, head, offsets)
         servos = [axis.servo for axis in pair.axes]
         if not head.lease_s:
-            _stand(servos)
-        try:
+            pair.stand()
+        with pair.holding_in_the_end():
             for servo in servos:
                 servo.check_identity()
             for servo in servos:
@@ -157,23 +140,7 @@ def ready_pair(
                 servo.set_up()
             for axis in pair.axes:
                 axis.take_hold()
-        except BaseException:  # a stop or a closing too: what hangs on an axis is not to fall
-            with link.undisturbed():
-                for servo in servos:
-                    servo.hold_again()
-            raise
     except BaseException:
         link.close()
         raise
     return pair
-
-
-def _stand(servos: Sequence[FeetechServo]) -> None:
-    """Tell each servo that is under way to stand, as far as it answers. Raises LineLost."""
-    for servo in servos:
-        try:
-            servo.stand()
-        except LineLost:
-            raise
-        except DriverError as error:  # told, with what it is, when the servo is made ready
-            log.debug("%s was not told to stand: %s", servo.name, error)

@@ -61,7 +61,7 @@ class FeetechServo:
         self._offsets = offsets
         self._registers = settings.model.registers
         self.truth = Truth(self.name, settings)
-        self._dropped = False
+        self.dropped = False
 
     def get(self, register: str) -> int:
         """Return a register's value; a lost reply is asked for again. Raises as `FeetechLink.proven`."""
@@ -161,22 +161,8 @@ class FeetechServo:
         return bound
 
     def check_place(self) -> int:
-        """See that the axis stands within its limits, droop aside; returns the count that may be its goal.
-
-        Raises
-        ------
-        WrongDevice
-            If it stands outside: moving from there could go the wrong way round.
-        """
-        counts, settings = self.look().counts, self._settings
-        low, high = settings.limit_counts
-        if not low - settings.slack_counts <= counts <= high + settings.slack_counts:
-            raise WrongDevice(
-                f"{self.name} stands at {counts} counts ({settings.angle_rad(counts):.4f} rad), outside its "
-                f"limits {low} to {high} ({settings.limits_rad[0]:.4f} to {settings.limits_rad[1]:.4f} rad): "
-                "with torque off turn it inside by hand, or correct zero_counts or limits_rad"
-            )
-        return min(max(counts, low), high)
+        """Return the count that may be the axis' goal where it stands, as `ServoAxisSettings.held_counts`."""
+        return self._settings.held_counts(self.name, self.look().counts)
 
     def set_up(self) -> None:
         """Bring the servo's permanent settings to what the configuration says; the torque may be off then.
@@ -205,7 +191,7 @@ class FeetechServo:
                     f"{self.name} must be set to {told} with its torque off, and its torque is on: support "
                     "the axis and set torque_off_at_start: true, or switch the servo off and on"
                 )
-            self._dropped = True
+            self.dropped = True
             self.set("torque_enable", 0)
         log.info("%s: setting %s", self.name, told)
         self._unlocked(different)
@@ -225,16 +211,6 @@ class FeetechServo:
                     self._link.write_unanswered(self.servo_id, self._registers[name], value, model)
         finally:
             self.set("lock", LOCKED)
-
-    def hold_again(self) -> None:
-        """Switch on the torque that `set_up` has dropped, if nothing has since; never raises."""
-        if self._dropped:
-            try:
-                self.set("goal_position", self.look().counts)
-                self.set("torque_enable", 1)
-            except (NoReply, BadReply, WrongDevice) as error:
-                log.warning("%s: its torque is off and could not be switched on again: %s", self.name, error)
-        self._dropped = False
 
     @property
     def profile(self) -> tuple[int, int]:
@@ -277,7 +253,7 @@ class FeetechServo:
                 self.set("torque_enable", 1)
             except WrongDevice:
                 raise HardwareFault(f"{self.name} does not switch its torque on") from None
-        self._dropped = False
+        self.dropped = False
         return come_to_rest(self.look, self.set, self._settings.limit_counts, self._link.clock)
 
     def release(self) -> None:

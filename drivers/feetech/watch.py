@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 
-from drivers.errors import BadReply, HardwareFault, WatchdogTripped
+from drivers.errors import BadReply
 from drivers.feetech.pair import FeetechAxis, FeetechPair
 from drivers.feetech.servo import fault_words
+from drivers.servo_bus.pair import SessionWatch
 from drivers.servo_bus.session import GivenUp
 
 log = logging.getLogger(__name__)
@@ -18,17 +19,14 @@ times as fast as one that was taken for one of 1 count."""
 FAST_SPAN_S = 0.04
 
 
-class FeetechWatch:
-    """The watch over two servos, from when they were made ready until the line is given up.
+class FeetechWatch(SessionWatch[FeetechAxis]):
+    """The watch over two servos, as `SessionWatch`; a trip is a lease that has run out under way."""
 
-    Attributes
-    ----------
-    tripped
-        Whether a lease has run out under way; latched until `end_trip`.
-    """
+    trip_words = "the lease of a move ran out: this process was silent for too long; stop ends it"
+    trip_refusal = "the lease of a move ran out; stop lets the head move again"
 
     def __init__(self, pair: FeetechPair, lease_s: float) -> None:
-        self.tripped = False
+        super().__init__(pair.axes)
         self._pair = pair
         self._lease_s = lease_s
         self._too_fast: dict[str, str] = {}
@@ -41,9 +39,6 @@ class FeetechWatch:
             self.tripped = True
             log.error("the head stood at the end of its lease: this process was silent for too long")
             self._pair.brake()
-
-    def look_soon(self) -> None:
-        """Nothing: each sample is looked at."""
 
     def look(self) -> None:
         """Look whether both servos are as they were left.
@@ -101,32 +96,6 @@ class FeetechWatch:
             axis.motion.limp()
         log.error("%s", axis.hardware_error)
 
-    def check_free(self) -> None:
-        """See that nothing forbids a move. Raises HardwareFault."""
-        for axis in self._pair.axes:
-            if words := axis.hardware_error or self._too_fast.get(axis.servo.name, ""):
-                raise HardwareFault(words)
-        if self.tripped:
-            raise WatchdogTripped("the lease of a move ran out; stop lets the head move again")
-
-    def arm(self) -> None:
-        """Nothing: each goal is lent."""
-
-    def arm_axis(self, axis: FeetechAxis) -> None:
-        """Nothing."""
-
-    def has_stopped(self, axis: FeetechAxis) -> bool:
-        """Return False: an axis at the end of its lease obeys."""
-        return False
-
-    def end_trip(self) -> None:
-        """Forget that a lease ran out: both axes stand, with their old goals void."""
-        self.tripped = False
-
-    def faults(self, now_s: float) -> tuple[str, ...]:
-        """Return what is wrong, in plain words."""
-        words = [axis.hardware_error for axis in self._pair.axes] + list(self._too_fast.values())
-        if self.tripped:
-            words.append("the lease of a move ran out: this process was silent for too long; stop ends it")
-        words += [axis.motion.stuck_words(now_s) for axis in self._pair.axes]
-        return tuple(word for word in words if word)
+    def own_words(self, axis: FeetechAxis) -> list[str]:
+        """Return what forbids an axis to move: its servo's fault, a speed that was not commanded."""
+        return [*super().own_words(axis), *filter(None, [self._too_fast.get(axis.servo.name)])]

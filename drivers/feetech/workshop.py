@@ -7,12 +7,13 @@ little, slowly, weakly, and leaves it as it was.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 from drivers.clock import Clock
-from drivers.errors import BadOptions, DriverError, HardwareFault, NoReply, OutOfRange, WrongDevice
+from drivers.errors import DriverError, HardwareFault, NoReply, WrongDevice
 from drivers.feetech.link import FeetechLink, open_link
 from drivers.feetech.models import (
     BAUD_RATES,
@@ -24,15 +25,26 @@ from drivers.feetech.models import (
     FeetechModel,
     status_words,
 )
-from drivers.feetech.packets import HIGHEST_ID
 from drivers.serial_line import OpenLine, SerialLine
-from drivers.servo_bus.bench import FoundServo, Scan, ServoFacts, Trial, TrialStep
+from drivers.servo_bus.bench import (
+    LONGEST_STEP_S,
+    FoundServo,
+    Scan,
+    ServoFacts,
+    Trial,
+    TrialStep,
+    check_change,
+    check_trial,
+    restored,
+    scanned,
+    watched_step,
+)
+from drivers.servo_bus.course import ServoSample
 from drivers.servo_bus.exchange import ATTEMPTS, again
-from drivers.servo_bus.rest import STEP_RESTS_S, Rest
+from drivers.servo_bus.rest import Rest, rests
 
 TRIAL_SPEED_RAD_PER_S, TRIAL_ACCELERATION_RAD_PER_S2 = 0.2, 1.0
-TRIAL_POLL_S, LONGEST_STEP_S = 0.02, 10.0
-WARM_MARGIN_C = 10
+CHANGED = ("acceleration", "goal_time", "goal_speed", "torque_limit")
 PROBE_SPEED, PROBE_S, PROBE_COUNTS = 3, 1.0, 6
 """What a servo is told to find out the unit of its speed: 3 counts a second, or 150; more than 6 are many."""
 
@@ -44,27 +56,18 @@ def scan(
     clock: Clock | None = None,
     open_line: OpenLine = SerialLine,
 ) -> Scan:
-    """Ask at every baud rate who is there; ``clock`` and ``open_line`` are those of `FeetechLink`.
+    """Ask at every baud rate who is there, as `scanned`; the rest as of `FeetechLink`."""
+    opened = partial(open_link, port, reply_timeout_s=reply_timeout_s, clock=clock, open_line=open_line)
+    return scanned(bauds, opened, _there)
 
-    Raises
-    ------
-    LineLost, BadOptions
-        If the line cannot be opened at all, or the adapter cannot do a rate.
-    """
-    found: list[FoundServo] = []
-    garbled: list[int] = []
-    for baud in bauds:
-        link = open_link(port, baud, reply_timeout_s, clock=clock, open_line=open_line)
-        try:
-            ids, noise = link.ping_all()
-            if noise:
-                garbled.append(baud)
-            for servo_id in ids:
-                with suppress(NoReply):
-                    found.append(_found(link, servo_id))
-        finally:
-            link.close()
-    return Scan(tuple(found), tuple(bauds), tuple(garbled))
+
+def _there(link: FeetechLink) -> tuple[list[FoundServo], int]:
+    ids, noise = link.ping_all()
+    found = []
+    for servo_id in ids:
+        with suppress(NoReply):
+            found.append(_found(link, servo_id))
+    return found, noise
 
 
 def _found(link: FeetechLink, servo_id: int) -> FoundServo:
@@ -142,13 +145,7 @@ def set_id(
     NoReply, BadReply, LineLost
         If it cannot be reached, before or afterwards.
     """
-    for name, value in (("old", old), ("new", new)):
-        if not 0 <= value <= HIGHEST_ID:
-            raise BadOptions(f"the {name} id {value} cannot be; an id is 0 to {HIGHEST_ID}")
-    if new_baud is not None and new_baud not in BAUD_RATES:
-        raise BadOptions(f"{new_baud} baud cannot be; there is {', '.join(map(str, BAUD_RATES))}")
-    if old == new and new_baud in (None, link.baud):
-        raise BadOptions(f"servo {old} already has this id and baud rate; there is nothing to do")
+    check_change(link, old, new, new_baud, BAUD_RATES)
     model, _, _ = identify(link, old)
     if old != new:
         with suppress(NoReply):
@@ -191,22 +188,25 @@ def try_out(link: FeetechLink, servo_id: int, amplitude_rad: float, torque_perce
     start = values["present_position"]
     _check_fit(servo_id, values, reach)
     steps: list[TrialStep] = []
-    with _restored(link, servo_id, model, values):
+    set_ = partial(_set, link, servo_id, model)
+    found = [] if values["torque_enable"] else [("torque_enable", 0)]
+    found += [(name, values[name]) for name in CHANGED if name in values]
+    with restored(f"servo {servo_id}", set_, found):
         if not model.is_scs:
             weak = round(values["max_torque"] * torque_percent / 100)
-            _set(link, servo_id, model, "torque_limit", weak)
+            set_("torque_limit", weak)
             unit = max(1, round(TRIAL_ACCELERATION_RAD_PER_S2 / model.acceleration_unit_rad_per_s2))
-            _set(link, servo_id, model, "acceleration", unit)
+            set_("acceleration", unit)
         for name, value in (("goal_time", 0), ("goal_speed", PROBE_SPEED), ("goal_position", start)):
-            _set(link, servo_id, model, name, value)
-        _set(link, servo_id, model, "torque_enable", 1)
+            set_(name, value)
+        set_("torque_enable", 1)
         try:
             speed_unit = _speed_unit(link, servo_id, model, start + reach)
             speed = PROBE_SPEED
             if speed_unit is not None:
                 model = replace(model, speed_unit_counts=speed_unit)
                 speed = max(1, round(TRIAL_SPEED_RAD_PER_S / model.velocity_unit_rad_per_s))
-            _set(link, servo_id, model, "goal_speed", speed)
+            set_("goal_speed", speed)
             fence = start - 2 * reach, start + 2 * reach
             for goal in (start + reach, start - reach, start):
                 steps.append(_step(link, servo_id, model, goal, fence))
@@ -240,37 +240,7 @@ def _check_fit(servo_id: int, values: Mapping[str, int], reach: int) -> None:
         raise WrongDevice(f"{name} is in mode {values['operating_mode']}; a trial needs position mode, 0")
     if values["status"]:
         raise HardwareFault(f"{name} reports {status_words(values['status'])}")
-    if values["present_temperature"] > values["temperature_limit"] - WARM_MARGIN_C:
-        raise HardwareFault(
-            f"{name} is {values['present_temperature']} C, near its limit of {values['temperature_limit']} C"
-        )
-    low, high, start = values["min_angle_limit"], values["max_angle_limit"], values["present_position"]
-    if not low + reach <= start <= high - reach:
-        raise OutOfRange(
-            f"{name} stands at {start} counts; a move of {reach} counts to each side leaves its limits {low} "
-            f"to {high}"
-        )
-
-
-@contextmanager
-def _restored(
-    link: FeetechLink, servo_id: int, model: FeetechModel, values: Mapping[str, int]
-) -> Iterator[None]:
-    """Leave the servo as it was found, torque first, whatever of it fails."""
-    names = ("acceleration", "goal_time", "goal_speed", "torque_limit")
-    wanted = [] if values["torque_enable"] else ["torque_enable"]
-    wanted += [name for name in names if name in values]
-    try:
-        yield
-    finally:
-        left = []
-        for name in wanted:
-            try:
-                _set(link, servo_id, model, name, values[name])
-            except DriverError:
-                left.append(name)
-        if left:
-            raise WrongDevice(f"servo {servo_id} is not left as it was found in {' and '.join(left)}")
+    check_trial(name, values, (values["min_angle_limit"], values["max_angle_limit"]), reach)
 
 
 def _speed_unit(link: FeetechLink, servo_id: int, model: FeetechModel, goal: int) -> int | None:
@@ -284,55 +254,26 @@ def _speed_unit(link: FeetechLink, servo_id: int, model: FeetechModel, goal: int
     link.write(servo_id, model.registers["goal_position"], goal, model)
     link.clock.sleep(PROBE_S)
     _stand(link, servo_id, model, (min(before, goal), max(before, goal)))
-    until_s, rest = link.clock.now_s() + LONGEST_STEP_S, Rest()
-    while not _look(link, servo_id, model, rest)[1] and link.clock.now_s() < until_s:
-        link.clock.sleep(TRIAL_POLL_S)
+    rests(lambda: again(link, lambda: link.look(servo_id, model)), link.clock, LONGEST_STEP_S, Rest())
     after = link.proven(servo_id, position, model)
     if abs(after - before) > PROBE_COUNTS:
         return 50
     return 1 if abs(goal - before) > PROBE_COUNTS + 2 else None
 
 
-def _look(
-    link: FeetechLink, servo_id: int, model: FeetechModel, rest: Rest
-) -> tuple[Mapping[str, int], bool]:
-    """Return what a servo says about its motion, and whether it stands. Raises DriverError."""
-    sent_s = link.clock.now_s()
-    values = again(link, lambda: link.look(servo_id, model))
-    return values, rest.take(values, sent_s, link.clock.now_s())
-
-
 def _step(
     link: FeetechLink, servo_id: int, model: FeetechModel, goal: int, fence: tuple[int, int]
 ) -> TrialStep:
     """Watch one short move to its end."""
+    name = f"servo {servo_id}"
+
+    def look() -> ServoSample:
+        sample = again(link, lambda: link.look(servo_id, model))
+        if sample.alert:
+            words = status_words(sample.values["status"])
+            raise HardwareFault(f"{name} reports {words}; the trial is ended")
+        return sample
+
     began_s = link.clock.now_s()
     again(link, lambda: link.write(servo_id, model.registers["goal_position"], goal, model))
-    most, rest = 0, Rest(STEP_RESTS_S)
-    while True:
-        values, stands = _look(link, servo_id, model, rest)
-        if values["status"]:
-            raise HardwareFault(
-                f"servo {servo_id} reports {status_words(values['status'])}; the trial is ended"
-            )
-        if not fence[0] <= values["present_position"] <= fence[1]:
-            raise OutOfRange(
-                f"servo {servo_id} left the fence of the trial at {values['present_position']} counts "
-                f"(allowed {fence[0]} to {fence[1]}); it is stopped"
-            )
-        most = max(most, abs(values.get("present_current", 0)))
-        elapsed_s = link.clock.now_s() - began_s
-        if (stands and not values["moving"]) or elapsed_s > LONGEST_STEP_S:
-            break
-        link.clock.sleep(TRIAL_POLL_S)
-    left = abs(values["present_position"] - goal)
-    if left > max(abs(fence[1] - fence[0]) / 16, 4):
-        raise HardwareFault(
-            f"servo {servo_id} stands {left} counts from its goal: blocked, or too weak with this bound of "
-            "its drive; it is stopped"
-        )
-    current = None if model.current_unit_A is None else most * model.current_unit_A
-    return TrialStep(
-        goal, values["present_position"], elapsed_s, current,
-        values["present_voltage"] / 10, values["present_temperature"],
-    )  # fmt: skip
+    return watched_step(name, look, link.clock, began_s, goal, fence, model.current_unit_A)

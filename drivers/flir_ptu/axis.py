@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drivers.approach import legs_to
-from drivers.errors import OutOfRange, WrongDevice
+from drivers.errors import WrongDevice
 from drivers.flir_ptu.options import DEVICE, AxisOptions
 
 log = logging.getLogger(__name__)
@@ -119,15 +119,6 @@ class StepAxis:
         """Return the configuration's limits as positions, the lower first."""
         ends = sorted(self.position_from_rad(end) for end in self.options.limits_rad)
         return ends[0], ends[1]
-
-    def check_goal(self, angle_rad: float) -> None:
-        """Pass an angle within the configuration's limits. Raises OutOfRange."""
-        low, high = self.options.limits_rad
-        if not low <= angle_rad <= high:
-            raise OutOfRange(
-                f"{self.name} {angle_rad:.4f} rad is outside its limits {low:.4f} to {high:.4f} rad",
-                device=DEVICE,
-            )
 
     def check_limits(self) -> None:
         """Pass limits of the configuration that the unit can reach. Raises WrongDevice."""

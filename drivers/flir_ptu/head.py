@@ -21,12 +21,13 @@ from typing import Any
 from drivers.absent import Absence
 from drivers.approach import rising_below_rad
 from drivers.clock import Clock, ClockLock, SystemClock, deadlines_on
-from drivers.errors import BadReply, DriverError, HardwareFault, LineLost, NoReply, OutOfRange
+from drivers.errors import BadReply, DriverError, HardwareFault, LineLost, NoReply
 from drivers.flir_ptu import protocol as ask
 from drivers.flir_ptu.axis import StepAxis, StepCount
 from drivers.flir_ptu.conversation import Conversation, StopCameFirst
 from drivers.flir_ptu.options import DEVICE, Options, options_from
 from drivers.flir_ptu.unit import SupplyWatch, checked_version, measure, ready_axes
+from drivers.goals import check_goal
 from drivers.interfaces import AxisMotion, Reading
 from drivers.serial_line import OpenLine, SerialLine
 
@@ -148,10 +149,8 @@ class FlirPtu:
             If it did not confirm; unless only the last step is unconfirmed, nothing moves.
         """
         goals = {"pan": pan_rad, "tilt": tilt_rad}
-        for name, angle in goals.items():
-            self._axes[name].check_goal(angle)
-        if speed_rad_per_s is not None and not speed_rad_per_s > 0:
-            raise OutOfRange(f"speed {speed_rad_per_s} rad/s is not a positive number", device=DEVICE)
+        limits = [self._axes[name].options.limits_rad for name in goals]
+        check_goal((pan_rad, tilt_rad), limits, speed_rad_per_s, DEVICE)
         with self._talking() as talk:
             if self._count.lost:
                 raise HardwareFault("; ".join(self._count.lost.values()), device=DEVICE)

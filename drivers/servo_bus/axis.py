@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from drivers.clock import Clock
-from drivers.servo_bus.course import AxisCourse
+from drivers.servo_bus.course import AxisCourse, ServoSample
 from drivers.servo_bus.settings import HeadSettings, ServoAxisSettings
 
 
 class HeldServo(Protocol):
-    """A servo as an axis needs it."""
+    """A servo as an axis needs it; ``dropped`` while its torque is off because setting it up wanted that."""
+
+    dropped: bool
 
     @property
     def name(self) -> str:
@@ -36,6 +38,14 @@ class HeldServo(Protocol):
 
     def send_leg(self, profile: tuple[int, int], goal: int) -> None:
         """Set a goal with the profile that leads there. Raises DriverError."""
+        ...
+
+    def stand(self) -> object:
+        """Make where it is its goal, if it holds. Raises DriverError."""
+        ...
+
+    def look(self) -> ServoSample:
+        """Return its present motion; a lost reply is asked for again. Raises DriverError."""
         ...
 
     def release(self) -> None:
@@ -69,7 +79,7 @@ class ServoAxis(Generic[S, A]):
         Of its profile, as the servo rounds it.
     """
 
-    def __init__(self, servo: S, clock: Clock, settings: A, head: HeadSettings) -> None:
+    def __init__(self, servo: S, clock: Clock, settings: A, head: HeadSettings[Any]) -> None:
         self.settings = settings
         self._clock = clock
         self.servo = servo

@@ -11,16 +11,18 @@ import threading
 from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from drivers.absent import Absence
 from drivers.approach import rising_below_rad
 from drivers.clock import Clock, SystemClock, deadlines_on
 from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
+from drivers.goals import check_goal
 from drivers.interfaces import AxisMotion, AxisReport, Reading, Reporting
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.bus import Bus
-from drivers.servo_bus.session import GivenUp, ServoPair, ServoSession, SessionWatch
+from drivers.servo_bus.pair import ServoPair, SessionWatch
+from drivers.servo_bus.session import GivenUp, ServoSession
 from drivers.servo_bus.settings import HeadSettings
 
 log = logging.getLogger(__name__)
@@ -50,7 +52,7 @@ class BusHead(Reporting):
     """
 
     def __init__(
-        self, settings: HeadSettings, clock: Clock | None = None, open_line: OpenLine = SerialLine
+        self, settings: HeadSettings[Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
     ) -> None:
         self.settings = settings
         self._stamps = clock or SystemClock()
@@ -90,22 +92,14 @@ class BusHead(Reporting):
         LineLost, NoReply, BadReply
             If the servos do not confirm the goals.
         """
+        axes = (self.settings.pan, self.settings.tilt)
+        check_goal((pan_rad, tilt_rad), [axis.limits_rad for axis in axes], speed_rad_per_s)
         speed = self.settings.speed_rad_per_s if speed_rad_per_s is None else speed_rad_per_s
-        if not speed > 0:
-            raise OutOfRange(f"speed {speed_rad_per_s} rad/s is not a positive number")
-        slowest = max(a.model.velocity_unit_rad_per_s for a in (self.settings.pan, self.settings.tilt))
+        slowest = max(axis.model.velocity_unit_rad_per_s for axis in axes)
         if speed < slowest:
             raise OutOfRange(
                 f"speed {speed:g} rad/s is less than the {slowest:.4f} rad/s that the servos know"
             )
-        for name, axis, angle in zip(
-            AXES, (self.settings.pan, self.settings.tilt), (pan_rad, tilt_rad), strict=True
-        ):
-            low, high = axis.limits_rad
-            if not low <= angle <= high:
-                raise OutOfRange(
-                    f"{name} {angle:.4f} rad is outside the head's limits {low:.4f} to {high:.4f} rad"
-                )
         capped = min(speed, self.settings.speed_rad_per_s)
         self._call("move", lambda session: session.move((pan_rad, tilt_rad), capped), moves=True)
 
@@ -197,7 +191,7 @@ class BusHead(Reporting):
         return self._absence.again_s if self._session is None else self._session.poll_due_s
 
     @abstractmethod
-    def _ready(self, clock: Clock, open_line: OpenLine) -> tuple[ServoPair, SessionWatch]:
+    def _ready(self, clock: Clock, open_line: OpenLine) -> tuple[ServoPair[Any, Any], SessionWatch[Any]]:
         """Open the line, make both servos ready without moving them, and begin to watch them."""
 
     def _connect(self) -> ServoSession:

@@ -11,7 +11,6 @@ from drivers.servo_bus.axis import ServoAxis
 from drivers.servo_bus.course import ServoSample
 
 REST_S = 0.5
-STEP_RESTS_S = 0.2  # where the servo has said besides that its move is over
 LOOK_S = 0.01  # between one look and the next
 COME_TO_REST_S, HOLDS_S = 0.5, 0.05  # of an axis that is to hold, at most, and at least
 HALT_TRIES, HALT_REST_S = 5, 2.5

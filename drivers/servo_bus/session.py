@@ -10,13 +10,13 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import DriverError, LineLost, NoReply, WatchdogTripped
 from drivers.interfaces import Reading
 from drivers.servo_bus.axis import ServoAxis
-from drivers.servo_bus.course import ServoSample
+from drivers.servo_bus.pair import ServoPair, SessionWatch
 from drivers.servo_bus.settings import HeadSettings
 
 log = logging.getLogger(__name__)
@@ -36,92 +36,6 @@ class GivenUp(Exception):
     def __init__(self, error: DriverError) -> None:
         super().__init__(str(error))
         self.error = error
-
-
-class ServoPair(Protocol):
-    """Pan and tilt on one open line."""
-
-    @property
-    def axes(self) -> Sequence[ServoAxis[Any, Any]]:
-        """Pan and tilt."""
-        ...
-
-    @property
-    def clock(self) -> Clock:
-        """Of the line's deadlines."""
-        ...
-
-    def samples(self) -> Sequence[ServoSample]:
-        """Return what both servos say about their motion now, pan first. Raises DriverError."""
-        ...
-
-    def sample(self, axis: Any) -> ServoSample:
-        """Return what one servo says about its motion now, asking it alone. Raises DriverError."""
-        ...
-
-    def send_goals(self, goals: Sequence[int], speeds: Sequence[int]) -> Sequence[int]:
-        """Write profile and goal of both axes with one packet; returns as much of the goals as was sent.
-
-        Raises LineLost, BadReply.
-        """
-        ...
-
-    def brake(self) -> None:
-        """Tell each axis that holds to brake, whatever the line or the other axis does. Raises LineLost."""
-        ...
-
-    def close(self) -> None:
-        """Close the line."""
-        ...
-
-
-class SessionWatch(Protocol):
-    """Looks for what servos do by themselves."""
-
-    @property
-    def tripped(self) -> bool:
-        """Whether silence has stopped a motion; latched until `end_trip`."""
-        ...
-
-    def heard_again(self, silence_s: float) -> None:
-        """Note how long nothing was heard of the servos."""
-        ...
-
-    def look(self) -> None:
-        """Look whether they are as they were left. Raises GivenUp, DriverError."""
-        ...
-
-    def look_soon(self) -> None:
-        """Have the next `look` look."""
-        ...
-
-    def note_alert(self, axis: Any) -> None:
-        """A servo reports a fault: brake both axes and say which. Raises GivenUp, DriverError."""
-        ...
-
-    def check_free(self) -> None:
-        """See that nothing forbids a move. Raises HardwareFault, WatchdogTripped."""
-        ...
-
-    def arm(self) -> None:
-        """Have silence stop the servos from now on. Raises DriverError."""
-        ...
-
-    def arm_axis(self, axis: Any) -> None:
-        """The same of one axis. Raises DriverError."""
-        ...
-
-    def has_stopped(self, axis: Any) -> bool:
-        """Return whether silence has stopped an axis, which obeys no goal then. Raises DriverError."""
-        ...
-
-    def end_trip(self) -> None:
-        """Forget a trip: both axes stand where they were stopped."""
-        ...
-
-    def faults(self, now_s: float) -> tuple[str, ...]:
-        """Return what is wrong, in plain words."""
-        ...
 
 
 class ServoSession:
@@ -144,7 +58,9 @@ class ServoSession:
         When the servos want to be read again, seconds of the line's clock.
     """
 
-    def __init__(self, pair: ServoPair, watch: SessionWatch, head: HeadSettings, clock: Clock) -> None:
+    def __init__(
+        self, pair: ServoPair[Any, Axis], watch: SessionWatch[Axis], head: HeadSettings[Any], clock: Clock
+    ) -> None:
         self.pair = pair
         self.poll_due_s = 0.0
         self._head = head
@@ -352,7 +268,7 @@ class ServoSession:
         self.pair.close()
 
 
-def _stop_error(pair: ServoPair, failed: Mapping[Axis, DriverError]) -> DriverError:
+def _stop_error(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError]) -> DriverError:
     """What to tell of a stop that not every axis has confirmed."""
     error = next(iter(failed.values()))
     names = " and ".join(axis.servo.name for axis in failed)

@@ -1,14 +1,14 @@
-"""What options say of an axis that a servo turns, read strictly; a family of servos adds its own."""
+"""The options of a head of two servos and of its axes, read strictly; a family of servos adds its own."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 from drivers.approach import APPROACHES, ApproachedAxis
-from drivers.errors import BadOptions
+from drivers.errors import BadOptions, WrongDevice
 from drivers.options import OptionReader
 
 Rest = Literal["hold", "torque_off"]
@@ -67,34 +67,6 @@ class CountedModel(Protocol):
         ...
 
 
-class HeadSettings(Protocol):
-    """What a head of two servos is made of, whatever their family."""
-
-    @property
-    def port(self) -> str: ...
-    @property
-    def pan(self) -> ServoAxisSettings: ...
-    @property
-    def tilt(self) -> ServoAxisSettings: ...
-    @property
-    def speed_rad_per_s(self) -> float: ...
-    @property
-    def acceleration_rad_per_s2(self) -> float: ...
-    @property
-    def poll_hz(self) -> float: ...
-    @property
-    def settle_s(self) -> float: ...
-    @property
-    def resting_poll_s(self) -> float:
-        """How often servos that stand are read, seconds."""
-        ...
-
-    @property
-    def silence_s(self) -> float:
-        """How long nothing may be sent so that both axes have stopped by themselves; 0 if they never do."""
-        ...
-
-
 @dataclass(frozen=True, kw_only=True)
 class ServoAxisSettings(ApproachedAxis):
     """One axis of the head, as of `ApproachedAxis`; its limits are also the servo's position limits.
@@ -137,6 +109,26 @@ class ServoAxisSettings(ApproachedAxis):
         """How far beyond a limit an axis that was sent to it may stand: it droops, or dithers."""
         return max(LEAST_SLACK_COUNTS, math.ceil(self.settle_rad / self.model.count_rad))
 
+    def held_counts(self, name: str, counts: int) -> int:
+        """Return the nearest goal within the limits to where an axis stands.
+
+        A few counts beyond a limit are passed (`slack_counts`): an axis that holds at its limit droops, and
+        would be locked out for good.
+
+        Raises
+        ------
+        WrongDevice
+            If it stands outside: moving from there could go the wrong way round.
+        """
+        low, high = self.limit_counts
+        if not low - self.slack_counts <= counts <= high + self.slack_counts:
+            raise WrongDevice(
+                f"{name} stands at {counts} counts ({self.angle_rad(counts):.4f} rad), outside its "
+                f"limits {low} to {high} ({self.limits_rad[0]:.4f} to {self.limits_rad[1]:.4f} rad): "
+                "with torque off turn it inside by hand, or correct zero_counts or limits_rad"
+            )
+        return min(max(counts, low), high)
+
     def acceleration_counts(self, acceleration_rad_per_s2: float) -> int:
         """Return a profile acceleration, not below the one given: braking takes no longer than promised."""
         return max(1, math.ceil(acceleration_rad_per_s2 / self.model.acceleration_unit_rad_per_s2 - 1e-6))
@@ -144,6 +136,53 @@ class ServoAxisSettings(ApproachedAxis):
     def velocity_counts(self, speed_rad_per_s: float) -> int:
         """Return a profile velocity, not above the speed; never 0, which would mean as fast as it can."""
         return max(1, math.floor(speed_rad_per_s / self.model.velocity_unit_rad_per_s + 1e-9))
+
+
+A = TypeVar("A", bound=ServoAxisSettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeadSettings(Generic[A]):
+    """A head of two servos on one bus; a family of servos adds its own.
+
+    Attributes
+    ----------
+    port, baud
+        The line: a serial device or a pyserial URL, and its bits per second.
+    pan, tilt
+        The axes.
+    speed_rad_per_s, acceleration_rad_per_s2
+        Of the profile inside the servos; the speed is also the cap of every move.
+    poll_hz
+        How often the servos are read while they move, if no client asks.
+    reply_timeout_s
+        How long a reply may take beyond its time on the wire; a lost one must not trip a watchdog.
+    settle_s
+        How long both axes must stand in position to count as settled.
+    torque_off_at_start
+        Whether torque may be dropped at start-up where permanent settings must be changed.
+    """
+
+    port: str
+    pan: A
+    tilt: A
+    baud: int = 1_000_000
+    speed_rad_per_s: float = 1.0
+    acceleration_rad_per_s2: float = 4.0
+    poll_hz: float = 50.0
+    reply_timeout_s: float = 0.05
+    settle_s: float = 0.1
+    torque_off_at_start: bool = False
+
+    @property
+    def resting_poll_s(self) -> float:
+        """How often servos that stand are read, seconds."""
+        return max(1 / self.poll_hz, RESTING_POLL_S)
+
+    @property
+    def silence_s(self) -> float:
+        """How long nothing may be sent so that both axes have stopped by themselves; 0 if they never do."""
+        return 0.0
 
 
 AXIS_KEYS = (
@@ -198,16 +237,90 @@ def axis_values(
     }
 
 
+def head_values(
+    read: OptionReader, axis: Callable[[OptionReader, str], A], most_poll_hz: float, steepest: float
+) -> dict[str, Any]:
+    """Return the values of a head's options as `HeadSettings` has them, without baud and patience.
+
+    Parameters
+    ----------
+    read
+        Of the head.
+    axis
+        Reads one axis.
+    most_poll_hz, steepest
+        Bounds of ``poll_hz`` and ``acceleration_rad_per_s2``.
+
+    Raises
+    ------
+    BadOptions
+        For a value that cannot be.
+    """
+    values = {
+        "port": read.text("port", "a serial device such as /dev/ttyUSB0 or a URL"),
+        "pan": axis(read, "pan"),
+        "tilt": axis(read, "tilt"),
+        "poll_hz": read.number("poll_hz", 50.0, 10.0, most_poll_hz),
+        "speed_rad_per_s": read.number("speed_rad_per_s", 1.0, 0.03, 10.0),
+        "acceleration_rad_per_s2": read.number("acceleration_rad_per_s2", 4.0, 0.4, steepest),
+        "settle_s": read.number("settle_s", 0.1, 0.0, 5.0),
+        "torque_off_at_start": read.flag("torque_off_at_start", False),
+    }
+    number = values["pan"].servo_id
+    if number == values["tilt"].servo_id:
+        raise BadOptions(f"options.pan.id and options.tilt.id are both {number}, expected two ids")
+    return values
+
+
+def check_polling(read: OptionReader, baud: int, poll_hz: float, poll_bytes: int) -> None:
+    """Refuse bits per second that are too few to read both servos as often as is asked."""
+    wire_s = poll_bytes * 10 / baud
+    if wire_s > 1 / poll_hz:
+        raise read.refused(
+            "baud",
+            f" {baud}: reading both servos takes {1000 * wire_s:.1f} ms, too long for "
+            f"poll_hz {poll_hz:g}; expected {math.ceil(poll_bytes * 10 * poll_hz)} baud or more "
+            "(mastctl servo set-id has --new-baud)",
+        )
+
+
+def patience_s(
+    read: OptionReader, head: Mapping[str, Any], key: str, usual_s: float, shortest_s: float
+) -> float:
+    """Return how long a servo goes on after the last packet; 0: for ever.
+
+    It is short enough for the head to stand `STANDS_WITHIN_S` after the last poll, braking included.
+
+    Raises
+    ------
+    BadOptions
+        If it is too long, or none is short enough.
+    """
+    speed, acceleration = head["speed_rad_per_s"], head["acceleration_rad_per_s2"]
+    brakes_s = speed / acceleration
+    longest_s = round(STANDS_WITHIN_S - 1 / head["poll_hz"] - brakes_s, 9)
+    braking = f"braking from {speed:g} rad/s at {acceleration:g} rad/s2 takes {brakes_s:.3g} s"
+    if longest_s < shortest_s and read.values.get(key) != 0:
+        least = speed / (STANDS_WITHIN_S - 1 / head["poll_hz"] - shortest_s)
+        raise read.refused(
+            "acceleration_rad_per_s2",
+            f" is {acceleration:g}: {braking}, so that no {key} stops the head within {STANDS_WITHIN_S:g} s "
+            f"in all; expected {least:.3g} or more, a lower speed_rad_per_s, or {key}: 0 to do without",
+        )
+    value: float = read.number(key, min(usual_s, longest_s), 0.0, STANDS_WITHIN_S)
+    if value and not shortest_s <= value <= longest_s:
+        raise read.refused(
+            key,
+            f" is {value:.3g} s, and {braking}; expected {shortest_s:g} to {longest_s:.3g} s, which with the "
+            f"last poll's age is {STANDS_WITHIN_S:g} s in all, or 0 to do without",
+        )
+    return value
+
+
 def check_axis(read: OptionReader, axis: ServoAxisSettings) -> None:
     """Refuse limits that the servo cannot hold, and an approach that takes no backlash up."""
     _check_reach(read, axis)
     _check_approach(read, axis)
-
-
-def checked_pair(pan: ServoAxisSettings, tilt: ServoAxisSettings) -> None:
-    """Refuse two servos of one id. Raises BadOptions."""
-    if pan.servo_id == tilt.servo_id:
-        raise BadOptions(f"options.pan.id and options.tilt.id are both {pan.servo_id}, expected two ids")
 
 
 def _check_reach(read: OptionReader, axis: ServoAxisSettings) -> None:

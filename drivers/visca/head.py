@@ -20,6 +20,7 @@ from typing import Any
 from drivers.absent import Absence
 from drivers.clock import Clock, ClockLock, SystemClock, deadlines_on
 from drivers.errors import BadReply, DriverError, LineLost, NoReply, OutOfRange, Refused, WrongDevice
+from drivers.goals import check_goal
 from drivers.interfaces import AxisMotion, Reading
 from drivers.serial_line import ByteLine, OpenLine, SerialLine
 from drivers.visca.options import DEVICE, AxisOptions, ViscaOptions, options_from
@@ -131,15 +132,11 @@ class ViscaHead:
         NoReply, BadReply, LineLost
             If it did not confirm; a stop was sent then.
         """
+        angles = pan_rad, tilt_rad
+        check_goal(angles, [axis.options.limits_rad for axis in self._axes], speed_rad_per_s, DEVICE)
         speed = self._options.speed_rad_per_s if speed_rad_per_s is None else speed_rad_per_s
-        if not speed > 0:
-            raise OutOfRange(f"speed {speed_rad_per_s} rad/s is not a positive number", device=DEVICE)
         goals, codes = [], []
-        for name, axis, angle in zip(AXES, self._axes, (pan_rad, tilt_rad), strict=True):
-            low, high = axis.options.limits_rad
-            if not low <= angle <= high:
-                words = f"{name} {angle:.4f} rad is outside the head's limits {low:.4f} to {high:.4f} rad"
-                raise OutOfRange(words, device=DEVICE)
+        for name, axis, angle in zip(AXES, self._axes, angles, strict=True):
             step = axis.options.fastest_rad_per_s / FASTEST_CODES[name]
             code = min(FASTEST_CODES[name], math.floor(speed / step + 1e-9))
             if code < 1:

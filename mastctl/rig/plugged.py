@@ -15,7 +15,6 @@ from shlex import quote
 from typing import Any
 
 from drivers.dynamixel import workshop as dynamixel
-from drivers.dynamixel.link import REPLY_TIMEOUT_S
 from drivers.dynamixel.models import MODELS
 from drivers.dynamixel.settings import POLL_BYTES
 from drivers.errors import BadOptions, DriverError
@@ -25,6 +24,7 @@ from drivers.feetech import workshop as feetech
 from drivers.flir_ptu import workshop as flir_ptu
 from drivers.flir_ptu.workshop import Facts
 from drivers.servo_bus.bench import FoundServo, Scan
+from drivers.servo_bus.link import REPLY_TIMEOUT_S
 from drivers.servo_bus.settings import CountedModel
 from drivers.v4l2 import find
 from drivers.v4l2.node import Node, capture_nodes

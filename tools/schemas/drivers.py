@@ -19,7 +19,7 @@ from drivers.feetech.settings import FeetechAxisSettings, FeetechSettings, feete
 from drivers.flir_ptu import options as flir_ptu
 from drivers.pixels import FORMATS, GENICAM
 from drivers.recordings.replay import OPTIONS as REPLAY_OPTIONS
-from drivers.servo_bus.settings import ServoAxisSettings
+from drivers.servo_bus.settings import HeadSettings, ServoAxisSettings
 from drivers.sim import camera_settings, ground, heads, placed, scene
 from drivers.sim.pan_tilt import DEFAULT_HEADS
 from drivers.sim.settings import simulation_settings
@@ -78,7 +78,7 @@ def dynamixel() -> Schema:
     for axis_name in ("pan", "tilt"):
         noted.at(f"{axis_name}.model").tell(_model(MODELS, "-T"))
     noted.at("watchdog_s").value.pop("default")  # it depends on speed and acceleration
-    found = _settings(noted.schema(), DynamixelSettings)
+    found = _settings(noted.schema(), HeadSettings, DynamixelSettings)
     for name in ("pan", "tilt"):
         _approach(
             _settings(found["properties"][name], ApproachedAxis, ServoAxisSettings, DynamixelAxisSettings)
@@ -95,7 +95,7 @@ def feetech() -> Schema:
     for axis_name in ("pan", "tilt"):
         noted.at(f"{axis_name}.model").tell(_model(FEETECH_MODELS))
     noted.at("lease_s").value.pop("default")  # it depends on speed and acceleration
-    found = _settings(noted.schema(), FeetechSettings)
+    found = _settings(noted.schema(), HeadSettings, FeetechSettings)
     for name in ("pan", "tilt"):
         _approach(
             _settings(found["properties"][name], ApproachedAxis, ServoAxisSettings, FeetechAxisSettings)

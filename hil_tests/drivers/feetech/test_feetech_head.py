@@ -231,7 +231,7 @@ def test_a_servo_that_unloads_itself_is_told_in_words_and_moves_again_when_it_is
     [
         ({"lease_s": 0.6}, "lease_s"),
         ({"baud": 57_600}, "too long for poll_hz 50"),
-        ({"acceleration_rad_per_s2": 1.0}, "and no lease stops the head"),
+        ({"acceleration_rad_per_s2": 1.0}, "so that no lease_s stops the head"),
         ({"pan": {"id": 1, "model": "STS3251", "limits_rad": [-1, 1]}}, "did you mean 'STS3250'"),
         ({"pan": {"id": 1, "model": "SCS0009", "limits_rad": [-1, 1]}}, "are of two series"),
         ({"pan": {"id": 1, "model": "STS", "limits_rad": [-4, 1]}}, "does not cross the seam"),

@@ -200,7 +200,7 @@ def test_limits_go_into_the_unit_and_are_checked_before_it(opened: Bench) -> Non
     assert unit.heard[at : at + 2] == [f"PNU{low}", f"PXU{high}"] and "LU" in unit.heard
     before = len(unit.heard)
     for pan, tilt in ((2.6, 0.0), (0.0, -0.71), (math.nan, 0.0), (0.0, math.inf)):
-        with pytest.raises(OutOfRange, match=r"(pan|tilt) .* rad is outside its limits"):
+        with pytest.raises(OutOfRange, match=r"(pan|tilt) .* rad is outside the head's limits"):
             head.move(pan, tilt)
     assert len(unit.heard) == before, "nothing was sent"
 
