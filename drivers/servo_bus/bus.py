@@ -141,18 +141,23 @@ class Bus:
         return cast(T, job.result)
 
     def close(self, last: Callable[[], None], timeout_s: float) -> None:
-        """Run ``last`` in the thread as the last call of all and end the thread; never raises."""
-        if self._closing is None:
-            self._closing = job = _Job(last, self._clock, first=True)
-            self._last_stop = object()
-            self._urgent_jobs.append(job)
-            self._wake()
-            if not job.ends_within(timeout_s):
-                log.warning("%s: the bus thread hangs and is left behind", self._name)
-                return
-            self._thread.join(timeout_s)  # it waits for nothing any more
-            if job.error is not None:
-                log.warning("%s: %s", self._name, job.error)
+        """Run ``last`` in the thread as the last call of all and end the thread; never raises.
+
+        A second call waits for the first one's ``last``.
+        """
+        with self._called:
+            job = self._closing
+            if job is None:
+                self._closing = job = _Job(last, self._clock, first=True)
+                self._last_stop = object()
+                self._urgent_jobs.append(job)
+                self._called.notify_all()
+        if not job.ends_within(timeout_s):
+            log.warning("%s: the bus thread hangs and is left behind", self._name)
+            return
+        self._thread.join(timeout_s)  # it waits for nothing any more
+        if job.error is not None:
+            log.warning("%s: %s", self._name, job.error)
 
     def _wake(self) -> None:
         """Have the thread look for calls; they are in their row already, so that `urgent` sees a stop."""

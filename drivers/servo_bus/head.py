@@ -121,10 +121,11 @@ class BusHead(Reporting):
         self._call("stop", ServoSession.stop, first=True, tries=not self.settings.silence_s)
 
     def close(self) -> None:
-        """Stop, leave each servo as its ``at_close`` says, and let go of the line; never raises."""
+        """Stop, leave each servo as its ``at_close`` says, and let go of the line; never raises.
+
+        A second call returns when the first has ended.
+        """
         with self._state:
-            if self._closed:
-                return
             self._closed = True
         self._bus.close(self._close_now, CLOSE_TIMEOUT_S)
 

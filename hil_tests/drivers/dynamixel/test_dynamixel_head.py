@@ -113,6 +113,20 @@ def test_more_than_the_servo_can_is_refused_in_words() -> None:
         it.open(acceleration_rad_per_s2=30.0)  # 17189 rev/min2; from the factory it takes 10765
 
 
+def test_a_second_close_returns_when_the_first_has_left_the_servos() -> None:
+    # Else a rover that is closed beside its head takes the line away from under the last stop.
+    with rig() as it:
+        head = it.open()
+        head.move(1.0, 0.5)
+        it.clock.sleep(0.2)
+        speed, first = it.speed_rad_per_s(0), it.beside(head.close)
+        it.until(lambda: it.speed_rad_per_s(0) < speed, "the first to brake")
+        assert [servo.table["bus_watchdog"] for servo in it.servos] != [0, 0]
+        head.close()
+        assert [servo.table["bus_watchdog"] for servo in it.servos] == [0, 0]
+        first.wait()
+
+
 def test_torque_may_be_dropped_at_the_start_where_the_configuration_allows_it() -> None:
     with opened(pan={"torque_enable": 1}, options={"torque_off_at_start": True}) as (it, head):
         assert it.servos[0].table["min_position_limit"] == 419  # 2048 - 2.5 rad, inwards
