@@ -28,6 +28,8 @@ from calib.geometry.cahvor import CameraModel, letters_of
 from calib.geometry.lens import TINY, Lens, ray_angle
 from calib.geometry.lens_rays import bend
 from calib.geometry.lenses import fisheye, opencv
+from calib.geometry.lenses.fisheye import FisheyeLens
+from calib.geometry.lenses.opencv import OpencvLens
 from calib.geometry.lenses.projection import FreeLens
 from calib.geometry.rigid import FloatArray, tangents
 
@@ -178,7 +180,7 @@ def _predict_free(model: CameraModel, lens: FreeLens, points_m: FloatArray) -> P
         d_step[:, 0, parameter_part(kind, "H")] = q
         d_step[..., parameter_part(kind, "V")] = (d_turn @ z)[..., None] * (-x / fy)
         d_step[:, 1, parameter_part(kind, "V")] += q
-        if "D" in model.letters:
+        if isinstance(lens, (OpencvLens, FisheyeLens)):  # splines are read, not fitted
             d_step[..., parameter_part(kind, "D")] = np.einsum(
                 "ij,jkn->nik", matrix[:2, :2], lens.coefficient_rates(local)
             )

@@ -19,12 +19,11 @@ from typing import Any
 import numpy as np
 
 from calib.geometry.lens import NEAREST_M, SETTLED, TINY
-from calib.geometry.lenses.opencv import Bent, Unbent, first_root, start_polynomial
+from calib.geometry.lenses.opencv import Bent, Start, Unbent, first_root, start_table
 from calib.geometry.rigid import FloatArray
 
 NAMES = ("k1", "k2", "k3", "k4")
 
-_MOST_TERMS = 14
 _HALVINGS = 60
 
 
@@ -135,12 +134,7 @@ class FisheyeLens:
 
     def _angle(self, t: FloatArray, t2: FloatArray) -> tuple[FloatArray, np.ndarray]:
         """Angles of slopes, and which exist."""
-        powers, largest = self._start
-        square = np.minimum(t2, largest)
-        theta = np.full_like(t, powers[0])
-        for power in powers[1:]:
-            theta *= square
-            theta += power
+        theta = self._start.ratio(t2)
         theta *= t
         for _ in range(6):
             step = self._bent(theta)
@@ -179,11 +173,7 @@ class FisheyeLens:
         if not isfinite(t2):
             return None
         t = max(hypot(u, v), TINY)
-        powers, largest = self._start
-        square, theta = min(t2, largest), powers[0]
-        for power in powers[1:]:
-            theta = theta * square + power
-        theta *= t
+        theta = self._start.ratio(t2) * t
         for _ in range(6):
             rate = self._growth(theta)
             if not rate > 0.0:
@@ -216,9 +206,6 @@ class FisheyeLens:
 
     @cached_property
     @np.errstate(all="ignore")
-    def _start(self) -> tuple[tuple[float, ...], float]:
-        """Polynomial of theta / t by t^2, highest first, and the t^2 up to which it holds."""
-        terms = (3, 5, 7, 9, 11, _MOST_TERMS)
-        return start_polynomial(
-            lambda theta: (theta, self._bent(theta)), self.far_rad, self.image_slope, terms
-        )
+    def _start(self) -> Start:
+        """Table of theta / t."""
+        return start_table(lambda theta: (theta, self._bent(theta)), self.far_rad, self.image_slope)

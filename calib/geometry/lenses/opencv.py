@@ -16,7 +16,7 @@ time, inside the image. Its domain is what the axis reaches before the first fol
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from math import atan, degrees, inf, isfinite, nan, sqrt
@@ -36,13 +36,13 @@ MOST_TURN_RAD = 1.5
 _DIRECTIONS, _RADII, _STEEPEST = 48, 256, 100.0
 """Where the fold of a lens that is not round is looked for: directions, radii, and the largest slope."""
 
-_START_ERROR, _MOST_TERMS, _NARROWINGS = 2e-6, 12, 8
-"""The inverse begins with a polynomial this near, or of so many terms; its range is narrowed so often."""
+_KNOTS, _NARROWINGS = 8192, 8
+"""Knots of the table that an inverse begins with; its range is narrowed so often at most."""
 
 _SAME_RATES = 1e-4
 """After a step below this the derivatives of the step before are good enough."""
 
-_LEFT = 1e-15
+_LEFT = 1e-14
 """A pixel's slopes are settled with a residual this small. Others take Newton's way by themselves."""
 
 _ROUNDING, _NEWTON = 1e-15, 40
@@ -285,7 +285,7 @@ class OpencvLens:
             if abs(step_x) + abs(step_y) < SETTLED:
                 per = 1.0 / sqrt(1.0 + x * x + y * y)
                 return x * per, y * per, per
-        if not u * u + v * v < self._start[2] ** 2:
+        if not u * u + v * v < self._start[1] ** 2:
             return None
         some_x, some_y, found = self._follow(np.array([u]), np.array([v]))
         if not found[0]:
@@ -393,15 +393,15 @@ class OpencvLens:
 
     @cached_property
     @np.errstate(all="ignore")
-    def _start(self) -> tuple[tuple[float, ...], float, float]:
-        """Polynomial of chi / t by t^2, highest first, the t^2 it holds up to, and the largest t seen."""
+    def _start(self) -> tuple[Start, float]:
+        """Table of chi / t, and the largest t seen."""
 
         def bent(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
             rho = np.tan(angle)
             return rho, rho * self._radial(rho * rho)[0]
 
         end = atan(min(max(self.near, 1e-3), _STEEPEST))
-        powers, largest = start_polynomial(bent, end, self.image_slope, (3, 5, 7, 9, _MOST_TERMS))
+        table = start_table(bent, end, self.image_slope)
         farthest = inf
         if self.far < inf:
             around = np.linspace(0.0, 2.0 * np.pi, 4 * _DIRECTIONS)
@@ -409,31 +409,24 @@ class OpencvLens:
                 float(np.hypot(*self._flat(rho * np.cos(around), rho * np.sin(around))[:2]).max())
                 for rho in (self.near, self.far)
             )
-        return powers, largest, farthest if isfinite(farthest) else inf
+        return table, farthest if isfinite(farthest) else inf
 
     def _begin(self, u: Any, v: Any) -> tuple[Any, Any]:
         """Undistorted slopes to begin with."""
-        powers, largest, _ = self._start
-        array = isinstance(u, np.ndarray)
-
-        def ratio(u: Any, v: Any) -> Any:
-            t2 = u * u + v * v
-            t2 = np.minimum(t2, largest) if array else min(t2, largest)
-            k = powers[0]
-            for power in powers[1:]:
-                k = k * t2 + power
-            return k
-
-        k = ratio(u, v)
+        table = self._start[0]
+        k = table.ratio(u * u + v * v)
         x, y = u * k, v * k
         if self._beside is None:  # type: ignore[attr-defined]
             return x, y
         p1, p2, h1, h2, j1, j2 = self._beside  # type: ignore[attr-defined]
-        tau = x * x + y * y
-        g = (2.0 * p1) * y + (2.0 * p2) * x
-        u, v = u - x * g - tau * (h1 + h2 * tau), v - y * g - tau * (j1 + j2 * tau)
-        k = ratio(u, v)
-        return u * k, v * k
+        for _ in range(2):
+            tau = x * x + y * y
+            g = (2.0 * p1) * y + (2.0 * p2) * x
+            h, j = (h1 + h2 * tau, j1 + j2 * tau) if h2 or j2 else (h1, j1)
+            flat_u, flat_v = u - x * g - tau * h, v - y * g - tau * j
+            k = table.ratio(flat_u * flat_u + flat_v * flat_v)
+            x, y = flat_u * k, flat_v * k
+        return x, y
 
     def _undistorted(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, np.ndarray]:
         """Undistorted slopes of distorted ones, and which exist."""
@@ -469,10 +462,12 @@ class OpencvLens:
         valid = (left < _LEFT) & (tau < min(self.near * self.near, 1e300))
         if not valid.all():
             rows = np.flatnonzero(~valid)
-            rows = rows[np.hypot(u[rows], v[rows]) < self._start[2]]
-            x[rows], y[rows], valid[rows] = self._newton(u[rows], v[rows], x[rows], y[rows])
+            rows = rows[np.hypot(u[rows], v[rows]) < self._start[1]]
+            if len(rows):
+                x[rows], y[rows], valid[rows] = self._newton(u[rows], v[rows], x[rows], y[rows])
             rows = rows[~valid[rows]]
-            x[rows], y[rows], valid[rows] = self._follow(u[rows], v[rows])
+            if len(rows):
+                x[rows], y[rows], valid[rows] = self._follow(u[rows], v[rows])
         return x, y, valid
 
     def _newton(
@@ -487,7 +482,7 @@ class OpencvLens:
                 left = np.abs(off_u) + np.abs(off_v)
                 rounding = 1.0 + np.abs(u) + np.abs(v)
                 rounding += np.sqrt(tau) * (np.abs(ux) + np.abs(uy) + np.abs(vx) + np.abs(vy))
-                settled = left < 0.25 * _ROUNDING * rounding
+                settled = left < 0.5 * _ROUNDING * rounding
                 if settled.all():
                     break
                 step_x, step_y = (vy * off_u - uy * off_v) * per, (ux * off_v - vx * off_u) * per
@@ -514,32 +509,48 @@ class OpencvLens:
         return x, y, found & ~lost
 
 
-def start_polynomial(
-    bent: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
-    end_rad: float,
-    image_slope: float,
-    terms: Sequence[int],
-) -> tuple[tuple[float, ...], float]:
-    """Return the polynomial that an inverse begins with, and the t^2 up to which it holds.
+class Start(NamedTuple):
+    """A table of what is sought over t, by t^2 in even steps, which an inverse begins with.
 
-    ``bent`` gives of angles (n,) up to ``end_rad`` what is sought and the slope t. The polynomial, highest
-    power first, is of what is sought over t, by t^2; it has as many of ``terms`` as it takes.
+    values, rises (n,): at the beginning of each step, and to the next; per_square: steps in t^2 of 1.
     """
+
+    values: FloatArray
+    rises: FloatArray
+    per_square: float
+
+    def ratio(self, square: Any) -> Any:
+        """Return what is sought over t; the last of the table beyond its end."""
+        last = len(self.values) - 1
+        if isinstance(square, float):
+            place = min(square * self.per_square, float(last))
+            at = int(place)
+            return self.values.item(at) + (place - at) * self.rises.item(at)
+        places = square * self.per_square
+        np.minimum(places, last, out=places)
+        numbers = places.astype(np.intp)
+        places -= numbers
+        places *= self.rises.take(numbers, mode="clip")
+        places += self.values.take(numbers, mode="clip")
+        return places
+
+
+def start_table(
+    bent: Callable[[FloatArray], tuple[FloatArray, FloatArray]], end_rad: float, image_slope: float
+) -> Start:
+    """Return the table of an inverse; ``bent`` gives of angles (n,) what is sought, and the slope t."""
     for _ in range(_NARROWINGS):
-        angles = np.linspace(0.0, end_rad, 1025)[1:-1]
+        angles = np.linspace(0.0, end_rad, 2 * _KNOTS)[1:-1]
         sought, t = bent(angles)
         last = int(np.searchsorted(t, 1.1 * image_slope))
-        if last >= 64:
+        if last >= _KNOTS // 16:
             break
         end_rad = float(angles[last])
-    last = max(last, 64)
+    last = max(last, _KNOTS // 16)
     square, ratio = t[:last] ** 2, sought[:last] / t[:last]
-    for count in terms:
-        fit = np.polynomial.Chebyshev.fit(square, ratio, count - 1)
-        if np.abs(fit(square) - ratio).max() < _START_ERROR:
-            break
-    power = fit.convert(kind=np.polynomial.Polynomial, domain=[-1, 1]).coef
-    return tuple(power[::-1].tolist()), float(square[-1])
+    places = np.linspace(0.0, float(square[-1]), _KNOTS)
+    values = np.interp(places, square, ratio)
+    return Start(values, np.append(np.diff(values), 0.0), (_KNOTS - 1) / float(square[-1]))
 
 
 def first_root(polynomial: np.polynomial.Polynomial) -> float:

@@ -40,10 +40,6 @@ class FreeLens(Protocol):
         """Return the directions that land on slopes (2, n)."""
         ...
 
-    def coefficient_rates(self, local: FloatArray) -> FloatArray:
-        """Return d slope / d coefficient (2, k, n) of points (3, n)."""
-        ...
-
     def bend_point(self, a: float, b: float, w: float) -> tuple[float, float]:
         """Return the slopes at which one point is seen, not-a-number if it is not."""
         ...

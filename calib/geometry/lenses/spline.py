@@ -168,10 +168,6 @@ class SplineLens:
         inverse = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
         return Unbent(directions, valid, np.einsum("ijn,jkn->ikn", d_place, inverse))
 
-    def coefficient_rates(self, local: FloatArray) -> FloatArray:
-        """A splined lens is not fitted."""
-        raise NotImplementedError("a splined lens is read, not fitted")
-
     def bend_point(self, a: float, b: float, w: float) -> tuple[float, float]:
         """Return the slopes at which one point is seen, not-a-number if it is not."""
         if not isfinite(a + b + w):
