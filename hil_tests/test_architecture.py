@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.rooms import PACKAGES, drawn, read_package
+from tools.rooms import PACKAGES, Package, drawn, read_package
 
 FOLDER = Path(__file__).resolve().parent.parent / "tools"
 WORKERS = {"closed_loop.run", "against_others.mrcal_fit", "benchmarks.mrcal_worker"}
@@ -103,14 +103,19 @@ def test_a_driver_waits_on_the_clock_that_it_is_given_and_on_nothing_beside_it(
     assert {file.name: found for file in files if (found := beside.findall(file.read_text()))} == {}
 
 
-def test_no_room_imports_upwards_or_in_a_circle() -> None:
-    for name in PACKAGES:
-        assert read_package(name).circles == [], name
+@pytest.fixture(scope="module")
+def packages() -> list[Package]:
+    return [read_package(name) for name in PACKAGES]
 
 
-def test_the_picture_of_the_rooms_is_the_one_of_the_code(repository: Path) -> None:
+def test_no_room_imports_upwards_or_in_a_circle(packages: list[Package]) -> None:
+    for package in packages:
+        assert package.circles == [], package.name
+
+
+def test_the_picture_of_the_rooms_is_the_one_of_the_code(repository: Path, packages: list[Package]) -> None:
     picture = (repository / "docs" / "img" / "rooms.svg").read_text()
-    assert picture == drawn([read_package(name) for name in PACKAGES]), "run python -m tools.rooms --svg"
+    assert picture == drawn(packages), "run python -m tools.rooms --svg"
 
 
 def test_a_library_whose_inner_classes_are_subclassed_is_bounded_above(repository: Path) -> None:

@@ -77,12 +77,12 @@ def meanings(listed: Collection[str], root: Path = REPOSITORY) -> dict[str, list
             elif isinstance(node, ast.Tuple):
                 for code, message in _side_by_side(node.elts, known):
                     beside.setdefault(code, []).append(message)
-            elif isinstance(node, ast.Call) and ast.unparse(node.func) in raised | {ANSWER}:
-                values = node.args[1:] if ast.unparse(node.func) in STATUS_FIRST else node.args
+            elif isinstance(node, ast.Call) and _name(node.func) in raised | {ANSWER}:
+                values = node.args[1:] if _name(node.func) in STATUS_FIRST else node.args
                 for code, message in _side_by_side(values[:2], known):
                     messages.setdefault(code, []).append(message)
                 for code in (code for one in values[:1] for code in _constant(one)):
-                    beside.setdefault(code, []).append(sentences.get(ast.unparse(node.func), ""))
+                    beside.setdefault(code, []).append(sentences.get(_name(node.func), ""))
             if isinstance(node, ast.Call):
                 for code, message in _side_by_side(node.args, known):
                     anywhere.setdefault(code, []).append(message)
@@ -91,15 +91,22 @@ def meanings(listed: Collection[str], root: Path = REPOSITORY) -> dict[str, list
     return {code: words for code, words in found.items() if code in listed or code in of_commands}
 
 
+def _name(called: ast.expr) -> str:
+    return called.id if isinstance(called, ast.Name) else ""
+
+
 def _first_sentence(kind: ast.ClassDef) -> str:
     return " ".join((ast.get_docstring(kind) or "").split("\n\n")[0].split())
 
 
 def _in_order(node: ast.AST) -> Iterator[ast.AST]:
     """Yield nodes as they stand in the text, so that a message is known before it is raised."""
-    for child in ast.iter_child_nodes(node):
-        yield child
-        yield from _in_order(child)
+    waiting = [node]
+    while waiting:
+        one = waiting.pop()
+        if one is not node:
+            yield one
+        waiting.extend(reversed(list(ast.iter_child_nodes(one))))
 
 
 def _codes_of(kind: ast.ClassDef) -> Iterator[str]:

@@ -33,13 +33,16 @@ def marked() -> list[tuple[int, str, str]]:
 def _markers(file: Path) -> Iterator[tuple[int, str, str]]:
     name = str(file.relative_to(REPOSITORY))
     place: dict[int, str] = {}
-    tree = ast.parse(file.read_text())
+    text = file.read_text()
+    if "mark.long(" not in text:
+        return
+    tree = ast.parse(text)
     for node in ast.walk(tree):
         if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
             for decorator in node.decorator_list:
                 place |= {id(inner): f"{name}::{node.name}" for inner in ast.walk(decorator)}
     for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("pytest.mark.long", "mark.long"):
+        if isinstance(node, ast.Call) and _is_marker(node.func):
             try:
                 part, why = (ast.literal_eval(argument) for argument in node.args)
             except ValueError:
@@ -47,6 +50,10 @@ def _markers(file: Path) -> Iterator[tuple[int, str, str]]:
                     f"{name}:{node.lineno}: long(part, why) wants a number and a string"
                 ) from None
             yield part, place.get(id(node), name), why
+
+
+def _is_marker(name: ast.expr) -> bool:
+    return getattr(name, "attr", "") == "long" and ast.unparse(name) in ("pytest.mark.long", "mark.long")
 
 
 def table() -> str:

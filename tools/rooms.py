@@ -64,12 +64,13 @@ class Package:
         """For each room how high it stands; rooms of a circle stand on one level, above what they use."""
         rooms = self.rooms
         levels = dict.fromkeys(rooms, 1)
-        together = {room: ring for ring in self.circles for room in ring}
+        rings = self.circles
+        together = {room: ring for ring in rings for room in ring}
         for _ in rooms:
             for room, used in rooms.items():
                 below = used - together.get(room, frozenset())
                 levels[room] = max([levels[room], *(levels[other] + 1 for other in below)])
-            for ring in self.circles:
+            for ring in rings:
                 levels |= dict.fromkeys(ring, max(levels[room] for room in ring))
         return levels
 
@@ -86,17 +87,17 @@ def read_package(name: str) -> Package:
     """Read the imports of one package from its text."""
     files = {_module(file): file for file in sorted((REPOSITORY / name).rglob("*.py"))}
     texts = {module: file.read_text() for module, file in files.items()}
-    inside = {module: text for module, text in texts.items() if "." in module}
+    inside = {module: ast.parse(text) for module, text in texts.items() if "." in module}
     return Package(
         name,
-        {module: _imported(text, inside) - {module} for module, text in inside.items()},
-        {module: _first_sentence(text) for module, text in inside.items()},
+        {module: _imported(tree, inside) - {module} for module, tree in inside.items()},
+        {module: _first_sentence(tree) for module, tree in inside.items()},
         sum(text.count("\n") for text in texts.values()),
     )
 
 
-def _first_sentence(text: str) -> str:
-    return (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0]
+def _first_sentence(tree: ast.Module) -> str:
+    return (ast.get_docstring(tree) or "").partition("\n")[0]
 
 
 def _module(file: Path) -> str:
@@ -104,10 +105,10 @@ def _module(file: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def _imported(text: str, known: Mapping[str, str]) -> frozenset[str]:
+def _imported(tree: ast.Module, known: Mapping[str, ast.Module]) -> frozenset[str]:
     """Modules of the package that a text imports."""
     found: set[str] = set()
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:

@@ -35,11 +35,9 @@ class Cells:
 
     def is_black(self, x_m: ArrayLike, y_m: ArrayLike) -> BoolArray:
         """Return whether points of the board are black; not-a-number is white."""
-        column = np.searchsorted(self.x_m, x_m, side="right") - 1
-        row = np.searchsorted(self.y_m, y_m, side="right") - 1
-        height, width = self.black.shape
-        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        return np.asarray(inside & self.black[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)])
+        column = np.searchsorted(self.x_m, x_m, side="right")
+        row = np.searchsorted(self.y_m, y_m, side="right")
+        return np.asarray(np.pad(self.black, 1)[row, column])
 
     def rectangles_m(self) -> list[Rectangle]:
         """Return the black cells as few (left, top, right, bottom), metres, that do not overlap."""

@@ -37,7 +37,7 @@ RIM = np.array([[0.0, 0.0], [-0.5, 0.0], [0.0, -0.5], [-0.5, -0.5]])
 """Those that tell whether it does: middle, sides and corners, the others being the next pixels'."""
 
 OUTLINE_POINTS = 33
-RAYS_AT_ONCE = 400_000
+RAYS_AT_ONCE = 60_000
 BENT_STEPS = 5
 TABLES_KEPT = 8
 
@@ -170,12 +170,13 @@ class BenchBoards:
         by_row, by_column = (np.gradient(grid, axis=axis).reshape(-1, 2) for axis in (0, 1))
         front = directions[:, 2] > 0.0
         few = self._looked(board, hits, by_column, by_row, front, RIM)
-        busy = np.flatnonzero(_uneven(few.reshape(*shape, len(RIM), 2)))
-        value, covered = few[:, 0].T.copy()
+        told = few[0] + 1000.0 * few[1]
+        busy = np.flatnonzero(_uneven(told.reshape(*shape, len(RIM))))
+        value, covered = few[..., 0].copy()
         for k in range(0, len(busy), RAYS_AT_ONCE // RAYS):
             some = busy[k : k + RAYS_AT_ONCE // RAYS]
             many = self._looked(board, hits[some], by_column[some], by_row[some], front[some], WITHIN)
-            value[some], covered[some] = many.mean(axis=1).T
+            value[some], covered[some] = many.mean(axis=-1)
         under = image[box]
         under[...] = under * (1.0 - covered.reshape(shape)) + value.reshape(shape)
 
@@ -188,12 +189,18 @@ class BenchBoards:
         front: NDArray[np.bool_],
         offsets: Float64,
     ) -> Float64:
-        """Light and cover (n, k, 2) of places in pixels, ``offsets`` (k, 2) from their middles."""
-        places = hits[:, None] + by_column[:, None] * offsets[:, :1] + by_row[:, None] * offsets[:, 1:]
+        """Light and cover (2, n, k) of places in pixels, ``offsets`` (k, 2) from their middles."""
+        x, y = (
+            hits[:, k, None]
+            + np.outer(by_column[:, k], offsets[:, 0])
+            + np.outer(by_row[:, k], offsets[:, 1])
+            for k in (0, 1)
+        )
+        most_x, most_y = board.half_size_m
         with np.errstate(invalid="ignore"):
-            paper = (np.abs(places) <= board.half_size_m).all(axis=-1)
-        black = pattern_of(board.board).is_black(places[..., 0], places[..., 1]) & front[:, None]
-        return np.stack([paper * np.where(black, INK_DN, PAPER_DN), paper.astype(np.float64)], axis=-1)
+            paper = (np.abs(x) <= most_x) & (np.abs(y) <= most_y)
+        black = pattern_of(board.board).is_black(x, y) & front[:, None]
+        return np.stack([paper * np.where(black, INK_DN, PAPER_DN), paper])
 
     def _table(self, camera: CameraModel) -> tuple[Float64, Float64]:
         """Directions (h, w, 3) of a camera's rays, and where they begin relative to C, (h, w, 3)."""
@@ -252,11 +259,10 @@ def checked(name: str, board: BenchBoard, others: Collection[str]) -> BenchBoard
     return board
 
 
-def _uneven(few: Float64) -> NDArray[np.bool_]:
-    """Which pixels (h, w) see more than one colour at their middles, sides and corners (h, w, 4, 2)."""
-    height, width = few.shape[:2]
+def _uneven(told: Float64) -> NDArray[np.bool_]:
+    """Which pixels (h, w) see more than one colour at their middles, sides and corners (h, w, 4)."""
+    height, width = told.shape[:2]
     fine = np.empty((2 * height + 1, 2 * width + 1))
-    told = few[..., 0] + 1000.0 * few[..., 1]
     for k, (dx, dy) in enumerate(RIM):
         fine[int(2 * dy) + 1 : -1 : 2, int(2 * dx) + 1 : -1 : 2] = told[..., k]
     fine[-1], fine[:, -1] = fine[-2], fine[:, -2]

@@ -318,13 +318,16 @@ def _stands(rig: HeadRig) -> bool:
     return rig.true_rad(now_s) == rig.true_rad(now_s - 0.05)
 
 
+ANOTHER_HEAD = pytest.mark.long(1, "the loop with another head; one of each maker is in the quick run")
+
+
 @pytest.mark.parametrize(
     ("wire", "head", "worst_px"),
     [
-        (None, "ptu_d46_70", 1.5),
+        pytest.param(None, "ptu_d46_70", 1.5, marks=ANOTHER_HEAD),
         ("flir_ptu", "ptu_d46_70", 1.5),
         ("dynamixel", "dynamixel_x", 6.0),
-        ("dynamixel", "ph42", 1.5),
+        pytest.param("dynamixel", "ph42", 1.5, marks=ANOTHER_HEAD),
     ],
 )
 @pytest.mark.usefixtures("one_scene")

@@ -31,7 +31,10 @@ def fits(navcams: Rig) -> list[Calibration]:
     return [fit_joint(survey_of(navcams, 100 + seed, SMALL)) for seed in range(SURVEYS)]
 
 
-@pytest.mark.long(1, "a scatter of many fits; one fit beside its covariance is in the quick run")
+SCATTER = pytest.mark.long(1, "a scatter of many fits; one fit beside its covariance is in the quick run")
+
+
+@SCATTER
 def test_stated_sigmas_are_the_scatter(fits: list[Calibration], true_rig: Rig) -> None:
     truth = np.array([*true_rig.mast.translation_m, *true_rig.mast.rotation_rad])
     errors = np.array([f.estimate[:6] - truth for f in fits])
@@ -42,6 +45,7 @@ def test_stated_sigmas_are_the_scatter(fits: list[Calibration], true_rig: Rig) -
     assert abs(off) < CHI_SQUARE_OFF, f"mean of squares {np.mean(whitened):.2f} where 6 is expected"
 
 
+@SCATTER
 def test_predicted_pixels_scatter_as_stated(fits: list[Calibration], true_rig: Rig) -> None:
     squares = []
     for fit in fits:
@@ -54,6 +58,7 @@ def test_predicted_pixels_scatter_as_stated(fits: list[Calibration], true_rig: R
     assert abs(off) < CHI_SQUARE_OFF, f"mean of squares {np.mean(squares):.2f} where 2 is expected"
 
 
+@SCATTER
 def test_weighted_sum_of_squares_is_chi_square(fits: list[Calibration]) -> None:
     off = [(f.chi2 - f.degrees_of_freedom) / np.sqrt(2 * f.degrees_of_freedom) for f in fits]
     assert abs(np.mean(off)) * np.sqrt(SURVEYS) < CHI_SQUARE_OFF
@@ -61,6 +66,7 @@ def test_weighted_sum_of_squares_is_chi_square(fits: list[Calibration]) -> None:
     assert np.mean([len(f.outliers) for f in fits]) < 0.3
 
 
+@pytest.mark.long(4, "a scatter of twelve fits; each sigma is compared with a second fit in the quick run")
 def test_the_papers_sigmas_hold_its_scatter(navcams: Rig) -> None:
     truth = np.array([*navcams.mast.translation_m, *navcams.mast.rotation_rad])
     squares = []

@@ -169,7 +169,10 @@ def test_a_board_by_the_others_is_what_a_fit_without_it_says(made: Made, good: C
     assert min(one.least_chance for one in good.left_out_boards) > 1e-4
 
 
-@pytest.mark.parametrize("seed", [7, 8, 9])
+MORE_DRAWS = pytest.mark.long(2, "more draws of the same; one is in the quick run")
+
+
+@pytest.mark.parametrize("seed", [7, *(pytest.param(seed, marks=MORE_DRAWS) for seed in (8, 9))])
 def test_a_board_read_at_other_angles_is_told_by_itself_or_by_what_is_left_out(
     navcams: Rig, seed: int
 ) -> None:

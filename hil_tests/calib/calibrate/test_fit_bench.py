@@ -280,7 +280,12 @@ def test_a_camera_without_a_picture_left_is_asked_for_no_drift() -> None:
     assert {drift.what for drift in drifts} == {"pan", "tilt", "navcam_left"}
 
 
-@pytest.mark.parametrize(("size_m", "look"), [(0.05, 6), (0.5, 6), (0.02, 8)])
+ANOTHER_MOVE = pytest.mark.long(
+    1, "another distance by which a board moved; a great and a small one are quick"
+)
+
+
+@pytest.mark.parametrize(("size_m", "look"), [pytest.param(0.05, 6, marks=ANOTHER_MOVE), (0.5, 6), (0.02, 8)])
 def test_a_board_that_moved_counts_as_two_placements_and_is_named(size_m: float, look: int) -> None:
     plan = BenchPlan(attitudes=10, mishaps=(Mishap("board", look, size_m),))
     fit = fit_bench(simulate_bench(2, plan))

@@ -103,8 +103,20 @@ def uncertain(rig: Rig) -> RigCovariance:
     return RigCovariance(tuple(names), np.outer(d * sigma, d * sigma) * correlation)
 
 
-@pytest.mark.parametrize(("sigma_rad", "moves"), [(0.0, False), (3e-4, False), (3e-4, True)])
-@pytest.mark.parametrize("calibrated", [False, True])
+ONE_KIND = pytest.mark.long(4, "fewer kinds of errors; exact joints, and all kinds at once, are quick")
+
+
+@pytest.mark.parametrize(
+    ("calibrated", "sigma_rad", "moves"),
+    [
+        (False, 0.0, False),
+        (True, 3e-4, True),
+        pytest.param(False, 3e-4, False, marks=ONE_KIND),
+        pytest.param(False, 3e-4, True, marks=ONE_KIND),
+        pytest.param(True, 0.0, False, marks=ONE_KIND),
+        pytest.param(True, 3e-4, False, marks=ONE_KIND),
+    ],
+)
 def test_the_search_ellipse_is_that_of_drawn_errors(
     rig: Rig, uncertain: RigCovariance, sigma_rad: float, moves: bool, calibrated: bool
 ) -> None:

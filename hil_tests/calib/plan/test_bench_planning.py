@@ -74,7 +74,7 @@ def test_pointing_depends_on_each_unknown_as_pointing_with_another_rig_does(rig:
             for tilt in np.linspace(-0.5, 0.1, 3):
                 for click in CLICKS:
                     approach = 1 if approach != 1 else -1
-                    if tried % 7 or row % 5 == 0:
+                    if tried % 7 == 0 or row % 5 == 0:
                         landed.append((row, _landed(rig, other, (pan, tilt), approach, click)))
                     row += 1
         wanted = np.array([off for _, off in landed]) / step

@@ -152,7 +152,10 @@ def test_a_placement_that_moved_and_spoils_the_fit_is_left_out_with_a_sentence(
     assert reason.grade == "care" and "shows the board 24.7 px aside" in reason.sentence
 
 
-@pytest.mark.parametrize("print_m", [0.0, 1e-4])
+EXACT = pytest.mark.long(1, "the case of an exact print; an inexact one is in the quick run")
+
+
+@pytest.mark.parametrize("print_m", [pytest.param(0.0, marks=EXACT), 1e-4])
 def test_a_run_plans_with_corners_that_are_off_by_what_print_and_lens_add(print_m: float) -> None:
     survey = simulate_bench(1, BenchPlan(attitudes=9, checks=3, own_px=0.01, print_m=print_m))
     former = fit_bench(survey).rig

@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 import pytest
 
+from calib.adjust.result import Calibration
+from calib.calibrate.paper import fit_paper
 from calib.survey.check import check_survey
 from calib.survey.reader import read_survey
 from calib.survey.records import Survey, SurveyImage
@@ -22,7 +24,8 @@ from calib.targets.boards import Dots
 from hil_tests.calib.adjust.small_surveys import with_shifted_dots
 from hil_tests.mastctl.calibration.survey_world import edit_yaml, navcam_survey, write_folder
 from mastctl.calibration.detection import with_dots
-from mastctl.calibration.run import sentence_of
+from mastctl.calibration.run import FITS, Method, checked_survey, sentence_of
+from mastctl.calibration.verdict import judge_calibration
 from mastctl.cli.main import main
 from tools.sim_survey.blunders import (
     with_moved_tape,
@@ -377,13 +380,33 @@ def test_warnings_go_into_the_result_and_its_verdict(
 # What is wrong only here and there is left out and named.
 
 
-def outliers(folder: Path, capsys: pytest.CaptureFixture[str], *words: str) -> list[str]:
+class Judged(NamedTuple):
+    """What a survey comes to: the grade, its reasons in a row, and names of what was left out."""
+
+    grade: str
+    reasons: str
+    left_out: list[str]
+
+
+def judged(survey: Survey, method: Method = "joint") -> Judged:
+    """What the command does with a survey before it writes anything."""
+    fit = FITS[method](survey, 6)
+    verdict = judge_calibration(survey, fit, checked_survey(survey, method))
+    reasons = " | ".join(reason.sentence for reason in verdict.reasons)
+    return Judged(verdict.grade, reasons, outliers_of(fit))
+
+
+def outliers_of(fit: Calibration) -> list[str]:
     """Names of what was left out; the fit without it must be as good as the noise."""
-    code, told = calibrate(capsys, folder, *words)
-    assert code == 0, told
-    if told["method"] == "joint":
-        assert all(0.08 < value < 0.12 for pair in told["rms_px"].values() for value in pair), told["rms_px"]
-    return [outlier["name"] for outlier in told["outliers"]]
+    if fit.method == "joint":
+        assert all(0.08 < value < 0.12 for pair in fit.rms_px.values() for value in pair), fit.rms_px
+    return [outlier.name for outlier in fit.outliers]
+
+
+def outliers(survey: Survey, method: Method = "joint") -> list[str]:
+    """Names of what a fit leaves out of a survey that the check lets through."""
+    checked_survey(survey, method)
+    return outliers_of(FITS[method](survey, 6))
 
 
 @pytest.mark.parametrize("shift_m", [0.012, 1.0])
@@ -392,31 +415,33 @@ def test_a_tape_measured_wrongly_is_named(
 ) -> None:
     shift = np.array([0.6, 0.64, 0.48]) * shift_m
     folder = written(with_moved_tape(navcam_survey(1)[0], "level", "mast-2", "b", shift), tmp_path)
-    assert outliers(folder, capsys) == ["tape b of placement mast-2 (set-up level)"]
+    code, told = calibrate(capsys, folder)
+    assert code == 0, told
+    assert all(0.08 < value < 0.12 for pair in told["rms_px"].values() for value in pair), told["rms_px"]
+    names = [outlier["name"] for outlier in told["outliers"]]
+    assert names == ["tape b of placement mast-2 (set-up level)"]
 
 
 @pytest.mark.parametrize("shift_m", [0.02, 1.0])
 def test_the_papers_method_lists_the_images_of_a_board_with_a_wrong_tape(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], shift_m: float
+    shift_m: float,
 ) -> None:
     survey = navcam_survey(1)[0]
     wrong = {f"image {image.name}" for image in survey.images if image.placement == "mast-2"}
     shift = np.array([0.6, 0.64, 0.48]) * shift_m
-    folder = written(with_moved_tape(survey, "level", "mast-2", "b", shift), tmp_path)
-    code, told = calibrate(capsys, folder, "--method", "paper")
-    assert code == 0, told
-    assert {outlier["name"] for outlier in told["outliers"]} == wrong
-    assert any("tapes of placement mast-2 (set-up level)" in note for note in told["notes"])
+    moved = with_moved_tape(survey, "level", "mast-2", "b", shift)
+    checked_survey(moved, "paper")
+    fit = fit_paper(moved)
+    assert set(outliers_of(fit)) == wrong
+    assert any("tapes of placement mast-2 (set-up level)" in note for note in fit.notes)
 
 
 @pytest.mark.parametrize("method", ["joint", "paper"])
 @pytest.mark.parametrize("shift_m", [0.012, 1.0])
-def test_a_prism_measured_wrongly_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], shift_m: float, method: str
-) -> None:
+def test_a_prism_measured_wrongly_is_named(shift_m: float, method: Method) -> None:
     shift = np.array([0.6, 0.64, 0.48]) * shift_m
-    folder = written(with_wrong_prism(navcam_survey(1)[0], "level", "p2", shift), tmp_path)
-    assert outliers(folder, capsys, "--method", method) == ["prism p2 of set-up level"]
+    survey = with_wrong_prism(navcam_survey(1)[0], "level", "p2", shift)
+    assert outliers(survey, method) == ["prism p2 of set-up level"]
 
 
 def test_a_prism_that_may_be_any_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -429,23 +454,18 @@ def test_a_prism_that_may_be_any_is_refused(tmp_path: Path, capsys: pytest.Captu
 
 @pytest.mark.parametrize("method", ["joint", "paper"])
 @pytest.mark.parametrize("distance_px", [1.0, 40.0])
-def test_a_wrong_dot_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], distance_px: float, method: str
-) -> None:
+def test_a_wrong_dot_is_named(distance_px: float, method: Method) -> None:
     rng = np.random.default_rng(5)
     survey, places = with_outlier_dots(navcam_survey(1)[0], IMAGE, 1, distance_px, rng)
     row, column = places[0]
     name = f"image {IMAGE} dot (row {row}, column {column})"
-    assert outliers(written(survey, tmp_path), capsys, "--method", method) == [name]
+    assert outliers(survey, method) == [name]
 
 
 @pytest.mark.parametrize("shift_px", [0.5, 30.0])
-def test_a_shifted_image_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], shift_px: float
-) -> None:
+def test_a_shifted_image_is_named(shift_px: float) -> None:
     shifted = with_shifted_dots(navcam_survey(1)[0], IMAGE, (shift_px, -shift_px))
-    folder = written(shifted, tmp_path)
-    assert outliers(folder, capsys) == [f"image {IMAGE}"]
+    assert outliers(shifted) == [f"image {IMAGE}"]
 
 
 def test_a_shifted_image_that_the_papers_method_keeps_is_told(
@@ -460,16 +480,11 @@ def test_a_shifted_image_that_the_papers_method_keeps_is_told(
 
 @pytest.mark.parametrize("method", ["joint", "paper"])
 @pytest.mark.parametrize("boards", [("navcam-3m-1", "navcam-3m-2"), ("mast-1", "mast-2")])
-def test_two_boards_mixed_up_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], boards: tuple[str, str], method: str
-) -> None:
+def test_two_boards_mixed_up_are_named(boards: tuple[str, str], method: Method) -> None:
     survey = navcam_survey(1)[0]
     wrong = {f"image {image.name}" for image in survey.images if image.placement in boards}
-    folder = written(with_swapped_boards(survey, "level", *boards), tmp_path)
-    code, told = calibrate(capsys, folder, "--method", method)
-    assert code == 0, told
-    assert {outlier["name"] for outlier in told["outliers"]} == wrong
-    reasons = " | ".join(reason["sentence"] for reason in told["verdict"]["reasons"])
+    _, reasons, left_out = judged(with_swapped_boards(survey, "level", *boards), method)
+    assert set(left_out) == wrong
     assert (
         f"the boards of placements {boards[0]} and {boards[1]} (set-up level) seem to be exchanged" in reasons
     )
@@ -487,18 +502,21 @@ def test_two_boards_mixed_up_are_named(
 )
 @pytest.mark.parametrize("method", ["joint", "paper"])
 def test_an_image_with_the_placement_of_another_is_told_whose_it_is(
-    folder: Path, capsys: pytest.CaptureFixture[str], image: str, own: str, other: str, method: str
+    folder: Path, capsys: pytest.CaptureFixture[str], image: str, own: str, other: str, method: Method
 ) -> None:
     rows(folder / IMAGES, lambda c, _: c | {"placement": other} if c["image"] == image else c)
     # Drawing a report takes longer than all the rest; an image without any pixels is the hard one to draw.
-    drawn = method == "joint" and (image, other) in ((IMAGE, "mast-5"), (CHECK, "mast-8"))
-    report = ["--report", str(folder.parent / "r")] if drawn else []
-    code, told = calibrate(capsys, folder, "--method", method, *report)
-    assert code == 0, told
-    reasons = " | ".join(reason["sentence"] for reason in told["verdict"]["reasons"])
-    assert f"image {image} cannot show placement {other} but would show {own} (set-up level)" in reasons
-    assert told["verdict"]["grade"] == ("bad" if image == CHECK else "care")
-    assert [o["name"] for o in told["outliers"]] == ([] if image == CHECK else [f"image {image}"])
+    if method == "joint" and (image, other) in ((IMAGE, "mast-5"), (CHECK, "mast-8")):
+        code, told = calibrate(capsys, folder, "--report", str(folder.parent / "r"))
+        assert code == 0, told
+        verdict = told["verdict"]
+        reasons = " | ".join(reason["sentence"] for reason in verdict["reasons"])
+        found = Judged(verdict["grade"], reasons, [outlier["name"] for outlier in told["outliers"]])
+    else:
+        found = judged(read_survey(folder), method)
+    assert f"image {image} cannot show placement {other} but would show {own} (set-up level)" in found.reasons
+    assert found.grade == ("bad" if image == CHECK else "care")
+    assert found.left_out == ([] if image == CHECK else [f"image {image}"])
 
 
 # Pictures that cannot be used

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import resource
 import select
 import shutil
@@ -22,21 +23,33 @@ from calib.files.mast_file import load_rig, save_rig
 from calib.survey.reader import read_survey
 from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey, write_folder
 from mastctl.calibration import detection
+from mastctl.calibration import run as calibration_run
 from mastctl.calibration.run import FITS
 from mastctl.cli.main import main
-from mastctl.report import pages
+from mastctl.report import pages, plots
+
+FITTED = """
+import pickle, sys
+from mastctl.calibration import run
+from mastctl.cli.main import main
+from mastctl.report import plots
+with open(sys.argv[1], "rb") as kept:
+    fit = pickle.load(kept)
+run.FITS["paper"] = run.fit_joint = lambda *ignored: fit
+plots.installed = lambda: False
+"""
+"""The command in a process of its own, with a fit that is there already and a report of words alone."""
 
 KILLED_AT = """
-import os, signal, sys
-from mastctl.cli.main import main
+import os, signal
 fsync, calls = os.fsync, []
 def deadly(file):
     calls.append(file)
-    if len(calls) == int(sys.argv[1]):
+    if len(calls) == int(sys.argv[2]):
         os.kill(os.getpid(), signal.SIGKILL)
     fsync(file)
 os.fsync = deadly
-sys.exit(main(sys.argv[2:]))
+sys.exit(main(sys.argv[3:]))
 """
 
 FILE_LIMIT_BYTES = 20_000
@@ -53,10 +66,20 @@ def fitted(survey: Path) -> Calibration:
     return fit_paper(read_survey(survey))
 
 
+@pytest.fixture(scope="module")
+def kept(fitted: Calibration, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The fit for processes of their own."""
+    path = tmp_path_factory.mktemp("fit") / "fit.pickle"
+    path.write_bytes(pickle.dumps(fitted))
+    return path
+
+
 @pytest.fixture(autouse=True)
 def one_fit(fitted: Calibration, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In this process the survey is fitted once: what comes after the fit is tried here."""
+    """The survey is fitted once, and no plot is drawn: what comes after the fit is tried here."""
     monkeypatch.setitem(FITS, "paper", lambda survey, mast_parameters: fitted)
+    monkeypatch.setattr(calibration_run, "fit_joint", lambda survey, mast_parameters: fitted)
+    monkeypatch.setattr(plots, "installed", lambda: False)
 
 
 def words(survey: Path, out: Path, *more: str) -> list[str]:
@@ -73,12 +96,13 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("at", [1, 2, 3])
-def test_a_kill_while_writing_leaves_whole_files(survey: Path, tmp_path: Path, at: int) -> None:
+def test_a_kill_while_writing_leaves_whole_files(survey: Path, kept: Path, tmp_path: Path, at: int) -> None:
     """The first two syncs are of the mast file and its folder, the third is of the report."""
     out = tmp_path / "m.yaml"
     save_rig(navcam_rig(), out)
     old = out.read_bytes()
-    done = run(KILLED_AT, str(at), *words(survey, out, "--report", str(tmp_path / "r")))
+    report = words(survey, out, "--report", str(tmp_path / "r"))
+    done = run(FITTED + KILLED_AT, str(kept), str(at), *report)
     assert done.returncode == -signal.SIGKILL, done.stderr
     load_rig(out)
     assert (out.read_bytes() == old) == (at == 1)
@@ -88,7 +112,7 @@ def test_a_kill_while_writing_leaves_whole_files(survey: Path, tmp_path: Path, a
     load_rig(out)
 
 
-def test_a_full_disk_leaves_everything_as_it_was(survey: Path, tmp_path: Path) -> None:
+def test_a_full_disk_leaves_everything_as_it_was(survey: Path, kept: Path, tmp_path: Path) -> None:
     out = tmp_path / "m.yaml"
     save_rig(navcam_rig(), out)
     save_rig(navcam_rig(), out)
@@ -97,8 +121,8 @@ def test_a_full_disk_leaves_everything_as_it_was(survey: Path, tmp_path: Path) -
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (FILE_LIMIT_BYTES, FILE_LIMIT_BYTES))
 
-    code = "import sys; from mastctl.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    done = run(code, *words(survey, out), preexec_fn=limit)
+    code = FITTED + "sys.exit(main(sys.argv[2:]))"
+    done = run(code, str(kept), *words(survey, out), preexec_fn=limit)
     assert done.returncode == 2, done.stderr
     assert "cannot be saved: File too large" in json.loads(done.stdout)["error"]["message"]
     assert "Traceback" not in done.stderr

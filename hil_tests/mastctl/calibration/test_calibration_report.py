@@ -84,6 +84,7 @@ def test_a_turned_mast_changes_pointing_at_positions_but_not_at_clicks() -> None
     assert change_map(rig, replace(rig, cameras={}, stereo={}), "navcam", 6.0) is None
 
 
+@pytest.mark.long(1, "a scatter of four fits; each survey's check images are judged in the quick run")
 def test_check_images_are_as_far_off_as_the_survey_noise_explains() -> None:
     ratios = []
     for seed in range(10, 14):

@@ -32,7 +32,16 @@ def frames(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("joint_sigma", [[], ["--joint-sigma-rad", "0.0013"]], ids=["default", "flight's"])
+STATED = pytest.mark.long(4, "the same with a stated scatter of the joints, a second fit of real pictures")
+
+
+@pytest.mark.parametrize(
+    "joint_sigma",
+    [
+        pytest.param([], id="default"),
+        pytest.param(["--joint-sigma-rad", "0.0013"], marks=STATED, id="flight's"),
+    ],
+)
 def test_what_explains_real_pictures_but_predicts_no_others_is_refused(
     joint_sigma: list[str], mast: Path, frames: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

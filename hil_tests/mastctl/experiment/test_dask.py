@@ -114,7 +114,7 @@ def test_campaigns_of_numbers(places: tuple[Executor, Executor]) -> None:
     same(places, works)
 
 
-@pytest.mark.long(2, "draws and measures whole pictures twice; one pointing does so in the quick run")
+@pytest.mark.long(2, "draws and measures whole pictures twice; numbers and surveys are in the quick run")
 def test_campaigns_of_pictures(places: tuple[Executor, Executor]) -> None:
     rig, stress = load_rig(RIG_FILE).rig, dots.STRESSES["none"]
     works = works_of(
@@ -130,13 +130,14 @@ def test_campaigns_of_pictures(places: tuple[Executor, Executor]) -> None:
     assert str(first) != str(second)
 
 
+@pytest.mark.long(4, "a rover is drawn here and on the cluster; numbers and surveys are in the quick run")
 def test_a_pointing_on_a_rover_of_its_own(places: tuple[Executor, Executor]) -> None:
     (((document, _),),) = same(places, [Work(one_pointing, [PointingTask(ROVER, 2.0, 0)], str)], record)
     (distance,) = document["distances"]
     assert (distance["targets"], distance["failed"]) == (1, 0)
 
 
-@pytest.mark.long(3, "six rovers, one after the other; one pointing is in the quick run")
+@pytest.mark.long(3, "six rovers, one after the other; numbers and surveys are in the quick run")
 def test_pointings_and_a_handoff_each_with_its_own_draw(places: tuple[Executor, Executor]) -> None:
     works: list[Work[Any, Any]] = [
         Work(one_pointing, [PointingTask(ROVER, 2.0, index) for index in range(2)], str),

@@ -17,10 +17,10 @@ from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 
-HEAD_ALONE = pytest.mark.long(1, "the case without the light; that with it is in the quick run")
+pytestmark = pytest.mark.long(1, "the worst day is rendered; a kind day's approach is in the quick run")
 
 
-@pytest.fixture(scope="module", params=[pytest.param("head", marks=HEAD_ALONE), "head and light"])
+@pytest.fixture(scope="module", params=["head", "head and light"])
 def daemon(
     request: pytest.FixtureRequest, repository: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[RunningDaemon]:

@@ -15,6 +15,7 @@ import pytest
 from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.rig import Mast, Rig
 from hil_tests.mastctl.recorder.recorder_world import CONFIG
+from hil_tests.mastctl.watch.small_rover import small
 from mastctl.cli.main import main
 from mastctl.client import Client
 from mastctl.config import Listen, load_config
@@ -25,7 +26,7 @@ from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.what_if import WouldBe, pointings_with, rms, seen_in
 from mastctl.recorder.writer import Attached
 
-CLICKS_PX = ((300.0, 500.0), (700.0, 600.0), (200.0, 650.0))
+CLICKS_PX = ((150.0, 250.0), (350.0, 300.0), (100.0, 325.0))
 ROUNDED_PX = 1e-3  # the record's pixels have four digits
 
 
@@ -38,15 +39,16 @@ def wrong_mast(right: Rig) -> Rig:
     )
 
 
-def recorded(mast_file: Path, folder: Path) -> Path:
+def recorded(mast_file: Path, true_file: Path, folder: Path) -> Path:
     """Point at some pixels with a mast file, and record it; return the recording."""
     config = load_config()
-    simulation = {**config.hardware.simulation, "speed": "max"}
+    simulation = {**config.hardware.simulation, "speed": "max", "rover": str(true_file)}
+    cameras = {name: one for name, one in config.hardware.cameras.items() if name.startswith("navcam")}
     config = replace(
         config,
         listen=Listen(port=0),
         mast_file=mast_file,
-        hardware=replace(config.hardware, simulation=simulation),
+        hardware=replace(config.hardware, simulation=simulation, cameras=cameras),
     )
     stored = load_rig(mast_file)
     mast = AttachedMast(stored.rig, Attached(mast_file.name, mast_file.read_bytes()))
@@ -73,13 +75,16 @@ def recorded(mast_file: Path, folder: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def files(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """On Navcams of few pixels: drawing takes most of the time."""
     folder = tmp_path_factory.mktemp("what_if")
-    right = load_rig(load_config().mast_file).rig
+    save_rig(small(load_rig(repository / "configs/sim/rocky8.yaml").rig), folder / "true.yaml")
+    right = small(load_rig(load_config().mast_file).rig)
     found = {"right": folder / "right.yaml", "wrong": folder / "wrong.yaml"}
     save_rig(right, found["right"])
     save_rig(wrong_mast(right), found["wrong"])
-    return found | {f"{name} run": recorded(path, folder / name) for name, path in found.items()}
+    true = folder / "true.yaml"
+    return found | {f"{name} run": recorded(path, true, folder / name) for name, path in found.items()}
 
 
 def would_be(recording: Recording, mast_file: Path) -> list[WouldBe]:
@@ -95,7 +100,7 @@ def test_the_right_mast_file_is_said_to_leave_what_it_really_leaves(files: dict[
     first = [one for one in said if one.seen.pointing == 1]
     assert len(first) == len(CLICKS_PX)
     before = np.array([one.seen.residual_px for one in first])
-    assert np.abs(before).max() > 0.5  # the wrong file is felt
+    assert np.abs(before).max() > 0.25  # the wrong file is felt, in these coarse pixels
     off, sigma = [], []
     for one, other in zip(said, real, strict=True):
         assert one.residual_px is not None and one.sigma_px is not None

@@ -67,7 +67,18 @@ def killed_while_latched(bench: Bench) -> None:
         assert client.estop(reason="sparks", name="Ana")["kept"] is True
 
 
-@pytest.mark.parametrize("way", ["listen", "any port", "copy", "STATE_DIRECTORY", "XDG_STATE_HOME", "HOME"])
+ANOTHER_WAY = pytest.mark.long(1, "another address or folder, two daemons each; one of each kind is quick")
+
+
+@pytest.mark.parametrize(
+    "way",
+    [
+        "any port",
+        "copy",
+        "HOME",
+        *(pytest.param(way, marks=ANOTHER_WAY) for way in ("listen", "STATE_DIRECTORY", "XDG_STATE_HOME")),
+    ],
+)
 def test_the_next_daemon_of_the_head_is_latched_whatever_way_it_begins(
     bench: Bench, tmp_path: Path, way: str
 ) -> None:

@@ -18,6 +18,7 @@ DAYS = 3000
 POINTINGS = 12
 
 
+@pytest.mark.long(1, "statistics over thousands of days; that the evidence is a fair bet is tested quickly")
 def test_thousands_of_honest_days_raise_no_more_false_alarms_than_stated() -> None:
     rng = np.random.default_rng(20)
     root = rng.normal(0.0, 0.5, (4, 4))

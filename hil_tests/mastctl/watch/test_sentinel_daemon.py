@@ -74,7 +74,10 @@ def stands(client: Client) -> tuple[float, float]:
     ("change", "what"),
     [
         (lambda rig: bumped(rig, "navcam_left", (0.0, 1.8e-3, 0.0)), "navcam_left turned 1."),
-        (lambda rig: refocused(rig, "navcam_right", 5e-3), "navcam_right refocused: focal length +0.5"),
+        pytest.param(
+            *(lambda rig: refocused(rig, "navcam_right", 5e-3), "navcam_right refocused: focal length +0.5"),
+            marks=pytest.mark.long(1, "the case of the focus; those of a mount and of a joint are quick"),
+        ),
         (lambda rig: slipped(rig, 0.0, 4e-3), "tilt slipped by +"),
         pytest.param(
             *(lambda rig: slipped(rig, 4e-3, 0.0), "pan slipped by +"),

@@ -16,7 +16,7 @@ from mastctl.web.described import EVENTS, FILES, answers_of
 from tools.campaigns.fuzz_daemon import UNASKED, ask, taken_back
 
 FUZZ_S = 30.0
-EXAMPLES = 4  # of each route, twice
+EXAMPLES, FEWER = 4, 2  # of each route, twice
 
 
 def test_every_route_has_a_model_a_kind_of_file_or_events_and_no_other_is_named(
@@ -57,7 +57,7 @@ def test_whatever_is_asked_the_answer_is_as_described(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
-        check(daemon.url, capfd, None, seed=1)
+        check(daemon.url, capfd, None, FEWER, seed=1)
         done = r'commands_total{command="(point|jog|track.stop|record.start|reload)",result="ok"}'
         until(lambda: re.search(done, HTTP.get(f"{daemon.url}/metrics").text), "some were carried out")
 
@@ -67,13 +67,17 @@ def test_whatever_is_asked_for_a_while_the_answer_is_as_described(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
-        check(daemon.url, capfd, FUZZ_S)
+        check(daemon.url, capfd, FUZZ_S, EXAMPLES)
 
 
 def check(
-    url: str, capfd: pytest.CaptureFixture[str], seconds: float | None, seed: int | None = None
+    url: str,
+    capfd: pytest.CaptureFixture[str],
+    seconds: float | None,
+    examples: int,
+    seed: int | None = None,
 ) -> None:
     """Have a daemon asked, and nothing may be wrong."""
-    code = ask(url, seconds, EXAMPLES, seed)
+    code = ask(url, seconds, examples, seed)
     told = capfd.readouterr().out[-6000:].encode("ascii", "backslashreplace").decode()  # xdist sends UTF-8
     assert code == 0, told
