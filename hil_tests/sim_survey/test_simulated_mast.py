@@ -27,7 +27,7 @@ def run_tool(repository: Path, words: list[str], monkeypatch: pytest.MonkeyPatch
     return int(ended.value.code or 0)
 
 
-@pytest.mark.long(4, "makes the shipped mast files anew; what they hold is tested quickly")
+@pytest.mark.long(4, "makes the shipped mast files anew; their content is tested quickly")
 @pytest.mark.parametrize("name", ["rocky8_simulated", "skew8_simulated"])
 def test_its_own_command_makes_the_shipped_mast_file_again(
     repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str

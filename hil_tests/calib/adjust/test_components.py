@@ -57,7 +57,7 @@ def test_the_kind_that_is_worse_than_stated_is_found_and_no_other(
         assert abs(c.factor - expected) < OFF * c.factor_sigma, c
 
 
-OTHER_KIND = pytest.mark.long(4, "the same of what is better than stated; what is worse is in the quick run")
+OTHER_KIND = pytest.mark.long(4, "measurements better than stated; worse ones are in the quick run")
 
 
 @pytest.mark.parametrize(
