@@ -1,6 +1,6 @@
 """Geometry, measurement, estimation and storage: arrays and frozen dataclasses in and out.
 
-The names below are what a user of the library wants; docs/reference/calib.md has each with an example. A
+The names below are the library's interface; docs/reference/calib.md has each with an example. A
 name is imported when it is first asked for, so that ``import calib`` by itself loads nothing else.
 """
 

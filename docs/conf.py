@@ -30,6 +30,9 @@ html_title = "mastctl"
 html_favicon = "../mastctl/web/operator/icon.svg"
 html_copy_source = False  # the wheel holds the site, and needs no page twice
 autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"  # no bare list of the fields above their descriptions
+html_static_path = ["style"]
+html_css_files = ["site.css"]
 autodoc_member_order = "bysource"
 napoleon_google_docstring = False
 

@@ -1,7 +1,8 @@
 """Devices that are away: why, when they are worth another try, and a camera that joins when it can be opened.
 
-A factory may fail, which is tried again with a growing wait, or block for as long as it likes, which nobody
-can end from outside. So each opening has a thread of its own, and whoever asks is told at once how it stands.
+A factory may fail, which is tried again with a growing wait, or block for as long as it likes, and nothing
+can end that from outside. So each opening has a thread of its own, and a caller gets its present state at
+once.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ def let_go(opening: Opening) -> None:
 
 
 class AbsentCamera:
-    """What stands for a camera until it can be opened.
+    """Stands for a camera until it can be opened.
 
     Parameters
     ----------

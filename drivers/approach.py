@@ -32,12 +32,12 @@ def last_turn(approach: Approach, goal_rad: float, gravity_turnover_rad: float) 
 
 @dataclass(frozen=True, kw_only=True)
 class ApproachedAxis:
-    """What options say of an axis, whatever turns it. Angles are the mast's: pan to the right, tilt up.
+    """The options of an axis, of any driver. Angles are the mast's: pan to the right, tilt up.
 
     Attributes
     ----------
     limits_rad
-        What may be commanded; the device is told it too, if it can be.
+        What may be commanded; set in the device too, if it can be.
     sign
         1 if the device counts up where the axis turns positive, else -1.
     approach
@@ -47,8 +47,8 @@ class ApproachedAxis:
     approach_rad
         How long the last stretch is; more than the backlash.
     gravity_turnover_rad
-        The angle at which the weight changes sides, for ``gravity``: below it the weight pulls the axis
-        down (the last stretch turns positive), above it up.
+        The angle at which the weight changes sides, for ``gravity``. Below it the weight pulls the axis down
+        (the last stretch turns positive), above it up.
     """
 
     limits_rad: tuple[float, float]
@@ -81,7 +81,7 @@ def legs_to(
     turn
         Which way the counts go on the last stretch: 1, -1, or 0 for either.
     places
-        Where the axis stands or comes to rest before it can turn; None if nobody knows.
+        Where the axis stands or comes to rest before it can turn; None if unknown.
     """
     low, high = limits
     start = min(max(goal - turn * stretch, low), high)

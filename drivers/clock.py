@@ -1,8 +1,8 @@
 """One clock for everything: the machine's monotonic clock, or one that a test turns by hand.
 
-Whoever waits, waits on the clock that it was given, also for another thread: `Clock.signal` is a condition
-whose waits end by this clock, and `Clock.thread` makes a thread that the clock knows of.
-`drivers.simulation_clock` says what a clock does with that which is not bound to real time.
+Code that waits does so on the clock that it was given, also for another thread. `Clock.signal` is a condition
+whose waits end by this clock; `Clock.thread` makes a thread that the clock knows. `drivers.simulation_clock`
+says what a clock does with that which is not bound to real time.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ LOG = "log"
 
 @dataclass(frozen=True)
 class Word:
-    """What a fault word does to one kind of device.
+    """The effect of a fault word on one kind of device.
 
     Attributes
     ----------
@@ -110,9 +110,9 @@ HEAD_WORDS: Mapping[str, Word] = MappingProxyType(
         ),
     }
 )
-"""Words of a head. ``axis`` is 0 for pan, 1 for tilt, 2 for both; ``replies`` says how many replies a fault
-falls on before it is over, ``probability`` how likely it falls on each, ``sender`` the id of the servo whose
-replies are meant, 0 for any (on a line only)."""
+"""Words of a head. ``axis`` is 0 for pan, 1 for tilt, 2 for both; ``replies`` is the number of replies after
+which a fault is over, ``probability`` that of each reply. ``sender`` is the id of the servo whose replies are
+meant, 0 for any (on a line only)."""
 
 CAMERA_WORDS: Mapping[str, Word] = MappingProxyType(
     {
@@ -248,7 +248,7 @@ class FaultPanel:
 
     @property
     def words(self) -> Mapping[str, Mapping[str, Word]]:
-        """What each device takes: its words, by its name."""
+        """The words that each device takes, by its name."""
         return MappingProxyType(self._words)
 
     def listen(self, changed: Callable[[], None]) -> None:
@@ -313,7 +313,7 @@ class FaultPanel:
             as ``after_s``: seconds from now. The same word may come more than once; where two of them are in
             force, the later one of the list is.
         origin
-            What messages call the list.
+            The name of the list in messages.
 
         Raises
         ------

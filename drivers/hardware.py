@@ -82,7 +82,7 @@ class InstalledDriver:
     Attributes
     ----------
     kind, name
-        What it drives, and what a configuration calls it.
+        The device that it drives, and its name in a configuration.
     factory
         ``package.module:factory``.
     package
@@ -113,7 +113,7 @@ def factory_of(kind: Kind, driver: str, device: str) -> str:
     Parameters
     ----------
     kind
-        What it is to drive.
+        The device that it is to drive.
     driver
         The factory itself, or the name by which an installed package offers one.
     device
@@ -146,7 +146,7 @@ def factory_of(kind: Kind, driver: str, device: str) -> str:
 
 
 def head_name(settings: HardwareSettings) -> str | None:
-    """Return which head the settings drive, whoever wrote them: None for one in this program's memory.
+    """Return which head any settings drive: None for one in this program's memory.
 
     A head is its line (`drivers.serial_line.stable_name` of the option ``port``); one from outside without
     such an option is its factory with all options.
@@ -227,7 +227,7 @@ class Hardware:
 
     @property
     def kind(self) -> HardwareKind:
-        """What the devices are, together."""
+        """The kind of the devices, together."""
         devices = {PAN_TILT: self.pan_tilt, **self.cameras}
         found = {self._kinds.get(name) or _own_word(device) for name, device in devices.items()}
         return found.pop() if len(found) == 1 else "mixed"

@@ -140,8 +140,9 @@ class AxisMotion:
     beyond_goal_rad
         How far past a goal it may go on purpose, to come to it from one side.
     rising_below_rad
-        To a goal below this angle it comes turning positive, to one above it negative, whichever way it came;
-        infinite for a head that always turns the same way at last. None: it comes the shortest way.
+        It approaches a goal below this angle in the positive direction, and one above it in the negative
+        direction. Infinite for a head that always turns the same way at last. None: it comes the shortest
+        way.
     count_rad
         One count of its encoder, or one step; None where it is not known.
     """

@@ -1,4 +1,4 @@
-"""The one door to hardware: from a configuration's driver names to open devices.
+"""The one entry point to hardware: from a configuration's driver names to open devices.
 
 Nothing else knows real and simulated drivers both. A name is ``dynamixel``, ``flir_ptu``, ``v4l2``, ``sim``,
 ``replay``, or for a driver from outside this repository ``package.module:factory`` or the name that an
@@ -89,7 +89,7 @@ def halt_head(settings: HardwareSettings) -> list[str]:
     Returns
     -------
     list of str
-        What was done to each axis, in plain words.
+        The actions on each axis, in plain words.
 
     Raises
     ------

@@ -26,7 +26,7 @@ def is_whole(value: object) -> TypeGuard[int]:
 
 
 class OptionReader:
-    """One mapping of options; whatever it refuses is told with the key, the value and what would be right.
+    """One mapping of options; a refusal names the key, the value and what would be right.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class OptionReader:
     known, needed
         The keys that may, and that must, be there.
     place
-        What stands before a key in a refusal, such as ``options.pan.``.
+        The text before a key in a refusal, such as ``options.pan.``.
     device
         The device's name in refusals.
 
@@ -69,7 +69,7 @@ class OptionReader:
         return self.refused(key, f" is {self.values.get(key)!r}, expected {expected}")
 
     def refused(self, key: str, words: str) -> BadOptions:
-        """Return the refusal of a key, told in words that follow its name."""
+        """Return the refusal of a key, in words that follow its name."""
         return BadOptions(f"{self._place}{key}{words}", device=self._device)
 
     def section(

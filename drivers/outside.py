@@ -1,6 +1,6 @@
 """Devices and scenes that are not in this repository, by the name of a factory: ``package.module:factory``.
 
-Foreign code may do anything while it is imported and called: one sentence tells it.
+Foreign code may do anything while it is imported and called: one sentence reports it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def device_from_outside(name: str, driver: str, options: Mapping[str, Any], prot
     driver, options
         The factory and its keywords.
     protocol
-        What the device is to do: `drivers.interfaces.PanTilt` or `drivers.interfaces.Camera`.
+        The Protocol of the device: `drivers.interfaces.PanTilt` or `drivers.interfaces.Camera`.
 
     Raises
     ------

@@ -1,9 +1,9 @@
 """An open line of bytes to a device: a serial device, ``socket://HOST:PORT`` or ``rfc2217://HOST:PORT``.
 
-pyserial opens it; what the bytes mean is not known here. What pyserial 3.5 leaves to do is done for every
-driver alike: a wait sleeps in the kernel, with a deadline of CLOCK_MONOTONIC; the line is this program's
-alone; a USB adapter's latency timer is set to its least; a host that is away costs 0.5 s, not 5 s, and
-closing closes at once; a pulled cable is a `LineLost`, what can never be opened `BadOptions`.
+pyserial opens it; this module does not know the meaning of the bytes. It adds to pyserial 3.5, for every
+driver alike: A wait sleeps in the kernel, with a deadline of CLOCK_MONOTONIC. The line is this program's
+alone. A USB adapter's latency timer is set to its least. A host that is away costs 0.5 s, not 5 s, and
+closing closes at once. A pulled cable is a `LineLost`; a port that can never be opened is `BadOptions`.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ gives termios.error; a port closed under a read TypeError or AttributeError."""
 def stable_name(port: str) -> str:
     """Return a line's name, the same whatever path leads there: what is kept of a head is kept by it.
 
-    A USB adapter's is that of udev (with its serial number), of whatever number it got when it was plugged
-    in; that of another device its path without links; of a URL host and port. A pseudo terminal's number is
-    given again to the next one, so the moment at which it was made belongs to its name.
+    A USB adapter's is that of udev (with its serial number), at any port. That of another device is its path
+    without links; of a URL, host and port. A pseudo terminal's number is given again to the next one, so the
+    moment at which it was made belongs to its name.
     """
     if "://" in port:
         parts = urlsplit(port)
@@ -91,7 +91,7 @@ class ByteLine(Protocol):
 
 
 class OpenLine(Protocol):
-    """How a driver opens its line: `SerialLine`, unless somebody gives it another."""
+    """How a driver opens its line: `SerialLine`, unless it is given another."""
 
     def __call__(self, port: str, baud: int, device: str = "") -> ByteLine:
         """Return an open line; parameters and errors as of `SerialLine`."""

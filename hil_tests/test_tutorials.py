@@ -4,7 +4,7 @@ A tutorial's `console` block holds commands (`$ `) and what each prints, standar
 ends with `&` runs until the tutorial's end; the next one waits for what it prints. A block after a line that
 ends with a file's name in backticks and a colon is that file. `...` stands for anything. Numbers may be
 others than on the page, but those with a sign and decimals (pixels, radians, metres) only by `NEAR`. The
-daemon listens at another port than the page's.
+daemon listens at another port than the page's. pip installs from the wheels of this environment's set-up.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ LOGGED = re.compile(r"^WARNING (?:drivers|mastctl)\.[\w.]+: .*\n", re.MULTILINE)
 """Logged by a real-time servo line on a machine with much else to do; results are compared all the same."""
 LONGEST_S = 1800.0
 """A net for one command, on a machine with much else to do."""
+REPOSITORY = Path(__file__).parents[1]
 PAGES = ("first-pointing", "servos-to-verdict", "first-ci-test", "recalibrate")
 
 
@@ -91,13 +92,20 @@ class Walk:
             "XDG_STATE_HOME": f"{temporary}/state",  # short, for its sockets
             "MASTCTL_HEADS": f"{temporary}/heads",
             "TMPDIR": temporary,
+            "PIP_NO_INDEX": "1",
+            "PIP_FIND_LINKS": str(Path(sys.prefix) / "wheels"),
         }
 
     def here(self, text: str) -> str:
         text = re.sub(r"\bmastctl run\b", f"mastctl run --listen {self.address}", text)
-        return text.replace("127.0.0.1:8420", self.address)
+        return text.replace("127.0.0.1:8420", self.address).replace("CHECKOUT", str(REPOSITORY))
 
     def run(self, command: str, shown: str) -> None:
+        if selected := re.fullmatch(r"\. (\S+)/bin/activate", command):
+            chosen = self.folder / selected[1]
+            self.environ |= {"VIRTUAL_ENV": str(chosen), "PATH": f"{chosen}/bin:{self.environ['PATH']}"}
+            assert (chosen / "bin" / "activate").is_file(), command
+            return
         if command.endswith("&"):
             self.begin(command.removesuffix("&"), shown)
             return

@@ -8,7 +8,7 @@ prisms' CAD positions define the rover frame.
 
 A bench has no station: its boards' poses are unknown, or one of them is held; the rover frame is the mast's
 own or hangs on what is held; and the joints' errors (``calib.geometry.rig``) and the boards' bows may be
-unknowns too. What joints and boards are usually like holds such an unknown where pictures hardly show it.
+unknowns too. A prior of usual joints and boards holds such an unknown where pictures hardly show it.
 
 A residual of the station is taken in the rover frame: turning it does not change its size, since the
 station's sigma is the same for each axis. Rigid unknowns move by a turn (3, a rotation vector
@@ -60,7 +60,7 @@ HUBER = 3.0
 """Length of a residual, in sigmas, from which its pull no longer grows while blunders are looked for."""
 
 USUAL_JOINT_RAD = 0.01
-"""What a joint's harmonics and backlash are like, one sigma, radians; hobby servos have 6 to 9 mrad."""
+"""A joint's usual harmonics and backlash, one sigma, radians; hobby servos have 6 to 9 mrad."""
 
 USUAL_BOW_M = 0.005
 """How far a board's edges are usually from flat, one sigma, metres."""
@@ -293,7 +293,7 @@ class Adjustment:
             yield block.residual, 1
 
     def reading(self, state: Estimate, image: ImageTerm) -> tuple[float, float]:
-        """What the joints would have read of an image without noise, as the state has it."""
+        """The joints' readings of an image without noise, by the state."""
         if image.attitude is None or image.attitude < 0 or not len(state.joints_rad):
             return image.pan_rad, image.tilt_rad
         pan, tilt = state.joints_rad[image.attitude]
@@ -403,7 +403,7 @@ class Adjustment:
         return ResidualBlock.of(self.unknowns, self.station_residual(state, point), rates, 3, point.sigma_m)
 
     def known(self, state: Estimate) -> Iterator[tuple[Known, ResidualBlock]]:
-        """What is known beforehand: usual lenses, joints and boards, prisms from CAD, joint readings."""
+        """The priors: usual lenses, joints and boards, prisms from CAD, joint readings."""
         for key, unknown in self.unknowns.items():
             kind, *which = key
             if kind == "camera":

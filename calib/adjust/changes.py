@@ -1,10 +1,10 @@
-"""What changed while a bench's pictures were taken: a board, a joint, a camera, from some picture on.
+"""Finds changes while a bench's pictures were taken: a board, a joint, a camera, from some picture on.
 
 For every picture after which something may have changed, the fit is asked what it would gain if it had: the
 board of the placement stood elsewhere from there on (six numbers), pan or tilt read otherwise (one), a camera
 had another focal length (one) or looked elsewhere in the head (three). Near the fit the problem is linear, so
 that the gains follow from sums over pictures and no further fit is made (score tests). Of changes that
-explain the same, that with the fewest numbers is told. A pan that slips between two placements is seen by
+explain the same, that with the fewest numbers is reported. A pan that slips between two placements is seen by
 nothing and does no harm.
 """
 
@@ -26,7 +26,7 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
 
 UNLIKELY = 1e-7
-"""A change is told if so large a gain, were it none, had less than this chance over all that were tried."""
+"""A change is reported if so large a gain, were it none, had less than this chance over all tries."""
 
 AS_GOOD = 0.98
 """A change with fewer numbers is preferred if it gains this part of the best one's."""
@@ -63,12 +63,12 @@ class BenchChange:
     before, after
         Names of the pictures between which it changed.
     step
-        What it changed by, about: turn and shift of the board (6), radians (1) of a joint, a part of the
-        focal length (1), turn of the camera (3).
+        The approximate change: turn and shift of the board (6), radians (1) of a joint, a part of the focal
+        length (1), turn of the camera (3).
     chi2
-        What it explains of the weighted sum of squares.
+        The part of the weighted sum of squares that it explains.
     sure
-        Whether little would be left then; else only another fit tells, for far from it nothing is linear.
+        Whether little would be left then; else only another fit shows it, for far from it nothing is linear.
     chance
         Of so large a gain without any change, all that were tried counted.
     """
@@ -265,7 +265,7 @@ def reading_rows(problem: Adjustment, state: Estimate, rows: Sequence[Rows]) -> 
 def scatter(readings: Sequence[Rows], axis: str, covariance: FloatArray, gain: float) -> float:
     """Return how much larger the squares of a joint's readings are than their sigma allows, less a gain.
 
-    A joint whose readings scatter more than stated, by a play that nobody knew of, has not slipped.
+    A joint whose readings scatter more than stated, by an unknown play, has not slipped.
     """
     squares = redundancy = 0.0
     for row in readings:

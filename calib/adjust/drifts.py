@@ -1,4 +1,4 @@
-"""What a bench's fit is tested for: joints and cameras that drift, and what each placement says of the rest.
+"""Tests of a bench's fit: joints and cameras that drift, and each placement against the rest.
 
 Near the fit the problem is linear: what a drift would gain is a score test, as a change from one picture on
 is (``calib.adjust.changes``); what the pictures of a placement say of cameras, axes and joints is held
@@ -33,7 +33,7 @@ class BenchDrift:
     step
         By how much in all: radians (1) of a joint; of a camera a part of the focal length and its turn (4).
     chi2
-        What it explains of the weighted sum of squares.
+        The part of the weighted sum of squares that it explains.
     chance
         Of so large a gain without any, all that were asked counted.
     moves_px
@@ -123,7 +123,7 @@ class OtherPlacements:
 
     @property
     def sentence(self) -> str:
-        """What contradicts the others, and what to do."""
+        """The contradiction to the others, and the remedy."""
         return (
             f"placement {self.board[1]} of board {self.board[0]} contradicts the others: its pictures say "
             f"something else of cameras, axes and joints (chi-square {self.chi2:.0f} for {self.freedom} "

@@ -34,7 +34,7 @@ LEAST = 0.1
 """A sigma is narrowed to this part of the stated one at most: what is smaller still is no noise."""
 
 STAYS = 20.0
-"""What was called wrong stays so up to a chance so many times larger."""
+"""A kind that was called wrong stays so up to a chance so many times larger."""
 
 APART = 0.001
 """Tapes and prisms are one instrument's, unless chance makes them differ so seldom."""
@@ -53,7 +53,7 @@ class Component:
     factor, factor_sigma
         Sigma found over sigma stated, and how sure that is.
     weighed
-        What the stated sigma was multiplied by for the fit: 1 where the factor is no more than luck.
+        The factor on the stated sigma for the fit: 1 where it is no more than luck.
     chance, small_chance
         Of residuals as large, and as small, were the stated sigma right.
     """

@@ -1,4 +1,4 @@
-"""What the rest of the measurements says of some of them, had these not been there: an image, a board.
+"""Tests some measurements against all others, as if they had not been there: an image, a board.
 
 Taken out of the normal equations, the dots of an image leave the others with another minimum and the
 covariance C = (N - JᵀJ)⁻¹. The error of that prediction moves the dots together: their residuals r have
@@ -36,7 +36,7 @@ SOLE = 1e-6
 """Part of what is known of an unknown that the others are taken to contribute at least: it is inverted."""
 
 TOLD = 1e-3
-"""A direction of whose variance some measurements take away less than this part is not theirs to tell."""
+"""A direction of whose variance some measurements take away less than this part is not determined by them."""
 
 REPEATS = 3
 """Times that the dots of an image are judged by one another."""
@@ -53,7 +53,8 @@ class LeftOut:
     def statistic(self, good: np.ndarray) -> tuple[float, int]:
         """Return chi-square of some of the dots (n,) taken together, and its degrees of freedom.
 
-        Directions that the image itself tells and the others hardly do cannot be tested, and count as free.
+        Directions that the image itself determines and the others hardly do cannot be tested, and count as
+        free.
         """
         rows = np.repeat(good, 2)
         rates, residual = self.rates[rows], self.residual[rows]
@@ -65,7 +66,7 @@ class LeftOut:
 
     def pull(self) -> tuple[float, int]:
         """Return chi-square of what these dots say of the unknowns against what the others say, and of how
-        many numbers; those that either hardly tells are not compared."""
+        many numbers; those that either hardly determines are not compared."""
         told, along = np.linalg.eigh(self.rates.T @ self.rates)
         compared = (told > TOLD) & (REDUNDANT * (1.0 + told) <= 1.0)
         told, gradient = told[compared], along[:, compared].T @ (self.rates.T @ self.residual)
@@ -147,7 +148,7 @@ class LeftOutBoard:
         Rms per coordinate of its dots in the fit, and with all but its pose from the others; not-a-number
         without dots, or where the others leave something open that its images need.
     chi2, freedom, chance
-        What it adds to the sum of squares, of how many numbers, and the chance of more if all is right.
+        Its part of the sum of squares, of how many numbers, and the chance of more if all is right.
     mast_sigmas, mast_chance
         How far the mast would be elsewhere without it, the length of the step in sigmas of the fit's mast;
         and the chance of such a step, which has the covariance of the fit without it less that with it.

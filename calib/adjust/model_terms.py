@@ -5,8 +5,8 @@ costs, and what it does to the others, follows from the covariance (a Wald test 
 fit is needed until the choice is made. The least significant goes first, until all that are left are.
 
 A term that is not significant is left out only if the pictures show that it is small: what could hide in it
-moves pixels by less than ``HIDDEN_PX``. Else it stays with its sigma, so that the fit is not sure of what
-nobody has seen; but play, which is none or more, needs to be seen.
+moves pixels by less than ``HIDDEN_PX``. Else it stays with its sigma, so that the fit is not sure of unseen
+effects; but play, which is none or more, needs to be seen.
 
 The two harmonics of a joint enter together: over the part of a turn that a head sees boards in, one can do
 most of the other's work, and a fit with the wrong one alone would be sure of numbers that are not so.
@@ -45,7 +45,7 @@ class ModelTerm:
 
     @property
     def name(self) -> str:
-        """What a person calls it; no two terms of a model have the same."""
+        """Its name for people; no two terms of a model have the same."""
         return f"bow of {self.of}" if self.kind == "bow" else f"{self.of} {self.kind}"
 
     @property
@@ -80,7 +80,7 @@ TERM_KINDS = ("joints", "mast", "bow")
 """The kinds of unknowns (``calib.adjust.unknowns``) that terms are numbers of."""
 
 HIDDEN_PX = 0.1
-"""What may hide in a term that is left out, one sigma, rms: half of what a person's click is off by."""
+"""The error that a term left out may hide, one sigma, rms: half that of a person's click."""
 
 
 def bow_of(board: str) -> ModelTerm:

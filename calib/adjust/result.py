@@ -1,4 +1,4 @@
-"""What a calibration gives: the rig, how sure it is, what was left out and what remains unexplained."""
+"""The result of a calibration: the rig, its uncertainty, measurements left out, and residuals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HELD_FIXED = (
     "an offset of pan is no parameter: it is the mast's rotation z",
     "an offset of tilt is no parameter: it turns all head cameras together, which their own axes do as well",
 )
-"""What no survey of any kind can tell from other parameters, and which of them stands for it."""
+"""Parameters that no survey can separate from others, and which of those stands for them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +92,11 @@ class FittedRig:
         Camera to (x, y) rms of what was fitted in images, and of check images, which were not; pixels.
         Without images whose board, as it is named, the camera cannot see.
     images
-        What remains of every image.
+        The residuals of every image.
     outliers, degenerate
-        What was left out, each with its reason, and what the measurements leave open.
+        The measurements left out, each with its reason, and the directions left open.
     notes
-        What else a person should know, a sentence each.
+        Further facts for a person, a sentence each.
     chi2, degrees_of_freedom, chi2_probability
         Sum of squares of the residuals in stated sigmas, what it is expected to be, and the chance of a
         larger one were all sigmas right; nan where the method does not weigh by them.
@@ -146,10 +146,10 @@ class Calibration(FittedRig):
     estimate
         (p,) values of the parameters; 0 for the two of an A or O, which count from the rig's own.
     wider, left_out_boards
-        What further numbers would gain, the likeliest first, and what the rest says of each board; empty
+        The gain of further numbers, the likeliest first, and the test of each board against the rest; empty
         where the method does not weigh by sigmas.
     station
-        What remains of every prism and tape.
+        The residuals of every prism and tape.
     rover_from_station
         By set-up.
     prisms_in_rover_m
@@ -198,7 +198,7 @@ class TermGain:
 
     @property
     def name(self) -> str:
-        """What a person calls the term."""
+        """The term's name for people."""
         return self.term.name
 
     @property
@@ -240,15 +240,15 @@ class BenchCalibration(FittedRig):
     checks
         Camera to what check images should be off by, and how likely it is that they are off by more.
     gauges
-        What pictures cannot know and how it was fixed, a sentence each.
+        Quantities that pictures cannot determine, and how they were fixed, a sentence each.
     placements
         Each placement held against the others, the least likely first.
     drifts
         How far each joint and each camera drifts, the least likely first.
     joint_rad
-        What one joint reading is off by, besides its joint's errors.
+        The error of one joint reading, besides its joint's errors.
     inexact_m
-        What corners are off by on the board beyond their own sigmas; 0 where these explain them.
+        The error of corners on the board beyond their own sigmas; 0 where these explain them.
     bows_m
         By board its bow (across, down), metres.
     """

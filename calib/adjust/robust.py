@@ -1,6 +1,6 @@
 """A fit without its blunders, every kind of measurement weighed by what its residuals show.
 
-Pulls are bounded first (Huber), so that blunders can be told by the tests of `calib.adjust.outliers`; then
+Pulls are bounded first (Huber), so that blunders can be found by the tests of `calib.adjust.outliers`; then
 plain least squares without them. Where residuals show that a kind of measurement is worse than stated, the
 fit is done again with the sigma that they show (`calib.adjust.goodness`), and so is its covariance.
 """
@@ -41,8 +41,8 @@ WEIGHED = 0.02
 class Weighed:
     """A fit with sigmas as large as residuals show them.
 
-    ``images`` are all that were fitted, with every dot and these sigmas; ``excess`` is by how much the
-    squared residuals of the kinds that were widened were larger in the first fit than stated sigmas allow.
+    ``images`` are all that were fitted, with every dot and these sigmas. ``excess`` is how far the squared
+    residuals of the widened kinds, in the first fit, exceeded what stated sigmas allow.
     """
 
     problem: Adjustment

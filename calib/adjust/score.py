@@ -1,4 +1,4 @@
-"""What numbers beside those that were fitted would gain, told by the fit's own normal equations.
+"""The gain of numbers beside those that were fitted, from the fit's own normal equations.
 
 Rao's score test: with the Jacobian E of the further numbers beside J of those that were fitted, the residual
 r at the minimum and C = (JᵀJ)⁻¹, the sum of squares would fall by gᵀ S⁻¹ g to first order, where
@@ -25,7 +25,7 @@ MADE_UP = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """What further numbers would gain.
+    """The gain of further numbers.
 
     ``chi2`` by how much the sum of squares would fall, ``freedom`` how many of the numbers count, ``values``
     (k,) of each number and ``sigma`` (k,), not-a-number where it cannot be told by itself. ``rms`` is by how

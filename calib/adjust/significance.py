@@ -106,6 +106,6 @@ def typical_scale(squares: FloatArray, freedom: int = 2) -> float:
 
 
 def typical_px(residuals_px: FloatArray) -> float:
-    """Return the sigma of a coordinate that the median length of residuals (n, 2) tells, pixels."""
+    """Return the sigma of a coordinate that the median length of residuals (n, 2) gives, pixels."""
     square = np.nan_to_num((residuals_px**2).sum(axis=1), nan=np.inf)
     return float(np.sqrt(typical_scale(square))) if len(square) else float("inf")

@@ -36,7 +36,7 @@ class Normal(NamedTuple):
 
 
 class LeastSquaresProblem(Protocol[State]):
-    """What a fit needs to know; costs are infinite where a state is impossible."""
+    """The input of a fit; costs are infinite where a state is impossible."""
 
     def normal(self, state: State) -> Normal:
         """Return cost and normal equations."""
@@ -74,7 +74,7 @@ def minimise(
     Parameters
     ----------
     problem, start
-        What to fit, and from where.
+        The problem, and its start.
     weak
         (p,) added to the diagonal of JᵀJ without any pull: unknowns that the data leave open stay where
         they are. None adds nothing.

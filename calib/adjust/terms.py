@@ -1,4 +1,4 @@
-"""What a fit is made of: the dots of an image, a point of the station, and what lenses are usually like."""
+"""The terms of a fit: the dots of an image, a point of the station, and the prior of lenses."""
 
 from __future__ import annotations
 
@@ -153,14 +153,14 @@ def widened_images(images: Sequence[ImageTerm], factors: Mapping[str, float]) ->
 O_SIGMA_RAD = 0.02
 R_SIGMA = (0.5, 1.0)
 E_SIGMA_M = 0.01
-"""What lenses are like, one sigma: O beside A, R1 and R2, E0 to E2. Flight cameras stay within some 2.5 of
+"""The prior of lenses, one sigma: O beside A, R1 and R2, E0 to E2. Flight cameras stay within some 2.5 of
 these; a survey that sees a lens well does not feel them, and one that does not cannot run away with it."""
 
 LIMITS = {"O": (O_SIGMA_RAD,) * 3, "R": R_SIGMA, "E": (E_SIGMA_M,) * 3}
 """The same by a camera's letters."""
 
 D_SIGMA = {"p": 0.02, "s": 0.05, "tau": 0.1, "k": 1.0}
-"""What OpenCV's coefficients are like, one sigma, by their first letter. Both parts of a ratio of polynomials
+"""The prior of OpenCV's coefficients, one sigma, by their first letter. Both parts of a ratio of polynomials
 may grow together, and the picture hardly changes: k1 and k4 by the same, the others by products with these.
 A fit follows that curve for hundreds of steps unless it is short; with 10 instead of 1 one Navcam did not
 settle in 200, with 1 it takes 10 and leaves the same residuals."""

@@ -1,4 +1,4 @@
-"""What remains of every measurement after a fit, how sure the fit is, and what it leaves open."""
+"""Residuals of every measurement after a fit, the fit's uncertainty, and the directions it leaves open."""
 
 from __future__ import annotations
 
@@ -177,8 +177,8 @@ def pixel_covariance(
 ) -> tuple[FloatArray, FloatArray]:
     """Return predicted pixels (n, 2) of rover-frame points (n, 3), metres, and covariances (n, 2, 2), px².
 
-    What is uncertain is the calibration; points and joint angles count as exact. Points that have no
-    pixel come out as not-a-number.
+    Only the calibration is uncertain; points and joint angles count as exact. Points that have no pixel come
+    out as not-a-number.
     """
     rig, names = calibration.rig, calibration.parameter_names
     pixels, rates = pixel_rates(rig, names, camera, pan_rad, tilt_rad, points_m)

@@ -32,7 +32,7 @@ class Unknown:
     key
         What it is.
     names
-        (k,) of its numbers, as a calibration tells them.
+        (k,) of its numbers, as a calibration names them.
     step
         (k,) how far each may be off at all: one that the data leave open stays where it is.
     prior, sigma

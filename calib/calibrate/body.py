@@ -1,12 +1,12 @@
 """Correct the pose of a body pair from hand-offs: the paper's bias from two set-ups of the prisms.
 
 Weighted least squares for one rigid motion of the pair against the mast cameras, which hold the rover frame.
-Targets at one range cannot tell a turn from a shift; a prior says how far two prism set-ups can disagree, and
-directions in which the hand-offs add little to it are named. The significance is that of the directions that
-the hand-offs do see, against no motion at all.
+Targets at one range cannot separate a turn from a shift; a prior says how far two prism set-ups can disagree,
+and directions in which the hand-offs add little to it are named. The significance is that of the directions
+that the hand-offs do see, against no motion at all.
 
 The corrected rig's covariance: with e what the rig's parameters are wrong by, the hand-offs' residuals are G
-e + noise, and the step is K times them. What remains, e - LK (G e + noise), has the covariance (1 - LKG) P (1
+e + noise, and the step is K times them. The remainder e - LK (G e + noise) has the covariance (1 - LKG) P (1
 - LKG)ᵀ + LK R (LK)ᵀ (Joseph's form, right for any K). It ties the corrected cameras to mast and mast cameras,
 which they were corrected by.
 """

@@ -2,7 +2,7 @@
 
 The mast cameras define the rover frame here; the body's cameras move as one rigid body by a *step*: a shift
 (3, metres) and a turn (3, radians, a rotation vector) about the middle of their centres, rover axes.
-Clicks and joint readings err once per hand-off, so the eyes of one hand-off share that part of the noise.
+Clicks and joint readings err once per hand-off, so the cameras of one hand-off share that part of the noise.
 
 `calib.calibrate.body` makes a correction of them, with what was left out.
 """
@@ -38,10 +38,10 @@ _JOINTS = np.array([8, 9])
 
 
 class Equations(NamedTuple):
-    """Of n hand-offs and k eyes: found less predicted (n, 2k), its rates to a step (n, 2k, 6) and to the
+    """Of n hand-offs and k cameras: found less predicted (n, 2k), its rates to a step (n, 2k, 6) and to the
     target's position (n, 2k, 3), and covariance (n, 2k, 2k).
 
-    Rates are of the predicted pixels. What an eye did not find has residual and rates 0 and covariance 1.
+    Rates are of the predicted pixels. A camera that found nothing has residual and rates 0 and covariance 1.
     """
 
     residual_px: FloatArray
@@ -52,7 +52,7 @@ class Equations(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BodySights:
-    """What the cameras of a body pair found.
+    """The sights of a body pair's cameras.
 
     Attributes
     ----------
@@ -219,7 +219,7 @@ WORDS = ("roll", "pitch", "yaw", "shift forward", "shift right", "shift down")
 class LeftOutHandoff:
     """A hand-off that was not used: which, by how much (px), and the failed test.
 
-    It contradicts the rest, by ``off_px`` in the worst eye; or, if it is not ``one_point``, its clicks
+    It contradicts the rest, by ``off_px`` in the worst camera; or, if it is not ``one_point``, its clicks
     contradict each other, by ``off_px`` across the epipolar line.
     """
 
@@ -242,9 +242,9 @@ class LeftOutHandoff:
 
 @dataclass(frozen=True, eq=False)
 class EyesApart:
-    """What is left between the two eyes of a pair: mean of right less left, px, with covariance, in sigmas.
+    """The remainder between the two cameras of a pair: mean of right less left, px, covariance, sigmas.
 
-    One rigid motion cannot explain it: one eye moved by itself, or its model is off.
+    One rigid motion cannot explain it: one camera moved by itself, or its model is off.
     """
 
     offset_px: FloatArray

@@ -30,7 +30,7 @@ LEAST_PART = 0.02
 """And if it predicts nearer by this part at least."""
 
 MOST_IMAGES, MOST_POINTS = 20, 40
-"""As many pictures, spread over all, and points of each, tell families apart."""
+"""As many pictures, spread over all, and points of each, separate families."""
 
 _STEPS = 8
 

@@ -1,10 +1,10 @@
 """The paper's calibration (section III): each camera at one joint setting, then the mast, each step exact.
 
-Cameras are fitted to images of purpose ``camera``, set-ups and boards taken from the station as they are.
-The mast is fitted to images of purpose ``mast`` with those cameras (eq. (9)), which it then carries to the
-head. All dots weigh the same; what the station got wrong shows as residuals. The covariance
-is that of this estimator (``calib.calibrate.paper``). Dots that disagree with the rest of their image
-are left out beforehand (``calib.calibrate.starts.stray_dots``).
+Cameras are fitted to images of purpose ``camera``, set-ups and boards taken from the station as they are. The
+mast is fitted to images of purpose ``mast`` with those cameras (eq. (9)), which it then carries to the head.
+All dots weigh the same; errors of the station show as residuals. The covariance is that of this estimator
+(``calib.calibrate.paper``). Dots that disagree with the rest of their image are left out beforehand
+(``calib.calibrate.starts.stray_dots``).
 
 Written with normal equations (k cameras, m mast, s station: boards, set-ups, prisms and joints), the
 station's noise moves boards and set-ups, the cameras follow, and the mast follows both:

@@ -34,9 +34,9 @@ from calib.calibrate.starts.survey import Start, start_values
 from calib.survey.records import Survey
 
 WRONG_MINIMUM = 6.0
-"""A fit is refused if the typical dot is this many times farther off than its sigma says, or than ``dot_px``
-of the survey where that is more (a print is in no dot's own sigma): stated sigmas are wrong by two or three,
-wrong minima by a hundred."""
+"""A fit is refused if the typical dot is this many times farther off than its sigma, or than ``dot_px`` of
+the survey where that is more (a dot's own sigma has no print). Stated sigmas are wrong by two or three, wrong
+minima by a hundred."""
 
 MANY = 0.15
 """More than this part of the tapes left out (and more than three) are no blunders: the model fails."""

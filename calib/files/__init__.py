@@ -90,7 +90,7 @@ def build_model(
     cahvore_type: int = 0,
     linearity: float | None = None,
 ) -> tuple[CameraModel, tuple[str, ...]]:
-    """Return the camera model of numbers read from a file, A and O normalised, with the notes to tell.
+    """Return the camera model of numbers read from a file, A and O normalised, with the notes to report.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """Saving a file so that a crash at any moment leaves the old content or the new, never less.
 
-Steps of `save_bytes`: write the new content beside the file and fsync it; give the old content a second name;
-rename the new one into place; fsync the folder; rename the old one to ``NAME.previous.SUFFIX``. After a crash
-in between the folder may hold a hidden ``.NAME.*.new`` or ``.NAME.*.old`` beside the file; neither is ever
-read. `replace_bytes` is the same without a second name, for what a program keeps for itself. Not so
-`overwrite_bytes`, which is for who cannot wait.
+`save_bytes` writes the new content beside the file and fsyncs it. It gives the old content a second name,
+renames the new one into place, fsyncs the folder, and renames the old one to ``NAME.previous.SUFFIX``. After
+a crash in between the folder may hold a hidden ``.NAME.*.new`` or ``.NAME.*.old`` beside the file; neither is
+ever read. `replace_bytes` is the same without a second name, for a program's own files. `overwrite_bytes`
+writes in place, for callers that cannot wait.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def save_bytes(path: str | Path, data: bytes) -> None:
 def replace_bytes(path: Path, data: bytes, mode: int = 0o600) -> None:
     """Replace the file's content in one step; when this returns it is on the disk.
 
-    What crashes have left of earlier tries is taken away. One process at a time may do this to a file.
+    Leftovers of crashed tries are removed. One process at a time may do this to a file.
 
     Raises
     ------
@@ -119,9 +119,9 @@ def replace_bytes(path: Path, data: bytes, mode: int = 0o600) -> None:
 def overwrite_bytes(path: Path, data: bytes) -> None:
     """Write over what the file holds, blanks after it; when this returns it is on the disk.
 
-    No name and no length changes, so the file system has nothing to note beside the bytes: on ext4 this takes
-    a twentieth of the time of `replace_bytes`, and waits for nobody else's files. A crash meanwhile leaves
-    the old, the new, or parts of both.
+    No name and no length changes, so the file system writes the bytes alone. On ext4 this takes a twentieth
+    of the time of `replace_bytes`, and does not wait for other files. A crash meanwhile leaves the old, the
+    new, or parts of both.
 
     Raises
     ------

@@ -1,11 +1,11 @@
 """The ``.cahvor`` text files of JPL's camera-model library and of mrcal.
 
 Lines ``KEY = value`` in any order, ``#`` comments. ``Model`` is ``CAHV``, ``CAHVOR``, ``CAHVORE1``,
-``CAHVORE2`` or ``CAHVORE3,linearity``, each followed by words that are ignored. ``S`` and ``S internal``
-head matrices, one row a line: the covariance of the vectors' components, and of Hs, Hc, Vs, Vc, Theta (all
-five follow from the vectors). JPL's readers find keys by scanning forward for ``C =`` or ``Hs    =`` with
-exactly these blanks, so this writer keeps JPL's order and blanks; numbers are in shortest round-trip form
-instead of nine decimals.
+``CAHVORE2`` or ``CAHVORE3,linearity``, each followed by words that are ignored. ``S`` and ``S internal`` head
+matrices, one row a line: the covariance of the vectors' components, and of Hs, Hc, Vs, Vc, Theta (all five
+follow from the vectors). JPL's readers find keys by scanning forward for ``C =`` or ``Hs    =`` with exactly
+these blanks, so this writer keeps JPL's order and blanks. Numbers are in shortest round-trip form instead of
+nine decimals.
 
 The format has no place for the frame's name, provenance, or a fit other than the covariance of the vectors.
 Sources: VICAR ``cmod_stdio_*.c`` (what is written and scanned for), mrcal ``cahvor.py`` (what is accepted).

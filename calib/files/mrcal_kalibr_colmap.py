@@ -2,10 +2,10 @@
 
 mrcal's ``.cameramodel`` is a Python mapping in text, one camera with its pose. ``extrinsics`` are rt_fromref:
 a rotation vector and a translation from the reference frame, whose name the file has no place for, to camera
-axes. LENSMODEL_CAHVOR and LENSMODEL_CAHVORE_linearity=p hold fx fy cx cy, then alpha and beta, with O = (sin
-α cos β, sin β, cos α cos β) in camera axes, R0 R1 R2, and E0 E1 E2: exact twins of ours, but for H and V that
-are not at right angles. LENSMODEL_PINHOLE and OPENCV4, 5, 8, 12 are read too, and OPENCV5 and 8 written where
-asked for. Source: https://mrcal.secretsauce.net/cameramodels.html and lensmodels.html.
+axes. LENSMODEL_CAHVOR and LENSMODEL_CAHVORE_linearity=p hold fx fy cx cy, alpha and beta, R0 R1 R2, and E0 E1
+E2. O is (sin α cos β, sin β, cos α cos β) in camera axes. They are exact twins of ours if H and V are at
+right angles. LENSMODEL_PINHOLE and OPENCV4, 5, 8, 12 are read too, and OPENCV5 and 8 written where asked for.
+Source: https://mrcal.secretsauce.net/cameramodels.html and lensmodels.html.
 
 Kalibr's camchain has cameras ``cam0``, ``cam1``, ... in YAML, each placed against the one before.
 ``camera_model: pinhole`` with ``distortion_model`` radtan (k1 k2 p1 p2), equidistant (k1 k2 k3 k4) or none.

@@ -70,7 +70,7 @@ _CLOSING = {"(": ")", "{": "}"}
 
 
 def parse_label(text: str, path: str | Path) -> LabelBlock:
-    """Return the label that the text begins with; what follows its ``END`` is not looked at.
+    """Return the label at the beginning of the text; everything after its ``END`` is ignored.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """PDS3 products: a label, attached to its image or detached, with camera model, mast angles and image.
 
-What the labels of MER and MSL call these things: group ``GEOMETRIC_CAMERA_MODEL`` (MSL: ``..._PARMS``)
-with MODEL_TYPE and MODEL_COMPONENT_1..9 (C A H V O R E, then T = type and P = linearity); the mast is group
+Names in the labels of MER and MSL. A camera is group ``GEOMETRIC_CAMERA_MODEL`` (MSL: ``..._PARMS``) with
+MODEL_TYPE and MODEL_COMPONENT_1..9 (C A H V O R E, then T = type and P = linearity). The mast is group
 ``PMA_ARTICULATION_STATE`` (MER) or ``RSM_ARTICULATION_STATE_PARMS`` (MSL) with ``AZIMUTH-MEASURED`` and
 ``ELEVATION-MEASURED`` among its angle names. Only MEASURED angles go with the camera model of a label:
 REQUESTED and FINAL differ by milliradians.

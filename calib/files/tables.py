@@ -1,9 +1,9 @@
 """Tables of numbers as CSV: points and pixels in, points, pixels and rays out.
 
-In: UTF-8, with or without a byte-order mark, any line ends; the first line names the columns exactly; a cell
-is a number, ``nan`` and ``inf`` included; a row whose cells are all empty is a row of not-a-numbers, as this
-module writes them. Out: a header, one row an input row, shortest round-trip numbers, empty cells where there
-is no number.
+In: UTF-8, with or without a byte-order mark, any line ends. The first line names the columns exactly. A cell
+is a number, ``nan`` and ``inf`` included. A row of empty cells is a row of not-a-numbers, as this module
+writes them. Out: a header, one row an input row, shortest round-trip numbers, empty cells where there is no
+number.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def read_table(path: str | Path, columns: Sequence[str]) -> FloatArray:
     Raises
     ------
     BadFile
-        For another header, a row of another length, or a cell that is no number; the place is the row,
+        For another header, a row of another length, or a cell that is not a number. The place is the row,
         counted from 1 after the header, and the line of the file.
     """
     return parse_table(read_bytes(path, MAX_BYTES), path, columns)

@@ -182,8 +182,8 @@ def nearest_opencv(model: CameraModel, kind: Kind) -> CameraModel:
     """Return the camera of one of OpenCV's kinds, without skew, whose pixels come nearest to a model's.
 
     Of 14 coefficients k1, k2, k3, p1, p2 and the turns of the plane are used. A plane turned about both axes
-    and a camera turned back leave a picture that leans by the product of both turns: so OpenCV holds H and V
-    that are not at right angles.
+    and a camera turned back leave an image that leans by the product of both turns. So OpenCV can hold H and
+    V that are not at right angles.
 
     Raises
     ------

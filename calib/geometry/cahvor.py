@@ -3,8 +3,8 @@
 Pixels are (x, y) = (column, row), 0-based; the centre of the top-left pixel is (0, 0). H and V need not be at
 right angles, and mirrored images are as good as others.
 
-A camera of OpenCV's families is a CAHV with a lens in front: z of the lens is A, y is the part of V across A,
-and x is at right angles to both. H, V and A in those axes are the camera matrix, with its skew in H.
+A camera of OpenCV's families is a CAHV with a lens in front. Its z is A, its y is the part of V across A, and
+its x is at right angles to both. H, V and A in those axes are the camera matrix, with its skew in H.
 
 Sources: Yakimovsky and Cunningham 1978 (CAHV); Gennery 2001, 2006 (CAHVOR, CAHVORE); JPL's camera-model
 library as published with VICAR (``cmod_cahv*.c``).
@@ -108,16 +108,16 @@ class CameraModel(ReadOnlyArrays):
     Raises
     ------
     ValueError
-        If the numbers are no camera; the sentence names the letter.
+        If the parameters do not define a camera; the sentence names the letter.
 
     Notes
     -----
-    A point has a pixel if the lens reaches it: for CAHV and CAHVOR it is in front of C along A and along O,
-    for CAHVORE its ray is within the angle that the linearity allows (a right angle over ``linearity``, at
-    most half a turn), and for both it is nearer to O than where the polynomial of R first folds. Points so
-    near a CAHVORE lens that two rays of the image pass through them have none. A lens of OpenCV's reaches
-    what is nearer to A than where it first folds (``limit_words``). Everything else comes out
-    as not-a-number and False. A point outside the image keeps its numbers.
+    A point has a pixel if the lens reaches it. For CAHV and CAHVOR it is then in front of C along
+    A and along O. For CAHVORE its ray is within the angle that the linearity allows (a right angle over
+    ``linearity``, at most half a turn), and for both it is nearer to O than where the polynomial of R first
+    folds. Points so near a CAHVORE lens that two rays of the image pass through them have none. A lens of
+    OpenCV's reaches what is nearer to A than where it first folds (``limit_words``). Everything else comes
+    out as not-a-number and False. A point outside the image keeps its numbers.
 
     Examples
     --------
@@ -255,8 +255,8 @@ class CameraModel(ReadOnlyArrays):
     ) -> tuple[CameraModel, float]:
         """Return the model with A and O made unit vectors, and by how much that moves a pixel at most.
 
-        Arguments as the class, A and O of any length but zero. The change, in pixels, is the largest over
-        the image of points 1 m and 1 km away, against JPL's formulas with the vectors as given; infinite
+        Arguments as the class, A and O of any length but zero. The change, in pixels, is the largest over the
+        image, of points 1 m and 1 km away, against JPL's formulas with the vectors as given. It is infinite
         if those give no pixel somewhere.
 
         Raises

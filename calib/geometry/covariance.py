@@ -11,7 +11,7 @@ closed form, by the derivatives of the camera (`calib.geometry.parameters`) and 
 Whether two clicks mean one point follows: two rays have four coordinates and a point three. What is left
 over, how far the rays pass each other, is one number that is zero but for noise; its square over the variance
 that clicks and rig give it is chi-square with one degree of freedom. Along the epipolar line nothing can be
-told: there every pixel is a point at another range.
+tested: there every pixel is a point at another range.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class RigCovariance(ReadOnlyArrays):
         return RigCovariance(tuple(self.names[i] for i in kept), self.covariance[np.ix_(kept, kept)])
 
     def among(self, names: Sequence[str]) -> FloatArray:
-        """Return the covariance (k, k) of other names in their order; what has no place here is exact."""
+        """Return the covariance (k, k) of other names in their order; names not here are exact."""
         at = {name: i for i, name in enumerate(self.names)}
         theirs = [i for i, name in enumerate(names) if name in at]
         mine = [at[names[i]] for i in theirs]

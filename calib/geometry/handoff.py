@@ -1,9 +1,9 @@
 """Camera hand-off: where a target that one stereo pair sees falls in other cameras (the paper's section V).
 
-Three steps: a ray through each picked pixel of the pair; the point nearest to both rays; that point projected
-into each next camera, on the body or on the head, the head turned or not. The covariance goes the same way,
-to first order in closed form: what clicks, joint angles and calibration are wrong by is carried through the
-whole chain, so that errors which both sides share cancel as they do in the rig.
+There are three steps: a ray through each picked pixel of the pair, the point nearest to both rays, and its
+projection into each next camera, on the body or on the head, the head turned or not. The covariance goes the
+same way, to first order in closed form. Errors of clicks, joint angles and calibration are carried through
+the whole chain, so that errors which both sides share cancel as they do in the rig.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from calib.geometry.rigid import FloatArray
 
 
 class Bent(NamedTuple):
-    """What the lens does to points (a, b, w): slopes (3, n), rows u, v and 1, and which points it reaches.
+    """The lens applied to points (a, b, w): slopes (3, n), rows u, v and 1, and which points it reaches.
 
     With derivatives: d(u, v) = m (da, db) + c (n c.(da, db) + k dw), with c (2, n) across the axis.
     """

@@ -1,9 +1,9 @@
 """Exact pointing: the joint angles that bring a target onto a chosen pixel of a head camera.
 
-The pixel's ray (origin c, unit direction d, both in the head frame) comes from the camera model itself, so
+The pixel's ray (origin c, unit direction d, both in the head frame) comes from the camera model itself. So
 lens distortion, a moving entrance point, oblique H and V and a principal point off centre are all exact, for
-any pixel. The paper (section IV) turns the camera by a small rotation vector instead, eqs. (19)-(22).
-The letters are those of calib.geometry.reach.
+any pixel. The paper (section IV) turns the camera by a small rotation vector instead, eqs. (19)-(22). The
+letters are those of calib.geometry.reach.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """From points to pixels and back, for a camera whose vectors are given in its lens frame.
 
 A point is turned into the lens frame (origin C, z along O), bent into slopes (`calib.geometry.lens_rays`),
-and a plane projection by H, V and A makes pixels of slopes; a ray goes the same way back. What is here does
-not change when the camera moves: where it stands comes with each call as C and the lens frame's axes.
+and a plane projection by H, V and A makes pixels of slopes; a ray goes the same way back. Nothing here
+changes when the camera moves: its place comes with each call as C and the lens frame's axes.
 
 Labels print six digits, so A and O are not unit vectors to the last; they are normalised on load. The plain
 formulas of JPL's library, which takes them as they are (`project_as_published`), serve only to say by how

@@ -4,10 +4,10 @@ rover_from_head(pan, tilt) = Trans(t) Rot(x,θx) Rot(y,θy) Rot(z,θz) · Rot(z,
 Rot(y,tilt) (paper eqs. (6)-(8); a and k make it any two revolute axes). Positive pan turns right, positive
 tilt looks up. Angles are true ones, not what an encoder reads (`calib.geometry.rig`).
 
-What a joint reads is wrong by true = u + Σ (c_i cos(i u) + s_i sin(i u)), where u is the angle read, less
-half the backlash if the axis came to rest from smaller angles, plus half of it if from larger ones. The first
-harmonic is an encoder's disc or magnet off its centre (an arm's sag looks the same in tilt), the second one
-that is oval. The kinematics speak of true angles, a head of read ones.
+A joint's true angle is u + Σ (c_i cos(i u) + s_i sin(i u)). There u is the angle read, less half the backlash
+if the axis came to rest from smaller angles, plus half of it if from larger ones. The first harmonic is an
+encoder's disc or magnet off its centre (an arm's sag looks the same in tilt), the second one that is oval.
+The kinematics speak of true angles, a head of read ones.
 """
 
 from __future__ import annotations

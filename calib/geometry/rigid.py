@@ -49,7 +49,7 @@ def finite_float(name: str, value: float) -> float:
 class ReadOnlyArrays:
     """For frozen dataclasses: arrays that were read-only stay so when it is unpickled or deeply copied.
 
-    What is made of them once and kept would else go on saying what they were.
+    Values that were made of them once and kept would else be stale.
     """
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -205,7 +205,7 @@ def _off_rotation(matrix: FloatArray) -> float:
 def carried_covariance(covariance: FloatArray, now_from_then: Rigid) -> FloatArray:
     """Return a motion's covariance (6, 6), stated in one frame, along the axes and at the origin of another.
 
-    A turn r and a shift t of then move a point x of now by R r x (x - p) + R t. What comes back is exactly
+    A turn r and a shift t of then move a point x of now by R r x (x - p) + R t. The result is exactly
     symmetric and has no negative variance.
     """
     turn, shift = now_from_then.rotation, now_from_then.translation_m

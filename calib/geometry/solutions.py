@@ -91,7 +91,7 @@ def ordered(
     from_pan_rad, from_tilt_rad
         Where the head is now.
     read
-        What the head reads at a solution's true angles: limits, and where it is now, are then readings too.
+        The head's readings at a solution's true angles; limits and the present angles are then readings too.
         By default joints read true.
 
     Raises

@@ -1,7 +1,7 @@
 """One hand-off and what came of it: all that is needed to judge it again later, with any mast file.
 
 The geometric pixel is what the mast cameras say, the found one what the destination's picture says. Many of
-these tell whether the two sets of cameras mean the same rover frame (`calib.matching.handed_over`,
+these show whether the two sets of cameras mean the same rover frame (`calib.matching.handed_over`,
 `calib.calibrate.body`).
 
 The constant offset that they leave in each destination camera is the mast's self-check in service. Nothing is
@@ -108,7 +108,7 @@ def matched_handoff(
     mast_digest, pair, joints, clicks_px, sigma_px, to_joints
         As in `MatchedHandoff`; what ``handoff`` was made of.
     handoff, refined
-        What came of it; destination cameras that do not see the target, or were not looked at, are left out.
+        Its result; destination cameras that do not see the target, or were not looked at, are left out.
     time
         When; now if left out.
     """

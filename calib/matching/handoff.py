@@ -3,7 +3,7 @@
 The source pair gives the surface around the target (`calib.matching.partner`); the source patch is warped
 over it into each destination camera and correlated inside the ellipse that the geometric hand-off leaves
 (`calib.matching.patch`). What is found there counts only if it is the one thing that fits, and if the
-destination's two eyes and the source's range mean the same point.
+destination's two cameras and the source's range mean the same point.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class RefineSettings:
         Bounds of the search window's half side; below, the ellipse would be smaller than what the warp can
         be wrong by.
     model_px
-        One sigma of what camera models are wrong by, for comparing what eyes see. Flight cameras: 0.2 to 0.5.
+        One sigma of what camera models are wrong by, for comparing what cameras see. Flight cameras: 0.2 to
+        0.5.
     click_px
         How far the second click may lie from where the pair's pictures put the first, beyond four sigma.
     worst_chi2
@@ -109,7 +110,7 @@ def refine_handoff(
     handoff
         The geometric hand-off of the same target.
     source
-        Left and right eye of the pair that sees the target.
+        Left and right camera of the pair that sees the target.
     clicks_px
         (2, 2) the target in both.
     destinations
@@ -193,7 +194,7 @@ def _looked_up(
 
 
 def _whole_window(found: PatchMatch, eye: Eye, search_px: float) -> bool:
-    """Tell whether the patch fits into the picture wherever in the window the target is."""
+    """Return whether the patch fits into the picture wherever in the window the target is."""
     reach = search_px + found.half_px
     size = np.array(eye.camera.size_px)
     return bool((found.predicted_px >= reach).all() and (found.predicted_px <= size - 1 - reach).all())
@@ -204,7 +205,7 @@ def _agreeing(
     handoff: Handoff,
     settings: RefineSettings,
 ) -> dict[str, RefinedPixel]:
-    """Take back what the other destination eyes, or the source's range, do not confirm."""
+    """Take back what the other destination cameras, or the source's range, do not confirm."""
     accepted = {name: one for name, one in refined.items() if one.verdict == "accepted"}
     doubting = [name for name, one in refined.items() if one.verdict in ("ambiguous", "occluded", "flat")]
     if not accepted:
@@ -225,7 +226,7 @@ def _agreeing(
 def _misfit(accepted: Mapping[str, RefinedPixel], handoff: Handoff, settings: RefineSettings) -> float:
     """Weighted square of how far the found pixels lie from the hand-off's, all together.
 
-    What the eyes share (a range or a calibration that is off) may move them together as far as that is
+    What the cameras share (a range or a calibration that is off) may move them together as far as that is
     uncertain; against each other they may be wrong only by what each alone can.
     """
     order = [name for name, predicted in handoff.pixels.items() if predicted is not None]

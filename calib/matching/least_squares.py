@@ -55,7 +55,7 @@ class LeastSquaresMatch:
     correlation
         Normalised correlation of template and image at the found place, pixels weighted as in the fit, -1..1.
     middle
-        The place that the patch's middle alone tells, `NARROW` as wide, the deformation kept.
+        The place that the patch's middle alone shows, `NARROW` as wide, the deformation kept.
     """
 
     pixel_px: FloatArray

@@ -1,17 +1,17 @@
-"""Follow one target while the rover moves: predicted, found in both eyes, filtered, or said to be lost.
+"""Follow one target while the rover moves: predicted, found in both cameras, filtered, or said to be lost.
 
 The state is the target's position in the rover frame with its covariance (`calib.matching.track`). A look
-(`seen_by`) warps the key picture of the target through its surface into each eye as that eye would see it now
-(`calib.matching.patch`), so that neither scale nor slant nor the change to another camera spoils the
-correlation; finds it near the prediction; and takes it only if both eyes, the prediction and the picture mean
-the same point.
+(`seen_by`) warps the key picture of the target through its surface into each camera as that camera would see
+it now (`calib.matching.patch`), so that neither scale nor slant nor the change to another camera spoils the
+correlation; finds it near the prediction; and takes it only if both cameras, the prediction and the picture
+mean the same point.
 
 A target that is not found is ``lost``: the state goes on by rover motion alone, its covariance grows, and
 with it the window of the next look. It is found again by the same rules, so that another rock does not take
 its place.
 
-Whether pictures contradict the motion that a track was carried over: it has the covariance that was told of
-the motion; the pictures after it tell where the target is without that. How far the two lie apart, against
+Whether pictures contradict the motion that a track was carried over: it has the covariance that was stated of
+the motion; the pictures after it show where the target is without that. How far the two lie apart, against
 the covariance of both, is chi-square. Once in a thousand looks an honest motion is off by so much; below that
 nothing is said.
 """
@@ -118,7 +118,7 @@ FALSE_ALARMS = 0.001
 
 @dataclass(frozen=True, eq=False)
 class PoseDoubt:
-    """What pictures say against a motion.
+    """The evidence of pictures against a motion.
 
     Attributes
     ----------
@@ -170,19 +170,19 @@ def pose_doubt(
 
 
 UNKNOWN_M = 100.0
-"""One sigma of where a target is of which only the pictures tell."""
+"""One sigma of where a target is of which only the pictures show."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackLook:
-    """What one look told.
+    """The result of one look.
 
     Attributes
     ----------
     track
         The track after it.
     found
-        By camera name: the match in that eye, with its verdict.
+        By camera name: the match in that camera, with its verdict.
     reason
         Why the target counts as lost, one sentence; empty while it is tracked.
     chi2
@@ -190,8 +190,8 @@ class TrackLook:
     renewed
         Whether the key picture is now from this look.
     doubt
-        What both eyes say against the motion since the last look, if they do; the target may be tracked all
-        the same.
+        The evidence of both cameras against the motion since the last look, if any; the target may be tracked
+        all the same.
     """
 
     track: Track
@@ -209,7 +209,7 @@ def seen_by(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings | Non
     ----------
     eyes
         By camera name: one picture, or those of a stereo pair (left first) of one moment, cameras in the
-        rover frame. A frame that is missing is left out; one eye alone serves while the target is tracked.
+        rover frame. A frame that is missing is left out; one camera alone serves while the target is tracked.
     """
     settings = settings or TrackSettings()
     look = _seen(track, eyes, settings)
@@ -224,7 +224,7 @@ def seen_by(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings | Non
 def _seen_elsewhere(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings) -> PoseDoubt | None:
     """What a wider window shows of a target that is not where the motion since the last look put it.
 
-    Both eyes must know the key picture well and mean one point. The target stays lost all the same: so far
+    Both cameras must know the key picture well and mean one point. The target stays lost all the same: so far
     off, the next rock may look like it.
     """
     key = anchored(track)
@@ -303,7 +303,7 @@ def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings) -> Tra
 def _matched(
     track: Track, key: KeyPicture, plane: Plane, eyes: Mapping[str, Eye], settings: TrackSettings
 ) -> tuple[dict[str, PatchMatch], Plane | None]:
-    """Look in every picture by the key; return also the surface that one eye, asked by the other, told."""
+    """Look in every picture by the key; return also the surface of a camera asked by the other."""
     found = {name: _found(track, key, plane, eye, settings) for name, eye in eyes.items()}
     alone = [one for one in found.values() if one.verdict == "good"]
     # Stereo confirms whatever one eye has found: of a lost target that eye must know the key picture well.
@@ -328,7 +328,7 @@ def _not_confirmed(track: Track, found: Mapping[str, PatchMatch], good: Mapping[
 
 
 def _turned(track: Track, position_m: FloatArray) -> Rigid:
-    """The motion's error that a found position tells of, as far as it is the motion's.
+    """The motion's error that a found position shows, as far as it is the motion's.
 
     A heading off by half a degree puts a target 10 m away 9 cm off. Were the key camera shifted by as much
     instead of turned, it would look at flat ground under another angle, and steps would add up.
@@ -353,10 +353,11 @@ def _found(track: Track, key: KeyPicture, plane: Plane, eye: Eye, settings: Trac
 def _asked_the_other(
     found: Mapping[str, PatchMatch], eyes: Mapping[str, Eye]
 ) -> tuple[dict[str, PatchMatch], Plane | None]:
-    """Look from the eye that found the target into the one that did not; return also the surface this told.
+    """Look from the camera that found the target into the one that did not; return also its surface.
 
-    The place in the other eye is as uncertain as that in the first, seen over the surface, and its own match.
-    On a rock the two eyes see the surface more differently than one eye sees it before and after a step.
+    The place in the other camera is as uncertain as that in the first, seen over the surface, and its own
+    match. On a rock the two cameras see the surface more differently than one camera sees it before and after
+    a step.
     """
     seen = next(name for name, one in found.items() if one.verdict == "good")
     other = next(name for name in found if name != seen)

@@ -1,9 +1,9 @@
-"""Find a pixel's partner in the other eye, and the surface that two eyes see there.
+"""Find a pixel's partner in the other camera, and the surface that two cameras see there.
 
 Around the best place of a sweep along the pixel's ray (`calib.matching.sweep`) the surface is seen
 pixel by pixel (`calib.matching.relief`); carried over it, the patch is matched freely in both directions
 (`calib.matching.patch`), so the offset across the epipolar line is measured, not assumed:
-eyes that disagree there are out of calibration, or a picture is not what it claims to be.
+cameras that disagree there are out of calibration, or a picture is not what it claims to be.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ MATCHED_BACK_PX = 2.0  # the way back is not refined: half a pixel of the sweep,
 
 @dataclass(frozen=True, eq=False)
 class StereoMatch:
-    """The partner of a pixel, the surface there, and whether the eyes agree.
+    """The partner of a pixel, the surface there, and whether the cameras agree.
 
     Attributes
     ----------
     match
         The partner pixel with its verdict; nothing below counts unless it is ``good``.
     plane
-        The local surface: a plane that fits what both eyes see near the pixel.
+        The local surface: a plane that fits what both cameras see near the pixel.
     across_px, across_sigma_px
         Distance of the partner from the epipolar line, signed, and one sigma of the matching alone.
     relief
-        What stands off the plane around the pixel, and what belongs to no surface there.
+        The relief off the plane around the pixel, and the pixels that belong to no surface there.
     """
 
     match: PatchMatch
@@ -160,14 +160,14 @@ def normal_seen(
     found: PatchMatch,
     own: PatchMatch | None = None,
 ) -> FloatArray:
-    """Return the surface's unit normal (3,) that the deformations found by two eyes tell.
+    """Return the surface's unit normal (3,) that the deformations found by two cameras show.
 
     Parameters
     ----------
     target_m
         (3,) the target.
     plane
-        The surface over which the searched patches were warped; its normal is returned where the two eyes
+        The surface over which the searched patches were warped; its normal is returned where the two cameras
         see too little of a slope.
     found
         What was found in ``partner``.

@@ -67,8 +67,8 @@ def match_patch(
     search_px
         Half side of the window around the predicted place, destination pixels.
     relief
-        What stands off the plane around the target, if two eyes saw it: it is carried over as it stands, and
-        what is not seen to belong to the surface does not count.
+        The relief off the plane around the target, if two cameras saw it. It is carried over as it stands,
+        and pixels that do not belong to the surface do not count.
 
     Raises
     ------
@@ -131,7 +131,7 @@ def _surface_term(
 ) -> FloatArray:
     """Return the covariance (2, 2) px² that a target off the patch's plane adds: e eᵀ along the parallax.
 
-    The patch tells where its plane is; the target itself lies off it by ``roughness`` of the patch's half
+    The patch shows where its plane is; the target itself lies off it by ``roughness`` of the patch's half
     extent on the plane, hence 1 / sine of the viewing angle as much along the source's ray.
     """
     ray, half = source.ray(target), template.half_px

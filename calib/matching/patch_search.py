@@ -1,7 +1,7 @@
 """Textured patches of a reduced picture, and where other pictures show them: quick, to a fraction of a pixel.
 
 What `calib.matching.patch` does for one target with care, this does for some twenty places at once in a
-millisecond or two: enough to tell which view a picture shows, not enough to measure a target. Pictures are
+millisecond or two: enough to find which view a picture shows, not enough to measure a target. Pictures are
 reduced to some 256 columns by area, so that noise hardly counts and differences of scale and slope stay
 small.
 
@@ -56,7 +56,7 @@ class Reduced:
         return np.asarray(places * self.step + (self.step - 1) / 2)
 
     def holds(self, places: FloatArray, margin: float) -> Mask:
-        """Tell which places (n, 2) lie at least ``margin`` inside the reduced picture."""
+        """Return which places (n, 2) lie at least ``margin`` inside the reduced picture."""
         size = np.array(self.grey.shape[::-1])
         with np.errstate(invalid="ignore"):
             return np.asarray(((places >= margin) & (places <= size - 1 - margin)).all(axis=1))
@@ -139,8 +139,8 @@ def found(
 
 
 AGREEING = {"told": (5, 0.25), "any": (6, 0.4)}
-"""How many patches, and which share of those that a view should show, must agree on it: the told view needs
-fewer, since a large thing may have moved in the picture, than one that is looked for everywhere."""
+"""How many patches, and which share of those that a view should show, must agree on it: the reported view
+needs fewer, since a large thing may have moved in the picture, than one that is looked for everywhere."""
 AGREE = 1.2
 """Patches agree whose places differ by no more, reduced pixels: relief, shape, and the search itself."""
 SEARCH_SIGMA = 0.15
@@ -174,7 +174,7 @@ class AgreedView:
     correlation: float
 
     def holds(self, view: Literal["told", "any"]) -> bool:
-        """Tell whether enough patches agree."""
+        """Return whether enough patches agree."""
         least, share = AGREEING[view]
         return self.agreeing >= max(least, share * self.expected)
 

@@ -1,10 +1,10 @@
-"""The surface around a pixel as two eyes see it: a plane, what stands off it, and where it ends.
+"""The surface around a pixel as two cameras see it: a plane, what stands off it, and where it ends.
 
 A patch near a rock's edge shows the rock and what lies behind it, and no plane carries both to another view.
-So a small window around each of the patch's pixels is looked up in the other eye, at inverse ranges before
+So a small window around each of the patch's pixels is looked up in the other camera, at inverse ranges before
 and behind a plane. Where it fits best says how far off the plane that pixel's surface is. A pixel whose
-window fits nowhere shows something else: what lies beyond a step in depth, or is hidden from the other eye.
-It does not count.
+window fits nowhere shows something else: what lies beyond a step in depth, or is hidden from the other
+camera. It does not count.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ WINDOW_PX = 5
 """Side of the window around each pixel. A larger one puts the edge of what is nearer farther out, and
 flattens small stones; a smaller one finds less texture."""
 REACH_PX = 6.0
-"""So far before and behind the plane a window is looked up, pixels of the other eye..."""
+"""So far before and behind the plane a window is looked up, pixels of the other camera..."""
 STEP_PX = 0.5
-"""...in such steps, between which a parabola tells the summit."""
+"""...in such steps, between which a parabola shows the summit."""
 ACROSS_PX = 3.0
-"""So far beside the epipolar line the other eye may see the patch: its calibration may be off."""
+"""So far beside the epipolar line the other camera may see the patch: its calibration may be off."""
 FITS = 0.6
 """Of what noise allows, a window must correlate by as much."""
 SPECKS_PX = 5
 """Side of the median that leaves out what few pixels say by chance."""
 EDGE_PX = 3
-"""What lies nearer to something that does not count does not count either: a window reaches over the edge."""
+"""Pixels nearer to one that does not count do not count either: a window reaches over the edge."""
 SMOOTH_PX = 1.5
 """One sigma of the Gaussian that averages neighbouring windows, which count by texture..."""
 MOST_VARIANCE_DN2 = 400.0
@@ -42,14 +42,14 @@ MOST_VARIANCE_DN2 = 400.0
 PASSES = 2
 """So often the plane is fitted to what was seen off it."""
 LEAST_PIXELS = 30
-"""Fewer tell no surface."""
+"""Fewer show no surface."""
 ROBUST_PX = 0.3
-"""What lies farther off the fitted plane counts less."""
+"""Pixels farther off the fitted plane count less."""
 SIGMA_PX = 0.05
-"""One sigma of a place along the epipolar line as single windows tell it on smooth ground..."""
+"""One sigma of a place along the epipolar line as single windows show it on smooth ground..."""
 NEAR_PX = 3
 """...to which what the windows within so many pixels differ by is added: rough, curved, or a step. Where they
-differ by no more than that the target lies on the plane, which all of the patch tells better."""
+differ by no more than that the target lies on the plane, which all of the patch shows better."""
 FIT_STEPS = 4
 
 
@@ -60,7 +60,8 @@ class _Seen:
     Attributes
     ----------
     off_px, counts
-        (n, n) how far off the plane, pixels of the other eye along the epipolar line; and which belong to it.
+        (n, n) how far off the plane, pixels of the other camera along the epipolar line; and which belong to
+        it.
     px_m
         Pixels there for each 1/m of inverse range.
     sigma_px
@@ -86,7 +87,7 @@ def surface_seen(
     half_px: int,
     noise_dn: float,
 ) -> tuple[Plane, Relief] | None:
-    """Return the surface around a pixel as two eyes see it, or None where they see none.
+    """Return the surface around a pixel as two cameras see it, or None where they see none.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Patches of one picture in a later one of the same camera: where told joint angles put them, or anywhere.
+"""Patches of one picture in a later one of the same camera: by the reported joint angles, or anywhere.
 
-Ranges come from the other eye of the earlier moment where there is one. Without it a patch may be at any
-range from ``nearest_m`` on. What follows for the later view is `calib.matching.shown_view`'s.
+Ranges come from the other camera of the earlier moment where there is one. Without it a patch may be at any
+range from ``nearest_m`` on. `calib.matching.shown_view` concludes the later view.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ LEAST_CORRELATION = 0.7
 CLUSTER_RAD = 0.03
 
 RANGES = 48
-"""Inverse ranges tried along a patch's line in the other eye."""
+"""Inverse ranges tried along a patch's line in the other camera."""
 
 STEP_RAD = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """A camera's picture (h, w) grey with the joint angles told for it."""
+    """A camera's picture (h, w) grey with the joint angles reported for it."""
 
     image: Grey
     pan_rad: float
@@ -101,7 +101,7 @@ class Comparison:
         return self._rig.camera_in_rover(self._name, pan_rad, tilt_rad)
 
     def patches(self, beside: tuple[str, Posed] | None) -> tuple[_Patches, _Patches]:
-        """The textured patches of the earlier picture, and those of them that the told view should show."""
+        """The textured patches of the earlier picture, and those that the reported view should show."""
         places = self.before.places
         camera = self.camera(*self.before.angles_rad)
         pixels = self.earlier.to_full(places)
@@ -127,7 +127,7 @@ class Comparison:
         return every, inside
 
     def _ranged(self, patches: _Patches, name: str, picture: Posed) -> _Patches:
-        """The patches with ranges from the other eye; without one where it shows nothing alike."""
+        """The patches with ranges from the other camera; without one where it shows nothing alike."""
         other = picture.reduced
         camera = self._rig.camera_in_rover(name, *picture.angles_rad)
         tried = np.linspace(1e-4, 1.0 / self._nearest_m, RANGES)

@@ -1,15 +1,15 @@
 """Which view a picture shows: its joint angles by what it shares with an earlier picture of the same camera.
 
-Some twenty textured patches of the earlier picture are looked for where the joint angles told for the later
-one put them. Every found patch is a vote for two angles; what most agree on is the view. If that is not the
-told one, or none is found, the patches are looked for in the whole picture, and the angles solved for.
+Some twenty textured patches of the earlier picture are looked for where the joint angles reported for the
+later one put them. Every found patch is a vote for two angles; the view is the majority's. If that is not the
+reported one, or none is found, the patches are looked for in the whole picture, and the angles solved for.
 
 Rotation moves a picture as a whole, whatever its range; the camera's own way with the head moves near things
-further. Ranges come from the other eye of the earlier moment where there is one. Without it a patch may be at
-any range from ``nearest_m`` on, and what that leaves open of the angles is the bound ``parallax_rad``.
+further. Ranges come from the other camera of the earlier moment where there is one. Without it a patch may be
+at any range from ``nearest_m`` on, and what that leaves open of the angles is the bound ``parallax_rad``.
 
-Not decided here: what follows from a contradiction. Not told here: changes below the tolerance of `Limits`,
-which joints with play make themselves, and a picture of another moment of the same view.
+Not decided here: what follows from a contradiction. Not reported here: changes below the tolerance of
+`Limits`, which joints with play make themselves, and a picture of another moment of the same view.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Verdict = Literal["seen", "small_move", "contradicted", "unlike", "too_plain", "
 
 @dataclass(frozen=True)
 class ViewLimits:
-    """What may lie between told and shown angles without contradiction.
+    """The allowed difference of reported and shown angles.
 
     Attributes
     ----------
@@ -53,26 +53,26 @@ class ViewLimits:
 
 @dataclass(frozen=True)
 class ShownView:
-    """What view a picture shows.
+    """The view that a picture shows.
 
     Attributes
     ----------
     verdict
-        ``seen``: the told one. ``small_move``: the told one, but the way is so small that the picture of
-        before would pass too, or that the shown view is as near to the one before. ``contradicted``: another
-        one. ``unlike``: nothing of what the earlier picture shows, though much of it should be there.
-        ``too_plain``: too little texture, or a pattern that fits both views. ``no_overlap``: the told view
-        shares too little with the earlier one, and the picture shows none of it either.
+        ``seen``: the reported one. ``small_move``: the reported one, but the way is so small that the picture
+        of before would pass too, or that the shown view is as near to the one before. ``contradicted``:
+        another one. ``unlike``: nothing of what the earlier picture shows, though much of it should be there.
+        ``too_plain``: too little texture, or a pattern that fits both views. ``no_overlap``: the reported
+        view shares too little with the earlier one, and the picture shows none of it either.
     pan_rad, tilt_rad
         The shown view; not-a-number if none was found.
     off_rad
-        Shown less told, (pan, tilt).
+        Shown less reported, (pan, tilt).
     sigma_rad, parallax_rad
         One sigma of the fit, and the largest error by ranges that are not known, (pan, tilt).
     allowed_rad
         How large ``off_rad`` may be, (pan, tilt).
     off_px
-        How far the shown view moves the patches against the told one, root of the mean square.
+        How far the shown view moves the patches against the reported one, root of the mean square.
     agreeing, expected
         Patches that agree on the view, and that it should show.
     """
@@ -97,7 +97,7 @@ def shown_view(
     beside: tuple[str, Posed] | None = None,
     limits: ViewLimits | None = None,
 ) -> ShownView:
-    """Tell which view a later picture of a head camera shows.
+    """Return which view a later picture of a head camera shows.
 
     Parameters
     ----------
@@ -106,11 +106,11 @@ def shown_view(
     camera
         Name of the camera that took both pictures.
     before, after
-        The earlier picture, whose told angles are believed, and the later one, whose are checked.
+        The earlier picture, whose reported angles are believed, and the later one, whose are checked.
     beside
-        Name and picture of the other eye at the earlier moment, for ranges.
+        Name and picture of the other camera at the earlier moment, for ranges.
     limits
-        What may lie between told and shown.
+        The allowed difference of reported and shown.
 
     Examples
     --------
@@ -164,7 +164,7 @@ def overlap(rig: Rig, camera: str, before_rad: tuple[float, float], after_rad: t
 
 
 def _told(fit: AgreedView, told: FloatArray, way: FloatArray, limits: ViewLimits) -> ShownView:
-    """What a fit says about the told view."""
+    """What a fit says about the reported view."""
     off = fit.angles_rad - told
     allowed = (
         limits.floor_rad + limits.share * float(way.max()) + fit.parallax_rad + limits.sigmas * fit.sigma_rad

@@ -1,4 +1,4 @@
-"""A plane swept along a pixel's ray, from near to infinity: where the other eye shows what this one sees.
+"""A plane swept along a pixel's ray, from near to infinity: where the other camera shows what this one sees.
 
 At each inverse range the patch is laid on planes of a few slopes and looked up in the other picture, so slope
 and scale do not spoil the correlation; the line it follows is as curved as the lenses make it.

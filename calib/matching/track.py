@@ -3,10 +3,10 @@
 A motion of the rover carries the target over and adds the motion's own covariance (`moved_track`). Begun by
 `calib.matching.track`, seen again by `calib.matching.look`.
 
-A place is followed only if it can be told from its surroundings. What correlates with its own neighbourhood
-will be confused with it: an edge along its length, a pattern with its repetition. And a patch with little
-texture is found again only as long as the light stays: what else it shows is shading, and the edges of
-shadows, which move with the sun.
+A place is followed only if it differs from its surroundings. A place that correlates with its own
+neighbourhood will be confused with it: an edge along its length, a pattern with its repetition. And a patch
+with little texture is found again only as long as the light stays: what else it shows is shading, and the
+edges of shadows, which move with the sun.
 
 The key picture is renewed when scale or view have changed, not at every step: each renewal hands on its
 error.
@@ -39,8 +39,8 @@ State = Literal["tracked", "lost"]
 SIZES = MatchSettings(half_px=12, near_px=6.0, roughness=0.04, relief=0.1, worst_ratio=0.7, least_lead=0.03)
 """Smaller patches than a single match takes: seen flat from 10 m, 41 px of ground are 0.8 m long and no
 plane, and what lies off the plane pulls the place along as the view steepens. Roughness and relief make nine
-in ten and more of the range errors lie within two of the told sigmas. A second place may fit a little better
-than elsewhere: the other eye and the prediction must confirm the best."""
+in ten and more of the range errors lie within two of the stated sigmas. A second place may fit a little
+better than elsewhere: the other camera and the prediction must confirm the best."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,9 @@ class TrackSettings:
     least_px, most_px
         Bounds of the window's half side.
     model_px
-        One sigma of what the cameras' models are wrong by between two eyes and two pairs.
+        One sigma of what the cameras' models are wrong by between two cameras and two pairs.
     worst_chi2
-        Of the innovation, four pixel coordinates against the prior: 1 in 1000 good looks with both eyes is
+        Of the innovation, four pixel coordinates against the prior: 1 in 1000 good looks with both cameras is
         above 18.5.
     renew_grown, renew_shrunk
         The key picture is renewed when the target's surface is seen this much larger or smaller...
@@ -64,7 +64,7 @@ class TrackSettings:
         ...or foreshortened this much otherwise: seen flat, a step nearer shows much that it did not.
     renew_below
         Or when the correlation falls below this: what is seen now is no longer what the key picture shows.
-        One eye that sees so little of it does not find a lost target again.
+        One camera that sees so little of it does not find a lost target again.
     worst_drift_m
         One sigma of the drift from the picked place; beyond it the target counts as lost.
     """
@@ -111,7 +111,7 @@ class Track:
     key
         The key picture.
     standby
-        The key that the last look with both eyes would have given: what is looked for where a look by the
+        The key that the last look with both cameras would have given: what is looked for where a look by the
         key loses the target, since the light has changed or another side shows. None after a renewal.
     misses
         Looks since it was last found.
@@ -131,8 +131,8 @@ class Track:
     def target_covariance_m2(self) -> FloatArray:
         """(3, 3) of the target that was picked: of the followed place, and of its drift from the picked one.
 
-        What pixels and motions tell; an error that all cameras of the mast file share is not in it, and one
-        that two eyes do not share is averaged by looks from one place as if it were noise.
+        What pixels and motions show; an error that all cameras of the mast file share is not in it, and one
+        that two cameras do not share is averaged by looks from one place as if it were noise.
         """
         return self.covariance_m2 + self.key.drift_m2
 
@@ -197,7 +197,7 @@ WORST_SIGMA_PX = 0.2
 def indistinct(
     image: Grey, camera: CameraModel, pixel_px: FloatArray, plane: Plane, settings: MatchSettings
 ) -> str:
-    """Return why a target could not be told from what surrounds it, empty if it can.
+    """Return why a target cannot be distinguished from its surroundings, empty if it can.
 
     Parameters
     ----------
@@ -241,8 +241,8 @@ MIDDLE_SEARCH_PX = 4.0
 """How far the range of a patch's middle may put it from where the whole patch puts it, at the start."""
 
 EYES_PX = 0.4
-"""One sigma, each pixel coordinate, of what two eyes' models may be wrong by where a track is begun: what is
-found 2 px off the epipolar line is another thing, or the mast file is off."""
+"""One sigma, each pixel coordinate, of what two cameras' models may be wrong by where a track is begun: what
+is found 2 px off the epipolar line is another thing, or the mast file is off."""
 
 
 def start_track(left: Eye, right: Eye, left_px: FloatArray, sigma_px: float = 0.2) -> Track:
@@ -261,7 +261,7 @@ def start_track(left: Eye, right: Eye, left_px: FloatArray, sigma_px: float = 0.
     ------
     CalibError
         With the reason, if the target cannot be followed: sky, plain surface, an edge, repeated pattern,
-        hidden from the other eye, outside the picture.
+        hidden from the other camera, outside the picture.
     """
     pixel = np.asarray(left_px, dtype=np.float64)
     if pixel.shape != (2,) or not np.isfinite(pixel).all():
@@ -316,10 +316,10 @@ def fresh_key(
     plane: Plane,
     slope: Plane | None,
 ) -> KeyPicture | None:
-    """A key from the pictures of this look; None if one eye alone saw the target.
+    """A key from the pictures of this look; None if one camera alone saw the target.
 
-    ``slope`` is the surface that one eye asked through the other told. Without it both were asked through the
-    key, over ``plane``, and tell the surface together.
+    ``slope`` is the surface that one camera, asked through the other, gave. Without it both were asked
+    through the key, over ``plane``, and show the surface together.
     """
     if len(good) < 2:
         return None

@@ -39,7 +39,8 @@ class MatchSettings:
     most_half_px
         How far it may grow in an enlarged picture.
     noise_dn
-        Grey noise of one picture, one sigma; used to tell texture from noise and what correlation to expect.
+        Grey noise of one picture, one sigma; used to distinguish texture from noise, and for the expected
+        correlation.
     flat_sigma_px
         A patch whose gradient cannot hold this sigma in its worst direction is flat. Edges fail here too.
     least_correlation
@@ -56,7 +57,7 @@ class MatchSettings:
         it. It counts as far as the two cameras stand apart. 0 for what is known to be plane; the default
         is what makes sigmas true on the simulated rover's ground and rocks.
     rough_beside_relief
-        Whether ``roughness`` counts too where two eyes saw what stands off the plane.
+        Whether ``roughness`` counts too where two cameras saw what stands off the plane.
     near_px
         By how much nearer pixels count more in the refinement: one sigma of a Gaussian that is round on the
         surface and as large as a circle of this radius in the destination. 0: all of the patch alike.
@@ -180,7 +181,7 @@ def judged(
 
 
 def rivalled(best: float, second: float, settings: MatchSettings) -> bool:
-    """Tell whether a second place fits nearly as well as the best."""
+    """Return whether a second place fits nearly as well as the best."""
     return best - second < settings.least_lead or (1.0 - best) > settings.worst_ratio * (1.0 - second)
 
 

@@ -150,7 +150,7 @@ class Template:
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """What of a patch stands off its plane, and what of it is no part of the surface there.
+    """The relief of a patch off its plane, and its pixels that are not part of the surface.
 
     Attributes
     ----------
@@ -294,7 +294,7 @@ def _cubic(half: int, samples: int) -> FloatArray:
 
 
 def _inside(maps: FloatArray, shape: tuple[int, ...]) -> bool:
-    """Tell whether all pixels (..., 2) lie in an image of this shape."""
+    """Return whether all pixels (..., 2) lie in an image of this shape."""
     x, y = maps[..., 0], maps[..., 1]
     return bool(x.min() >= 0 and y.min() >= 0 and x.max() <= shape[1] - 1 and y.max() <= shape[0] - 1)
 
@@ -326,7 +326,7 @@ class Surface:
         return np.asarray(values, dtype=np.float64)
 
     def inside(self, pixels_px: FloatArray) -> bool:
-        """Tell whether all pixels (..., 2) lie in the cut."""
+        """Return whether all pixels (..., 2) lie in the cut."""
         return _inside(pixels_px - np.asarray(self.corner_px), self.coefficients.shape)
 
 

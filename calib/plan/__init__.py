@@ -1,1 +1,1 @@
-"""What a picture of a board would tell: the choice of poses and placements of a bench calibration."""
+"""The choice of poses and placements of a bench calibration, by the information of their images."""

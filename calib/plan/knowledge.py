@@ -1,21 +1,21 @@
-"""What pictures of boards tell of a rig: their information, before and after they are taken.
+"""The information of images of boards about a rig, before and after they are taken.
 
 Unknown are the cameras, the mast's axis offset and twist, the errors of both joints and one pose for each
-placement of a board. Where the mast frame stands in the rover frame, and so pan zero and tilt zero, no board
-of unknown pose can tell: the mast frame is held as the present estimate has it.
+placement of a board. No board of unknown pose can show where the mast frame stands in the rover frame, nor
+pan zero and tilt zero. So the mast frame is held as the present estimate has it.
 
 Each shot (all cameras at one attitude of the head) adds JᵀJ of its weighted pixel rates, with the reading
-errors of its two joints eliminated. What is known beforehand is so wide that it only keeps directions closed
-that no picture has shown yet.
+errors of its two joints eliminated. The prior is so wide that it only keeps directions closed that no picture
+has shown yet.
 
 From that follows how well the rig would point, over the whole of where it points: the figure that the choice
 of poses lowers. A target is clicked in a pair of the head at one attitude, ranged by it, and brought to the
-image centre by the closed form. What the rig's parameters are off by moves the ranged place, and where the
-head then looks. With the picture of the landing as truth the residual is, at first order,
+image centre by the closed form. Errors of the rig's parameters move the ranged place, and the direction in
+which the head then looks. With the picture of the landing as truth the residual is, at first order,
 
     e = -(d pixel / d rig + d pixel / d point . d point / d rig),
 
-the rates of the landing's picture, and the ranged point as both clicks hold it. A single camera is told the
+the rates of the landing's picture, and the ranged point as both clicks hold it. A single camera is given the
 range.
 """
 
@@ -54,7 +54,7 @@ class BoardView:
 class BenchShot:
     """All cameras' pictures at one attitude: the read angles, radians, and from where each joint came.
 
-    ``pan_approach`` and ``tilt_approach`` are 1 from smaller angles, -1 from larger, 0 where nobody knows.
+    ``pan_approach`` and ``tilt_approach`` are 1 from smaller angles, -1 from larger, 0 where unknown.
     """
 
     placement: str
@@ -113,7 +113,7 @@ class Knowledge:
         return np.diag(np.array(sigma) ** -2.0)
 
     def information(self, shots: Iterable[BenchShot]) -> FloatArray:
-        """Return what shots tell of the rig (p, p), boards' poses eliminated, and what was known before."""
+        """Return the information of shots about the rig (p, p), boards' poses eliminated, with the prior."""
         total = self.beforehand.copy()
         by_board: dict[str, list[BenchShot]] = {}
         for shot in shots:
@@ -123,7 +123,7 @@ class Knowledge:
         return total
 
     def of_shot(self, shot: BenchShot) -> FloatArray:
-        """Return what one shot tells of the rig and of its board's pose: (p + 6, p + 6)."""
+        """Return the information of one shot about the rig and its board's pose: (p + 6, p + 6)."""
         rows, turned = [], []
         board = self.boards[shot.placement]
         for view in shot.views:
@@ -194,7 +194,7 @@ class Knowledge:
 
 
 def without_board(told: FloatArray) -> FloatArray:
-    """Return what is left of (p + 6, p + 6) about the rig, (p, p), if nobody knows the board."""
+    """Return what is left of (p + 6, p + 6) about the rig, (p, p), if the board's pose is unknown."""
     rig, across, board = told[:-6, :-6], told[:-6, -6:], told[-6:, -6:]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(board), 1e-300))
     own = np.linalg.pinv(board * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)

@@ -1,4 +1,4 @@
-"""Where a board should stand next: places in words that a person can follow, and which tells most.
+"""Where a board should stand next: places in words for a person, and the most informative of them.
 
 A camera on the body is tied to the head by boards that both see. It does not move: however many pictures are
 taken, each placement shows it the board once.
@@ -24,7 +24,7 @@ BEARINGS_DEG = (-50.0, -25.0, 0.0, 25.0, 50.0)
 HEIGHTS_DEG = (-25.0, -8.0, 8.0)
 TURNS_DEG = ((0.0, 0.0), (30.0, 0.0), (-30.0, 0.0), (0.0, 30.0), (0.0, -30.0))
 SMALLEST_PART = 0.2
-"""Of the picture's width that a board should fill at least: farther away it tells little."""
+"""Of the picture's width that a board should fill at least: farther away it shows little."""
 
 PATTERN = ((0.5, 0.5), (0.2, 0.25), (0.8, 0.75), (0.8, 0.25), (0.2, 0.75))
 """Where in the picture the middle of a board that does not stand yet is supposed to be, shot by shot."""
@@ -118,7 +118,7 @@ def _inside(bearing_deg: float, limits_rad: tuple[float, float]) -> float:
 
 
 def placements(known: Knowledge, sought: Sought) -> Iterator[Placement]:
-    """Yield places that the head's cameras can see, at ranges where the board tells something."""
+    """Yield places that the head's cameras can see, at ranges where the board is informative."""
     near_m = _near_m(known, sought)
     width_m = float(np.ptp(sought.in_board_m[:, 0]))
     far_m = min(
@@ -145,7 +145,7 @@ def advise(
     most: int = 90,
     seed: int = 0,
 ) -> Advice | None:
-    """Return the placement of which a few shots would tell most, or None if none can be seen.
+    """Return the placement of which a few shots are most informative, or None if none can be seen.
 
     ``most`` placements are tried, drawn by ``seed``.
     """
@@ -166,7 +166,7 @@ def advise(
 
 
 def told_by(known: Knowledge, sought: Sought, placement: Placement) -> FloatArray | None:
-    """Return what a pattern of shots of a board that stood so would tell of the rig; None of too few."""
+    """Return the information of a pattern of shots of a board that stood so; None of too few."""
     head = known.rig.mast.rover_from_head(0.0, 0.0)
     supposed = replace(known, boards={"": placement.rover_from_board(head)})
     camera = next(c for c in known.rig.cameras.values() if c.on == "head")
@@ -224,8 +224,8 @@ def body_px(known: Knowledge, covariance: FloatArray, camera: str) -> float:
 def advise_for_body(
     known: Knowledge, sought: Sought, shots: Collection[BenchShot], cameras: Collection[str]
 ) -> Advice | None:
-    """Return the placement that tells most of some body cameras, or None if none shows them a board that the
-    head can see; ``expected_px`` is then what their pixels are off by."""
+    """Return the most informative placement for some body cameras, or None if none shows them a board that
+    the head can see. ``expected_px`` is the error of their pixels afterwards."""
     base = known.information(shots)
     best: tuple[int, float, Placement] | None = None
     for placement in _low_placements(known, sought):

@@ -1,4 +1,4 @@
-"""Attitudes of the head that show a board, and the one among them that tells most.
+"""Attitudes of the head that show a board, and the most informative one among them.
 
 Where a board is, one picture of it and a rig that is known roughly say.
 """
@@ -41,12 +41,12 @@ EXCHANGES = 2
 """Rounds in which each of some shots that are chosen together may give way to a better one."""
 
 ANYWHERE = 1e-6
-"""What is known of a board's pose before any picture: it is within some kilometre (1/m², 1/rad²)."""
+"""The prior of a board's pose before any picture: it is within some kilometre (1/m², 1/rad²)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sought:
-    """What a shot has to show, and where the head may look.
+    """The requirements of a shot, and where the head may look.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Sought:
     sigma_px
         Of a corner.
     least
-        Corners that a picture must show to count; all of them for a board whose parts cannot be told apart.
+        Corners that a picture must show to count; all of them for a board whose parts look alike.
     pan_limits_rad, tilt_limits_rad
         The head's.
     one_sided
@@ -260,7 +260,7 @@ def _other_sides(shot: BenchShot) -> list[BenchShot]:
 
 
 def with_board(known: Knowledge, shots: Sequence[BenchShot], placement: str) -> FloatArray:
-    """Return what shots tell of the rig and of one placement's board: information (p + 6, p + 6)."""
+    """Return the information of shots about the rig and one placement's board: (p + 6, p + 6)."""
     size = len(known.names)
     told = np.zeros((size + 6, size + 6))
     told[:size, :size] = known.information(shot for shot in shots if shot.placement != placement)

@@ -1,8 +1,8 @@
 """Rigid alignment of measured points with points of a design, and which of them was mis-measured.
 
 The pose is closed form: the rotation from the weighted singular value decomposition (Kabsch 1976; Umeyama
-1991 for the sign). Its covariance is of a small turn and shift in frame b, which move the pose (R, t) to
-Exp(turn) R and t + shift, and so a point by turn x (R x_in_a) + shift.
+1991 for the sign). Its covariance is of a small turn and shift in frame b. They move the pose (R, t) to
+Exp(turn) R and t + shift, and a point by turn x (R x_in_a) + shift.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ def align(
 ) -> Alignment:
     """Fit the pose between two sets of points, and leave out those that were mis-measured.
 
-    With four points or more, while chi-square is beyond what chance makes of it, the one point is left out
-    without which the others fit, provided that no other point's leaving would do. Else, and with three
-    points, the distances between points say which disagree, and nothing is left out.
+    With four points or more, if chi-square is beyond chance, one point is left out: the only one without
+    which the others fit. If there is no such point, and with three points, the distances between points say
+    which disagree, and nothing is left out.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """The check of a survey before it is fitted: is all there, does it span enough, does it agree with itself.
 
-Nothing here is fitted beyond rigid alignments, so it takes well under a second. What a single image, tape or
-dot does to the result is judged again, and finer, by the tests of the fit.
+Nothing here is fitted beyond rigid alignments, so it takes well under a second. The tests of the fit judge
+each single image, tape and dot again, and finer.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Find the dots in all pictures of a survey, several at a time.
 
-Where the board should be comes from the station (prisms, tapes) and the rough camera, carried to each image's
-joint angles by a plain mast: pan about a vertical axis amid the head's rough cameras, tilt about y. Rough
+The station (prisms, tapes) and the rough camera predict where the board is. A plain mast carries the camera
+to each image's joint angles: pan about a vertical axis amid the head's rough cameras, tilt about y. Rough
 cameras are good to 20 cm and 10 degrees, and so is this. Cameras without a rough place are taken as upright.
 """
 
@@ -122,7 +122,7 @@ def find_in_file(
 def expectations(survey: Survey) -> dict[str, PredictedBoard | Upright | None]:
     """Return what is known beforehand of each image's board, by image name.
 
-    None where the station data do not tell the board's pose.
+    None where the station data do not determine the board's pose.
     """
     try:
         setups = {name: fit.b_from_a for name, fit in rover_from_station(survey).items()}

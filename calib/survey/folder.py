@@ -1,4 +1,4 @@
-"""What every survey folder is read with: its files, pictures' sizes, rows of its tables, and survey.yaml.
+"""Reads the parts of every survey folder: its files, images' sizes, rows of its tables, and survey.yaml.
 
 Each value is refused with its file and line, or its key.
 """
@@ -203,7 +203,7 @@ SCHEMA = "mastctl/survey/1"
 CSV_MAX_BYTES = 200_000_000
 
 LARGEST_ANGLE_RAD = 1e4
-"""Beyond these a number is no measurement; what is merely unlikely is for the check of the survey."""
+"""Beyond these a number is not a measurement; the check of the survey judges unlikely ones."""
 
 EDGE_PX = 1.0
 """How far outside its image a dot or corner may have been found: noise at the border."""

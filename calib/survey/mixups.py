@@ -32,8 +32,8 @@ Placement = tuple[str, str]
 def mixups(survey: Survey) -> Iterator[SurveyFinding]:
     """Yield boards that face away, and images that disagree with the others of their camera.
 
-    Compared is the direction of the board with the angle of pan, and its distance with the size of the grid
-    in the picture, each against the camera's median: neither its mounting nor its focal length matters.
+    The direction of the board is compared with the angle of pan, and its distance with the size of the grid
+    in the image. Each is taken against the camera's median, so neither mounting nor focal length matters.
     """
     boards, eyes = rover_from_boards(survey), eyes_in_rover_m(survey)
     yield from _facing_away(boards, eyes)
@@ -42,7 +42,7 @@ def mixups(survey: Survey) -> Iterator[SurveyFinding]:
 
 
 def rover_from_boards(survey: Survey) -> dict[Placement, Rigid]:
-    """Return where boards stand, by set-up and placement, as far as three prisms and three tapes tell."""
+    """Return where boards stand, by set-up and placement, as far as prisms and tapes determine it."""
     rover: dict[str, Rigid] = {}
     for (setup, _), seen in survey.measured("prism").items():
         design = [survey.prisms_in_rover_m[name] for name in seen]

@@ -1,6 +1,6 @@
 """Read a survey folder strictly: what is wrong is refused with file, line and column.
 
-A bench's folder has boards whose places nobody measured, and no station.
+A bench's folder has boards at unknown places, and no station.
 """
 
 from __future__ import annotations
@@ -207,14 +207,14 @@ def read_survey(folder: str | Path) -> Survey:
     Returns
     -------
     Survey
-        Its ``digest`` is the SHA-256 over names and contents of these files and of the pictures that
-        images.csv names, so it is the same on every machine and changes with every byte.
+        Its ``digest`` is the SHA-256 over names and contents of these files and of the images that images.csv
+        names. It is the same on every machine and changes with every byte.
 
     Raises
     ------
     BadFile
-        For a file that is missing or cannot be read, an unknown key, column or name, a number that is none,
-        a row that is there twice, a picture of another size: which file, which place, what would be right.
+        For a file that is missing or cannot be read, an unknown key, column or name, an invalid number, a
+        double row, an image of another size. The message has the file, the place, and what would be right.
     """
     read = SurveyFolder(Path(folder))
     document = read.document()

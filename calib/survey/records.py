@@ -18,7 +18,7 @@ Approach = Literal[-1, 0, 1]
 
 @dataclass(frozen=True, eq=False)
 class SurveyCamera:
-    """What is known of a camera beforehand.
+    """The prior knowledge of a camera.
 
     ``rough_C_m`` and ``rough_A`` (3,) are in the rover frame at the angles of its first image, good to
     20 cm and 10 degrees, or None; ``focal_px`` is rough too.
@@ -85,7 +85,7 @@ class Click:
 class Sigma:
     """Standard deviations of the measurements, one axis each.
 
-    A bench has ``corner_px``, of corners whose own sigma corners.csv does not tell, and ``joint_rad``;
+    A bench has ``corner_px``, of corners without a sigma of their own in corners.csv, and ``joint_rad``;
     station and dots are 0 there.
     """
 
@@ -100,9 +100,9 @@ class Sigma:
 class Survey:
     """Everything that was measured.
 
-    ``dots`` maps an image's name to its dots; ``digest`` identifies the folder's contents. A bench, which has
-    no station, has ``boards`` by name, whose poses are unknown (one for each set-up, placement and board),
-    and ``corners`` by an image's name; ``board``, prisms, station, dots and clicks are then empty.
+    ``dots`` maps an image's name to its dots; ``digest`` identifies the folder's contents. A bench has no
+    station: it has ``boards`` by name, with unknown poses (one for each set-up, placement and board), and
+    ``corners`` by an image's name. Its ``board``, prisms, station, dots and clicks are empty.
     """
 
     folder: Path
@@ -144,9 +144,9 @@ class SurveyFinding:
     place
         Where: a file with its line, a camera, a set-up, a placement.
     message
-        What is so, with its numbers.
+        The finding, with its numbers.
     advice
-        What to measure or correct.
+        The measurement to take or correct.
     tested_again
         Whether it is about single measurements that the joint fit tests itself, by all the others.
     """

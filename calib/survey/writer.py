@@ -42,14 +42,14 @@ BENCH_TABLE_COLUMNS = (
 
 
 class NotWritten(BadFile):
-    """The file system refuses, as a full disk does; what was written before is whole."""
+    """The file system refuses, as a full disk does; everything written before is whole."""
 
 
 class BenchFolder:
     """A bench's folder that grows by one image at a time.
 
-    Whenever the process is killed, or the machine stops, `calib.survey.read_survey` takes the folder: an
-    image that is in images.csv has its picture, and all of its corners or none of them.
+    After a kill or a power cut at any moment `calib.survey.read_survey` reads the folder. An image in
+    images.csv has its file, and all of its corners or none of them.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class BenchFolder:
         image
             Of a name that is not there yet; its ``row`` does not count.
         corners
-            What was found in it; None or empty where nothing was.
+            The corners found in it; None or empty where there were none.
         picture
             The bytes of ``image.file``, PNG or JPEG; None where it is there already, or there is none.
 

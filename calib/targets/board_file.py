@@ -10,7 +10,7 @@
     bar_m: {across: 0.15, down: 0.15}         # as drawn
     measured: {across_m: 0.1497}              # as printed; down_m too where it differs
 
-What is read has the sizes of the print: each times measured over drawn.
+The board that is read has the sizes of the print: each times measured over drawn.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ KINDS = ("charuco", "aprilgrid", "dots", "checkerboard")
 LARGEST_M, MOST_CELLS = 10.0, 100
 
 WORST_SCALE, WORST_ASPECT = 0.3, 0.03
-"""A bar further than this from what was drawn is another bar, or told in other units."""
+"""A bar that differs more than this from the drawn one is another bar, or has other units."""
 
 KEYS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "charuco": (("square_m", "marker_m", "dictionary"), ("first_id", "legacy")),

@@ -1,10 +1,10 @@
-"""The kinds of boards: what is printed, and where its corners are in the board's frame.
+"""The kinds of boards: the print, and where its corners are in the board's frame.
 
 Board frame: origin in the middle of the grid of corners, x to the right along a row, y down a column, z into
 the board. Sizes are those of the print in hand, after a measured bar (`calib.targets.board_file`).
 
-A board bends. ``bow_m`` = (across, down) is how far its middle stands out towards who looks at it, against
-its left and right edges and against its upper and lower ones: the deflection that mrcal calls calobject_warp.
+A board bends. ``bow_m`` = (across, down) is how far its middle stands out towards the viewer: against its
+left and right edges, and against its upper and lower ones. mrcal calls it calobject_warp.
 
 The dot board of a survey has a frame like it: origin at the grid's centre, x along a row, y down a column.
 """
@@ -111,8 +111,8 @@ class _Squares(_Grid):
 class Checkerboard(_Squares):
     """A plain chessboard, the square in its upper left corner black.
 
-    Without markers, so it must be seen whole; if columns and rows are both even or both odd it looks the same
-    upside down, and its upper side in the image is taken for its upper side.
+    It has no markers, so it must be seen whole. If columns and rows are both even or both odd it looks the
+    same upside down; then the side that is up in the image counts as its upper side.
     """
 
     kind: ClassVar[Literal["checkerboard"]] = "checkerboard"
@@ -146,7 +146,7 @@ class Charuco(_Squares):
 class AprilGrid(_Grid):
     """Tags in rows and columns with a black square between the corners of each four: Kalibr's AprilGrid.
 
-    Tags count from the lower left one, to the right and then up; and so do corners, row by row over all tags:
+    Tags count from the lower left one, to the right and then up. So do corners, row by row over all tags:
     corner 0 is the lower left corner of the first tag, corner 2 * columns the one over it.
 
     Attributes

@@ -1,9 +1,8 @@
 """Find the corners of a board in an image, or say in a sentence why there are none.
 
-Markers say which corners are where to a pixel or two (`calib.targets.markers`), each corner is fitted to its
-grey levels (`calib.targets.saddles`), corners beside those that were found are looked for where these say
-they are, and what does not fit the smooth map of the others is dropped. Dots are left to
-`calib.targets.dots`.
+Markers give the place of each corner to a pixel or two (`calib.targets.markers`). Each corner is fitted to
+its grey levels (`calib.targets.saddles`), and further corners are looked for beside those found. Corners that
+do not fit the smooth map of the others are dropped. Dots are left to `calib.targets.dots`.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ OTHERS = (
     ("DICT_ARUCO_ORIGINAL", 1), ("DICT_APRILTAG_36h11", 1), ("DICT_APRILTAG_36h11", 2),
 )  # fmt: skip
 BLURRED_PX, SMEARED, SMOOTH_PX = 2.0, 2.0, 1.0
-"""Standard deviation of a blur that is told; of one direction against the other; of what takes noise off."""
+"""Standard deviation of a blur that is stated; of one direction against the other; of the smoothing."""
 
 FEWEST_OTHERS = 6
 FEWEST_MIRRORED = 3
@@ -184,7 +183,7 @@ def _some(numbers: list[int]) -> str:
 
 
 LEAST_SIGMA_PX = 0.001
-"""What aliasing and whole grey levels leave at best."""
+"""The best that aliasing and whole grey levels allow."""
 
 FARTHEST_PX = 4.0
 """A corner is looked for so far from where the markers say that it is."""
@@ -221,8 +220,8 @@ class CornersNotFound(NamedTuple):
 def find_corners(board: AnyBoard, image: Levels) -> Corners | CornersNotFound:
     """Return the corners of a board that an image shows, or why there are none.
 
-    Part of a board is enough where its markers say which part; chessboards and dots must be seen whole, their
-    upper side up in the image where the print does not tell.
+    Part of a board is enough where its markers show which part. Chessboards and dots must be seen whole,
+    their upper side up in the image unless the print shows it.
 
     Parameters
     ----------
@@ -234,8 +233,8 @@ def find_corners(board: AnyBoard, image: Levels) -> Corners | CornersNotFound:
     Returns
     -------
     Corners | CornersNotFound
-        sigma_px is what noise, blur and slant leave of each corner, by what the fit of its grey levels left
-        over: errors that neighbours share, as of the print, are not in it.
+        sigma_px is the uncertainty of each corner from noise, blur and slant, by the residuals of its grey
+        levels. Errors that neighbours share, such as the print's, are not in it.
 
     Raises
     ------

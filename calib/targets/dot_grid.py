@@ -1,12 +1,12 @@
 """The board's grid out of spots that may be its dots: neighbours linked, the whole board cut out.
 
-The shape of a dot's image tells the local tilt: undone, the four neighbours of a dot stand at one spacing in
+The shape of a dot's image gives the local tilt: undone, the four neighbours of a dot stand at one spacing in
 two directions at right angles. From neighbour to neighbour the grid grows over the board; each step adapts to
 the last, so perspective and lens distortion bend it freely.
 
-The map from the board's plane to the image follows without any camera model: a homography and, on top, a
-polynomial in the place on the board for what a lens bends. It carries dots that were missed to where they
-must be, gives every dot's shape and the bias of its centre, and tells dots that do not fit the others.
+The map from the board's plane to the image needs no camera model: it is a homography and a polynomial in the
+place on the board, for the lens. It carries dots that were missed to where they must be, gives every dot's
+shape and the bias of its centre, and finds dots that do not fit the others.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class PlaneMap:
 
 
 def fit_plane_map(points_m: FloatArray, pixels_px: FloatArray) -> PlaneMap | None:
-    """Return the map that fits the dots (n, 2) best, or None where they do not tell one (fewer than 6)."""
+    """Return the map that fits the dots (n, 2) best, or None where they determine none (fewer than 6)."""
     if len(points_m) < 6:
         return None
     scale = float(np.abs(points_m).max())

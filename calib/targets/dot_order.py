@@ -22,7 +22,7 @@ SURE_RAD = np.radians(32.0)
 """The nearest order is taken if it is off by less than this; the next is then 58 degrees off or more."""
 
 STEEPEST = 0.3
-"""A camera that looks down so steeply that less than this of the vertical is in its image tells nothing."""
+"""A camera that looks down so steeply that less than this of the vertical is in its image shows nothing."""
 
 
 class Ordered(NamedTuple):
@@ -84,8 +84,8 @@ def order_by_gravity(
     down_in_board
         (3,), the direction in the board's frame that is down in an upright camera's image.
 
-    Other arguments and the result as ``order_by_steps``. None also if the camera looks down so steeply
-    that its uprightness tells nothing.
+    Other arguments and the result as ``order_by_steps``. None also if the camera looks down so steeply that
+    its uprightness shows nothing.
     """
     homography = _camera_from_places(camera, places, middles_px)
     if homography is None:
@@ -179,7 +179,7 @@ class PredictedBoard:
 class Upright:
     """Only that the camera stands upright.
 
-    ``camera`` is a rough one in its own frame (x right, y down, z along A); ``down_in_board`` (3,) the
+    ``camera`` is a rough one in its own frame (x right, y down, z along A). ``down_in_board`` (3,) is the
     direction in the board's frame that is down in an upright camera's image.
     """
 

@@ -6,13 +6,12 @@ Here each spot must be a filled ellipse with an even ring of paper around it, wh
 Then each one's ellipse is fitted to the grey levels around its outline. Model of a dot, in pixels u from its
 middle: lit paper b0 + b·u, times 1 less a contrast times the share of the pixel that the dot covers. For a
 straight edge blurred by a normal distribution that share is Phi(-d / s), with d the distance from the
-outline. The shape is given (the board's map tells it); middle, size, blur, light and contrast are fitted, for
-all dots at once.
+outline. The shape is given (by the board's map); middle, size, blur, light and contrast are fitted, for all
+dots at once.
 
 A camera does not carry the centre of a circle to the middle of the circle's image. The boundary is carried
-over point by point and the centroid of the area inside is taken, which is exact through any lens; the
-difference to the centre's own image is what a measurement of dots is corrected by (Song et al. 2024, arXiv
-2403.04583).
+over point by point and the centroid of the area inside is taken, which is exact through any lens. Its
+difference to the centre's own image corrects the measurement (Song et al. 2024, arXiv 2403.04583).
 """
 
 from __future__ import annotations
@@ -187,8 +186,8 @@ PARAMETERS = 8
 class DotCentres(NamedTuple):
     """Fitted dots, not-a-number where the fit found none.
 
-    middles_px (n, 2); sigma_px (n,) one standard deviation per axis, from the noise that the fit left;
-    sizes (n,) fitted over given radius; contrast_dn (n,); noise_dn (n,) rms of what the fit left over.
+    middles_px (n, 2); sigma_px (n,) per axis, from the noise that the fit left; sizes (n,) fitted over given
+    radius; contrast_dn (n,); noise_dn (n,) rms of the fit's residuals.
     """
 
     middles_px: FloatArray
@@ -346,10 +345,9 @@ BOUNDARY_POINTS = 32
 def area_centroids(boundaries_px: ArrayLike) -> FloatArray:
     """Return the centroids (n, 2) of the areas inside smooth closed curves (n, points, 2).
 
-    By Green's theorem: with x(t), y(t) the curve, A = 1/2 int (x y' - y x') dt, and the centroid is
-    1/(2A) int (x² y', -y² x') dt. Derivatives are those of the trigonometric polynomial through the points,
-    so that a curve that is an even picture of a circle needs few of them (a polygon of 64 sides is off by
-    0.16 % of what is wanted).
+    By Green's theorem: with x(t), y(t) the curve, A = 1/2 int (x y' - y x') dt, and the centroid is 1/(2A)
+    int (x² y', -y² x') dt. Derivatives are those of the trigonometric polynomial through the points, so few
+    points do for a smooth image of a circle (a polygon of 64 sides is off by 0.16 %).
     """
     boundaries = np.asarray(boundaries_px, dtype=np.float64)
     count = boundaries.shape[1]

@@ -1,9 +1,8 @@
 """Find the dot board in an image: which dots, where to a few hundredths of a pixel, and how surely.
 
-Spots that look like dots (`calib.targets.dot_spots`) are grown into a grid out of which the board is cut
-(`calib.targets.dot_grid`), counted in the order that the prediction tells (`calib.targets.dot_order`), fitted
-to the grey levels, and corrected for the difference between the middle of a circle's image and the image of
-its centre.
+Spots that look like dots (`calib.targets.dot_spots`) are grown into a grid, out of which the board is cut
+(`calib.targets.dot_grid`). They are counted in the predicted order (`calib.targets.dot_order`) and fitted to
+the grey levels. A correction leads from the middle of a circle's image to the image of its centre.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from calib.targets.dot_spots import Candidates, Image, Levels, bias_through, dot
 SMALLEST_DOT_PX = 3.5
 
 LEAST_SIGMA_PX = 0.003
-"""What aliasing and whole grey levels leave at best."""
+"""The best that aliasing and whole grey levels allow."""
 
 FAR_OFF = 6.0
 """Sigmas from the map of all dots, beyond which a dot is dropped."""
@@ -39,8 +38,8 @@ FAR_OFF = 6.0
 class DotsFound(NamedTuple):
     """Dots of one image.
 
-    rows, columns (n,) from 0; pixels_px (n, 2), the images of the dots' centres; sigma_px (n,), one standard
-    deviation per axis; residual_px, rms distance per axis to a smooth map of the board.
+    rows, columns (n,) from 0; pixels_px (n, 2), the images of the dots' centres; sigma_px (n,), per axis;
+    residual_px, rms distance per axis to a smooth map of the board.
     """
 
     rows: IntArray
@@ -67,11 +66,10 @@ def find_dots(
     board
         Rows, columns, spacing and diameter.
     expected
-        ``PredictedBoard``, good to 20 cm and 10 degrees, gives the part of the image that is searched (the
-        whole image after that), the size of dots and the order of rows and columns. Without it the whole
-        image is searched for dots of any size, and rows and columns are counted so that the camera stands
-        upright (``Upright``), or rows run to the right in the image (None). An order that is not sure is a
-        failure.
+        ``PredictedBoard``, good to 20 cm and 10 degrees, gives the part of the image that is searched first,
+        the size of dots and the order of rows and columns. Without it the whole image is searched for dots of
+        any size. Rows and columns are then counted so that the camera stands upright (``Upright``), or rows
+        run to the right in the image (None). An order that is not sure is a failure.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Which corners of a board are where in an image, to a pixel or two: by markers, or as a plain chessboard.
 
-OpenCV finds both; what is here decides which markers stand as on the board, tells where corners are that have
-not been measured yet, and turns a chessboard the way round that its colours say.
+OpenCV finds both. This module decides which markers stand as on the board, predicts corners that have not
+been measured yet, and turns a chessboard as its colours say.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def predicted(known: MeasuredCorners, ids: IntArray, places_m: FloatArray) -> Me
     """Return corners where the known points nearest to each say that they are.
 
     A homography of the neighbourhood: what the lens bends within it is below a pixel. Left out are corners
-    whose neighbours do not tell one.
+    whose neighbours do not determine one.
     """
     count = min(NEIGHBOURS, len(known.points_m))
     if not len(ids) or count < FEWEST_NEIGHBOURS:
@@ -115,7 +115,7 @@ STANDS_WITHIN = 0.35
 
 
 class Markers(NamedTuple):
-    """What OpenCV found: ids (n,); corners_px (n, 4, 2) in the order of the markers' own upright pictures."""
+    """OpenCV's markers: ids (n,); corners_px (n, 4, 2) in the order of the markers' own upright pictures."""
 
     ids: IntArray
     corners_px: FloatArray
@@ -173,7 +173,7 @@ def count_of(board: MarkerBoard) -> int:
 
 
 def corners_on_board_m(board: MarkerBoard) -> FloatArray:
-    """Return the corners (n, 4, 2) of all markers, metres, in the order in which OpenCV tells them."""
+    """Return the corners (n, 4, 2) of all markers, metres, in the order in which OpenCV gives them."""
     if isinstance(board, AprilGrid):
         step, side = board.tag_m + board.gap_m, board.tag_m
         up, column = np.divmod(np.arange(board.rows * board.columns), board.columns)

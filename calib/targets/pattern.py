@@ -1,4 +1,4 @@
-"""What is printed on a board: black on white, in the board's frame."""
+"""The print on a board: black on white, in the board's frame."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""What the driver knows about the axes: scale, limits, where each was seen last, whether its count holds.
+"""The driver's knowledge of the axes: scale, limits, where each was seen last, whether its count holds.
 
 A position is what the unit counts, one step of the motor. Whether a position that was read can be true, and
 whether the axis has settled, is judged here and nowhere else; nothing here talks to the unit.
 
 A unit counts steps and has no encoder. Inside its limits an axis runs into a limit switch (``!P``, ``!T``)
-only when it has lost count; of an axis that stands still that is damaged bytes or a restart, so all of the
-unit has to be checked again, its positions too. An axis that is somewhere else after the line was down has
+only when it has lost count. For an axis that stands still the message is damaged bytes or a restart, so all
+of the unit is checked again, its positions too. An axis that is somewhere else after the line was down has
 lost count as well.
 """
 
@@ -59,7 +59,7 @@ class StepAxis:
     options
         Of the configuration.
     resolution_arcsec
-        What the unit says one position is.
+        The size of one position, by the unit.
 
     Attributes
     ----------
@@ -225,17 +225,17 @@ class StepAxis:
 
 
 class StepCount:
-    """What speaks against the positions that a unit tells.
+    """The evidence against the positions that a unit reports.
 
     Attributes
     ----------
     lost
         By axis, why its count is lost, in words; empty while it is good. It stays lost.
     doubted
-        Where the axes stood, rad, when a limit hit was told of one that stood still; empty if none was. To
-        be checked, and then to be told by `look_back`.
+        Where the axes stood, rad, when a limit hit was reported of one that stood still; empty if none was.
+        To be checked, and then compared by `look_back`.
     halt_owed
-        Whether a moving axis has hit its limit since the unit was halted last (who halts it clears this).
+        Whether a moving axis has hit its limit since the unit was halted last (halting clears this).
     """
 
     def __init__(self) -> None:
@@ -244,7 +244,7 @@ class StepCount:
         self.halt_owed = False
 
     def hit(self, axis: str, axes: Mapping[str, StepAxis]) -> None:
-        """Note a limit hit told of an axis; ``axes`` as they are known, empty before the unit is checked."""
+        """Note a limit hit of an axis; ``axes`` as they are known, empty before the unit is checked."""
         if self.doubted:
             return
         if axes and all(one.rests for one in axes.values()):
@@ -257,7 +257,7 @@ class StepCount:
             log.warning("%s: %s", DEVICE, self.lost[axis])
 
     def look_back(self, axes: Mapping[str, StepAxis]) -> None:
-        """Compare the axes, checked anew, with where they stood when a limit hit was told; that is over."""
+        """Compare the axes, checked anew, with their places when a limit hit was reported; that is over."""
         stood, self.doubted = self.doubted, {}
         for name, before_rad in stood.items():
             if abs(axes[name].angle_rad - before_rad) > 1.5 * axes[name].position_rad:

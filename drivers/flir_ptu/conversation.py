@@ -1,16 +1,16 @@
 """One question at a time with a unit: each answer is matched to its question, or is not taken at all.
 
-The answer to a question is the next line that fits it, within a deadline of the clock. A line that
-does not fit is an error, never skipped in silence, unless it is the last answer once more. After any error
-the two sides may be out of step: an answer may still be under way. Then nothing is asked before `in_step` has
-let the line fall quiet and has asked the resolutions of both axes, whose words no other answer has: since a
-unit answers in order, whatever was under way has come by then and was thrown away. The resolutions also tell
-a reset or another step mode.
+The answer to a question is the next line that fits it, within a deadline of the clock. A line that does not
+fit is an error, never skipped in silence, unless it is the last answer once more. After any error the two
+sides may be out of step: an answer may still be under way. Then nothing is asked before `in_step` has let the
+line fall quiet and has asked the resolutions of both axes, whose words no other answer has. A unit answers in
+order, so everything under way has come by then and was thrown away. The resolutions also show a reset or
+another step mode.
 
 At the start the unit is asked for words and echo (``FV``, ``EE``), because both say which question an answer
-belongs to. A unit does not tell capitals from small letters, but echoes them: so each command is written
-otherwise than the last one (``PP``, ``Pp``, ``pP``), and the echo tells which of several alike is answered.
-One that stays terse or without such an echo is understood too; it is listened to for longer after an error.
+belongs to. A unit ignores the case of letters, but echoes it. So each command is written otherwise than the
+last one (``PP``, ``Pp``, ``pP``), and the echo shows which of several alike is answered. One that stays terse
+or without such an echo is understood too; it is listened to for longer after an error.
 """
 
 from __future__ import annotations
@@ -74,9 +74,9 @@ class Conversation:
     device
         The head's name in errors.
     on_hit
-        Told the axis, ``pan`` or ``tilt``, whenever a limit hit comes that nobody asked for.
+        Called with the axis, ``pan`` or ``tilt``, whenever an unrequested limit hit comes.
     clock
-        What its deadlines run on; it goes on while somebody waits for the line.
+        What its deadlines run on; it goes on while a thread waits for the line.
 
     Attributes
     ----------
@@ -153,10 +153,10 @@ class Conversation:
         return number
 
     def sure(self, query: Query, first: float | None = None) -> float:
-        """Return the number that answers a query twice in a row; ``first`` is one that was told before.
+        """Return the number that answers a query twice in a row; ``first`` is an earlier answer.
 
-        For what is asked once and then used all the time: the protocol has no checksum. Raises as `ask`, and
-        BadReply if no two answers are the same.
+        For values that are asked once and then used all the time: the protocol has no checksum. Raises as
+        `ask`, and BadReply if no two answers are the same.
         """
         return self._twice(query.letters, lambda: self.ask(query), first)
 

@@ -1,6 +1,6 @@
 """Driver ``flir_ptu``: Directed Perception / FLIR D46, D47, D48E and E46 as a `drivers.interfaces.PanTilt`.
 
-It has no thread. Whoever calls waits for the unit, never longer than a few reply times. It is not responsible
+It has no thread. The caller waits for the unit, never longer than a few reply times. It is not responsible
 for the service's soft limits and not for the decision what to do about a fault: it reports.
 
 - Both axes start together: the goals are sent in slaved mode (``S``) and begin with ``I``. Each step is
@@ -71,7 +71,7 @@ class FlirPtu:
     Attributes
     ----------
     version
-        What the unit says about itself.
+        The unit's own description.
     stops_beside
         A stop is confirmed sooner beside a call under way than after it.
     """
@@ -175,10 +175,10 @@ class FlirPtu:
     def stop(self) -> None:
         """Halt both axes; they hold where they come to rest, and no second leg of a move follows.
 
-        If another call is under way, anything has to be asked first, or bytes came that nobody asked for, the
-        halt goes out at once. A call under way gets the answer that it waits for, and then gives way; where
-        anything else comes, the halt goes out again in order. A line that is away is tried at once: a unit
-        has no watchdog that silence would trip.
+        If another call is under way, anything has to be asked first, or unrequested bytes came, the halt goes
+        out at once. A call under way gets the answer that it waits for, and then gives way; where anything
+        else comes, the halt goes out again in order. A line that is away is tried at once: a unit has no
+        watchdog that silence would trip.
 
         Raises
         ------

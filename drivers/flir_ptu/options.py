@@ -24,8 +24,8 @@ class AxisOptions(ApproachedAxis):
     zero_rad
         The axis's angle where the unit stands at position 0.
     resolution_arcsec
-        What a position has to be, seconds of arc; None takes what the unit says. An E46 needs it, since it
-        says something wrong before its first reset.
+        The size of a position, seconds of arc; None takes the unit's own. An E46 needs it, since it reports a
+        wrong one before its first reset.
     """
 
     zero_rad: float = 0.0

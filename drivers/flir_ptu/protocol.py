@@ -1,12 +1,12 @@
-"""What a unit is asked and what it says, line by line: answers, errors, limit hits before any of them.
+"""The requests to a unit and its replies, line by line: answers, errors, limit hits before any of them.
 
 From the manuals (PTU-D46 v2.14, section 4.2; E series v6.00): a command that succeeds is answered ``*``, a
 query ``* <text>``, a failure ``! <words>``, each ended by CR or LF or both. An axis that runs into a limit
 switch puts ``!P`` or ``!T`` in between whenever it happens; a reset gives ``!T!T!P!P*``. With echo on the
 command itself stands first: ``PP * Current Pan position is 22``.
 
-The protocol has no checksum. So a line counts only if all of it fits: the echo is the command that was sent,
-the words are those of the quantity that was asked for, and there is one number and nothing else with digits.
+The protocol has no checksum. So a line counts only if all of it fits. The echo is the command that was sent,
+the words are those of the requested quantity, and there is one number and nothing else with digits.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def answer_of(line: bytes, command: str) -> PtuAnswer | None:
     line
         Without its end; limit hits in it are passed over.
     command
-        What was sent, without its delimiter.
+        The command that was sent, without its delimiter.
     """
     rest, echo, exact = without_hits(line), False, False
     if not all(32 <= byte < 127 for byte in rest):

@@ -1,11 +1,11 @@
-"""What is asked of a unit as a whole: to be ready, where both axes are, how its supply is. Moves nothing.
+"""Asks a unit as a whole: whether it is ready, where both axes are, how its supply is. Moves nothing.
 
-Its protocol cannot detect a damaged digit. So a position is taken at once only where the axis rests by all
-that is known. Otherwise the unit is asked again, and a middle answer is taken if it lies between its
-neighbours, and these no further apart than the axis can go meanwhile: with one of them damaged, what is taken
-still is where the axis was during the call. A unit tells one axis at a time. Where both move they are asked
-by turns, and what is taken is a middle answer of pan, and for its moment tilt on the straight line between
-the two middle answers around it, if tilt turns evenly there.
+Its protocol cannot detect a damaged digit. So a position is taken at once only where the axis is known to
+rest. Otherwise the unit is asked again. A middle answer is taken if it lies between its neighbours, and these
+are no further apart than the axis can go meanwhile. With one of them damaged, the answer taken still is where
+the axis was during the call. A unit reports one axis at a time. Where both move they are asked by turns. Then
+a middle answer of pan is taken, and tilt for its moment on the straight line between the two middle answers
+around it, if tilt turns evenly there.
 
 The manuals' answer to ``O`` is ``Input 30 VDC @ 86 degF``; units with more sensors list more temperatures.
 They give no bounds for all models, so these are the configuration's, or what was there at the start.
@@ -136,7 +136,7 @@ def checked_version(talk: Conversation, options: Options, known: str) -> str:
     Parameters
     ----------
     known
-        What it said before; empty if it was not asked yet.
+        Its earlier answers; empty if it was not asked yet.
 
     Raises
     ------
@@ -170,7 +170,7 @@ def ready_axes(
     Parameters
     ----------
     resolutions
-        What it says that a position is, seconds of arc.
+        The size of a position, by the unit, seconds of arc.
     known
         The axes before the unit or its line was away, whose usual speeds are kept; empty the first time.
 
@@ -240,7 +240,7 @@ def _try(talk: Conversation, command: str) -> None:
 
 @dataclass(frozen=True)
 class Supply:
-    """Supply, volts, and the hottest temperature that the unit tells, °C."""
+    """Supply, volts, and the hottest temperature that the unit reports, °C."""
 
     volts: float
     hottest_c: float
@@ -272,7 +272,7 @@ class SupplyWatch:
     Attributes
     ----------
     words
-        What is wrong, in plain words; empty if nothing is, or the unit does not tell.
+        The faults, in plain words; empty if there are none, or the unit does not report them.
     """
 
     def __init__(self, options: Options, clock: Clock) -> None:
@@ -292,7 +292,7 @@ class SupplyWatch:
             self._at_start = sorted((first, again, third), key=lambda supply: supply.volts)[1]
 
     def look(self, talk: Conversation) -> None:
-        """Ask and judge now and then; a fault is told only if it is measured twice. Raises as `begin`."""
+        """Ask and judge now and then; a fault counts only if it is measured twice. Raises as `begin`."""
         if self._at_start is None or self._clock.now_s() < self._due_s:
             return
         words: tuple[str, ...] = ()

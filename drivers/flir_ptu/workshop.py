@@ -19,7 +19,7 @@ HOMING_S = 60.0
 
 @dataclass(frozen=True)
 class AxisFacts:
-    """One axis: positions are steps, speeds steps a second. None where the unit does not tell."""
+    """One axis: positions are steps, speeds steps a second. None where the unit does not report it."""
 
     resolution_arcsec: float
     position: int

@@ -1,9 +1,10 @@
 """Recorded frames with the joint angles measured when they were taken.
 
-Other people's pictures are read in two forms: PDS3 products of one camera (image, and the label's measured
-mast angles), and a CSV beside ordinary image files with the columns ``camera,pan_rad,tilt_rad,file``. Pixels
-of more than 8 bits become 8 by one linear scale for all frames of a camera, never one for each: grey levels
-stay comparable. Of what mastctl itself recorded (MCAP) the facts are there at once, a picture when asked for.
+Other people's images are read in two forms. One is PDS3 products of one camera (image, and the label's
+measured mast angles). The other is a CSV beside ordinary image files with the columns
+``camera,pan_rad,tilt_rad,file``. Pixels of more than 8 bits become 8 by one linear scale for all frames of a
+camera, never one for each: grey levels stay comparable. Of what mastctl itself recorded (MCAP) the facts are
+there at once, a picture when asked for.
 """
 
 from __future__ import annotations
@@ -114,8 +115,8 @@ def read_products(
     Raises
     ------
     BadOptions
-        If a product cannot be read, has no image or no measured mast angles, is of another instrument or
-        size than the first, or two were taken at the same angles.
+        If a product cannot be read or has no image or measured mast angles. Also if it is of another
+        instrument or size than the first, or two were taken at the same angles.
     """
     found: list[tuple[float, float, Path]] = []
     samples: list[NDArray[np.generic]] = []
@@ -289,7 +290,7 @@ class McapFrame:
     Attributes
     ----------
     facts
-        What stands beside the picture (topic ``/camera/NAME/frame``).
+        The facts beside the image (topic ``/camera/NAME/frame``).
     path, entry
         Where its picture is.
     """

@@ -1,9 +1,9 @@
-"""What is left of an MCAP file, read from front to end: whole, cut off anywhere, or damaged in the middle.
+"""Reads an MCAP file from front to end: whole, cut off anywhere, or damaged in the middle.
 
-The library's own readers trust the index at the end of a file, which a killed writer has not written, and
-end at the first record that is cut off. Here every record that is whole counts (https://mcap.dev/spec:
-an opcode, a length, the content), and every chunk whose checksum is right; what is not is counted and
-passed over. Nothing is taken from the index.
+The library's own readers trust the index at the end of a file, which a killed writer has not written, and end
+at the first record that is cut off. Here every record that is whole counts (https://mcap.dev/spec: an opcode,
+a length, the content), and every chunk whose checksum is right; others are counted and passed over. Nothing
+is taken from the index.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from drivers.errors import DriverError
 
 MAGIC = b"\x89MCAP0\r\n"
 LARGEST_RECORD = 1 << 30
-"""A longer record is damage: a length that nobody wrote."""
+"""A longer record is damage: no writer wrote that length."""
 
 _FRAME = struct.Struct("<BQ")
 _END = frozenset((Opcode.DATA_END, Opcode.FOOTER))
@@ -39,7 +39,7 @@ class BadRecording(DriverError):
 
 @dataclass
 class McapContents:
-    """What was met while a file was read; it grows as the reading goes on.
+    """The findings while a file was read; they grow as the reading goes on.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class McapContents:
     damaged
         Chunks and records that were passed over because they are not what was written.
     whole_bytes
-        Up to where records are whole; what follows was being written when the writer died.
+        Up to where records are whole; the rest was being written when the writer died.
     left_over_bytes
         How much follows there.
     """
@@ -103,7 +103,7 @@ def read_items(path: Path, found: McapContents | None = None) -> Iterator[Item]:
     ------
     BadRecording
         If it cannot be read, or does not begin like an MCAP file; an empty one is a recording of nothing.
-        What is wrong further on is passed over.
+        Damage further on is passed over.
     """
     told = found if found is not None else McapContents()
     try:

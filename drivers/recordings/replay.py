@@ -1,12 +1,11 @@
 """Replay: recorded frames with joint angles, served through the same PanTilt and Camera as live ones.
 
-The head is always at one of the recorded pointings. A move goes to the recorded pointing nearest to the
-angles asked for, at once, if that is within the tolerance; else it is refused and the message names the
-nearest. The reading is the recorded, *measured* angle, not the asked one. Cameras deliver the frame
-recorded at the pointing with fresh time stamps, at a fixed frame rate.
+The head is always at one of the recorded pointings. A move goes at once to the recorded pointing nearest to
+the requested angles, if that is within the tolerance. Else it is refused and the message names the nearest.
+The reading is the recorded, *measured* angle, not the asked one. Cameras deliver the frame recorded at the
+pointing with fresh time stamps, at a fixed frame rate.
 
-What replay is not responsible for: there is no motion in between, no blur, and no frame where none was
-recorded.
+Replay has no motion in between, no blur, and no frame where none was recorded.
 """
 
 from __future__ import annotations
@@ -171,7 +170,7 @@ class ReplayedHead:
 class ReplayedCamera:
     """A camera that delivers the frame recorded where the head stands; safe from any thread.
 
-    Frame n is exposed at a fixed instant, so its sequence number is a function of time; a frame that nobody
+    Frame n is exposed at a fixed instant, so its sequence number is a function of time; a frame that was not
     fetched is a gap.
     """
 
@@ -223,7 +222,7 @@ class ReplayedCamera:
         return ""
 
     def recent_times(self) -> list[FrameTime]:
-        """Return none: frames that nobody asks for are never made."""
+        """Return none: frames that are not requested are never made."""
         return []
 
     def close(self) -> None:

@@ -14,7 +14,7 @@ Pair = Annotated[list[float], Len(2, 2)]
 
 
 class PlacementAsked(TypedDict):
-    """Where a board is asked for, from the head's axes; ``waits``: until an operator confirms that it stands.
+    """Where a board is asked for, from the head's axes; ``needs_confirmation``: by an operator.
 
     ``bearing_deg`` to the right of pan zero, ``height_deg`` above the axes, ``turned_deg``: its face, to the
     head's right and upwards.
@@ -25,8 +25,8 @@ class PlacementAsked(TypedDict):
     bearing_deg: float
     height_deg: float
     turned_deg: Pair
-    words: str
-    waits: bool
+    description: str
+    needs_confirmation: bool
 
 
 class CoverageTold(TypedDict):
@@ -100,7 +100,7 @@ class BenchRunTold(TypedDict):
     most: Count
     predicted_px: float | None
     target_px: float | None
-    floor_px: float | None
+    counts_px: float | None
     expected_px: float | None
     next_rad: Angles | None
     cameras: dict[str, CoverageTold]

@@ -55,7 +55,7 @@ class TurnedTold(TypedDict):
 class MeasuredTold(TypedDict):
     """A pointing that counts: where, the residual, the part that joints do not explain, its predicted sigma.
 
-    ``time_s`` since 1970 (UTC); ``square``: of ``off_px`` over all that is expected, 2 on average.
+    ``time_s`` since 1970 (UTC); ``chi_square``: of ``off_px`` over all that is expected, 2 on average.
     """
 
     time_s: float
@@ -74,7 +74,7 @@ class MeasuredTold(TypedDict):
     sigma_px: Pixel
     match_sigma_px: Pixel
     count_rad: Angles
-    square: float
+    chi_square: float
 
 
 class CalibrationHealthTold(CalibrationTold):

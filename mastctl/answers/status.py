@@ -73,7 +73,7 @@ class Sun(TypedDict):
     frame: Literal["site", "rover"]
     half_angle_rad: float
     left_s: Seconds | None
-    holds: bool
+    active: bool
 
 
 class SunTold(TypedDict):

@@ -76,10 +76,10 @@ class PlacementLine:
         Of the placement.
     range_m, bearing_deg, height_deg, turned_deg
         As of `calib.plan.placements.Placement`.
-    words
+    description
         The same for a person.
-    waits
-        Whether somebody has to say that it stands.
+    needs_confirmation
+        Whether an operator has to confirm that it stands.
     """
 
     name: Words
@@ -87,8 +87,8 @@ class PlacementLine:
     bearing_deg: Number
     height_deg: Number
     turned_deg: Pair
-    words: Words
-    waits: bool
+    description: Words
+    needs_confirmation: bool
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -121,7 +121,7 @@ class BenchProgress:
         Where it works.
     pictures, most
         Taken of the camera with most of them, and how many there may be.
-    predicted_px, target_px, floor_px
+    predicted_px, target_px, counts_px
         Rms per axis of a first pointing: what the calibration leaves, may leave, and what counts alone leave.
     next_rad
         The next attitude, pan and tilt.
@@ -136,7 +136,7 @@ class BenchProgress:
     most: Count
     predicted_px: Maybe
     target_px: Maybe
-    floor_px: Maybe
+    counts_px: Maybe
     next_rad: Pair
     expected_px: Maybe
     cells: dict[str, Annotated[tuple[Count, ...], Field(min_length=MOST_CELLS, max_length=MOST_CELLS)]]

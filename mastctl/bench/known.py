@@ -117,7 +117,7 @@ class BenchKnowledge:
     # -- what follows ----------------------------------------------------------------------------------
 
     @property
-    def floor_px(self) -> float:
+    def counts_px(self) -> float:
         """What the head's counts alone leave of a first pointing, rms per axis."""
         return self.aim.by_counts_px(self.now.joint_sigma_rad)
 

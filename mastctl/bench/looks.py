@@ -49,9 +49,9 @@ class BenchGoal:
     placements: tuple[int, int] = (2, 4)
     checks: int = 5
 
-    def at_least_px(self, floor_px: float) -> float:
+    def at_least_px(self, counts_px: float) -> float:
         """Return what the calibration may leave: as asked, or what counts leave anyway."""
-        return max(self.pointing_px, floor_px)
+        return max(self.pointing_px, counts_px)
 
     def will_take(self, picture_s: Mapping[str, float], pointing: Collection[str], choice_s: float) -> str:
         """Return in words how long a run takes.
@@ -202,7 +202,7 @@ class Looks:
             return False
         now_px = self._known.predicted_px()
         if (
-            now_px <= 0.7 * self._wanted.at_least_px(self._known.floor_px)
+            now_px <= 0.7 * self._wanted.at_least_px(self._known.counts_px)
             and self._known.fitted_looks >= here
         ):
             return True
@@ -237,8 +237,8 @@ class Looks:
                 known.pictures(),
                 self._wanted.pictures,
                 known.predicted_px(),
-                self._wanted.at_least_px(known.floor_px),
-                known.floor_px,
+                self._wanted.at_least_px(known.counts_px),
+                known.counts_px,
                 (choice.shot.pan_rad, choice.shot.tilt_rad),
                 choice.expected_px,
                 known.cells(),

@@ -51,7 +51,7 @@ class BenchDone:
         The mast file.
     checked
         What the end showed; None of a folder that was fitted again.
-    predicted_px, calibrated_px, floor_px
+    predicted_px, calibrated_px, counts_px
         Rms per axis of a first pointing: what was expected when pictures sufficed, what the calibration's own
         covariance tells, and what counts alone leave.
     seconds, placements, pictures
@@ -68,7 +68,7 @@ class BenchDone:
     _: KW_ONLY
     predicted_px: float | None = None
     calibrated_px: float | None = None
-    floor_px: float | None = None
+    counts_px: float | None = None
     seconds: float | None = None
     placements: int = 0
     pictures: int = 0
@@ -103,7 +103,7 @@ class BenchDone:
             "rover_seconds": self.seconds,
             "predicted_px": self.predicted_px,
             "calibrated_px": self.calibrated_px,
-            "counts_px": self.floor_px,
+            "counts_px": self.counts_px,
             "report": None if self.page is None else str(self.page),
         }
         if self.checked is not None:
@@ -127,8 +127,8 @@ class BenchDone:
         """Yield what a pointing may expect, and what was measured: words and figures."""
         if self.calibrated_px is not None:
             yield "first pointing, rms an axis, by the calibration", px(self.calibrated_px)
-        if self.floor_px is not None:
-            yield "the same by the encoders' counts alone", px(self.floor_px)
+        if self.counts_px is not None:
+            yield "the same by the encoders' counts alone", px(self.counts_px)
         if self.checked is not None and self.checked.pointing_rms_px is not None:
             x, y = self.checked.pointing_rms_px
             promised = self.checked.pointing_promised_px or 0.0
@@ -198,7 +198,7 @@ def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> B
         saved,
         checked,
         predicted_px=known.predicted_px(),
-        floor_px=known.floor_px,
+        counts_px=known.counts_px,
         seconds=known.kept.seconds(),
         placements=len(known.placements()),
         pictures=known.pictures(),
@@ -239,7 +239,7 @@ def save_bench(
         verdict,
         saved,
         predicted_px=None if predicted is None else predicted[0],
-        floor_px=None if predicted is None else predicted[1],
+        counts_px=None if predicted is None else predicted[1],
         placements=len(calibration.rover_from_board),
         pictures=max(Counter(image.camera for image in fitted).values(), default=0),
     )

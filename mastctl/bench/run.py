@@ -298,7 +298,7 @@ class BenchRun:
                 known.take(name, look, check=True)
         checks = known.of(name, check=True)
         pointings = []
-        predicted_px = math.hypot(known.predicted_px(), known.floor_px)
+        predicted_px = math.hypot(known.predicted_px(), known.counts_px)
         for told in point_at_corners(
             self._eyes,
             known.now,
@@ -353,7 +353,7 @@ class BenchRun:
             self._teller.say(f"no fit yet: {reason}")
         if len(over) < self.wanted.placements[0] or self._body_advice() is not None:
             return False
-        return self.known.predicted_px() <= self.wanted.at_least_px(self.known.floor_px)
+        return self.known.predicted_px() <= self.wanted.at_least_px(self.known.counts_px)
 
     def _body_advice(self) -> Advice | None:
         """Where the board would tie body cameras to the head that are not tied yet."""

@@ -210,10 +210,11 @@ class Lines:
         self._tell(now)
 
     def place(self, name: str, placement: Placement, head: BenchHead) -> None:
-        """Ask for a placement, and wait until somebody says that it stands."""
+        """Ask for a placement, and wait until an operator confirms that it stands."""
         while self._waits and not self._stands.empty():
             self._stands.get()  # of a placement before
-        self._tell(BenchAsks(name, **asdict(placement), words=placement.words(), waits=self._waits))
+        described = {**asdict(placement), "description": placement.words()}
+        self._tell(BenchAsks(name, **described, needs_confirmation=self._waits))
         if self._waits:
             self._stands.get()
         self._tell(BenchStands(name))

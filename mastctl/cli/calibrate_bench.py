@@ -91,7 +91,9 @@ def add_commands(subparsers: Any) -> None:
         "--mast-at", type=float, nargs=6, metavar=pose,
         help="the mast stands there (metres, radians as in a mast file), as level and tape say",
     )  # fmt: skip
-    where.add_argument("--like", type=Path, metavar="MAST.yaml", help="the mast stands as in this mast file")
+    where.add_argument(
+        "--mast-like", type=Path, metavar="MAST.yaml", help="the mast stands as in this mast file"
+    )
     where.add_argument(
         "--board-at", type=float, nargs=6, metavar=("X", "Y", "Z", "YAW", "PITCH", "ROLL"),
         help="the first placement's board stands there: its middle (metres), and its turn about the rover's "
@@ -172,8 +174,8 @@ def _frame(args: argparse.Namespace) -> RoverFrame:
         if numbers is not None and not all(math.isfinite(number) for number in numbers):
             raise WrongUse(f"--{option.replace('_', '-')} holds a number that is not finite")
     mast_at = args.mast_at
-    if args.like is not None:
-        mast = load_rig(args.like).rig.mast
+    if args.mast_like is not None:
+        mast = load_rig(args.mast_like).rig.mast
         mast_at = [*mast.translation_m.tolist(), *mast.rotation_rad.tolist()]
     return RoverFrame(mast_at, args.board_at, args.body_stays)
 

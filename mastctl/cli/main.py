@@ -302,7 +302,7 @@ man
 schema config
 conform http://127.0.0.1:8420
 doctor --config rover.yaml
-sentinel reference --folder sentinel --rest 0,-0.3
+sentinel reference --folder sentinel --pose 0,-0.3
 sentinel look --folder sentinel
 sentinel watch --folder sentinel --every-s 86400
 sentinel status --folder sentinel

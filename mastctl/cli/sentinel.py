@@ -24,12 +24,12 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     sentinel = subparsers.add_parser(
         "sentinel",
         help="notice a bumped camera, a slipped joint, a lens refocused",
-        description="Keeps pictures of a few rests of the head, takes them again, names what has changed.",
+        description="Keeps images of a few poses of the head, takes them again, names what has changed.",
     )
     acts = sentinel.add_subparsers(dest="act", required=True, metavar="ACT")
     reference = acts.add_parser("reference", help="take the pictures that later looks are compared with")
     reference.add_argument(
-        "--rest", action="append", type=_rest, metavar="PAN,TILT", help="a rest, radians (default: six)"
+        "--pose", action="append", type=_pose, metavar="PAN,TILT", help="a pose, radians (default: six)"
     )
     reference.set_defaults(run=_reference)
     look = acts.add_parser("look", help="take them again and report changes; 1 if there is one")
@@ -60,7 +60,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
         add_daemon_options(one)
 
 
-def _rest(text: str) -> tuple[float, float]:
+def _pose(text: str) -> tuple[float, float]:
     try:
         pan, tilt = (float(word) for word in text.split(","))
     except ValueError:
@@ -85,17 +85,17 @@ def _reference(args: argparse.Namespace) -> int:
     from mastctl.watch.reference import save_reference
 
     with client_of(args) as client, _steering(args, client):
-        rests = args.rest or usual_rests(client)
+        rests = args.pose or usual_rests(client)
         _, cameras = head_cameras(client)
         if not cameras:
             raise output.CommandError("no_camera", "the daemon has no camera on the head")
-        with output.waiting(args.json, f"taking {len(rests)} rests"):
+        with output.waiting(args.json, f"taking images at {len(rests)} poses"):
             taken = take_pictures(client, rests, cameras)
     if taken.missing:
         which, why = next(iter(taken.missing.items()))
         raise output.CommandError("no_picture", f"no reference was taken: {which}: {why}")
     saved = save_reference(args.folder, now_utc().isoformat(timespec="seconds"), rests, taken.pictures)
-    counts = f"{len(saved.pictures)} pictures at {len(rests)} rests"
+    counts = f"{len(saved.pictures)} images at {len(rests)} poses"
     words = f"{args.folder}: {counts}, mast file {saved.mast_digest[:12]}"
     told = {
         "folder": str(args.folder),
@@ -114,7 +114,7 @@ def _look(args: argparse.Namespace) -> int:
     with (
         client_of(args) as client,
         _steering(args, client),
-        output.waiting(args.json, f"looking at {len(reference.rests)} rests"),
+        output.waiting(args.json, f"looking at {len(reference.rests)} poses"),
     ):
         drift = look_again(client, reference)
     return _tell(args, add_look(args.folder, reference, now_utc().isoformat(timespec="seconds"), drift))

@@ -40,7 +40,9 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     reset = subparsers.add_parser("reset", help="release an emergency stop; nothing moves by that")
     reset.add_argument("--reason", required=True, metavar="WORDS", help="why it is safe to move again")
     reset.add_argument("--name", required=True, metavar="WHO", help="who says so")
-    reset.add_argument("--of", metavar="NAME", help="whose emergency stop, where several are latched")
+    reset.add_argument(
+        "--latched-by", metavar="NAME", help="release the stop that this person latched, where several are"
+    )
     reset.set_defaults(run=_reset)
 
     halt = subparsers.add_parser(
@@ -74,7 +76,7 @@ def _estop(args: argparse.Namespace) -> int:
 
 def _reset(args: argparse.Namespace) -> int:
     with client_of(args, whatever_configured=True) as client:
-        answer = client.reset(reason=args.reason, name=args.name, of=args.of)
+        answer = client.reset(reason=args.reason, name=args.name, latched_by=args.latched_by)
     was = answer["released"]
     left = "".join(f"; still latched: {one['name']}: {one['reason']}" for one in answer["left"])
     words = f"released (it was latched by {was['name']}, {was['at']}: {was['reason']})"

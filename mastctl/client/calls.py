@@ -97,7 +97,7 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
         range_m, plane
             How far what the pixel shows is from its camera, metres, or a plane of the rover frame in which it
             lies: ``{"point_m": (x, y, z), "normal": (x, y, z)}``, level without ``normal``. The pair's other
-            eye is not asked then.
+            camera is not asked then.
         deadline_s
             How long it is given, seconds of the daemon's clock; then the head is stopped and the operation
             fails with ``deadline_passed``. By default from the longest way and the speed.
@@ -222,9 +222,9 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
         told = {key: value for key, value in body.items() if value is not None}
         return await self._daemon.json(EstopTold, "POST", "/estop", json=told)
 
-    async def reset(self, *, reason: str, name: str, of: str | None = None) -> ResetTold:
+    async def reset(self, *, reason: str, name: str, latched_by: str | None = None) -> ResetTold:
         """Release an emergency stop, of several that of ``of``; nothing moves before the next command."""
-        told = {"reason": reason, "name": name, **({} if of is None else {"of": of})}
+        told = {"reason": reason, "name": name, **({} if latched_by is None else {"latched_by": latched_by})}
         return await self._daemon.json(ResetTold, "POST", "/reset", json=told)
 
     async def pose(

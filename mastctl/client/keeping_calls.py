@@ -103,8 +103,8 @@ class KeepingCalls:
         board, board_file, resume
             One of them: the name of a packaged board, the text of a BOARD.yaml, the name of a run.
         wanted_px, pictures
-            The error that the calibration may leave of a first pointing, rms an axis, and how many pictures
-            of each camera at most; by default 0.2 and 60, or as the run had them.
+            The error that the calibration may leave of a first pointing, rms an axis, and the most pictures
+            of each camera. By default 0.2 and 60, or as the run had them.
         by_hand
             Whether a simulated board waits for `board_stands` too, as a real one does.
 
@@ -158,7 +158,7 @@ class KeepingCalls:
         return await self._daemon.command(RecordingEnded, "POST", "/recordings/stop")
 
     async def recording(self, name: str, file: str) -> bytes:
-        """Return a file of a recording whole, by the names that `recordings` tells."""
+        """Return a file of a recording whole, by the names that `recordings` returns."""
         name, file = quote(name, safe=""), quote(file, safe="")
         return bytes((await self._daemon.ask("GET", f"/recordings/{name}/{file}")).content)
 

@@ -1,4 +1,4 @@
-"""Live pictures of a daemon as they come: JPEG with its facts, at the pace of whoever takes them."""
+"""Live pictures of a daemon as they come: JPEG with its facts, at the pace of the caller."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def live_pictures(daemon: DaemonConnection, cameras: Sequence[str]) -> Iterator[
     Raises
     ------
     ClientError
-        ``no_daemon`` if nobody answers; ``refused`` if the daemon does not send them, with its reason.
+        ``no_daemon`` if no daemon answers; ``refused`` if the daemon does not send them, with its reason.
     """
     path = daemon.socket_path
     base = "http://localhost" if path is not None else daemon.url.rstrip("/")

@@ -113,7 +113,7 @@ class SimulationCalls:
 
         Returns
         -------
-        told
+        answer
             ``position_in_site_m``, ``position_m`` in the rover frame when the frame was taken, ``pixel_px``;
             null where the camera could not see it, all where a pixel shows the sky.
 

@@ -81,7 +81,7 @@ def latched_sentence(entries: Sequence[Latched]) -> str:
         return entries[0].sentence
     told = "; ".join(f"{one.name}: {one.reason}" for one in entries)
     words = f"{len(entries)} emergency stops are latched ({told})"
-    return f"{words}; 'mastctl reset' with a reason, a name and whose it is ('--of') releases each"
+    return f"{words}; 'mastctl reset' with a reason, a name and whose it is ('--latched-by') releases each"
 
 
 @dataclass(frozen=True)

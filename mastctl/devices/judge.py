@@ -259,7 +259,7 @@ class KeepOutJudge:
         found = []
         sun = self._sun
         if sun is not None and sun.until_s is not None and not sun.holds(now_s):
-            words = "the stated direction of the sun holds no longer, and nothing keeps the cameras off it"
+            words = "the stated direction of the sun has expired, and nothing keeps the cameras off it"
             found.append(
                 StandingFault(
                     SUN, "sun_not_known", words, sun.until_s, "another direction is stated, or none"
@@ -317,7 +317,7 @@ class KeepOutJudge:
                 "frame": sun.frame,
                 "half_angle_rad": sun.half_angle_rad,
                 "left_s": None if sun.until_s is None else max(0.0, sun.until_s - now_s),
-                "holds": sun.holds(now_s),
+                "active": sun.holds(now_s),
             },
         }
 

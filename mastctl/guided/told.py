@@ -62,7 +62,7 @@ class GuidedRun:
         The newest placement, and how many there were since the run began or went on.
     pictures, most
         Of the camera with most.
-    predicted_px, target_px, floor_px, expected_px
+    predicted_px, target_px, counts_px, expected_px
         What the calibration would leave of a first pointing now, may leave, what counts leave; and what it
         would leave with the next picture.
     next_rad
@@ -96,7 +96,7 @@ class GuidedRun:
     most: int = 0
     predicted_px: float | None = None
     target_px: float | None = None
-    floor_px: float | None = None
+    counts_px: float | None = None
     expected_px: float | None = None
     next_rad: tuple[float, float] | None = None
     cameras: Mapping[str, CameraCells] = field(default_factory=dict)
@@ -135,7 +135,7 @@ def _after(run: GuidedRun, line: BenchLine) -> GuidedRun:
         case BenchSteps():
             return replace(run, step=line.step, state="running")
         case BenchAsks():
-            state: BenchState = "asking" if line.waits else "running"
+            state: BenchState = "asking" if line.needs_confirmation else "running"
             return replace(run, asked=line.asked, placements=run.placements + 1, step="place", state=state)
         case BenchStands():
             return replace(run, state="running", step="search")
@@ -174,7 +174,7 @@ def _progressed(run: GuidedRun, now: BenchProgress) -> GuidedRun:
         most=now.most,
         predicted_px=now.predicted_px,
         target_px=now.target_px,
-        floor_px=now.floor_px,
+        counts_px=now.counts_px,
         expected_px=now.expected_px,
         next_rad=now.next_rad,
         curve=curve,

@@ -164,7 +164,7 @@ class Latch:
             return self._folder.why_temporary or "this daemon keeps its state in a temporary folder"
         return self._problem or "the disk has not confirmed it yet"
 
-    def release(self, reason: str, name: str, of: str | None = None) -> Latched:
+    def release(self, reason: str, name: str, latched_by: str | None = None) -> Latched:
         """Release one entry on the disk, then in memory; return it.
 
         Parameters
@@ -188,7 +188,7 @@ class Latch:
             raise Unable("not_saved", words, PATIENCE_S)
         try:
             entries, asked = self.entries, self._asked
-            held = _meant(entries, of)
+            held = _meant(entries, latched_by)
             left = tuple(one for one in entries if one is not held)
             with self._changed:  # before the disk changes: from here on nobody is told that it holds a stop
                 self._kept = None
@@ -383,19 +383,21 @@ def _merged(entries: tuple[Latched, ...], more: tuple[Latched, ...]) -> tuple[La
     return entries
 
 
-def _meant(entries: tuple[Latched, ...], of: str | None) -> Latched:
+def _meant(entries: tuple[Latched, ...], latched_by: str | None) -> Latched:
     """The entry that is to be released. Raises NotNow."""
     if not entries:
         raise NotNow("not_estopped", "no emergency stop is latched")
     names = ", ".join(one.name for one in entries)
-    if of is not None:
+    if latched_by is not None:
         for one in entries:
-            if one.name == _told(of, ""):
+            if one.name == _told(latched_by, ""):
                 return one
-        raise NotNow("not_estopped", f"no emergency stop of {_told(of, 'nobody')} is latched, but of {names}")
+        raise NotNow(
+            "not_estopped", f"no emergency stop of {_told(latched_by, 'nobody')} is latched, but of {names}"
+        )
     if len(entries) > 1:
         words = f"{len(entries)} emergency stops are latched, of {names}; each is released by itself"
-        raise NotNow("several_estops", f"{words}: say whose ('of'; mastctl reset --of NAME)")
+        raise NotNow("several_estops", f"{words}: say whose ('latched_by'; mastctl reset --latched-by NAME)")
     return entries[0]
 
 

@@ -134,7 +134,7 @@ class Stopping:
             self._machine.stop_ended()
         return held
 
-    def reset(self, reason: str, name: str, of: str | None = None) -> ResetTold:
+    def reset(self, reason: str, name: str, latched_by: str | None = None) -> ResetTold:
         """Release one emergency stop; nothing moves before the last is released, and a command comes.
 
         Parameters
@@ -163,7 +163,7 @@ class Stopping:
         if self._devices.stop_pending:
             raise NotNow("stopping", "the mast is being stopped; an emergency stop is released after that")
         with self._resetting:
-            held = self._latch.release(reason, name, of)
+            held = self._latch.release(reason, name, latched_by)
             self._devices.allow_moves(held)  # and not what another one blocks that came meanwhile
             self._machine.reset(name, reason, lambda: self._latch.entries)
             left = [one.told() for one in self._latch.entries]

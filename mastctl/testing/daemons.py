@@ -1,7 +1,7 @@
 """One daemon after the other in this process, and what a test asks of its rover.
 
-A test gets a daemon of its own: nothing that the one before did (faults, a track, a stop, the mast file
-in use, where head and rover stand, what the clock says) is left, because none of it is there any more.
+A test gets a daemon of its own. Nothing of the test before is left: no faults, track, stop, mast file in use,
+place of head and rover, or time of the clock.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The pytest plug-in: ``mast_daemon``, ``mast_client``, ``simulated_rover`` and ``fault``.
 
-pytest loads it at every start of every project beside which mastctl is installed: nothing is imported here
-but pytest and the standard library, and no process is started, until a test asks for a fixture.
+pytest loads it at every start of every project beside which mastctl is installed. So it imports only pytest
+and the standard library, and starts no process until a test asks for a fixture.
 """
 
 from __future__ import annotations

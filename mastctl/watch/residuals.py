@@ -299,7 +299,7 @@ class CalibrationHealth:
                 {
                     **one.measured.told(),
                     "sigma_px": list(one.sigma_px),
-                    "square": one.square,
+                    "chi_square": one.square,
                 }
                 for one in reversed(self._newest)
             ],

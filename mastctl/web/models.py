@@ -62,11 +62,11 @@ class EstopBody(BaseModel):
 
 
 class ResetBody(_Strict):
-    """``POST /reset``: why the emergency stop is released, and by whom; of several, ``of`` says whose."""
+    """``POST /reset``: why and by whom the stop is released; of several, ``latched_by`` names one."""
 
     reason: Words
     name: Words
-    of: Words | None = None
+    latched_by: Words | None = None
 
 
 class LeaseBody(_Strict):

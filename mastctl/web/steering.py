@@ -143,7 +143,7 @@ def add_estop(app: FastAPI) -> None:
 
     @command(app, "POST /reset", RESET, "Release an emergency stop; nothing moves before the next command")
     def reset(body: ResetBody, here: Here) -> ResetTold:
-        return here.service.stopping.reset(body.reason, body.name, body.of)
+        return here.service.stopping.reset(body.reason, body.name, body.latched_by)
 
 
 async def _words(request: Request) -> dict[str, str]:

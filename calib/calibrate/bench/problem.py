@@ -116,7 +116,7 @@ INEXACT = 1.15
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """What is chosen and not measured.
+    """The choices that are not measured.
 
     Attributes
     ----------
@@ -349,7 +349,7 @@ class BenchProblem:
         return True
 
     def candidates(self) -> tuple[str, ...]:
-        """Terms that pictures could tell: backlash only where the axis came from both sides."""
+        """Terms that pictures could determine: backlash only where the axis came from both sides."""
         found = []
         approaches = np.array([t.approach for t in self.terms.images if t.attitude is not None])
         for name, term in candidate_terms(self.boards).items():

@@ -1,4 +1,4 @@
-"""What a bench's fit says: sigmas, gains of terms, what check images should show, gauges in words."""
+"""The statements of a bench's fit: sigmas, gains of terms, expected check images, gauges in words."""
 
 from __future__ import annotations
 

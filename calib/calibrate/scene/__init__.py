@@ -1,1 +1,1 @@
-"""Pictures of a still scene at many angles, and what they tell of cameras, axes and joints."""
+"""Pictures of a still scene at many angles, as measurements of cameras, axes and joints."""

@@ -1,11 +1,11 @@
-"""What has changed since reference pictures were taken: found in their differences, tested, and named.
+"""Finds changes since reference pictures were taken: in their differences, tested, and named.
 
-Each view (a camera at a rest of the head) is looked at again; its features have moved by little. A robust
-fit turns them into four numbers: shift x and y of the picture's middle, a turn about it, a change of scale.
-What moved by itself (rocks, shadows' edges) is left out there. The numbers of all views are then explained
-by one change at a time: a camera turned in the head, a lens refocused, a joint slipped, the rover turned
-under the mast. Light and weather spoil a view as a whole, so each view has an error of its own beside that
-of its features, and each rest one of both joints.
+Each view (a camera at a rest of the head) is looked at again; its features have moved by little. A robust fit
+turns them into four numbers: shift x and y of the picture's middle, a turn about it, a change of scale.
+Things that moved by themselves (rocks, shadows' edges) are left out there. The numbers of all views are then
+explained by one change at a time: a camera turned in the head, a lens refocused, a joint slipped, the rover
+turned under the mast. Light and weather spoil a view as a whole, so each view has an error of its own beside
+that of its features, and each rest one of both joints.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
 
 ALARM_SIGMAS = 6.0
-"""A change is told from here on, if two looks one after the other say so."""
+"""A change is reported from here on, if two looks one after the other say so."""
 
 JOINT_SIGMA_RAD = 2e-4
 """What a rest of the head is off by chance, each time."""
 
 VIEW_SIGMA = np.array([0.1, 0.1, 1e-4, 1e-4])
-"""What light, weather and temperature move a whole view by: px, px, rad, part of the scale."""
+"""The motion of a whole view by light, weather and temperature: px, px, rad, part of the scale."""
 
 AS_GOOD = 9.0
 """A change that explains a chi-square less by this little would do as well."""

@@ -97,7 +97,7 @@ SEEN = 0.5
 
 @dataclass(frozen=True, eq=False)
 class SceneFit:
-    """What a scene tells of a rig.
+    """The result of a scene about a rig.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ class SceneFit:
     names, values, covariance
         The numbers that were corrected (p,), in radians, and their covariance (p, p), widened by ``scale``.
     unseen
-        Names of those of them that the pictures hardly tell.
+        Names of those that the pictures hardly determine.
     gains
         By term in the order they were taken, the rejected last: significance in sigmas.
     rest_rad
@@ -148,7 +148,7 @@ def fit_scene(
     features: Sequence[Feature],
     joint_sigma_rad: float = JOINT_SIGMA_RAD,
 ) -> SceneFit:
-    """Return what features of a still scene tell of a rig.
+    """Fit a rig's corrections to features of a still scene.
 
     Parameters
     ----------

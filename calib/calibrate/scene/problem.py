@@ -37,7 +37,7 @@ class SceneProblem:
     Attributes
     ----------
     rig, views, features
-        What is believed, the pictures, and what they show together.
+        The assumed rig, the pictures, and what they show together.
     names
         Of the rig's numbers (p,), as `calib.calibrate.scene.terms` has them.
     joint_sigma_rad

@@ -1,4 +1,4 @@
-"""Dots that are not where the rest of their image says, told without a camera.
+"""Finds dots that are not where the rest of their image says, without a camera.
 
 Over one board, pixels are a smooth function of the place on it, whatever the lens and the board's pose: a
 polynomial of the fourth degree is good to some hundredths of a pixel. What is left of a dot is its own
@@ -86,7 +86,7 @@ def _test(survey: Survey, dots: Dots, degree: int) -> tuple[FloatArray, FloatArr
 def stray_points(places_m: FloatArray, pixels_px: FloatArray, sigma_px: FloatArray) -> np.ndarray:
     """Return which points (n,) of one image are grossly off where the rest of a flat board says.
 
-    None where there are too few to tell. ``places_m`` (n, 2) on the board; it may be partly seen.
+    None where there are too few. ``places_m`` (n, 2) on the board; it may be partly seen.
     """
     degree = _degree(len(places_m))
     if not degree:

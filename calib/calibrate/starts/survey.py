@@ -1,8 +1,8 @@
 """From a survey to a place where least squares can start: set-ups, boards, cameras and mast in turn.
 
 Each step takes the one before as exact, as the paper does, and is robust: a prism or tape that disagrees with
-its drawing is left out of the start, and so is an image that belongs to another board. What is left out here
-is judged again by the fit's own test.
+its drawing is left out of the start, and so is an image that belongs to another board. The fit's own test
+judges again all that is left out here.
 
 Cameras start from their rough focal length and the surveyed points alone (``calib.calibrate.starts.camera``).
 A camera's rough place and direction are not used: they help to find dots (``calib.survey.find_dots``) and to

@@ -59,7 +59,11 @@ def test_a_placement_waits_for_the_answer_and_for_none_that_came_before_it() -> 
     waiting.join(10.0)
     assert not waiting.is_alive()
     asked, stands = told(out)
-    assert asked["waits"] and asked["turned_deg"] == [20.0, 0.0] and "25 degrees left" in asked["words"]
+    assert (
+        asked["needs_confirmation"]
+        and asked["turned_deg"] == [20.0, 0.0]
+        and "25 degrees left" in asked["description"]
+    )
     assert stands == {"event": "stands", "name": "p1"}
 
 

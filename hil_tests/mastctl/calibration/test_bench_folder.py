@@ -61,10 +61,10 @@ def test_the_mast_stands_where_level_and_tape_say(
     code, told, _ = run(capsys, folder, "--out", first, "--mast-at", "0.3", "0", "-1.4", "0", "0.01", "0")
     assert code == 0
     assert told["mast"]["translation_m"] == [0.3, 0.0, -1.4]
-    code, told, _ = run(capsys, folder, "--out", second, "--like", first)
+    code, told, _ = run(capsys, folder, "--out", second, "--mast-like", first)
     assert code == 0
     assert told["mast"]["rotation_rad"] == pytest.approx([0.0, 0.01, 0.0], abs=1e-12)
-    both = "--like", first, "--mast-at", "0", "0", "0", "0", "0", "0"
+    both = "--mast-like", first, "--mast-at", "0", "0", "0", "0", "0", "0"
     assert run(capsys, folder, "--out", second, *both)[0] == 2
 
 

@@ -178,7 +178,7 @@ def test_the_sun_is_kept_out_until_its_moment_and_then_missed_aloud() -> None:
     assert [fault.code for fault in door.faults(at(0.5, 0.02))] == ["sun_in_view"]
     assert door.faults(at(0.5, 0.5)) == ()
     told = door.told()["sun"]
-    assert (told["left_s"], told["holds"]) == (10.0, True)
+    assert (told["left_s"], told["active"]) == (10.0, True)
     clock = door._clock
     assert isinstance(clock, ManualClock)
     clock.advance(10.5)

@@ -21,7 +21,7 @@ from mastctl.guided.told import GuidedRun
 
 PLACE = {
     "event": "place", "name": "p1", "range_m": 1.1, "bearing_deg": 0.0, "height_deg": 0.0,
-    "turned_deg": [20.0, 0.0], "words": "straight ahead", "waits": True,
+    "turned_deg": [20.0, 0.0], "description": "straight ahead", "needs_confirmation": True,
 }  # fmt: skip
 BEGUN = {
     "event": "begun", "board_m": [0.55, 0.33], "cameras": {"navcam_left": [1024, 768]}, "folder": "seen",
@@ -29,7 +29,7 @@ BEGUN = {
 }  # fmt: skip
 PROGRESS = {
     "event": "progress", "placement": "p1", "pictures": 3, "most": 60, "predicted_px": 6.2,
-    "target_px": 0.2, "floor_px": 0.03, "next_rad": [0.3, -0.1], "expected_px": 3.7,
+    "target_px": 0.2, "counts_px": 0.03, "next_rad": [0.3, -0.1], "expected_px": 3.7,
     "cells": {"navcam_left": [2] * 48},
 }  # fmt: skip
 DONE = {

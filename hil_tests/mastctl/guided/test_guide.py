@@ -45,7 +45,7 @@ def test_a_run_is_followed_from_its_beginning_over_a_placement_to_its_verdict(tm
         begun = made.begin(wanted_px=0.5)
         assert (begun.state, begun.by, begun.wanted_px) == ("running", "Ana", 0.5)
         asked = made.until("asking").asked
-        assert asked is not None and asked.turned_deg == (20.0, 0.0) and asked.waits
+        assert asked is not None and asked.turned_deg == (20.0, 0.0) and asked.needs_confirmation
         assert made.leases.control().holder == "bench calibration"  # type: ignore[union-attr]
         made.guide.stands()
         run = made.until("done")

@@ -259,7 +259,7 @@ def test_the_status_shows_all_stops_and_nothing_moves_before_the_last_is_release
         with pytest.raises(ClientError) as refused:
             client.reset(reason="aired", name="Cem")
         assert refused.value.code == "several_estops"
-        told = client.reset(reason="aired", name="Cem", of="Ana")
+        told = client.reset(reason="aired", name="Cem", latched_by="Ana")
         assert (told["latched"], told["released"]["name"]) == (True, "Ana")
         assert [one["name"] for one in told["left"]] == ["Ben"]
         assert client.status()["state"] == "stopped"

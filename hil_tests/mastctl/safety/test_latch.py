@@ -520,8 +520,8 @@ def test_a_stop_in_the_middle_of_a_reset_leaves_nothing_latched_and_the_next_com
         client.estop(reason="sparks", name="Ana")
         true = service.latch.release
 
-        def release(reason: str, name: str, of: str | None) -> Latched:
-            held = true(reason, name, of)
+        def release(reason: str, name: str, latched_by: str | None) -> Latched:
+            held = true(reason, name, latched_by)
             service.machine.stop_asked()
             return held
 
@@ -545,8 +545,8 @@ def test_an_emergency_stop_in_the_middle_of_a_reset_is_latched_everywhere(
         client.estop(reason="sparks", name="Ana")
         true = service.latch.release
 
-        def release(reason: str, name: str, of: str | None) -> Latched:
-            held = true(reason, name, of)
+        def release(reason: str, name: str, latched_by: str | None) -> Latched:
+            held = true(reason, name, latched_by)
             service.stopping.latch_estop("smoke", "Cem")
             return held
 

@@ -30,7 +30,7 @@ THERE = (0.4, -0.2)
 def daemon(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
     with small_rover(repository, tmp_path_factory.mktemp("sentinel")) as made:
         folder = made.service.folder.path / "sentinel"
-        rests = [word for rest in RESTS for word in (f"--rest={rest}",)]
+        rests = [word for rest in RESTS for word in (f"--pose={rest}",)]
         assert main(["sentinel", "reference", "--folder", str(folder), "--url", made.url, *rests]) == 0
         yield made
 

@@ -88,7 +88,7 @@ export class Bench {
     const before = this.run;
     this.run = run;
     if (run.name !== before?.name || run.state !== before.state || run.asked?.name !== before.asked?.name) {
-      if (run.state === "asking") this.speak(`Put the board ${run.asked.words}. Then press It stands.`);
+      if (run.state === "asking") this.speak(`Put the board ${run.asked.description}. Then press It stands.`);
       else if (run.state === "done") this.speak(`Bench calibration: ${run.sentence}.`);
       else if (run.state === "interrupted") this.speak(`Bench calibration interrupted: ${run.sentence}.`, run.code !== "left");
       if (["done", "interrupted"].includes(run.state)) this.look();
@@ -174,7 +174,7 @@ export class Bench {
     this.asked.hidden = run.step === "over" || (!asked && run.step !== "begin");
     this.stands.hidden = !asking;
     this.stands.disabled = !this.may || this.busy;
-    say(this.words, !asked ? "The calibration program starts …" : `${asking ? `Placement ${asked.name}: put the board ` : `Placement ${asked.name}: `}${asked.words}.${asking ? " It need not be exact. Lean it against something that does not move." : ""}`);
+    say(this.words, !asked ? "The calibration program starts …" : `${asking ? `Placement ${asked.name}: put the board ` : `Placement ${asked.name}: `}${asked.description}.${asking ? " It need not be exact. Lean it against something that does not move." : ""}`);
     const key = asked && JSON.stringify([asked, run.board_m]);
     if (key === this.sketched) return;
     this.sketched = key;

@@ -32,7 +32,7 @@ export function fromAbove(asked, size) {
   const face = rad(asked.bearing_deg - asked.turned_deg[0]);
   const towards = [middle[0] - 0.22 * Math.cos(face), middle[1] - 0.22 * Math.sin(face)];
   const [bx, by] = at(middle);
-  return s("svg", { class: "sketch", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `From above: the board ${asked.words}` },
+  return s("svg", { class: "sketch", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `From above: the board ${asked.description}` },
     arcs.map((r) => s("circle", { class: "arc", cx: width / 2, cy: base, r: r * scale })),
     arcs.filter((r) => r * scale < base - 8).map((r) => s("text", { class: "tickname end", x: width / 2 - 0.6 * r * scale - 3, y: base - 0.8 * r * scale }, `${number(r, step < 1 ? 1 : 0)} m`)),
     s("path", { class: "sight", d: `M${point(width / 2, base)}L${point(bx, by)}` }),
@@ -50,7 +50,7 @@ export function asSeen(asked, size) {
   const part = (u, v) => corners[0].map((one, k) => one + u * (corners[1][k] - one) + v * (corners[3][k] - one));
   const fields = [];
   for (let row = 0; row < 4; row += 1) for (let column = row % 2; column < 6; column += 2) fields.push(shape([[column, row], [column + 1, row], [column + 1, row + 1], [column, row + 1]].map(([u, v]) => at(part(u / 6, v / 4)))));
-  return s("svg", { class: "sketch", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `As the head sees it from pan 0, tilt 0: the board ${asked.words}` },
+  return s("svg", { class: "sketch", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `As the head sees it from pan 0, tilt 0: the board ${asked.description}` },
     s("rect", { class: "field", x: 0.5, y: 0.5, width: width - 1, height: height - 1 }),
     s("path", { class: "zero", d: `M0 ${height / 2}H${width}M${width / 2} 0V${height}` }),
     s("path", { class: "paper", d: shape(corners.map(at)) }),

@@ -58,7 +58,7 @@ export class HeadPanel {
     this.drawMap();
     const off = this.joints && Math.max(Math.abs(this.joints.true_pan_rad - this.joints.pan_rad), Math.abs(this.joints.true_tilt_rad - this.joints.tilt_rad));
     const { sun } = this;
-    say(this.sunNote, !sun ? "" : sun.holds ? `Hatched in the map: the head keeps ${deg(sun.half_angle_rad, 1).slice(1)} off the sun${sun.left_s === null ? "" : `, for ${forTime(sun.left_s)} more when this was told`}.` : "Where the sun stands is not known any more; nothing keeps the head off it.");
+    say(this.sunNote, !sun ? "" : sun.active ? `Hatched in the map: the head keeps ${deg(sun.half_angle_rad, 1).slice(1)} off the sun${sun.left_s === null ? "" : `, for ${forTime(sun.left_s)} more when this was told`}.` : "Where the sun stands is not known any more; nothing keeps the head off it.");
     say(this.note, off > 5e-6 ? `By the mast file's joints the head truly stands at ${deg(this.joints.true_pan_rad, 3)} ${deg(this.joints.true_tilt_rad, 3)}.` : "");
   }
 

@@ -294,7 +294,7 @@ for (const dialog of document.querySelectorAll("dialog")) dialog.querySelector("
 byId("reset-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   try {
-    await post("/reset", { reason: byId("reset-reason").value, name: byId("reset-name").value, of: releasing });
+    await post("/reset", { reason: byId("reset-reason").value, name: byId("reset-name").value, latched_by: releasing });
     answered(byId("reset"));
   } catch (error) {
     say(byId("reset-said"), error.message);

@@ -774,7 +774,7 @@ def test_a_release_that_came_too_late_releases_nobody_else_s_stop(pair: BOTH, vi
         for name in ("Ana", "Ben"):
             http.post("/estop", json={"reason": "sparks", "name": name})
         one.page.get_by_role("button", name="Release Ana’s").click()
-        http.post("/reset", json={"reason": "mended", "name": "Cleo", "of": "Ana"}).raise_for_status()
+        http.post("/reset", json={"reason": "mended", "name": "Cleo", "latched_by": "Ana"}).raise_for_status()
         one.page.wait_for_selector("#estop:not(:has-text('Ana'))")
         one.page.locator("#reset-reason").fill("mended")
         one.page.locator("#reset-name").fill("Dan")
