@@ -19,6 +19,7 @@ import pytest
 
 from hil_tests.machine import debian
 from hil_tests.waiting import until
+from mastctl.answers.words import WELL
 from mastctl.client import Client, ClientError
 
 pytestmark = pytest.mark.long(4, "a whole Debian is made, mastctl installed and systemd booted in it")
@@ -158,8 +159,8 @@ class Booted:
     def mastctl(self, *words: str, fails: bool = False) -> str:
         return self.run("/opt/mastctl/bin/mastctl", *words, fails=fails)
 
-    def status(self) -> dict[str, Any]:
-        return dict(json.loads(self.mastctl("status", "--json")))
+    def status(self, *words: str) -> dict[str, Any]:
+        return dict(json.loads(self.mastctl("status", "--json", *words)))
 
     def property(self, name: str) -> str:
         return self.run("systemctl", "show", "--property", name, "--value", "mastctl").strip()
@@ -185,7 +186,8 @@ def machine(service_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Ite
 def test_systemd_starts_the_service_and_says_how_it_is(machine: Booted) -> None:
     machine.run("systemctl", "start", "servos", "mastctl")
     assert machine.property("ActiveState") == "active"
-    assert machine.property("StatusText") == "ready"
+    assert machine.status("--wait", "30")["state"] in WELL
+    until(lambda: machine.property("StatusText") in WELL, "systemd knows it")
     assert "1.4 OK" in machine.run("systemd-analyze", "security", "--no-pager", "mastctl")
     machine.run("systemctl", "reload", "mastctl")
 
@@ -197,13 +199,12 @@ def test_a_daemon_that_hangs_is_killed_its_servos_halted_and_it_comes_back(machi
         machine.back_after("STOP"),
         r"Watchdog timeout",
         r"Killing process \d+ \(mastctl\) with signal SIGKILL",
-        r"pan \(servo 1\) was (stopped by its watchdog|told to stand)",
+        r"pan \(servo 1\) was (stopped by its watchdog|commanded to stand)",
         r"Failed with result 'watchdog'",
         r"Started mastctl.service",
     )
-    status = machine.status()
-    assert status["state"] == "ready" and not status["moving"]
-    assert status["joints"]["pan_rad"] < 1.25
+    until(lambda: not machine.status("--wait", "30")["moving"], "the head stands")
+    assert machine.status()["joints"]["pan_rad"] < 1.25
 
 
 def test_a_latch_is_held_through_a_kill_until_somebody_resets_it(machine: Booted) -> None:
@@ -223,7 +224,7 @@ def test_systemctl_stop_stops_the_head_first_and_nothing_starts_again(machine: B
     in_order(
         machine.journal()[before:],
         r"ending: the mast is stopped first",
-        r"pan \(servo 1\) was told to stand where it is, and holds",
+        r"pan \(servo 1\) was commanded to stand where it is, and holds",
         r"Deactivated successfully",
     )
     assert machine.property("ActiveState") == "inactive"  # and not "activating", as before a restart
