@@ -5,9 +5,10 @@ from __future__ import annotations
 import inspect
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from string import ascii_uppercase
+from typing import Any
 
 from drivers.approach import ApproachedAxis
 from drivers.aravis import options as aravis_options
@@ -24,10 +25,12 @@ from drivers.sim import camera_settings, ground, heads, placed, scene
 from drivers.sim.pan_tilt import DEFAULT_HEADS
 from drivers.sim.settings import simulation_settings
 from drivers.v4l2 import options as v4l2
-from drivers.visca import options as visca_options
+from drivers.visca import options as visca
 from tools.schemas.watched import FLAG, TEXT, Schema, number, settings_schema, vector, watched
 
 NUMBER: Schema = {"type": "number"}
+AXES = ("pan", "tilt")
+Read = Callable[[dict[str, Any]], Any]
 PATTERN_WORDS = "patternErrorMessage"
 """The key by which editors show a sentence in place of a pattern."""
 
@@ -68,67 +71,62 @@ def _port(schemes: Iterable[str]) -> Schema:
     return {"type": "string", "pattern": rf"^(?:(?:{kinds})://|(?!.*://)).*\S", PATTERN_WORDS: words}
 
 
-def dynamixel() -> Schema:
-    """Options of a Dynamixel head, whatever the models."""
+def head_options() -> dict[str, Schema]:
+    """Return the options of each pan/tilt driver of ours, by its name."""
+    servo = {"id": 1, "limits_rad": [-0.1, 0.1]}
+    more = {"current_limit_A": 1.0, "approach": "positive", "approach_rad": 0.1}
+    x_and_p = [{**servo, **more, "model": one} for one in ("XM430-W350", "PH54-200-S500", "PH42-020-S300")]
+    sts_and_scs = [{**servo, "model": one} for one in ("STS3215", "SCS0009")]
+    turned = {"limits_rad": [-0.5, 0.5]}
+    counted = {**turned, "count_rad": 0.001, "fastest_rad_per_s": 1.0}
+    of_x, of_sts = (ServoAxisSettings, DynamixelAxisSettings), (ServoAxisSettings, FeetechAxisSettings)
+    return {
+        "dynamixel": _servos(
+            dynamixel_settings, x_and_p, _model(MODELS, "-T"), "watchdog_s", DynamixelSettings, *of_x
+        ),
+        "feetech": _servos(
+            feetech_settings, sts_and_scs, _model(FEETECH_MODELS), "lease_s", FeetechSettings, *of_sts
+        ),
+        "flir_ptu": _units(
+            flir_ptu.options_from, turned, ("socket", "rfc2217"), flir_ptu.Options, flir_ptu.AxisOptions
+        ),
+        "visca": _units(visca.options_from, counted, visca.SCHEMES, visca.ViscaOptions, visca.AxisOptions),
+    }
+
+
+def _servos(
+    read: Read, axes: Iterable[Schema], model: Schema, guard: str, head: type, *of_axis: type
+) -> Schema:
+    """A head of two servos, whatever the models; ``guard`` has a default that hangs on other values."""
     with watched("options.") as noted:
-        for model in ("XM430-W350", "PH54-200-S500", "PH42-020-S300"):
-            axis = {"id": 1, "model": model, "limits_rad": [-0.1, 0.1], "current_limit_A": 1.0}
-            axis |= {"approach": "positive", "approach_rad": 0.1}
-            dynamixel_settings({"port": "/dev/x", "pan": axis, "tilt": {**axis, "id": 2}})
-    for axis_name in ("pan", "tilt"):
-        noted.at(f"{axis_name}.model").tell(_model(MODELS, "-T"))
-    noted.at("watchdog_s").value.pop("default")  # it depends on speed and acceleration
-    found = _settings(noted.schema(), HeadSettings, DynamixelSettings)
-    for name in ("pan", "tilt"):
-        _approach(
-            _settings(found["properties"][name], ApproachedAxis, ServoAxisSettings, DynamixelAxisSettings)
-        )
-    return found
+        for axis in axes:
+            read({"port": "/dev/x", "pan": axis, "tilt": {**axis, "id": 2}})
+    for name in AXES:
+        noted.at(f"{name}.model").tell(model)
+    noted.at(guard).value.pop("default")
+    return _described(noted.schema(), (HeadSettings, head), *of_axis)
 
 
-def feetech() -> Schema:
-    """Options of a Feetech head, whatever the models."""
+def _units(read: Read, axis: Schema, schemes: Iterable[str], head: type, of_axis: type) -> Schema:
+    """A head that is one device, at a line or an address."""
+    volts = {"supply_V": [10.0, 30.0]} if "supply_V" in head.__dataclass_fields__ else {}
     with watched("options.") as noted:
-        for model in ("STS3215", "SCS0009"):
-            axis = {"id": 1, "model": model, "limits_rad": [-0.1, 0.1]}
-            feetech_settings({"port": "/dev/x", "pan": axis, "tilt": {**axis, "id": 2}})
-    for axis_name in ("pan", "tilt"):
-        noted.at(f"{axis_name}.model").tell(_model(FEETECH_MODELS))
-    noted.at("lease_s").value.pop("default")  # it depends on speed and acceleration
-    found = _settings(noted.schema(), HeadSettings, FeetechSettings)
-    for name in ("pan", "tilt"):
-        _approach(
-            _settings(found["properties"][name], ApproachedAxis, ServoAxisSettings, FeetechAxisSettings)
-        )
-    return found
-
-
-def ptu() -> Schema:
-    """Options of a FLIR PTU."""
-    axis = {"limits_rad": [-0.5, 0.5]}
-    with watched("options.") as noted:
-        flir_ptu.options_from({"port": "/dev/x", "pan": axis, "tilt": axis, "supply_V": [10.0, 30.0]})
-    noted.at("port").value = _port(("socket", "rfc2217"))
-    noted.at("supply_V").value = {**noted.at("supply_V").value, "type": ["array", "null"]}
-    for name in ("pan", "tilt"):
+        read({"port": "/dev/x", "pan": axis, "tilt": axis, **volts})
+    noted.at("port").value = _port(schemes)
+    for key in volts:
+        noted.at(key).value = {**noted.at(key).value, "type": ["array", "null"]}
+    for name in AXES:
         noted.at(f"{name}.limits_rad").value["items"] = number(-math.tau, math.tau)
-    found = _settings(noted.schema(), flir_ptu.Options)
-    for name in ("pan", "tilt"):
-        _approach(_settings(found["properties"][name], ApproachedAxis, flir_ptu.AxisOptions))
-    return found
+    return _described(noted.schema(), (head,), of_axis)
 
 
-def visca() -> Schema:
-    """Options of a head that speaks VISCA."""
-    axis = {"limits_rad": [-0.5, 0.5], "count_rad": 0.001, "fastest_rad_per_s": 1.0}
-    with watched("options.") as noted:
-        visca_options.options_from({"port": "/dev/x", "pan": axis, "tilt": axis})
-    noted.at("port").value = _port(visca_options.SCHEMES)
-    for name in ("pan", "tilt"):
-        noted.at(f"{name}.limits_rad").value["items"] = number(-math.tau, math.tau)
-    found = _settings(noted.schema(), visca_options.ViscaOptions)
-    for name in ("pan", "tilt"):
-        _settings(found["properties"][name], visca_options.AxisOptions)
+def _described(found: Schema, head: tuple[type, ...], *of_axis: type) -> Schema:
+    """Add the meanings of a head's options and its axes'."""
+    _settings(found, *head)
+    for name in AXES:
+        axis = _settings(found["properties"][name], ApproachedAxis, *of_axis)
+        if "approach" in axis["properties"]:
+            _approach(axis)
     return found
 
 

@@ -21,14 +21,11 @@ from mastctl.bench import simulated
 from mastctl.config import CONFIG_SCHEMA, HOST_NAME, LONGEST_SOCKET_PATH, parse_config
 from tools.schemas.drivers import (
     camera_options,
-    dynamixel,
     fault_list,
-    feetech,
     genicam_options,
-    ptu,
+    head_options,
     replay,
     simulation,
-    visca,
 )
 from tools.schemas.watched import FLAG, TEXT, Schema, mapping_in, number, vector, watched
 
@@ -67,16 +64,9 @@ def config() -> Schema:
         "pattern": IDENTIFIER,
         "not": {"const": "sun"},
     }
-    drivers = {"dynamixel": dynamixel(), "feetech": feetech(), "flir_ptu": ptu(), "visca": visca()}
-    drivers |= {"replay": replay()}
-    _by(inner["pan_tilt"], "driver", {name: {"options": one} for name, one in drivers.items()})
-    for name in ("dynamixel", "feetech", "flir_ptu", "visca"):
-        inner["pan_tilt"]["allOf"][list(drivers).index(name)]["then"]["required"] = ["options"]
-    camera = inner["cameras"]["additionalProperties"]
-    drivers = {"v4l2": camera_options(), "aravis": genicam_options(), "replay": replay()}
-    _by(camera, "driver", {name: {"options": one} for name, one in drivers.items()})
-    for name in ("v4l2", "aravis"):
-        camera["allOf"][list(drivers).index(name)]["then"]["required"] = ["options"]
+    _drivers(inner["pan_tilt"], head_options())
+    cameras = {"v4l2": camera_options(), "aravis": genicam_options()}
+    _drivers(inner["cameras"]["additionalProperties"], cameras)
     inner["listen"]["dependentSchemas"] = {
         "socket": {"properties": dict.fromkeys(("host", "port", "tls"), False)},
     }
@@ -257,6 +247,13 @@ def _by(holder: Schema, key: str, cases: Mapping[str, Mapping[str, Schema]]) -> 
         {"if": {"required": [key], "properties": {key: {"const": word}}}, "then": {"properties": dict(then)}}
         for word, then in cases.items()
     ]
+
+
+def _drivers(holder: Schema, options: dict[str, Schema]) -> None:
+    """Let a driver's name decide its options, which each but a replay needs."""
+    _by(holder, "driver", {name: {"options": one} for name, one in (options | {"replay": replay()}).items()})
+    for case in holder["allOf"][: len(options)]:
+        case["then"]["required"] = ["options"]
 
 
 def _model(found: Schema) -> Schema:
