@@ -135,7 +135,9 @@ def test_a_fault_fires_its_alert_and_every_panel_shows_something(
     assert (
         mast_client.wait(mast_client.point(pixel=("navcam_left", shot.frame_id, 400, 300)))["state"] == "done"
     )
-    assert prometheus("ALERTS") == []
+    until(
+        lambda: not prometheus("ALERTS"), "no alert is pending"
+    )  # on a busy machine one may be, for a moment
     with mast_client.lease():
         mute = fault("pan_tilt", "mute", replies=1e9)
         firing = until(lambda: prometheus('ALERTS{alertstate="firing"}'), "an alert fires")
