@@ -282,8 +282,9 @@ json.dump({"plots": plots, "topics": sorted(topics)}, sys.stdout)
 @pytest.mark.long(2, "fetches rerun-sdk, 90 MB, into an environment of its own")
 def test_rerun_reads_back_what_the_recording_holds(recording: Path, tmp_path: Path) -> None:
     python = tmp_path / "environment" / "bin" / "python"
-    subprocess.run([sys.executable, "-m", "venv", python.parent.parent], check=True)
-    install = [python, "-m", "pip", "install", "-q", "--no-compile", "rerun-sdk>=0.41,<0.42", "mcap"]
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", python.parent.parent], check=True)
+    install = [sys.executable, "-m", "pip", "--python", python, "install", "-q", "--no-compile"]
+    install += ["rerun-sdk>=0.41,<0.42", "mcap"]
     fetched = subprocess.run(install, capture_output=True, text=True)
     if fetched.returncode != 0:
         pytest.skip(f"rerun-sdk cannot be fetched: {fetched.stderr[-200:]}")
