@@ -129,6 +129,11 @@ class Newest(Generic[Arrived]):
                     return None
                 self._changed.wait(left_s)
 
+    def wait_until(self, holds: Callable[[], bool], timeout_s: float) -> None:
+        """Wait until a frame came with which something ``holds``, or none will come, for so long at most."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or bool(self._lost) or holds(), timeout_s)
+
     def _converted(self) -> tuple[Image, bytes] | None:
         """The newest frame's picture; None if making it finds it damaged.
 

@@ -167,7 +167,8 @@ def wrong_length(format: PictureFormat, data: memoryview) -> str:
         return "" if len(data) in lengths else f"{len(data)} bytes where {lengths[0]} are expected"
     if bytes(data[:2]) != _JPEG_BEGIN:
         return "no JPEG: it does not begin like one"
-    whole = bytes(data).rstrip(b"\0").endswith(_JPEG_END)  # some cameras fill up with zeros
+    tail = bytes(data[-256:]).rstrip(b"\0")  # some cameras fill up with zeros
+    whole = (tail or bytes(data).rstrip(b"\0")).endswith(_JPEG_END)
     return "" if whole else f"a JPEG cut off after {len(data)} bytes"
 
 

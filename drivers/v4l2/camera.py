@@ -12,8 +12,9 @@ from drivers import pixels
 from drivers.clock import Clock, SystemClock
 from drivers.errors import NoCamera, NoFreshFrame, StreamFailed
 from drivers.interfaces import CameraSetting, Frame, FrameTime
+from drivers.newest import Counters
 from drivers.v4l2 import find
-from drivers.v4l2.capture import Bytes, Capture, Counters
+from drivers.v4l2.capture import Bytes, Capture
 from drivers.v4l2.controls import get_value, list_controls
 from drivers.v4l2.exposure import GROUPS, ExposureControl
 from drivers.v4l2.options import CameraOptions, parse_options
@@ -98,7 +99,7 @@ class V4l2Camera:
     @property
     def counters(self) -> Counters:
         """What happened to the frames so far."""
-        return self.capture.counters
+        return self.capture.newest.counters
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -117,7 +118,7 @@ class V4l2Camera:
         NoCamera
             At once, if the camera is gone.
         """
-        damaged = self.capture.damaged
+        damaged = self.capture.newest.damaged
         taken = self.capture.take(exposed_after_s, timeout_s)
         if taken is None:
             if lost := self.capture.lost:
@@ -156,7 +157,7 @@ class V4l2Camera:
 
     def recent_times(self) -> list[FrameTime]:
         """Return the times of the last good frames of this stream, oldest first."""
-        return [FrameTime(frame.sequence, frame.window.begin_s) for frame in self.capture.recent()]
+        return [FrameTime(frame.sequence, frame.window.begin_s) for frame in self.capture.newest.recent()]
 
     def abilities(self) -> dict[str, Any]:
         """Return what the camera offers, as JSON: ``formats`` and ``controls`` with their values now."""
@@ -290,7 +291,7 @@ class V4l2Camera:
         damaged = counters.damaged - damaged_before
         if damaged:
             message += f"; {damaged} came damaged ({counters.last_damage})"
-        last = self.capture.newest
+        last = self.capture.newest.frame
         if last is None:
             return message if damaged else f"{message}; none came at all"
         age_s = exposed_after_s - last.window.begin_s

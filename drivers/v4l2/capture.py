@@ -1,8 +1,7 @@
 """The thread of one camera: always dequeues, checks, keeps the newest good frame, reopens what went away.
 
-The newest frame stays in the kernel's buffer until the next one is there. Whoever asks for it has it
-converted straight from there, once for all that ask; a slow caller holds up no more than that one buffer.
-What runs for every frame is kept short: one that nobody asks for costs little more than its system calls.
+The newest frame stays in the kernel's buffer until the next one is there (`drivers.newest`); a slow caller
+holds up no more than that one buffer. One that nobody asks for costs little more than its system calls.
 """
 
 from __future__ import annotations
@@ -12,18 +11,18 @@ import os
 import select
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers import pixels
 from drivers.clock import Clock
-from drivers.errors import BadFrame, DriverError, NoCamera, StreamFailed
+from drivers.errors import DriverError, NoCamera, StreamFailed
 from drivers.interfaces import CameraSetting, Image
+from drivers.newest import Newest
 from drivers.pixels import PictureFormat
 from drivers.v4l2 import abi, find
 from drivers.v4l2.node import Dequeued, Node
@@ -42,51 +41,6 @@ LATE_S = 0.005  # a frame is late if it comes more than a period and this after 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0  # between tries to open a camera that is there and fails
 GONE_PAUSE_S = 0.1  # between looks for one that is not: they disturb nobody
 CLOSE_PATIENCE_S = 2.0  # for the thread to end: a device that died may hold it in the kernel
-RECENT_FRAMES = 30  # a second's: from their times the offset between two cameras is learned
-
-
-@dataclass
-class Counters:
-    """What happened to a camera's frames since it was opened.
-
-    Attributes
-    ----------
-    good, damaged
-        Frames that were published, and frames that were refused (error flag, length, stamp). The first one or
-        two of a stream are neither, where nothing tells yet when their exposure began.
-    dropped
-        Frames that never came, by gaps in the driver's count.
-    late
-        Good frames that came more than a period and 5 ms after their stamp.
-    reopened
-        How often the camera was lost and opened again.
-    last_damage
-        What was wrong with the last refused frame.
-    """
-
-    good: int = 0
-    damaged: int = 0
-    dropped: int = 0
-    late: int = 0
-    reopened: int = 0
-    last_damage: str = ""
-
-
-@dataclass(eq=False)
-class _Shared:
-    """What the thread and its callers share, under one lock; callers wait for ``changed``."""
-
-    changed: threading.Condition = field(default_factory=lambda: threading.Condition(threading.Lock()))
-    newest: Arrived | None = None
-    node: Node | None = None  # in whose memory the newest lies
-    picture: Image | None = None  # the newest converted, once somebody asked
-    jpeg: bytes = b""  # what it was made of, if that is a JPEG
-    recent: deque[Arrived] = field(default_factory=lambda: deque(maxlen=RECENT_FRAMES))  # of this stream
-    counters: Counters = field(default_factory=Counters)
-    lost: str = ""
-    closed: bool = False
-    ended: bool = False  # the thread is through and touches nothing any more
-    left_behind: bool = False  # nobody waits for it
 
 
 class Capture:
@@ -126,7 +80,9 @@ class Capture:
         self._clock = clock
         self._between = between
         self._exposure_s = exposure_s
-        self._shared = _Shared()
+        self.newest: Newest[Arrived] = Newest()
+        self._ended = self._left_behind = False  # whether the thread is through, and nobody waits for it
+        self._ending = threading.Lock()
         self._opening = threading.Lock()
         self._in_force: Mapping[str, ValuesSet] = {}  # of the stream that was opened last
         self._pause_s = FIRST_PAUSE_S
@@ -153,79 +109,25 @@ class Capture:
             opened.pop_all()
 
     @property
-    def counters(self) -> Counters:
-        """What happened to the frames so far."""
-        with self._shared.changed:
-            return replace(self._shared.counters)
-
-    @property
-    def damaged(self) -> int:
-        """How many frames were refused so far."""
-        return self._shared.counters.damaged
-
-    @property
     def lost(self) -> str:
         """Why there are no frames now: the camera is gone or its stream failed; empty while it streams."""
-        with self._shared.changed:
-            return self._shared.lost
-
-    @property
-    def newest(self) -> Arrived | None:
-        """The newest good frame, however old; None if there is none."""
-        with self._shared.changed:
-            return self._shared.newest
-
-    def recent(self) -> list[Arrived]:
-        """Return the last good frames of this stream, oldest first, without their pictures."""
-        with self._shared.changed:
-            return list(self._shared.recent)
+        return self.newest.lost
 
     def take(self, exposed_after_s: float, timeout_s: float) -> tuple[Arrived, Image, bytes] | None:
-        """Return the newest frame, once its exposure began after that moment, and its read-only picture,
-        with the JPEG that it was made of (empty where the camera gives none).
+        """Return the newest frame, once its exposure began after that moment, as `Newest.take`.
 
         A frame that was there before is given only while its stamp is at most a period and 5 ms old: when the
-        computer stood still for longer, a newer one is on its way. None after ``timeout_s``, and at once when
-        the camera is lost or closed.
+        computer stood still for longer, a newer one is on its way.
         """
-        shared, until_s = self._shared, time.monotonic() + timeout_s
-        with shared.changed:
-            first = shared.newest
-            while True:
-                newest = shared.newest
-                if (
-                    newest is not None
-                    and newest.window.begin_s > exposed_after_s
-                    and (newest is not first or self._is_young(newest))
-                    and (picture := self._picture(newest)) is not None
-                ):
-                    return newest, picture, shared.jpeg
-                left_s = until_s - time.monotonic()
-                if shared.closed or shared.lost or left_s <= 0:
-                    return None
-                shared.changed.wait(left_s)
+        return self.newest.take(exposed_after_s, timeout_s, self._is_young)
 
     def _is_young(self, frame: Arrived) -> bool:
         return self._clock.now_s() - frame.buffer.stamp_s <= self.period_s + LATE_S
 
-    def _picture(self, newest: Arrived) -> Image | None:
-        """Convert the newest frame unless it is; None if that finds it damaged.
-
-        It is done under the lock: the frame's buffer does not go back meanwhile.
-        """
-        shared = self._shared
-        if shared.picture is None and shared.node is not None:
-            data = np.frombuffer(shared.node.bytes_of(newest.buffer), np.uint8)
-            try:
-                shared.picture = self._convert(newest.format, data)
-                shared.jpeg = pixels.jpeg_of(newest.format, data)
-                shared.picture.setflags(write=False)
-            except BadFrame as error:
-                shared.newest = None
-                shared.counters.good -= 1
-                shared.counters.damaged += 1
-                shared.counters.last_damage = str(error)
-        return shared.picture
+    def _made(self, node: Node, frame: Arrived) -> tuple[Image, bytes]:
+        """A frame's picture, with the JPEG that it was made of."""
+        data = np.frombuffer(node.bytes_of(frame.buffer), np.uint8)
+        return self._convert(frame.format, data), pixels.jpeg_of(frame.format, data)
 
     def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
         """Change settings; a stream that is opened later has them too.
@@ -249,32 +151,20 @@ class Capture:
 
     def await_settled(self, timeout_s: float) -> None:
         """Wait until a frame came that shows no setting of before, or none will, for so long at most."""
-        shared = self._shared
-        with shared.changed:
-            shared.changed.wait_for(
-                lambda: (
-                    shared.closed
-                    or bool(shared.lost)
-                    or all(values.settled for values in self._in_force.values())
-                ),
-                timeout_s,
-            )
+        self.newest.wait_until(lambda: all(values.settled for values in self._in_force.values()), timeout_s)
 
     def close(self) -> None:
         """End the thread and let go of the camera.
 
         A driver that hangs in the kernel is left behind after 2 s; its thread lets go when it comes back.
         """
-        with self._shared.changed:
-            if self._shared.closed:
-                return
-            self._shared.closed = True
-            self._shared.changed.notify_all()
+        if not self.newest.close():
+            return
         os.eventfd_write(self._wake, 1)
         self._thread.join(CLOSE_PATIENCE_S)
-        with self._shared.changed:
-            self._shared.left_behind = self._thread.is_alive() and not self._shared.ended
-            left_behind = self._shared.left_behind
+        with self._ending:
+            self._left_behind = self._thread.is_alive() and not self._ended
+            left_behind = self._left_behind
         if left_behind:
             log.warning("%s: its driver hangs; it is closed when the driver comes back", self._name)
         else:
@@ -287,9 +177,9 @@ class Capture:
         try:
             self._serve(stream)
         finally:
-            with self._shared.changed:
-                self._shared.ended = True
-                left_behind = self._shared.left_behind
+            with self._ending:
+                self._ended = True
+                left_behind = self._left_behind
             if left_behind:
                 os.close(self._wake)
 
@@ -306,7 +196,8 @@ class Capture:
                     log.exception("%s: the capture failed", self._name)
                     self._lose(f"{self._name}: the capture failed: {type(error).__name__}: {error}")
                 finally:
-                    self._let_go()
+                    self.newest.forget()
+                    self._held = None
                     stream.close()
             if self._closing_after(self._pause_s):
                 return
@@ -319,8 +210,6 @@ class Capture:
         poll = select.poll()
         poll.register(node.fileno(), select.POLLIN)
         poll.register(self._wake, select.POLLIN)
-        with self._shared.changed:
-            self._shared.node = node
         silent_since_s: float | None = None
         while True:
             found = dict(poll.poll(max(1.0, 1e3 * SILENT_PERIODS * stream.period_s)))
@@ -356,32 +245,21 @@ class Capture:
             self._offset += self._last_sequence + 1 - sequence
             sequence = self._last_sequence + 1
         self._last_sequence = sequence
-        if wrong:
-            with (shared := self._shared).changed:
-                shared.counters.dropped += dropped
-                shared.counters.damaged += 1
-                shared.counters.last_damage = wrong
-            stream.node.queue(buffer.number)
-            return
-        told = {name: values.of(sequence, buffer.stamp_s) for name, values in stream.in_force.items()}
-        timing = Timing(*told[EXPOSURE.name], *self._spacing.see(sequence, buffer.stamp_s))
-        window = exposure_window(stream.rule, timing, buffer.flags, buffer.stamp_s, received_s)
+        window = None
+        if not wrong:
+            told = {name: values.of(sequence, buffer.stamp_s) for name, values in stream.in_force.items()}
+            timing = Timing(*told[EXPOSURE.name], *self._spacing.see(sequence, buffer.stamp_s))
+            window = exposure_window(stream.rule, timing, buffer.flags, buffer.stamp_s, received_s)
         if window is None:
-            with self._shared.changed:
-                self._shared.counters.dropped += dropped
+            self.newest.refuse(dropped, wrong)
             stream.node.queue(buffer.number)
             return
         settings = {name: value for name, (value, _) in told.items()}
         arrived = Arrived(
             buffer, stream.format, timing, window, sequence, self._streams, received_s, settings
         )
-        with (shared := self._shared).changed:
-            shared.counters.dropped += dropped
-            shared.counters.good += 1
-            shared.counters.late += received_s - buffer.stamp_s > stream.period_s + LATE_S
-            shared.newest, shared.picture = arrived, None
-            shared.recent.append(arrived)
-            shared.changed.notify_all()
+        late = received_s - buffer.stamp_s > stream.period_s + LATE_S
+        self.newest.publish(arrived, partial(self._made, stream.node, arrived), dropped=dropped, late=late)
         held, self._held = self._held, buffer.number
         if held is not None:
             stream.node.queue(held)
@@ -391,23 +269,8 @@ class Capture:
 
     def _lose(self, why: str) -> None:
         """Say that there are no frames for now."""
-        with self._shared.changed:
-            if not self._shared.lost:
-                log.warning("%s; it is opened again when it is back", why)
-            self._shared.lost = why
-            self._forget()
-            self._shared.changed.notify_all()
-
-    def _let_go(self) -> None:
-        """Forget the frame that lies in the memory of a stream that ends."""
-        with self._shared.changed:
-            self._forget()
-        self._held = None
-
-    def _forget(self) -> None:
-        shared = self._shared
-        shared.newest = shared.node = shared.picture = None
-        shared.recent.clear()
+        if self.newest.lose(why):
+            log.warning("%s; it is opened again when it is back", why)
 
     def _closing_after(self, pause_s: float) -> bool:
         """Wait before the next try; True when closed."""
@@ -424,13 +287,9 @@ class Capture:
                 self._pause_s = GONE_PAUSE_S
             elif not isinstance(error, DriverError):  # a defect: the thread goes on trying, and says so
                 log.exception("%s: opening again failed", self._name)
-            with self._shared.changed:
-                self._shared.lost = str(error) or type(error).__name__
+            self.newest.lose(str(error) or type(error).__name__)
             return None
-        with self._shared.changed:
-            self._shared.lost = ""
-            self._shared.counters.reopened += 1
-            self._shared.changed.notify_all()
+        self.newest.come_back()
         log.warning("%s is back at %s", self._name, stream.node.path)
         return stream
 

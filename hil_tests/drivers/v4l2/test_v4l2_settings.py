@@ -30,7 +30,7 @@ def test_a_frame_stamped_before_a_change_has_the_old_one_and_none_is_told_a_valu
 
         def told(exposure_s: float = 0.036) -> dict[str, float | None]:
             seen.arrive(sensor.shoot(PERIOD_S, exposure_s))
-            newest = camera.capture.newest
+            newest = camera.capture.newest.frame
             return {} if newest is None else dict(newest.settings)
 
         for _ in range(SETTLE_FRAMES + 1):
