@@ -77,6 +77,10 @@ def test_a_joint_that_slipped_leaves_no_mast_file(tmp_path: Path, capsys: pytest
     assert not (tmp_path / "m.yaml").exists()
 
 
+WHOLE = pytest.mark.long(2, "a whole command; the fit names it quickly in calib/calibrate/test_fit_bench.py")
+
+
+@WHOLE
 def test_a_board_that_moved_is_told_in_the_verdict(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -98,6 +102,7 @@ def test_one_placement_alone_is_told(tmp_path: Path, capsys: pytest.CaptureFixtu
     )
 
 
+@WHOLE
 def test_a_print_less_exact_than_its_corners_are_found_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
