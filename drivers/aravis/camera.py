@@ -121,6 +121,7 @@ class AravisCamera:
         window, exposure_s = arrived.window, arrived.exposure_s
         self._last = GenicamFrame(
             image=image,
+            settings={"exposure_s": exposure_s, **self.capture.fixed},
             sequence=arrived.sequence,
             mid_exposure_s=window.mid_s,
             exposure_s=window.length_s,

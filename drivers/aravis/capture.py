@@ -191,6 +191,7 @@ class GenicamCapture:
         self._longest_s = device.exposure_s or device.period_s or 1.0
         least_delay_s = self._options.margin_s + (0.0 if self._options.stamp == "end" else self._longest_s)
         self._clock = CameraClock(least_delay_s)
+        self.fixed = {} if device.gain is None else {"gain": device.gain}  # of each frame, as a setting
         self._streams += 1
         self._last_number, self._delayed, self._learned = None, 0, 0
         return device

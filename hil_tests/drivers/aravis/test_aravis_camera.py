@@ -73,7 +73,9 @@ def test_a_clock_that_cannot_be_read_makes_the_window_longer_and_still_true() ->
 
 def test_each_frame_brings_its_own_exposure_time(device: GigeCamera) -> None:
     camera = opened(exposure_s=0.003)
-    assert camera.next_frame(time.monotonic(), NET_S).set_exposure_s == pytest.approx(0.003)
+    frame = camera.next_frame(time.monotonic(), NET_S)
+    assert frame.set_exposure_s == pytest.approx(0.003)
+    assert frame.settings == {"exposure_s": frame.set_exposure_s}
     device._set_float(0x3000, 6000.0)  # another program, or an automatic of the camera
     until(lambda: camera.next_frame(time.monotonic(), NET_S).set_exposure_s == pytest.approx(0.006), "6 ms")
     camera.close()
