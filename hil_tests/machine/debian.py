@@ -89,9 +89,7 @@ def booted(root: Path, console: Path) -> Iterator[int]:
             ).stdout.strip() in (b"running", b"degraded"),
             "systemd is up",
         )  # fmt: skip
-        yield first
-        subprocess.run(inside(first, "systemctl", "poweroff"), capture_output=True)
-        until(lambda: process.poll() is not None, "systemd is down")
+        yield first  # then it is ended from outside: its own way down takes a minute
 
 
 def inside(first: int, *command: str) -> list[str]:
