@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ from drivers.aravis.capture import GenicamCapture
 from drivers.aravis.options import AravisOptions, parse_options
 from drivers.clock import Clock
 from drivers.errors import NoCamera, NoFreshFrame
-from drivers.interfaces import Frame, FrameTime
+from drivers.interfaces import CameraSetting, Frame, FrameTime
 from drivers.newest import Counters
 
 
@@ -97,6 +98,22 @@ class AravisCamera:
         """Return the times of the last good frames of this stream, oldest first."""
         return [FrameTime(frame.sequence, frame.window.begin_s) for frame in self.capture.newest.recent()]
 
+    def settings(self) -> list[CameraSetting]:
+        """Return exposure, gain, white balance and focus, as far as it has them. Raises DriverError."""
+        return self.capture.settings()
+
+    def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
+        """Change some of them, as `drivers.interfaces.Adjustable.adjust`."""
+        return self.capture.adjust(wanted)
+
+    @contextmanager
+    def exposure_held(self) -> Iterator[None]:
+        """Wait until a change that was made before shows, for a second at most: a measurement compares
+        pictures. Inside the block the exposure is as the camera's features leave it.
+        """
+        self.capture.await_settled()
+        yield
+
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> GenicamFrame:
         """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.
 
@@ -118,10 +135,10 @@ class AravisCamera:
         last = self._last
         if last is not None and last.image is image:
             return last
-        window, exposure_s = arrived.window, arrived.exposure_s
+        window, exposure_s = arrived.window, arrived.settings.get("exposure_s")
         self._last = GenicamFrame(
             image=image,
-            settings={"exposure_s": exposure_s, **self.capture.fixed},
+            settings=arrived.settings,
             sequence=arrived.sequence,
             mid_exposure_s=window.mid_s,
             exposure_s=window.length_s,

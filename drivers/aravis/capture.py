@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from drivers.aravis.camera_clock import CameraClock, ClockStepped, GenicamWindow
 from drivers.aravis.device import Device, Filled
 from drivers.aravis.options import SOFTWARE, AravisOptions
+from drivers.aravis.settings import EXPOSURE
 from drivers.errors import DriverError, NoCamera, StreamFailed
-from drivers.interfaces import Image
+from drivers.interfaces import CameraSetting, Image
 from drivers.newest import Newest
 from drivers.pixels import PictureFormat
+from drivers.values_set import ValuesSet
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +33,7 @@ DELAYED_S, DELAYED_FRAMES = 1.0, 5  # so many frames that come so late: the came
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0  # between tries to open a camera that is there and fails
 CLOSE_PATIENCE_S, CLOSING_S = 2.0, 1.0
 LATE_S = 0.005
+SETTLE_S = 1.0
 
 Convert = Callable[[PictureFormat, NDArray[np.uint8]], Image]
 
@@ -42,8 +45,8 @@ class ArrivedGenicam(NamedTuple):
     ----------
     filled, window
         The buffer with the camera's own count and stamp, and in which the whole exposure lay.
-    exposure_s
-        Its exposure time by the camera's own word; None if it is not known.
+    settings
+        Those of this frame, by name: as it came with them, else as they were set; None for what is not known.
     sequence, stream
         Our own count, which grows over every reopening, and the number of the stream.
     received_s
@@ -52,7 +55,7 @@ class ArrivedGenicam(NamedTuple):
 
     filled: Filled
     window: GenicamWindow
-    exposure_s: float | None
+    settings: Mapping[str, float | None]
     sequence: int
     stream: int
     received_s: float
@@ -74,6 +77,10 @@ class GenicamCapture:
         self._triggering = threading.Lock()
         self._asked: list[float] = []  # moments of triggers that no frame answered yet; under the lock below
         self._asking = threading.Lock()
+        self._opening = threading.Lock()  # guards what is adjusted, and which values are in force
+        self._adjusted: dict[str, float] = {}
+        self._longest_s: float  # of an exposure that is not known
+        self._clock: CameraClock
         self._streams = 0
         self._last_sequence = -1
         self._last_number: int | None = None
@@ -125,6 +132,51 @@ class GenicamCapture:
         if self.period_s is None or not self._options.free_running:
             return True
         return time.monotonic() - frame.received_s <= self.period_s + LATE_S
+
+    def settings(self) -> list[CameraSetting]:
+        """Return what may be changed, as the camera has it now. Raises DriverError."""
+        return self._there().settings()
+
+    def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
+        """Change settings; a stream that is opened later has them too.
+
+        Raises
+        ------
+        BadSetting, DriverError
+            As `drivers.interfaces.Adjustable.adjust`.
+        """
+        self._there()
+        with self._opening:
+            device = self._there()
+            self._allow(wanted.get(EXPOSURE.name, 0.0))
+            became, notes, refused = device.change(wanted, self._in_force)
+            self._adjusted |= became
+            self._allow(became.get(EXPOSURE.name, 0.0))
+        if refused is not None:
+            raise refused
+        return notes
+
+    def await_settled(self) -> None:
+        """Wait until a frame came that shows no setting of before, for a second at most."""
+        if self._options.free_running:
+            in_force = self._in_force
+            self.newest.wait_until(lambda: all(one.settled for one in in_force.values()), SETTLE_S)
+
+    def _there(self) -> Device:
+        """The camera that streams. Raises NoCamera if it is gone."""
+        device = self._device
+        if device is None or self.newest.lost:
+            raise NoCamera(self.newest.lost or f"{self._name}: it is being opened again")
+        return device
+
+    def _allow(self, exposure_s: float) -> None:
+        """Take in that exposures may become so long."""
+        self._longest_s = max(self._longest_s, exposure_s)
+        self._clock.least_delay_s = self._least_delay_s()
+
+    def _least_delay_s(self) -> float:
+        """How late the quickest frame's first packet comes after its stamp, at most."""
+        return self._options.margin_s + (0.0 if self._options.stamp == "end" else self._longest_s)
 
     def close(self) -> None:
         """End the thread and let go of the camera; one that is gone is left behind after 2 s."""
@@ -187,11 +239,11 @@ class GenicamCapture:
         return device
 
     def _open(self) -> Device:
-        device = Device(self._options, self._name)
-        self._longest_s = device.exposure_s or device.period_s or 1.0
-        least_delay_s = self._options.margin_s + (0.0 if self._options.stamp == "end" else self._longest_s)
-        self._clock = CameraClock(least_delay_s)
-        self.fixed = {} if device.gain is None else {"gain": device.gain}  # of each frame, as a setting
+        with self._opening:
+            device = Device(self._options, self._name, self._adjusted)
+            self._longest_s = device.values.get(EXPOSURE.name) or device.period_s or 1.0
+            self._clock = CameraClock(self._least_delay_s())
+            self._in_force = {name: ValuesSet(value) for name, value in device.values.items()}
         self._streams += 1
         self._last_number, self._delayed, self._learned = None, 0, 0
         return device
@@ -244,16 +296,27 @@ class GenicamCapture:
             self.newest.refuse(dropped, wrong)
             device.queue(filled.handle)
             return
-        exposure_s = device.exposure_s if filled.exposure_s is None else filled.exposure_s
-        window = self._clock.window(
-            filled.stamp_s, self._options.stamp, exposure_s or self._longest_s, triggered_s, filled.arrived_s
-        )
-        frame = ArrivedGenicam(filled, window, exposure_s, self._last_sequence, self._streams, received_s)
+        window = self._window(filled, self._longest_s, triggered_s)
+        settings: dict[str, float | None] = {}
+        for name, values in self._in_force.items():
+            settings[name], highest = values.of(self._last_sequence, window.end_s, window.begin_s)
+            if name == EXPOSURE.name and highest is not None:
+                window = self._window(filled, highest, triggered_s)
+        settings |= filled.told
+        if told_s := filled.told.get(EXPOSURE.name):
+            window = self._window(filled, told_s, triggered_s)
+        frame = ArrivedGenicam(filled, window, settings, self._last_sequence, self._streams, received_s)
         self.newest.publish(frame, partial(self._made, device, filled.handle), dropped=dropped, late=False)
         held, self._held = self._held, filled.handle
         if held is not None:
             device.queue(held)
         self._pause_s = FIRST_PAUSE_S
+
+    def _window(self, filled: Filled, longest_s: float, triggered_s: float) -> GenicamWindow:
+        """In which stretch of our time a frame was exposed, for so long at most."""
+        return self._clock.window(
+            filled.stamp_s, self._options.stamp, longest_s, triggered_s, filled.arrived_s
+        )
 
     def _made(self, device: Device, handle: int) -> tuple[Image, bytes]:
         """The picture of a buffer."""
@@ -284,7 +347,7 @@ class GenicamCapture:
     def _wrong_delay(self, filled: Filled) -> str:
         """Why a frame comes too late to be believed; empty if it does not. Raises StreamFailed for many."""
         delay_s = filled.arrived_s - filled.stamp_s - self._clock.high_s
-        if delay_s <= DELAYED_S:
+        if delay_s <= DELAYED_S + self._longest_s:
             self._delayed = 0
             return ""
         self._delayed += 1

@@ -6,6 +6,8 @@ import ctypes
 import logging
 import threading
 import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -14,14 +16,16 @@ from numpy.typing import NDArray
 from drivers.aravis import find
 from drivers.aravis.library import CONTROL_LOST, GenicamError, library
 from drivers.aravis.options import SOFTWARE, AravisOptions
-from drivers.errors import CameraBusy, DriverError, StreamFailed, UnsupportedFormat
+from drivers.aravis.settings import CHUNKS, EXPOSURE, Meaning, change, set_up, settings_of
+from drivers.errors import CameraBusy, DriverError, NoCamera, StreamFailed, UnsupportedFormat
+from drivers.interfaces import CameraSetting
 from drivers.pixels import GENICAM, PictureFormat
+from drivers.values_set import ValuesSet
 
 log = logging.getLogger(__name__)
 
 RATE_TOLERANCE = 0.02
-_OFF, _CONTINUOUS = 0, 0  # ARV_AUTO_OFF, ARV_ACQUISITION_MODE_CONTINUOUS
-_EXPOSURE_CHUNK = "ExposureTime"
+_CONTINUOUS = 0  # ARV_ACQUISITION_MODE_CONTINUOUS
 _LATCHES = (("TimestampLatch", "TimestampLatchValue"), ("GevTimestampControlLatch", "GevTimestampValue"))
 _TICKS = "GevTimestampTickFrequency"
 
@@ -50,8 +54,8 @@ class Filled(NamedTuple):
         The camera's count: 16 bits that leave out 0, or 64 bits.
     stamp_s, arrived_s
         The camera's stamp by its own clock, and when its first packet came, seconds of CLOCK_MONOTONIC.
-    exposure_s
-        The exposure time that the camera sent with it (chunk data); None if it sends none.
+    told
+        The settings that the camera sent with it (chunk data), by name.
     """
 
     handle: int
@@ -59,7 +63,7 @@ class Filled(NamedTuple):
     number: int
     stamp_s: float
     arrived_s: float
-    exposure_s: float | None
+    told: Mapping[str, float]
 
 
 class Device:
@@ -67,8 +71,10 @@ class Device:
 
     Attributes
     ----------
-    format, period_s, exposure_s
-        As the camera answered; a triggered camera has a period of None, one without exposure control None.
+    format, period_s
+        As the camera answered; a triggered camera has a period of None.
+    values
+        Its settings by name, as they are at the opening; None for one that its automatic sets.
     problems
         Sentences about controls that are missing or not as asked.
     lost
@@ -82,12 +88,14 @@ class Device:
         If the camera cannot be opened or does not start.
     """
 
-    def __init__(self, options: AravisOptions, name: str) -> None:
+    def __init__(self, options: AravisOptions, name: str, adjusted: Mapping[str, float]) -> None:
         self._arv = library(name)
-        self._options, self._name = options, name
+        self._options, self._name, self._adjusted = options, name, adjusted
+        self._asking = threading.Lock()  # Aravis's features are not made for several threads
         self.lost = threading.Event()
         self.problems: list[str] = []
         self._parser: int | None = None
+        self._chunks: list[Meaning] = []
         self._stream: int | None = None
         self._latch: tuple[str, str] | None = None
         self._control_lost = CONTROL_LOST(
@@ -120,12 +128,10 @@ class Device:
         self._set_format()
         self._set_region()
         self.period_s = self._set_pace()
-        self.exposure_s = self._set_exposure()
-        if options.gain is not None and self._has("gain"):
-            arv("camera_set_gain", camera, options.gain)
-            self.gain: float | None = arv("camera_get_gain", camera)
-        else:
-            self.gain = None
+        by_options = {"exposure_s": options.exposure_s, "gain": options.gain}
+        wanted = {name: value for name, value in by_options.items() if value is not None}
+        self.values, others = set_up(arv, camera, {**wanted, **self._adjusted})
+        self.problems += others
         if self._is_gige and options.packet_bytes is not None:
             arv("camera_gv_set_packet_size", camera, options.packet_bytes)
         self._ask_chunks()
@@ -195,41 +201,26 @@ class Device:
             )
         return 1 / rate_hz if rate_hz > 0 else None
 
-    def _set_exposure(self) -> float | None:
-        """Set the exposure time; return the camera's own word, None where an automatic has it."""
-        arv, camera, asked_s = self._arv, self._camera, self._options.exposure_s
-        if not self._has("exposure_time", asked_s is not None):
-            return None
-        automatic = bool(arv("camera_is_exposure_auto_available", camera))
-        if asked_s is not None:
-            if automatic:
-                arv("camera_set_exposure_time_auto", camera, _OFF)
-            arv("camera_set_exposure_time", camera, 1e6 * asked_s)
-        elif automatic:
-            return None
-        return float(arv("camera_get_exposure_time", camera)) / 1e6
-
-    def _has(self, what: str, needed: bool = True) -> bool:
-        """Whether the camera has a control; one that is asked for in vain is a problem."""
-        found = bool(self._arv(f"camera_is_{what}_available", self._camera))
-        if found and what == "gain" and self._arv("camera_is_gain_auto_available", self._camera):
-            self._arv("camera_set_gain_auto", self._camera, _OFF)
-        if not found and needed:
-            self.problems.append(f"the camera has no control for {what.replace('_', ' ')}; it stays as it is")
-        return found
-
     def _ask_chunks(self) -> None:
-        """Have each frame bring its own exposure time, where the camera can."""
+        """Have each frame bring its own exposure time and gain, where the camera can."""
         arv, camera = self._arv, self._camera
         if "ChunkModeActive" in self._options.features:
             return
         try:
             if arv("camera_are_chunks_available", camera):
                 arv("camera_set_chunk_mode", camera, 1)
-                arv("camera_set_chunk_state", camera, _EXPOSURE_CHUNK, 1)
                 self._parser = arv("camera_create_chunk_parser", camera)
         except GenicamError as error:
-            log.info("%s: no exposure time with each frame: %s", self._name, error)
+            log.info("%s: no settings with each frame: %s", self._name, error)
+        if self._parser is None:
+            return
+        for one in CHUNKS:
+            try:
+                if one is EXPOSURE or arv("camera_is_feature_available", camera, one.feature):
+                    arv("camera_set_chunk_state", camera, one.feature, 1)
+                    self._chunks.append(one)
+            except GenicamError as error:
+                log.info("%s: no %s with each frame: %s", self._name, one.word, error)
 
     def _find_latch(self) -> None:
         """See how the camera's clock is read, if it can be."""
@@ -271,10 +262,11 @@ class Device:
             return None
         command, value = self._latch
         try:
-            before_s = time.monotonic()
-            self._arv("camera_execute_command", self._camera, command)
-            after_s = time.monotonic()
-            ticks = self._arv("camera_get_integer", self._camera, value)
+            with self._asking:
+                before_s = time.monotonic()
+                self._arv("camera_execute_command", self._camera, command)
+                after_s = time.monotonic()
+                ticks = self._arv("camera_get_integer", self._camera, value)
         except GenicamError as error:
             raise StreamFailed(f"its clock cannot be read: {error}", device=self._name) from None
         return before_s, ticks / self._ticks_hz, after_s
@@ -282,11 +274,33 @@ class Device:
     def trigger(self) -> None:
         """Have one frame exposed. Raises StreamFailed if the camera does not answer."""
         try:
-            self._arv("camera_software_trigger", self._camera)
+            with self._asking:
+                self._arv("camera_software_trigger", self._camera)
         except GenicamError as error:
             raise StreamFailed(
                 f"it did not take the {SOFTWARE.lower()} trigger: {error}", device=self._name
             ) from None
+
+    def settings(self) -> list[CameraSetting]:
+        """Return what may be changed, as the camera has it now. Raises DriverError."""
+        with self._asking:
+            self._check_open()
+            try:
+                return settings_of(self._arv, self._camera, self._options, self.period_s)
+            except GenicamError as error:
+                raise StreamFailed(f"it does not tell its settings: {error}", device=self._name) from None
+
+    def change(
+        self, wanted: Mapping[str, float], in_force: Mapping[str, ValuesSet]
+    ) -> tuple[dict[str, float], Sequence[str], DriverError | None]:
+        """Change settings, as `drivers.aravis.settings.change`. Raises NoCamera if it was closed."""
+        with self._asking:
+            self._check_open()
+            return change(self._arv, self._camera, wanted, in_force, self._name)
+
+    def _check_open(self) -> None:
+        if not self._camera:
+            raise NoCamera("it went away", device=self._name)
 
     def wait(self, timeout_s: float) -> Filled | None:
         """Wait for the next buffer; None if none came."""
@@ -305,7 +319,7 @@ class Device:
             arv("buffer_get_frame_id", handle),
             1e-9 * arv("buffer_get_timestamp", handle),
             now_s - ago_s,
-            None if wrong else self._chunk_exposure_s(handle),
+            {} if wrong else self._told_with(handle),
         )
 
     def _wrong_picture(self, handle: int) -> str:
@@ -318,16 +332,14 @@ class Device:
             "" if got == (width, height) else f"it has {got[0]}x{got[1]} px where {width}x{height} were set"
         )
 
-    def _chunk_exposure_s(self, handle: int) -> float | None:
-        if self._parser is None:
-            return None
-        try:
-            chunk_us = self._arv(
-                "chunk_parser_get_float_value", self._parser, handle, f"Chunk{_EXPOSURE_CHUNK}"
-            )
-        except GenicamError:
-            return None
-        return float(chunk_us) / 1e6
+    def _told_with(self, handle: int) -> dict[str, float]:
+        """The settings that came with a buffer."""
+        told = {}
+        for one in self._chunks:
+            with suppress(GenicamError):  # not in this frame
+                chunk = self._arv("chunk_parser_get_float_value", self._parser, handle, f"Chunk{one.feature}")
+                told[one.name] = one.unit * float(chunk)
+        return told
 
     def bytes_of(self, handle: int) -> tuple[NDArray[np.uint8], PictureFormat]:
         """Return a buffer's picture, uint8 (n,), which is Aravis's memory, and how it is laid out.
@@ -347,16 +359,17 @@ class Device:
 
     def close(self) -> None:
         """Stop and let go; never raises. It takes seconds for a camera that is gone: Aravis asks it again."""
-        if self._stream is not None:
-            try:
-                self._arv("camera_stop_acquisition", self._camera)
-            except GenicamError as error:
-                log.info("%s: stopping: %s", self._name, error)
-        for handle in (self._parser, self._stream, self._camera):
-            if handle:
-                self._arv.unref(handle)
-        self._parser = self._stream = None
-        self._camera = 0
+        with self._asking:
+            if self._stream is not None:
+                try:
+                    self._arv("camera_stop_acquisition", self._camera)
+                except GenicamError as error:
+                    log.info("%s: stopping: %s", self._name, error)
+            for handle in (self._parser, self._stream, self._camera):
+                if handle:
+                    self._arv.unref(handle)
+            self._parser = self._stream = None
+            self._camera = 0
 
     def _told(self, error: GenicamError) -> DriverError:
         """A refusal of Aravis while opening, as one of ours."""

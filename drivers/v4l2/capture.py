@@ -28,8 +28,9 @@ from drivers.v4l2 import abi, find
 from drivers.v4l2.node import Dequeued, Node
 from drivers.v4l2.options import CameraOptions
 from drivers.v4l2.settings import EXPOSURE, change, settings_of, with_settings
-from drivers.v4l2.stamps import Arrived, Spacing, StampCheck, Timing, ValuesSet, exposure_window
+from drivers.v4l2.stamps import Arrived, Spacing, StampCheck, Timing, exposure_window
 from drivers.v4l2.stream import Stream
+from drivers.values_set import ValuesSet
 
 log = logging.getLogger(__name__)
 

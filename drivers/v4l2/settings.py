@@ -17,7 +17,7 @@ from drivers.v4l2 import abi
 from drivers.v4l2.controls import CameraControl, first_of, get_value, list_controls, set_value
 from drivers.v4l2.node import Node
 from drivers.v4l2.options import CameraOptions
-from drivers.v4l2.stamps import ValuesSet
+from drivers.values_set import ValuesSet
 
 EXPOSURE_UNIT_S = 1e-4  # of V4L2_CID_EXPOSURE_ABSOLUTE
 

@@ -21,7 +21,8 @@ from drivers.v4l2.controls import (
 from drivers.v4l2.node import Node
 from drivers.v4l2.options import CameraOptions
 from drivers.v4l2.settings import EXPOSURE, EXPOSURE_UNIT_S, MEANINGS, value_of
-from drivers.v4l2.stamps import StampRule, ValuesSet
+from drivers.v4l2.stamps import StampRule
+from drivers.values_set import ValuesSet
 
 log = logging.getLogger(__name__)
 

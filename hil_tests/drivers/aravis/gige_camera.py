@@ -19,14 +19,16 @@ GVCP_PORT = 3956
 XML_AT = 0x10000
 TICKS_HZ = 125_000_000  # 8 ns, as many cameras have
 MONO8 = 0x01080001
-CHUNK_EXPOSURE_ID = 0x1001
+CHUNK_IDS = {0: 0x1001, 1: 0x1002}  # by ChunkSelector
 CCP, PORT, PACKET, DESTINATION = 0xA00, 0xD00, 0xD04, 0xD18
 LATCH, LATCHED = 0x944, 0x948
 (
     WIDTH, HEIGHT, FORMAT, RUNS, MODE, SELECTOR, TRIGGERED, SOURCE, SOFTWARE, CHUNKS, CHUNK_SELECTOR,
-    CHUNK_ON, PAYLOAD, OFFSET_X, OFFSET_Y,
-) = range(0x2000, 0x2000 + 15 * 4, 4)  # fmt: skip
-EXPOSURE, RATE = 0x3000, 0x3008
+    CHUNK_ON, PAYLOAD, OFFSET_X, OFFSET_Y, FOCUS, WHITE, GAIN_AUTO,
+) = range(0x2000, 0x2000 + 18 * 4, 4)  # fmt: skip
+EXPOSURE, RATE, GAIN = 0x3000, 0x3008, 0x3010
+EXPOSURE_STEP_US = 20.0
+WRITE_PROTECTED = 0x8005
 
 _INTEGERS = {
     "Width": (WIDTH, 16, 2048), "Height": (HEIGHT, 16, 2048), "OffsetX": (OFFSET_X, 0, 2048),
@@ -39,8 +41,10 @@ _CHOICES = {
     "TriggerSelector": (SELECTOR, {"FrameStart": 0}),
     "TriggerMode": (TRIGGERED, {"Off": 0, "On": 1}),
     "TriggerSource": (SOURCE, {"Software": 0, "Line1": 1}),
-    "ChunkSelector": (CHUNK_SELECTOR, {"ExposureTime": 0}),
+    "ChunkSelector": (CHUNK_SELECTOR, {"ExposureTime": 0, "Gain": 1}),
 }
+_MORE_INTEGERS = {"Focus": (FOCUS, 0, 1023), "BalanceWhiteTemperature": (WHITE, 2500, 10000)}
+_MORE_CHOICES = {"GainAuto": (GAIN_AUTO, {"Off": 0, "Continuous": 1})}
 _COMMANDS = {
     "AcquisitionStart": (RUNS, 1), "AcquisitionStop": (RUNS, 0), "TriggerSoftware": (SOFTWARE, 1),
     "GevTimestampControlLatch": (LATCH, 2),
@@ -55,15 +59,20 @@ def _register(kind: str, name: str, address: int, length: int, port: str = "Devi
     )
 
 
-def _genicam(clock_readable: bool) -> bytes:
+def _genicam(clock_readable: bool, more: bool) -> bytes:
     """The description of the features, in GenICam's XML."""
-    words, names = [], [*_INTEGERS, *_CHOICES, "ExposureTime", "AcquisitionFrameRate", "ChunkModeActive"]
-    for name, (address, low, high) in _INTEGERS.items():
+    integers, choices = (
+        ({**_INTEGERS, **_MORE_INTEGERS}, {**_CHOICES, **_MORE_CHOICES}) if more else (_INTEGERS, _CHOICES)
+    )
+    floats = [("ExposureTime", EXPOSURE, 1e6), ("AcquisitionFrameRate", RATE, 200.0)]
+    floats += [("Gain", GAIN, 24.0)] * more
+    words, names = [], [*integers, *choices, *(name for name, _, _ in floats), "ChunkModeActive"]
+    for name, (address, low, high) in integers.items():
         words.append(
             f'<Integer Name="{name}"><pValue>{name}Reg</pValue><Min>{low}</Min><Max>{high}</Max></Integer>'
         )
         words.append(_register("IntReg", f"{name}Reg", address, 4))
-    for name, (address, entries) in _CHOICES.items():
+    for name, (address, entries) in choices.items():
         inside = "".join(
             f'<EnumEntry Name="{entry}"><Value>{value}</Value></EnumEntry>'
             for entry, value in entries.items()
@@ -81,7 +90,7 @@ def _genicam(clock_readable: bool) -> bytes:
     if clock_readable:
         words.append(_register("IntReg", "GevTimestampValue", LATCHED, 8))
         names.append("GevTimestampValue")
-    for name, address, high in (("ExposureTime", EXPOSURE, 1e6), ("AcquisitionFrameRate", RATE, 200.0)):
+    for name, address, high in floats:
         words.append(
             f'<Float Name="{name}"><pValue>{name}Reg</pValue><Min>0.1</Min><Max>{high}</Max></Float>'
         )
@@ -90,10 +99,10 @@ def _genicam(clock_readable: bool) -> bytes:
         on = "<OnValue>1</OnValue><OffValue>0</OffValue>"
         words.append(f'<Boolean Name="{name}"><pValue>{name}Reg</pValue>{on}</Boolean>')
         words.append(_register("IntReg", f"{name}Reg", address, 4))
-    words.append(_register("FloatReg", "ChunkExposureTime", 0, 8, "ChunkPort"))
-    words.append(
-        f'<Port Name="ChunkPort"><ChunkID>{CHUNK_EXPOSURE_ID:x}</ChunkID></Port><Port Name="Device"/>'
-    )
+    for name, number in zip(("ExposureTime", "Gain"), CHUNK_IDS.values(), strict=True):
+        words.append(_register("FloatReg", f"Chunk{name}", 0, 8, f"{name}Port"))
+        words.append(f'<Port Name="{name}Port"><ChunkID>{number:x}</ChunkID></Port>')
+    words.append('<Port Name="Device"/>')
     listed = "".join(f"<pFeature>{name}</pFeature>" for name in names)
     return (
         '<?xml version="1.0" encoding="utf-8"?><RegisterDescription ModelName="Memory" VendorName="mastctl" '
@@ -115,18 +124,31 @@ class GigeCamera:
         Whether the clock can be latched.
     clock_ahead_s
         How far the camera's clock is ahead of CLOCK_MONOTONIC; may be set anew at any time.
+    more
+        Whether it has gain with an automatic, white balance and focus beside its exposure time.
+    behind
+        So many frames are exposed with the former settings after others were written.
+    refuses
+        Registers that it refuses to have written.
     delay_s
         From the middle of a frame's exposure to its first packet, beside half the exposure.
     """
 
-    def __init__(self, address: str, *, clock_readable: bool = True, clock_ahead_s: float = 0.0) -> None:
+    def __init__(
+        self, address: str, *, clock_readable: bool = True, clock_ahead_s: float = 0.0, more: bool = False
+    ) -> None:
         self.clock_ahead_s = clock_ahead_s
         self.delay_s = 0.001
         self.lose: Callable[[int, int], bool] = lambda frame, packet: False
         self.exposed_s: list[tuple[float, float]] = []  # begin and end by CLOCK_MONOTONIC, of every frame
+        self.gains: list[float] = []  # of every frame
+        self.behind = 0
+        self.refuses: set[int] = set()
+        self._chunks_on: dict[int, int] = {}
+        self._written_settings: list[tuple[float, float]] = []  # exposure time and gain, not yet in force
         self.frames = 0
         self._memory = bytearray(XML_AT)
-        xml = _genicam(clock_readable)
+        xml = _genicam(clock_readable, more)
         for at, text in (
             (0x48, "mastctl"),
             (0x68, "Memory"),
@@ -140,6 +162,7 @@ class GigeCamera:
         started = {
             0x0: 0x00010002, 0x24: struct.unpack(">I", socket.inet_aton(address))[0], 0x600: 1, 0x904: 1,
             0x934: 0x6, 0x938: 3000, 0x940: TICKS_HZ, WIDTH: 64, HEIGHT: 48, FORMAT: MONO8, PACKET: 1400,
+            FOCUS: 40, WHITE: 5000, GAIN_AUTO: 1,
         }  # fmt: skip
         for at, value in started.items():
             self._set(at, value)
@@ -196,9 +219,13 @@ class GigeCamera:
             except TimeoutError:
                 continue
             _, _, command, _, number = struct.unpack(">BBHHH", packet[:8])
-            if (answer := self._answer(command, packet[8:])) is not None:
+            data = packet[8:]
+            refused = command in (0x82, 0x86) and struct.unpack(">I", data[:4])[0] in self.refuses
+            answer = struct.pack(">HH", 0, 0) if refused else self._answer(command, data)
+            if answer is not None:
+                status = WRITE_PROTECTED if refused else 0
                 self._socket.sendto(
-                    struct.pack(">HHHH", 0, command + 1, len(answer), number) + answer, sender
+                    struct.pack(">HHHH", status, command + 1, len(answer), number) + answer, sender
                 )
 
     def _answer(self, command: int, data: bytes) -> bytes | None:
@@ -223,8 +250,13 @@ class GigeCamera:
             struct.pack_into(">Q", self._memory, LATCHED, self._ticks(time.monotonic()))
         if at == SOFTWARE and self._get(RUNS) and self._get(TRIGGERED) and self._get(SOURCE) == 0:
             threading.Thread(target=self._expose, daemon=True).start()
-        with_chunk = 8 + 8 + 8 if self._get(CHUNKS) and self._get(CHUNK_ON) else 0
-        self._set(PAYLOAD, self._get(WIDTH) * self._get(HEIGHT) + with_chunk)
+        if at == CHUNK_ON:
+            self._chunks_on[self._get(CHUNK_SELECTOR)] = self._get(CHUNK_ON)
+        if at == EXPOSURE:
+            steps = round(1e6 * self._exposure_s() / EXPOSURE_STEP_US)
+            self._set_float(EXPOSURE, EXPOSURE_STEP_US * max(1, steps))
+        chunks = sum(self._chunks_on.values()) if self._get(CHUNKS) else 0
+        self._set(PAYLOAD, self._get(WIDTH) * self._get(HEIGHT) + (8 + 16 * chunks if chunks else 0))
 
     def _run(self) -> None:
         """Expose freely, at the rate that is set."""
@@ -241,19 +273,24 @@ class GigeCamera:
 
     def _expose(self) -> None:
         """Expose one frame, stamp its beginning, and send it (GVSP)."""
-        began_s, exposure_s = time.monotonic(), self._exposure_s()
+        gain = float(struct.unpack_from(">d", self._memory, GAIN)[0])
+        self._written_settings = [*self._written_settings, (self._exposure_s(), gain)][-1 - self.behind :]
+        exposure_s, gain = self._written_settings[0]
+        began_s = time.monotonic()
         stamp = self._ticks(began_s)
         self.exposed_s.append((began_s, began_s + exposure_s))
+        self.gains.append(gain)
         self._over.wait(exposure_s)
         self._over.wait(self.delay_s)
         self.frames += 1
         number = (self.frames - 1) % 65535 + 1
         image = self.picture(self.frames).tobytes()
-        chunks = self._get(CHUNKS) and self._get(CHUNK_ON)
+        chunks = [one for one, on in self._chunks_on.items() if on] if self._get(CHUNKS) else []
         kind = 0x4001 if chunks else 1
         if chunks:
             image += struct.pack(">II", 0, len(image))
-            image += struct.pack(">dII", 1e6 * exposure_s, CHUNK_EXPOSURE_ID, 8)
+        for one in chunks:
+            image += struct.pack(">dII", (1e6 * exposure_s, gain)[one], CHUNK_IDS[one], 8)
         leader = struct.pack(
             ">HHQIIIIIHH", 0, kind, stamp, MONO8, self._get(WIDTH), self._get(HEIGHT), 0, 0, 0, 0
         )

@@ -108,6 +108,7 @@ def test_the_software_trigger_exposes_when_a_frame_is_asked_for(device: GigeCame
     camera = opened(rate_hz=None, trigger_source="Software")
     with pytest.raises(NoFreshFrame):
         camera.next_frame(time.monotonic() + 3600.0, 0.05)  # a triggered frame is no proof of the future
+    until(lambda: device.frames == 1, "the frame of that request")
     before = device.frames
     for count in range(1, 6):
         asked_s = time.monotonic()

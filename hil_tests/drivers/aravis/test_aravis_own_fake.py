@@ -16,6 +16,7 @@ import pytest
 from drivers.aravis import find, library
 from drivers.aravis.camera import AravisCamera, GenicamFrame, open_camera
 from drivers.errors import NoCamera
+from drivers.values_set import SETTLE_FRAMES
 from hil_tests.waiting import NET_S, until
 
 pytestmark = pytest.mark.skipif(
@@ -84,6 +85,21 @@ def test_pictures_and_times_are_the_fakes(fake: Start) -> None:
     numbers = [frame.camera_sequence for frame in taken(triggered, 3)]
     assert numbers == [numbers[0], numbers[0] + 1, numbers[0] + 2]
     triggered.close()
+
+
+def test_its_settings_change_as_it_streams(fake: Start) -> None:
+    fake("A6")
+    camera = open_camera({**OPTIONS, "gain": 2}, name="cam")
+    exposure, gain = camera.settings()
+    assert (exposure.name, exposure.value, exposure.maximum) == ("exposure_s", 0.01, 1 / 40)
+    assert (gain.name, gain.value, gain.minimum, gain.maximum) == ("gain", 2.0, 0.0, 10.0)
+    assert taken(camera, 1)[0].settings == {"exposure_s": 0.01, "gain": 2.0}
+    (note,) = camera.adjust({"gain": 5.5, "exposure_s": 0.02})
+    assert note == "cam: gain is 5 where 5.5 was asked for: the camera's nearest"
+    told = taken(camera, SETTLE_FRAMES + 2)
+    assert told[0].settings == {"exposure_s": None, "gain": None}
+    assert told[-1].settings == {"exposure_s": 0.02, "gain": 5.0}
+    camera.close()
 
 
 def test_it_is_found_by_its_serial_number_and_by_its_name(fake: Start) -> None:

@@ -27,7 +27,8 @@ from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.capture import Capture
 from drivers.v4l2.node import Dequeued, Identity
 from drivers.v4l2.options import parse_options
-from drivers.v4l2.stamps import StampRule, ValuesSet
+from drivers.v4l2.stamps import StampRule
+from drivers.values_set import ValuesSet
 from hil_tests.waiting import NET_S, until
 
 SIZE_PX = (16, 8)

@@ -8,7 +8,7 @@ from drivers.errors import BadSetting
 from drivers.interfaces import Adjustable
 from drivers.v4l2 import abi, settings
 from drivers.v4l2.controls import CameraControl, ControlProblem
-from drivers.v4l2.stamps import SETTLE_FRAMES, ValuesSet
+from drivers.values_set import SETTLE_FRAMES, ValuesSet
 from hil_tests.drivers.v4l2.test_v4l2_never_old import bench
 from hil_tests.drivers.v4l2.v4l2_sensor import AUTO, EXPOSURE, Sensor
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from drivers.v4l2 import abi
-from drivers.v4l2.stamps import Spacing, StampCheck, StampRule, Timing, ValuesSet, Window, exposure_window
+from drivers.v4l2.stamps import Spacing, StampCheck, StampRule, Timing, Window, exposure_window
+from drivers.values_set import ValuesSet
 
 START = abi.BUF_FLAG_TIMESTAMP_MONOTONIC | 0x10000
 END = abi.BUF_FLAG_TIMESTAMP_MONOTONIC

@@ -1,0 +1,240 @@
+"""The settings that go by meaning: exposure, gain, white balance and focus, at the opening and at run time.
+
+Exposure and gain have several names in GenICam, all of which Aravis knows. For a white balance in kelvin and
+a focus there is no standard name; those here are The Imaging Source's.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from drivers.aravis.library import GenicamError, Library
+from drivers.aravis.options import AravisOptions
+from drivers.errors import BadSetting, DriverError, StreamFailed
+from drivers.interfaces import CameraSetting
+from drivers.values_set import ValuesSet
+
+OFF = "Off"
+ROUNDING = 1e-6  # of a value that went through the camera's own number format
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """Which features a setting is.
+
+    Attributes
+    ----------
+    name, word
+        As in `drivers.interfaces.SETTINGS`, and in words.
+    feature, automatic
+        The GenICam names of its value, also as chunk data, and of its automatic.
+    called
+        How Aravis calls it in its functions; empty: it has none for it.
+    unit
+        What one of the camera is worth.
+    """
+
+    name: str
+    word: str
+    feature: str
+    automatic: str
+    called: str = ""
+    unit: float = 1.0
+
+
+EXPOSURE = Meaning("exposure_s", "exposure time", "ExposureTime", "ExposureAuto", "exposure_time", 1e-6)
+GAIN = Meaning("gain", "gain", "Gain", "GainAuto", "gain")
+MEANINGS = (
+    EXPOSURE,
+    GAIN,
+    Meaning("white_balance_k", "white balance", "BalanceWhiteTemperature", "BalanceWhiteAuto"),
+    Meaning("focus", "focus", "Focus", "FocusAuto"),
+)
+CHUNKS = (EXPOSURE, GAIN)
+"""Those that GenICam has as chunk data."""
+
+
+class Control:
+    """One setting of one opened camera. Its methods raise GenicamError.
+
+    Attributes
+    ----------
+    exists
+        Whether the camera has it.
+    """
+
+    def __init__(self, arv: Library, camera: int, meaning: Meaning) -> None:
+        self._arv, self._camera, self.meaning = arv, camera, meaning
+        asked = (meaning.feature,) * (not meaning.called)
+        name = f"is_{meaning.called or 'feature'}_available"
+        self.exists = bool(arv(f"camera_{name}", camera, *asked))
+
+    def _kind(self) -> str:
+        """How GenICam keeps the feature."""
+        try:
+            self._arv("camera_get_float", self._camera, self.meaning.feature)
+        except GenicamError:
+            return "integer"
+        return "float"
+
+    @property
+    def automatic(self) -> bool:
+        """Whether the camera itself sets it now."""
+        name = self.meaning.automatic
+        if not self._arv("camera_is_feature_available", self._camera, name):
+            return False
+        return str(self._arv("camera_get_string", self._camera, name)) != OFF
+
+    def value(self) -> float | None:
+        """Return what is set now; None if the camera sets it itself."""
+        if self.automatic:
+            return None
+        one = self.meaning
+        if one.called:
+            return one.unit * float(self._arv(f"camera_get_{one.called}", self._camera))
+        return one.unit * float(self._arv(f"camera_get_{self._kind()}", self._camera, one.feature))
+
+    def bounds(self) -> tuple[float, float]:
+        """Return the least and the highest that may be set."""
+        one = self.meaning
+        kind = "" if one.called else self._kind()
+        number = ctypes.c_int64 if kind == "integer" else ctypes.c_double
+        low, high = number(), number()
+        asked = (one.feature,) if kind else ()
+        name = f"camera_get_{kind or one.called}_bounds"
+        self._arv(name, self._camera, *asked, ctypes.byref(low), ctypes.byref(high))
+        return one.unit * low.value, one.unit * high.value
+
+    def set(self, value: float) -> None:
+        """Turn its automatic off, and set it."""
+        if self.automatic:
+            self._arv("camera_set_string", self._camera, self.meaning.automatic, OFF)
+        one, counts = self.meaning, value / self.meaning.unit
+        if one.called:
+            self._arv(f"camera_set_{one.called}", self._camera, counts)
+        elif self._kind() == "float":
+            self._arv("camera_set_float", self._camera, one.feature, counts)
+        else:
+            self._arv("camera_set_integer", self._camera, one.feature, round(counts))
+
+
+def set_up(
+    arv: Library, camera: int, wanted: Mapping[str, float]
+) -> tuple[dict[str, float | None], list[str]]:
+    """Set what is wanted, by name, of a camera that is being opened.
+
+    Returns
+    -------
+    values
+        Of each setting that it has, None for one that its automatic sets.
+    problems
+        A sentence for each that it lacks, or that became another.
+
+    Raises
+    ------
+    GenicamError
+        If it refuses one.
+    """
+    values: dict[str, float | None] = {}
+    problems: list[str] = []
+    for one in MEANINGS:
+        control = Control(arv, camera, one)
+        if not control.exists:
+            if one.name in wanted:
+                problems.append(f"the camera has no control for {one.word}; it stays as it is")
+            continue
+        if one.name in wanted:
+            control.set(wanted[one.name])
+        value = values[one.name] = control.value()
+        if one.name in wanted:
+            problems += _other(one, value, wanted[one.name])
+    return values, problems
+
+
+def _other(one: Meaning, value: float | None, wanted: float) -> list[str]:
+    """A sentence for a value that became another than wanted; none if it did not."""
+    if value is None:
+        return [f"{one.name} stays with the camera's automatic where {wanted:.6g} was asked for"]
+    if math.isclose(value, wanted, rel_tol=ROUNDING, abs_tol=1e-12):
+        return []
+    return [f"{one.name} is {value:.6g} where {wanted:.6g} was asked for: the camera's nearest"]
+
+
+def settings_of(
+    arv: Library, camera: int, options: AravisOptions, period_s: float | None
+) -> list[CameraSetting]:
+    """Return what of a camera may be changed, as it is now.
+
+    ``period_s`` is from frame to frame and bounds an exposure; None if the camera is triggered or does not
+    say.
+
+    Raises
+    ------
+    GenicamError
+        If the camera does not answer.
+    """
+    found = []
+    for one in MEANINGS:
+        control = Control(arv, camera, one)
+        if not control.exists:
+            continue
+        low, high = control.bounds()
+        if one is EXPOSURE and period_s is not None:
+            high = min(high, period_s)
+        refusal = ""
+        if one.name == "focus" and one.feature not in options.features:
+            refusal = (
+                f"is not in the camera's options (features: {one.feature}), "
+                "so no restart could come back to the calibrated one"
+            )
+        found.append(
+            CameraSetting(one.name, control.value(), low, high, automatic=control.automatic, refusal=refusal)
+        )
+    return found
+
+
+def change(
+    arv: Library, camera: int, wanted: Mapping[str, float], in_force: Mapping[str, ValuesSet], device: str
+) -> tuple[dict[str, float], Sequence[str], DriverError | None]:
+    """Change settings one after the other, and note from which frame on each is in force.
+
+    Returns
+    -------
+    became
+        The new value of each that was changed, as the camera has it.
+    notes
+        A sentence for each that became another than asked for.
+    refused
+        The error of one that the camera did not take; those behind it were left alone.
+    """
+    became: dict[str, float] = {}
+    notes: list[str] = []
+    for one in MEANINGS:
+        if one.name not in wanted:
+            continue
+        values, value, why = in_force.get(one.name), None, ""
+        if values is None:
+            return became, notes, BadSetting(f"it has no control for {one.word}", device=device)
+        values.begin(time.monotonic())
+        try:
+            control = Control(arv, camera, one)
+            try:
+                control.set(wanted[one.name])
+            except GenicamError as error:
+                why = str(error)
+            value = control.value()
+        except GenicamError as error:
+            words = f"nobody knows whether {one.name} was changed: {why or error}"
+            return became, notes, StreamFailed(words, device=device)
+        finally:
+            values.end(value, time.monotonic())
+        if why or value is None:
+            words = why or "its automatic stays on"
+            return became, notes, BadSetting(f"{one.name} was not changed: {words}", device=device)
+        became[one.name] = value
+        notes += [f"{device}: {words}" for words in _other(one, value, wanted[one.name])]
+    return became, notes, None

@@ -1,0 +1,134 @@
+"""Exposure and gain of a GigE Vision camera changed as it streams: each frame is told what it truly has."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+
+from drivers.aravis import library
+from drivers.aravis.camera import AravisCamera, GenicamFrame, open_camera
+from drivers.errors import BadSetting
+from drivers.interfaces import Adjustable, HoldsExposure
+from drivers.values_set import SETTLE_FRAMES
+from hil_tests.drivers.aravis import gige_camera
+from hil_tests.drivers.aravis.gige_camera import GigeCamera
+from hil_tests.drivers.aravis.test_aravis_camera import ADDRESS, OPTIONS, truly_inside
+from hil_tests.waiting import NET_S, until
+
+pytestmark = pytest.mark.skipif(
+    not library.installed(), reason=f"libaravis-0.8 is not installed: {library.INSTALL}"
+)
+
+
+@pytest.fixture
+def device() -> Iterator[GigeCamera]:
+    camera = GigeCamera(ADDRESS, clock_ahead_s=77.0, more=True)
+    yield camera
+    camera.unplug()
+
+
+Opened = Callable[..., AravisCamera]
+
+
+@pytest.fixture
+def opened(device: GigeCamera) -> Iterator[Opened]:
+    """Opens a camera, which is closed before the device goes."""
+    with ExitStack() as cameras:
+
+        def opened(**options: Any) -> AravisCamera:
+            camera = open_camera({**OPTIONS, **options}, name="cam")
+            cameras.callback(camera.close)
+            return camera
+
+        yield opened
+
+
+def taken(camera: AravisCamera, device: GigeCamera) -> GenicamFrame:
+    """The next frame, whose window holds its true exposure and whose settings are true or not told."""
+    frame = camera.next_frame(time.monotonic(), NET_S)
+    assert truly_inside(frame, device)
+    began_s, ended_s = device.exposed_s[frame.camera_sequence - 1]
+    truly = {"exposure_s": ended_s - began_s, "gain": device.gains[frame.camera_sequence - 1]}
+    for name, value in truly.items():
+        told = frame.settings[name]
+        assert told is None or told == pytest.approx(value), f"{name} of frame {frame.sequence}"
+    return frame
+
+
+@pytest.mark.parametrize("behind", [0, 2])
+def test_a_frame_is_told_the_former_value_then_none_then_the_new_one(
+    device: GigeCamera, opened: Opened, behind: int
+) -> None:
+    device.behind = behind
+    camera = opened(features={"ChunkModeActive": False}, gain=3.0)
+    assert isinstance(camera, Adjustable)
+    assert isinstance(camera, HoldsExposure)
+    assert taken(camera, device).settings["exposure_s"] == pytest.approx(0.005)
+    assert camera.adjust({"exposure_s": 0.012}) == []
+    first = taken(camera, device)
+    assert first.settings["exposure_s"] is None
+    assert first.settings["gain"] == 3.0, "of the others nothing became unknown"
+    with camera.exposure_held():  # waits until the change shows
+        later = taken(camera, device)
+    assert later.settings["exposure_s"] == pytest.approx(0.012)
+    assert later.sequence >= first.sequence + SETTLE_FRAMES - 1
+
+
+def test_with_chunk_data_every_frame_is_told_its_own(device: GigeCamera, opened: Opened) -> None:
+    device.behind = 2
+    camera = opened(gain=3.0)
+    taken(camera, device)
+    camera.adjust({"exposure_s": 0.012, "gain": 9.0})
+    told = [taken(camera, device).settings for _ in range(SETTLE_FRAMES)]
+    assert not any(None in one.values() for one in told)
+    assert told[-1] == {
+        "exposure_s": pytest.approx(0.012), "gain": 9.0, "white_balance_k": 5000.0, "focus": 40.0
+    }  # fmt: skip
+
+
+def test_bounds_are_the_cameras_and_a_change_turns_the_automatic_off(
+    device: GigeCamera, opened: Opened
+) -> None:
+    camera = opened()
+    settings = {one.name: one for one in camera.settings()}
+    exposure, gain, focus = settings["exposure_s"], settings["gain"], settings["focus"]
+    assert (exposure.minimum, exposure.maximum) == pytest.approx((1e-7, 0.02))  # a frame's period
+    assert (gain.minimum, gain.maximum, gain.automatic, gain.value) == (0.1, 24.0, True, None)
+    assert settings["white_balance_k"].maximum == 10000.0
+    assert focus.refusal.startswith("is not in the camera's options (features: Focus)")
+    camera.adjust({"gain": 4.0, "white_balance_k": 3200.0})
+    values = {one.name: (one.value, one.automatic) for one in camera.settings()}
+    assert (values["gain"], values["white_balance_k"]) == ((4.0, False), (3200.0, False))
+
+
+def test_a_rounded_value_is_told_and_a_refused_one_too(device: GigeCamera, opened: Opened) -> None:
+    camera = opened()
+    (note,) = camera.adjust({"exposure_s": 0.004315})
+    assert note == "cam: exposure_s is 0.00432 where 0.004315 was asked for: the camera's nearest"
+    device.refuses.add(gige_camera.EXPOSURE)
+    with pytest.raises(BadSetting, match="cam: exposure_s was not changed: "):
+        camera.adjust({"exposure_s": 0.008, "gain": 5.0})
+    frame = until(lambda: (f := taken(camera, device)).settings["exposure_s"] and f, "settled")
+    assert frame.settings["exposure_s"] == pytest.approx(0.00432)
+
+
+def test_a_camera_that_is_opened_again_has_the_values_of_the_run_time(
+    device: GigeCamera, opened: Opened
+) -> None:
+    camera = opened(features={"Focus": 40})
+    camera.adjust({"exposure_s": 0.009, "gain": 7.0, "focus": 55.0})
+    device.unplug()
+    until(lambda: camera.capture.newest.lost, "the loss")
+    again = GigeCamera(ADDRESS, more=True)
+    try:
+        until(lambda: not camera.capture.newest.lost, "the return")
+        frame = taken(camera, again)
+    finally:
+        again.unplug()
+    assert frame.settings == {
+        "exposure_s": pytest.approx(0.009), "gain": 7.0, "white_balance_k": 5000.0, "focus": 55.0
+    }  # fmt: skip
