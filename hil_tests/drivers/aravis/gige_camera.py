@@ -299,6 +299,7 @@ class GigeCamera:
         parts.append((2, struct.pack(">II", kind, self._get(HEIGHT))))
         target = socket.inet_ntoa(struct.pack(">I", self._get(DESTINATION))), self._get(PORT) & 0xFFFF
         for index, (content, data) in enumerate(parts):
-            if not self.lose(self.frames, index) and not self._over.is_set():
+            listens = target[1] and not self._over.is_set()  # a stream that ended set its port to 0
+            if listens and not self.lose(self.frames, index):
                 head = struct.pack(">HHI", 0, number, content << 24 | index)
                 self._out.sendto(head + data, target)

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from typing import Any
+from collections.abc import Iterator
 
 import pytest
 
 from drivers.aravis import library
-from drivers.aravis.camera import AravisCamera, GenicamFrame, open_camera
+from drivers.aravis.camera import AravisCamera, GenicamFrame
 from drivers.errors import BadSetting
 from drivers.interfaces import Adjustable, HoldsExposure
 from drivers.values_set import SETTLE_FRAMES
 from hil_tests.drivers.aravis import gige_camera
 from hil_tests.drivers.aravis.gige_camera import GigeCamera
-from hil_tests.drivers.aravis.test_aravis_camera import ADDRESS, OPTIONS, truly_inside
+from hil_tests.drivers.aravis.test_aravis_camera import ADDRESS, OPENED, opened, truly_inside
 from hil_tests.waiting import NET_S, until
 
 pytestmark = pytest.mark.skipif(
@@ -28,23 +26,9 @@ pytestmark = pytest.mark.skipif(
 def device() -> Iterator[GigeCamera]:
     camera = GigeCamera(ADDRESS, clock_ahead_s=77.0, more=True)
     yield camera
+    while OPENED:
+        OPENED.pop().close()
     camera.unplug()
-
-
-Opened = Callable[..., AravisCamera]
-
-
-@pytest.fixture
-def opened(device: GigeCamera) -> Iterator[Opened]:
-    """Opens a camera, which is closed before the device goes."""
-    with ExitStack() as cameras:
-
-        def opened(**options: Any) -> AravisCamera:
-            camera = open_camera({**OPTIONS, **options}, name="cam")
-            cameras.callback(camera.close)
-            return camera
-
-        yield opened
 
 
 def taken(camera: AravisCamera, device: GigeCamera) -> GenicamFrame:
@@ -60,9 +44,7 @@ def taken(camera: AravisCamera, device: GigeCamera) -> GenicamFrame:
 
 
 @pytest.mark.parametrize("behind", [0, 2])
-def test_a_frame_is_told_the_former_value_then_none_then_the_new_one(
-    device: GigeCamera, opened: Opened, behind: int
-) -> None:
+def test_a_frame_is_told_the_former_value_then_none_then_the_new_one(device: GigeCamera, behind: int) -> None:
     device.behind = behind
     camera = opened(features={"ChunkModeActive": False}, gain=3.0)
     assert isinstance(camera, Adjustable)
@@ -78,7 +60,7 @@ def test_a_frame_is_told_the_former_value_then_none_then_the_new_one(
     assert later.sequence >= first.sequence + SETTLE_FRAMES - 1
 
 
-def test_with_chunk_data_every_frame_is_told_its_own(device: GigeCamera, opened: Opened) -> None:
+def test_with_chunk_data_every_frame_is_told_its_own(device: GigeCamera) -> None:
     device.behind = 2
     camera = opened(gain=3.0)
     taken(camera, device)
@@ -90,9 +72,7 @@ def test_with_chunk_data_every_frame_is_told_its_own(device: GigeCamera, opened:
     }  # fmt: skip
 
 
-def test_bounds_are_the_cameras_and_a_change_turns_the_automatic_off(
-    device: GigeCamera, opened: Opened
-) -> None:
+def test_bounds_are_the_cameras_and_a_change_turns_the_automatic_off(device: GigeCamera) -> None:
     camera = opened()
     settings = {one.name: one for one in camera.settings()}
     exposure, gain, focus = settings["exposure_s"], settings["gain"], settings["focus"]
@@ -105,7 +85,7 @@ def test_bounds_are_the_cameras_and_a_change_turns_the_automatic_off(
     assert (values["gain"], values["white_balance_k"]) == ((4.0, False), (3200.0, False))
 
 
-def test_a_rounded_value_is_told_and_a_refused_one_too(device: GigeCamera, opened: Opened) -> None:
+def test_a_rounded_value_is_told_and_a_refused_one_too(device: GigeCamera) -> None:
     camera = opened()
     (note,) = camera.adjust({"exposure_s": 0.004315})
     assert note == "cam: exposure_s is 0.00432 where 0.004315 was asked for: the camera's nearest"
@@ -116,9 +96,7 @@ def test_a_rounded_value_is_told_and_a_refused_one_too(device: GigeCamera, opene
     assert frame.settings["exposure_s"] == pytest.approx(0.00432)
 
 
-def test_a_camera_that_is_opened_again_has_the_values_of_the_run_time(
-    device: GigeCamera, opened: Opened
-) -> None:
+def test_a_camera_that_is_opened_again_has_the_values_of_the_run_time(device: GigeCamera) -> None:
     camera = opened(features={"Focus": 40})
     camera.adjust({"exposure_s": 0.009, "gain": 7.0, "focus": 55.0})
     device.unplug()
