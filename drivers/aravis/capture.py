@@ -302,9 +302,9 @@ class GenicamCapture:
             settings[name], highest = values.of(self._last_sequence, window.end_s, window.begin_s)
             if name == EXPOSURE.name and highest is not None:
                 window = self._window(filled, highest, triggered_s)
-        settings |= filled.told
-        if told_s := filled.told.get(EXPOSURE.name):
-            window = self._window(filled, told_s, triggered_s)
+        settings |= filled.sent
+        if sent_s := filled.sent.get(EXPOSURE.name):
+            window = self._window(filled, sent_s, triggered_s)
         frame = ArrivedGenicam(filled, window, settings, self._last_sequence, self._streams, received_s)
         self.newest.publish(frame, partial(self._made, device, filled.handle), dropped=dropped, late=False)
         held, self._held = self._held, filled.handle

@@ -54,7 +54,7 @@ class Filled(NamedTuple):
         The camera's count: 16 bits that leave out 0, or 64 bits.
     stamp_s, arrived_s
         The camera's stamp by its own clock, and when its first packet came, seconds of CLOCK_MONOTONIC.
-    told
+    sent
         The settings that the camera sent with it (chunk data), by name.
     """
 
@@ -63,7 +63,7 @@ class Filled(NamedTuple):
     number: int
     stamp_s: float
     arrived_s: float
-    told: Mapping[str, float]
+    sent: Mapping[str, float]
 
 
 class Device:
@@ -288,7 +288,7 @@ class Device:
             try:
                 return settings_of(self._arv, self._camera, self._options, self.period_s)
             except GenicamError as error:
-                raise StreamFailed(f"it does not tell its settings: {error}", device=self._name) from None
+                raise StreamFailed(f"its settings cannot be read: {error}", device=self._name) from None
 
     def change(
         self, wanted: Mapping[str, float], in_force: Mapping[str, ValuesSet]
@@ -319,7 +319,7 @@ class Device:
             arv("buffer_get_frame_id", handle),
             1e-9 * arv("buffer_get_timestamp", handle),
             now_s - ago_s,
-            {} if wrong else self._told_with(handle),
+            {} if wrong else self._sent_with(handle),
         )
 
     def _wrong_picture(self, handle: int) -> str:
@@ -332,7 +332,7 @@ class Device:
             "" if got == (width, height) else f"it has {got[0]}x{got[1]} px where {width}x{height} were set"
         )
 
-    def _told_with(self, handle: int) -> dict[str, float]:
+    def _sent_with(self, handle: int) -> dict[str, float]:
         """The settings that came with a buffer."""
         told = {}
         for one in self._chunks:

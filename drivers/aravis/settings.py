@@ -35,7 +35,7 @@ class Meaning:
     called
         How Aravis calls it in its functions; empty: it has none for it.
     unit
-        What one of the camera is worth.
+        Of the camera's own number, in that of `SETTINGS`.
     """
 
     name: str
@@ -228,7 +228,7 @@ def change(
                 why = str(error)
             value = control.value()
         except GenicamError as error:
-            words = f"nobody knows whether {one.name} was changed: {why or error}"
+            words = f"it is not known whether {one.name} was changed: {why or error}"
             return became, notes, StreamFailed(words, device=device)
         finally:
             values.end(value, time.monotonic())
