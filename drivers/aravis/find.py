@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
 import threading
 from dataclasses import dataclass
 from typing import Any
 
 from drivers.aravis.library import GenicamError, Library, installed, library
 from drivers.aravis.options import AravisOptions
-from drivers.errors import BadOptions, CameraBusy, NoCamera
+from drivers.errors import BadOptions, CameraBusy, NoCamera, StreamFailed, UnsupportedFormat
+from drivers.pixels import GENICAM
 
 _LISTING = threading.Lock()
 """Aravis has one list of devices, which each search makes anew."""
@@ -34,6 +36,51 @@ class FoundGenicam:
 def list_cameras() -> list[FoundGenicam]:
     """Return the cameras on network and USB, which takes a second; none if Aravis is not installed."""
     return _listed(library()) if installed() else []
+
+
+def options_for(camera: FoundGenicam, by_serial: bool, fastest_hz: float) -> dict[str, Any]:
+    """Return options that open a camera as it is now: its format (else the first that is read), region, rate.
+
+    Parameters
+    ----------
+    camera
+        It is opened for a moment, and nothing of it is set.
+    by_serial
+        Whether its serial number names it, else its id.
+    fastest_hz
+        The rate of one that is quicker now.
+
+    Raises
+    ------
+    DriverError
+        If another program has it, it does not answer, or it has no format that is read.
+    """
+    name = camera.words
+    arv, handle = library(name), open_camera(AravisOptions(id=camera.id), name)
+    try:
+        offered = arv.texts("camera_dup_available_pixel_formats_as_strings", handle)
+        now = arv("camera_get_pixel_format_as_string", handle)
+        read = [one for one in (now, *offered) if one in GENICAM]
+        if not read:
+            raise UnsupportedFormat(
+                f"this driver reads none of its formats {', '.join(offered)}", device=name
+            )
+        region = [ctypes.c_int() for _ in range(4)]
+        arv("camera_get_region", handle, *(ctypes.byref(one) for one in region))
+        x, y, width, height = (one.value for one in region)
+        has_rate = arv("camera_is_frame_rate_available", handle)
+        rate_hz = arv("camera_get_frame_rate", handle) if has_rate else 0.0
+    except GenicamError as error:
+        raise StreamFailed(f"it cannot be asked: {error}", device=name) from None
+    finally:
+        arv.unref(handle)
+    return {
+        **({"serial": camera.serial} if by_serial else {"id": camera.id}),
+        "format": read[0],
+        "size_px": [width, height],
+        **({"offset_px": [x, y]} if (x, y) != (0, 0) else {}),
+        "rate_hz": round(min(rate_hz, fastest_hz), 3) if rate_hz > 0 else None,
+    }
 
 
 def is_meant(options: AravisOptions, found: FoundGenicam) -> bool:

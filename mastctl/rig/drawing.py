@@ -80,7 +80,7 @@ def configuration(
         "listen": {"host": "127.0.0.1", "port": 8420},
         "pan_tilt": {"driver": driver, "options": {"port": port, **options}},
         "cameras": {
-            name: {"driver": "v4l2", "options": dict(camera.options)}
+            name: {"driver": camera.driver, "options": dict(camera.options)}
             for name, camera in zip(names, cameras, strict=False)
         },
         "limits": {

@@ -6,7 +6,7 @@ Nothing that is there is ever replaced. Without any hardware the folder holds th
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
@@ -92,7 +92,7 @@ def write_rig(
         MAST: _MAST_WORDS.encode() + dump_mapping(drawing(name, cameras, answers)),
     }
     names = camera_names(len(cameras))
-    known = [tuple(usb_of(_device(camera, machine), machine)) for camera in cameras]
+    known = [tuple(_usb_of(camera, machine)) for camera in cameras]
     alike = [name for name, one in zip(names, known, strict=True) if one and known.count(one) > 1]
     files[RULES] = rules(head, plugged, machine, alike).encode()
     notes = [f"{' and '.join(alike)} {SAME_SERIAL}"] if alike else []
@@ -155,9 +155,13 @@ _MAST_WORDS = """\
 """
 
 
-def _device(camera: PluggedCamera, machine: ExaminedMachine) -> Path:
-    """A camera's folder in sysfs."""
-    return machine.at("/sys/class/video4linux") / camera.node.name / "device"
+def _usb_of(
+    camera: PluggedCamera, machine: ExaminedMachine, by_socket: bool = False
+) -> Iterator[tuple[str, str]]:
+    """What singles out a camera's node for udev; nothing for a camera without one."""
+    if camera.node is None:
+        return iter(())
+    return usb_of(machine.at("/sys/class/video4linux") / camera.node.name / "device", machine, by_socket)
 
 
 def rules(
@@ -174,7 +178,7 @@ def rules(
         lines += _rule('SUBSYSTEM=="tty", SUBSYSTEMS=="usb"', list(usb_of(device, machine)), LINE[5:])
     for name, camera in zip(camera_names(len(plugged.cameras)), plugged.cameras, strict=False):
         about = 'SUBSYSTEM=="video4linux", ATTR{index}=="0"'
-        matches = list(usb_of(_device(camera, machine), machine, by_socket=name in alike))
+        matches = list(_usb_of(camera, machine, by_socket=name in alike))
         lines += _rule(about, matches, f"v4l/by-id/mast-{name.replace('_', '-')}")
     return text + "\n".join(lines) + "\n" if len(lines) > 2 else text
 

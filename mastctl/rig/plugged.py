@@ -14,6 +14,8 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
+from drivers.aravis import find as genicam
+from drivers.aravis import library as genicam_library
 from drivers.dynamixel import workshop as dynamixel
 from drivers.dynamixel.models import MODELS
 from drivers.dynamixel.settings import POLL_BYTES
@@ -88,6 +90,10 @@ PTU_BAUDS = (9600, 38_400)
 """As units come from the factory, and as docs/how-to/hardware.md has them set up."""
 LEAST_PX, USUAL_HZ = (640, 480), 30.0
 MOST_CAMERAS, BY_ID = 2, "by-id"
+NO_GENICAM = (
+    "no camera was found; GigE Vision and USB3 Vision cameras are found only with the library Aravis: "
+    f"{genicam_library.INSTALL}"
+)
 BY_HAND = "write it into configuration and mast file by hand (configs/rigs/rover.yaml has six)"
 
 
@@ -139,12 +145,23 @@ class PluggedHead:
 
 @dataclass(frozen=True)
 class PluggedCamera:
-    """A camera that has a format that is read: its names, its node now, and options of driver ``v4l2``."""
+    """A camera that has a format that is read.
+
+    Attributes
+    ----------
+    card, bus
+        Its names.
+    node
+        Its node now; None for a camera of GigE Vision or USB3 Vision.
+    options, driver
+        Its options, and of which driver they are.
+    """
 
     card: str
     bus: str
-    node: Path
+    node: Path | None
     options: dict[str, Any]
+    driver: str = "v4l2"
 
     @property
     def words(self) -> str:
@@ -260,6 +277,19 @@ def ask_cameras() -> tuple[list[PluggedCamera], list[str]]:
             others.append(f"{one.card} at {one.bus}: {error}")
             continue
         cameras.append(PluggedCamera(one.card, one.bus, one.node, options))
+    industrial = sorted(genicam.list_cameras(), key=lambda one: (one.serial, one.id))
+    serials = [one.serial for one in industrial]
+    for camera in industrial:
+        by_serial = bool(camera.serial) and serials.count(camera.serial) == 1
+        try:
+            options = genicam.options_for(camera, by_serial, USUAL_HZ)
+        except DriverError as error:
+            others.append(str(error))
+            continue
+        names = f"{camera.vendor} {camera.model} {camera.serial}", camera.address or camera.protocol
+        cameras.append(PluggedCamera(*names, None, options, "aravis"))
+    if not cameras and not genicam_library.installed():
+        others.append(NO_GENICAM)
     return cameras, others
 
 

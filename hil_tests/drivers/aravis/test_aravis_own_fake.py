@@ -38,8 +38,7 @@ def _locked(lock: socket.socket) -> bool:
     return True
 
 
-@pytest.fixture
-def fake() -> Iterator[Start]:
+def fakes() -> Iterator[Start]:
     """Starts Aravis's fake; one at a time on a machine, since all have one address and port."""
     running: list[subprocess.Popen[str]] = []
 
@@ -57,6 +56,9 @@ def fake() -> Iterator[Start]:
         for process in running:
             process.kill()
             process.communicate()
+
+
+fake = pytest.fixture(name="fake")(fakes)
 
 
 def is_ramp(frame: GenicamFrame) -> bool:
