@@ -193,7 +193,8 @@ def ready_pair(
 ) -> Pair:
     """Open the line and make both servos ready, without moving them: checked, set up, holding, armed.
 
-    Without a watchdog an axis may still be under way: each is told to stand first, whatever the other does.
+    Without a watchdog an axis may still be under way. Each is commanded to stand first, whatever the other
+    does.
     An axis whose torque was dropped to set it up holds again if it cannot be made ready.
 
     ``reboots`` are those done to this head; ``urgent``, ``clock`` and ``open_line`` are those of `Link`.

@@ -76,4 +76,4 @@ def _stood(axis: FeetechAxis) -> str:
         return "has its torque off"
     if (held := servo.get("goal_position")) != goal:  # nobody answers the packet that says so
         raise NoReply(f"{servo.name} did not take the command to stand, its goal is {held}")
-    return "was told to stand where it is, and holds"
+    return "was commanded to stand where it is, and holds"

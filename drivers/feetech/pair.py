@@ -110,8 +110,9 @@ def ready_pair(
 ) -> FeetechPair:
     """Open the line and make both servos ready, without moving them: checked, set up, holding.
 
-    Each is told to stand first, whatever the other does: it may still be under way. ``questions`` and
-    ``offsets`` are of the head, over all its lines; ``urgent``, ``clock`` and ``open_line`` of `Port`.
+    Without a lease each is commanded to stand first, whatever the other does: it may still be under way.
+    ``questions`` and ``offsets`` are of the head, over all its lines; ``urgent``, ``clock`` and ``open_line``
+    of `Port`.
 
     Raises
     ------

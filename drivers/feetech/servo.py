@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
-from drivers.errors import BadReply, HardwareFault, NoReply, WrongDevice
+from drivers.errors import DriverError, HardwareFault, WrongDevice
 from drivers.feetech.link import FeetechLink
 from drivers.feetech.models import LOCKED, MODELS_BY_NUMBER, POSITION_MODE, UNLOCKED, status_words
 from drivers.feetech.settings import FeetechAxisSettings, FeetechSettings
@@ -210,7 +210,8 @@ class FeetechServo:
                 else:
                     self._link.write_unanswered(self.servo_id, self._registers[name], value, model)
         finally:
-            self.set("lock", LOCKED)
+            with self._link.undisturbed():  # a stop or a closing that broke it off leaves none unlocked
+                self.set("lock", LOCKED)
 
     @property
     def profile(self) -> tuple[int, int]:
@@ -263,7 +264,7 @@ class FeetechServo:
                 self.set("torque_enable", 0)
             if "torque_limit" in self._registers:
                 self.set("torque_limit", self.torque_limit)
-        except (NoReply, BadReply, WrongDevice) as error:
+        except DriverError as error:
             log.warning("%s is not left as it should be at the end: %s", self.name, error)
 
 

@@ -160,12 +160,18 @@ def set_id(
             )
         link.write(old, registers["torque_enable"], 0, model)
     link.write(old, registers["lock"], UNLOCKED, model)
-    if old != new:
-        link.write_unanswered(old, registers["id"], new, model)
-    if new_baud is not None and new_baud != link.baud:
-        link.write_unanswered(new, registers["baud"], BAUD_RATES.index(new_baud), model)
-        link.set_baud(new_baud)
-    link.write(new, registers["lock"], LOCKED, model)
+    try:
+        if old != new:
+            link.write_unanswered(old, registers["id"], new, model)
+        if new_baud is not None and new_baud != link.baud:
+            link.write_unanswered(new, registers["baud"], BAUD_RATES.index(new_baud), model)
+            link.set_baud(new_baud)
+        link.write(new, registers["lock"], LOCKED, model)
+    except BaseException:  # it has the one id or the other, and its EEPROM stays unlocked under neither
+        for servo_id in {new, old}:
+            with suppress(DriverError):
+                link.write(servo_id, registers["lock"], LOCKED, model)
+        raise
     link.ping(new)
 
 

@@ -89,7 +89,7 @@ class ServoPair(ABC, Generic[L, X]):
             with self.link.undisturbed():
                 for axis in self.axes:
                     if axis.servo.dropped:
-                        _hold_again(axis.servo)
+                        _hold_again(axis)
             raise
 
     def close(self) -> None:
@@ -97,11 +97,13 @@ class ServoPair(ABC, Generic[L, X]):
         self.link.close()
 
 
-def _hold_again(servo: HeldServo) -> None:
+def _hold_again(axis: ServoAxis[Any, Any]) -> None:
     """Switch on the torque that setting a servo up has dropped; never raises."""
+    servo: HeldServo = axis.servo
+    low, high = axis.settings.limit_counts
     servo.dropped = False
     try:
-        servo.set("goal_position", servo.look().counts)
+        servo.set("goal_position", min(max(servo.look().counts, low), high))  # it may droop beyond a limit
         servo.set("torque_enable", 1)
     except DriverError as error:
         log.warning("%s: its torque is off and could not be switched on again: %s", servo.name, error)

@@ -165,8 +165,9 @@ class ViscaHead:
     def stop(self) -> None:
         """Stop both axes and see that they stand; they hold there.
 
-        If another call is under way the command goes out at once, and again in its turn. Raises NoReply,
-        BadReply, LineLost if the head did not confirm, or still moves.
+        If another call is under way the command goes out at once, and again in its turn. A line that is away
+        is tried at once: no silence stops a head. Raises NoReply, BadReply, Refused, LineLost, WrongDevice if
+        the head did not confirm, or still moves.
         """
         self._stops += 1
         if not self._turn.acquire(blocking=False):
@@ -203,14 +204,17 @@ class ViscaHead:
 
     @contextmanager
     def _talking(self, held: bool = False) -> Any:
-        """The head, for one caller at a time; a line that turns out dead is closed."""
+        """The head, for one caller at a time; a line that turns out dead is closed.
+
+        A stop has ``held`` the turn already, and tries a line that is away at once.
+        """
         if not held:
             self._turn.acquire()
         try:
             if self._closed:
                 raise NoReply("it is closed", device=DEVICE)
             if self._line is None:
-                self._connect()
+                self._connect(at_once=held)
             yield
         except LineLost as error:
             if self._line is not None:
@@ -221,9 +225,9 @@ class ViscaHead:
             if not held:
                 self._turn.release()
 
-    def _connect(self) -> None:
-        """Open the line and stop the head, which may still be under way; not too often."""
-        if self._time.now_s() < self._absence.again_s:
+    def _connect(self, at_once: bool = False) -> None:
+        """Open the line and stop the head, which may still be under way; not too often, or at once."""
+        if not at_once and self._time.now_s() < self._absence.again_s:
             self._absence.check()
         try:
             self._line = self._open_line(self._options.port, self._options.baud, DEVICE)
@@ -286,8 +290,13 @@ class ViscaHead:
 
         Raises NoReply, Refused, LineLost.
         """
-        for _ in range(STOP_TRIES):
-            self._order(stop_command(self._options.address))
+        for left in reversed(range(STOP_TRIES)):
+            try:
+                self._order(stop_command(self._options.address))
+            except (NoReply, Refused):
+                if not left:
+                    raise
+                continue
             self._forget_targets()
             until_s = self._time.now_s() + BRAKES_WITHIN_S
             while (asked_s := self._time.now_s()) < until_s:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import subprocess
 import sys
 import threading
@@ -201,6 +202,31 @@ def test_a_state_is_waited_for(client: Client, go: threading.Event) -> None:
     assert told["state"] == words[-1] == "ready"
     with pytest.raises(ClientError, match=r"the state is ready and not stopped after 0\.2 s"):
         client.wait_state("stopped", timeout_s=0.2)
+
+
+@pytest.mark.parametrize("way", ["operation", "state", "track"])
+def test_a_wait_on_a_daemon_that_hangs_ends_with_its_time(way: str) -> None:
+    waits: dict[str, Callable[[Client], Any]] = {
+        "operation": lambda client: client.wait("000001", 0.2),
+        "state": lambda client: client.wait_state("ready", timeout_s=0.2),
+        "track": lambda client: client.wait_track("000001", 0.2),
+    }
+    ended = threading.Event()
+
+    def hang(listener: socket.socket) -> None:
+        connection, _ = listener.accept()
+        with connection:
+            connection.recv(65536)
+            ended.wait(NET_S / 3)  # less than the usual patience with one request
+
+    with socket.create_server(("127.0.0.1", 0)) as listener, ThreadPoolExecutor(1) as pool:
+        hangs = pool.submit(hang, listener)
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        with Client(url) as client, pytest.raises(ClientError, match="took the request but did not") as told:
+            waits[way](client)
+        hung = not hangs.done()
+        ended.set()
+    assert told.value.code == "timeout" and hung
 
 
 def test_importing_the_client_loads_no_image_library() -> None:

@@ -327,8 +327,8 @@ def _daemon(args: argparse.Namespace) -> Iterator[Client]:
                 if running["mast"]["digest"] != digest_of(config.mast_file.read_bytes()):
                     raise CommandError(
                         "other_daemon",
-                        f"the daemon at {listen.url} uses the mast file {running['mast']['file']}, and the "
-                        f"configuration names {config.mast_file.name}; end it, or give --url",
+                        f"the daemon at {listen.url} uses a {running['mast']['file']} that differs from "
+                        f"{config.mast_file}; end it, give --url, or a --config with another listen.port",
                     )
                 yield client
                 return

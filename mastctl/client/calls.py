@@ -5,7 +5,8 @@ A question is a coroutine over a `mastctl.client.connection.DaemonConnection`, w
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+import math
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, Literal, cast
 from urllib.parse import quote
@@ -52,15 +53,17 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
     def __init__(self, daemon: DaemonConnection) -> None:
         self._daemon = daemon
 
+    def _longest_s(self, timeout_s: float | None) -> float:
+        """Longest time of a request: the connection's, or what is left of a wait if that is less."""
+        return min(self._daemon.timeout_s, math.inf if timeout_s is None else timeout_s)
+
     async def status(self, timeout_s: float | None = None) -> Status:
         """Return what the daemon knows at this moment.
 
         ``timeout_s`` shortens the longest time of this request, seconds. Another program's answer is
         ``bad_answer``.
         """
-        longest_s = self._daemon.timeout_s
-        timeout_s = longest_s if timeout_s is None else min(timeout_s, longest_s)
-        status = await self._daemon.json(Status, "GET", "/status", timeout=timeout_s)
+        status = await self._daemon.json(Status, "GET", "/status", timeout=self._longest_s(timeout_s))
         if not isinstance(status.get("state"), str) or "mast" not in status:
             raise self._daemon.bad_answer("its status has no state, or no mast")
         return status
@@ -134,9 +137,10 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
             body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
         return await self._daemon.json(PreviewTold, "POST", "/point/preview", json=body)
 
-    async def operation(self, operation_id: str) -> OperationTold:
-        """Return an operation's record."""
-        return await self._daemon.json(OperationTold, "GET", f"/operations/{quote(operation_id, safe='')}")
+    async def operation(self, operation_id: str, timeout_s: float | None = None) -> OperationTold:
+        """Return an operation's record; ``timeout_s`` as of `status`."""
+        path = f"/operations/{quote(operation_id, safe='')}"
+        return await self._daemon.json(OperationTold, "GET", path, timeout=self._longest_s(timeout_s))
 
     async def operations(self) -> list[OperationListed]:
         """Return the newest operations, newest first, without their steps."""
@@ -162,7 +166,11 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
         """
         told = 0
         query = {"topics": "operation", "key": operation_id}
-        changes = followed(self._daemon, query, lambda: self.operation(operation_id), timeout_s)
+
+        def ask(within_s: float) -> Awaitable[OperationTold]:
+            return self.operation(operation_id, within_s)
+
+        changes = followed(self._daemon, query, ask, timeout_s)
         async for record in changes:
             for step in record["steps"][told:]:
                 told += 1
@@ -223,7 +231,7 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
         return await self._daemon.json(EstopTold, "POST", "/estop", json=told)
 
     async def reset(self, *, reason: str, name: str, latched_by: str | None = None) -> ResetTold:
-        """Release an emergency stop, of several that of ``of``; nothing moves before the next command."""
+        """Release an emergency stop, of several that of ``latched_by``; a later command moves again."""
         told = {"reason": reason, "name": name, **({} if latched_by is None else {"latched_by": latched_by})}
         return await self._daemon.json(ResetTold, "POST", "/reset", json=told)
 
@@ -266,9 +274,9 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
             body["time_s"] = time_s
         return await self._daemon.json(PoseTaken, "POST", "/pose", json=body)
 
-    async def track(self) -> TrackTold:
-        """Return the track as it is."""
-        return await self._daemon.json(TrackTold, "GET", "/track")
+    async def track(self, timeout_s: float | None = None) -> TrackTold:
+        """Return the track as it is; ``timeout_s`` as of `status`."""
+        return await self._daemon.json(TrackTold, "GET", "/track", timeout=self._longest_s(timeout_s))
 
     async def start_track(
         self,

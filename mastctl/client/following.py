@@ -15,13 +15,14 @@ AGAIN_S = (0.1, 0.5, 1.0)  # pauses before a stream that broke is begun again
 SILENT_S = 10.0  # the daemon shows every 2 s that it is there
 LAST_S = 3.0  # of a wait: then it ends to the moment, and not with the next sign of life
 PASSING = ("no_daemon", "timeout", "closing")
+LEAST_S = 1.0  # for a request, on a machine that is busy
 ASK_S = 0.25  # between questions to a daemon that has no stream left
 
 
 async def followed(
     daemon: DaemonConnection,
     query: Mapping[str, Any],
-    ask: Callable[[], Awaitable[T]],
+    ask: Callable[[float], Awaitable[T]],
     timeout_s: float,
 ) -> AsyncGenerator[T]:
     """Yield a value as it is, then at each change, for some seconds.
@@ -34,7 +35,7 @@ async def followed(
     query
         Which events, of one topic and key.
     ask
-        Returns the value by a request of its own.
+        Returns the value by a request of its own that may take so many seconds.
 
     Raises
     ------
@@ -46,7 +47,7 @@ async def followed(
     pauses: list[float] = []  # a daemon that does not answer at the beginning is told at once
     while True:
         try:
-            yield await ask()
+            yield await ask(max(until_s - time.monotonic(), LEAST_S))
             pauses = pauses or list(AGAIN_S)  # it answers
             async with aclosing(_stream(daemon, query, until_s)) as values:
                 async for value in values:

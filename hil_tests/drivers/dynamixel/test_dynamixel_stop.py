@@ -16,7 +16,7 @@ from drivers.dynamixel.head import DynamixelHead
 from drivers.dynamixel.link import Link
 from drivers.dynamixel.pair import Pair
 from drivers.dynamixel.servo import Servo
-from drivers.errors import DriverError, LineLost, NoReply
+from drivers.errors import DriverError, LineLost, NoReply, WrongDevice
 from drivers.servo_bus.bus import Bus
 from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.dynamixel_packets import BROADCAST, Instruction
@@ -471,6 +471,27 @@ def test_an_axis_whose_torque_was_dropped_to_set_it_up_holds_again_when_that_is_
         getattr(head, overtaking)()
         assert broken_off == [1]
         assert table["torque_enable"] == 1
+
+
+def test_an_axis_that_droops_beyond_its_limit_holds_again_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    with opened(options={"torque_off_at_start": True, "watchdog_s": 0}) as (it, head):
+        it.line.hang_up()
+        it.until(lambda: failed(head) and head._session is None, "the line to be given up")
+        servo, true_set = it.servos[1], Servo.set
+        servo.table["return_delay_time"] = 250  # somebody else has set it
+        low = head.settings.tilt.limit_counts[0]
+
+        def fails(one: Servo, name: str, value: int) -> None:
+            if name == "return_delay":
+                it.axes[1].to_count(it.now_s(), (low - 2 - 2048) * COUNT_RAD, 50.0)
+                it.until(lambda: not it.axes[1].under_way(it.now_s()), "it droops")
+                raise WrongDevice("no")
+            true_set(one, name, value)
+
+        monkeypatch.setattr(Servo, "set", fails)
+        it.line.come_back()
+        it.until(lambda: isinstance(failed(head), WrongDevice), "the refusal")
+        assert servo.table["torque_enable"] == 1
 
 
 def test_a_move_whose_goals_went_out_but_that_is_told_as_failed_brakes(

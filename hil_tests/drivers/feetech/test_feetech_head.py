@@ -19,7 +19,7 @@ from drivers.errors import BadOptions, DriverError, HardwareFault, NoReply, Watc
 from drivers.faults import FaultPanel
 from drivers.feetech import workshop
 from drivers.feetech.head import FeetechHead, halt, open_head
-from drivers.feetech.link import open_link
+from drivers.feetech.link import FeetechLink, open_link
 from drivers.feetech.servo import FeetechServo
 from drivers.feetech.settings import feetech_settings
 from drivers.sim.axis import AxisSettings
@@ -126,7 +126,7 @@ def test_without_a_lease_a_move_goes_on_when_the_host_hangs_and_halt_ends_it() -
         it.clock.sleep(0.3)
         told = halt(it.options(), it.clock, it.line.open)
         assert told == [
-            "pan (servo 1) was told to stand where it is, and holds",
+            "pan (servo 1) was commanded to stand where it is, and holds",
             "tilt (servo 2) has its torque off",
         ]
         rested = it.pan_rad()
@@ -146,6 +146,55 @@ def test_permanent_settings_are_written_once_with_the_lock_open_for_them_alone()
         it.servos[0].set_power(False, it.now_s())
         it.servos[0].set_power(True, it.now_s())
         assert it.servos[0].memory["return_delay"] == 0, "it was saved"
+
+
+def test_a_line_that_is_lost_after_the_last_stop_is_let_go_of(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with bench() as it:
+        head, plain, closed = it.open(), FeetechServo.release, []
+
+        def release(servo: FeetechServo) -> None:
+            it.line.hang_up()
+            plain(servo)
+
+        monkeypatch.setattr(FeetechServo, "release", release)
+        true_close = FeetechLink.close
+        monkeypatch.setattr(FeetechLink, "close", lambda link: (closed.append(link), true_close(link)))
+        head.close()
+        assert len(closed) == 1
+        assert "pan (servo 1) is not left as it should be at the end" in caplog.text
+        assert "tilt (servo 2) is not left as it should be at the end" in caplog.text
+
+
+def test_closing_that_breaks_off_a_set_up_leaves_the_eeprom_locked_and_the_axis_holding(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with opened(options={"lease_s": 0, "torque_off_at_start": True}) as (it, head):
+        it.line.hang_up()
+        it.until(lambda: failed(head) and head._session is None, "the line to be given up")
+        memory, plain, unlocked = it.servos[1].memory, FeetechServo.set, it.gate()
+        memory["return_delay"] = 250  # somebody else has set it
+
+        def set_late(servo: FeetechServo, name: str, value: int) -> None:
+            if name == "return_delay" and not unlocked.is_open:
+                unlocked.set()
+                it.until(head._bus.urgent, "the closing")
+            plain(servo, name, value)
+
+        monkeypatch.setattr(FeetechServo, "set", set_late)
+        locks: list[tuple[int, int]] = []
+        true_close = FeetechLink.close
+
+        def close(link: FeetechLink) -> None:
+            locks.append((memory["lock"], memory["torque_enable"]))
+            true_close(link)
+
+        monkeypatch.setattr(FeetechLink, "close", close)
+        it.line.come_back()
+        unlocked.wait()
+        head.close()
+        assert locks == [(1, 1)]
 
 
 def test_an_offset_in_the_eeprom_is_told_and_never_written(caplog: pytest.LogCaptureFixture) -> None:
@@ -296,6 +345,23 @@ def test_halt_does_not_take_a_servo_for_stopped_that_missed_the_command(
         monkeypatch.setattr(FeetechServo, "send", lambda self, goal: None)  # lost on the line
         with pytest.raises(NoReply, match="did not take the command to stand, its goal is 2700"):
             halt(it.options(), it.clock, it.line.open)
+
+
+@pytest.mark.parametrize("mishap", [None, KeyboardInterrupt], ids=["the id is lost", "ctrl-c"])
+def test_a_change_of_id_that_fails_leaves_the_eeprom_locked(
+    mishap: type[BaseException] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lost(*told: object) -> None:
+        if mishap is not None:
+            raise mishap
+
+    with bench() as it:
+        link = open_link(it.line.path, 1_000_000, 0.05, clock=it.clock, open_line=it.line.open)
+        monkeypatch.setattr(FeetechLink, "write_unanswered", lost)
+        with pytest.raises(mishap or NoReply):
+            workshop.set_id(link, 1, 7)
+        link.close()
+        assert it.servos[0].memory["lock"] == 1
 
 
 @pytest.mark.parametrize("amplitude_rad", [0.05, 0.3])

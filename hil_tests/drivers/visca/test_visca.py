@@ -16,7 +16,16 @@ from typing import Any
 import pytest
 
 from drivers.clock import SystemClock
-from drivers.errors import BadOptions, BadReply, DriverError, NoReply, OutOfRange, Refused, WrongDevice
+from drivers.errors import (
+    BadOptions,
+    BadReply,
+    DriverError,
+    LineLost,
+    NoReply,
+    OutOfRange,
+    Refused,
+    WrongDevice,
+)
 from drivers.faults import FaultPanel
 from drivers.sim.heads import AxisSettings
 from drivers.sim.wire.axis import WireAxis
@@ -131,6 +140,23 @@ def test_a_stop_takes_no_late_answer_to_the_move_before_it_for_its_own() -> None
         head.stop()
         assert it.axes[0].velocity_rad_per_s(it.now_s()) == 0.0
         assert 0.0 < it.axes[0].angle_rad(it.now_s()) < 0.5
+
+
+def test_a_stop_is_sent_again_when_its_answer_is_lost_and_tries_a_line_that_is_away_at_once() -> None:
+    with opened() as (it, head):
+        head.move(0.9, 0.0, 0.2)
+        it.panel.set("pan_tilt", "mute", replies=1)
+        head.stop()
+        assert it.axes[0].velocity_rad_per_s(it.now_s()) == 0.0
+        head.move(0.9, 0.0, 0.2)
+        it.line.hang_up()
+        for _ in range(8):  # each failed try waits longer before the next one
+            it.clock.sleep(2.0)
+            with pytest.raises(LineLost):
+                head.read()
+        it.line.come_back()
+        head.stop()
+        assert it.axes[0].velocity_rad_per_s(it.now_s()) == 0.0
 
 
 def test_a_head_that_does_not_obey_a_stop_is_told() -> None:

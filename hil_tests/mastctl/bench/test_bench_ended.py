@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -25,6 +26,8 @@ from calib.survey.reader import read_survey
 from calib.survey.writer import NotWritten, write_survey
 from calib.targets.board_file import save_board
 from calib.targets.boards import Charuco
+from hil_tests.mastctl.outside_daemon import write_config
+from hil_tests.mastctl.service_fakes import FakeHardware
 from mastctl.bench.eyes import BenchInterrupted, BenchLook, NoLight
 from mastctl.bench.folder import RunFolder, looks_of
 from mastctl.bench.run import BenchRun
@@ -32,6 +35,7 @@ from mastctl.bench.search import BoardNotFound, BoardSearch
 from mastctl.bench.teller import Terminal
 from mastctl.cli import calibrate_bench
 from mastctl.cli.main import main
+from mastctl.daemon import RunningDaemon
 from tools.sim_survey.bench import BenchPlan, simulate_bench
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
@@ -81,6 +85,21 @@ def test_whatever_ends_a_run_says_where_all_is_kept_and_that_the_same_command_go
     assert exit_code == code and said in told
     assert KEPT.format(folder=tmp_path / "m.bench") in told
     assert not (tmp_path / "m.yaml").exists()
+
+
+def test_a_daemon_with_another_mast_file_of_the_same_name_is_told_by_the_path_of_ours(
+    pair: tuple[RunningDaemon, FakeHardware], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "ours").mkdir()
+    config = write_config(tmp_path / "ours", f"{{port: {urlsplit(pair[0].url).port}}}")
+    mast_file = config.parent / "little.yaml"
+    mast_file.write_text(mast_file.read_text() + "# ours\n")
+    save_board(tmp_path / "board.yaml", Charuco(10, 7, 0.055, 0.042))
+    words = ["--board", tmp_path / "board.yaml", "--out", tmp_path / "m.yaml", "--config", config, "--json"]
+    assert main(["calibrate", "bench", *map(str, words)]) == 1
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert error["code"] == "other_daemon"
+    assert f"uses a little.yaml that differs from {mast_file}; end it" in error["message"]
 
 
 def test_a_disk_that_is_full_leaves_a_folder_that_is_whole_and_gone_on_with_when_there_is_room(

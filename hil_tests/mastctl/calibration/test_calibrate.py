@@ -65,6 +65,8 @@ def test_json_has_the_contracts_keys_and_the_truth_within_its_sigmas(
         assert (sigma < 0.01).all()
     assert told["mast"]["axis_offset_m"] == 0.0
     assert told["seconds"] > 0
+    for joint in ("pan", "tilt"):
+        assert any(f"an offset of {joint} is no parameter" in words for words in told["held_fixed"])
     assert told["verdict"]["grade"] == "good", told["verdict"]
     kinds = {one["kind"]: one for one in told["sigmas_found"]}
     assert set(kinds) == {"dots of navcam_left", "dots of navcam_right", "tapes", "prisms"}

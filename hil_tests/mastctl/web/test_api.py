@@ -692,7 +692,7 @@ def test_the_sun_is_told_kept_out_and_forgotten(web: httpx.Client) -> None:
     answer = web.post("/limits/sun", json=body).json()
     told, boxes = answer["sun"], answer["boxes"]
     assert any(low <= 0.1 <= high for low, high in (box["pan_rad"] for box in boxes))
-    assert told["holds"] and told["frame"] == "site" and 3600.0 - NET_S < told["left_s"] <= 3600.0
+    assert told["active"] and told["frame"] == "site" and 3600.0 - NET_S < told["left_s"] <= 3600.0
     assert "keep-out sun" in refused(web.post("/point", json=ANGLES), 422, "keep_out")
     vector = {"direction": [-2.0, 0.0, 0.0], "frame": "rover", "half_angle_rad": 0.2}
     assert web.post("/limits/sun", json=vector).json()["sun"]["direction"] == [-1.0, 0.0, 0.0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from hil_tests.mastctl.guided.guided_world import BEGUN, DONE, HEAD, PLACE, PROG
 from hil_tests.mastctl.service_fakes import HTTP, FakeHardware, ScriptedLoop
 from hil_tests.mastctl.web.network import network_daemon
 from hil_tests.waiting import NET_S, until
+from mastctl.answers.bench import BenchResult, BenchRunTold
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.guided.guide import WayIn
@@ -29,6 +31,13 @@ client = Client(URL, name="bench calibration")
 client.use_lease(os.environ["MASTCTL_LEASE"])
 """
 """As the real program does: by what it finds in its environment."""
+
+
+def test_the_page_reads_only_what_a_bench_calibration_tells(repository: Path) -> None:
+    page = "".join(one.read_text() for one in (repository / "mastctl/web/operator").glob("bench*.js"))
+    for name, told in (("run", BenchRunTold), ("result", BenchResult)):
+        read = set(re.findall(rf"\b{name}\??\.([a-z_]+)", page))
+        assert read and read <= told.__annotations__.keys(), read - told.__annotations__.keys()
 
 
 def scripted(daemon: RunningDaemon, script: str) -> None:

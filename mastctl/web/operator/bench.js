@@ -187,7 +187,7 @@ export class Bench {
     this.error.hidden = !run.curve.length;
     put(this.plot, curve(run));
     const next = run.next_rad && !["done", "interrupted"].includes(run.state) ? row("Most helps now", `pan ${deg(run.next_rad[0], 0)}, tilt ${deg(run.next_rad[1], 0)}: to ${px(run.expected_px)}`) : null;
-    put(this.facts, row("Now, wanted", `${px(run.predicted_px)}, ${px(run.target_px)}`), row("Counts alone leave", px(run.floor_px)), row("Pictures a camera", ["done", "interrupted"].includes(run.state) ? String(run.pictures) : `${run.pictures} of ${run.most} at most`), next);
+    put(this.facts, row("Now, wanted", `${px(run.predicted_px)}, ${px(run.target_px)}`), row("Counts alone leave", px(run.counts_px)), row("Pictures a camera", ["done", "interrupted"].includes(run.state) ? String(run.pictures) : `${run.pictures} of ${run.most} at most`), next);
     put(this.table.lastChild, h("tr", {}, h("th", { scope: "col" }, "pictures"), h("th", { scope: "col" }, "predicted, px")), run.curve.map(([k, value]) => h("tr", {}, h("td", { class: "n" }, k), h("td", { class: "n" }, number(value, 3)))));
   }
 

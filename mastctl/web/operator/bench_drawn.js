@@ -77,7 +77,7 @@ export function curve(run) {
   const [width, height, left, low] = [300, 190, 44, 166];
   const known = run.curve;
   const target = run.target_px ?? run.wanted_px;
-  const values = [...known.map(([, px]) => px), target, run.floor_px].filter((one) => one > 0);
+  const values = [...known.map(([, px]) => px), target, run.counts_px].filter((one) => one > 0);
   const [top, bottom] = [Math.max(2 * target, ...values) * 1.3, Math.min(...values) / 1.5];
   const x = (pictures) => left + ((width - left - 10) * pictures) / Math.max(run.most, ...known.map(([k]) => k), 1);
   const y = (px) => low - ((low - 8) * Math.log(px / bottom)) / Math.log(top / bottom);
@@ -89,7 +89,7 @@ export function curve(run) {
     s("path", { class: "ring", d: `M${left} 8V${low}H${width - 10}` }),
     s("path", { class: "wanted", d: `M${left} ${y(target)}H${width - 10}` }),
     s("text", { class: "wanted-name end", x: width - 12, y: y(target) - 4 }, `wanted ${shownPx(target)} px`),
-    run.floor_px ? [s("path", { class: "counts", d: `M${left} ${y(run.floor_px)}H${width - 10}` }), s("text", { class: "tickname start", x: left + 4, y: y(run.floor_px) - 4 }, "counts alone")] : null,
+    run.counts_px ? [s("path", { class: "counts", d: `M${left} ${y(run.counts_px)}H${width - 10}` }), s("text", { class: "tickname start", x: left + 4, y: y(run.counts_px) - 4 }, "counts alone")] : null,
     known.length > 1 ? s("polyline", { class: "line", points: known.map(([k, px]) => `${x(k).toFixed(1)},${y(px).toFixed(1)}`).join(" ") }) : null,
     last ? s("circle", { class: "tip", cx: x(last[0]), cy: y(last[1]), r: 4 }) : null,
     s("text", { class: "tickname start", x: left, y: height - 8 }, "0"), s("text", { class: "tickname end", x: width - 10, y: height - 8 }, `${run.most} pictures`));

@@ -26,7 +26,7 @@ BOTH = tuple[RunningDaemon, FakeHardware]
 Visits = Callable[..., Visit]
 
 STANDS = {"event": "stands", "name": "p1"}
-SECOND = {**PLACE, "name": "p2", "bearing_deg": 50.0, "words": "50 degrees right"}
+SECOND = {**PLACE, "name": "p2", "bearing_deg": 50.0, "description": "50 degrees right"}
 SAID = {"event": "said", "sentence": "pointed at corner 7: residual -0.01, 0.02 px"}
 ENDS = (
     "import shutil\nshutil.copy(os.path.join(os.path.dirname(MAST), 'little.yaml'), MAST)\n"
