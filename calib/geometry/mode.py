@@ -6,7 +6,8 @@ axis, hence H' = s H + t A and V' likewise for every model: a pixel is (H.q, V.q
 H x V against A, which is right: the picture is a mirror image.
 
 The lens of OpenCV's families stands in the camera's axes, y of which is V's part across A. Where V is turned
-over, these axes are turned by half a turn about A. Coefficients whose terms are even change their sign then.
+over, these axes are turned by half a turn about A. Coefficients whose terms are even change their sign then,
+and control points of splines, which stand around A, change their places and signs.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ def in_mode(model: CameraModel, mode: Mode) -> CameraModel:
     Raises
     ------
     BadMode
-        As `pixel_change`; and for a splined lens that is turned upside down.
+        As `pixel_change`.
 
     Examples
     --------
@@ -133,9 +134,10 @@ def in_mode(model: CameraModel, mode: Mode) -> CameraModel:
         letter: change.scale[axis] * vector + change.shift[axis] * model.A
         for axis, (letter, vector) in enumerate((("H", model.H), ("V", model.V)))
     }
-    if mode.flip[1] and model.free_lens is not None:
-        if model.spline is not None:
-            raise BadMode("a splined lens that is turned upside down has no control points of its own")
+    if mode.flip[1] and model.spline is not None:
+        control = model.distortion.reshape(model.spline.rows, model.spline.columns, 2)
+        moved["distortion"] = -control[::-1, ::-1].ravel()
+    elif mode.flip[1] and model.free_lens is not None:
         moved["distortion"] = model.distortion * _signs(model)
     return replace(model, size_px=change.size_px, **moved)
 

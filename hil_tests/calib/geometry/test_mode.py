@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.geometry.cahvor import CameraModel
+from calib.geometry.cahvor import SPLINED, CameraModel
 from calib.geometry.covariance import pixel_rates, stored_covariance
 from calib.geometry.lenses import opencv
+from calib.geometry.lenses.spline import SplineGrid
 from calib.geometry.mode import BadMode, Mode, in_mode, pixel_change, rig_in_mode
 from calib.geometry.parameters import parameter_names
 from calib.geometry.pointing import solve
@@ -78,7 +79,7 @@ def test_pixels_of_every_mode_are_those_of_opencv_with_a_scaled_matrix(count: in
         assert np.abs(seen - expected)[valid].max() < SAME_PX, mode
 
 
-@pytest.mark.parametrize("kind", ["CAHV", "CAHVOR", "CAHVORE", "OPENCV_FISHEYE"])
+@pytest.mark.parametrize("kind", ["CAHV", "CAHVOR", "CAHVORE", "OPENCV_FISHEYE", "splines 2", "splines 3"])
 def test_rays_and_pixels_of_other_models_agree_with_the_full_picture(kind: str) -> None:
     camera = cahvor()
     if kind == "CAHVORE":
@@ -89,6 +90,12 @@ def test_rays_and_pixels_of_other_models_agree_with_the_full_picture(kind: str) 
         )
     elif kind == "CAHV":
         camera = replace(camera, kind="CAHV", O=None, R=None)
+    elif kind.startswith("splines"):
+        grid = SplineGrid(int(kind[-1]), 11, 9, 130.0)
+        control = 0.01 * np.random.default_rng(2).normal(size=2 * 11 * 9)
+        camera = CameraModel.of_matrix(
+            SPLINED, SIZE, camera.camera_matrix, control, camera.rotation, camera.C, grid
+        )
     pixels = np.stack(np.meshgrid(np.linspace(100, 600, 7), np.linspace(45, 435, 6)), axis=-1).reshape(-1, 2)
     full = camera.ray(pixels)
     assert full.valid.all()
