@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
+from numbers import Real
+from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import BadReply, BadSetting, DriverError
@@ -111,12 +113,7 @@ class CameraSettings:
         camera = self._cameras[name]
         if not isinstance(camera, Adjustable):
             return [], self._holds[name] > 0
-        told = list(camera.settings())
-        for one in told:
-            if not isinstance(one, CameraSetting) or one.name not in SETTINGS:
-                words = f"settings returned {getattr(one, 'name', type(one).__name__)!r}"
-                raise BadReply(f"{words} where one of {', '.join(SETTINGS)} is expected", device=name)
-        return told, self._holds[name] > 0
+        return [_believed(one, name) for one in camera.settings()], self._holds[name] > 0
 
     def _note_focus(self, name: str, before: Sequence[CameraSetting]) -> None:
         """Compare a camera's focus with that of before its first change."""
@@ -139,6 +136,39 @@ class _Refocused:
     calibrated: float
     now: float
     since_s: float
+
+
+def _believed(one: object, camera: str) -> CameraSetting:
+    """A driver's word on a setting, its numbers as Python's own. Raises BadReply for what cannot be."""
+    if not isinstance(one, CameraSetting) or one.name not in SETTINGS:
+        words = f"settings returned {getattr(one, 'name', type(one).__name__)!r}"
+        raise BadReply(f"{words} where one of {', '.join(SETTINGS)} is expected", device=camera)
+    found: dict[str, Any] = {}
+    for key, is_right, expected in _RIGHT:
+        found[key] = value = getattr(one, key)
+        if not is_right(value):
+            words = f"settings returned {one.name} with {key} {value!r}"
+            raise BadReply(f"{words} where {expected} is expected", device=camera)
+        if _is_number(value):
+            found[key] = float(value)
+    if found["minimum"] > found["maximum"]:
+        words = f"settings returned {one.name} with minimum {one.minimum:g} above maximum {one.maximum:g}"
+        raise BadReply(words, device=camera)
+    return CameraSetting(one.name, **found)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+_RIGHT: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
+    ("value", lambda value: value is None or _is_number(value), "a finite number or None"),
+    ("minimum", _is_number, "a finite number"),
+    ("maximum", _is_number, "a finite number"),
+    ("step", lambda value: _is_number(value) and value >= 0, "a finite number of 0 or more"),
+    ("automatic", lambda value: isinstance(value, bool), "True or False"),
+    ("refusal", lambda value: isinstance(value, str), "a text"),
+)
 
 
 def check_wanted(known: Sequence[CameraSetting], wanted: Mapping[str, float], camera: str) -> None:

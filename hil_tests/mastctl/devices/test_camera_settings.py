@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from drivers.errors import BadReply, BadSetting, Refused
@@ -143,11 +144,37 @@ def test_a_camera_that_refuses_says_so_and_is_no_fault(client: Client, left: Set
     assert not client.status()["faults"]
 
 
-def test_a_driver_that_tells_a_setting_nobody_knows_is_told(client: Client, left: SetCamera) -> None:
+ODD: tuple[tuple[Any, ...], ...] = (
+    (1.0, 0.0, float("inf")),
+    (float("nan"), 0.0, 2.0),
+    ("1", 0.0, 2.0),
+    (1.0, 0.0, None),
+    (1.0, 3.0, 2.0),
+    (1.0, 0.0, 2.0, -1.0),
+    (1.0, 0.0, 2.0, 0.0, None),
+    (1.0, 0.0, 2.0, 0.0, False, None),
+)
+
+
+def test_a_driver_that_tells_what_cannot_be_is_told_and_nothing_has_changed(
+    client: Client, left: SetCamera
+) -> None:
     left.told = CameraSetting("iris", 1.0, 0.0, 2.0)
     assert "'iris' where one of exposure_s" in refused(
         BadReply.code, lambda: client.camera_settings("navcam_left")
     )
+    for odd in ODD:
+        left.told = CameraSetting("gain", *odd)
+        for act in (client.camera_settings, lambda name: client.set_camera(name, gain=1)):
+            words = refused(BadReply.code, lambda act=act: act("navcam_left"))  # type: ignore[misc]
+            assert words.startswith("navcam_left: settings returned gain with "), words
+    assert not left.sets
+
+
+def test_numbers_of_numpy_are_numbers(client: Client, left: SetCamera) -> None:
+    left.told = CameraSetting("gain", np.float32(1.5), np.int64(1), np.float64(2.0))  # type: ignore[arg-type]
+    (gain,) = client.set_camera("navcam_left", gain=1)["settings"]
+    assert (gain["value"], gain["minimum"], gain["maximum"]) == (1.5, 1.0, 2.0)
 
 
 def test_who_does_not_hold_the_lease_changes_nothing(client: Client, pair: Pair, left: SetCamera) -> None:
