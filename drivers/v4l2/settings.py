@@ -97,14 +97,15 @@ def settings_of(node: Node, options: CameraOptions, period_s: float | None) -> l
     for one in MEANINGS:
         if (control := first_of(controls, (one.control,))) is None:
             continue
-        highest = control.maximum * one.unit
-        if one is EXPOSURE and period_s is not None:
-            highest = min(highest, period_s)
+        lowest, highest = control.minimum * one.unit, control.maximum * one.unit
+        if one is EXPOSURE and period_s is not None:  # in whole steps, or rounding would exceed it
+            whole_s = math.floor(period_s / one.unit + 1e-6) * one.unit
+            highest = max(lowest, min(highest, whole_s))
         found.append(
             CameraSetting(
                 one.name,
                 value_of(node, controls, one),
-                control.minimum * one.unit,
+                lowest,
                 highest,
                 control.step * one.unit,
                 is_automatic(node, controls, one),

@@ -71,11 +71,11 @@ class CameraSettings:
                 words = "an operation compares its pictures and holds its settings; wait for it or stop it"
                 raise NotNow("busy", f"{name}: {words}")
             before, _ = self._told(name)
-            check_wanted(before, wanted, name)
+            changes = check_wanted(before, wanted, name)
             camera = self._cameras[name]
             assert isinstance(camera, Adjustable)
             try:
-                return [str(note) for note in camera.adjust(wanted)]
+                return [str(note) for note in camera.adjust(changes)]
             finally:
                 if "focus" in wanted:
                     self._note_focus(name, before)
@@ -171,9 +171,15 @@ _RIGHT: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
 )
 
 
-def check_wanted(known: Sequence[CameraSetting], wanted: Mapping[str, float], camera: str) -> None:
-    """Pass settings that a camera has, can change, and that are within its bounds. Raises BadSetting."""
+def check_wanted(
+    known: Sequence[CameraSetting], wanted: Mapping[str, float], camera: str
+) -> dict[str, float]:
+    """Return settings that a camera has, can change, and that are within its bounds. Raises BadSetting.
+
+    Bounds are shown with six digits, and one that comes back so is the bound.
+    """
     has = {one.name: one for one in known}
+    found: dict[str, float] = {}
     for name, value in wanted.items():
         if name not in has:
             words = f"it has {', '.join(has)}" if has else "nothing of it can be changed while it runs"
@@ -181,9 +187,12 @@ def check_wanted(known: Sequence[CameraSetting], wanted: Mapping[str, float], ca
         one, unit = has[name], SETTINGS[name] and f" {SETTINGS[name]}"
         if one.refusal:
             raise BadSetting(f"{name} {one.refusal}", device=camera)
-        if not (math.isfinite(value) and one.minimum <= value <= one.maximum):
-            words = f"{one.minimum:g} to {one.maximum:g}{unit} is expected"
-            raise BadSetting(f"{name} is to be {value:g}{unit}, {words}", device=camera)
+        low, high = f"{one.minimum:g}", f"{one.maximum:g}"
+        if not min(float(low), one.minimum) <= value <= max(float(high), one.maximum):
+            words = f"{name} is to be {value:g}{unit}, {low} to {high}{unit} is expected"
+            raise BadSetting(words, device=camera)
+        found[name] = min(max(value, one.minimum), one.maximum)
+    return found
 
 
 class ExposureHold:

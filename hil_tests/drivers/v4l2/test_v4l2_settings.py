@@ -65,6 +65,9 @@ def test_bounds_are_the_cameras_and_the_frames(monkeypatch: pytest.MonkeyPatch) 
         assert exposure.automatic and exposure.value is None
         assert gain.automatic and (gain.minimum, gain.maximum) == (0.0, 255.0)
         assert not focus.automatic and focus.value == 30.0 and not focus.refusal
+    with bench(monkeypatch, "uvc", told_hz=60.0, rate_hz=60.0, controls=ALL, values=VALUES) as seen:
+        highest_s = seen.camera.settings()[0].maximum
+        assert highest_s == pytest.approx(0.0166), "whole steps, and no longer than a frame"
 
 
 def test_a_focus_that_no_restart_could_come_back_to_and_an_exposure_of_a_group_stand_fixed(

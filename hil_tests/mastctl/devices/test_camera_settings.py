@@ -261,3 +261,13 @@ def test_bounds_belong_to_the_settings() -> None:
     for value in (0.999, 4.001, float("nan"), float("inf")):
         with pytest.raises(BadSetting, match="1 to 4 is expected"):
             check_wanted(known, {"gain": value}, "eye")
+
+
+def test_a_bound_as_it_is_shown_is_the_bound() -> None:
+    """Six digits are shown: 3 counts of 1e-4 s are above 0.0003 by a bit, 1/60 s is below 0.0166667."""
+    known = [CameraSetting("exposure_s", 0.01, 3 * 1e-4, 1 / 60, 1e-4)]
+    for value, bound in ((0.0003, 3 * 1e-4), (0.0166667, 1 / 60), (0.01, 0.01)):
+        assert check_wanted(known, {"exposure_s": value}, "eye") == {"exposure_s": bound}
+    for value in (0.00029999, 0.0166668):
+        with pytest.raises(BadSetting, match=r"0\.0003 to 0\.0166667 s is expected"):
+            check_wanted(known, {"exposure_s": value}, "eye")

@@ -8,7 +8,7 @@ const plain = (value) => String(Number(value.toPrecision(6)));
 
 export class Settings {
   constructor() {
-    this.choice = h("select", { "aria-label": "Camera", onchange: () => this.look() });
+    this.choice = h("select", { "aria-label": "Camera", onchange: () => this.choose() });
     this.rows = h("table", { class: "figures" });
     this.set = h("button", { type: "submit" }, "Set");
     this.hint = h("p", { class: "quiet" });
@@ -23,7 +23,16 @@ export class Settings {
     if (names.join() === this.names?.join()) return;
     this.names = names;
     put(this.choice, names.map((name) => h("option", { value: name }, called(name))));
-    this.look();
+    this.choose();
+  }
+
+  /** Another camera: the fields of the one before must not stand beside its name, also where it does not answer. */
+  choose() {
+    this.now = null;
+    put(this.rows);
+    for (const told of [this.hint, this.said]) say(told, "");
+    this.set.disabled = true;
+    return this.look();
   }
 
   allow(may) {
@@ -69,6 +78,7 @@ export class Settings {
   }
 
   async send() {
+    if (!this.now) return;
     const changed = [...this.fields].filter(([one, field]) => field.value !== "" && field.value !== (one.value === null ? "" : plain(one.value)));
     if (!changed.length) return;
     try {
