@@ -30,6 +30,7 @@ HEADS = {
     "dynamixel": "drivers.dynamixel.head",
     "feetech": "drivers.feetech.head",
     "flir_ptu": "drivers.flir_ptu.head",
+    "pelco": "drivers.pelco.head",
     "visca": "drivers.visca.head",
 }
 """Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them, and whose

@@ -79,6 +79,7 @@ DRIVER_OF = {
     "feetech_pty": "feetech",
     "ptu_pty": "flir_ptu",
     "visca_pty": "visca",
+    "pelco_pty": "pelco",
 }
 
 
@@ -114,6 +115,8 @@ def test_a_head_of_this_repository_goes_through_it(
         more = ""
     if driver == "visca":
         ends = [f"count_rad: {VISCA_COUNT_RAD}, fastest_rad_per_s: {SPEED_RAD_PER_S}, {end}" for end in ends]
+    if driver == "pelco":
+        ends = [f"fastest_rad_per_s: {SPEED_RAD_PER_S}, {end}" for end in ends]
     options = f"{{port: {port}, {more}pan: {{{ends[0]}}}, tilt: {{{ends[1]}}}}}"
     pan_tilt = f"{{driver: {driver}, options: {options}}}"
     last = bench(repository, configuration(tmp_path, pan_tilt))

@@ -35,10 +35,11 @@ KERNEL = pytest.mark.long(
     2, "in the quick run it is on a turned clock; here each case drives a head for seconds"
 )
 LONG = [pytest.param(name, marks=KERNEL) for name in REAL]
-WIRES = ["dynamixel", "feetech", "ptu", "visca"]
+WIRES = ["dynamixel", "feetech", "ptu", "visca", "pelco"]
 OTHER = pytest.mark.long(2, "its session is that of Dynamixel's, and quick where a line is wanted (feetech)")
-SAME = [pytest.param(name, marks=OTHER) for name in ("feetech", "scs", "visca")]
-QUICK = [name for name in TURNED if name not in ("feetech", "scs", "visca")]
+LATER = ("feetech", "scs", "visca", "pelco", "pelco_p")
+SAME = [pytest.param(name, marks=OTHER) for name in LATER]
+QUICK = [name for name in TURNED if name not in LATER]
 MADE = {**RIGS, **TURNED}
 T = TypeVar("T")
 
@@ -59,7 +60,8 @@ def trial_of(rig: HeadRig) -> HeadTrial:
     """The rig as the checks of heads take one."""
     return HeadTrial(
         rig.head, LIMITS_RAD, 1.0, limits_rad=LIMITS_RAD, own_limits=True,
-        count_rad=rig.count_rad, settle_rad=rig.settle_rad, true_rad=rig.true_rad, clock=rig.clock,
+        count_rad=rig.count_rad, settle_rad=rig.settle_rad, step_rad=rig.step_rad,
+        true_rad=rig.true_rad, clock=rig.clock,
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ REAL = pytest.mark.long(
 
 
 OTHER = pytest.mark.long(3, "the same of other heads; the bus and session of Feetech's are Dynamixel's")
-LATER = [pytest.param(name, marks=OTHER) for name in ("feetech", "feetech_echo", "scs", "visca")]
+LATER = [pytest.param(name, marks=OTHER) for name in ("feetech", "feetech_echo", "scs", "visca", "pelco")]
 
 
 @pytest.mark.parametrize(

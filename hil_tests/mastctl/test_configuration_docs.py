@@ -22,6 +22,7 @@ from drivers.errors import BadOptions
 from drivers.feetech import settings as feetech
 from drivers.flir_ptu import options as flir_ptu
 from drivers.hardware import CAMERAS, HEADS, OURS
+from drivers.pelco import options as pelco
 from drivers.recordings.replay import OPTIONS as REPLAY_OPTIONS
 from drivers.sim import settings as simulation
 from drivers.sim.camera_settings import CameraSettings, TemperatureSettings
@@ -147,6 +148,11 @@ def visca_options() -> dict[str, Any]:
     return {"port": "/dev/x", "pan": axis, "tilt": axis}
 
 
+def pelco_options() -> dict[str, Any]:
+    axis = {"limits_rad": [-0.5, 0.5], "fastest_rad_per_s": 1.0}
+    return {"port": "/dev/x", "pan": axis, "tilt": axis}
+
+
 def v4l2_options() -> dict[str, Any]:
     return {"device": "/dev/v4l/by-id/x", "exposure_s": 0.01, "auto_exposure": {}}
 
@@ -184,6 +190,8 @@ def known_of(driver: str) -> set[str]:
         return options_known(feetech.feetech_settings, feetech_options())
     if driver == "flir_ptu":
         return options_known(flir_ptu.options_from, ptu_options())
+    if driver == "pelco":
+        return options_known(pelco.options_from, pelco_options())
     if driver == "visca":
         return options_known(visca.options_from, visca_options())
     if driver == "aravis":
@@ -251,6 +259,7 @@ SOURCES: dict[str, tuple[str, Callable[[dict[str, Any]], Any], Callable[[], dict
     "dynamixel": ("Options of `dynamixel`", dynamixel.dynamixel_settings, dynamixel_options),
     "feetech": ("Options of `feetech`", feetech.feetech_settings, feetech_options),
     "flir_ptu": ("Options of `flir_ptu`", flir_ptu.options_from, ptu_options),
+    "pelco": ("Options of `pelco`", pelco.options_from, pelco_options),
     "visca": ("Options of `visca`", visca.options_from, visca_options),
     "v4l2": ("Options of `v4l2`", lambda values: v4l2.parse_options(values, "cam_left"), v4l2_options),
     "aravis": (

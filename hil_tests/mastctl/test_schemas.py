@@ -18,6 +18,7 @@ from drivers.errors import BadOptions
 from drivers.feetech.settings import feetech_settings
 from drivers.flir_ptu import options as flir_ptu
 from drivers.hardware import CAMERAS, HEADS
+from drivers.pelco import options as pelco
 from drivers.visca import options as visca
 from hil_tests.calib.files import test_store
 from hil_tests.calib.survey import test_survey
@@ -127,19 +128,20 @@ def test_a_broken_file_is_refused_by_the_schema_as_by_the_program(schemas: dict[
 
 AXIS = {"id": 1, "model": "XM430-W350", "limits_rad": [-1.0, 1.0]}
 FEETECH, XL430, XC330 = {"model": "STS3215"}, {"model": "XL430-W250"}, {"model": "xc330_t181"}
-COUNTED = {"count_rad": 0.001, "fastest_rad_per_s": 1.0}
+OWN = {"visca": {"count_rad": 0.001, "fastest_rad_per_s": 1.0}, "pelco": {"fastest_rad_per_s": 1.0}}
 READERS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "dynamixel": dynamixel_settings,
     "feetech": feetech_settings,
     "flir_ptu": flir_ptu.options_from,
+    "pelco": pelco.options_from,
     "visca": visca.options_from,
 }
 
 
 def options_of(driver: str, pan: dict[str, Any], **more: Any) -> dict[str, Any]:
     """Good options of a driver with these in their place."""
-    if driver in ("flir_ptu", "visca"):
-        own = COUNTED if driver == "visca" else {}
+    if driver in ("flir_ptu", "pelco", "visca"):
+        own: dict[str, Any] = OWN.get(driver, {})
         axes = {axis: {**own, "limits_rad": [-0.5, 0.5]} for axis in ("pan", "tilt")}
     else:
         own = FEETECH if driver == "feetech" else {}
@@ -171,6 +173,8 @@ BROKEN_OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "too late a reply": ("dynamixel", options_of("dynamixel", {}, reply_timeout_s=0.3)),
     "slow brakes": ("feetech", options_of("feetech", {}, acceleration_rad_per_s2=0.4)),
     "more counts than VISCA has": ("visca", options_of("visca", {"count_rad": 1e-5})),
+    "a count of Pelco's own": ("pelco", options_of("pelco", {"count_rad": 0.001})),
+    "more than a turn": ("pelco", options_of("pelco", {"limits_rad": [-3.2, 3.2]})),
 }
 OPTIONS_CANNOT = {
     "one id for both": "one value against another",
@@ -184,6 +188,7 @@ OPTIONS_CANNOT = {
     "too late a reply": "one value against another",
     "slow brakes": "one value against another",
     "more counts than VISCA has": "one value against another",
+    "more than a turn": "one value against another",
 }
 """What a schema cannot say of options, and why; the driver says it when it is opened."""
 
@@ -209,6 +214,7 @@ def test_broken_options_are_refused_by_the_schema_as_by_the_driver(schemas: dict
         ("feetech", options_of("feetech", {"model": "sts3215"})),
         ("flir_ptu", options_of("flir_ptu", {"approach": "none"}, port="socket://bench:4000")),
         ("visca", options_of("visca", {}, port="/dev/serial/by-id/usb-x")),
+        ("pelco", options_of("pelco", {"resolution_rad": 0.001}, protocol="P", baud=2400)),
     ],
 )
 def test_what_a_driver_takes_its_schema_takes(

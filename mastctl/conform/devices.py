@@ -35,7 +35,7 @@ from mastctl.devices.opening import Bounds, head_beside, open_one_camera
 
 log = logging.getLogger(__name__)
 
-COUNTS = {"dynamixel": 3, "feetech": 3, "flir_ptu": 1, "visca": 1}
+COUNTS = {"dynamixel": 3, "feetech": 3, "flir_ptu": 1, "pelco": 1, "visca": 1}
 """How many counts from its goal a head of this repository may stand when it calls itself settled."""
 
 STOPS_WITHIN_S = 3.0
@@ -109,6 +109,7 @@ def head_under_test(
         )  # fmt: skip
         if count_rad is not None:
             trial.settle_rad = COUNTS[settings.pan_tilt.driver] * count_rad
+            trial.step_rad = step_of(settings.pan_tilt)
         try:
             try:
                 first = trial.read()
@@ -209,12 +210,26 @@ def count_of(device: DeviceSettings) -> float | None:
 
         read = options_from(options)
         return max(read.pan.count_rad, read.tilt.count_rad)
+    if device.driver == "pelco":
+        from drivers.pelco.options import options_from as pelco_options_from
+
+        pelco = pelco_options_from(options)
+        return max(pelco.pan.resolution_rad, pelco.tilt.resolution_rad)
     if device.driver == "flir_ptu":
         from drivers.flir_ptu.workshop import facts
 
         found = facts(str(options.get("port")), int(options.get("baud", 9600)))
         return math.radians(max(found.pan.resolution_arcsec, found.tilt.resolution_arcsec) / 3600)
     return None
+
+
+def step_of(device: DeviceSettings) -> float:
+    """Return the way that a head makes at its own speed, whatever was asked, radians."""
+    if device.driver != "pelco":
+        return 0.0
+    from drivers.pelco.options import options_from
+
+    return options_from(device.options).step_rad
 
 
 ALL: Mapping[str, Sequence[Check[Any]]] = {"head": HEADS.checks, "camera": CAMERAS.checks}

@@ -258,7 +258,7 @@ def fastest_seen(trial: HeadTrial, asked_rad_per_s: float) -> tuple[float, float
             angles = np.interp(moments_s, stamps_s, [angles[axis] for _, angles in readings])
         fastest = max(fastest, float(np.abs(np.diff(angles)).max()) / step_s)
     count_rad = OUTSIDE_COUNT_RAD if trial.count_rad is None else trial.count_rad
-    return fastest, 2 * count_rad / step_s
+    return fastest, (2 * count_rad + trial.step_rad) / step_s
 
 
 @HEADS.check(

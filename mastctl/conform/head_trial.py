@@ -43,6 +43,8 @@ class HeadTrial:
         One count; None: not known.
     settle_rad
         How far from its goal a settled head may stand, beyond the rounding to counts.
+    step_rad
+        The way that an axis may make at its own speed: a head that keeps a speed only as a mean.
     true_rad
         Where the axes truly are at a moment of the last minute; None where nobody knows.
     open_again
@@ -62,6 +64,7 @@ class HeadTrial:
     own_limits: bool = False
     count_rad: float | None = None
     settle_rad: float = 0.006
+    step_rad: float = 0.0
     true_rad: Callable[[float], Angles] | None = None
     open_again: Callable[[], PanTilt] | None = None
     closed: bool = False

@@ -48,6 +48,7 @@ from tools.campaigns.servo_rigs import (
     feetech,
     fresh_servos,
     opened_on,
+    pelco,
     ptu,
     visca,
 )
@@ -62,6 +63,8 @@ DRIVERS: dict[str, Callable[[], AbstractContextManager[HeadRig]]] = {
     "scs": partial(feetech, "SCS0009", lease_s=0.2, reply_timeout_s=0.05, turned=True),
     "ptu": partial(ptu, turned=True),
     "visca": partial(visca, turned=True),
+    "pelco": partial(pelco, turned=True),
+    "pelco_p": partial(pelco, "P", turned=True),
 }
 """Those without ``_pty`` on a turned clock, without real time."""
 MIXTURE = "mixture"

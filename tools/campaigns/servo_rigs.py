@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.head import DynamixelHead
@@ -23,6 +23,9 @@ from drivers.faults import FaultPanel
 from drivers.feetech.head import open_head as open_feetech
 from drivers.flir_ptu.head import open_head as open_flir_ptu
 from drivers.interfaces import PanTilt
+from drivers.pelco.head import open_head as open_pelco
+from drivers.pelco.options import UNIT_RAD as PELCO_COUNT_RAD
+from drivers.pelco.options import PelcoOptions
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.sim.axis import AxisSettings
 from drivers.sim.heads import HeadSettings
@@ -35,6 +38,7 @@ from drivers.sim.wire.feetech_bus import FeetechBus
 from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
 from drivers.sim.wire.line import PtyLine, TcpLine
 from drivers.sim.wire.memory_line import MemoryLine
+from drivers.sim.wire.pelco import SimulatedPelco
 from drivers.sim.wire.ptu import SimulatedPtu
 from drivers.sim.wire.visca import SimulatedVisca
 from drivers.simulation_clock import SimulationClock
@@ -71,6 +75,8 @@ class HeadRig:
         The simulated line, None in memory.
     settle_rad
         How far from its goal a settled head may be, beyond the rounding to counts; nothing when simulated.
+    step_rad
+        The way that an axis may make at its own speed, whatever was asked.
     fastest_rad_per_s
         Bound of every move's speed, None where it is not known.
     sent
@@ -86,6 +92,7 @@ class HeadRig:
     line: MemoryLine | PtyLine | TcpLine | None = None
     sent: list[int] = field(default_factory=lambda: [0])
     settle_rad: float = 1e-9
+    step_rad: float = 0.0
     fastest_rad_per_s: float | None = SPEED_RAD_PER_S
 
 
@@ -184,6 +191,27 @@ def visca(*, turned: bool = False) -> Iterator[HeadRig]:
         head = open_visca(options, clock, opens)
         stack.callback(head.close)
         yield HeadRig("VISCA", head, clock, panel, _truth(axes), VISCA_COUNT_RAD, line, sent)
+
+
+@contextmanager
+def pelco(protocol: Literal["D", "P"] = "D", *, turned: bool = False) -> Iterator[HeadRig]:
+    """A head that speaks Pelco-D or Pelco-P behind a serial line."""
+    with ExitStack() as stack:
+        clock = _clock(turned)
+        panel, axes = _axes(clock)
+        sent = [0]
+        device = SimulatedPelco(*axes, fastest_rad_per_s=SPEED_RAD_PER_S, protocol=protocol)
+        line, opens = _serial_line(stack, device, clock, panel, sent)
+        own = {"fastest_rad_per_s": SPEED_RAD_PER_S}
+        options = {
+            "port": line.path, "pan": {"limits_rad": list(LIMITS_RAD[0]), **own}, "protocol": protocol,
+            "tilt": {"limits_rad": list(LIMITS_RAD[1]), **own}, "speed_rad_per_s": SPEED_RAD_PER_S,
+        }  # fmt: skip
+        head = open_pelco(options, clock, opens)
+        stack.callback(head.close)
+        made = HeadRig(f"Pelco-{protocol}", head, clock, panel, _truth(axes), PELCO_COUNT_RAD, line, sent)
+        made.step_rad = 0.0 if turned else PelcoOptions.step_rad
+        yield made
 
 
 class CountedServo(SimulatedServo):
@@ -372,6 +400,7 @@ RIGS: dict[str, Callable[[], Any]] = {
     "ptu_pty": ptu,
     "ptu_tcp": ptu_tcp,
     "visca_pty": visca,
+    "pelco_pty": pelco,
 }
 """On the machine's clock."""
 
@@ -382,5 +411,7 @@ TURNED: dict[str, Callable[[], Any]] = {
     "scs": partial(feetech, "SCS0009", reply_timeout_s=0.1, echoes=True, turned=True),
     "ptu": partial(ptu, turned=True),
     "visca": partial(visca, turned=True),
+    "pelco": partial(pelco, turned=True),
+    "pelco_p": partial(pelco, "P", turned=True),
 }
 """On a turned clock."""

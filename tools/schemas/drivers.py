@@ -18,7 +18,9 @@ from drivers.faults import BOUNDS, CAMERA_WORDS, HEAD_WORDS, LOG_WORDS, WHEN
 from drivers.feetech.models import MODELS as FEETECH_MODELS
 from drivers.feetech.settings import FeetechAxisSettings, FeetechSettings, feetech_settings
 from drivers.flir_ptu import options as flir_ptu
+from drivers.pelco import options as pelco
 from drivers.pixels import FORMATS, GENICAM
+from drivers.ptz.options import AxisOptions, PtzOptions
 from drivers.recordings.replay import OPTIONS as REPLAY_OPTIONS
 from drivers.servo_bus.settings import HeadSettings, ServoAxisSettings
 from drivers.sim import camera_settings, ground, heads, placed, scene
@@ -78,7 +80,8 @@ def head_options() -> dict[str, Schema]:
     x_and_p = [{**servo, **more, "model": one} for one in ("XM430-W350", "PH54-200-S500", "PH42-020-S300")]
     sts_and_scs = [{**servo, "model": one} for one in ("STS3215", "SCS0009")]
     turned = {"limits_rad": [-0.5, 0.5]}
-    counted = {**turned, "count_rad": 0.001, "fastest_rad_per_s": 1.0}
+    fast = {**turned, "fastest_rad_per_s": 1.0}
+    counted = {**fast, "count_rad": 0.001}
     of_x, of_sts = (ServoAxisSettings, DynamixelAxisSettings), (ServoAxisSettings, FeetechAxisSettings)
     return {
         "dynamixel": _servos(
@@ -88,9 +91,17 @@ def head_options() -> dict[str, Schema]:
             feetech_settings, sts_and_scs, _model(FEETECH_MODELS), "lease_s", FeetechSettings, *of_sts
         ),
         "flir_ptu": _units(
-            flir_ptu.options_from, turned, ("socket", "rfc2217"), flir_ptu.Options, flir_ptu.AxisOptions
+            flir_ptu.options_from, turned, ("socket", "rfc2217"), (flir_ptu.Options,), flir_ptu.AxisOptions
         ),
-        "visca": _units(visca.options_from, counted, visca.SCHEMES, visca.ViscaOptions, visca.AxisOptions),
+        "pelco": _units(
+            pelco.options_from,
+            fast,
+            pelco.SCHEMES,
+            (PtzOptions, pelco.PelcoOptions),
+            AxisOptions,
+            pelco.PelcoAxisOptions,
+        ),
+        "visca": _units(visca.options_from, counted, visca.SCHEMES, (PtzOptions,), AxisOptions),
     }
 
 
@@ -107,9 +118,11 @@ def _servos(
     return _described(noted.schema(), (HeadSettings, head), *of_axis)
 
 
-def _units(read: Read, axis: Schema, schemes: Iterable[str], head: type, of_axis: type) -> Schema:
+def _units(
+    read: Read, axis: Schema, schemes: Iterable[str], head: tuple[type, ...], *of_axis: type
+) -> Schema:
     """A head that is one device, at a line or an address."""
-    volts = {"supply_V": [10.0, 30.0]} if "supply_V" in head.__dataclass_fields__ else {}
+    volts = {"supply_V": [10.0, 30.0]} if hasattr(head[0], "supply_V") else {}
     with watched("options.") as noted:
         read({"port": "/dev/x", "pan": axis, "tilt": axis, **volts})
     noted.at("port").value = _port(schemes)
@@ -117,7 +130,7 @@ def _units(read: Read, axis: Schema, schemes: Iterable[str], head: type, of_axis
         noted.at(key).value = {**noted.at(key).value, "type": ["array", "null"]}
     for name in AXES:
         noted.at(f"{name}.limits_rad").value["items"] = number(-math.tau, math.tau)
-    return _described(noted.schema(), (head,), of_axis)
+    return _described(noted.schema(), head, *of_axis)
 
 
 def _described(found: Schema, head: tuple[type, ...], *of_axis: type) -> Schema:

@@ -22,6 +22,7 @@ TABLES = {
     "Options of `dynamixel`": ("pan_tilt", "dynamixel"),
     "Options of `feetech`": ("pan_tilt", "feetech"),
     "Options of `flir_ptu`": ("pan_tilt", "flir_ptu"),
+    "Options of `pelco`": ("pan_tilt", "pelco"),
     "Options of `visca`": ("pan_tilt", "visca"),
     "Options of `v4l2`": ("cameras", "v4l2"),
     "Options of `aravis`": ("cameras", "aravis"),

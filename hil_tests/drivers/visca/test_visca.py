@@ -163,7 +163,7 @@ def test_a_head_that_does_not_obey_a_stop_is_told() -> None:
     with opened() as (it, head):
         head.move(0.9, 0.0, 0.1)
         it.device._drive = lambda body, time_s: [(0x41,), (0x51,)]  # type: ignore[method-assign]
-        with pytest.raises(NoReply, match="acknowledged the stop, and still moves"):
+        with pytest.raises(NoReply, match="got the command to stop, and still moves"):
             head.stop()
 
 

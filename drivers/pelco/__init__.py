@@ -1,0 +1,1 @@
+"""Pan/tilt heads of the security world that speak Pelco-D or Pelco-P."""
