@@ -139,8 +139,8 @@ class Calls(LeaseCalls, KeepingCalls, SimulationCalls):
 
     async def operation(self, operation_id: str, timeout_s: float | None = None) -> OperationTold:
         """Return an operation's record; ``timeout_s`` as of `status`."""
-        path = f"/operations/{quote(operation_id, safe='')}"
-        return await self._daemon.json(OperationTold, "GET", path, timeout=self._longest_s(timeout_s))
+        longest_s, word = self._longest_s(timeout_s), quote(operation_id, safe="")
+        return await self._daemon.json(OperationTold, "GET", f"/operations/{word}", timeout=longest_s)
 
     async def operations(self) -> list[OperationListed]:
         """Return the newest operations, newest first, without their steps."""

@@ -5,8 +5,10 @@ Nothing that is there is ever replaced. Without any hardware the folder holds th
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
@@ -66,7 +68,7 @@ class NewRigFolder:
 def check_free(folder: Path) -> None:
     """Refuse a folder in which a file would be replaced. Raises InTheWay with the first."""
     for name in (CONFIG, MAST, TRUE_RIG, RULES, README, SCHEMAS):
-        if (folder / name).exists():
+        if os.path.lexists(folder / name):  # a link to nowhere too
             raise InTheWay(f"{folder / name} exists, and nothing is replaced; another folder is expected")
 
 
@@ -128,17 +130,20 @@ def _written(
     folder: Path, files: Mapping[str, bytes], steps: tuple[str, ...], simulated: bool
 ) -> NewRigFolder:
     """Write the files and the schemas that their first lines name, and read configuration and drawing."""
-    for name, data in files.items():
-        save_bytes(folder / name, data)
     kinds = ((CONFIG, "config"), (MAST, "mast"))
-    names = [*files, *(f"{SCHEMAS}/{name_schema(folder / name, kind).name}" for name, kind in kinds)]
+    names = [*files, *(f"{SCHEMAS}/{kind}.json" for _, kind in kinds)]
     try:
+        for name, data in files.items():
+            save_bytes(folder / name, data)
+        for name, kind in kinds:
+            name_schema(folder / name, kind)
         config = load_config(folder / CONFIG)
         check_cameras(config, load_rig(config.mast_file).rig)
     except Exception:
         for name in names:  # a second try, with other answers, finds no file in its way
             (folder / name).unlink(missing_ok=True)
-        (folder / SCHEMAS).rmdir()
+        with suppress(OSError):
+            (folder / SCHEMAS).rmdir()
         raise
     return NewRigFolder(folder, tuple(names), simulated, steps)
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -67,7 +68,7 @@ IN_MRCAL = ("OPENCV4", "OPENCV5", "OPENCV8", "OPENCV12")
 WANTED = 1.01
 """Our rms over the others', at most."""
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp"}
-FEWEST = 8
+FEWEST, FEWEST_PICTURES = 8, 3
 
 
 @dataclass(frozen=True)
@@ -88,9 +89,10 @@ class FamilyRow:
         """Whether our rms is within 1 % of OpenCV's, if its lens serves the whole picture, and of mrcal's."""
         beside = [self.mrcal_px] + ([self.opencv_px] if self.opencv_image == 1.0 else [])
         told = [one for one in beside if one]
-        if not told or self.ours_px is None:
+        if not told:
             return ""
-        return "met" if all(self.ours_px <= WANTED * one for one in told) else "NOT MET"
+        ours_px = math.inf if self.ours_px is None else self.ours_px
+        return "met" if all(ours_px <= WANTED * one for one in told) else "NOT MET"
 
 
 def fit_ours(kind: Kind, size_px: tuple[int, int], terms: Sequence[ImageTerm]) -> tuple[float, str]:
@@ -205,7 +207,7 @@ def compare(
 
 
 def main() -> int:
-    """Compare and print; exit code 1 if our rms is more than 1 % above another's."""
+    """Compare and print; exit code 1 if our rms is more than 1 % above another's, or there is none."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     sample = REPOSITORY.parent / "shared" / "data" / "opencv_stereo"
     parser.add_argument(
@@ -221,6 +223,11 @@ def main() -> int:
     rows: list[FamilyRow] = []
     if arguments.board is not None:
         size_px, terms = folder_terms(arguments.board, arguments.folder)
+        if len(terms) < FEWEST_PICTURES:
+            parser.error(
+                f"{arguments.folder}: {len(terms)} pictures show {FEWEST} corners of the board or more, "
+                f"{FEWEST_PICTURES} are expected"
+            )
         rows += compare(arguments.folder.name, size_px, terms, None)
     else:
         for side in ("left", "right"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,11 @@ import pytest
 from calib.adjust.solver import minimise
 from calib.files import blind_part
 from calib.geometry.cahvor import Kind
+from calib.targets.board_file import save_board
+from calib.targets.boards import Charuco
+from tools.against_others import families
 from tools.against_others.calibration import WORST_RATIO, boards_problem, boards_residuals, rms
-from tools.against_others.families import fit_opencv, fit_ours, sample_terms
+from tools.against_others.families import FamilyRow, fit_opencv, fit_ours, sample_terms
 from tools.against_others.points import BoardViews, opencv_views, read_views
 
 
@@ -39,6 +43,24 @@ def test_rms_is_no_worse_than_opencvs(views: BoardViews, factor: float) -> None:
                      for v in (fit.state.cameras["camera"].V, fit.state.cameras["camera"].H))  # fmt: skip
     assert width == pytest.approx(matrix[0, 0], rel=0.01)
     assert height == pytest.approx(matrix[1, 1], rel=0.01)
+
+
+def test_a_family_that_ours_does_not_fit_and_opencv_does_is_no_success() -> None:
+    row = FamilyRow("left", "OPENCV8", 0.4, 0.4, 1.0, None, 0.1)
+    assert row.verdict == "met"
+    for ours_px in (0.5, None):
+        assert replace(row, ours_px=ours_px).verdict == "NOT MET"
+        assert replace(row, ours_px=ours_px, opencv_image=0.44).verdict == "", "their lens has a pole"
+
+
+def test_a_folder_without_the_board_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_board(tmp_path / "board.yaml", Charuco(10, 7, 0.055, 0.042))
+    with pytest.raises(SystemExit) as ended, pytest.MonkeyPatch.context() as patched:
+        patched.setattr("sys.argv", ["families", "--board", str(tmp_path / "board.yaml"), str(tmp_path)])
+        families.main()
+    assert ended.value.code == 2
+    told = f"{tmp_path}: 0 pictures show 8 corners of the board or more, 3 are expected"
+    assert told in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", ["OPENCV8", "OPENCV12", "OPENCV_FISHEYE"])

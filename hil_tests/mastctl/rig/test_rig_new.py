@@ -16,6 +16,8 @@ from typing import Any
 import jsonschema_rs
 import pytest
 
+from calib.errors import BadFile
+from calib.files.atomic import save_bytes
 from calib.files.mast_file import load_rig
 from calib.files.yaml_text import parse_mapping
 from drivers.aravis import find as genicam
@@ -42,6 +44,7 @@ from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.packaged import schema_files
+from mastctl.rig import folder as folder_module
 from mastctl.rig import plugged
 from mastctl.rig.drawing import RigAnswers
 from mastctl.rig.folder import CONFIG, MAST, README, RULES, write_rig
@@ -228,6 +231,25 @@ def test_answers_that_make_no_rig_leave_nothing_in_the_way_of_the_next_try(
         capsys.readouterr()
         told = written(capsys, str(folder), "--port", port)
     assert f"'{folder / CONFIG}'" in told["next"][0], "a shell takes the folder as one word"
+
+
+def test_a_disk_that_is_full_leaves_nothing_in_the_way_and_a_link_to_nowhere_is_not_replaced(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, data: bytes) -> None:
+        if path.name == "README.md":
+            raise BadFile(path, "", "cannot be saved: No space left on device")
+        save_bytes(path, data)
+
+    with bench.line(DynamixelBus(bench.servos((1, 2)))) as port:
+        with monkeypatch.context() as patched:
+            patched.setattr(folder_module, "save_bytes", full)
+            assert main(["rig", "new", str(tmp_path), "--port", port]) == 2
+        assert "No space left on device" in capsys.readouterr().err
+        assert list(tmp_path.iterdir()) == []
+        (tmp_path / MAST).symlink_to(tmp_path / "nowhere")
+        assert main(["rig", "new", str(tmp_path), "--port", port]) == 2
+        assert f"{tmp_path / MAST} exists, and nothing is replaced" in capsys.readouterr().err
 
 
 def test_without_hardware_it_writes_the_twin_that_runs(
