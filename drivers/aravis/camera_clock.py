@@ -9,13 +9,40 @@ Bounds widen as long as nothing new is observed, by the most that two crystals d
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from drivers.aravis.options import Stamped
 
 DRIFT = 1e-4
 """100 ppm: two crystals of 50 ppm each, in opposite directions; usual ones have 20 to 50."""
+
+
+SET_S = 1e-3
+"""The wall's clock was set if it moved by more against CLOCK_MONOTONIC between two frames; time servers slew
+by 500 ppm at most."""
+
+
+LATEST_S = 1.0
+"""No frame waits longer in Aravis before it is taken."""
+
+
+@dataclass
+class WallClock:
+    """How long ago Aravis stamped a frame's first packet; it stamps by the wall's clock, which can be set."""
+
+    _offsets_s: deque[float] = field(default_factory=lambda: deque(maxlen=8))
+
+    def ago_s(self, stamped_s: float, wall_s: float, now_s: float) -> float:
+        """Return how long before ``now_s`` (CLOCK_MONOTONIC) it was, at most; both clocks were read at once.
+
+        0 where the wall's clock was set in the last eight frames: the frame came by now, no more is known.
+        """
+        offset_s = wall_s - now_s
+        same = bool(self._offsets_s) and all(abs(offset_s - was_s) <= SET_S for was_s in self._offsets_s)
+        self._offsets_s.append(offset_s)
+        return min(max(0.0, wall_s - stamped_s), LATEST_S) if same else 0.0
 
 
 class ClockStepped(Exception):

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.aravis import find
+from drivers.aravis.camera_clock import WallClock
 from drivers.aravis.library import CONTROL_LOST, GenicamError, library
 from drivers.aravis.options import SOFTWARE, AravisOptions
 from drivers.aravis.settings import CHUNKS, EXPOSURE, Meaning, change, set_up, settings_of
@@ -94,6 +95,7 @@ class Device:
         self._asking = threading.Lock()  # Aravis's features are not made for several threads
         self.lost = threading.Event()
         self.problems: list[str] = []
+        self._wall = WallClock()
         self._parser: int | None = None
         self._chunks: list[Meaning] = []
         self._stream: int | None = None
@@ -310,8 +312,7 @@ class Device:
             return None
         now_s, wall_s = time.monotonic(), time.time()
         status = arv("buffer_get_status", handle)
-        # Aravis stamps the first packet by the wall clock, which may have been set meanwhile.
-        ago_s = min(max(0.0, wall_s - 1e-9 * arv("buffer_get_system_timestamp", handle)), 1.0)
+        ago_s = self._wall.ago_s(1e-9 * arv("buffer_get_system_timestamp", handle), wall_s, now_s)
         wrong = "" if status == 0 else STATUS.get(status, f"Aravis says status {status}")
         return Filled(
             handle,

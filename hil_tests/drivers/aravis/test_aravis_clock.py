@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from drivers.aravis.camera_clock import DRIFT, CameraClock, ClockStepped
+from drivers.aravis.camera_clock import DRIFT, CameraClock, ClockStepped, WallClock
 
 AHEAD_S = 1000.0  # the camera's clock before ours
 NONE_S = -math.inf
@@ -85,3 +85,13 @@ def test_without_readings_only_the_trigger_says_when_an_exposure_began() -> None
     clock = CameraClock(0.015)
     clock.arrived(50.5 + AHEAD_S, 50.52)
     assert clock.window(50.5 + AHEAD_S, "start", 0.01, 50.49, 50.52).begin_s == 50.49
+
+
+def test_a_wall_clock_that_was_set_makes_no_frame_older_or_newer_than_it_is() -> None:
+    wall, ahead_s = WallClock(), 1.7e9
+    assert wall.ago_s(9.99 + ahead_s, 10.0 + ahead_s, 10.0) == 0.0  # nothing to compare with yet
+    assert wall.ago_s(10.09 + ahead_s, 10.1 + ahead_s, 10.1) == pytest.approx(0.01, abs=1e-6)
+    for step_s in (0.5, -0.5):  # set between the packet and the taking, and for a while after
+        stamped_s, ahead_s = 10.19 + ahead_s, ahead_s + step_s
+        assert [wall.ago_s(stamped_s, 10.2 + ahead_s, 10.2) for _ in range(8)] == [0.0] * 8
+        assert wall.ago_s(10.19 + ahead_s, 10.2 + ahead_s, 10.2) == pytest.approx(0.01, abs=1e-6)

@@ -77,4 +77,4 @@ def test_wrong_use_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -
 
 def test_a_list_is_one_document(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["camera", "list", "--json"]) == 0
-    assert set(json.loads(capsys.readouterr().out)) == {"cameras", "refused"}
+    assert set(json.loads(capsys.readouterr().out)) == {"cameras", "genicam", "refused"}

@@ -336,6 +336,9 @@ STAMPS_ONLY = {
 }  # fmt: skip
 
 
+COMPARED_ONLY = {"drivers/aravis/device.py"}  # with the library's own stamps; `WallClock` sees it being set
+
+
 def test_no_deadline_reads_a_clock_that_can_be_set_back(repository: Path) -> None:
     """What runs a head lives on CLOCK_MONOTONIC; the wall's clock only stamps what people read."""
     found = set()
@@ -355,6 +358,8 @@ def test_no_deadline_reads_a_clock_that_can_be_set_back(repository: Path) -> Non
                 if isinstance(node, ast.Attribute) and ast.unparse(node) in WALL_CLOCKS:
                     found.add(str(path.relative_to(repository)))
     for path in (repository / "drivers").rglob("*.py"):
+        if str(path.relative_to(repository)) in COMPARED_ONLY:
+            continue
         text = path.read_text(encoding="utf-8")
         assert "time.time(" not in text and "datetime.now(" not in text, path
     assert found <= STAMPS_ONLY, found - STAMPS_ONLY
