@@ -60,6 +60,21 @@ def test_a_frame_is_told_the_former_value_then_none_then_the_new_one(device: Gig
     assert later.sequence >= first.sequence + SETTLE_FRAMES - 1
 
 
+def test_a_longer_exposure_lies_in_its_window_where_the_clock_cannot_be_read() -> None:
+    device = GigeCamera(ADDRESS, clock_readable=False, clock_ahead_s=-7.0, more=True)
+    device.behind = 2
+    camera = opened(features={"ChunkModeActive": False}, gain=3.0)
+    try:
+        for exposure_s in (0.018, 0.001):
+            camera.adjust({"exposure_s": exposure_s})
+            frame = until(lambda: (f := taken(camera, device)).settings["exposure_s"] and f, "settled")
+            assert frame.settings["exposure_s"] == pytest.approx(exposure_s)
+        assert camera.counters.damaged == 0
+    finally:
+        camera.close()
+        device.unplug()
+
+
 def test_with_chunk_data_every_frame_is_told_its_own(device: GigeCamera) -> None:
     device.behind = 2
     camera = opened(gain=3.0)
