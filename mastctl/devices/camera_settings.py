@@ -18,7 +18,7 @@ from mastctl.control.standing import StandingFault
 from mastctl.devices.thread import DeviceThread
 from mastctl.errors import NotNow
 
-HOLD_TIMEOUT_S = 1.0
+HOLD_TIMEOUT_S = 3.0  # a driver waits up to 2 s for changes under way to show
 SET_TIMEOUT_S = 2.0
 
 

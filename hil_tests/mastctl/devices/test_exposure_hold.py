@@ -12,6 +12,7 @@ import pytest
 
 from drivers.clock import SystemClock
 from drivers.errors import DriverError, NoReply, Refused
+from drivers.v4l2.camera import HOLD_MOST_S
 from hil_tests.mastctl.devices.turned import Hang, Turned
 from hil_tests.mastctl.service_fakes import (
     SIZE_PX,
@@ -23,6 +24,7 @@ from hil_tests.mastctl.service_fakes import (
 )
 from hil_tests.waiting import NET_S
 from mastctl.client import Client
+from mastctl.devices.camera_settings import HOLD_TIMEOUT_S
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
 
@@ -165,6 +167,11 @@ def test_a_camera_that_hangs_while_it_is_told_to_hold_keeps_nobody_waiting_and_i
     clock.until(lambda: left.told == ["held", "released"], "the late hold's release")
     assert devices.frames(["navcam_left"], clock.now_s(), 1.0)
     assert devices.faults() == ()
+
+
+def test_a_hold_that_waits_as_long_as_a_driver_may_is_not_said_to_hang() -> None:
+    """At 8 frames/s and fewer a V4L2 camera waits a second for settings, and one for its automatic."""
+    assert HOLD_TIMEOUT_S > 2 * HOLD_MOST_S
 
 
 def test_a_release_that_hangs_is_a_fault_of_that_camera_alone(
