@@ -140,9 +140,11 @@ class PtzHead(ABC):
         LineLost
             If the line is gone; a later call opens it anew.
         """
+        stops = self._stops
         with self._talking():
             time_s = self._look()
-            self._advance()
+            if stops == self._stops:  # else its command has gone out already
+                self._advance()
             now_s = self._time.now_s()
             settled = all(a.arrived and now_s - a.since_s >= self._options.settle_s for a in self._axes)
             pan, tilt = (axis.angle_rad for axis in self._axes)

@@ -106,6 +106,27 @@ def test_the_mean_speed_is_never_more_than_asked_while_a_step_goes_at_the_heads_
         assert fastest <= FASTEST_RAD_PER_S
 
 
+def test_a_reading_sends_no_step_after_a_stop_that_came_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+    with opened() as (it, head):
+        head.move(0.5, 0.0, 0.4)
+        stopped, plain = it.gate(), head._look
+
+        def look() -> float:
+            time_s = plain()
+            if not stopped.is_open:
+                stopped.set()
+                ends.append(it.beside(head.stop))
+                it.until(lambda: head._stops, "the stop")
+            return time_s
+
+        ends: list[Any] = []
+        monkeypatch.setattr(head, "_look", look)
+        it.clock.sleep(0.1)
+        head.read()
+        ends[0].wait()
+        assert it.places()[0] == 0.0
+
+
 @pytest.mark.parametrize("kind", ["D", "P"])
 def test_a_head_that_nobody_reads_any_more_stands_after_one_step(kind: str) -> None:
     with opened({"protocol": kind}, protocol=kind) as (it, head):
