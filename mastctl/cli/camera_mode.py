@@ -59,7 +59,9 @@ def camera_mode(args: argparse.Namespace) -> int:
         raise output.WrongUse("--crop, --bin or --flip is expected: the calibrated mode needs no other file")
     if args.out.exists() and args.out.samefile(args.file):
         raise output.WrongUse(f"--out {args.out} is MAST.yaml itself, which a second run would change again")
-    noted = [*rig.provenance.get("modes", ()), {"camera": name, "of": stored.digest, "mode": mode.words}]
+    before = rig.provenance.get("modes", [])  # a free place: anything may stand there
+    before = before if isinstance(before, list) else [] if before is None else [before]
+    noted = [*before, {"camera": name, "of": stored.digest, "mode": mode.words}]
     written = save_rig(replace(rig, provenance={**rig.provenance, "modes": noted}), args.out)
     told = {"out": str(args.out), "camera": name, "size_px": list(size_px), "mode": mode.words}
     if args.json:

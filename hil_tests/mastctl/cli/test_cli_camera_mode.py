@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -41,6 +42,23 @@ def test_a_mast_file_of_a_mode_is_written_and_says_so(
     assert stored.rig.provenance["modes"] == [
         {"camera": "navcam_left", "of": load_rig(mast).digest, "mode": mode}
     ]
+
+
+@pytest.mark.parametrize(
+    ("modes", "kept"), [(3, [3]), (None, []), ({"a": 1}, [{"a": 1}]), ([{"mode": "x"}], [{"mode": "x"}])]
+)
+def test_other_modes_of_a_provenance_stay_whatever_they_are(
+    mast: Path, tmp_path: Path, modes: object, kept: list[object]
+) -> None:
+    """Anybody may write anything under ``provenance``."""
+    save_rig(replace(load_rig(mast).rig, provenance={"modes": modes}), mast)
+    new = tmp_path / "new.yaml"
+    assert (
+        main(["camera", "mode", str(mast), "--camera", "navcam_left", "--flip", "both", "--out", str(new)])
+        == 0
+    )
+    noted = load_rig(new).rig.provenance["modes"]
+    assert list(noted[:-1]) == kept and noted[-1]["mode"] == "flip horizontal and vertical"
 
 
 @pytest.mark.parametrize(
