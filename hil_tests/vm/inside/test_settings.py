@@ -11,7 +11,7 @@ import pytest
 from drivers.errors import BadSetting
 from drivers.v4l2 import find
 from drivers.v4l2.camera import V4l2Camera, open_camera
-from drivers.v4l2.stamps import SETTLE_FRAMES
+from drivers.values_set import SETTLE_FRAMES
 from hil_tests.vm.inside.conftest import BUS, VIVID, inject, options
 from hil_tests.waiting import NET_S, until
 
