@@ -76,7 +76,8 @@ class GenicamCapture:
         self._over = threading.Event()
         self._triggering = threading.Lock()
         self._asked: list[float] = []  # moments of triggers that no frame answered yet; under the lock below
-        self._asking = threading.Lock()
+        self._past = 0  # of those, oldest first: so many that none answers any more
+        self._asking = threading.Condition()
         self._opening = threading.Lock()  # guards what is adjusted, and which values are in force
         self._adjusted: dict[str, float] = {}
         self._longest_s: float  # of an exposure that is not known
@@ -107,15 +108,27 @@ class GenicamCapture:
         try:
             if found := self.newest.take(exposed_after_s, 0.0, lambda frame: True):
                 return found
-            if not self._fire():
+            if not self._fire(until_s):
                 return None
             return self.newest.take(exposed_after_s, until_s - time.monotonic(), lambda frame: True)
         finally:
             self._triggering.release()
 
-    def _fire(self) -> bool:
-        """Send the software trigger, and note when; False if there is no camera."""
+    def _fire(self, until_s: float) -> bool:
+        """Send the software trigger, and note when; False if there is no camera.
+
+        After a trigger that no frame answered, the next frame may be that one's, late, and counts as such. So
+        a camera whose clock cannot be read is triggered again only when no late frame is believed any more.
+        By a clock that is read a frame shows its age: its trigger waits for as long as that is uncertain.
+        """
         with self._asking:
+            if self._unanswered():
+                if self._clock.readings:
+                    self._asking.wait_for(lambda: False, min(self._unsure_s(), until_s - time.monotonic()))
+                elif not self._asking.wait_for(
+                    lambda: not self._unanswered(), max(0.0, until_s - time.monotonic())
+                ):
+                    return False
             device = self._device
             if device is None:
                 return False
@@ -126,6 +139,15 @@ class GenicamCapture:
                 self._asked.pop()
                 raise
         return True
+
+    def _unanswered(self) -> bool:
+        """Whether a frame may come that answers a former trigger."""
+        return len(self._asked) > self._past
+
+    def _unsure_s(self) -> float:
+        """How much earlier than it did a frame's exposure may seem to begin, by the camera's clock."""
+        before_stamp_s = 0.0 if self._options.stamp == "start" else self._longest_s
+        return self._clock.high_s - self._clock.low_s + before_stamp_s
 
     def _is_young(self, frame: ArrivedGenicam) -> bool:
         """Whether no newer one should be here: a triggered camera's stays young."""
@@ -217,6 +239,8 @@ class GenicamCapture:
         with self._asking:
             self._device = None
             self._asked.clear()
+            self._past = 0
+            self._asking.notify_all()
         self.newest.forget()
         self._held = None
         closing = threading.Thread(target=device.close, name=f"closing {self._name}", daemon=True)
@@ -232,10 +256,10 @@ class GenicamCapture:
                 log.exception("%s: opening again failed", self._name)
             self.newest.lose(str(error) or type(error).__name__)
             return None
-        self.newest.come_back()
-        log.warning("%s is back", self._name)
         with self._asking:
             self._device = device
+        self.newest.come_back()  # from here on it is asked
+        log.warning("%s is back", self._name)
         return device
 
     def _open(self) -> Device:
@@ -254,6 +278,7 @@ class GenicamCapture:
         silent_s = max(SILENT_S, SILENT_PERIODS * (device.period_s or 0.0))
         read_next_s = self._read_clock(device, heard_s)
         while not self._over.is_set():
+            waits_s = time.monotonic()
             filled = device.wait(WAIT_S)
             now_s = time.monotonic()
             if device.lost.is_set():
@@ -264,7 +289,10 @@ class GenicamCapture:
                 self._take(device, filled, now_s)
                 if now_s >= read_next_s:
                     read_next_s = self._read_clock(device, now_s)
-            elif self._options.free_running and now_s - heard_s > silent_s:
+                continue
+            # Exposed at once, it would come so late after its stamp that `_wrong_delay` refuses it.
+            self._give_up(waits_s - DELAYED_S - 2 * self._longest_s - self._options.margin_s)
+            if self._options.free_running and now_s - heard_s > silent_s:
                 raise StreamFailed(
                     f"it gave no frame for {now_s - heard_s:.1f} s (its cable, its power?)",
                     device=self._name,
@@ -282,8 +310,8 @@ class GenicamCapture:
 
     def _take(self, device: Device, filled: Filled, received_s: float) -> None:
         """Check one buffer; publish it if it is good, and give the last one back, else itself."""
-        dropped = self._count(filled)
-        triggered_s, wrong = self._triggered_s(), filled.wrong
+        missing = self._count(filled)
+        triggered_s, wrong, dropped = self._triggered_s(missing), filled.wrong, missing or 0
         if not wrong:
             try:
                 self._clock.arrived(filled.stamp_s, filled.arrived_s)
@@ -323,26 +351,41 @@ class GenicamCapture:
         data, format = device.bytes_of(handle)
         return self._convert(format, data), b""
 
-    def _triggered_s(self) -> float:
-        """When the trigger was sent that this frame answers; -inf where that is not known."""
-        if self._options.trigger_source != SOFTWARE:
+    def _triggered_s(self, missing: int | None) -> float:
+        """When the trigger was sent that this frame answers, or an earlier one; -inf where that is not known.
+
+        Frames come in the order of their triggers, and those that are missing answered the oldest ones.
+        """
+        if self._options.trigger_source != SOFTWARE or missing is None:
             return -math.inf
         with self._asking:
-            asked, self._asked = self._asked, self._asked[1:]
-        return asked[0] if asked else -math.inf
+            at = max(missing, self._past)
+            triggered_s = self._asked[at] if at < len(self._asked) else -math.inf
+            del self._asked[: at + 1]
+            self._past = 0
+            self._asking.notify_all()
+        return triggered_s
 
-    def _count(self, filled: Filled) -> int:
-        """Count a frame; return how many are missing before it."""
-        step = 1
+    def _give_up(self, before_s: float) -> None:
+        """Take in that no frame answers a trigger sent before that moment: none is there, and later than that
+        none is believed.
+        """
+        with self._asking:
+            self._past = sum(asked_s < before_s for asked_s in self._asked)
+            self._asking.notify_all()
+
+    def _count(self, filled: Filled) -> int | None:
+        """Count a frame; return how many are missing before it, None if its number does not say."""
+        step, known = 1, True
         if self._last_number is not None:
             step = filled.number - self._last_number
             if step <= 0 and self._last_number < 2**16:
                 step += 2**16 - 1  # the count of 16 bits leaves out 0
             if not 0 < step < 2**15:  # it began again: nothing says how many that cost
-                step = 1
+                step, known = 1, False
         self._last_number = filled.number
         self._last_sequence += step
-        return step - 1
+        return step - 1 if known else None
 
     def _wrong_delay(self, filled: Filled) -> str:
         """Why a frame comes too late to be believed; empty if it does not. Raises StreamFailed for many."""

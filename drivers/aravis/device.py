@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import math
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -17,7 +18,7 @@ from drivers.aravis import find
 from drivers.aravis.camera_clock import WallClock
 from drivers.aravis.library import CONTROL_LOST, GenicamError, library
 from drivers.aravis.options import SOFTWARE, AravisOptions
-from drivers.aravis.settings import CHUNKS, EXPOSURE, Meaning, change, set_up, settings_of
+from drivers.aravis.settings import CHUNKS, EXPOSURE, ROUNDING, Control, Meaning, change, set_up, settings_of
 from drivers.errors import CameraBusy, DriverError, NoCamera, StreamFailed, UnsupportedFormat
 from drivers.interfaces import CameraSetting
 from drivers.pixels import GENICAM, PictureFormat
@@ -98,6 +99,7 @@ class Device:
         self._wall = WallClock()
         self._parser: int | None = None
         self._chunks: list[Meaning] = []
+        self._longest_s, self._told_chunk = math.inf, False
         self._stream: int | None = None
         self._latch: tuple[str, str] | None = None
         self._control_lost = CONTROL_LOST(
@@ -223,6 +225,8 @@ class Device:
                     self._chunks.append(one)
             except GenicamError as error:
                 log.info("%s: no %s with each frame: %s", self._name, one.word, error)
+        with suppress(GenicamError):
+            self._longest_s = Control(arv, camera, EXPOSURE).bounds()[1] or math.inf
 
     def _find_latch(self) -> None:
         """See how the camera's clock is read, if it can be."""
@@ -334,12 +338,19 @@ class Device:
         )
 
     def _sent_with(self, handle: int) -> dict[str, float]:
-        """The settings that came with a buffer."""
+        """The settings that came with a buffer; those that cannot be true are left out."""
         told = {}
         for one in self._chunks:
             with suppress(GenicamError):  # not in this frame
                 chunk = self._arv("chunk_parser_get_float_value", self._parser, handle, f"Chunk{one.feature}")
-                told[one.name] = one.unit * float(chunk)
+                value = one.unit * float(chunk)
+                highest = self._longest_s * (1 + ROUNDING)
+                if math.isfinite(value) and (one is not EXPOSURE or 0.0 < value <= highest):
+                    told[one.name] = value
+                elif not self._told_chunk:
+                    self._told_chunk = True
+                    words = "%s: a frame came with %s %.6g, which cannot be; such values are left out"
+                    log.warning(words, self._name, one.name, value)
         return told
 
     def bytes_of(self, handle: int) -> tuple[NDArray[np.uint8], PictureFormat]:

@@ -110,9 +110,22 @@ class Control:
         return one.unit * low.value, one.unit * high.value
 
     def set(self, value: float) -> None:
-        """Turn its automatic off, and set it."""
-        if self.automatic:
-            self._arv("camera_set_string", self._camera, self.meaning.automatic, OFF)
+        """Turn its automatic off, and set it; a value that is refused leaves the automatic as it was."""
+        name = self.meaning.automatic
+        was = str(self._arv("camera_get_string", self._camera, name)) if self.automatic else OFF
+        if was != OFF:
+            self._arv("camera_set_string", self._camera, name, OFF)
+        try:
+            self._set(value)
+        except GenicamError as error:
+            if was != OFF:
+                try:
+                    self._arv("camera_set_string", self._camera, name, was)
+                except GenicamError as other:
+                    raise GenicamError(f"{error}; {name} stays {OFF}: {other}") from None
+            raise
+
+    def _set(self, value: float) -> None:
         one, counts = self.meaning, value / self.meaning.unit
         if one.called:
             self._arv(f"camera_set_{one.called}", self._camera, counts)
@@ -184,7 +197,7 @@ def settings_of(
             continue
         low, high = control.bounds()
         if one is EXPOSURE and period_s is not None:
-            high = min(high, period_s)
+            high = max(low, min(high, period_s))
         refusal = ""
         if one.name == "focus" and one.feature not in options.features:
             refusal = (

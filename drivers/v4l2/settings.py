@@ -156,16 +156,21 @@ def change(
         values.begin(clock.now_s())
         value = None
         try:
-            problem = None
+            problem, was, left = None, None, ""
             if (automatic := first_of(controls, (one.automatic,))) is not None:
+                was = get_value(node, automatic)
                 problem = set_value(node, automatic, one.off)
             problem = problem or set_value(node, control, counts)
+            refused = problem is not None and problem.became is None
+            # A refused value leaves the automatic as it was.
+            if refused and automatic and was is not None and set_value(node, automatic, was) is not None:
+                left = f"; {automatic.name} stays {one.off}"
             value = value_of(node, controls, one)
         finally:
             values.end(value, clock.now_s())
         if value is None or (problem is not None and problem.became is None):
             words = "its automatic stays on" if problem is None else problem.message
-            return became, notes, BadSetting(f"{one.name} was not changed: {words}", device=device)
+            return became, notes, BadSetting(f"{one.name} was not changed: {words}{left}", device=device)
         became[one.name] = value
         if not math.isclose(value, wanted[one.name], rel_tol=1e-9, abs_tol=1e-12):
             notes.append(

@@ -130,6 +130,10 @@ class GigeCamera:
         So many frames are exposed with the former settings after others were written.
     refuses
         Registers that it refuses to have written.
+    sends_us
+        The exposure time of the chunk data where it is to be another than the true one.
+    ignores, triggers
+        So many software triggers it takes next without exposing anything, and how many it took.
     delay_s
         From the middle of a frame's exposure to its first packet, beside half the exposure.
     """
@@ -143,6 +147,8 @@ class GigeCamera:
         self.exposed_s: list[tuple[float, float]] = []  # begin and end by CLOCK_MONOTONIC, of every frame
         self.gains: list[float] = []  # of every frame
         self.behind = 0
+        self.sends_us: float | None = None
+        self.ignores = self.triggers = 0
         self.refuses: set[int] = set()
         self._chunks_on: dict[int, int] = {}
         self._written_settings: list[tuple[float, float]] = []  # exposure time and gain, not yet in force
@@ -169,6 +175,7 @@ class GigeCamera:
         self._set_float(EXPOSURE, 10_000.0)
         self._set_float(RATE, 50.0)
         self._over = threading.Event()
+        self._exposing = threading.Lock()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((address, GVCP_PORT))
         self._socket.settimeout(0.05)
@@ -249,7 +256,11 @@ class GigeCamera:
         if at == LATCH:
             struct.pack_into(">Q", self._memory, LATCHED, self._ticks(time.monotonic()))
         if at == SOFTWARE and self._get(RUNS) and self._get(TRIGGERED) and self._get(SOURCE) == 0:
-            threading.Thread(target=self._expose, daemon=True).start()
+            self.triggers += 1
+            self.ignores -= 1
+            if self.ignores < 0:
+                self.ignores = 0
+                threading.Thread(target=self._expose, daemon=True).start()
         if at == CHUNK_ON:
             self._chunks_on[self._get(CHUNK_SELECTOR)] = self._get(CHUNK_ON)
         if at == EXPOSURE:
@@ -272,7 +283,11 @@ class GigeCamera:
             self._over.wait(max(0.0, next_s - time.monotonic()))
 
     def _expose(self) -> None:
-        """Expose one frame, stamp its beginning, and send it (GVSP)."""
+        """Expose one frame, stamp its beginning, and send it (GVSP); one after the other."""
+        with self._exposing:
+            self._expose_one()
+
+    def _expose_one(self) -> None:
         gain = float(struct.unpack_from(">d", self._memory, GAIN)[0])
         self._written_settings = [*self._written_settings, (self._exposure_s(), gain)][-1 - self.behind :]
         exposure_s, gain = self._written_settings[0]
@@ -289,8 +304,9 @@ class GigeCamera:
         kind = 0x4001 if chunks else 1
         if chunks:
             image += struct.pack(">II", 0, len(image))
+        sent_us = 1e6 * exposure_s if self.sends_us is None else self.sends_us
         for one in chunks:
-            image += struct.pack(">dII", (1e6 * exposure_s, gain)[one], CHUNK_IDS[one], 8)
+            image += struct.pack(">dII", (sent_us, gain)[one], CHUNK_IDS[one], 8)
         leader = struct.pack(
             ">HHQIIIIIHH", 0, kind, stamp, MONO8, self._get(WIDTH), self._get(HEIGHT), 0, 0, 0, 0
         )

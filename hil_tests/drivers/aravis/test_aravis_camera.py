@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -128,6 +131,112 @@ def test_the_software_trigger_exposes_when_a_frame_is_asked_for(device: GigeCame
         assert device.exposed_s[frame.camera_sequence - 1][0] >= asked_s
         assert truly_inside(frame, device)
     camera.close()
+
+
+@pytest.fixture(params=[False, True], ids=["clock not readable", "clock readable"])
+def either_clock(request: pytest.FixtureRequest) -> Iterator[GigeCamera]:
+    camera = GigeCamera(ADDRESS, clock_readable=request.param, clock_ahead_s=-55.0)
+    yield camera
+    while OPENED:
+        OPENED.pop().close()
+    camera.unplug()
+
+
+def fresh(camera: AravisCamera, device: GigeCamera) -> GenicamFrame:
+    """The frame of a request, which was truly exposed after it."""
+    asked_s = time.monotonic()
+    frame = camera.next_frame(asked_s, NET_S)
+    assert device.exposed_s[frame.camera_sequence - 1][0] >= asked_s
+    assert truly_inside(frame, device)
+    return frame
+
+
+@pytest.mark.parametrize("how", ["ignored", "lost", "late"])
+def test_after_a_trigger_without_a_frame_the_next_request_has_its_own(
+    either_clock: GigeCamera, how: str
+) -> None:
+    device = either_clock
+    camera = opened(rate_hz=None, trigger_source="Software")
+    for _ in range(2):
+        gone = fresh(camera, device).camera_sequence + 1
+        device.ignores = int(how == "ignored")
+        device.delay_s = 0.3 if how == "late" else 0.001
+        device.lose = lambda frame, packet, gone=gone: how == "lost" and frame == gone  # type: ignore[misc]
+        with pytest.raises(NoFreshFrame):
+            camera.next_frame(time.monotonic(), 0.05)
+        device.delay_s = 0.001
+        fresh(camera, device)
+    assert fresh(camera, device).camera_sequence == device.frames
+
+
+def test_a_request_that_is_too_short_to_be_sure_of_its_frame_triggers_none() -> None:
+    device = GigeCamera(ADDRESS, clock_readable=False)
+    try:
+        camera = opened(rate_hz=None, trigger_source="Software")
+        device.ignores = 1
+        for _ in range(3):  # the first one's frame may still come
+            with pytest.raises(NoFreshFrame):
+                camera.next_frame(time.monotonic(), 0.01)
+        assert device.triggers == 1
+        fresh(camera, device)
+        camera.close()
+    finally:
+        device.unplug()
+
+
+def test_a_frame_whose_number_steps_back_is_given_no_triggers_moment() -> None:
+    device = GigeCamera(ADDRESS, clock_readable=False)
+    try:
+        camera = opened(rate_hz=None, trigger_source="Software")
+        fresh(camera, device)
+        device.frames -= 1  # the camera gives the same number again: a frame twice, or another one
+        device.exposed_s.pop()
+        with pytest.raises(NoFreshFrame):
+            camera.next_frame(time.monotonic(), 0.1)
+        fresh(camera, device)
+        camera.close()
+    finally:
+        device.unplug()
+
+
+def test_a_request_at_the_moment_of_the_return_waits_for_its_frame(device: GigeCamera) -> None:
+    camera = opened(rate_hz=None, trigger_source="Software")
+    fresh(camera, device)
+    newest, frames = camera.capture.newest, []
+    returned, triggers = newest.come_back, device.triggers
+
+    def ask() -> None:
+        with suppress(NoFreshFrame):
+            frames.append(fresh(camera, device))
+        ended.set()
+
+    def come_back() -> None:
+        returned()
+        asking.start()
+        until(lambda: ended.is_set() or device.triggers > triggers, "the trigger of that request")
+
+    ended, asking = threading.Event(), threading.Thread(target=ask, daemon=True)
+    newest.come_back = come_back  # type: ignore[method-assign]
+    camera.capture._there().lost.set()  # as Aravis tells it
+    until(ended.is_set, "the end of that request")
+    assert len(frames) == 1
+
+
+@pytest.mark.parametrize("sends_us", [-4000.0, 0.0, float("nan"), float("inf"), 1e12])
+def test_an_exposure_time_that_cannot_be_is_left_out_and_told_once(
+    device: GigeCamera, sends_us: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    device.sends_us = sends_us
+    with caplog.at_level(logging.WARNING):
+        camera = opened(stamp="either")
+        for _ in range(3):
+            frame = camera.next_frame(time.monotonic(), NET_S)
+            assert truly_inside(frame, device)
+            assert frame.set_exposure_s == pytest.approx(0.005), "as it was set"
+    (told,) = [record.getMessage() for record in caplog.records if "cannot be" in record.getMessage()]
+    assert told == (
+        f"cam: a frame came with exposure_s {1e-6 * sends_us:.6g}, which cannot be; such values are left out"
+    )
 
 
 def test_the_input_line_exposes_and_nothing_else_does(device: GigeCamera) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from drivers.aravis import library
 from drivers.aravis.camera import AravisCamera, GenicamFrame
+from drivers.aravis.settings import settings_of
 from drivers.errors import BadSetting
 from drivers.interfaces import Adjustable, HoldsExposure
 from drivers.values_set import SETTLE_FRAMES
@@ -109,6 +110,35 @@ def test_a_rounded_value_is_told_and_a_refused_one_too(device: GigeCamera) -> No
         camera.adjust({"exposure_s": 0.008, "gain": 5.0})
     frame = until(lambda: (f := taken(camera, device)).settings["exposure_s"] and f, "settled")
     assert frame.settings["exposure_s"] == pytest.approx(0.00432)
+
+
+class RefusesAfter(set[int]):
+    """Registers that are refused; the gain's automatic too once the gain was."""
+
+    def __contains__(self, at: object) -> bool:
+        if at == gige_camera.GAIN:
+            self.add(gige_camera.GAIN_AUTO)
+        return super().__contains__(at)
+
+
+def test_a_refused_value_leaves_the_automatic_on_or_says_that_it_is_off(device: GigeCamera) -> None:
+    camera = opened()
+    device.refuses.add(gige_camera.GAIN)
+    with pytest.raises(BadSetting, match=r"cam: gain was not changed: (?!.*GainAuto)"):
+        camera.adjust({"gain": 5.0})
+    gain = next(one for one in camera.settings() if one.name == "gain")
+    assert (gain.automatic, gain.value) == (True, None)
+    device.refuses = RefusesAfter({gige_camera.GAIN})
+    with pytest.raises(BadSetting, match=r"cam: gain was not changed: .*; GainAuto stays Off: "):
+        camera.adjust({"gain": 5.0})
+
+
+def test_bounds_hold_where_a_frame_takes_less_time_than_the_least_exposure(device: GigeCamera) -> None:
+    camera = opened()
+    arv = library.library("cam")
+    options, handle = camera.capture._options, camera.capture._there()._camera
+    exposure = settings_of(arv, handle, options, 1e-8)[0]
+    assert exposure.minimum == exposure.maximum == pytest.approx(1e-7)
 
 
 def test_a_camera_that_is_opened_again_has_the_values_of_the_run_time(device: GigeCamera) -> None:

@@ -114,3 +114,22 @@ def test_a_camera_that_makes_another_of_it_is_told_and_one_that_refuses_is_not_b
         with pytest.raises(BadSetting, match="focus was not changed: focus does not take 40"):
             seen.camera.adjust({"gain": 10.0, "focus": 40.0})
         assert seen.camera.capture._options.focus == 30
+
+
+def test_a_refused_value_leaves_the_automatic_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    with bench(monkeypatch, "uvc", controls=ALL, values=VALUES) as seen:
+        seen.node.refused = (GAIN.id,)
+        with pytest.raises(BadSetting, match="gain was not changed: gain does not take 200"):
+            seen.camera.adjust({"gain": 200.0})
+        gain = next(one for one in seen.camera.settings() if one.name == "gain")
+        assert gain.automatic and gain.value is None
+        real = settings.set_value
+
+        def keeps_off(node: object, control: CameraControl, value: int) -> ControlProblem | None:
+            if (control.id, value) == (AUTOGAIN.id, 1):
+                return ControlProblem("gain_automatic", "busy")
+            return real(node, control, value)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(settings, "set_value", keeps_off)
+        with pytest.raises(BadSetting, match=r"gain was not changed: .*; gain_automatic stays 0$"):
+            seen.camera.adjust({"gain": 200.0})
