@@ -168,7 +168,7 @@ def change(
             value = value_of(node, controls, one)
         finally:
             values.end(value, clock.now_s())
-        if value is None or (problem is not None and problem.became is None):
+        if value is None or refused:
             words = "its automatic stays on" if problem is None else problem.message
             return became, notes, BadSetting(f"{one.name} was not changed: {words}{left}", device=device)
         became[one.name] = value
