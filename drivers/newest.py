@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 from drivers.errors import BadFrame
-from drivers.interfaces import Image
+from drivers.interfaces import Frame, Image
 
 RECENT_FRAMES = 30  # a second's: from their times the offset between two cameras is learned
 ROUNDING_S = 1e-9  # a frame told by its middle and length is not newer than itself
@@ -32,6 +32,37 @@ class Kept(Protocol):
 
     @property
     def window(self) -> Window: ...
+
+    @property
+    def sequence(self) -> int: ...
+
+
+@dataclass(frozen=True, eq=False)
+class TimedFrame(Frame):
+    """A frame with what is known of its time.
+
+    ``exposure_s`` of `Frame` is here the window in which the exposure of all rows surely lay, and
+    ``mid_exposure_s`` is its middle.
+
+    Attributes
+    ----------
+    mid_uncertainty_s
+        The most that the true mid-exposure may be away from ``mid_exposure_s``.
+    set_exposure_s
+        The camera's own exposure time, None if not known: also for the first frames after it was changed.
+    stamp_s, received_s
+        The stamp (of the kernel, or of the camera's own clock), and when the frame was whole, by
+        CLOCK_MONOTONIC; seconds.
+    driver_sequence, stream
+        The driver's or the camera's own count, and the stream's number.
+    """
+
+    mid_uncertainty_s: float
+    set_exposure_s: float | None
+    stamp_s: float
+    received_s: float
+    driver_sequence: int
+    stream: int
 
 
 @dataclass
@@ -97,6 +128,20 @@ class Newest(Generic[Arrived]):
     def frame(self) -> Arrived | None:
         """The newest good frame, however old; None if there is none."""
         return self._frame
+
+    def instead(self, exposed_after_s: float, timeout_s: float, damaged_before: int, now_s: float) -> str:
+        """Return what to say when no fresh frame came, in plain words."""
+        counters, last = self.counters, self.frame
+        message = f"no frame exposed after the asked moment came within {timeout_s:.3g} s"
+        if damaged := counters.damaged - damaged_before:
+            message += f"; {damaged} came damaged ({counters.last_damage})"
+        if last is None:
+            return message if damaged else f"{message}; none came at all"
+        age_s = exposed_after_s - last.window.begin_s
+        if age_s < 0.0:  # late enough, but older than a frame that is still to come
+            age_s = now_s - last.window.begin_s
+            return f"{message}; the last good one is frame {last.sequence}, {age_s:.3f} s old"
+        return f"{message}; the last good one is frame {last.sequence}, exposed {age_s:.3f} s before"
 
     def recent(self) -> list[Arrived]:
         """Return the last good frames of this stream, oldest first."""

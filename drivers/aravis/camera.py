@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 from drivers import pixels
@@ -12,36 +12,8 @@ from drivers.aravis.capture import GenicamCapture
 from drivers.aravis.options import AravisOptions, parse_options
 from drivers.clock import Clock
 from drivers.errors import NoCamera, NoFreshFrame
-from drivers.interfaces import CameraSetting, Frame, FrameTime
-from drivers.newest import Counters
-
-
-@dataclass(frozen=True, eq=False)
-class GenicamFrame(Frame):
-    """A frame with what is known of its time.
-
-    ``exposure_s`` of `Frame` is here the window in which the exposure of all rows surely lay, and
-    ``mid_exposure_s`` is its middle.
-
-    Attributes
-    ----------
-    mid_uncertainty_s
-        The most that the true mid-exposure may be away from ``mid_exposure_s``.
-    set_exposure_s
-        The camera's own exposure time: with the frame where it sends chunk data, else as it was set; None if
-        not known.
-    stamp_s, received_s
-        The stamp of the camera's own clock, and when the frame was whole, seconds of CLOCK_MONOTONIC.
-    camera_sequence, stream
-        The camera's own count, and the stream's number.
-    """
-
-    mid_uncertainty_s: float
-    set_exposure_s: float | None
-    stamp_s: float
-    received_s: float
-    camera_sequence: int
-    stream: int
+from drivers.interfaces import CameraSetting, FrameTime
+from drivers.newest import Counters, TimedFrame
 
 
 def open_camera(options: Mapping[str, Any], clock: Clock | None = None, name: str = "aravis") -> AravisCamera:
@@ -66,7 +38,7 @@ class AravisCamera:
         self.name = name
         self._options = options
         self.capture = GenicamCapture(options, name, pixels.colour if options.colour else pixels.grey)
-        self._last: GenicamFrame | None = None
+        self._last: TimedFrame | None = None
 
     @property
     def counters(self) -> Counters:
@@ -114,7 +86,7 @@ class AravisCamera:
         self.capture.await_settled()
         yield
 
-    def next_frame(self, exposed_after_s: float, timeout_s: float) -> GenicamFrame:
+    def next_frame(self, exposed_after_s: float, timeout_s: float) -> TimedFrame:
         """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.
 
         Raises
@@ -130,13 +102,14 @@ class AravisCamera:
         if taken is None:
             if lost := newest.lost:
                 raise NoCamera(lost)
-            raise NoFreshFrame(self._instead(exposed_after_s, timeout_s, damaged), device=self.name)
+            words = self.capture.newest.instead(exposed_after_s, timeout_s, damaged, time.monotonic())
+            raise NoFreshFrame(words, device=self.name)
         arrived, image, _ = taken
         last = self._last
         if last is not None and last.image is image:
             return last
         window, exposure_s = arrived.window, arrived.settings.get("exposure_s")
-        self._last = GenicamFrame(
+        self._last = TimedFrame(
             image=image,
             settings=arrived.settings,
             sequence=arrived.sequence,
@@ -146,7 +119,7 @@ class AravisCamera:
             set_exposure_s=exposure_s,
             stamp_s=arrived.filled.stamp_s,
             received_s=arrived.received_s,
-            camera_sequence=arrived.filled.number,
+            driver_sequence=arrived.filled.number,
             stream=arrived.stream,
         )
         return self._last
@@ -154,15 +127,3 @@ class AravisCamera:
     def close(self) -> None:
         """Let go of the camera; a waiting call ends with NoFreshFrame."""
         self.capture.close()
-
-    def _instead(self, exposed_after_s: float, timeout_s: float, damaged_before: int) -> str:
-        """What to say when no fresh frame came."""
-        counters = self.counters
-        message = f"no frame exposed after the asked moment came within {timeout_s:.3g} s"
-        if damaged := counters.damaged - damaged_before:
-            message += f"; {damaged} came damaged ({counters.last_damage})"
-        last = self.capture.newest.frame
-        if last is None:
-            return message if damaged else f"{message}; none came at all"
-        age_s = exposed_after_s - last.window.begin_s
-        return f"{message}; the last good one is frame {last.sequence}, exposed {age_s:.3f} s before"

@@ -5,14 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 from drivers import pixels
 from drivers.clock import Clock, SystemClock
 from drivers.errors import NoCamera, NoFreshFrame, StreamFailed
-from drivers.interfaces import CameraSetting, Frame, FrameTime
-from drivers.newest import Counters
+from drivers.interfaces import CameraSetting, FrameTime
+from drivers.newest import Counters, TimedFrame
 from drivers.v4l2 import find
 from drivers.v4l2.capture import Bytes, Capture
 from drivers.v4l2.controls import get_value, list_controls
@@ -24,33 +23,6 @@ from drivers.v4l2.stream import Stream, sizes_text
 JUDGE_EVERY_S = 0.25  # how often the automatic exposure looks at a frame
 HOLD_PERIODS = 8  # so long a hold waits for a change under way to show: it takes three frames once it is made
 HOLD_MOST_S = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class V4l2Frame(Frame):
-    """A frame with what is known of its time.
-
-    ``exposure_s`` of `Frame` is here the window in which the exposure of all rows surely lay, and
-    ``mid_exposure_s`` is its middle.
-
-    Attributes
-    ----------
-    mid_uncertainty_s
-        The most that the true mid-exposure may be away from ``mid_exposure_s``.
-    set_exposure_s
-        The camera's own exposure time, None if not known: also for the first frames after it was changed.
-    stamp_s, received_s
-        The kernel's stamp, and when the frame was dequeued, seconds of CLOCK_MONOTONIC.
-    driver_sequence, stream
-        The driver's count, which starts anew with each stream, and the stream's number.
-    """
-
-    mid_uncertainty_s: float
-    set_exposure_s: float | None
-    stamp_s: float
-    received_s: float
-    driver_sequence: int
-    stream: int
 
 
 def open_camera(options: Mapping[str, Any], clock: Clock | None = None, name: str = "v4l2") -> V4l2Camera:
@@ -94,7 +66,7 @@ class V4l2Camera:
         except BaseException:
             self._leave_group()
             raise
-        self._last: V4l2Frame | None = None
+        self._last: TimedFrame | None = None
 
     @property
     def counters(self) -> Counters:
@@ -106,7 +78,7 @@ class V4l2Camera:
         """(width, height) of every picture."""
         return self.capture.format.size_px
 
-    def next_frame(self, exposed_after_s: float, timeout_s: float) -> V4l2Frame:
+    def next_frame(self, exposed_after_s: float, timeout_s: float) -> TimedFrame:
         """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.
 
         Its stamp is at most a period and 5 ms old, or it came during the call.
@@ -123,13 +95,14 @@ class V4l2Camera:
         if taken is None:
             if lost := self.capture.lost:
                 raise NoCamera(lost)
-            raise NoFreshFrame(self._instead(exposed_after_s, timeout_s, damaged), device=self.name)
+            words = self.capture.newest.instead(exposed_after_s, timeout_s, damaged, self._clock.now_s())
+            raise NoFreshFrame(words, device=self.name)
         arrived, image, jpeg = taken
         last = self._last
         if last is not None and last.image is image:
             return last
         buffer, window, exposure_s = arrived.buffer, arrived.window, arrived.timing.exposure_s
-        self._last = V4l2Frame(
+        self._last = TimedFrame(
             image=image,
             jpeg=jpeg,
             settings=arrived.settings,
@@ -283,19 +256,3 @@ class V4l2Camera:
         finally:
             with self._exposed:
                 self._changing, self._asked_s = False, stream.asked_exposure_s
-
-    def _instead(self, exposed_after_s: float, timeout_s: float, damaged_before: int) -> str:
-        """What to say when no fresh frame came."""
-        counters = self.counters
-        message = f"no frame exposed after the asked moment came within {timeout_s:.3g} s"
-        damaged = counters.damaged - damaged_before
-        if damaged:
-            message += f"; {damaged} came damaged ({counters.last_damage})"
-        last = self.capture.newest.frame
-        if last is None:
-            return message if damaged else f"{message}; none came at all"
-        age_s = exposed_after_s - last.window.begin_s
-        if age_s < 0.0:  # late enough, but older than a frame that is still to come
-            age_s = self._clock.now_s() - last.buffer.stamp_s
-            return f"{message}; the last good one is frame {last.sequence}, {age_s:.3f} s old"
-        return f"{message}; the last good one is frame {last.sequence}, exposed {age_s:.3f} s before"

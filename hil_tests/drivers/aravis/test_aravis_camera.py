@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 
 from drivers.aravis import library
-from drivers.aravis.camera import AravisCamera, GenicamFrame, open_camera
+from drivers.aravis.camera import AravisCamera, open_camera
 from drivers.errors import DriverError, NoCamera, NoFreshFrame, UnsupportedFormat
+from drivers.newest import TimedFrame
 from hil_tests.drivers.aravis.gige_camera import GigeCamera
 from hil_tests.waiting import NET_S, until
 
@@ -45,10 +46,10 @@ def opened(**options: Any) -> AravisCamera:
     return OPENED[-1]
 
 
-def truly_inside(frame: GenicamFrame, device: GigeCamera) -> bool:
+def truly_inside(frame: TimedFrame, device: GigeCamera) -> bool:
     """Whether the true exposure lay in the window that the frame states, and it is the frame's picture."""
-    began_s, ended_s = device.exposed_s[frame.camera_sequence - 1]
-    assert set(frame.image.ravel().tolist()) == {frame.camera_sequence % 251}
+    began_s, ended_s = device.exposed_s[frame.driver_sequence - 1]
+    assert set(frame.image.ravel().tolist()) == {frame.driver_sequence % 251}
     window_end_s = frame.exposure_began_s + frame.exposure_s
     return frame.exposure_began_s <= began_s + ROUNDING_S and ended_s <= window_end_s + ROUNDING_S
 
@@ -58,7 +59,7 @@ def test_a_frame_is_exposed_after_the_asked_moment_in_the_window_that_it_states(
     for _ in range(10):
         asked_s = time.monotonic()
         frame = camera.next_frame(asked_s, NET_S)
-        assert device.exposed_s[frame.camera_sequence - 1][0] >= asked_s
+        assert device.exposed_s[frame.driver_sequence - 1][0] >= asked_s
         assert frame.exposure_began_s > asked_s
         assert truly_inside(frame, device)
         assert not frame.image.flags.writeable
@@ -73,7 +74,7 @@ def test_a_clock_that_cannot_be_read_makes_the_window_longer_and_still_true() ->
         camera = opened(stamp="either")
         frames = [camera.next_frame(time.monotonic(), NET_S) for _ in range(5)]
         assert all(truly_inside(frame, device) for frame in frames)
-        assert frames[0].camera_sequence > 4  # the first ones only showed how soon a frame may come
+        assert frames[0].driver_sequence > 4  # the first ones only showed how soon a frame may come
         camera.close()
     finally:
         device.unplug()
@@ -93,7 +94,7 @@ def test_a_frame_that_lost_a_packet_is_counted_and_never_delivered(device: GigeC
     device.lose = lambda frame, packet: frame % 2 == 0 and packet == 2
     camera = opened()
     frames = [camera.next_frame(time.monotonic(), NET_S) for _ in range(6)]
-    assert all(frame.camera_sequence % 2 for frame in frames)
+    assert all(frame.driver_sequence % 2 for frame in frames)
     assert all(truly_inside(frame, device) for frame in frames)
     until(lambda: camera.counters.damaged >= 5, "damaged frames counted")
     assert "packets" in camera.counters.last_damage
@@ -110,11 +111,11 @@ def test_frames_that_never_came_are_counted_by_their_numbers(device: GigeCamera)
     gone = device.frames + 20
     device.lose = lambda frame, packet: gone <= frame < gone + 3
     last = until(
-        lambda: (f := camera.next_frame(time.monotonic(), NET_S)).camera_sequence > gone + 3 and f, "more"
+        lambda: (f := camera.next_frame(time.monotonic(), NET_S)).driver_sequence > gone + 3 and f, "more"
     )
     assert camera.counters.dropped == before + 3
     grew = last.sequence - first.sequence  # gaps are gaps of our count too
-    assert grew == last.camera_sequence - first.camera_sequence
+    assert grew == last.driver_sequence - first.driver_sequence
     camera.close()
 
 
@@ -128,7 +129,7 @@ def test_the_software_trigger_exposes_when_a_frame_is_asked_for(device: GigeCame
         asked_s = time.monotonic()
         frame = camera.next_frame(asked_s, NET_S)
         assert device.frames == before + count
-        assert device.exposed_s[frame.camera_sequence - 1][0] >= asked_s
+        assert device.exposed_s[frame.driver_sequence - 1][0] >= asked_s
         assert truly_inside(frame, device)
     camera.close()
 
@@ -142,11 +143,11 @@ def either_clock(request: pytest.FixtureRequest) -> Iterator[GigeCamera]:
     camera.unplug()
 
 
-def fresh(camera: AravisCamera, device: GigeCamera) -> GenicamFrame:
+def fresh(camera: AravisCamera, device: GigeCamera) -> TimedFrame:
     """The frame of a request, which was truly exposed after it."""
     asked_s = time.monotonic()
     frame = camera.next_frame(asked_s, NET_S)
-    assert device.exposed_s[frame.camera_sequence - 1][0] >= asked_s
+    assert device.exposed_s[frame.driver_sequence - 1][0] >= asked_s
     assert truly_inside(frame, device)
     return frame
 
@@ -158,7 +159,7 @@ def test_after_a_trigger_without_a_frame_the_next_request_has_its_own(
     device = either_clock
     camera = opened(rate_hz=None, trigger_source="Software")
     for _ in range(2):
-        gone = fresh(camera, device).camera_sequence + 1
+        gone = fresh(camera, device).driver_sequence + 1
         device.ignores = int(how == "ignored")
         device.delay_s = 0.3 if how == "late" else 0.001
         device.lose = lambda frame, packet, gone=gone: how == "lost" and frame == gone  # type: ignore[misc]
@@ -166,7 +167,7 @@ def test_after_a_trigger_without_a_frame_the_next_request_has_its_own(
             camera.next_frame(time.monotonic(), 0.05)
         device.delay_s = 0.001
         fresh(camera, device)
-    assert fresh(camera, device).camera_sequence == device.frames
+    assert fresh(camera, device).driver_sequence == device.frames
 
 
 def test_a_request_that_is_too_short_to_be_sure_of_its_frame_triggers_none() -> None:
@@ -249,7 +250,7 @@ def test_the_input_line_exposes_and_nothing_else_does(device: GigeCamera) -> Non
     time.sleep(0.02)  # more than the clock's uncertainty: else the frame may be from before
     device.pulse()
     frame = camera.next_frame(asked_s, NET_S)
-    assert frame.camera_sequence == device.frames == 1
+    assert frame.driver_sequence == device.frames == 1
     assert truly_inside(frame, device)
     with pytest.raises(NoFreshFrame):
         camera.next_frame(time.monotonic(), 0.05)
@@ -284,7 +285,7 @@ def test_a_clock_that_is_set_while_it_streams_lets_no_old_frame_pass(device: Gig
     except DriverError:  # lost, and opened again
         until(lambda: camera.counters.reopened, "opened again")
         frame = camera.next_frame(asked_s, NET_S)
-    assert device.exposed_s[frame.camera_sequence - 1][0] >= asked_s
+    assert device.exposed_s[frame.driver_sequence - 1][0] >= asked_s
     camera.close()
 
 

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from drivers.aravis import find, library
-from drivers.aravis.camera import AravisCamera, GenicamFrame, open_camera
+from drivers.aravis.camera import AravisCamera, open_camera
 from drivers.errors import NoCamera
+from drivers.newest import TimedFrame
 from drivers.values_set import SETTLE_FRAMES
 from hil_tests.waiting import NET_S, until
 
@@ -61,18 +62,18 @@ def fakes() -> Iterator[Start]:
 fake = pytest.fixture(name="fake")(fakes)
 
 
-def is_ramp(frame: GenicamFrame) -> bool:
+def is_ramp(frame: TimedFrame) -> bool:
     """Whether every pixel is as the fake draws it at an exposure time of 10 ms: (x + y + number) % 255."""
     rows, columns = np.indices(frame.image.shape)
-    return bool(np.array_equal(frame.image, (columns + rows + frame.camera_sequence) % 255))
+    return bool(np.array_equal(frame.image, (columns + rows + frame.driver_sequence) % 255))
 
 
-def true_stamp_s(frame: GenicamFrame) -> float:
+def true_stamp_s(frame: TimedFrame) -> float:
     """The fake's stamp is the wall clock's, which this machine can tell."""
     return frame.stamp_s - (time.time() - time.monotonic())
 
 
-def taken(camera: AravisCamera, count: int) -> list[GenicamFrame]:
+def taken(camera: AravisCamera, count: int) -> list[TimedFrame]:
     return [camera.next_frame(time.monotonic(), NET_S) for _ in range(count)]
 
 
@@ -84,7 +85,7 @@ def test_pictures_and_times_are_the_fakes(fake: Start) -> None:
         assert frame.exposure_began_s <= true_stamp_s(frame) <= frame.exposure_began_s + frame.exposure_s
     camera.close()
     triggered = open_camera({**OPTIONS, "rate_hz": None, "trigger_source": "Software"}, name="cam")
-    numbers = [frame.camera_sequence for frame in taken(triggered, 3)]
+    numbers = [frame.driver_sequence for frame in taken(triggered, 3)]
     assert numbers == [numbers[0], numbers[0] + 1, numbers[0] + 2]
     triggered.close()
 

@@ -8,10 +8,11 @@ from collections.abc import Iterator
 import pytest
 
 from drivers.aravis import library
-from drivers.aravis.camera import AravisCamera, GenicamFrame
+from drivers.aravis.camera import AravisCamera
 from drivers.aravis.settings import settings_of
 from drivers.errors import BadSetting
 from drivers.interfaces import Adjustable, HoldsExposure
+from drivers.newest import TimedFrame
 from drivers.values_set import SETTLE_FRAMES
 from hil_tests.drivers.aravis import gige_camera
 from hil_tests.drivers.aravis.gige_camera import GigeCamera
@@ -32,12 +33,12 @@ def device() -> Iterator[GigeCamera]:
     camera.unplug()
 
 
-def taken(camera: AravisCamera, device: GigeCamera) -> GenicamFrame:
+def taken(camera: AravisCamera, device: GigeCamera) -> TimedFrame:
     """The next frame, whose window holds its true exposure and whose settings are true or not told."""
     frame = camera.next_frame(time.monotonic(), NET_S)
     assert truly_inside(frame, device)
-    began_s, ended_s = device.exposed_s[frame.camera_sequence - 1]
-    truly = {"exposure_s": ended_s - began_s, "gain": device.gains[frame.camera_sequence - 1]}
+    began_s, ended_s = device.exposed_s[frame.driver_sequence - 1]
+    truly = {"exposure_s": ended_s - began_s, "gain": device.gains[frame.driver_sequence - 1]}
     for name, value in truly.items():
         told = frame.settings[name]
         assert told is None or told == pytest.approx(value), f"{name} of frame {frame.sequence}"
