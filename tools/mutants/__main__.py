@@ -2,16 +2,15 @@
 
     .venv/bin/python -m tools.mutants calib/geometry drivers/flir_ptu/head.py --mutants 40 --seed 1
 
-Each mutant is one change in one line of a copy of the checkout. Of the eight test files nearest to the
-module, those that enter the changed function run against it, the quickest first, until the first failure,
-which counts if the same test fails again with the change and passes without it. A mutant that no test objects
-to has survived: either the tests lack something, or the line decides nothing.
-Survivors are printed with their place, to be looked at one by one.
+Each mutant is one change in one line of a copy of the checkout. Up to --tests test files run against it,
+those nearest to the module first (by imports, then by how often they mention its names), until the first
+failure, which counts if the same test fails again with the change and passes without it. A mutant that no
+test objects to has survived: either the tests lack something, or the line decides nothing.
+Each mutant's end is printed with its place, survivors to be looked at one by one.
 
 N mutants are drawn from each place named. Told apart from what a test objected to are those that only took
 too long, and broken ones: the changed module cannot even be imported, which is no test's merit, so these are
-not counted at all. Test files that fail without any change, or take longer than --longest seconds of
-processor time, are left out.
+not counted at all.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from typing import NamedTuple
 from mastctl.cli.output import at_least
 from tools.command import end, new_file, options
 from tools.mutants.sites import TESTS, MutantSite, imports, nearest, sites
-from tools.mutants.trial import MutantEnded, end_with_tests, run, run_change, warm
+from tools.mutants.trial import end_with_tests, run_change, warm
 
 REPOSITORY = Path(__file__).resolve().parent.parent.parent
 FOLDERS = ("calib", "drivers", "mastctl", "hil_tests", "configs", "tools", "docs")
@@ -48,7 +47,6 @@ FILES = (
     "requirements.lock",
     "requirements-demo.txt",
 )
-ALONE_S = 10.0  # what any test may take in processor time, beside three times what its file takes unchanged
 PATIENCE_S = 1200.0  # by the clock on the wall, for a run that waits for what never comes
 
 
@@ -95,18 +93,12 @@ def _copied(folder: Path, count: int) -> list[Path]:
     return copies
 
 
-def _unchanged(test: str, longest_s: float) -> MutantEnded:
-    """Run one test file on the code as it is."""
-    return run(_Own.copy, {test: longest_s}, PATIENCE_S, watched=True)
-
-
-def _tried(site: MutantSite, allowed_s: dict[str, float]) -> Tried:
+def _tried(site: MutantSite, tests: list[str], allowed_s: float) -> Tried:
     """Make one change, run the tests until one objects, and take it back."""
-    tests = [*allowed_s]
     if not tests:
         return Tried(site, "untested", "", 0.0, tests)
     file = _Own.copy / site.file
-    ended = run_change(file, site.applied(file.read_text()), _Own.copy, allowed_s, PATIENCE_S)
+    ended = run_change(file, site.applied(file.read_text()), _Own.copy, tests, allowed_s, PATIENCE_S)
     return Tried(site, ended.outcome.replace("passed", "survived"), ended.test, ended.cpu_s, tests)
 
 
@@ -140,36 +132,16 @@ def _counted(place: str, outcomes: list[str]) -> str:
     return f"{place}: {', '.join([share, *also])}"
 
 
-def _allowed_s(site: MutantSite, near: list[str], alone: dict[str, MutantEnded]) -> dict[str, float]:
-    """The tests for one change, quickest first, with the processor time that a test of each may take."""
-    files = [
-        test
-        for test in near
-        if (ended := alone[test]).outcome == "passed"
-        and (not site.function or ended.reached is None or (site.file, site.function) in ended.reached)
-    ]
-    return {
-        test: ALONE_S + 3 * alone[test].cpu_s for test in sorted(files, key=lambda test: alone[test].cpu_s)
-    }
-
-
 def _all_tried(chosen: list[MutantSite], args: argparse.Namespace, copies: list[Path]) -> Iterator[Tried]:
     graph = imports(REPOSITORY)
-    near = {site.file: nearest(REPOSITORY, graph, site.file, args.tests, args.among) for site in chosen}
-    files = sorted({test for tests in near.values() for test in tests})
     context = get_context("fork")
     own: SimpleQueue[Path] = context.SimpleQueue()
     for copy in copies:
         own.put(copy)
     with ProcessPoolExecutor(len(copies), context, _begin, (own,)) as pool:
         try:
-            runs = pool.map(_unchanged, files, [args.longest] * len(files))
-            alone = dict(zip(files, runs, strict=True))
-            for test, ended in alone.items():
-                if ended.outcome != "passed":
-                    why = f"unchanged it is {ended.outcome} after {ended.cpu_s:.0f} s"
-                    print(f"left out, {why}: {test}", flush=True)
-            yield from pool.map(_tried, chosen, [_allowed_s(site, near[site.file], alone) for site in chosen])
+            near = [nearest(REPOSITORY, graph, site.file, args.tests, args.among) for site in chosen]
+            yield from pool.map(_tried, chosen, near, [args.longest] * len(chosen))
         except BaseException:  # a signal too: nobody waits for what runs
             for worker in active_children():
                 worker.terminate()
@@ -186,7 +158,7 @@ def main() -> int:
     parser.add_argument("--among", default=TESTS, metavar="FOLDER", help="only tests in this folder")
     parser.add_argument("--jobs", type=number, default=os.cpu_count() or 1, metavar="N")
     parser.add_argument(
-        "--longest", type=number, default=120, metavar="S", help="slower test files are left out"
+        "--longest", type=number, default=60, metavar="S", help="processor time that a test may take"
     )
     parser.add_argument("--out", type=new_file, metavar="FILE", help="every mutant and its end, as JSON")
     args = parser.parse_args()
@@ -197,12 +169,9 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         for one in _all_tried(chosen, args, _copied(Path(folder), args.jobs)):
             ended.append(one)
-            if one.outcome != "killed":
-                by = f"  ({one.test})" if one.test else ""
-                print(
-                    f"{one.outcome}: {one.site.told((REPOSITORY / one.site.file).read_text())}{by}",
-                    flush=True,
-                )
+            by = f"  ({one.test})" if one.test else ""
+            what = one.site.told((REPOSITORY / one.site.file).read_text())
+            print(f"{len(ended)}/{len(chosen)} {one.outcome}, {one.cpu_s:.0f} s: {what}{by}", flush=True)
     print(f"seed {args.seed}")
     outcome = {one.site: one.outcome for one in ended}
     for place, some in drawn.items():

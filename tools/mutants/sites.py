@@ -52,8 +52,6 @@ class MutantSite:
         The sort of change.
     text
         What takes its place.
-    function
-        First line of the function that holds it, its decorators included; 0 outside functions.
     """
 
     file: str
@@ -63,7 +61,6 @@ class MutantSite:
     end_column: int
     kind: str
     text: str
-    function: int = 0
 
     def applied(self, source: str) -> str:
         """Return the module's text with this change made."""
@@ -88,7 +85,6 @@ class MutantSite:
 def sites(repository: Path, file: str) -> list[MutantSite]:
     """Return every possible change of one module, in the order of its text."""
     tree = ast.parse((repository / file).read_text())
-    functions = _functions(tree)
     found = [
         MutantSite(
             file,
@@ -98,22 +94,11 @@ def sites(repository: Path, file: str) -> list[MutantSite]:
             node.end_col_offset,
             kind,
             text,
-            functions.get(node.lineno, 0),
         )
         for node, kind, text in _changes(tree)
         if node.end_lineno is not None and node.end_col_offset is not None
     ]
     return sorted(found, key=lambda site: (site.line, site.column, site.kind))
-
-
-def _functions(tree: ast.Module) -> dict[int, int]:
-    """For each line of a function's body, the function's first line; the innermost function's."""
-    first: dict[int, int] = {}
-    for node in ast.walk(tree):  # breadth first: inner functions come after outer ones
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and node.end_lineno:
-            start = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
-            first |= dict.fromkeys(range(node.body[0].lineno, node.end_lineno + 1), start)
-    return first
 
 
 def _changes(tree: ast.Module) -> Iterator[tuple[ast.expr | ast.stmt, str, str]]:

@@ -12,12 +12,10 @@ import os
 import signal
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 from typing import NamedTuple, NoReturn
 
 import pytest
@@ -28,7 +26,6 @@ LIBRARIES = ("cv2", "fastapi", "httpx", "hypothesis", "numba", "numpy.testing", 
 LIBRARIES += ("scipy.optimize", "scipy.spatial.transform", "scipy.stats", "uvicorn", "yaml")
 NOTHING_TO_RUN = 5  # pytest's code where every test is skipped or left out: nobody objects
 BROKEN = (2, 3, 4)  # pytest's codes for what ended before a test could judge: a module that fails on import
-STARTS_PROCESSES = ("os.exec", "os.fork", "os.posix_spawn", "os.spawn", "subprocess.Popen")
 
 
 class MutantEnded(NamedTuple):
@@ -36,23 +33,21 @@ class MutantEnded(NamedTuple):
 
     ``outcome`` is ``passed``, ``killed`` (a test objected), ``killed by timeout`` or ``broken`` (the tests
     could not be collected); ``test`` is who objected, ``cpu_s`` the processor time of the run and all that it
-    started. ``reached`` are the functions entered, as (file, first line); None where they were not watched,
-    or where other processes ran the code as well.
+    started.
     """
 
     outcome: str
     test: str
     cpu_s: float
-    reached: frozenset[tuple[str, int]] | None
 
 
 def run_change(
-    file: Path, changed: str, copy: Path, allowed_s: Mapping[str, float], patience_s: float
+    file: Path, changed: str, copy: Path, tests: Sequence[str], allowed_s: float, patience_s: float
 ) -> MutantEnded:
     """Run test files on a changed file until one test objects, and put the file back.
 
-    A test that objects must do so again, and must not without the change: else it failed by chance or by what
-    keeps the machine busy; it is left out, and the others go on.
+    A test that objects must do so again, and must not without the change: else it failed by chance, by what
+    keeps the machine busy, or always takes too long; it is left out, and the others go on.
     """
     source = file.read_text()
     doubtful: list[str] = []
@@ -60,16 +55,18 @@ def run_change(
     while True:
         try:
             file.write_text(changed)
-            ended = run(copy, allowed_s, patience_s, leave_out=doubtful)
+            ended = run(copy, tests, allowed_s, patience_s, leave_out=doubtful)
             cpu_s += ended.cpu_s
-            if ended.outcome != "killed":
+            if ended.outcome in ("passed", "broken") or not ended.test:
                 return ended._replace(cpu_s=cpu_s)
-            alone_s = {ended.test: allowed_s.get(ended.test.partition("::")[0], 60.0)}
-            again = run(copy, alone_s, patience_s)
+            again = ended
+            if ended.outcome == "killed":
+                again = run(copy, [ended.test], allowed_s, patience_s)
+                cpu_s += again.cpu_s
         finally:
             file.write_text(source)
-        without = run(copy, alone_s, patience_s)
-        cpu_s += again.cpu_s + without.cpu_s
+        without = run(copy, [ended.test], allowed_s, patience_s)
+        cpu_s += without.cpu_s
         if again.outcome != "passed" and without.outcome == "passed":
             return ended._replace(cpu_s=cpu_s)
         doubtful.append(ended.test)
@@ -94,23 +91,18 @@ def warm() -> None:
 
 
 def run(
-    copy: Path,
-    allowed_s: Mapping[str, float],
-    patience_s: float,
-    *,
-    watched: bool = False,
-    leave_out: Sequence[str] = (),
+    copy: Path, tests: Sequence[str], allowed_s: float, patience_s: float, *, leave_out: Sequence[str] = ()
 ) -> MutantEnded:
-    """Run test files, or single tests, until one test objects.
+    """Run test files, or single tests, in their order until one test objects.
 
-    ``allowed_s`` names them in their order with the processor time that a single test of each may take;
-    ``patience_s`` is what the whole may take by the clock on the wall; the tests in ``leave_out`` do not run.
+    ``allowed_s`` is the processor time that a single test may take, ``patience_s`` what the whole may take by
+    the clock on the wall; the tests in ``leave_out`` do not run.
     """
     said = copy.parent / "said"
     said.write_text("")
     pid = os.fork()
     if pid == 0:
-        _in_the_fork(copy, said, allowed_s, watched, leave_out)
+        _in_the_fork(copy, said, tests, allowed_s, leave_out)
     _running[:] = [pid]
     until_s = time.monotonic() + patience_s
     ended, status, used = os.wait4(pid, os.WNOHANG)
@@ -129,21 +121,19 @@ def _judged(said: Path, in_time: bool, status: int, cpu_s: float) -> MutantEnded
     lines = [json.loads(line) for line in said.read_text().splitlines()]
     begun = [line["begins"] for line in lines if "begins" in line]
     objected = [line["objects"] for line in lines if "objects" in line]
-    reached = [line["reached"] for line in lines if line.get("reached") is not None]
-    functions = frozenset((file, first) for file, first in reached[0]) if reached else None
     last = (objected or begun or [""])[-1]
     code = os.waitstatus_to_exitcode(status)
     if not in_time or code == -signal.SIGPROF:
-        return MutantEnded("killed by timeout", last, cpu_s, None)
+        return MutantEnded("killed by timeout", last, cpu_s)
     if code == NOTHING_TO_RUN:
-        return MutantEnded("passed", "", cpu_s, functions)
+        return MutantEnded("passed", "", cpu_s)
     if code in BROKEN or not begun:
-        return MutantEnded("broken", last, cpu_s, None)
-    return MutantEnded("killed" if code else "passed", last if code else "", cpu_s, functions)
+        return MutantEnded("broken", last, cpu_s)
+    return MutantEnded("killed" if code else "passed", last if code else "", cpu_s)
 
 
 def _in_the_fork(
-    copy: Path, said: Path, allowed_s: Mapping[str, float], watched: bool, leave_out: Sequence[str]
+    copy: Path, said: Path, tests: Sequence[str], allowed_s: float, leave_out: Sequence[str]
 ) -> NoReturn:
     """Be the process that runs the tests."""
     code = 4
@@ -162,12 +152,13 @@ def _in_the_fork(
             if name.partition(".")[0] in (*PACKAGES, TESTS, "__main__"):
                 del sys.modules[name]
         sys.path.insert(0, str(copy))
-        sys.dont_write_bytecode = not watched
+        sys.dont_write_bytecode = True
         with said.open("a", buffering=1) as file:
-            tests = _Watch(copy, file.write, allowed_s, watched)
             without = [f"--deselect={test}" for test in leave_out]
-            code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", *without, *allowed_s], plugins=[tests])
-            tests.tell()
+            code = pytest.main(
+                ["-x", "-q", "-p", "no:cacheprovider", *without, *tests],
+                plugins=[_Watch(file.write, allowed_s)],
+            )
     finally:
         os._exit(code)
 
@@ -175,42 +166,17 @@ def _in_the_fork(
 class _Watch:
     """A pytest plugin: says which test runs and which objects, and lets none take too long."""
 
-    def __init__(
-        self, copy: Path, write: Callable[[str], object], allowed_s: Mapping[str, float], watched: bool
-    ) -> None:
+    def __init__(self, write: Callable[[str], object], allowed_s: float) -> None:
         self._write = write
         self._allowed_s = allowed_s
-        self._root = f"{copy}{os.sep}"
-        self._codes: set[tuple[str, int]] = set()
-        self._others = False
-        self._watched = watched
-        if watched:
-            sys.addaudithook(self._hears)
-            threading.settrace(self._enters)
-            sys.settrace(self._enters)
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         self._say(begins=nodeid)
-        of_its_file_s = self._allowed_s.get(nodeid.partition("::")[0], 60.0)
-        signal.setitimer(signal.ITIMER_PROF, self._allowed_s.get(nodeid, of_its_file_s))
+        signal.setitimer(signal.ITIMER_PROF, self._allowed_s)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         if report.failed:
             self._say(objects=report.nodeid)
 
-    def tell(self) -> None:
-        """Say what was entered."""
-        sys.settrace(None)
-        found = sorted((name.removeprefix(self._root), line) for name, line in self._codes)
-        self._say(reached=None if self._others or not self._watched else found)
-
     def _say(self, **line: object) -> None:
         self._write(json.dumps(line) + "\n")
-
-    def _enters(self, frame: FrameType, event: str, arg: object) -> None:
-        code = frame.f_code
-        if code.co_filename.startswith(self._root):
-            self._codes.add((code.co_filename, code.co_firstlineno))
-
-    def _hears(self, event: str, arguments: object) -> None:
-        self._others = self._others or event in STARTS_PROCESSES
