@@ -78,20 +78,24 @@ class FamilyRow:
     pictures: str
     kind: str
     ours_px: float | None
-    opencv_px: float
+    opencv_px: float | None
     opencv_image: float
     mrcal_px: float | None
     ours_s: float
     note: str = ""
+    about_others: str = ""
 
     @property
     def verdict(self) -> str:
-        """Whether our rms is within 1 % of OpenCV's, if its lens serves the whole picture, and of mrcal's."""
+        """Whether our rms is within 1 % of OpenCV's, if its lens serves the whole picture, and of mrcal's.
+
+        A fit with a note (not settled, corners outside the lens) does not count as met.
+        """
         beside = [self.mrcal_px] + ([self.opencv_px] if self.opencv_image == 1.0 else [])
         told = [one for one in beside if one]
         if not told:
             return ""
-        ours_px = math.inf if self.ours_px is None else self.ours_px
+        ours_px = math.inf if self.ours_px is None or self.note else self.ours_px
         return "met" if all(ours_px <= WANTED * one for one in told) else "NOT MET"
 
 
@@ -188,7 +192,12 @@ def compare(
     interpreter = find_mrcal() if views is not None else None
     rows = []
     for kind in FLAGS:
-        opencv_px, camera = fit_opencv(kind, size_px, terms)
+        others, opencv_px, seen = [], None, 0.0
+        try:
+            opencv_px, camera = fit_opencv(kind, size_px, terms)
+            seen = 1.0 - blind_part(camera)
+        except cv2.error as reason:
+            others.append(f"OpenCV: {reason.err}")
         start_s = time.thread_time()
         try:
             ours_px, note = fit_ours(kind, size_px, terms)
@@ -200,9 +209,10 @@ def compare(
             mrcal_px, why = fit_mrcal(
                 kind, views, ROUGH_FOCAL * float(camera.camera_matrix[0, 0]), interpreter
             )
-            note = " ".join(filter(None, (note, why)))
-        seen = 1.0 - blind_part(camera)
-        rows.append(FamilyRow(name, kind, ours_px, opencv_px, seen, mrcal_px, taken_s, note))
+            others += [why] if why else []
+        rows.append(
+            FamilyRow(name, kind, ours_px, opencv_px, seen, mrcal_px, taken_s, note, "; ".join(others))
+        )
     return rows
 
 
@@ -245,15 +255,13 @@ def main() -> int:
         )
         for row in rows:
             ours = row.ours_px or np.nan
-            mrcal = (
-                (f"{row.mrcal_px:8.4f}", f"{ours / row.mrcal_px:6.3f}")
-                if row.mrcal_px
-                else ("       -", "     -")
+            opencv, mrcal = (
+                f"{px:8.4f} {ours / px:6.3f}" if px else "       -      -"
+                for px in (row.opencv_px, row.mrcal_px)
             )
-            end_of_row = f"{mrcal[0]} {mrcal[1]} {row.ours_s:6.2f}  {row.verdict} {row.note}"
             print(
-                f"{row.pictures:10} {row.kind:15} {ours:8.4f} {row.opencv_px:8.4f} "
-                f"{ours / row.opencv_px:6.3f} {row.opencv_image:6.0%} {end_of_row}"
+                f"{row.pictures:10} {row.kind:15} {ours:8.4f} {opencv} {row.opencv_image:6.0%} {mrcal} "
+                f"{row.ours_s:6.2f}  {row.verdict} {row.note} {row.about_others}".rstrip()
             )
     return 0 if all(row.verdict != "NOT MET" for row in rows) else 1
 

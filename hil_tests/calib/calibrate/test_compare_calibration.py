@@ -51,6 +51,9 @@ def test_a_family_that_ours_does_not_fit_and_opencv_does_is_no_success() -> None
     for ours_px in (0.5, None):
         assert replace(row, ours_px=ours_px).verdict == "NOT MET"
         assert replace(row, ours_px=ours_px, opencv_image=0.44).verdict == "", "their lens has a pole"
+    for note in ("ours not settled", "3 corners unseen"):
+        assert replace(row, note=note).verdict == "NOT MET"
+    assert replace(row, opencv_px=None, opencv_image=0.0).verdict == "", "OpenCV's own fit failed"
 
 
 def test_a_folder_without_the_board_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
