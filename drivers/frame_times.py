@@ -18,6 +18,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from calib.geometry.sensor_mode import SensorMode
 from drivers.interfaces import (
     Adjustable,
     Camera,
@@ -25,6 +26,7 @@ from drivers.interfaces import (
     Frame,
     FrameTime,
     HoldsExposure,
+    KnowsSensorMode,
     KnowsSize,
     Paced,
 )
@@ -43,12 +45,13 @@ COUNTED_FROM = 5
 def corrected(camera: Camera, offset_s: float) -> Camera:
     """Return a camera whose frames' ``mid_exposure_s`` are later by ``offset_s``; itself for 0.
 
-    It is `KnowsSize`, `HoldsExposure`, `Adjustable` and `Paced` if the camera is.
+    It is `KnowsSize`, `KnowsSensorMode`, `HoldsExposure`, `Adjustable` and `Paced` if the camera is.
     """
     if offset_s == 0.0:
         return camera
     can = (
         (KnowsSize, _KnowingSize),
+        (KnowsSensorMode, _KnowingSensorMode),
         (HoldsExposure, _HoldingExposure),
         (Adjustable, _Adjusting),
         (Paced, _Pacing),
@@ -104,6 +107,14 @@ class _KnowingSize(CorrectedCamera):
         """(width, height) of every picture."""
         size_px: tuple[int, int] = self._camera.size_px
         return size_px
+
+
+class _KnowingSensorMode(CorrectedCamera):
+    @property
+    def sensor_mode(self) -> SensorMode:
+        """Which pixels of its sensor its pictures show."""
+        mode: SensorMode = self._camera.sensor_mode
+        return mode
 
 
 class _HoldingExposure(CorrectedCamera):

@@ -16,6 +16,8 @@ from typing import Literal, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.geometry.sensor_mode import SensorMode
+
 Image = NDArray[np.uint8]
 
 
@@ -246,6 +248,16 @@ class KnowsSize(Protocol):
     @property
     def size_px(self) -> tuple[int, int]:
         """(width, height) of every picture that it gives."""
+        ...
+
+
+@runtime_checkable
+class KnowsSensorMode(Protocol):
+    """A camera that knows which pixels of its sensor its pictures show; not every camera has this."""
+
+    @property
+    def sensor_mode(self) -> SensorMode:
+        """As it was when the camera was opened; no picture of another mode is given."""
         ...
 
 

@@ -244,8 +244,8 @@ class _Opener:
             )
         from drivers.sim.cameras import HangingCamera
 
-        size_px = self.rover.rig.cameras[name].model.size_px
-        return HangingCamera(self.rover.cameras[name], size_px, self._clock, self.rover.faults)
+        mode = self.rover.sensor_modes[name]
+        return HangingCamera(self.rover.cameras[name], mode, self._clock, self.rover.faults)
 
     def _replayed(self, name: str, device: DeviceSettings) -> Any:
         """The head or a camera of a recording; devices with the same options share one."""

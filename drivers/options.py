@@ -108,6 +108,16 @@ class OptionReader:
             raise self.bad(key, f"a whole number from {low} to {high}")
         return value
 
+    def wholes(self, key: str, count: int, low: int, high: int) -> Any:
+        """Return ``count`` whole numbers within bounds, None where the key is left out."""
+        if key not in self.values:
+            return None
+        value = self.values[key]
+        right = isinstance(value, list | tuple) and all(is_whole(one) and low <= one <= high for one in value)
+        if not right or len(value) != count:
+            raise self.bad(key, f"{count} whole numbers from {low} to {high}")
+        return tuple(value)
+
     def flag(self, key: str, default: bool) -> bool:
         """Return a truth value."""
         value = self.values.get(key, default)

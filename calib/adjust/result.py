@@ -265,7 +265,9 @@ class BenchCalibration(FittedRig):
 
 def rig_of(survey: Survey, state: Estimate) -> Rig:
     """Return the rig of a state; it has the survey folder's name."""
-    cameras = {n: RigCamera(survey.cameras[n].on, m) for n, m in state.cameras.items()}
+    cameras = {
+        n: RigCamera(survey.cameras[n].on, m, survey.cameras[n].sensor_mode) for n, m in state.cameras.items()
+    }
     stereo = {p: pair for p, pair in survey.stereo.items() if set(pair) <= set(cameras)}
     name = survey.folder.name or "calibrated"
     return Rig(name, state.as_mast, cameras, stereo, joints=state.as_joints)

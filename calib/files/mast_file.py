@@ -30,6 +30,7 @@ from calib.files.yaml_text import MAX_BYTES, Section, dump_mapping, kind_of, par
 from calib.geometry.cahvor import COEFFICIENTS, FREE, KINDS, SPLINED, CameraModel, Kind
 from calib.geometry.lenses.spline import SplineGrid
 from calib.geometry.rig import MOST_HARMONICS, AxisJoint, JointErrors, Mast, Rig, RigCamera
+from calib.geometry.sensor_mode import FLIPS, FlipName, SensorMode, flip_name
 
 MAST_SCHEMA = "mastctl/mast/1"
 CAMERA_SCHEMA = "mastctl/camera/1"
@@ -70,7 +71,7 @@ def parse_rig(data: bytes, path: str | Path) -> StoredRig:
     """Read a mast file's bytes; ``path`` is for messages only. Raises BadFile as ``load_rig``."""
     document = parse_mapping(data, path)
     _check_schema(document, path, MAST_SCHEMA)
-    optional = ("stereo", "joints", "fit", "provenance")
+    optional: tuple[str, ...] = ("stereo", "joints", "fit", "provenance")
     top = Section(path, "", document, ("schema", "name", "mast", "cameras"), optional)
     mast = top.section("mast", ("translation_m", "rotation_rad"), ("axis_offset_m", "axis_twist_rad"))
     cameras: dict[str, RigCamera] = {}
@@ -79,10 +80,11 @@ def parse_rig(data: bytes, path: str | Path) -> StoredRig:
         if not CAMERA_NAME.fullmatch(name):
             raise top.bad(f"cameras.{name}", CAMERA_NAME_WORDS)
         place = f"cameras.{name}"
-        section = Section(path, place, top.mapping("cameras")[name], ("on", *_MODEL_KEYS), _MODEL_OPTIONS)
+        optional = (*_MODEL_OPTIONS, "sensor_mode")
+        section = Section(path, place, top.mapping("cameras")[name], ("on", *_MODEL_KEYS), optional)
         on = cast(Literal["head", "rover"], section.choice("on", ("head", "rover")))
         model, camera_notes = _model(section)
-        cameras[name] = RigCamera(on, model)
+        cameras[name] = RigCamera(on, model, read_sensor_mode(section, model.size_px))
         notes += camera_notes
     rig = Rig(
         name=top.text("name"),
@@ -120,7 +122,8 @@ def save_rig(rig: Rig, path: str | Path) -> StoredRig:
             "axis_twist_rad": float(mast.axis_twist_rad),
         },
         "cameras": {
-            name: {"on": camera.on, **_model_keys(camera.model)} for name, camera in rig.cameras.items()
+            name: {"on": camera.on, **_model_keys(camera.model), **sensor_mode_keys(camera.sensor_mode)}
+            for name, camera in rig.cameras.items()
         },
         "stereo": rig.stereo,
         **({} if rig.joints == JointErrors() else {"joints": joint_keys(rig.joints)}),
@@ -274,6 +277,36 @@ def _model_keys(model: CameraModel) -> dict[str, Any]:
     if model.kind == "CAHVORE":
         keys.update(type=int(model.cahvore_type), linearity=float(model.linearity))
     return keys
+
+
+def read_sensor_mode(camera: Section, size_px: tuple[int, int]) -> SensorMode | None:
+    """Return the ``sensor_mode`` of a camera whose pictures are (width, height); None where it has none.
+
+    Raises
+    ------
+    BadFile
+        If a key is missing or the crop is not inside the sensor.
+    """
+    if "sensor_mode" not in camera:
+        return None
+    section = camera.section("sensor_mode", ("flip",), ("sensor_px", "crop_px"))
+    flip = FLIPS[cast(FlipName, section.choice("flip", tuple(FLIPS)))]
+    crop: Any = section.integers("crop_px", 4, 0, LARGEST_IMAGE_PX) if "crop_px" in section else None
+    sensor: Any = section.integers("sensor_px", 2, 1, LARGEST_IMAGE_PX) if "sensor_px" in section else None
+    try:
+        return SensorMode(size_px, crop, sensor, flip)
+    except ValueError as error:
+        raise camera.bad("sensor_mode", str(error)) from None
+
+
+def sensor_mode_keys(mode: SensorMode | None) -> dict[str, Any]:
+    """Return a camera's ``sensor_mode`` as files and answers have it, without the size; empty for None."""
+    if mode is None:
+        return {}
+    keys: dict[str, Any] = {"flip": flip_name(mode.flip)}
+    if mode.crop_px is not None and mode.sensor_px is not None:
+        keys = {"sensor_px": list(mode.sensor_px), "crop_px": list(mode.crop_px), **keys}
+    return {"sensor_mode": keys}
 
 
 def _joints(section: Section) -> JointErrors:

@@ -18,54 +18,16 @@ from typing import Any
 
 import numpy as np
 
-from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.lenses.opencv import NAMES
 from calib.geometry.parameters import parameter_names, parameter_part
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, tangents
+from calib.geometry.sensor_mode import BadMode, Mode, sensor_mode_after
 
 EVEN = ("p1", "p2", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 """Coefficients of OpenCV's that change their sign when the lens is turned by half a turn."""
-
-
-class BadMode(CalibError):
-    """A mode that a calibration cannot be carried over to."""
-
-    code = "bad_mode"
-
-
-@dataclass(frozen=True)
-class Mode:
-    """The changes of the calibrated picture, in this order.
-
-    Attributes
-    ----------
-    crop_px
-        (x, y, width, height) of the part that is read, calibrated pixels; None: all of it.
-    binning
-        (across, down): so many pixels make one.
-    flip
-        (left to right, upside down).
-    """
-
-    crop_px: tuple[int, int, int, int] | None = None
-    binning: tuple[int, int] = (1, 1)
-    flip: tuple[bool, bool] = (False, False)
-
-    @property
-    def words(self) -> str:
-        """It in words; empty for the calibrated mode itself."""
-        found = []
-        if self.crop_px is not None:
-            found.append("crop {2}x{3} px from ({0}, {1})".format(*self.crop_px))
-        if self.binning != (1, 1):
-            found.append("binning {}x{}".format(*self.binning))
-        if any(self.flip):
-            sides = [word for word, on in zip(("horizontal", "vertical"), self.flip, strict=True) if on]
-            found.append(f"flip {' and '.join(sides)}")
-        return ", ".join(found)
 
 
 @dataclass(frozen=True)
@@ -143,7 +105,7 @@ def in_mode(model: CameraModel, mode: Mode) -> CameraModel:
 
 
 def rig_in_mode(rig: Rig, camera: str, mode: Mode) -> Rig:
-    """Return a rig one of whose cameras is in another mode, with its covariance.
+    """Return a rig one of whose cameras is in another mode, with its covariance and the sensor's mode.
 
     Of ``fit`` the covariance stays. Other figures there are of the calibrated picture and go.
 
@@ -165,7 +127,9 @@ def rig_in_mode(rig: Rig, camera: str, mode: Mode) -> Rig:
         whole[np.ix_(place, place)] = rates[np.ix_(has, has)]
         covariance = whole @ known.covariance @ whole.T
         fit = {"parameters": list(known.names), "covariance": covariance.tolist()}
-    return replace(rig, cameras={**rig.cameras, camera: replace(before, model=model)}, fit=fit)
+    sensor = None if before.sensor_mode is None else sensor_mode_after(before.sensor_mode, mode)
+    after = replace(before, model=model, sensor_mode=sensor)
+    return replace(rig, cameras={**rig.cameras, camera: after}, fit=fit)
 
 
 def _rates(model: CameraModel, mode: Mode) -> FloatArray:

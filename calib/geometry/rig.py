@@ -34,6 +34,7 @@ from calib.geometry.rigid import (
     rot_y,
     rot_z,
 )
+from calib.geometry.sensor_mode import SensorMode
 
 MOST_HARMONICS = 2
 STEEPEST = 0.25
@@ -279,10 +280,14 @@ class Mast(ReadOnlyArrays):
 
 @dataclass(frozen=True, eq=False)
 class RigCamera:
-    """A camera of a rig: its model in the frame of the thing it is mounted ``on``."""
+    """A camera of a rig: its model in the frame of the thing it is mounted ``on``.
+
+    ``sensor_mode`` is the one that its pictures were calibrated in; None if nothing says so.
+    """
 
     on: Literal["head", "rover"]
     model: CameraModel
+    sensor_mode: SensorMode | None = None
 
 
 @dataclass(frozen=True, eq=False)

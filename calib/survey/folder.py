@@ -18,7 +18,7 @@ import numpy as np
 
 from calib.errors import BadFile
 from calib.files import LARGEST_IMAGE_PX, digest_of, read_bytes
-from calib.files.mast_file import CAMERA_NAME, CAMERA_NAME_WORDS
+from calib.files.mast_file import CAMERA_NAME, CAMERA_NAME_WORDS, read_sensor_mode
 from calib.files.tables import NUMBER, check_header
 from calib.files.yaml_text import MAX_BYTES, Section, nearest, parse_mapping
 from calib.geometry.cahvor import FITTED, Kind
@@ -380,7 +380,9 @@ def cameras_of(top: Section) -> dict[str, SurveyCamera]:
             raise top.bad(f"cameras.{name}", CAMERA_NAME_WORDS)
         value: Any = top.mapping("cameras")[name]
         place = f"cameras.{name}"
-        section = Section(top.path, place, value, ("on", "size_px", "model", "focal_px"), ("rough",))
+        section = Section(
+            top.path, place, value, ("on", "size_px", "model", "focal_px"), ("rough", "sensor_mode")
+        )
         width, height = section.integers("size_px", 2, 1, LARGEST_IMAGE_PX)
         camera: dict[str, Any] = {}
         if "rough" in section:
@@ -396,6 +398,7 @@ def cameras_of(top: Section) -> dict[str, SurveyCamera]:
             size_px=(width, height),
             kind=cast(Kind, section.choice("model", FITTED)),
             focal_px=section.positive("focal_px", FURTHEST_M),
+            sensor_mode=read_sensor_mode(section, (width, height)),
             **camera,
         )
     if not cameras:

@@ -9,6 +9,7 @@ from typing import Literal
 
 from calib.geometry.cahvor import Kind
 from calib.geometry.rigid import FloatArray
+from calib.geometry.sensor_mode import SensorMode
 from calib.targets.boards import AnyBoard, Board, Corners, Dots
 
 StationKind = Literal["prism", "tape", "check"]
@@ -21,7 +22,8 @@ class SurveyCamera:
     """The prior knowledge of a camera.
 
     ``rough_C_m`` and ``rough_A`` (3,) are in the rover frame at the angles of its first image, good to
-    20 cm and 10 degrees, or None; ``focal_px`` is rough too.
+    20 cm and 10 degrees, or None; ``focal_px`` is rough too. ``sensor_mode`` is that of its pictures, None if
+    it is not known.
     """
 
     name: str
@@ -31,6 +33,7 @@ class SurveyCamera:
     focal_px: float
     rough_C_m: FloatArray | None = None
     rough_A: FloatArray | None = None
+    sensor_mode: SensorMode | None = None
 
 
 @dataclass(frozen=True, eq=False)

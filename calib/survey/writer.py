@@ -18,6 +18,7 @@ from typing import Any
 
 from calib.errors import BadFile
 from calib.files.atomic import replace_bytes, sync_folder
+from calib.files.mast_file import sensor_mode_keys
 from calib.files.yaml_text import dump_mapping
 from calib.survey.folder import SCHEMA
 from calib.survey.reader import (
@@ -195,7 +196,7 @@ def camera_document(camera: SurveyCamera) -> dict[str, Any]:
     }
     if camera.rough_C_m is not None and camera.rough_A is not None:
         document["rough"] = {"C": camera.rough_C_m, "A": camera.rough_A}
-    return document
+    return document | sensor_mode_keys(camera.sensor_mode)
 
 
 def images_table(images: Iterable[SurveyImage]) -> bytes:

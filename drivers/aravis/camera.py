@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from calib.geometry.sensor_mode import SensorMode
 from drivers import pixels
 from drivers.aravis.capture import GenicamCapture
 from drivers.aravis.options import AravisOptions, parse_options
@@ -49,6 +50,11 @@ class AravisCamera:
     def size_px(self) -> tuple[int, int]:
         """(width, height) of every picture."""
         return self.capture.format.size_px
+
+    @property
+    def sensor_mode(self) -> SensorMode:
+        """Which pixels of its sensor its pictures show, as far as it is known."""
+        return self.capture.sensor_mode
 
     @property
     def period_s(self) -> float:

@@ -90,6 +90,7 @@ class GenicamCapture:
         self._pause_s = FIRST_PAUSE_S
         self._device: Device | None = self._open()
         self.format, self.period_s = self._device.format, self._device.period_s
+        self.sensor_mode = self._device.sensor_mode
         self.problems, self.words = tuple(self._device.problems), self._device.words
         self._thread = threading.Thread(
             target=self._serve, args=(self._device,), name=f"capture {name}", daemon=True
@@ -265,6 +266,10 @@ class GenicamCapture:
     def _open(self) -> Device:
         with self._opening:
             device = Device(self._options, self._name, self._adjusted)
+            if self._streams and device.sensor_mode != self.sensor_mode:
+                device.close()
+                words = f"it came back with {device.sensor_mode.words} where it had {self.sensor_mode.words}"
+                raise StreamFailed(words, device=self._name)
             self._longest_s = device.values.get(EXPOSURE.name) or device.period_s or 1.0
             self._clock = CameraClock(self._least_delay_s())
             self._in_force = {name: ValuesSet(value) for name, value in device.values.items()}

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.geometry.sensor_mode import SensorMode
 from drivers.aravis import find
 from drivers.aravis.camera_clock import WallClock
 from drivers.aravis.library import CONTROL_LOST, GenicamError, library
@@ -79,6 +80,8 @@ class Device:
         Its settings by name, as they are at the opening; None for one that its automatic sets.
     problems
         Sentences about controls that are missing or not as asked.
+    sensor_mode
+        Which pixels of the sensor frames show, as far as the camera reports it.
     lost
         Set when the camera no longer obeys: it was unplugged, or another program took it.
 
@@ -140,6 +143,7 @@ class Device:
             arv("camera_gv_set_packet_size", camera, options.packet_bytes)
         self._ask_chunks()
         self._find_latch()
+        self.sensor_mode = self._sensor_mode()
         for problem in self.problems:
             log.warning("%s: %s", self._name, problem)
 
@@ -173,6 +177,30 @@ class Device:
         if (x, y, width, height) != asked:
             made = f"it made {width}x{height} at ({x}, {y}) of it"
             raise UnsupportedFormat(f"{told}{reason}; {made} and has {offered}", device=self._name)
+
+    def _sensor_mode(self) -> SensorMode:
+        """Which pixels of the sensor frames show. Region and offset count binned pixels (GenICam SFNC)."""
+        arv, camera = self._arv, self._camera
+
+        def value(kind: str, feature: str, usual: int) -> int:
+            there = arv("camera_is_feature_available", camera, feature)
+            return int(arv(f"camera_get_{kind}", camera, feature)) if there else usual
+
+        size_px, region = self._options.size_px, (*self._options.offset_px, *self._options.size_px)
+        flip = False, False
+        try:
+            flip = bool(value("boolean", "ReverseX", 0)), bool(value("boolean", "ReverseY", 0))
+            sensor = value("integer", "SensorWidth", 0), value("integer", "SensorHeight", 0)
+            across, down = (
+                value("integer", f"Binning{side}", 1) * value("integer", f"Decimation{side}", 1)
+                for side in ("Horizontal", "Vertical")
+            )
+            if all(sensor):
+                crop = region[0] * across, region[1] * down, region[2] * across, region[3] * down
+                return SensorMode(size_px, crop, sensor, flip)
+        except (GenicamError, ValueError) as error:
+            log.info("%s: which part of its sensor is read is not known: %s", self._name, error)
+        return SensorMode(size_px, flip=flip)
 
     def _bounds(self, name: str) -> tuple[int, int]:
         low, high = ctypes.c_int(), ctypes.c_int()

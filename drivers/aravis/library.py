@@ -70,6 +70,7 @@ _FUNCTIONS = {
     "arv_chunk_parser_get_float_value": "pps>d!",
     "arv_camera_is_feature_available": "ps>i!",
     "arv_camera_execute_command": "ps>v!",
+    "arv_camera_get_boolean": "ps>i!",
     "arv_camera_get_string": "ps>s!",
     "arv_camera_set_string": "pss>v!",
     "arv_camera_get_integer": "ps>q!",

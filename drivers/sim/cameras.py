@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.geometry.sensor_mode import SensorMode
 from drivers.clock import Clock
 from drivers.errors import BadSetting, NoFreshFrame, NoReply
 from drivers.faults import Fault, FaultPanel
@@ -341,15 +342,15 @@ class HangingCamera:
     ----------
     camera
         The camera behind it; its own calls do not hang.
-    size_px
-        (width, height) of its pictures.
+    sensor_mode
+        Which pixels of its sensor its pictures show.
     clock, faults
         The simulation's.
     """
 
-    def __init__(self, camera: Any, size_px: tuple[int, int], clock: Clock, faults: FaultPanel) -> None:
+    def __init__(self, camera: Any, sensor_mode: SensorMode, clock: Clock, faults: FaultPanel) -> None:
         self._camera = camera
-        self._size_px = size_px
+        self.sensor_mode = sensor_mode
         self._clock = clock
         self._faults = faults
         self._changed = clock.signal()
@@ -387,7 +388,7 @@ class HangingCamera:
     def size_px(self) -> tuple[int, int]:
         """(width, height) of its pictures."""
         self._hang(SIZE_PX)
-        return self._size_px
+        return self.sensor_mode.size_px
 
     @property
     def period_s(self) -> float:

@@ -22,8 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 from calib.errors import BadFile
 from calib.files.mast_file import load_rig
 from calib.geometry.cahvor import CameraModel
+from calib.geometry.mode import rig_in_mode
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
+from calib.geometry.sensor_mode import BadMode, Mode, SensorMode
 from calib.targets.boards import FLAT, AnyBoard
 from drivers.clock import Clock
 from drivers.errors import BadOptions, NoFreshFrame
@@ -113,6 +115,12 @@ class SimulatedRover:
             self.rig: Rig = load_rig(settings.rover).rig
         except BadFile as error:
             raise BadOptions(f"simulation.rover: {error}") from None
+        self.sensor_modes = {
+            name: SensorMode(camera.model.size_px, (0, 0, *camera.model.size_px), camera.model.size_px)
+            for name, camera in self.rig.cameras.items()
+        }
+        for name, mode in settings.sensor_modes.items():
+            self._set_mode(name, mode)
         check_cameras(settings.camera, max(c.model.size_px[1] for c in self.rig.cameras.values()))
         self.settings = settings
         self.site_from_rover = Rigid.identity()
@@ -156,6 +164,21 @@ class SimulatedRover:
         self._metered_at: dict[str, tuple[Rigid, NDArray[np.float32]]] = {}
         self.cameras: Mapping[str, SimulatedCamera] = MappingProxyType(
             {name: self._camera(name, clock, start_s) for name in self.rig.cameras}
+        )
+
+    def _set_mode(self, name: str, mode: Mode) -> None:
+        """Have a camera read another part of its sensor. Raises BadOptions."""
+        place = "simulation.sensor_modes"
+        if name not in self.rig.cameras:
+            raise BadOptions(f"{place}: there is no camera {name!r}{nearest(name, self.rig.cameras)}")
+        try:
+            self.rig = rig_in_mode(self.rig, name, mode)
+        except BadMode as error:
+            raise BadOptions(f"{place}.{name}: {error}") from None
+        sensor = self.sensor_modes[name]
+        size_px = self.rig.cameras[name].model.size_px
+        self.sensor_modes[name] = replace(
+            sensor, size_px=size_px, crop_px=mode.crop_px or sensor.crop_px, flip=mode.flip
         )
 
     def _check_over_ground(self) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from calib.geometry.sensor_mode import FLIPS, Mode
 from drivers.errors import BadOptions
 from drivers.faults import nearest, read_script
 from drivers.options import OptionReader, filled
@@ -51,6 +52,8 @@ class SimulationSettings:
         What a day does to lenses and mount.
     clocks
         By camera's name: when it exposes and what its stamps are worth; those of no entry are one and true.
+    sensor_modes
+        By camera's name: the crop, binning and flip of the true rig's pictures that it is set to.
     speed
         Of the clock that the rover is told to live on (`drivers.hardware.clock_for`); infinite: ``max``.
     """
@@ -65,11 +68,12 @@ class SimulationSettings:
     speed: float = 1.0
     temperature: TemperatureSettings = field(default_factory=TemperatureSettings)
     clocks: Mapping[str, ClockSettings] = field(default_factory=dict)
+    sensor_modes: Mapping[str, Mode] = field(default_factory=dict)
 
 
 KEYS = (
-    "rover", "head", "seed", "samples", "scene", "cameras", "temperature", "clocks", "faults", "wire",
-    "speed",
+    "rover", "head", "seed", "samples", "scene", "cameras", "temperature", "clocks", "sensor_modes", "faults",
+    "wire", "speed",
 )  # fmt: skip
 
 
@@ -82,8 +86,9 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
         Keys ``rover`` (a mast file, relative to ``folder``), ``head`` (a preset, see
         ``drivers.sim.heads.head_settings``), ``seed`` (of scene and noise), ``samples``, ``scene``
         (fields of ``SceneSettings``), ``cameras`` (fields of ``CameraSettings``), ``temperature`` (fields of
-        ``TemperatureSettings``), ``clocks`` (fields of ``ClockSettings`` by camera), ``faults`` (a list, or a
-        script's name), ``wire``, ``speed`` (`drivers.simulation_clock.simulation_speed`). Only ``rover`` is
+        ``TemperatureSettings``), ``clocks`` (fields of ``ClockSettings`` by camera), ``sensor_modes``
+        (``crop_px``, ``binning``, ``flip`` by camera), ``faults`` (a list, or a script's name), ``wire``,
+        ``speed`` (`drivers.simulation_clock.simulation_speed`). Only ``rover`` is
         needed.
     folder
         Where relative paths start.
@@ -123,7 +128,26 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
         speed=simulation_speed(section.get("speed", 1.0)),
         temperature=temperature_settings(section.get("temperature", {})),
         clocks=clock_settings(section.get("clocks", {})),
+        sensor_modes=_sensor_modes(read),
     )
+
+
+def _sensor_modes(simulation: OptionReader) -> dict[str, Mode]:
+    """The key ``sensor_modes``. Raises BadOptions."""
+    named = simulation.values.get("sensor_modes", {})
+    if not isinstance(named, Mapping):
+        raise simulation.bad("sensor_modes", "crop_px, binning and flip by camera's name")
+    modes = {}
+    for name in map(str, named):
+        place = f"simulation.sensor_modes.{name}."
+        if not isinstance(named[name], Mapping):
+            raise simulation.refused(f"sensor_modes.{name}", f" is {named[name]!r}, expected keys and values")
+        read = OptionReader(named[name], ("crop_px", "binning", "flip"), place=place)
+        crop = read.wholes("crop_px", 4, 0, 32768)
+        binning = read.wholes("binning", 2, 1, 64)
+        flip = FLIPS[read.one_of("flip", "none", tuple(FLIPS))]
+        modes[name] = Mode(crop, (1, 1) if binning is None else binning, flip)
+    return modes
 
 
 def scene_settings(section: Any, folder: Path) -> SceneSettings:

@@ -32,6 +32,11 @@ BUF_FLAG_TIMESTAMP_MONOTONIC = 0x00002000
 BUF_FLAG_TSTAMP_SRC_MASK = 0x00070000
 BUF_FLAG_TSTAMP_SRC_SOE = 0x00010000
 
+SEL_TGT_CROP = 0x0000
+SEL_TGT_CROP_BOUNDS = 0x0002
+SEL_TGT_NATIVE_SIZE = 0x0003
+SEL_TGT_COMPOSE = 0x0100
+
 CTRL_FLAG_DISABLED = 0x0001
 CTRL_FLAG_READ_ONLY = 0x0004
 CTRL_FLAG_HAS_PAYLOAD = 0x0100
@@ -56,6 +61,8 @@ CID_FOCUS_AUTO = 0x009A090C
 CID_AUTO_WHITE_BALANCE = 0x0098090C
 CID_AUTOGAIN = 0x00980912
 CID_GAIN = 0x00980913
+CID_HFLIP = 0x00980914
+CID_VFLIP = 0x00980915
 CID_WHITE_BALANCE_TEMPERATURE = 0x0098091A
 EXPOSURE_MANUAL = 1
 
@@ -213,6 +220,24 @@ class RequestBuffers(Structure):
     )
 
 
+class Rect(Structure):
+    """struct v4l2_rect."""
+
+    _fields_ = (("left", c_int32), ("top", c_int32), ("width", c_uint32), ("height", c_uint32))
+
+
+class Selection(Structure):
+    """struct v4l2_selection."""
+
+    _fields_ = (
+        ("type", c_uint32),
+        ("target", c_uint32),
+        ("flags", c_uint32),
+        ("r", Rect),
+        ("reserved", c_uint32 * 9),
+    )
+
+
 class Timeval(Structure):
     """struct timeval."""
 
@@ -364,6 +389,7 @@ VIDIOC_G_EXT_CTRLS = _both(71, ExtControls)
 VIDIOC_S_EXT_CTRLS = _both(72, ExtControls)
 VIDIOC_ENUM_FRAMESIZES = _both(74, FrmSizeEnum)
 VIDIOC_ENUM_FRAMEINTERVALS = _both(75, FrmIvalEnum)
+VIDIOC_G_SELECTION = _both(94, Selection)
 VIDIOC_QUERY_EXT_CTRL = _both(103, QueryExtCtrl)
 
 

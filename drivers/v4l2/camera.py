@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from calib.geometry.sensor_mode import SensorMode
 from drivers import pixels
 from drivers.clock import Clock, SystemClock
 from drivers.errors import NoCamera, NoFreshFrame, StreamFailed
@@ -77,6 +78,11 @@ class V4l2Camera:
     def size_px(self) -> tuple[int, int]:
         """(width, height) of every picture."""
         return self.capture.format.size_px
+
+    @property
+    def sensor_mode(self) -> SensorMode:
+        """Which pixels of its sensor its pictures show, as far as its driver reports it."""
+        return self.capture.sensor_mode
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> TimedFrame:
         """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.

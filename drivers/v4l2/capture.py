@@ -96,7 +96,7 @@ class Capture:
         with ExitStack() as opened:  # what is open when a later step fails is closed again
             stream = self._open()
             opened.callback(stream.close)
-            self.format = stream.format
+            self.format, self.sensor_mode = stream.format, stream.sensor_mode
             self.period_s = stream.period_s
             self._rate_told = stream.rate_told
             self.problems = tuple(stream.problems)
@@ -298,6 +298,10 @@ class Capture:
         with self._opening:
             exposure_s = None if self._exposure_s is None else self._exposure_s()
             stream = Stream(self._options, self._name, self._clock, exposure_s)
+            if self._streams and stream.sensor_mode != self.sensor_mode:
+                stream.close()
+                words = f"it came back with {stream.sensor_mode.words} where it had {self.sensor_mode.words}"
+                raise StreamFailed(words, device=self._name)
             self._in_force = stream.in_force
         self._check = StampCheck()
         self._spacing = Spacing(stream.period_s if stream.rate_told else None, stream.rule.margin_s)

@@ -164,6 +164,14 @@ class Node:
                 break
         return found
 
+    def selection(self, target: int) -> tuple[int, int, int, int] | None:
+        """Return a rectangle of its cropping: left, top, width, height; None if it reports none."""
+        # The kernel takes the single-planar type for nodes of either kind.
+        entry = abi.Selection(type=abi.BUF_TYPE_VIDEO_CAPTURE, target=target)
+        if not self._next(abi.VIDIOC_G_SELECTION, entry, "tell its crop"):
+            return None
+        return entry.r.left, entry.r.top, entry.r.width, entry.r.height
+
     # What it shall do
 
     def set_format(self, code: str, size_px: tuple[int, int]) -> PictureFormat:
@@ -279,14 +287,14 @@ class Node:
             buffer.m.planes, buffer.length = ctypes.addressof(self._planes), abi.MAX_PLANES
         return buffer
 
-    def _next(self, request: int, entry: ctypes.Structure) -> bool:
-        """Fill one entry of an enumeration; False at its end."""
+    def _next(self, request: int, entry: ctypes.Structure, what: str = "list its formats") -> bool:
+        """Fill one entry of an enumeration; False at its end, and where the driver has none."""
         try:
             fcntl.ioctl(self._fd, request, entry)
         except OSError as error:
             if error.errno in (errno.EINVAL, errno.ENOTTY, errno.ENODATA):
                 return False
-            raise self.failure(error, "list its formats") from None
+            raise self.failure(error, what) from None
         return True
 
     def _identify(self) -> Identity:

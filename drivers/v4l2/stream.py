@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
+from calib.geometry.sensor_mode import SensorMode
 from drivers.clock import Clock
 from drivers.errors import UnsupportedFormat
 from drivers.pixels import FORMATS, PictureFormat
@@ -51,6 +52,8 @@ class Stream:
         The exposure time that was set last, before the camera rounded it.
     problems
         Controls that are missing or not as asked.
+    sensor_mode
+        Which pixels of the sensor frames show, as far as the driver reports it.
 
     Raises
     ------
@@ -85,6 +88,7 @@ class Stream:
                 self._check_exposure(options.auto_exposure.longest_s, "'auto_exposure.longest_s' is")
             self._set_controls(options, exposure_s)
             self._check_exposure(self.exposure_s, "the camera has an exposure of")
+            self.sensor_mode = sensor_mode_of(self.node, self.format.size_px)
             self.node.start(options.buffers)
         except BaseException:
             self.node.close()
@@ -188,6 +192,27 @@ def set_format(node: Node, code: str, size_px: tuple[int, int], name: str) -> Pi
             device=name,
         )
     return answer
+
+
+def sensor_mode_of(node: Node, size_px: tuple[int, int]) -> SensorMode:
+    """Return which pixels of the sensor pictures of ``size_px`` show.
+
+    The crop counts from the native size's corner, or that of the crop bounds where there is no native size.
+    It is unknown of a driver without cropping, and where pictures are composed into a part of the buffer.
+    """
+    controls = list_controls(node)
+    flips = (first_of(controls, (control,)) for control in (abi.CID_HFLIP, abi.CID_VFLIP))
+    horizontal, vertical = (one is not None and bool(get_value(node, one)) for one in flips)
+    crop = node.selection(abi.SEL_TGT_CROP)
+    whole = node.selection(abi.SEL_TGT_NATIVE_SIZE) or node.selection(abi.SEL_TGT_CROP_BOUNDS)
+    composed = node.selection(abi.SEL_TGT_COMPOSE) or (0, 0, *size_px)
+    if crop is not None and whole is not None and composed == (0, 0, *size_px):
+        x, y = crop[0] - whole[0], crop[1] - whole[1]
+        try:
+            return SensorMode(size_px, (x, y, *crop[2:]), whole[2:], (horizontal, vertical))
+        except ValueError as error:
+            log.info("%s: the crop that its driver reports cannot be: %s", node.path, error)
+    return SensorMode(size_px, flip=(horizontal, vertical))
 
 
 def sizes_text(node: Node, code: str) -> str:

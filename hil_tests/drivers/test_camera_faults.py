@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from calib.geometry.sensor_mode import SensorMode
 from drivers.clock import SystemClock
 from drivers.errors import DriverError, NoFreshFrame, NoReply
 from drivers.faults import CAMERA_WORDS, FaultPanel
 from drivers.hardware import close_devices
-from drivers.interfaces import Camera, HoldsExposure, KnowsSize, Paced
+from drivers.interfaces import Camera, HoldsExposure, KnowsSensorMode, KnowsSize, Paced
 from drivers.sim.cameras import HangingCamera
 from drivers.simulation_clock import SimulationClock
 from hil_tests.drivers.fault_bench import PATIENCE_S, SIZE, START, Bench
@@ -149,7 +150,7 @@ def test_camera_hangs_in_the_call_that_is_named_until_the_fault_is_over(clock: A
     inner = SimpleNamespace(
         name="cam_left", next_frame=lambda *_: None, close=lambda: None, recent_times=list, period_s=0.1
     )
-    camera = HangingCamera(inner, SIZE, time_now, panel)
+    camera = HangingCamera(inner, SensorMode(SIZE), time_now, panel)
     panel.set("cam_left", "hang", call=number)
     for place, (name, call) in enumerate(CALLS.items(), 1):
         back = threading.Event()
@@ -184,8 +185,8 @@ def test_a_camera_that_hangs_in_close_is_left_behind_and_the_others_are_closed(
 
 
 def test_a_hanging_camera_is_one_of_every_kind(bench: Bench) -> None:
-    camera = HangingCamera(bench.camera, SIZE, bench.clock, bench.panel)
-    for kind in (Camera, KnowsSize, HoldsExposure, Paced):
+    camera = HangingCamera(bench.camera, SensorMode(SIZE), bench.clock, bench.panel)
+    for kind in (Camera, KnowsSize, KnowsSensorMode, HoldsExposure, Paced):
         assert isinstance(camera, kind)
     assert camera.next_frame(START, 5.0).image.shape[::-1] == camera.size_px == SIZE
     with camera.exposure_held():

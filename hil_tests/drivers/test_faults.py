@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from calib.geometry.sensor_mode import SensorMode
 from drivers.errors import BadOptions
 from drivers.faults import CAMERA_WORDS, HEAD_WORDS, LOG_WORDS, PAN_TILT, WHEN, FaultPanel, read_script
 from drivers.sim.cameras import HangingCamera
@@ -169,7 +170,9 @@ def test_every_word_of_a_camera_is_asked_for(bench: Bench, monkeypatch: pytest.M
         return find(panel, device, word, time_s)
 
     monkeypatch.setattr(FaultPanel, "_entry", noted)
-    HangingCamera(bench.camera, SIZE, bench.clock, bench.panel).next_frame(bench.clock.now_s(), 5.0)
+    HangingCamera(bench.camera, SensorMode(SIZE), bench.clock, bench.panel).next_frame(
+        bench.clock.now_s(), 5.0
+    )
     assert set(CAMERA_WORDS) <= asked
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
+from annotated_types import Len
 from typing_extensions import TypedDict
 
+from calib.geometry.sensor_mode import FlipName
 from mastctl.answers.words import Angles, Count, Json, Pixel, Point, Quaternion, Seconds, TrackState, Word
 
 
@@ -106,8 +108,20 @@ class CameraSettingTold(TypedDict):
     refusal: str | None
 
 
+class SensorModeTold(TypedDict):
+    """Which pixels of its sensor a camera's pictures show; ``crop_px`` is x, y, width, height. It and
+    ``sensor_px`` are null if they are not known."""
+
+    size_px: Annotated[list[Count], Len(2, 2)]
+    sensor_px: Annotated[list[Count], Len(2, 2)] | None
+    crop_px: Annotated[list[Count], Len(4, 4)] | None
+    flip: FlipName
+
+
 class CameraSettingsTold(TypedDict):
     """The settings of a camera that can change; ``held``: an operation keeps them as they are.
+
+    ``sensor_mode``: of the camera as it was opened, null where it does not know it.
 
     ``notes``: a sentence for each setting that became another than asked for.
     """
@@ -115,6 +129,7 @@ class CameraSettingsTold(TypedDict):
     camera: str
     settings: list[CameraSettingTold]
     held: bool
+    sensor_mode: SensorModeTold | None
     notes: list[str]
 
 

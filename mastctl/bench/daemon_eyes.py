@@ -14,6 +14,7 @@ import numpy as np
 from calib.calibrate.bench.problem import FEWEST_CORNERS
 from calib.files.mast_file import parse_rig
 from calib.geometry.rig import Rig
+from calib.geometry.sensor_mode import FLIPS, SensorMode
 from calib.targets.boards import AnyBoard
 from calib.targets.corners import CornersNotFound, find_corners
 from mastctl.bench.eyes import BenchHead, BenchInterrupted, BenchLook, NoLight, NotThere, SeenBoard
@@ -66,6 +67,11 @@ class DaemonEyes:
         self._pool = ThreadPoolExecutor(2, "bench-corners")
         status = client.status()
         rig = served_rig(parse_rig(client.mast_file(), "the daemon's mast file").rig, cameras)
+        held = {
+            name: replace(camera, sensor_mode=_sensor_mode(client, name))
+            for name, camera in rig.cameras.items()
+        }
+        rig = replace(rig, cameras=held)
         axes = status["axes"]
         limits = status["limits"]
         self._head = BenchHead(
@@ -221,6 +227,20 @@ class DaemonEyes:
 
     def _now_s(self) -> float:
         return float(self._client.status()["now_s"])
+
+
+def _sensor_mode(client: Client, camera: str) -> SensorMode | None:
+    """Which pixels of its sensor a camera's pictures show, as the daemon tells it."""
+    told: Any = client.camera_settings(camera).get("sensor_mode")
+    if told is None:
+        return None
+    size: Any
+    crop: Any
+    sensor: Any
+    size, crop, sensor = (
+        None if told[key] is None else tuple(told[key]) for key in ("size_px", "crop_px", "sensor_px")
+    )
+    return SensorMode(size, crop, sensor, FLIPS[told["flip"]])
 
 
 def served_rig(rig: Rig, cameras: Sequence[str]) -> Rig:

@@ -193,7 +193,9 @@ def survey_cameras(rig: Rig, names: Mapping[str, tuple[int, int]]) -> dict[str, 
         model = held.model
         focal_px = model.focal_px[0]
         kind = {"CAHV": "CAHVOR", SPLINED: "OPENCV8"}.get(model.kind, model.kind)
-        cameras[name] = SurveyCamera(name, held.on, size_px, cast(Any, kind), round(focal_px, 1))
+        cameras[name] = SurveyCamera(
+            name, held.on, size_px, cast(Any, kind), round(focal_px, 1), sensor_mode=held.sensor_mode
+        )
     return cameras
 
 

@@ -8,11 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from calib.geometry.sensor_mode import FLIPS, Mode
 from mastctl.cli import output
 from mastctl.cli.mast_files import camera_name, read_mast_file
 from mastctl.cli.output import at_least
-
-FLIPS = {"none": (False, False), "horizontal": (True, False), "vertical": (False, True), "both": (True, True)}
 
 
 def add_action(actions: Any) -> None:
@@ -42,7 +41,7 @@ def add_action(actions: Any) -> None:
 def camera_mode(args: argparse.Namespace) -> int:
     """Write the mast file of another mode."""
     from calib.files.mast_file import save_rig
-    from calib.geometry.mode import Mode, rig_in_mode
+    from calib.geometry.mode import rig_in_mode
 
     if len(args.bin) > 2:
         raise output.WrongUse(f"--bin has {len(args.bin)} numbers where one or two are expected")
@@ -62,6 +61,8 @@ def camera_mode(args: argparse.Namespace) -> int:
     before = rig.provenance.get("modes", [])  # a free place: anything may stand there
     before = before if isinstance(before, list) else [] if before is None else [before]
     noted = [*before, {"camera": name, "of": stored.digest, "mode": mode.words}]
+    if stored.rig.cameras[name].sensor_mode is not None and rig.cameras[name].sensor_mode is None:
+        output.tell(f"which part of the sensor {name} then shows is not known: its sensor_mode is left out")
     written = save_rig(replace(rig, provenance={**rig.provenance, "modes": noted}), args.out)
     told = {"out": str(args.out), "camera": name, "size_px": list(size_px), "mode": mode.words}
     if args.json:

@@ -247,6 +247,7 @@ def _add_check(actions: Any) -> None:
 
 def camera_check(args: argparse.Namespace) -> int:
     """Measure what a camera delivers, and show what it can do."""
+    from calib.files.mast_file import sensor_mode_keys
     from mastctl.setup.camera_check import quality_of
 
     if args.config is not None and (config := config_of(args)).hardware.cameras[args.camera].driver != "v4l2":
@@ -264,6 +265,7 @@ def camera_check(args: argparse.Namespace) -> int:
             "driver": camera.capture.identity.driver,
             "format": camera.capture.format.code,
             "size_px": list(camera.capture.format.size_px),
+            **sensor_mode_keys(camera.sensor_mode),
             "asked_rate_hz": 1 / camera.capture.period_s,
             **measured,
             "quality": quality.told(),
@@ -339,6 +341,7 @@ def _print_check(told: dict[str, Any]) -> None:
     rows = [
         ("camera", f"{told['card']} at {told['bus']} ({told['driver']})"),
         ("format", f"{told['format']} {width}x{height}, {told['asked_rate_hz']:.4g} Hz promised"),
+        ("sensor_mode", _mode_words(told)),
         ("rate", f"{rate} over {told['seconds']:g} s"),
         ("dropped, damaged, late", f"{told['dropped']}, {told['damaged']}, {told['late']}"),
         ("stamp to here", f"{low:.1f} to {high:.1f} ms, median {median:.1f} ms"),
@@ -356,6 +359,15 @@ def _print_check(told: dict[str, Any]) -> None:
         (c["name"], c["kind"], str(c["value"]), f"{c['minimum']} to {c['maximum']}") for c in told["controls"]
     ]
     output.print_table("controls", ("name", "kind", "value", "range"), controls)
+
+
+def _mode_words(told: dict[str, Any]) -> str:
+    """A sensor mode as a mast file has it."""
+    mode = told.get("sensor_mode")
+    if mode is None:
+        return "not known"
+    words = ", ".join(f"{key}: {value}" for key, value in mode.items())
+    return words if "crop_px" in mode else f"{words}; the driver does not report a crop"
 
 
 def _print_levels(quality: dict[str, Any]) -> None:
@@ -389,6 +401,7 @@ def _print_any_check(told: dict[str, Any]) -> None:
                 if uncertainty_s is None
                 else f"+-{1e3 * uncertainty_s:.1f} ms",
             ),
+            ("sensor_mode", _mode_words(told)),
             ("offset_s in use", f"{told['offset_s']:g}"),
             ("tells of itself", ", ".join(told["abilities"]) or "nothing"),
         ]

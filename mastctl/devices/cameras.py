@@ -17,12 +17,13 @@ from functools import partial
 
 import numpy as np
 
-from calib.geometry.rig import Rig
+from calib.geometry.rig import Rig, RigCamera
+from calib.geometry.sensor_mode import SensorMode
 from drivers.absent import AbsentCamera
 from drivers.clock import Clock, SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame
 from drivers.frame_times import Offset, Pairing, learned
-from drivers.interfaces import Camera, Frame, FrameTime, KnowsSize, Paced, Reading
+from drivers.interfaces import Camera, Frame, FrameTime, KnowsSensorMode, KnowsSize, Paced, Reading
 from mastctl.control.standing import StandingFault
 from mastctl.devices import frames as frame_checks
 from mastctl.devices.camera_settings import CameraSettings
@@ -70,11 +71,13 @@ class Cameras:
     ----------
     settings
         The settings of each.
+    sensor_modes
+        That of each camera that is open and knows it.
 
     Raises
     ------
     BadFrame
-        If a camera that knows its size has another than the mast file's.
+        If a camera that knows its size, or its sensor's mode, has another than the mast file's.
     """
 
     def __init__(
@@ -99,8 +102,8 @@ class Cameras:
         self._clock = clock
         self._time = time
         self._grace_s = CAMERA_GRACE_S if grace_s is None else grace_s
-        self._sizes_px: dict[str, tuple[int, int]] = {}
-        self._on_head: set[str] = set()
+        self.sensor_modes: dict[str, SensorMode] = {}
+        self._calibrated: dict[str, RigCamera] = {}
         if rig is not None:
             self.use_rig(rig)
         self._paired_s: dict[str, float] = {}  # per camera when the last frame that served a set began
@@ -362,8 +365,7 @@ class Cameras:
 
     def use_rig(self, rig: Rig) -> None:
         """Judge pictures by another mast file's sizes and mounts from now on."""
-        self._sizes_px = {name: camera.model.size_px for name, camera in rig.cameras.items()}
-        self._on_head = {name for name, camera in rig.cameras.items() if camera.on == "head"}
+        self._calibrated = dict(rig.cameras)
         self.settings.calibrated()
 
     def faults(self) -> list[StandingFault]:
@@ -405,13 +407,15 @@ class Cameras:
         if isinstance(place, AbsentCamera):
             self._cameras[name] = place.appeared()
             log.warning("%s is here", name)
-        self._check_size(name)
+        self._check_as_calibrated(name)
 
     def _check_sizes(self) -> None:
-        """Pass cameras that do not tell their size now, or have the mast file's. Raises BadFrame."""
+        """Pass cameras that are as calibrated, or do not tell it now. Raises BadFrame."""
         until_s = self._time.now_s() + SIZE_TIMEOUT_S
         asked = {
-            name: thread.submit("size_px", partial(self._check_size, name), SIZE_TIMEOUT_S, told=False)
+            name: thread.submit(
+                "size_px", partial(self._check_as_calibrated, name), SIZE_TIMEOUT_S, told=False
+            )
             for name, thread in self._threads.items()
         }
         for name, told in asked.items():
@@ -424,12 +428,35 @@ class Cameras:
             except DriverError as error:
                 log.warning("%s; the size is seen in its pictures", error)
 
-    def _check_size(self, name: str) -> None:
-        """Pass a camera that does not know its size, or has the mast file's. Raises BadFrame."""
-        camera = self._cameras[name]
-        if isinstance(camera, KnowsSize) and name in self._sizes_px:
+    def _check_as_calibrated(self, name: str) -> None:
+        """Pass a camera whose size and sensor mode, as far as it knows them, are the mast file's.
+
+        Raises
+        ------
+        BadFrame
+            If one is not.
+        BadReply
+            If it tells something else than a sensor mode.
+        """
+        camera, calibrated = self._cameras[name], self._calibrated.get(name)
+        if isinstance(camera, KnowsSize) and calibrated is not None:
             width, height = camera.size_px
-            frame_checks.check_size(name, (int(width), int(height)), self._sizes_px[name])
+            frame_checks.check_size(name, (int(width), int(height)), calibrated.model.size_px)
+        if not isinstance(camera, KnowsSensorMode):
+            return
+        mode = camera.sensor_mode
+        if not isinstance(mode, SensorMode):
+            words = f"sensor_mode is {type(mode).__name__} where a SensorMode is expected"
+            raise BadReply(words, device=name)
+        self.sensor_modes[name] = mode
+        if calibrated is not None and (then := calibrated.sensor_mode) is not None:
+            frame_checks.check_mode(name, mode, then)
+            if mode.crop_px is None and then.crop_px is not None:
+                log.warning(
+                    "%s: its driver does not report which part of its sensor is read; the crop "
+                    "is not compared with the mast file's",
+                    name,
+                )
 
     def _times_of(self, name: str) -> _Times | None:
         """What a camera tells of its frames' times; None if it is not `Paced`."""
@@ -450,7 +477,9 @@ class Cameras:
                 exposed_after_s, max(0.0, deadline_s - self._time.now_s())
             )
             now_s = self._clock.now_s()
-            frame = frame_checks.checked(answer, camera, self._sizes_px.get(camera), exposed_after_s, now_s)
+            known = self._calibrated.get(camera)
+            size_px = None if known is None else known.model.size_px
+            frame = frame_checks.checked(answer, camera, size_px, exposed_after_s, now_s)
             if newest is not None:
                 try:
                     _check_order(frame, newest)
@@ -503,7 +532,8 @@ class Cameras:
             self._still_since[frame.camera] = frame
             return
         moved_rad = max(abs(frame.pan_rad - since.pan_rad), abs(frame.tilt_rad - since.tilt_rad))
-        if frame.camera in self._on_head and moved_rad > MOVED_RAD:
+        known = self._calibrated.get(frame.camera)
+        if known is not None and known.on == "head" and moved_rad > MOVED_RAD:
             raise BadFrame(
                 f"the picture is frozen: equal to the last bit although the head moved {moved_rad:.6f} rad",
                 device=frame.camera,

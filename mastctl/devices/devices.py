@@ -16,6 +16,7 @@ from contextlib import AbstractContextManager
 from typing import Protocol
 
 from calib.geometry.rig import AxisJoint, JointErrors, Rig
+from calib.geometry.sensor_mode import SensorMode
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import BadReply, DriverError, LineLost, NoReply
 from drivers.interfaces import (
@@ -353,6 +354,11 @@ class Devices:
         """Return what a camera is set to, as `mastctl.devices.camera_settings.CameraSettings.told`."""
         check_known(camera, self._cameras.newest_frames())
         return self._cameras.settings.told(camera)
+
+    @property
+    def sensor_modes(self) -> Mapping[str, SensorMode]:
+        """Which pixels of its sensor each camera's pictures show, of those that are open and know it."""
+        return self._cameras.sensor_modes
 
     def set_camera(self, camera: str, wanted: Mapping[str, float]) -> list[str]:
         """Change it, as `mastctl.devices.camera_settings.CameraSettings.change`."""

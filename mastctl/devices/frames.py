@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
+from calib.geometry.sensor_mode import BadMode, SensorMode, flip_name, mode_between
 from drivers.errors import BadFrame, NoFreshFrame
 from drivers.interfaces import SETTINGS, Frame, Image
 from mastctl.errors import NoLonger, NotKnown, NotNow
@@ -65,6 +66,30 @@ def check_size(camera: str, size_px: tuple[int, int], wanted_px: tuple[int, int]
         words = "the image is {}x{} px where the mast file has {}x{} px".format(*size_px, *wanted_px)
         remedy = "for a crop or binning of the calibrated picture 'mastctl camera mode' writes a mast file"
         raise BadFrame(f"{words}; {remedy}", device=camera)
+
+
+def check_mode(camera: str, now: SensorMode, then: SensorMode) -> None:
+    """Raise BadFrame if a camera's pictures are not of the sensor mode that the mast file was calibrated in.
+
+    A crop that either lacks is not compared.
+    """
+    try:
+        change = mode_between(then, now)
+    except BadMode as error:
+        remedy = f"{error}: set the camera as it was, or calibrate it as it is"
+    else:
+        if not change.words:
+            return
+        given = ((" --crop {} {} {} {}", change.crop_px), (" --bin {} {}", change.binning))
+        options = "".join(words.format(*value) for words, value in given if value not in (None, (1, 1)))
+        options += f" --flip {flip_name(change.flip)}" if any(change.flip) else ""
+        remedy = (
+            f"'mastctl camera mode MAST.yaml --camera {camera}{options} --out NEW.yaml' writes its mast file"
+        )
+        if change.binning != (1, 1):
+            remedy += "; a camera that skips pixels and does not bin them has to be calibrated as it is"
+    words = f"its pictures show {now.words} where cameras.{camera}.sensor_mode of the mast file has"
+    raise BadFrame(f"{words} {then.words}; {remedy}", device=camera)
 
 
 def checked(

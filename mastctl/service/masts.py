@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,11 +15,14 @@ from calib.files.mast_file import StoredRig, parse_rig
 from calib.files.yaml_text import MAX_BYTES
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
+from calib.geometry.sensor_mode import SensorMode
+from drivers.errors import BadFrame
 from mastctl.answers import MastTold
 from mastctl.config import Config, check_cameras
 from mastctl.control.machine import StateMachine
 from mastctl.control.operations import OperationRunner
 from mastctl.devices.devices import Devices
+from mastctl.devices.frames import check_mode
 from mastctl.devices.opening import Bounds
 from mastctl.errors import BadRequest, NotNow
 from mastctl.safety.state_folder import folder_of
@@ -61,7 +64,7 @@ def read_mast(path: Path, config: Config) -> MastInUse:
     return MastInUse(stored, data, path)
 
 
-def read_next(name: str, config: Config, now: MastInUse) -> MastInUse:
+def read_next(name: str, config: Config, now: MastInUse, sensor_modes: Mapping[str, SensorMode]) -> MastInUse:
     """Read the mast file that shall take the place of another.
 
     Parameters
@@ -72,6 +75,8 @@ def read_next(name: str, config: Config, now: MastInUse) -> MastInUse:
         Names the folder, and the cameras that it must have.
     now
         The one in use: configured cameras must be mounted alike and take images of the same size.
+    sensor_modes
+        Those of cameras that know it, which have to be the file's.
 
     Raises
     ------
@@ -95,6 +100,12 @@ def read_next(name: str, config: Config, now: MastInUse) -> MastInUse:
         raise BadMastFile(str(error)) from None
     for camera in config.hardware.cameras:
         _check_camera(camera, stored, now.stored)
+        mode, calibrated = sensor_modes.get(camera), stored.rig.cameras[camera].sensor_mode
+        if mode is not None and calibrated is not None:
+            try:
+                check_mode(camera, mode, calibrated)
+            except BadFrame as error:
+                raise BadMastFile(f"{name}: {error}") from None
     return MastInUse(stored, data, path)
 
 
@@ -198,7 +209,7 @@ class Masts:
         DriverError
             If the head does not say whether it moves.
         """
-        return self._use(read_next(name, self._config, self.in_use))
+        return self._use(read_next(name, self._config, self.in_use, self._devices.sensor_modes))
 
     def back(self) -> MastInUse:
         """Go back to the mast file that was in use before, as it was then; the second time forth again.

@@ -68,7 +68,7 @@ def _reload(service: Service) -> ReloadTold:
     try:
         after = load_config(before.path)
         _refuse_fixed(before, after)
-        mast = _next_mast(before, after, service.masts.in_use)
+        mast = _next_mast(before, after, service)
         check_cameras(after, (mast or service.masts.in_use).stored.rig)
     except BadFile as error:
         raise BadRequest("bad_config", " ".join(str(error).split())) from None
@@ -96,14 +96,15 @@ def _refuse_fixed(before: Config, after: Config) -> None:
         raise NotNow("restart_needed", words)
 
 
-def _next_mast(before: Config, after: Config, now: MastInUse) -> MastInUse | None:
+def _next_mast(before: Config, after: Config, service: Service) -> MastInUse | None:
     """The mast file that comes into use; None if the one in use stays.
 
     One that a command has put into use stays as long as the configuration names the same as before.
     """
+    now = service.masts.in_use
     if after.mast_file == before.mast_file and now.path != after.mast_file:
         return None
-    named = read_next(after.mast_file.name, after, now)
+    named = read_next(after.mast_file.name, after, now, service.devices.sensor_modes)
     return None if named.stored.digest == now.stored.digest else named
 
 

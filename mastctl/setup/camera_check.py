@@ -11,9 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from calib.files.mast_file import sensor_mode_keys
 from drivers.clock import Clock
 from drivers.errors import DriverError, NoFreshFrame
-from drivers.interfaces import Camera, Frame, HoldsExposure, Image, KnowsSize, Paced
+from drivers.interfaces import Camera, Frame, HoldsExposure, Image, KnowsSensorMode, KnowsSize, Paced
 from mastctl.devices import frames as frame_checks
 from mastctl.devices.thread import DeviceThread
 
@@ -154,7 +155,12 @@ class CameraCheck:
 
     def _told(self, seconds: float) -> dict[str, Any]:
         frames, camera = self._frames, self._camera
-        abilities = (("size_px", KnowsSize), ("exposure_held", HoldsExposure), ("period_s", Paced))
+        abilities = (
+            ("size_px", KnowsSize),
+            ("sensor_mode", KnowsSensorMode),
+            ("exposure_held", HoldsExposure),
+            ("period_s", Paced),
+        )
         told: dict[str, Any] = {
             "camera": self._name,
             "seconds": seconds,
@@ -165,6 +171,8 @@ class CameraCheck:
             "abilities": [word for word, protocol in abilities if isinstance(camera, protocol)],
             "problems": self.problems(),
         }
+        if isinstance(camera, KnowsSensorMode):
+            told |= sensor_mode_keys(camera.sensor_mode)
         if frames:
             image = frames[-1].image
             told |= {

@@ -17,8 +17,9 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Query, Response, WebSocket
 from starlette.websockets import WebSocketDisconnect
 
+from calib.geometry.sensor_mode import SensorMode, flip_name
 from drivers.interfaces import SETTINGS
-from mastctl.answers import CameraSettingsTold
+from mastctl.answers import CameraSettingsTold, SensorModeTold
 from mastctl.as_json import as_json
 from mastctl.control.entry import CAMERA_SETTINGS
 from mastctl.frame_facts import headers_of
@@ -91,6 +92,7 @@ def add_cameras(app: FastAPI) -> None:
 
 def _told(here: Parts, camera: str, notes: list[str]) -> CameraSettingsTold:
     found, held = here.service.devices.camera_settings(camera)
+    mode = here.service.devices.sensor_modes.get(camera)
     return {
         "camera": camera,
         "settings": [
@@ -107,7 +109,17 @@ def _told(here: Parts, camera: str, notes: list[str]) -> CameraSettingsTold:
             for one in found
         ],
         "held": held,
+        "sensor_mode": None if mode is None else _mode_told(mode),
         "notes": notes,
+    }
+
+
+def _mode_told(mode: SensorMode) -> SensorModeTold:
+    return {
+        "size_px": list(mode.size_px),
+        "sensor_px": None if mode.sensor_px is None else list(mode.sensor_px),
+        "crop_px": None if mode.crop_px is None else list(mode.crop_px),
+        "flip": flip_name(mode.flip),
     }
 
 

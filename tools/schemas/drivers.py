@@ -203,6 +203,13 @@ def simulation() -> Schema:
     inner["temperature"] = settings_schema(camera_settings.TemperatureSettings(), camera_settings.DAY_BOUNDS)
     clock = settings_schema(camera_settings.ClockSettings(), camera_settings.CLOCK_BOUNDS)
     inner["clocks"] = {"type": "object", "additionalProperties": clock}
+    with watched() as noted:
+        whole = {"crop_px": [0, 0, 1, 1], "binning": [1, 1], "flip": "none"}
+        simulation_settings({"rover": "true.yaml", "sensor_modes": {"NAME": whole}}, Path())
+    inner["sensor_modes"] = {
+        "type": "object",
+        "additionalProperties": noted.at("simulation.sensor_modes.NAME").schema(),
+    }
     inner["head"] = {"anyOf": [{"enum": list(heads.PRESETS)}, _head()], "default": "ptu_d46_70"}
     inner["wire"] = {"enum": [*DEFAULT_HEADS, None]}
     inner["speed"] = {"anyOf": [number(0.1, 1000), {"const": "max"}], "default": 1}

@@ -99,7 +99,8 @@ def camera() -> Schema:
     with watched() as noted:
         for drawn in examples()[-1]["cameras"].values():
             document = {"schema": mast_file.CAMERA_SCHEMA, "frame": "head", **drawn}
-            del document["on"]
+            for key in ("on", "sensor_mode"):
+                document.pop(key, None)
             mast_file.parse_camera(_bytes(document), "camera.yaml")
     found = noted.schema()
     found["properties"]["schema"] = {"const": mast_file.CAMERA_SCHEMA}
@@ -122,6 +123,7 @@ def survey() -> Schema:
         "model": "CAHVOR",
         "focal_px": 600.0,
         "rough": {"C": [0, 0, 0], "A": [1, 0, 0]},
+        "sensor_mode": {"sensor_px": [640, 480], "crop_px": [0, 0, 640, 480], "flip": "none"},
     }
     points = {"a": [0.0, 0.0, 0.0], "b": [1.0, 0.0, 0.0], "c": [0.0, 1.0, 0.0]}
     common = {

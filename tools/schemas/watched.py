@@ -74,7 +74,8 @@ class Noted:
 
     def merge(self, other: Noted) -> None:
         """Add another note of the same place."""
-        self.required = [key for key in other.required if key in self.required or not self.read]
+        if other.read:
+            self.required = [key for key in other.required if key in self.required or not self.read]
         self.read, self.named = self.read or other.read, self.named or other.named
         if other.value:
             self.note(dict(other.value))
@@ -124,6 +125,7 @@ OPTIONS: Mapping[str, Callable[..., Schema]] = {
     "text": lambda expected, default=None: {**TEXT, **({"default": default} if default else {})},
     "number": lambda default, low, high: number(low, high, default),
     "whole": lambda default, low, high: number(low, high, default, "integer"),
+    "wholes": lambda count, low, high: vector(number(low, high, kind="integer"), count),
     "flag": lambda default: {**FLAG, "default": default},
     "one_of": lambda default, allowed, between="": {"enum": list(allowed), "default": default},
     "pair": lambda expected: vector({"type": "number"}, 2),

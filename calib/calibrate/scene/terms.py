@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.geometry.cahvor import SPLINED, CameraModel
-from calib.geometry.rig import JOINTS_NAMES, UNKNOWN, Approach, Rig, RigCamera, joints_of
+from calib.geometry.rig import JOINTS_NAMES, UNKNOWN, Approach, Rig, joints_of
 from calib.geometry.rig import joint_numbers_of as joint_numbers
 from calib.geometry.rigid import FloatArray
 from calib.matching.warp import Grey
@@ -178,10 +178,10 @@ def corrected(rig: Rig, names: Sequence[str], values: FloatArray) -> Rig:
             turns.setdefault(camera, np.zeros(3))["xyz".index(axis)] = value
     for camera, turn in turns.items():
         held = cameras[camera]
-        cameras[camera] = RigCamera(held.on, held.model.turned(turn))
+        cameras[camera] = replace(held, model=held.model.turned(turn))
     for camera, numbers_of_lens in lenses.items():
         held = cameras[camera]
-        cameras[camera] = RigCamera(held.on, lensed(held.model, **numbers_of_lens))
+        cameras[camera] = replace(held, model=lensed(held.model, **numbers_of_lens))
     mast = replace(rig.mast, axis_twist_rad=twist)
     return replace(rig, cameras=cameras, mast=mast, joints=joints_of(numbers))
 

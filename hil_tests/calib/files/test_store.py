@@ -23,6 +23,7 @@ from calib.files import mast_file as store
 from calib.files.atomic import keep_previous, previous_path, save_bytes
 from calib.files.yaml_text import parse_mapping
 from calib.geometry.covariance import moved_rig, stored_covariance
+from calib.geometry.sensor_mode import SensorMode
 
 # The contract's example, written as a person writes it.
 MAST_TEXT = """\
@@ -100,6 +101,9 @@ def test_a_saved_rig_comes_back_bit_for_bit_and_any_yaml_reader_reads_it(tmp_pat
     document["cameras"]["navcam_left"]["C"] = rng.normal(size=3).tolist()
     document["cameras"]["navcam_right"] = copy.deepcopy(document["cameras"]["navcam_left"])
     document["stereo"] = {"navcam": ["navcam_left", "navcam_right"]}
+    document["cameras"]["navcam_left"]["sensor_mode"] = {"flip": "none"}
+    whole = {"sensor_px": [2048, 1536], "crop_px": [8, 0, 2040, 1536], "flip": "both"}
+    document["cameras"]["navcam_right"]["sensor_mode"] = whole
     document["fit"] = {"rms_px": {"navcam_left": [0.1, 1e-30]}, "parameters": ["on", "1e-3", "yes"]}
     document["provenance"] = {"operator": "Zoë", "date": "2026-11-21", "note": "1:30"}
     rig = store.parse_rig(json.dumps(document).encode(), "rig.yaml").rig
@@ -112,6 +116,9 @@ def test_a_saved_rig_comes_back_bit_for_bit_and_any_yaml_reader_reads_it(tmp_pat
             np.testing.assert_array_equal(
                 getattr(again.rig.cameras[name].model, letter), getattr(camera.model, letter)
             )
+    modes = [again.rig.cameras[name].sensor_mode for name in document["cameras"]]
+    right = SensorMode((1024, 768), (8, 0, 2040, 1536), (2048, 1536), (True, True))
+    assert modes == [SensorMode((1024, 768)), None, right]
     np.testing.assert_array_equal(again.rig.mast.translation_m, rig.mast.translation_m)
     assert again.rig.mast.axis_twist_rad == 1e-7
     assert dict(again.rig.fit) == document["fit"]
@@ -120,6 +127,7 @@ def test_a_saved_rig_comes_back_bit_for_bit_and_any_yaml_reader_reads_it(tmp_pat
     outside = yaml.safe_load(path.read_bytes())
     assert outside["cameras"]["navcam_left"]["on"] == "head"
     assert outside["fit"] == document["fit"]
+    assert outside["cameras"]["navcam_right"]["sensor_mode"] == whole
     assert outside["cameras"]["navcam_left"]["C"] == document["cameras"]["navcam_left"]["C"]
     before = path.read_bytes()
     store.save_rig(again.rig, path)
@@ -168,6 +176,22 @@ BAD_MASTS: list[tuple[Callable[[dict[str, Any]], None], str, str]] = [
     (_edit(*NAVCAM, "A", value=[float("inf"), 0, 0]), "cameras.navcam_left.A[0]", "finite"),
     (_edit(*NAVCAM, "C", value=[1e12, 0, 0]), "cameras.navcam_left.C[0]", "up to 1e+09"),
     (_edit(*NAVCAM, "V", value=[511.5, 1290, 0]), "cameras.navcam_left", "one plane"),
+    (_edit(*NAVCAM, "sensor_mode", value={}), "cameras.navcam_left.sensor_mode.flip", "missing"),
+    (
+        _edit(*NAVCAM, "sensor_mode", value={"flip": True}),
+        "cameras.navcam_left.sensor_mode.flip",
+        "none, hor",
+    ),
+    (
+        _edit(*NAVCAM, "sensor_mode", value={"flip": "none", "crop_px": [0, 0, 9, 9], "sensor_px": [8, 9]}),
+        "cameras.navcam_left.sensor_mode",
+        "crop_px [0, 0, 9, 9] is not inside the sensor's 8x9 px",
+    ),
+    (
+        _edit(*NAVCAM, "sensor_mode", value={"flip": "none", "crop_px": [0, 0, 9, 9]}),
+        "cameras.navcam_left.sensor_mode",
+        "expected together",
+    ),
     (_edit(*NAVCAM, "E", value=[0, 0.1, 0]), "cameras.navcam_left.E", "has no E"),
     (_edit(*NAVCAM, "type", value=2), "cameras.navcam_left.type", "has no 'type'"),
     (_edit(*HAZCAM, "type", delete=True), "cameras.hazcam_right.type", "missing"),

@@ -14,10 +14,11 @@ from calib.geometry.cahvor import SPLINED, CameraModel
 from calib.geometry.covariance import pixel_rates, stored_covariance
 from calib.geometry.lenses import opencv
 from calib.geometry.lenses.spline import SplineGrid
-from calib.geometry.mode import BadMode, Mode, in_mode, pixel_change, rig_in_mode
+from calib.geometry.mode import in_mode, pixel_change, rig_in_mode
 from calib.geometry.parameters import parameter_names
 from calib.geometry.pointing import solve
 from calib.geometry.rig import Mast, Rig, RigCamera
+from calib.geometry.sensor_mode import BadMode, Mode, SensorMode, mode_between, sensor_mode_after
 
 SIZE = (640, 480)
 SAME_PX = 1e-9
@@ -176,3 +177,84 @@ def test_a_mode_that_is_not_one_is_refused_in_a_sentence(mode: Mode, words: str)
     with pytest.raises(BadMode) as refusal:
         in_mode(cahvor(), mode)
     assert words in str(refusal.value)
+
+
+SENSOR = (96, 64)
+FULL = SensorMode(SENSOR, (0, 0, *SENSOR), SENSOR)
+SENSOR_MODES = [
+    FULL,
+    SensorMode((48, 32), (0, 0, *SENSOR), SENSOR),
+    SensorMode((24, 32), (0, 0, *SENSOR), SENSOR),
+    SensorMode((64, 48), (16, 8, 64, 48), SENSOR),
+    SensorMode((16, 24), (16, 8, 64, 48), SENSOR),
+    SensorMode((40, 20), (12, 30, 40, 20), SENSOR),
+    SensorMode((10, 10), (12, 30, 40, 20), SENSOR),
+    SensorMode(SENSOR, (0, 0, *SENSOR), SENSOR, (True, False)),
+    SensorMode((32, 24), (16, 8, 64, 48), SENSOR, (True, True)),
+]
+
+
+def seen(sensor: np.ndarray, mode: SensorMode) -> np.ndarray:
+    """What a camera in a mode gives: cut out, averaged and turned by OpenCV."""
+    assert mode.crop_px is not None
+    x, y, width, height = mode.crop_px
+    cut = cv2.resize(sensor[y : y + height, x : x + width], mode.size_px, interpolation=cv2.INTER_AREA)
+    return turned(cut, mode.flip)
+
+
+def turned(picture: np.ndarray, flip: tuple[bool, bool]) -> np.ndarray:
+    code = {(True, False): 1, (False, True): 0, (True, True): -1}.get(flip)
+    return picture if code is None else cv2.flip(picture, code)
+
+
+def test_a_picture_of_one_sensor_mode_becomes_that_of_another_as_opencv_cuts_it() -> None:
+    """Each pair of modes either changes into one another to the last grey level, or is refused."""
+    sensor = np.random.default_rng(3).uniform(0, 255, SENSOR[::-1])
+    carried = 0
+    for then, now in product(SENSOR_MODES, repeat=2):
+        try:
+            mode = mode_between(then, now)
+        except BadMode:
+            continue
+        x, y, width, height = mode.crop_px or (0, 0, *then.size_px)
+        part = seen(sensor, then)[y : y + height, x : x + width]
+        size = width // mode.binning[0], height // mode.binning[1]
+        made = turned(cv2.resize(part, size, interpolation=cv2.INTER_AREA), mode.flip)
+        assert np.abs(made - seen(sensor, now)).max() < 1e-9, (then, now)
+        assert sensor_mode_after(then, mode) == now
+        assert pixel_change(then.size_px, mode).size_px == now.size_px
+        carried += 1
+    assert carried == 33
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "words"),
+    [
+        (SENSOR_MODES[3], FULL, "they show more of the sensor along x than was calibrated"),
+        (SENSOR_MODES[1], FULL, "a scale of 2 along x is no binning"),
+        (FULL, replace(FULL, size_px=(64, 64)), "a scale of 2/3 along x is no binning"),
+        (
+            SENSOR_MODES[1],
+            SensorMode((47, 32), (1, 0, 94, 64), SENSOR),
+            "begins or ends amid a pixel along x",
+        ),
+        (FULL, SensorMode((96, 60), (0, 0, 96, 60), (96, 60)), "a sensor of 96x60 px where the calibrated"),
+        (FULL, replace(SENSOR_MODES[5], flip=(True, False)), "the crop is not in the middle"),
+        (SensorMode((96, 64)), SENSOR_MODES[5], "which part of the sensor they show is not known"),
+    ],
+)
+def test_a_sensor_mode_that_no_change_leads_to_is_refused_with_the_reason(
+    then: SensorMode, now: SensorMode, words: str
+) -> None:
+    with pytest.raises(BadMode, match=words):
+        mode_between(then, now)
+
+
+def test_what_a_driver_does_not_tell_is_not_compared_and_flips_are() -> None:
+    untold = SensorMode(SENSOR, flip=(False, True))
+    assert mode_between(FULL, untold) == mode_between(untold, FULL) == Mode(flip=(False, True))
+    assert mode_between(untold, untold) == Mode()
+    assert sensor_mode_after(untold, Mode(binning=(2, 2))) == SensorMode((48, 32), flip=(False, True))
+    off_middle = replace(SENSOR_MODES[5], flip=(True, False))
+    assert mode_between(off_middle, off_middle) == Mode(), "the same is the same, from whatever side"
+    assert sensor_mode_after(off_middle, Mode(crop_px=(0, 0, 20, 20))) is None

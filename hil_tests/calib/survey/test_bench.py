@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from calib.errors import BadFile
+from calib.geometry.sensor_mode import SensorMode
 from calib.survey import writer as bench_writer
 from calib.survey.check import check_survey
 from calib.survey.reader import read_survey
@@ -22,7 +23,8 @@ boards:
   desk: {kind: dots, columns: 4, rows: 3, spacing_m: 0.02, dot_diameter_m: 0.01}
 sigma: {corner_px: 0.1, joint_rad: 0.0002}
 cameras:
-  navcam_left: {on: head, size_px: [1024, 768], model: CAHVOR, focal_px: 1290}
+  navcam_left:
+    {on: head, size_px: [1024, 768], model: CAHVOR, focal_px: 1290, sensor_mode: {flip: both}}
   hazcam_left: {on: rover, size_px: [640, 480], model: CAHVORE, focal_px: 309}
 """
 IMAGES = """\
@@ -60,6 +62,8 @@ def test_a_bench_is_read_as_written(tmp_path: Path) -> None:
     assert survey.corners["one"].pixels_px.tolist() == [[400.5, 300.25], [500.5, 380.25]]
     assert survey.corners["one"].sigma_px.tolist() == [0.1, 0.1]
     assert set(survey.corners) == {"one", "two"}
+    modes = [camera.sensor_mode for camera in survey.cameras.values()]
+    assert modes == [SensorMode((1024, 768), flip=(True, True)), None]
 
 
 def test_columns_stand_in_any_order_and_a_corner_may_have_its_own_sigma(tmp_path: Path) -> None:

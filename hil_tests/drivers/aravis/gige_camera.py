@@ -24,8 +24,9 @@ CCP, PORT, PACKET, DESTINATION = 0xA00, 0xD00, 0xD04, 0xD18
 LATCH, LATCHED = 0x944, 0x948
 (
     WIDTH, HEIGHT, FORMAT, RUNS, MODE, SELECTOR, TRIGGERED, SOURCE, SOFTWARE, CHUNKS, CHUNK_SELECTOR,
-    CHUNK_ON, PAYLOAD, OFFSET_X, OFFSET_Y, FOCUS, WHITE, GAIN_AUTO,
-) = range(0x2000, 0x2000 + 18 * 4, 4)  # fmt: skip
+    CHUNK_ON, PAYLOAD, OFFSET_X, OFFSET_Y, FOCUS, WHITE, GAIN_AUTO, SENSOR_WIDTH, SENSOR_HEIGHT, BIN_X, BIN_Y,
+    REVERSE_X, REVERSE_Y,
+) = range(0x2000, 0x2000 + 24 * 4, 4)  # fmt: skip
 EXPOSURE, RATE, GAIN = 0x3000, 0x3008, 0x3010
 EXPOSURE_STEP_US = 20.0
 WRITE_PROTECTED = 0x8005
@@ -43,7 +44,12 @@ _CHOICES = {
     "TriggerSource": (SOURCE, {"Software": 0, "Line1": 1}),
     "ChunkSelector": (CHUNK_SELECTOR, {"ExposureTime": 0, "Gain": 1}),
 }
-_MORE_INTEGERS = {"Focus": (FOCUS, 0, 1023), "BalanceWhiteTemperature": (WHITE, 2500, 10000)}
+_MORE_INTEGERS = {
+    "Focus": (FOCUS, 0, 1023), "BalanceWhiteTemperature": (WHITE, 2500, 10000),
+    "SensorWidth": (SENSOR_WIDTH, 1, 4096), "SensorHeight": (SENSOR_HEIGHT, 1, 4096),
+    "BinningHorizontal": (BIN_X, 1, 4), "BinningVertical": (BIN_Y, 1, 4),
+}  # fmt: skip
+_MORE_FLAGS = {"ReverseX": REVERSE_X, "ReverseY": REVERSE_Y}
 _MORE_CHOICES = {"GainAuto": (GAIN_AUTO, {"Off": 0, "Continuous": 1})}
 _COMMANDS = {
     "AcquisitionStart": (RUNS, 1), "AcquisitionStop": (RUNS, 0), "TriggerSoftware": (SOFTWARE, 1),
@@ -95,7 +101,9 @@ def _genicam(clock_readable: bool, more: bool) -> bytes:
             f'<Float Name="{name}"><pValue>{name}Reg</pValue><Min>0.1</Min><Max>{high}</Max></Float>'
         )
         words.append(_register("FloatReg", f"{name}Reg", address, 8))
-    for name, address in (("ChunkModeActive", CHUNKS), ("ChunkEnable", CHUNK_ON)):
+    flags = {"ChunkModeActive": CHUNKS, "ChunkEnable": CHUNK_ON} | (_MORE_FLAGS if more else {})
+    names += _MORE_FLAGS if more else ()
+    for name, address in flags.items():
         on = "<OnValue>1</OnValue><OffValue>0</OffValue>"
         words.append(f'<Boolean Name="{name}"><pValue>{name}Reg</pValue>{on}</Boolean>')
         words.append(_register("IntReg", f"{name}Reg", address, 4))
@@ -125,7 +133,8 @@ class GigeCamera:
     clock_ahead_s
         How far the camera's clock is ahead of CLOCK_MONOTONIC; may be set anew at any time.
     more
-        Whether it has gain with an automatic, white balance and focus beside its exposure time.
+        Whether it has gain with an automatic, white balance, focus, binning and flips beside its exposure
+        time, and tells its sensor of 256x192 px.
     behind
         So many frames are exposed with the former settings after others were written.
     refuses
@@ -168,7 +177,7 @@ class GigeCamera:
         started = {
             0x0: 0x00010002, 0x24: struct.unpack(">I", socket.inet_aton(address))[0], 0x600: 1, 0x904: 1,
             0x934: 0x6, 0x938: 3000, 0x940: TICKS_HZ, WIDTH: 64, HEIGHT: 48, FORMAT: MONO8, PACKET: 1400,
-            FOCUS: 40, WHITE: 5000, GAIN_AUTO: 1,
+            FOCUS: 40, WHITE: 5000, GAIN_AUTO: 1, SENSOR_WIDTH: 256, SENSOR_HEIGHT: 192, BIN_X: 1, BIN_Y: 1,
         }  # fmt: skip
         for at, value in started.items():
             self._set(at, value)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from calib.geometry.sensor_mode import SensorMode
 from drivers.aravis import library
 from drivers.aravis.camera import AravisCamera
 from drivers.aravis.settings import settings_of
@@ -43,6 +44,13 @@ def taken(camera: AravisCamera, device: GigeCamera) -> TimedFrame:
         told = frame.settings[name]
         assert told is None or told == pytest.approx(value), f"{name} of frame {frame.sequence}"
     return frame
+
+
+def test_the_sensors_mode_follows_region_binning_and_flips(device: GigeCamera) -> None:
+    """Offset and size count binned pixels, as GenICam's SFNC has it."""
+    features = {"BinningHorizontal": 2, "BinningVertical": 3, "ReverseX": True}
+    camera = opened(offset_px=[16, 4], features=features)
+    assert camera.sensor_mode == SensorMode((64, 48), (32, 12, 128, 144), (256, 192), (True, False))
 
 
 @pytest.mark.parametrize("behind", [0, 2])

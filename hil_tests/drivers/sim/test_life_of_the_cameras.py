@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from calib.geometry.rigid import Rigid
+from calib.geometry.sensor_mode import SensorMode
 from drivers.clock import ManualClock
 from drivers.errors import BadFrame, BadOptions, NoFreshFrame
 from drivers.frame_times import Pairing, corrected, learned
@@ -43,6 +44,18 @@ def rover(rig: Path, **simulation: Any) -> tuple[SimulatedRover, ManualClock]:
     section = {"rover": rig.name, "seed": 5, "samples": 1, "cameras": QUIET, **simulation}
     _MADE.append(SimulatedRover(simulation_settings(section, rig.parent), clock))
     return _MADE[-1], clock
+
+
+def test_a_camera_in_another_mode_shows_that_part_of_its_picture(small_rig: Path) -> None:
+    full = rover(small_rig)[0].cameras[LEFT].next_frame(1000.0, 1.0).image
+    modes = {LEFT: {"crop_px": [32, 24, 160, 128], "flip": "horizontal"}, RIGHT: {"binning": [2, 4]}}
+    device, _ = rover(small_rig, sensor_modes=modes)
+    part = device.cameras[LEFT].next_frame(1000.0, 1.0).image.astype(int)
+    assert np.quantile(np.abs(part - full[24:152, 32:192][:, ::-1]), 0.99) <= 1
+    size_px = full.shape[::-1]
+    assert device.sensor_modes[LEFT] == SensorMode((160, 128), (32, 24, 160, 128), size_px, (True, False))
+    assert device.sensor_modes[RIGHT] == SensorMode((128, 48), (0, 0, *size_px), size_px)
+    assert device.cameras[RIGHT].next_frame(1000.0, 1.0).image.shape == (48, 128)
 
 
 def test_a_camera_exposes_by_its_own_clock_and_stamps_by_it(small_rig: Path) -> None:
@@ -243,6 +256,15 @@ def test_all_of_it_with_camera_faults(small_rig: Path) -> None:
     ("section", "words"),
     [
         ({"clocks": {"navcam_lfet": {}}}, "there is no camera 'navcam_lfet'; did you mean 'navcam_left'"),
+        ({"sensor_modes": {"pancam": {}}}, "simulation.sensor_modes: there is no camera 'pancam'"),
+        (
+            {"sensor_modes": {LEFT: {"flip": "up"}}},
+            "sensor_modes.navcam_left.flip is 'up', expected none",
+        ),
+        ({"sensor_modes": {LEFT: {"binning": [2]}}}, "binning is .2., expected 2 whole numbers from 1 to 64"),
+        ({"sensor_modes": {LEFT: {"binning": [3, 1]}}}, "navcam_left: binning by 3 does not divide"),
+        ({"sensor_modes": 3}, "simulation.sensor_modes is 3, expected crop_px, binning and flip"),
+        ({"sensor_modes": {LEFT: 3}}, "simulation.sensor_modes.navcam_left is 3, expected keys and values"),
         ({"clocks": [1]}, "simulation.clocks is .1., expected keys and values by camera's name"),
         ({"clocks": {LEFT: {"drift": 3}}}, "simulation.clocks.navcam_left has no key 'drift'"),
         (

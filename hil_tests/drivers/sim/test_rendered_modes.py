@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.mode import Mode, in_mode
+from calib.geometry.mode import in_mode
 from calib.geometry.rigid import Rigid
+from calib.geometry.sensor_mode import Mode
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene
 

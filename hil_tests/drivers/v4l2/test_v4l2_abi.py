@@ -21,6 +21,8 @@ SIZES = {
     "CaptureParm": 40,
     "StreamParm": 204,
     "RequestBuffers": 20,
+    "Rect": 16,
+    "Selection": 64,
     "Timecode": 16,
     "Buffer": 88,
     "QueryExtCtrl": 232,
@@ -46,6 +48,7 @@ REQUESTS = {
     "VIDIOC_S_EXT_CTRLS": 0xC0205648,
     "VIDIOC_ENUM_FRAMESIZES": 0xC02C564A,
     "VIDIOC_ENUM_FRAMEINTERVALS": 0xC034564B,
+    "VIDIOC_G_SELECTION": 0xC040565E,
     "VIDIOC_QUERY_EXT_CTRL": 0xC0E85667,
 }
 

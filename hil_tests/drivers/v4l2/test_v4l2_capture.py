@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import pytest
 
+from calib.geometry.sensor_mode import SensorMode
 from drivers import pixels
 from drivers.errors import BadOptions, DriverError, NoCamera, NoFreshFrame, StreamFailed
 from drivers.interfaces import Camera
@@ -102,6 +103,7 @@ class FakeStream:
         self.period_s = 0.04
         self.exposure_s: float | None = 0.01
         self.problems: list[object] = []
+        self.sensor_mode = SensorMode(SIZE_PX)
         self.rate_told = True
         self.rule = StampRule(0.0)
         self.in_force = {"exposure_s": ValuesSet(0.01)}
@@ -124,11 +126,13 @@ class Bench:
         self.clock = TurnedClock()
         self.streams: list[FakeStream] = []
         self.refusals: deque[DriverError] = deque()
+        self.mode = SensorMode(SIZE_PX)
 
     def open(self, *ignored: object) -> FakeStream:
         if self.refusals:
             raise self.refusals.popleft()
         self.streams.append(FakeStream())
+        self.streams[-1].sensor_mode = self.mode
         return self.streams[-1]
 
 
@@ -316,6 +320,19 @@ def test_a_camera_that_stays_away_is_looked_for_as_often_all_the_time(
 def test_a_failed_stream_is_opened_again(bench: Bench, camera: V4l2Camera) -> None:
     bench.streams[0].node.put(StreamFailed("/dev/video7 does not give a frame: Input/output error"))
     until(lambda: len(bench.streams) == 2, "it is opened again")
+
+
+def test_a_camera_that_comes_back_in_another_mode_is_not_taken(bench: Bench, camera: V4l2Camera) -> None:
+    was, bench.mode = bench.mode, SensorMode(SIZE_PX, flip=(True, False))
+    bench.streams[0].node.put(StreamFailed("/dev/video7 does not give a frame: Input/output error"))
+    until(lambda: "it came back with" in camera.capture.lost, "the refusal")
+    assert camera.capture.lost == (
+        "navcam_left: it came back with an unknown part of its sensor as 16x8 px, flip horizontal "
+        "where it had an unknown part of its sensor as 16x8 px"
+    )
+    bench.mode = was
+    until(lambda: not camera.capture.lost, "the camera as it was")
+    assert all(stream.closed for stream in bench.streams[:-1]) and camera.sensor_mode == was
 
 
 def test_a_stream_is_given_back_its_own_buffers_only(bench: Bench, camera: V4l2Camera) -> None:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import pytest
 
+from calib.geometry.sensor_mode import SensorMode
 from drivers.errors import BadSetting
 from drivers.interfaces import Adjustable
-from drivers.v4l2 import abi, settings
+from drivers.v4l2 import abi, settings, stream
 from drivers.v4l2.controls import CameraControl, ControlProblem
 from drivers.values_set import SETTLE_FRAMES, ValuesSet
 from hil_tests.drivers.v4l2.test_v4l2_never_old import bench
-from hil_tests.drivers.v4l2.v4l2_sensor import AUTO, EXPOSURE, Sensor
+from hil_tests.drivers.v4l2.v4l2_sensor import AUTO, EXPOSURE, Sensor, SensorNode, use
 
 GAIN = CameraControl(abi.CID_GAIN, "gain", "integer", 0, 255, 1, 100, True, {})
 AUTOGAIN = CameraControl(abi.CID_AUTOGAIN, "gain_automatic", "boolean", 0, 1, 1, 1, True, {})
 FOCUS = CameraControl(abi.CID_FOCUS_ABSOLUTE, "focus", "integer", 0, 250, 5, 0, True, {})
+HFLIP = CameraControl(abi.CID_HFLIP, "horizontal_flip", "boolean", 0, 1, 1, 0, True, {})
+VFLIP = CameraControl(abi.CID_VFLIP, "vertical_flip", "boolean", 0, 1, 1, 0, True, {})
 ALL = (AUTO, EXPOSURE, AUTOGAIN, GAIN, FOCUS)
 VALUES = {AUTOGAIN.id: 1, GAIN.id: 16, FOCUS.id: 30}
 PERIOD_S = 0.04
@@ -46,6 +49,37 @@ def test_a_frame_stamped_before_a_change_has_the_old_one_and_none_is_told_a_valu
         assert told()["exposure_s"] == pytest.approx(0.036), "of the others nothing became unknown"
         with camera.exposure_held():
             assert told()["gain"] == 200.0
+
+
+CROP, BOUNDS, NATIVE, COMPOSE = (
+    abi.SEL_TGT_CROP, abi.SEL_TGT_CROP_BOUNDS, abi.SEL_TGT_NATIVE_SIZE, abi.SEL_TGT_COMPOSE,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("told", "crop_px", "sensor_px"),
+    [
+        ({}, None, None),
+        ({CROP: (16, 8, 32, 16)}, None, None),
+        ({CROP: (16, 8, 32, 16), BOUNDS: (8, 4, 64, 32)}, (8, 4, 32, 16), (64, 32)),
+        ({CROP: (16, 8, 32, 16), BOUNDS: (8, 4, 64, 32), NATIVE: (0, 0, 72, 40)}, (16, 8, 32, 16), (72, 40)),
+        ({CROP: (0, 0, 32, 16), BOUNDS: (0, 0, 64, 32), COMPOSE: (0, 0, 16, 8)}, (0, 0, 32, 16), (64, 32)),
+        ({CROP: (0, 0, 32, 16), BOUNDS: (0, 0, 64, 32), COMPOSE: (4, 0, 12, 8)}, None, None),
+        ({CROP: (60, 0, 32, 16), BOUNDS: (0, 0, 64, 32)}, None, None),
+    ],
+)
+def test_the_sensors_mode_is_as_far_as_the_driver_tells_it(
+    monkeypatch: pytest.MonkeyPatch,
+    told: dict[int, tuple[int, int, int, int]],
+    crop_px: tuple[int, int, int, int] | None,
+    sensor_px: tuple[int, int] | None,
+) -> None:
+    """Crops count from the corner of the native size, else of the bounds; not told of composed pictures."""
+    node = SensorNode("start", controls=(HFLIP, VFLIP))
+    node.selections, node.values[HFLIP.id], node.values[VFLIP.id] = told, 0, 1
+    use(monkeypatch, node)
+    found = stream.sensor_mode_of(node, (16, 8))  # type: ignore[arg-type]
+    assert found == SensorMode((16, 8), crop_px, sensor_px, (False, True))
 
 
 def test_a_hold_waits_until_a_change_shows(monkeypatch: pytest.MonkeyPatch) -> None:

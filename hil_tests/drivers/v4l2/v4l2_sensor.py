@@ -77,6 +77,7 @@ class SensorNode:
         self.kind = kind
         self.rate_hz = rate_hz
         self.controls = controls
+        self.selections: dict[int, tuple[int, int, int, int]] = {}  # by target; it tells none of others
         self.values = {AUTO.id: 3, EXPOSURE.id: 100}
         self.sets: list[tuple[int, int]] = []
         self.ready = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
@@ -115,6 +116,9 @@ class SensorNode:
 
     def set_format(self, code: str, size_px: tuple[int, int]) -> PictureFormat:
         return PictureFormat("GREY", SIZE_PX, SIZE_PX[0], SIZE_PX[0] * SIZE_PX[1])
+
+    def selection(self, target: int) -> tuple[int, int, int, int] | None:
+        return self.selections.get(target)
 
     def set_rate(self, rate_hz: float) -> float | None:
         return self.rate_hz

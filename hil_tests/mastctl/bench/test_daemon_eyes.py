@@ -10,11 +10,13 @@ import pytest
 
 from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.rig import AxisJoint, JointErrors
+from calib.geometry.sensor_mode import SensorMode
 from calib.plan.placements import Placement
 from calib.targets.boards import Charuco
 from mastctl.bench import daemon_eyes
 from mastctl.bench.daemon_eyes import DaemonEyes
 from mastctl.bench.eyes import BenchInterrupted, NoLight, NotThere
+from mastctl.bench.folder import survey_cameras
 from mastctl.bench.simulated import SimulatedPerson
 from mastctl.bench.teller import Terminal
 from mastctl.client import Client
@@ -52,6 +54,11 @@ def eyes(client: Client, monkeypatch: pytest.MonkeyPatch) -> Iterator[DaemonEyes
 
 def test_a_look_shows_the_board_with_one_reading_and_tells_what_the_head_is(eyes: DaemonEyes) -> None:
     assert eyes.head.one_sided and eyes.head.count_rad == pytest.approx(5.6e-5, rel=0.01)
+    left = eyes.head.rig.cameras["navcam_left"]
+    whole = SensorMode(left.model.size_px, (0, 0, *left.model.size_px), left.model.size_px)
+    assert left.sensor_mode == whole
+    kept = survey_cameras(eyes.head.rig, {"navcam_left": left.model.size_px})
+    assert kept["navcam_left"].sensor_mode == whole
     look = eyes.look(0.05, -0.02)
     assert [one.camera for one in look.found] == list(CAMERAS)
     assert look.pan_rad == pytest.approx(0.05, abs=1e-4) and look.seconds > 0.0

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.geometry.mode import Mode, in_mode
+from calib.geometry.mode import in_mode
+from calib.geometry.sensor_mode import Mode, SensorMode
 from hil_tests.mastctl.service_fakes import rig
 from mastctl.cli.main import main
 
@@ -42,6 +43,26 @@ def test_a_mast_file_of_a_mode_is_written_and_says_so(
     assert stored.rig.provenance["modes"] == [
         {"camera": "navcam_left", "of": load_rig(mast).digest, "mode": mode}
     ]
+
+
+def test_the_sensors_mode_is_carried_over_and_one_that_is_not_told_is_left_out(
+    mast: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    little, new = load_rig(mast).rig, tmp_path / "new.yaml"
+    off_middle = SensorMode((64, 48), (30, 8, 64, 48), (128, 96))
+
+    def written(mode: SensorMode, *options: str) -> SensorMode | None:
+        held = replace(little.cameras["navcam_left"], sensor_mode=mode)
+        save_rig(replace(little, cameras={**little.cameras, "navcam_left": held}), mast)
+        words = ["camera", "mode", str(mast), "--camera", "navcam_left", *options, "--out", str(new)]
+        assert main(words) == 0
+        return load_rig(new).rig.cameras["navcam_left"].sensor_mode
+
+    binned = written(off_middle, "--crop", "8", "4", "48", "40", "--bin", "2")
+    assert binned == SensorMode((24, 20), (38, 12, 48, 40), (128, 96))
+    assert written(off_middle, "--flip", "both") is None
+    told = "which part of the sensor navcam_left then shows is not known: its sensor_mode is left out"
+    assert told in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from calib.geometry.sensor_mode import SensorMode
 from drivers.clock import SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, LineLost, NoFreshFrame, NoReply
 from drivers.interfaces import AxisReport, Frame, FrameTime, Reading
@@ -750,6 +751,71 @@ def test_a_camera_of_another_size_than_the_mast_files_is_refused_at_the_start() 
     ):
         Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
     until(lambda: set(threading.enumerate()) <= before, "no thread is left")
+
+
+class ModalCamera(FakeCamera):
+    """A camera that knows which part of its sensor it reads."""
+
+    sensor_mode: Any = SensorMode((64, 48), (32, 24, 64, 48), (128, 96))
+
+
+PART = "64x48 px from (32, 24) of 128x96 px as 64x48 px"
+
+
+@pytest.mark.parametrize(
+    ("calibrated", "words"),
+    [
+        (
+            SensorMode((64, 48), (32, 24, 64, 48), (128, 96), (True, True)),
+            f"its pictures show {PART} where cameras.navcam_left.sensor_mode of the mast file has {PART}, "
+            "flip horizontal and vertical; 'mastctl camera mode MAST.yaml --camera navcam_left --flip both "
+            "--out NEW.yaml' writes",
+        ),
+        (
+            SensorMode((64, 48), (32, 0, 64, 96), (128, 96)),
+            "a scale of 2 along y is no binning: set the camera as it was, or calibrate it as it is",
+        ),
+        (SensorMode((64, 48), (40, 24, 64, 48), (128, 96)), "more of the sensor along x than was calibrated"),
+        (SensorMode((64, 48), (32, 24, 64, 48), (128, 96)), ""),
+        (SensorMode((64, 48)), ""),
+        (None, ""),
+    ],
+)
+def test_a_camera_in_another_mode_than_the_mast_files_is_refused_at_the_start_with_what_mends_it(
+    calibrated: SensorMode | None, words: str
+) -> None:
+    hardware, little = FakeHardware(), rig()
+    hardware.fake_cameras["navcam_left"] = ModalCamera("navcam_left", 0)
+    held = replace(little.cameras["navcam_left"], sensor_mode=calibrated)
+    modal = replace(little, cameras={**little.cameras, "navcam_left": held})
+    if words:
+        with pytest.raises(BadFrame) as refused:
+            Devices(hardware, LIMITS, DIGEST, SystemClock(), modal)
+        assert words in str(refused.value)
+        return
+    devices = Devices(hardware, LIMITS, DIGEST, SystemClock(), modal)
+    assert devices.sensor_modes == {"navcam_left": ModalCamera.sensor_mode}
+    devices.close()
+
+
+@pytest.mark.parametrize(
+    ("mode", "words"),
+    [
+        (SensorMode((64, 48)), "navcam_left: its driver does not report which part of its sensor is read"),
+        ((64, 48), "navcam_left: sensor_mode is tuple where a SensorMode is expected"),
+    ],
+)
+def test_a_driver_that_does_not_tell_its_crop_is_told_and_compared_with_nothing(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, mode: object, words: str
+) -> None:
+    hardware, little = FakeHardware(), rig()
+    monkeypatch.setattr(ModalCamera, "sensor_mode", mode)
+    hardware.fake_cameras["navcam_left"] = ModalCamera("navcam_left", 0)
+    whole = SensorMode((64, 48), (0, 0, 64, 48), (64, 48))
+    held = replace(little.cameras["navcam_left"], sensor_mode=whole)
+    modal = replace(little, cameras={**little.cameras, "navcam_left": held})
+    Devices(hardware, LIMITS, DIGEST, SystemClock(), modal).close()
+    assert words in caplog.text
 
 
 def test_a_start_that_is_refused_on_the_simulations_clock_blames_no_driver(

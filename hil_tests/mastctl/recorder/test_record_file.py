@@ -16,7 +16,8 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 
-from calib.geometry.mode import Mode, in_mode
+from calib.geometry.mode import in_mode
+from calib.geometry.sensor_mode import Mode
 from drivers.recordings.mcap_file import BadRecording, McapContents, McapEntry, read_items
 from hil_tests.mastctl.recorder.recorder_world import (
     CONFIG,

@@ -17,6 +17,7 @@ import pytest
 from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Mast, RigCamera
+from calib.geometry.sensor_mode import SensorMode
 from drivers.errors import NoReply
 from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, ScriptedLoop, rig
 from hil_tests.waiting import NET_S, until
@@ -186,7 +187,9 @@ def test_only_files_beside_the_configured_one_are_taken(quiet: httpx.Client, nam
     refusal(quiet.post("/mast", json={"file": name}), 422, "bad_mast_file")
 
 
-def test_bad_files_are_refused_with_the_reason(web: httpx.Client, folder: Path) -> None:
+def test_bad_files_are_refused_with_the_reason(
+    web: httpx.Client, folder: Path, daemon: RunningDaemon
+) -> None:
     before = in_use(web)
     (folder / "broken.yaml").write_text("schema: mastctl/mast/1\nname: broken\nmast: 3\ncameras: {}\n")
     assert "mast" in refusal(web.post("/mast", json={"file": "broken.yaml"}), 422, "bad_mast_file")
@@ -197,7 +200,15 @@ def test_bad_files_are_refused_with_the_reason(web: httpx.Client, folder: Path) 
         "on": {**little.cameras, "navcam_left": RigCamera("rover", left.model)},
         "size": {**little.cameras, "navcam_left": rig((32, 24)).cameras["navcam_left"]},
     }
-    words = {"lacking": "no camera hazcam_left", "on": "on the rover", "size": "32x24"}
+    daemon.service.devices.sensor_modes["navcam_left"] = SensorMode((64, 48))  # type: ignore[index]
+    flipped = replace(left, sensor_mode=SensorMode((64, 48), flip=(True, False)))
+    others["mode"] = {**little.cameras, "navcam_left": flipped}
+    words = {
+        "lacking": "no camera hazcam_left",
+        "on": "on the rover",
+        "size": "32x24",
+        "mode": "--flip horizontal",
+    }
     for name, cameras in others.items():
         save_rig(replace(little, cameras=cameras), folder / f"{name}.yaml")
         told = refusal(web.post("/mast", json={"file": f"{name}.yaml"}), 422, "bad_mast_file")

@@ -1,0 +1,191 @@
+"""Which pixels of its sensor a camera's pictures show, and how one such mode differs from another.
+
+Drivers read the mode, mast files keep it with the calibration, and the daemon compares the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from calib.errors import CalibError
+
+FlipName = Literal["none", "horizontal", "vertical", "both"]
+FLIPS: Mapping[FlipName, tuple[bool, bool]] = {
+    "none": (False, False),
+    "horizontal": (True, False),
+    "vertical": (False, True),
+    "both": (True, True),
+}
+"""Names of flips (left to right, upside down), in files and commands."""
+
+
+class BadMode(CalibError):
+    """A mode that a calibration cannot be carried over to."""
+
+    code = "bad_mode"
+
+
+@dataclass(frozen=True)
+class Mode:
+    """The changes of the calibrated picture, in this order.
+
+    Attributes
+    ----------
+    crop_px
+        (x, y, width, height) of the part that is read, calibrated pixels; None: all of it.
+    binning
+        (across, down): so many pixels make one.
+    flip
+        (left to right, upside down).
+    """
+
+    crop_px: tuple[int, int, int, int] | None = None
+    binning: tuple[int, int] = (1, 1)
+    flip: tuple[bool, bool] = (False, False)
+
+    @property
+    def words(self) -> str:
+        """It in words; empty for the calibrated mode itself."""
+        found = []
+        if self.crop_px is not None:
+            found.append("crop {2}x{3} px from ({0}, {1})".format(*self.crop_px))
+        if self.binning != (1, 1):
+            found.append("binning {}x{}".format(*self.binning))
+        if any(self.flip):
+            found.append(_flip_words(self.flip))
+        return ", ".join(found)
+
+
+@dataclass(frozen=True)
+class SensorMode:
+    """Which pixels of a sensor a camera's pictures show, as its driver reads it.
+
+    Attributes
+    ----------
+    size_px
+        (width, height) of the pictures.
+    crop_px
+        (x, y, width, height) of the part of the sensor that makes a picture, the sensor's pixels; None if the
+        driver does not report it.
+    sensor_px
+        (width, height) of all that can be read; None without ``crop_px``.
+    flip
+        Whether the camera turns its pictures (left to right, upside down).
+
+    Raises
+    ------
+    ValueError
+        If the crop is not inside the sensor, or one of the two is missing.
+    """
+
+    size_px: tuple[int, int]
+    crop_px: tuple[int, int, int, int] | None = None
+    sensor_px: tuple[int, int] | None = None
+    flip: tuple[bool, bool] = (False, False)
+
+    def __post_init__(self) -> None:
+        if self.crop_px is None or self.sensor_px is None:
+            if self.crop_px is not None or self.sensor_px is not None:
+                raise ValueError("crop_px and sensor_px are expected together")
+            return
+        x, y, width, height = self.crop_px
+        across, down = self.sensor_px
+        if min(x, y) < 0 or min(width, height) < 1 or x + width > across or y + height > down:
+            raise ValueError(
+                f"crop_px {list(self.crop_px)} is not inside the sensor's {across}x{down} px ([x, y, width, "
+                "height] is expected)"
+            )
+
+    @property
+    def words(self) -> str:
+        """It in words."""
+        part = "an unknown part of its sensor"
+        if self.crop_px is not None and self.sensor_px is not None:
+            part = "{2}x{3} px from ({0}, {1}) of {4}x{5} px".format(*self.crop_px, *self.sensor_px)
+        flip = f", {_flip_words(self.flip)}" if any(self.flip) else ""
+        return f"{part} as {self.size_px[0]}x{self.size_px[1]} px{flip}"
+
+    def centered(self, axis: int) -> bool:
+        """Return whether a known crop is in the middle of the sensor along x (0) or y (1)."""
+        assert self.crop_px is not None and self.sensor_px is not None
+        return 2 * self.crop_px[axis] + self.crop_px[axis + 2] == self.sensor_px[axis]
+
+
+def mode_between(then: SensorMode, now: SensorMode) -> Mode:
+    """Return how pictures of one mode differ from those of another of the same camera.
+
+    A crop that either lacks counts as equal. Some makers count the crop of a flipped picture from the one
+    side of the sensor, and some from the other. So such a crop has to be in the middle.
+
+    Raises
+    ------
+    BadMode
+        If no crop, binning and flip of the former pictures makes the present ones.
+    """
+    from fractions import Fraction  # brings `decimal`, which no command needs at its start
+
+    flip = then.flip[0] != now.flip[0], then.flip[1] != now.flip[1]
+    if then.crop_px is None or now.crop_px is None:
+        if then.size_px != now.size_px:
+            raise BadMode("which part of the sensor they show is not known")
+        return Mode(flip=flip)
+    if then.sensor_px != now.sensor_px:
+        sizes = ["{}x{} px".format(*one.sensor_px) for one in (now, then) if one.sensor_px]
+        raise BadMode(f"the camera has a sensor of {sizes[0]} where the calibrated one had {sizes[1]}")
+    begins, lengths, binnings = [], [], []
+    for axis, side in enumerate("xy"):
+        (then_begin, then_px), (begin, length) = then.crop_px[axis::2], now.crop_px[axis::2]
+        moved = flip[axis] or (then_begin, then_px) != (begin, length)
+        if moved and then.flip[axis] | now.flip[axis] and not (then.centered(axis) and now.centered(axis)):
+            raise BadMode(
+                "the crop is not in the middle, and from which side of the sensor it counts in flipped "
+                "pictures is the maker's choice"
+            )
+        one = Fraction(then_px, then.size_px[axis])
+        at, span, by = (begin - then_begin) / one, length / one, Fraction(length, now.size_px[axis]) / one
+        if at < 0 or at + span > then.size_px[axis]:
+            raise BadMode(f"they show more of the sensor along {side} than was calibrated")
+        if at.denominator != 1 or span.denominator != 1:
+            raise BadMode(f"their part of the calibrated picture begins or ends amid a pixel along {side}")
+        if by.denominator != 1:
+            raise BadMode(f"a scale of {1 / by} along {side} is no binning")
+        begins.append(int(at))
+        lengths.append(int(span))
+        binnings.append(int(by))
+    crop = begins[0], begins[1], lengths[0], lengths[1]
+    return Mode(None if crop == (0, 0, *then.size_px) else crop, (binnings[0], binnings[1]), flip)
+
+
+def sensor_mode_after(then: SensorMode, mode: Mode) -> SensorMode | None:
+    """Return the sensor's mode whose pictures are changed ones of another.
+
+    None where that is not known: a crop of a flipped picture that is not in its middle (`mode_between`).
+    """
+    from fractions import Fraction
+
+    crop = mode.crop_px or (0, 0, *then.size_px)
+    size_px = crop[2] // mode.binning[0], crop[3] // mode.binning[1]
+    flip = then.flip[0] != mode.flip[0], then.flip[1] != mode.flip[1]
+    if then.crop_px is None or then.sensor_px is None:
+        return SensorMode(size_px, flip=flip)
+    by = [Fraction(length, size) for length, size in zip(then.crop_px[2:], then.size_px, strict=True)]
+    x, y, width, height = (
+        begin + px * scale for begin, px, scale in zip((*then.crop_px[:2], 0, 0), crop, by * 2, strict=True)
+    )
+    after = SensorMode(size_px, (int(x), int(y), int(width), int(height)), then.sensor_px, flip)
+    try:
+        return after if mode_between(then, after) == mode else None
+    except BadMode:
+        return None
+
+
+def flip_name(flip: tuple[bool, bool]) -> FlipName:
+    """Return a flip's name, by `FLIPS`."""
+    return next(name for name, one in FLIPS.items() if one == flip)
+
+
+def _flip_words(flip: tuple[bool, bool]) -> str:
+    sides = [word for word, on in zip(("horizontal", "vertical"), flip, strict=True) if on]
+    return f"flip {' and '.join(sides)}"
