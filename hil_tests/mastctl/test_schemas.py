@@ -48,6 +48,7 @@ CANNOT = {
     "mast": {
         "cameras.navcam_left.A": "a vector's length",
         "cameras.navcam_left": "vectors against each other",
+        "cameras.navcam_left.sensor_mode": "one value against another",
         "stereo.n": "a camera that another key must have",
         "fit.a.b[1]": "not a number, in a mapping of any content",
     },

@@ -10,8 +10,9 @@ from typing import Any
 
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
-from drivers.interfaces import Camera
+from drivers.interfaces import Adjustable, Camera
 from mastctl.conform.checks import NotTried, PromiseBroken, Suite, expect
+from mastctl.conform.settings_trial import settings_tried
 from mastctl.conform.worker import beside, ended
 from mastctl.devices import frames as frame_checks
 from mastctl.setup.camera_check import FRAME_TIMEOUT_S, GRACE_S, CameraCheck
@@ -107,6 +108,20 @@ def _threads(trial: CameraTrial) -> None:
             ended("next_frame() beside another", call, FRAMES_EACH * (FRAME_TIMEOUT_S + GRACE_S))
         except DriverError as error:
             raise PromiseBroken(f"next_frame() beside another: {error}") from None
+
+
+@CAMERAS.check(
+    "camera.settings", "a setting that is changed by a little is read back, on new frames, and put back"
+)
+def _settings(trial: CameraTrial) -> str:
+    camera = trial.camera
+    if not isinstance(camera, Adjustable):
+        raise NotTried("nothing of it can be changed while it runs")
+    return settings_tried(
+        lambda: ended("settings()", beside(camera.settings)),
+        lambda name, value: ended("adjust()", beside(lambda: camera.adjust({name: value}))),
+        lambda: trial.frame(camera).settings,
+    )
 
 
 @CAMERAS.check("camera.close", "close ends a call that waits, twice does no harm, and then no frame comes")

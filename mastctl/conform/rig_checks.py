@@ -12,10 +12,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from drivers.interfaces import CameraSetting
 from mastctl.client import ClientError, Snapshot
 from mastctl.conform.checks import NotTried, PromiseBroken, Suite, expect
 from mastctl.conform.head_trial import Angles
 from mastctl.conform.rig import ARRIVED_RAD, POLL_S, RigTrial, field, number
+from mastctl.conform.settings_trial import settings_tried
 
 RIG: Suite[RigTrial] = Suite()
 
@@ -111,6 +113,40 @@ def _angles(trial: RigTrial) -> None:
     expect(not shot.moving, f"{camera}: a picture of the head at rest says that it moved")
     off_rad = _away((shot.pan_rad, shot.tilt_rad), at)
     expect(off_rad <= ARRIVED_RAD, f"{camera}: its angles are {off_rad:.4f} rad from the measured ones")
+
+
+@RIG.check(
+    "pictures.settings", "a setting that is changed by a little is read back, on new pictures, and put back"
+)
+def _settings(trial: RigTrial) -> str:
+    tried = []
+    for camera in trial.cameras:
+        try:
+            tried.append(f"{camera}: {_settings_of(trial, camera)}")
+        except NotTried as reason:
+            last = reason
+    if not tried:
+        raise last
+    return "; ".join(tried)
+
+
+def _settings_of(trial: RigTrial, camera: str) -> str:
+    """Try one camera's settings. Raises NotTried, PromiseBroken, ClientError."""
+
+    def read() -> list[CameraSetting]:
+        return [
+            CameraSetting(
+                one["name"], one["value"], one["minimum"], one["maximum"], one["step"], one["automatic"],
+                one["refusal"] or "",
+            )
+            for one in trial.client.camera_settings(camera)["settings"]
+        ]  # fmt: skip
+
+    return settings_tried(
+        read,
+        lambda name, value: trial.client.set_camera(camera, **{name: value})["notes"],
+        lambda: trial.picture(camera).settings,
+    )
 
 
 @RIG.check(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import partial
 from numbers import Real
@@ -75,10 +75,13 @@ class CameraSettings:
             camera = self._cameras[name]
             assert isinstance(camera, Adjustable)
             try:
-                return [str(note) for note in camera.adjust(changes)]
-            finally:
-                if "focus" in wanted:
-                    self._note_focus(name, before)
+                notes = [str(note) for note in camera.adjust(changes)]
+            except BaseException:
+                with suppress(Exception):  # the first error counts
+                    self._note_focus(name, wanted, before)
+                raise
+            self._note_focus(name, wanted, before)
+            return notes
 
         return self._threads[name].call("adjust", change, SET_TIMEOUT_S, told=False)
 
@@ -115,8 +118,10 @@ class CameraSettings:
             return [], self._holds[name] > 0
         return [_believed(one, name) for one in camera.settings()], self._holds[name] > 0
 
-    def _note_focus(self, name: str, before: Sequence[CameraSetting]) -> None:
-        """Compare a camera's focus with that of before its first change."""
+    def _note_focus(self, name: str, wanted: Mapping[str, float], before: Sequence[CameraSetting]) -> None:
+        """Compare a focus that was to be changed with that of before its first change."""
+        if "focus" not in wanted:
+            return
         had = next((one.value for one in before if one.name == "focus"), None)
         now = next((one.value for one in self._told(name)[0] if one.name == "focus"), None)
         former = self._refocused.get(name)

@@ -6,7 +6,7 @@ import http.client
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -19,7 +19,7 @@ from calib.files.mast_file import save_rig
 from drivers.clock import SystemClock
 from drivers.errors import NoFreshFrame, NoReply
 from drivers.faults import FaultPanel
-from drivers.interfaces import Frame
+from drivers.interfaces import CameraSetting, Frame
 from drivers.sim.axis import AxisSettings
 from drivers.sim.heads import HeadSettings
 from drivers.sim.pan_tilt import SimulatedPanTilt
@@ -46,6 +46,8 @@ def open_head(low_rad: float = -2.0, high_rad: float = 2.0, name: str = "") -> S
 class NoiseCamera:
     """A free-running camera of 50 Hz that sees noise, and gives the first frame after the moment asked for.
 
+    It has a gain in steps of 4, and a focus.
+
     It keeps the frames of some seconds, so that both cameras of a pair give frames of one moment,
     however late on a busy machine the second one is asked.
     """
@@ -54,9 +56,19 @@ class NoiseCamera:
 
     def __init__(self, seed: int = 0) -> None:
         self._seed = seed
+        self.gain = 8.0
         self._closed = threading.Event()
 
     def recent_times(self) -> list[object]:
+        return []
+
+    def settings(self) -> list[CameraSetting]:
+        focus = CameraSetting("focus", 30.0, 0.0, 250.0)
+        return [CameraSetting("gain", self.gain, 0.0, 100.0, 4.0), focus]
+
+    def adjust(self, wanted: Mapping[str, float]) -> list[str]:
+        assert list(wanted) == ["gain"]
+        self.gain = wanted["gain"]
         return []
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
@@ -70,7 +82,8 @@ class NoiseCamera:
             raise NoFreshFrame(f"no frame within {timeout_s:g} s")
         random = np.random.default_rng((self._seed, sequence))
         image = random.integers(0, 255, SIZE_PX[::-1], dtype=np.uint8)
-        return Frame(image, sequence, sequence * PERIOD_S + 0.001, 0.002)
+        settings = {"gain": self.gain}
+        return Frame(image, sequence, sequence * PERIOD_S + 0.001, 0.002, settings=settings)
 
     def close(self) -> None:
         self._closed.set()
@@ -137,7 +150,7 @@ class Proxy:
                 self.end_headers()
                 self.wfile.write(told.data)
 
-            do_GET = do_POST = do_DELETE = serve
+            do_GET = do_POST = do_PATCH = do_DELETE = serve
 
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self._server.daemon_threads = True

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from drivers.errors import DriverError, NoFreshFrame, NoReply
-from drivers.interfaces import Frame
+from drivers.interfaces import CameraSetting, Frame
 from hil_tests.mastctl.conform.conform_world import HERE, NoiseCamera
 from hil_tests.mastctl.service_fakes import SIZE_PX
 from mastctl.cli.main import main
@@ -80,6 +80,21 @@ class OneAtATime(NoiseCamera):
             self.busy.release()
 
 
+class Forgets(NoiseCamera):
+    """Takes a value, and has its own."""
+
+    def adjust(self, wanted: Mapping[str, float]) -> list[str]:
+        return []
+
+
+class StaysChanged(NoiseCamera):
+    """Comes back from no value."""
+
+    def adjust(self, wanted: Mapping[str, float]) -> list[str]:
+        self.gain = max(self.gain, wanted["gain"])
+        return []
+
+
 class ClosesOnce(NoiseCamera):
     def close(self) -> None:
         if self._closed.is_set():
@@ -108,6 +123,12 @@ BROKEN: list[tuple[str, str, type[NoiseCamera]]] = [
     ("another pace than told", "camera.told", OtherPace),
     ("another size than told", "camera.told", OtherSize),
     ("one call at a time", "camera.threads", OneAtATime),
+    ("a value that is not taken", "camera.settings", Forgets),
+    ("a value that stays", "camera.settings", StaysChanged),
+    ("frames of the value before", "camera.settings",
+     frames(lambda frame, asked_s: replace(frame, settings={"gain": 8.0}))),
+    ("frames of no known value", "camera.settings",
+     frames(lambda frame, asked_s: replace(frame, settings={"gain": None}))),
     ("close once only", "camera.close", ClosesOnce),
     ("open for ever", "camera.close", StaysOpen),
 ]  # fmt: skip
@@ -130,6 +151,26 @@ def test_a_broken_camera_is_found_by_the_check_meant_for_it(name: str, kind: typ
 def test_a_right_camera_keeps_every_promise() -> None:
     found = states(NoiseCamera(), *NAMES, open_again=NoiseCamera)
     assert {name: told for name, told in found.items() if told[0] != "passed"} == {}
+
+
+def test_a_camera_without_settings_to_change_is_not_tried_and_the_first_error_counts() -> None:
+    class Fixed(NoiseCamera):
+        def settings(self) -> list[CameraSetting]:
+            return [CameraSetting("gain", 8.0, 0.0, 9.0, 4.0, refusal="is fixed")]
+
+    words = "it has no setting but focus that can be changed now"
+    assert states(Fixed(), "camera.settings")["camera.settings"] == ("skipped", words)
+
+    class Refuses(NoiseCamera):
+        tries = 0
+
+        def adjust(self, wanted: Mapping[str, float]) -> list[str]:
+            self.tries += 1
+            raise NoReply(f"refusal {self.tries}")
+
+    camera = Refuses()
+    assert states(camera, "camera.settings")["camera.settings"] == ("failed", "refusal 1")
+    assert camera.tries == 2, "the value before was to be put back"
 
 
 def test_there_is_a_broken_camera_for_every_check() -> None:

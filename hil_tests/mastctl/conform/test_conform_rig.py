@@ -64,9 +64,9 @@ def edited(
     return {"after": after}
 
 
-def changed(document: dict[str, Any], *path: str, value: Any) -> dict[str, Any]:
+def changed(document: dict[str, Any], *path: Any, value: Any) -> dict[str, Any]:
     """The document with another value at a path."""
-    here = document
+    here: Any = document
     for key in path[:-1]:
         here = here[key]
     here[path[-1]] = value(here[path[-1]]) if callable(value) else value
@@ -184,6 +184,9 @@ LIES: list[tuple[str, str, Any]] = [
     ("a count that stands", "pictures.ids", header_says("sequence", "7")),
     ("angles of another pose", "pictures.joints", header_says("pan-rad", "0.05")),
     ("motion at rest", "pictures.joints", header_says("moving", "true")),
+    ("a setting that is not put back", "pictures.settings",
+     edited("/cameras", lambda told, _: changed(told, "settings", 0, "value", value=12.0))),
+    ("a picture of another setting", "pictures.settings", header_says("settings", '{"gain": 9.0}')),
     ("another goal", "motion.pointing", {"before": elsewhere}),
     ("limits not held", "motion.pointing",
      edited("/status", lambda s, _: changed(s, "joints", "tilt_rad", value=1.2) if s["moving"] else s)),
@@ -233,7 +236,7 @@ def test_a_lie_is_a_line_a_failure_in_the_report_and_exit_1(
     vars(proxy).update(header_says("mast-digest", "0" * 64))
     assert main(["conform", proxy.url, "--no-motion", "--only", "pictures", "--junit", str(junit)]) == 1
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 5 and lines[-1].endswith("does not conform: 3 passed, 1 failed, 0 skipped")
+    assert len(lines) == 6 and lines[-1].endswith("does not conform: 4 passed, 1 failed, 0 skipped")
     assert lines[0].startswith("FAILED pictures.facts") and "not that of the mast file" in lines[0]
     failure = ET.parse(junit).getroot().find("testsuite/testcase/failure")
     assert failure is not None and "not that of the mast file" in str(failure.get("message"))

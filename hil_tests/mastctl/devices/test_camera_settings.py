@@ -244,6 +244,15 @@ def test_another_focus_than_the_calibrated_one_is_a_fault_until_it_is_back(
     assert not client.status()["faults"], "the mast file that is loaded now is of this focus"
 
 
+def test_what_a_camera_refused_is_told_though_it_then_does_not_say_its_focus(
+    client: Client, left: SetCamera
+) -> None:
+    asked = iter([left.settings()])
+    left.settings = lambda: next(asked)  # type: ignore[method-assign]
+    left.refuses = BadSetting("its motor is stuck", device="navcam_left")
+    assert "its motor is stuck" in refused("bad_setting", lambda: client.set_camera("navcam_left", focus=35))
+
+
 def test_a_camera_that_hangs_keeps_nobody_waiting(
     client: Client, left: SetCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:

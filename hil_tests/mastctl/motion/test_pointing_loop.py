@@ -10,6 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calib.geometry.mode import rig_in_mode
+from calib.geometry.sensor_mode import Mode
 from hil_tests.mastctl.motion.pointing_world import (
     LIMITS,
     SIZE_PX,
@@ -54,6 +56,27 @@ def test_a_clicked_pixel_lands_on_the_aim_and_the_residual_is_the_true_one(
         assert np.abs(truth).max() < 0.5
         assert np.abs(np.array(pointing.residual_px) - truth).max() < MEASURED_PX
         assert max(pointing.residual_sigma_px) < MEASURED_PX
+
+
+@pytest.mark.parametrize("mirrored", ["navcam_left", "navcam_right"])
+def test_a_pair_one_of_whose_cameras_is_mirrored_points_like_any_other(mirrored: str) -> None:
+    """The click and the aim are in the left picture, mirrored or not."""
+    world = World()
+    world.image = lambda camera, number, image: image[:, ::-1].copy() if camera == mirrored else image
+
+    def plain(x_px: float) -> float:
+        return SIZE_PX[0] - 1 - x_px if mirrored == "navcam_left" else x_px
+
+    frame = world.shoot()
+    point_m = world.true_point(frame, plain(75.0), 50.0)
+    believed = rig_in_mode(rig(), mirrored, Mode(flip=(True, False)))
+    result, _ = run(world, click(frame, 75.0, 50.0), believed)
+    for pointing in result.pointings:
+        x_px, y_px = world.true_pixel(pointing.frame_id, point_m)
+        true_px = np.array([plain(x_px), y_px]) - MIDDLE_PX
+        assert pointing.residual_px is not None
+        assert np.abs(np.array(pointing.residual_px) - true_px).max() < MEASURED_PX
+        assert np.abs(true_px).max() < 0.5
 
 
 def test_a_position_is_told_as_sure_as_the_pixels_and_the_match_it_comes_from() -> None:

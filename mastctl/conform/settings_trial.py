@@ -1,0 +1,100 @@
+"""Settings of a camera tried while it runs: changed by a little, read back, seen on new frames, put back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+
+from drivers.interfaces import CameraSetting
+from mastctl.conform.checks import NotTried, expect
+
+FRAMES = 20  # so many may be of unknown settings after a change
+PART = 0.05  # of its value a setting is changed by, one step at least
+ROUNDING = 1e-6
+
+
+def settings_tried(
+    read: Callable[[], Sequence[CameraSetting]],
+    adjust: Callable[[str, float], Sequence[str]],
+    of_a_frame: Callable[[], Mapping[str, float | None]],
+) -> str:
+    """Try each setting that may be changed now but focus, and return their names in words.
+
+    A focus is left alone: its motor may not come back to the calibrated place.
+
+    Parameters
+    ----------
+    read, adjust
+        Return the settings, and change one; as `drivers.interfaces.Adjustable`.
+    of_a_frame
+        Returns the settings of a frame that is exposed from now on.
+
+    Raises
+    ------
+    PromiseBroken
+        If a setting is not as it was set, a frame has another, or it does not come back.
+    NotTried
+        If there is none to try.
+    """
+    tried = []
+    for one in read():
+        other = _beside(one)
+        if other is None or one.value is None:
+            continue
+        try:
+            _change(one.name, other, read, adjust, of_a_frame)
+        except BaseException:
+            with suppress(Exception):  # the first error counts
+                adjust(one.name, one.value)
+            raise
+        adjust(one.name, one.value)
+        back = _now(read, one.name)
+        words = f"{one.name} is {back} where {one.value:.6g} was put back"
+        expect(back is not None and _same(back, one.value), words)
+        tried.append(one.name)
+    if not tried:
+        raise NotTried("it has no setting but focus that can be changed now")
+    return ", ".join(tried)
+
+
+def _change(
+    name: str,
+    other: float,
+    read: Callable[[], Sequence[CameraSetting]],
+    adjust: Callable[[str, float], Sequence[str]],
+    of_a_frame: Callable[[], Mapping[str, float | None]],
+) -> None:
+    """Set another value, and follow it to a frame."""
+    notes = adjust(name, other)
+    now = _now(read, name)
+    expect(now is not None, f"{name} is not known after it was set to {other:.6g}")
+    assert now is not None
+    words = f"{name} is {now:.6g} where {other:.6g} was set, and no note says so"
+    expect(_same(now, other) or notes, words)
+    for _ in range(FRAMES):
+        told = of_a_frame().get(name)
+        if told is not None:
+            words = f"a frame exposed after {name} was set to {now:.6g} has {told:.6g}"
+            expect(_same(told, now), words)
+            return
+    expect(False, f"none of {FRAMES} frames after {name} was set has its value")
+
+
+def _beside(one: CameraSetting) -> float | None:
+    """A value beside the present one, within the bounds; None if it is not to be tried."""
+    if one.name == "focus" or one.value is None or one.automatic or one.refusal:
+        return None
+    by = max(one.step, PART * abs(one.value)) or PART * (one.maximum - one.minimum)
+    if one.step:
+        by = math.floor(by / one.step + ROUNDING) * one.step
+    within = (other for other in (one.value + by, one.value - by) if one.minimum <= other <= one.maximum)
+    return next(within, None) if by > 0.0 else None
+
+
+def _now(read: Callable[[], Sequence[CameraSetting]], name: str) -> float | None:
+    return next((one.value for one in read() if one.name == name), None)
+
+
+def _same(one: float, other: float) -> bool:
+    return math.isclose(one, other, rel_tol=ROUNDING, abs_tol=1e-12)
