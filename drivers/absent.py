@@ -8,16 +8,22 @@ once.
 from __future__ import annotations
 
 import copy
+import logging
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
 
+from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.interfaces import Camera, Frame
 
+log = logging.getLogger(__name__)
+
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 2.0
+LAST_STOP_S = 1.5
+"""How long the stop of a head that is closed is tried again; a line may come back meanwhile."""
 
 Opening = Future[Any]
 
@@ -53,6 +59,21 @@ class Absence:
         error = self.error
         if error is not None:
             raise copy.copy(error)
+
+
+def stop_at_last(stop: Callable[[], object], clock: Clock, device: str) -> None:
+    """Stop a head that is closed, which no silence stops; tried again for `LAST_STOP_S`. Never raises."""
+    until_s = clock.now_s() + LAST_STOP_S
+    while True:
+        try:
+            stop()
+        except DriverError as error:
+            if clock.now_s() < until_s:
+                clock.sleep(FIRST_WAIT_S)
+                continue
+            words = "the last stop was not confirmed, the head may still move; 'mastctl halt' stops it"
+            log.warning("%s: %s: %s", device, words, error)
+        return
 
 
 def begin_opening(name: str, make: Callable[[], Any]) -> Opening:

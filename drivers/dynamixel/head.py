@@ -17,9 +17,7 @@ from contextlib import closing
 from typing import Any
 
 from drivers.clock import Clock
-from drivers.dynamixel.link import Link
-from drivers.dynamixel.models import WATCHDOG_TRIPPED
-from drivers.dynamixel.pair import Axis, Pair, head_axes, ready_pair
+from drivers.dynamixel.pair import Pair, make_ready, open_pair
 from drivers.dynamixel.servo import Reboots
 from drivers.dynamixel.settings import DynamixelSettings, dynamixel_settings
 from drivers.dynamixel.watch import Watch
@@ -54,9 +52,12 @@ class DynamixelHead(BusHead):
         self._reboots = Reboots()
         super().__init__(settings, clock, open_line)
 
-    def _ready(self, clock: Clock, open_line: OpenLine) -> tuple[Pair, Watch]:
-        pair = ready_pair(self.settings, self._reboots, self._bus.urgent, clock=clock, open_line=open_line)
-        return pair, Watch(pair, self.settings, self._reboots)
+    def _open(self) -> Pair:
+        return open_pair(self.settings, self._bus.urgent, self._clock, self._open_line)
+
+    def _watch(self, pair: Pair) -> Watch:
+        make_ready(pair, self.settings, self._reboots)
+        return Watch(pair, self.settings, self._reboots)
 
 
 def halt(
@@ -66,18 +67,5 @@ def halt(
 
     ``clock`` and ``open_line`` are those of `Link`. Raises BadOptions, LineLost, NoReply.
     """
-    head = dynamixel_settings(options)
-    link = Link(head.port, head.baud, head.reply_timeout_s, clock=clock, open_line=open_line)
-    with closing(link):
-        return halt_axes(head_axes(link, head), _stood, link.clock)
-
-
-def _stood(axis: Axis) -> str:
-    """Tell one axis to stand, unless its watchdog has stopped it or it holds nothing."""
-    servo = axis.servo
-    if servo.get("bus_watchdog") == WATCHDOG_TRIPPED:
-        return "was stopped by its watchdog"
-    if not servo.get("torque_enable"):
-        return "has its torque off"
-    servo.stand()
-    return "was commanded to stand where it is, and holds"
+    with closing(open_pair(dynamixel_settings(options), clock=clock, open_line=open_line)) as pair:
+        return halt_axes(pair)

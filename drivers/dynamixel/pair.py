@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 
 from drivers.clock import Clock
 from drivers.dynamixel.link import Link
+from drivers.dynamixel.models import WATCHDOG_TRIPPED
 from drivers.dynamixel.packets import GroupAnswer, Part
 from drivers.dynamixel.registers import RegisterBlock
 from drivers.dynamixel.servo import Reboots, Servo, motion_blocks
@@ -27,15 +28,6 @@ FAST_TRIALS = 10
 
 
 Axis = ServoAxis[Servo, DynamixelAxisSettings]
-
-
-def head_axes(link: Link, head: DynamixelSettings) -> tuple[Axis, Axis]:
-    """Return pan and tilt on an open line."""
-    pan, tilt = (
-        ServoAxis(Servo(link, name, axis, head), link.clock, axis, head)
-        for name, axis in (("pan", head.pan), ("tilt", head.tilt))
-    )
-    return pan, tilt
 
 
 class Pair(ServoPair[Link, Axis]):
@@ -55,7 +47,10 @@ class Pair(ServoPair[Link, Axis]):
     """
 
     def __init__(self, link: Link, head: DynamixelSettings) -> None:
-        super().__init__(link, head_axes(link, head))
+        axes = (("pan", head.pan), ("tilt", head.tilt))
+        super().__init__(
+            link, [ServoAxis(Servo(link, name, axis, head), link.clock, axis, head) for name, axis in axes]
+        )
         self.fast = False
         self._head = head
         self._ids = [axis.settings.servo_id for axis in self.axes]
@@ -101,6 +96,16 @@ class Pair(ServoPair[Link, Axis]):
                 parts.append(axis.servo.part("goal_position", goal))
         if parts:
             self.link.shout(parts, BRAKE_COPIES)
+
+    def stood(self, axis: Axis) -> str:
+        """Command one axis to stand, unless its watchdog has stopped it; as `ServoPair.stood`."""
+        servo = axis.servo
+        if servo.get("bus_watchdog") == WATCHDOG_TRIPPED:
+            return "was stopped by its watchdog"
+        if not servo.get("torque_enable"):
+            return "has its torque off"
+        servo.stand()
+        return "was commanded to stand where it is, and holds"
 
     def _ask_both(self, fast: bool) -> tuple[GroupAnswer, tuple[RegisterBlock, ...]]:
         """Ask both servos for the next of the blocks that hold their motion."""
@@ -183,44 +188,34 @@ class Pair(ServoPair[Link, Axis]):
         return True
 
 
-def ready_pair(
+def open_pair(
     head: DynamixelSettings,
-    reboots: Reboots,
-    urgent: Callable[[], bool],
-    *,
+    urgent: Callable[[], bool] = lambda: False,
     clock: Clock | None = None,
     open_line: OpenLine = SerialLine,
 ) -> Pair:
-    """Open the line and make both servos ready, without moving them: checked, set up, holding, armed.
+    """Open the line to both servos; nothing is sent. Parameters and errors are those of `Link`."""
+    link = Link(head.port, head.baud, head.reply_timeout_s, urgent, clock=clock, open_line=open_line)
+    return Pair(link, head)
+
+
+def make_ready(pair: Pair, head: DynamixelSettings, reboots: Reboots) -> None:
+    """Make both servos ready, without moving them: checked, set up, holding, armed.
 
     Without a watchdog an axis may still be under way. Each is commanded to stand first, whatever the other
-    does.
-    An axis whose torque was dropped to set it up holds again if it cannot be made ready.
+    does. An axis whose torque was dropped to set it up holds again if it cannot be made ready.
 
-    ``reboots`` are those done to this head; ``urgent``, ``clock`` and ``open_line`` are those of `Link`.
+    ``reboots`` are those done to this head.
 
     Raises
     ------
     Overtaken
-        If a stop came meanwhile; the line is closed again.
+        If a stop came meanwhile.
     LineLost, NoReply, WrongDevice, HardwareFault, Refused
-        If the servos cannot be reached or do not fit; the line is closed again.
+        If the servos cannot be reached or do not fit.
     """
-    link = Link(head.port, head.baud, head.reply_timeout_s, urgent, clock=clock, open_line=open_line)
-    try:
-        pair = Pair(link, head)
-        if not head.watchdog_counts:
-            pair.stand()
-        _make_ready(pair, reboots)
-        pair.fast = head.fast_read and pair.prove_fast_read()
-    except BaseException:
-        link.close()
-        raise
-    return pair
-
-
-def _make_ready(pair: Pair, reboots: Reboots) -> None:
-    """Make both servos ready; raises as `ready_pair`."""
+    if not head.watchdog_counts:
+        pair.stand()
     servos = [axis.servo for axis in pair.axes]
     with pair.holding_in_the_end():
         for servo in servos:
@@ -234,3 +229,4 @@ def _make_ready(pair: Pair, reboots: Reboots) -> None:
         for axis in pair.axes:
             axis.take_hold()
         pair.arm()
+    pair.fast = head.fast_read and pair.prove_fast_read()

@@ -351,11 +351,11 @@ class Servo(ServoTable):
             )
             self.set("goal_pwm", limit)
 
-    def release(self) -> None:
-        """Switch the watchdog off, and torque too if the configuration says so; for the end."""
+    def release(self, limp: bool) -> None:
+        """Switch the watchdog off, and the torque if it is to be ``limp``; for the end."""
         for register in (
             "bus_watchdog",
-            *(("torque_enable",) if self._settings.at_close == "torque_off" else ()),
+            *(("torque_enable",) if limp else ()),
         ):
             try:
                 self.set(register, 0)

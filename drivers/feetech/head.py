@@ -11,9 +11,8 @@ from contextlib import closing
 from typing import Any
 
 from drivers.clock import Clock
-from drivers.errors import NoReply
-from drivers.feetech.link import Questions, open_link
-from drivers.feetech.pair import FeetechAxis, FeetechPair, ready_pair
+from drivers.feetech.link import Questions
+from drivers.feetech.pair import FeetechPair, make_ready, open_pair
 from drivers.feetech.settings import FeetechSettings, feetech_settings
 from drivers.feetech.watch import FeetechWatch
 from drivers.serial_line import OpenLine, SerialLine
@@ -48,11 +47,14 @@ class FeetechHead(BusHead):
         self._offsets: dict[int, int] = {}
         super().__init__(settings, clock, open_line)
 
-    def _ready(self, clock: Clock, open_line: OpenLine) -> tuple[FeetechPair, FeetechWatch]:
-        pair = ready_pair(
-            self.settings, self._questions, self._offsets, self._bus.urgent, clock=clock, open_line=open_line
+    def _open(self) -> FeetechPair:
+        return open_pair(
+            self.settings, self._questions, self._offsets, self._bus.urgent, self._clock, self._open_line
         )
-        return pair, FeetechWatch(pair, self.settings.lease_s)
+
+    def _watch(self, pair: FeetechPair) -> FeetechWatch:
+        make_ready(pair, self.settings)
+        return FeetechWatch(pair, self.settings.lease_s)
 
 
 def halt(
@@ -62,18 +64,5 @@ def halt(
 
     ``clock`` and ``open_line`` are those of `FeetechLink`. Raises BadOptions, LineLost, NoReply.
     """
-    head = feetech_settings(options)
-    link = open_link(head.port, head.baud, head.reply_timeout_s, clock=clock, open_line=open_line)
-    with closing(link):
-        return halt_axes(FeetechPair(link, head, {}).axes, _stood, link.clock)
-
-
-def _stood(axis: FeetechAxis) -> str:
-    """Tell one axis to stand and see that it took that. Raises DriverError."""
-    servo = axis.servo
-    goal = servo.stand()
-    if goal is None:
-        return "has its torque off"
-    if (held := servo.get("goal_position")) != goal:  # nobody answers the packet that says so
-        raise NoReply(f"{servo.name} did not take the command to stand, its goal is {held}")
-    return "was commanded to stand where it is, and holds"
+    with closing(open_pair(feetech_settings(options), clock=clock, open_line=open_line)) as pair:
+        return halt_axes(pair)

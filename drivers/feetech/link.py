@@ -287,12 +287,16 @@ def open_link(
     port: str,
     baud: int,
     reply_timeout_s: float = REPLY_TIMEOUT_S,
+    urgent: Callable[[], bool] = lambda: False,
     *,
+    questions: Questions | None = None,
     clock: Clock | None = None,
     open_line: OpenLine = SerialLine,
 ) -> FeetechLink:
     """Open a line and find out whether its adapter echoes; parameters and errors as of `FeetechLink`."""
-    link = FeetechLink(port, baud, reply_timeout_s, clock=clock, open_line=open_line)
+    link = FeetechLink(
+        port, baud, reply_timeout_s, urgent, questions=questions, clock=clock, open_line=open_line
+    )
     try:
         link.find_echo()
     except BaseException:

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from drivers.clock import Clock
-from drivers.feetech.link import FeetechLink, Questions
+from drivers.errors import NoReply
+from drivers.feetech.link import FeetechLink, Questions, open_link
 from drivers.feetech.servo import FeetechServo
 from drivers.feetech.settings import FeetechAxisSettings, FeetechSettings
 from drivers.serial_line import OpenLine, SerialLine
@@ -98,50 +99,59 @@ class FeetechPair(ServoPair[FeetechLink, FeetechAxis]):
         if data:
             self.link.shout(address, data, BRAKE_COPIES)
 
+    def stood(self, axis: FeetechAxis) -> str:
+        """Command one axis to stand, as `ServoPair.stood`. Raises DriverError."""
+        servo = axis.servo
+        goal = servo.stand()
+        if goal is None:
+            return "has its torque off"
+        if (held := servo.get("goal_position")) != goal:  # nobody answers the packet that says so
+            raise NoReply(f"{servo.name} did not take the command to stand, its goal is {held}")
+        return "was commanded to stand where it is, and holds"
 
-def ready_pair(
+
+def open_pair(
     head: FeetechSettings,
-    questions: Questions,
-    offsets: dict[int, int],
-    urgent: Callable[[], bool],
-    *,
+    questions: Questions | None = None,
+    offsets: dict[int, int] | None = None,
+    urgent: Callable[[], bool] = lambda: False,
     clock: Clock | None = None,
     open_line: OpenLine = SerialLine,
 ) -> FeetechPair:
-    """Open the line and make both servos ready, without moving them: checked, set up, holding.
+    """Open the line to both servos; nothing is set.
+
+    ``questions`` and ``offsets`` are of the head, over all its lines; ``urgent``, ``clock`` and ``open_line``
+    of `Port`. Raises LineLost, BadReply.
+    """
+    link = open_link(
+        head.port, head.baud, head.reply_timeout_s, urgent,
+        questions=questions, clock=clock, open_line=open_line,
+    )  # fmt: skip
+    return FeetechPair(link, head, {} if offsets is None else offsets)
+
+
+def make_ready(pair: FeetechPair, head: FeetechSettings) -> None:
+    """Make both servos ready, without moving them: checked, set up, holding.
 
     Without a lease each is commanded to stand first, whatever the other does: it may still be under way.
-    ``questions`` and ``offsets`` are of the head, over all its lines; ``urgent``, ``clock`` and ``open_line``
-    of `Port`.
 
     Raises
     ------
     Overtaken
-        If a stop came meanwhile; the line is closed again.
+        If a stop came meanwhile.
     LineLost, NoReply, BadReply, WrongDevice, HardwareFault
-        If the servos cannot be reached or do not fit; the line is closed again.
+        If the servos cannot be reached or do not fit.
     """
-    link = FeetechLink(
-        head.port, head.baud, head.reply_timeout_s, urgent,
-        questions=questions, clock=clock, open_line=open_line,
-    )  # fmt: skip
-    try:
-        link.find_echo()
-        pair = FeetechPair(link, head, offsets)
-        servos = [axis.servo for axis in pair.axes]
-        if not head.lease_s:
-            pair.stand()
-        with pair.holding_in_the_end():
-            for servo in servos:
-                servo.check_identity()
-            for servo in servos:
-                servo.check_health()
-                servo.check_place()
-            for servo in servos:
-                servo.set_up()
-            for axis in pair.axes:
-                axis.take_hold()
-    except BaseException:
-        link.close()
-        raise
-    return pair
+    servos = [axis.servo for axis in pair.axes]
+    if not head.lease_s:
+        pair.stand()
+    with pair.holding_in_the_end():
+        for servo in servos:
+            servo.check_identity()
+        for servo in servos:
+            servo.check_health()
+            servo.check_place()
+        for servo in servos:
+            servo.set_up()
+        for axis in pair.axes:
+            axis.take_hold()

@@ -257,10 +257,10 @@ class FeetechServo:
         self.dropped = False
         return come_to_rest(self.look, self.set, self._settings.limit_counts, self._link.clock)
 
-    def release(self) -> None:
-        """Switch the torque off if the configuration says so, and lift the questions' tokens; for the end."""
+    def release(self, limp: bool) -> None:
+        """Switch the torque off if it is to be ``limp``, and lift the questions' tokens; for the end."""
         try:
-            if self._settings.at_close == "torque_off":
+            if limp:
                 self.set("torque_enable", 0)
             if "torque_limit" in self._registers:
                 self.set("torque_limit", self.torque_limit)

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from drivers.absent import Absence
+from drivers.absent import Absence, stop_at_last
 from drivers.approach import rising_below_rad
 from drivers.clock import Clock, ClockLock, SystemClock, deadlines_on
 from drivers.errors import BadReply, DriverError, HardwareFault, LineLost, NoReply
@@ -206,17 +206,12 @@ class FlirPtu:
                 self._turn.release()
 
     def close(self) -> None:
-        """Halt and let go of the line."""
+        """Halt, as `stop_at_last`, and let go of the line."""
         with self._turn:
-            if self._closed:
-                return
-            try:
-                if self._talk is not None:
-                    self.stop()
-            except DriverError as error:
-                log.warning("the last stop was not confirmed: %s", error)
-            self._closed = True
-            self._drop()
+            if not self._closed:
+                stop_at_last(self.stop, self._time, DEVICE)
+                self._closed = True
+                self._drop()
 
     # The line
 

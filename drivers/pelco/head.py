@@ -13,33 +13,16 @@ Pan and tilt are asked one after the other; a reading's stamp is the middle betw
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from drivers.clock import Clock, SystemClock
 from drivers.errors import BadReply, DriverError
 from drivers.goals import check_goal
 from drivers.pelco.options import DEVICE, TURN, PelcoAxisOptions, PelcoOptions, options_from
 from drivers.pelco.protocol import ASK, LENGTH, SET, STOP, TOLD, frame, take_answer
-from drivers.ptz.head import AXES, PtzAxis, PtzHead, halt_head
-from drivers.serial_line import OpenLine, SerialLine
+from drivers.ptz.head import AXES, PtzAxis, PtzHead
 
 AGAIN_S = 0.25  # a position is sent again while the axis is not there: nothing says that it arrived
-
-
-def open_head(
-    options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
-) -> PelcoHead:
-    """Return the open head that the options name; opening stops it and moves nothing.
-
-    Raises
-    ------
-    BadOptions
-        For options that cannot be used.
-    LineLost, NoReply, BadReply, WrongDevice
-        If the head cannot be reached, or stands outside of its limits.
-    """
-    return PelcoHead(options_from(options), clock or SystemClock(), open_line)
 
 
 class _Axis(PtzAxis):
@@ -79,20 +62,21 @@ class _Axis(PtzAxis):
 
 
 class PelcoHead(PtzHead):
-    """An open head; safe to use from any thread. A move goes on only while the head is read."""
+    """An open head, as `PtzHead`. A move goes on only while the head is read."""
 
-    _scale = "sign"
+    _device, _scale = DEVICE, "sign"
 
-    def __init__(self, options: PelcoOptions, clock: Clock, open_line: OpenLine) -> None:
-        self._protocol, self._step_rad = options.protocol, options.step_rad
-        both = (options.pan, options.tilt)
+    def _read(self, options: Mapping[str, Any]) -> tuple[PelcoOptions, Sequence[PtzAxis]]:
+        read = options_from(options)
+        self._protocol, self._step_rad = read.protocol, read.step_rad
+        both = (read.pan, read.tilt)
         self._limits = [sorted(axis.counts(angle) for angle in axis.limits_rad) for axis in both]
         self._steps = [_Axis(axis) for axis in both]
-        self._speed_rad_per_s = options.speed_rad_per_s
+        self._speed_rad_per_s = read.speed_rad_per_s
         self._stepped_s = self._looked_s = -math.inf
         self._first = 0  # the axis asked for first, next time
         self._sure = False  # whether the positions known now were proved
-        super().__init__(options, self._steps, DEVICE, clock, open_line)
+        return read, self._steps
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         """Begin the way of both axes to the nearest positions, at no more than the speed asked for as a mean.
@@ -225,16 +209,4 @@ class PelcoHead(PtzHead):
         raise self._no_reply(f"{AXES[number]} position")
 
 
-def halt(
-    options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
-) -> list[str]:
-    """Stop both axes, and see that they stand; the head holds where that ends.
-
-    Raises
-    ------
-    BadOptions
-        For options that cannot be.
-    LineLost, NoReply, BadReply, WrongDevice
-        If it was not confirmed; the command has been sent all the same, unless the line is lost.
-    """
-    return halt_head(open_head(options, clock, open_line))
+open_head, halt = PelcoHead, PelcoHead.halt

@@ -6,21 +6,19 @@ after one that was lost, or had not been requested, nothing is asked for `LATE_S
 
 from __future__ import annotations
 
-import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from typing import Any
 
-from drivers.absent import Absence
-from drivers.clock import Clock, ClockLock, deadlines_on
+from drivers.absent import Absence, stop_at_last
+from drivers.clock import Clock, ClockLock, SystemClock, deadlines_on
 from drivers.errors import BadReply, DriverError, LineLost, NoReply, Refused, WrongDevice
 from drivers.interfaces import AxisMotion, Reading
 from drivers.ptz.options import AxisOptions, PtzOptions
-from drivers.serial_line import ByteLine, OpenLine
-
-log = logging.getLogger(__name__)
+from drivers.serial_line import ByteLine, OpenLine, SerialLine
 
 LATE_S = 0.7
 LISTENS_S = 0.02  # at a time, while late replies are waited out
@@ -79,33 +77,26 @@ class PtzHead(ABC):
     Parameters
     ----------
     options
-        As configured.
-    axes
-        Pan and tilt.
-    device
-        Its driver's name in errors.
+        As a configuration holds them.
     clock, open_line
         What it lives on.
-    late_s
-        How long nothing is asked after a reply went astray.
+
+    Raises
+    ------
+    BadOptions
+        For options that cannot be used.
+    LineLost, NoReply, BadReply, Refused, WrongDevice
+        If the head cannot be reached, or stands outside of its limits.
     """
 
     def __init__(
-        self,
-        options: PtzOptions,
-        axes: Sequence[PtzAxis],
-        device: str,
-        clock: Clock,
-        open_line: OpenLine,
-        late_s: float = LATE_S,
+        self, options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
     ) -> None:
-        self._options = options
-        self._axes = tuple(axes)
-        self._device = device
-        self._stamps = clock
-        self._time = deadlines_on(clock)
+        self._stamps = clock or SystemClock()
+        self._time = deadlines_on(self._stamps)
         self._open_line = open_line
-        self._late_s = late_s
+        self._late_s = LATE_S  # how long nothing is asked after a reply went astray
+        self._options, self._axes = self._read(options)
         self._turn = ClockLock(self._time)
         self._absence = Absence()
         self._line: ByteLine | None = None
@@ -114,6 +105,33 @@ class PtzHead(ABC):
         self._stops = 0  # asked for so far
         self._closed = False
         self._connect()
+
+    @classmethod
+    def halt(
+        cls, options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
+    ) -> list[str]:
+        """Stop both axes, and see that they stand; the head holds where that ends.
+
+        Raises
+        ------
+        BadOptions
+            For options that cannot be.
+        LineLost, NoReply, BadReply, Refused, WrongDevice
+            If it was not confirmed; the command has been sent all the same, unless the line is lost.
+        """
+        head = cls(options, clock, open_line)
+        try:
+            head.stop()
+        finally:
+            head.close()
+        return ["pan and tilt stopped, confirmed"]
+
+    _device = ""
+    """Its driver's name in errors."""
+
+    @abstractmethod
+    def _read(self, options: Mapping[str, Any]) -> tuple[PtzOptions, Sequence[PtzAxis]]:
+        """Read the options, and return its axes by them. Raises BadOptions."""
 
     @abstractmethod
     def _look(self) -> float:
@@ -168,17 +186,12 @@ class PtzHead(ABC):
             self._turn.release()
 
     def close(self) -> None:
-        """Stop and let go of the line."""
+        """Stop, as `stop_at_last`, and let go of the line."""
         with self._turn:
-            if self._closed:
-                return
-            try:
-                if self._line is not None:
-                    self._stand()
-            except DriverError as error:
-                log.warning("the last stop was not confirmed: %s", error)
-            self._closed = True
-            self._drop()
+            if not self._closed:
+                stop_at_last(self.stop, self._time, self._device)
+                self._closed = True
+                self._drop()
 
     def axis_motion(self) -> dict[str, AxisMotion]:
         """Return how each axis is taken to move, and its count."""
@@ -320,12 +333,3 @@ class PtzHead(ABC):
                 left_rad = abs(axis.target - axis.place) * axis.options.count_rad
                 words.append(f"{name} stands still {left_rad:.4f} rad from its goal: something holds it")
         return tuple(words)
-
-
-def halt_head(head: PtzHead) -> list[str]:
-    """Stop both axes of a head just opened, see that they stand, and close it. Raises DriverError."""
-    try:
-        head.stop()
-    finally:
-        head.close()
-    return ["pan and tilt stopped, confirmed"]

@@ -48,8 +48,8 @@ class HeldServo(Protocol):
         """Return its present motion; a lost reply is asked for again. Raises DriverError."""
         ...
 
-    def release(self) -> None:
-        """Leave it as the configuration says at the end; never raises."""
+    def release(self, limp: bool) -> None:
+        """Leave it alone at the end, with its torque off if ``limp``; never raises."""
         ...
 
 

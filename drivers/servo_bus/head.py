@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, TypeVar
 
-from drivers.absent import Absence
+from drivers.absent import Absence, stop_at_last
 from drivers.approach import rising_below_rad
 from drivers.clock import Clock, SystemClock, deadlines_on
 from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
@@ -22,14 +22,14 @@ from drivers.interfaces import AxisMotion, AxisReport, Reading, Reporting
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.bus import Bus
 from drivers.servo_bus.pair import ServoPair, SessionWatch
-from drivers.servo_bus.session import GivenUp, ServoSession
+from drivers.servo_bus.session import GivenUp, ServoSession, confirmed, leave, stop_error
 from drivers.servo_bus.settings import HeadSettings
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 CALL_TIMEOUT_S = 0.8  # the service waits 1 s
-CLOSE_TIMEOUT_S = 2.0
+CLOSE_TIMEOUT_S = 6.0  # tries of a line that is away, a stop, an axis that comes to rest
 AXES = ("pan", "tilt")
 
 
@@ -59,7 +59,7 @@ class BusHead(Reporting):
         self._clock = deadlines_on(self._stamps)
         self._open_line = open_line
         self._absence = Absence()
-        self._closed = False
+        self._closed = self._stop_owed = False
         self._state = threading.Lock()
         self._bus = Bus(settings.port, self._round, self._clock)
         self._session: ServoSession | None = self._connect()
@@ -104,7 +104,7 @@ class BusHead(Reporting):
         self._call("move", lambda session: session.move((pan_rad, tilt_rad), capped), moves=True)
 
     def stop(self) -> None:
-        """Brake both axes; each then holds or lets go as its ``at_stop`` says.
+        """Brake both axes; each then holds, or lets go when it stands, as its ``at_stop`` says.
 
         Each is told to brake by itself before anything is asked, and what else was under way on the line is
         broken off for it; a move that waits for its turn is not begun. After the watchdog has stopped the
@@ -118,12 +118,14 @@ class BusHead(Reporting):
             would feed the watchdog of one that did not hear it. With ``watchdog_s: 0`` nothing can be fed:
             a stop tries a line that is away at once.
         """
-        self._call("stop", ServoSession.stop, first=True, tries=not self.settings.silence_s)
+        away = None if self.settings.silence_s else self._stop_away
+        self._call("stop", ServoSession.stop, first=True, away=away)
 
     def close(self) -> None:
         """Stop, leave each servo as its ``at_close`` says, and let go of the line; never raises.
 
-        A second call returns when the first has ended.
+        Without a watchdog or lease, a line that is away is tried as `stop_at_last` does. A second call
+        returns when the first has ended.
         """
         with self._state:
             self._closed = True
@@ -156,22 +158,22 @@ class BusHead(Reporting):
         *,
         first: bool = False,
         moves: bool = False,
-        tries: bool = False,
+        away: Callable[[], T] | None = None,
     ) -> T:
-        """Have something done in the bus thread; one that ``tries`` does not leave an absent line alone."""
+        """Have something done in the bus thread, or ``away`` while the line is; None: it is left alone."""
         with self._state:
             if self._closed:
                 raise NoReply(f"the head on {self.settings.port} is closed; {what} was not sent")
-        if not tries:
+        if away is None:
             self._absence.check()
         return self._bus.call(
-            what, lambda: self._within(function, tries), CALL_TIMEOUT_S, first=first, moves=moves
+            what, lambda: self._within(function, away), CALL_TIMEOUT_S, first=first, moves=moves
         )
 
-    def _within(self, function: Callable[[ServoSession], T], tries: bool = False) -> T:
-        """Do something with the servos, which may end in giving the line up."""
-        if tries and self._session is None:
-            self._come_back()
+    def _within(self, function: Callable[[ServoSession], T], away: Callable[[], T] | None = None) -> T:
+        """Do something with the servos, which may end in giving the line up; ``away`` as of `_call`."""
+        if away is not None and self._session is None:
+            return away()
         self._absence.check()
         session = self._session
         assert session is not None
@@ -192,15 +194,19 @@ class BusHead(Reporting):
         return self._absence.again_s if self._session is None else self._session.poll_due_s
 
     @abstractmethod
-    def _ready(self, clock: Clock, open_line: OpenLine) -> tuple[ServoPair[Any, Any], SessionWatch[Any]]:
-        """Open the line, make both servos ready without moving them, and begin to watch them."""
+    def _open(self) -> Any:
+        """Return the `ServoPair` of a line that is opened; nothing is set. Raises LineLost, BadReply."""
+
+    @abstractmethod
+    def _watch(self, pair: Any) -> SessionWatch[Any]:
+        """Make both servos ready without moving them, and begin to watch them. Raises DriverError."""
 
     def _connect(self) -> ServoSession:
         """Open the line, make both servos ready, and read them once."""
         head = self.settings
-        pair, watch = self._ready(self._clock, self._open_line)
-        session = ServoSession(pair, watch, head, self._stamps)
+        pair: ServoPair[Any, Any] = self._open()
         try:
+            session = ServoSession(pair, self._watch(pair), head, self._stamps)
             session.poll_once()
         except BaseException as error:  # whatever it was goes on to the caller; the line is not left open
             pair.close()
@@ -220,6 +226,9 @@ class BusHead(Reporting):
         log.warning("%s is back: limits and modes checked, the head stands still", self.settings.port)
         self._session, self._motions = session, [axis.motion for axis in session.pair.axes]
         self._absence.end()
+        if self._stop_owed:  # as at_stop says
+            self._stop_owed = False
+            self._within(ServoSession.stop)
 
     def _give_up(self, session: ServoSession, error: DriverError) -> None:
         """Have both axes brake, close the line, and try again when the watchdogs must have stopped them."""
@@ -227,11 +236,32 @@ class BusHead(Reporting):
             session.pair.brake()
         session.pair.close()
         now_s = self._clock.now_s()
-        self._session = None
+        self._session, self._stop_owed = None, session.lets_go
         self._absence.note(error, now_s, self.settings.silence_s)
         log.warning("%s; trying again in %.1f s", error, self._absence.again_s - now_s)
 
+    def _stop_away(self, closes: bool = False) -> None:
+        """Command both axes to stand over a line that is away, opened for that alone.
+
+        To make them ready takes longer than a stop may; that comes next, and ends with the stop once more.
+        """
+        try:
+            pair: ServoPair[Any, Any] = self._open()
+        except DriverError as error:
+            self._absence.note(error, self._clock.now_s())
+            raise
+        try:
+            failed = confirmed(pair.axes, pair.stood, self._clock)
+            if closes:
+                leave(pair, failed)
+        finally:
+            pair.close()
+        if failed:
+            raise stop_error(pair, failed)
+        self._stop_owed, self._absence.again_s = True, self._clock.now_s()
+
     def _close_now(self) -> None:
-        if self._session is not None:
-            self._session.end()
-            self._session = None
+        session, self._session = self._session, None
+        failed = session is None or session.end()
+        if failed and not self.settings.silence_s:
+            stop_at_last(lambda: self._stop_away(closes=True), self._clock, self.settings.port)

@@ -64,6 +64,13 @@ class ServoPair(ABC, Generic[L, X]):
         Nothing is asked and there is no answer: `sample` shows the goal. Raises LineLost.
         """
 
+    @abstractmethod
+    def stood(self, axis: X) -> str:
+        """Command one axis to stand and see that it took that; returns its state in words.
+
+        Raises DriverError.
+        """
+
     def stand(self) -> None:
         """Command each axis that is under way to stand, as far as it answers. Raises LineLost."""
         waiting = list(self.axes)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import DriverError, NoReply
-from drivers.servo_bus.axis import ServoAxis
 from drivers.servo_bus.course import ServoSample
+from drivers.servo_bus.pair import ServoPair
 
 REST_S = 0.5
 LOOK_S = 0.01  # between one look and the next
 COME_TO_REST_S, HOLDS_S = 0.5, 0.05  # of an axis that is to hold, at most, and at least
 HALT_TRIES, HALT_REST_S = 5, 2.5
-A = TypeVar("A", bound=ServoAxis[Any, Any])
 
 
 class Rest:
@@ -65,17 +64,8 @@ def come_to_rest(
     return goal
 
 
-def halt_axes(axes: Sequence[A], command: Callable[[A], str], clock: Clock) -> list[str]:
+def halt_axes(pair: ServoPair[Any, Any]) -> list[str]:
     """Command each axis to stand, by itself, then see that those that hold do.
-
-    Parameters
-    ----------
-    axes
-        Pan and tilt.
-    command
-        Commands one and returns its state in words. Raises DriverError.
-    clock
-        Of the line.
 
     Raises
     ------
@@ -85,18 +75,18 @@ def halt_axes(axes: Sequence[A], command: Callable[[A], str], clock: Clock) -> l
     told: dict[str, str] = {}
     failed: dict[str, object] = {}
     for _ in range(HALT_TRIES):  # each once before any of them again
-        for axis in axes:
+        for axis in pair.axes:
             if axis.servo.name not in told:
                 try:
-                    told[axis.servo.name] = command(axis)
+                    told[axis.servo.name] = pair.stood(axis)
                 except DriverError as error:
                     failed[axis.servo.name] = error
     missing = {name: error for name, error in failed.items() if name not in told}
-    for axis in axes:
+    for axis in pair.axes:
         name = axis.servo.name
         if name in told:
             try:
-                stands, sample = rests(axis.servo.look, clock, HALT_REST_S, Rest())
+                stands, sample = rests(axis.servo.look, pair.clock, HALT_REST_S, Rest())
                 if not stands and sample.values.get("torque_enable", True):
                     missing[name] = "it got the command to stand, but still moves"
             except DriverError as error:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -16,7 +16,9 @@ from drivers.clock import Clock
 from drivers.errors import DriverError, LineLost, NoReply, WatchdogTripped
 from drivers.interfaces import Reading
 from drivers.servo_bus.axis import ServoAxis
+from drivers.servo_bus.course import STANDS_S
 from drivers.servo_bus.pair import ServoPair, SessionWatch
+from drivers.servo_bus.rest import Rest, rests
 from drivers.servo_bus.settings import HeadSettings
 
 log = logging.getLogger(__name__)
@@ -25,6 +27,8 @@ Axis = ServoAxis[Any, Any]
 ATTEMPTS, PATIENCE_S = 3, 0.15  # of a poll, before it counts as failed
 FAILED_POLLS = 2  # in a row, before the servos are set up anew
 STOP_PATIENCE_S = 0.2  # how long a stop asks for a confirmation that does not come
+STANDS_WITHIN_S = 2.5  # how long a stop waits for an axis to stand before its torque goes off
+KEPT = "%s did not come to rest within %.1f s of a stop: its torque stays on"
 
 
 class GivenUp(Exception):
@@ -69,6 +73,8 @@ class ServoSession:
         self._watch = watch
         self._heard_s = -math.inf
         self._failed_polls = 0
+        self._to_let_go: list[Axis] = []
+        self._let_go_until_s = 0.0
 
     def look(self) -> None:
         """Read both servos and see whether they are as they should be.
@@ -124,6 +130,7 @@ class ServoSession:
         self._watch.heard_again(silence_s)
         for axis in self.pair.axes:
             axis.go_on()
+        self._let_go()
         if all(axis.motion.settled(now_s) for axis in self.pair.axes):
             self.poll_due_s = now_s + self._head.resting_poll_s
 
@@ -162,6 +169,7 @@ class ServoSession:
             if not axis.motion.holds:
                 axis.take_hold()
                 self._watch.arm()
+        self._to_let_go = []
         self.poll_once()
         speeds = [axis.settings.velocity_counts(speed_rad_per_s) for axis in self.pair.axes]
         goals = [
@@ -194,7 +202,7 @@ class ServoSession:
         )
 
     def stop(self) -> None:
-        """Brake both axes; each then holds or lets go as its ``at_stop`` says.
+        """Brake both axes; each then holds, or lets go as soon as it stands, as its ``at_stop`` says.
 
         Raises
         ------
@@ -202,39 +210,41 @@ class ServoSession:
             If a servo did not confirm: silence lets the watchdogs stop what this could not.
         """
         failed = self._stop_each()
-        for axis in self.pair.axes:
-            if axis in failed or axis.settings.at_stop != "torque_off":
-                continue
-            if axis.motion.holds or not axis.hardware_error:  # a move that was broken off may have taken hold
-                try:
-                    axis.let_go()
-                except DriverError as error:
-                    failed[axis] = error
         if failed:
-            raise GivenUp(_stop_error(self.pair, failed))
+            raise GivenUp(stop_error(self.pair, failed))
         if self._watch.tripped:
             self._watch.end_trip()
+        self._let_go_until_s = self._clock.now_s() + STANDS_WITHIN_S
+        self._to_let_go = [axis for axis in self.pair.axes if axis.settings.at_stop == "torque_off"]
+        self._let_go()
+
+    @property
+    def lets_go(self) -> bool:
+        """Whether an axis is to stand before its torque goes off."""
+        return bool(self._to_let_go)
+
+    def _let_go(self) -> None:
+        """Switch off the torque of the axes that a stop left to stand first, and do. Raises DriverError."""
+        now_s = self._clock.now_s()
+        for axis in tuple(self._to_let_go):
+            if axis.hardware_error and not axis.motion.holds:
+                self._to_let_go.remove(axis)
+            elif not axis.motion.holds or axis.motion.stands(now_s):
+                axis.let_go()  # also where a move that was broken off has taken hold
+                self._to_let_go.remove(axis)
+            elif now_s > self._let_go_until_s:
+                log.warning(KEPT, axis.servo.name, STANDS_WITHIN_S)
+                self._to_let_go.remove(axis)
 
     def _stop_each(self) -> dict[Axis, DriverError]:
         """Brake each axis by itself; returns those that did not confirm, and why."""
-        failed: dict[Axis, DriverError] = {}
         try:
             self.pair.brake()
         except LineLost as error:
             return dict.fromkeys(self.pair.axes, error)
-        until_s = self._clock.now_s() + STOP_PATIENCE_S
         # the one that was heard of last first: it is the one that will answer
-        waiting = sorted(self.pair.axes, key=lambda axis: -axis.motion.heard_s)
-        while waiting and (not failed or self._clock.now_s() < until_s):
-            for axis in tuple(waiting):
-                try:
-                    self._confirm(axis)
-                except DriverError as error:
-                    failed[axis] = error
-                else:
-                    waiting.remove(axis)
-                    failed.pop(axis, None)
-        return failed
+        axes = sorted(self.pair.axes, key=lambda axis: -axis.motion.heard_s)
+        return confirmed(axes, self._confirm, self._clock)
 
     def _confirm(self, axis: Axis) -> None:
         """See that an axis brakes as it was told, or tell it again; raises as `Pair.samples`, `Servo.set`."""
@@ -254,21 +264,58 @@ class ServoSession:
         elif held != told or not motion.braking_well(told, axis.acceleration_rad_per_s2):
             axis.brake()
 
-    def end(self) -> None:
+    def end(self) -> bool:
         """Stop, leave each servo as its ``at_close`` says, and close the line; never raises.
 
-        A servo that does not confirm the stop keeps its watchdog.
+        A servo that does not confirm the stop keeps its watchdog. Returns whether one did not.
         """
         failed = self._stop_each()
-        for axis in self.pair.axes:
-            if axis in failed:
-                log.warning("%s did not confirm the last stop: %s", axis.servo.name, failed[axis])
-            else:
-                axis.servo.release()
+        leave(self.pair, failed)
         self.pair.close()
+        return bool(failed)
 
 
-def _stop_error(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError]) -> DriverError:
+def confirmed(
+    axes: Sequence[Axis], confirm: Callable[[Axis], object], clock: Clock
+) -> dict[Axis, DriverError]:
+    """Have each axis confirm a stop by itself, again for a while; returns those that did not, and why."""
+    failed: dict[Axis, DriverError] = {}
+    until_s = clock.now_s() + STOP_PATIENCE_S
+    waiting = list(axes)
+    while waiting and (not failed or clock.now_s() < until_s):
+        for axis in tuple(waiting):
+            try:
+                confirm(axis)
+            except DriverError as error:
+                failed[axis] = error
+            else:
+                waiting.remove(axis)
+                failed.pop(axis, None)
+    return failed
+
+
+def leave(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError]) -> None:
+    """Leave each axis that has confirmed the last stop as its ``at_close`` says; never raises.
+
+    Its torque goes off only when it stands.
+    """
+    for axis in pair.axes:
+        if axis in failed:
+            log.warning("%s did not confirm the last stop: %s", axis.servo.name, failed[axis])
+            continue
+        limp = axis.settings.at_close == "torque_off"
+        if limp:
+            try:
+                stands, sample = rests(axis.servo.look, pair.clock, STANDS_WITHIN_S, Rest(STANDS_S))
+                limp = stands or not sample.values.get("torque_enable", True)
+                if not limp:
+                    log.warning(KEPT, axis.servo.name, STANDS_WITHIN_S)
+            except DriverError as error:
+                log.warning("%s does not say whether it stands: %s", axis.servo.name, error)
+        axis.servo.release(limp)
+
+
+def stop_error(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError]) -> DriverError:
     """What to tell of a stop that not every axis has confirmed."""
     error = next(iter(failed.values()))
     names = " and ".join(axis.servo.name for axis in failed)

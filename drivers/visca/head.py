@@ -8,15 +8,14 @@ whose host is gone goes to the end of its move.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from drivers.clock import Clock, SystemClock
 from drivers.errors import BadReply, DriverError, OutOfRange, Refused
 from drivers.goals import check_goal
-from drivers.ptz.head import AXES, LATE_S, PtzAxis, PtzHead, halt_head
+from drivers.ptz.head import AXES, PtzAxis, PtzHead
 from drivers.ptz.options import PtzOptions
-from drivers.serial_line import OpenLine, SerialLine
+from drivers.serial_line import SerialLine
 from drivers.visca.options import DEVICE, options_from
 from drivers.visca.protocol import (
     ERROR_WORDS,
@@ -32,29 +31,18 @@ from drivers.visca.protocol import (
 from drivers.visca.udp import UdpLine
 
 
-def open_head(
-    options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
-) -> ViscaHead:
-    """Return the open head that the options name; opening stops it and moves nothing.
-
-    Raises
-    ------
-    BadOptions
-        For options that cannot be used.
-    LineLost, NoReply, BadReply, WrongDevice
-        If the head cannot be reached, or stands outside of its limits.
-    """
-    return ViscaHead(options_from(options), clock or SystemClock(), open_line)
-
-
 class ViscaHead(PtzHead):
-    """An open head; safe to use from any thread."""
+    """An open head, as `PtzHead`."""
 
-    def __init__(self, options: PtzOptions, clock: Clock, open_line: OpenLine) -> None:
-        numbered = options.port.startswith("udp://")
-        opens = UdpLine if numbered and open_line is SerialLine else open_line
-        axes = [PtzAxis(axis, axis.count_rad) for axis in (options.pan, options.tilt)]
-        super().__init__(options, axes, DEVICE, clock, opens, 0.0 if numbered else LATE_S)
+    _device = DEVICE
+
+    def _read(self, options: Mapping[str, Any]) -> tuple[PtzOptions, Sequence[PtzAxis]]:
+        read = options_from(options)
+        if read.port.startswith("udp://"):
+            self._late_s = 0.0
+            if self._open_line is SerialLine:
+                self._open_line = UdpLine
+        return read, [PtzAxis(axis, axis.count_rad) for axis in (read.pan, read.tilt)]
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         """Start both axes towards the nearest counts, each at the speed asked for or its nearest slower code.
@@ -144,16 +132,4 @@ class ViscaHead(PtzHead):
         raise self._no_reply(wanted.value)
 
 
-def halt(
-    options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
-) -> list[str]:
-    """Stop both axes, and see that they stand; the head holds where that ends.
-
-    Raises
-    ------
-    BadOptions
-        For options that cannot be.
-    LineLost, NoReply, BadReply, Refused, WrongDevice
-        If it was not confirmed; the command has been sent all the same, unless the line is lost.
-    """
-    return halt_head(open_head(options, clock, open_line))
+open_head, halt = ViscaHead, ViscaHead.halt

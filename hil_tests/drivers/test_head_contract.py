@@ -315,6 +315,24 @@ def test_close_of_a_head_that_is_gone_does_not_raise(wired: HeadRig) -> None:
     wired.head.close()
 
 
+def test_close_stops_a_head_whose_line_is_away_as_soon_as_it_is_back(wired: HeadRig) -> None:
+    line = wired.line
+    assert line is not None
+    attempt(lambda: wired.head.move(0.9, 0.3, 0.3))
+    until(lambda: (r := attempt(wired.head.read)) and r.pan_rad > 0.05, "motion", clock=wired.clock)
+    line.hang_up()
+    until(lambda: attempt(wired.head.read) is None, "an error", clock=wired.clock)
+
+    def back() -> None:
+        wired.clock.sleep(0.4)
+        line.come_back()
+
+    wired.clock.thread(back, "a cable plugged in again").start()
+    wired.head.close()
+    until(lambda: _stands(wired), "standing", clock=wired.clock)
+    assert wired.true_rad(wired.clock.now_s())[0] < 0.8
+
+
 def _stands(rig: HeadRig) -> bool:
     now_s = rig.clock.now_s()
     return rig.true_rad(now_s) == rig.true_rad(now_s - 0.05)

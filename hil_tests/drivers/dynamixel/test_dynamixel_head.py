@@ -313,7 +313,7 @@ def test_stop_may_let_an_axis_go_and_a_move_takes_hold_of_it_again() -> None:
         it.options["pan"]["at_stop"] = "torque_off"
         head = it.open()
         head.stop()
-        assert [servo.table["torque_enable"] for servo in it.servos] == [0, 1]
+        it.until(lambda: [servo.table["torque_enable"] for servo in it.servos] == [0, 1], "torque off")
         assert head.read().faults == ()
         head.move(0.3, 0.0)
         assert it.settled(head).pan_rad == pytest.approx(0.3, abs=COUNT_RAD)

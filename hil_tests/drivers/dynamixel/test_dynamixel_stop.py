@@ -398,12 +398,12 @@ def test_a_stop_that_breaks_off_a_taking_hold_leaves_no_torque_on_where_it_lets_
             it.options[axis]["at_stop"] = "torque_off"
         head = it.open()
         head.stop()
-        assert [servo.table["torque_enable"] for servo in it.servos] == [0, 0]
+        it.until(lambda: not any(servo.table["torque_enable"] for servo in it.servos), "no torque")
         mover = it.beside(lambda: failed_move(head))
         it.until(lambda: it.servos[held].table["torque_enable"], "torque")
         head.stop()
         mover.wait()
-        assert [servo.table["torque_enable"] for servo in it.servos] == [0, 0]
+        it.until(lambda: not any(servo.table["torque_enable"] for servo in it.servos), "no torque")
         head.close()
 
 
@@ -435,6 +435,7 @@ def test_without_a_watchdog_a_stop_tries_a_line_that_is_away_at_once(silent: int
             it.until(lambda a=axis: a.velocity_rad_per_s(it.now_s()) == 0, "rest")
             assert axis.angle_rad(it.now_s()) - axis.angle_rad(back_s) < 0.4, "it ran on to its goal"
         if silent is None:
+            it.until(lambda: not failed(head), "an answer")
             assert it.settled(head).faults == ()
 
 
@@ -469,7 +470,7 @@ def test_an_axis_whose_torque_was_dropped_to_set_it_up_holds_again_when_that_is_
         it.line.come_back()
         limp.wait()
         getattr(head, overtaking)()
-        assert broken_off == [1]
+        assert set(broken_off) == {1}
         assert table["torque_enable"] == 1
 
 

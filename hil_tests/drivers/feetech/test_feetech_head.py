@@ -22,6 +22,7 @@ from drivers.feetech.head import FeetechHead, halt, open_head
 from drivers.feetech.link import FeetechLink, open_link
 from drivers.feetech.servo import FeetechServo
 from drivers.feetech.settings import feetech_settings
+from drivers.servo_bus.rest import Rest
 from drivers.sim.axis import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.feetech_bus import FeetechBus
@@ -134,6 +135,63 @@ def test_without_a_lease_a_move_goes_on_when_the_host_hangs_and_halt_ends_it() -
         assert it.pan_rad() == rested and 0.05 < rested < 0.9
 
 
+def test_without_a_lease_a_stop_is_confirmed_over_a_line_that_has_just_come_back() -> None:
+    with opened(options={"lease_s": 0, "acceleration_rad_per_s2": 2.0}) as (it, head):  # brakes for 0.6 s
+        head.move(0.9, 0.3)
+        it.until(lambda: it.axes[0].velocity_rad_per_s(it.now_s()) > 0.8, "motion")
+        it.line.hang_up()
+        it.until(lambda: failed(head) and head._session is None, "the line to be given up")
+        head._absence.again_s = it.now_s() + NET_S  # not before somebody asks for it
+        it.line.come_back()
+        head.stop()
+        it.until(lambda: it.axes[0].velocity_rad_per_s(it.now_s()) == 0, "rest")
+        assert it.pan_rad() < 0.8
+        assert it.until(lambda: not failed(head), "an answer")
+        assert head.read().faults == ()
+
+
+@pytest.mark.parametrize("ending", ["stop", "close"])
+@pytest.mark.parametrize("away", [False, True], ids=["", "over a line that comes back"])
+def test_torque_goes_off_only_when_the_axis_stands(
+    ending: str, away: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with bench() as it:
+        options = it.options(lease_s=0, acceleration_rad_per_s2=2.0)
+        options["pan"]["at_stop"] = options["pan"]["at_close"] = "torque_off"
+        head, plain, speeds = open_head(options, it.clock, it.line.open), FeetechServo.set, []
+
+        def set_(servo: FeetechServo, name: str, value: int) -> None:
+            if (name, value) == ("torque_enable", 0):
+                speeds.append(it.axes[0].velocity_rad_per_s(it.now_s()))
+            plain(servo, name, value)
+
+        monkeypatch.setattr(FeetechServo, "set", set_)
+        head.move(0.9, 0.3)
+        it.until(lambda: it.axes[0].velocity_rad_per_s(it.now_s()) > 0.8, "motion")
+        if away:
+            it.line.hang_up()
+            it.until(lambda: failed(head) and head._session is None, "the line to be given up")
+            it.line.come_back()
+        getattr(head, ending)()
+        it.until(lambda: not it.servos[0].memory["torque_enable"], "torque off")
+        assert speeds == [0.0]
+        assert it.servos[1].memory["torque_enable"] == 1
+        head.close()
+
+
+def test_an_axis_that_does_not_come_to_rest_keeps_its_torque_at_the_end(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with bench() as it:
+        options = it.options()
+        options["pan"]["at_close"] = "torque_off"
+        head = open_head(options, it.clock, it.line.open)
+        monkeypatch.setattr(Rest, "take", lambda *_: False)
+        head.close()
+        assert it.servos[0].memory["torque_enable"] == 1
+        assert "pan (servo 1) did not come to rest within 2.5 s of a stop" in caplog.text
+
+
 def test_permanent_settings_are_written_once_with_the_lock_open_for_them_alone() -> None:
     with bench(return_delay=250) as it:
         it.open().close()
@@ -154,9 +212,9 @@ def test_a_line_that_is_lost_after_the_last_stop_is_let_go_of(
     with bench() as it:
         head, plain, closed = it.open(), FeetechServo.release, []
 
-        def release(servo: FeetechServo) -> None:
+        def release(servo: FeetechServo, limp: bool) -> None:
             it.line.hang_up()
-            plain(servo)
+            plain(servo, limp)
 
         monkeypatch.setattr(FeetechServo, "release", release)
         true_close = FeetechLink.close
@@ -194,7 +252,7 @@ def test_closing_that_breaks_off_a_set_up_leaves_the_eeprom_locked_and_the_axis_
         it.line.come_back()
         unlocked.wait()
         head.close()
-        assert locks == [(1, 1)]
+        assert set(locks) == {(1, 1)}
 
 
 def test_an_offset_in_the_eeprom_is_told_and_never_written(caplog: pytest.LogCaptureFixture) -> None:
@@ -301,7 +359,8 @@ def cli(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bench]:
     with bench() as it:
         monkeypatch.setattr(heads, "SYSTEM", tmp_path / "no_such")
         monkeypatch.setattr(heads, "_home", lambda: tmp_path)
-        monkeypatch.setattr(open_link, "__kwdefaults__", {"clock": it.clock, "open_line": it.line.open})
+        asked = {"questions": None, "clock": it.clock, "open_line": it.line.open}
+        monkeypatch.setattr(open_link, "__kwdefaults__", asked)
         monkeypatch.setattr(workshop.scan, "__defaults__", (it.clock, it.line.open))
         yield it
 
