@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import logging
 import threading
@@ -35,6 +36,15 @@ HEADS = {
 }
 """Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them, and whose
 ``halt(options)`` stops a head that no daemon drives any more."""
+
+HEAD_OPTIONS = {
+    "dynamixel": "drivers.dynamixel.settings:dynamixel_settings",
+    "feetech": "drivers.feetech.settings:feetech_settings",
+    "flir_ptu": "drivers.flir_ptu.options:options_from",
+    "pelco": "drivers.pelco.options:options_from",
+    "visca": "drivers.visca.options:options_from",
+}
+"""The reader of the options of each."""
 
 CAMERAS = {"aravis": "drivers.aravis.camera", "v4l2": "drivers.v4l2.camera"}
 """Camera drivers of this repository: the module whose ``open_camera(options, clock, name)`` opens one."""
@@ -176,6 +186,12 @@ class DeviceSettings:
     driver: str
     options: Mapping[str, Any] = field(default_factory=dict)
     offset_s: float = 0.0
+
+
+def head_options(device: DeviceSettings) -> Any:
+    """Return the options of a head of this repository as its driver reads them. Raises BadOptions."""
+    module, _, reader = HEAD_OPTIONS[device.driver].partition(":")
+    return getattr(importlib.import_module(module), reader)(device.options)
 
 
 @dataclass(frozen=True)

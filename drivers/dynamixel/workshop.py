@@ -34,6 +34,7 @@ from drivers.servo_bus.bench import (
     ServoFacts,
     Trial,
     TrialStep,
+    changing,
     check_change,
     check_trial,
     restored,
@@ -135,7 +136,8 @@ def table_of(link: Link, servo_id: int, model: ServoModel) -> ServoTable:
 def set_id(link: Link, old: int, new: int, new_baud: int | None = None, *, torque_off: bool = False) -> None:
     """Give a servo another id, and another baud rate if asked; see that it took them.
 
-    Connect that one servo alone if two may have the same id: they would both take the new one.
+    A change that is broken off says what the servo is left with. Connect that one servo alone if two may have
+    the same id: they would both take the new one.
 
     Raises
     ------
@@ -166,14 +168,18 @@ def set_id(link: Link, old: int, new: int, new_baud: int | None = None, *, torqu
                 "--torque-off"
             )
         table.set("torque_enable", 0)
-    if old != new:
-        _change(link, old, model, "id", new)
-        _confirm(link, new, model, f"servo {old} did not take the id {new}")
-    if new_baud is not None and new_baud != link.baud:
-        _change(link, new, model, "baud", codes[new_baud])
-        link.clock.sleep(0.05)  # the servo changes its rate after its answer
-        link.set_baud(new_baud)
-        _confirm(link, new, model, f"servo {new} does not answer at {new_baud} baud")
+    with changing(link, "dynamixel", old, new_baud) as change:
+        if old != new:
+            change.ids = [old, new]
+            _change(link, old, model, "id", new)
+            _confirm(link, new, model, f"servo {old} did not take the id {new}")
+            change.ids = [new]
+        if change.new_baud is not None:
+            change.bauds.append(change.new_baud)
+            _change(link, new, model, "baud", codes[change.new_baud])
+            link.clock.sleep(0.05)  # the servo changes its rate after its answer
+            link.set_baud(change.new_baud)
+            _confirm(link, new, model, f"servo {new} does not answer at {change.new_baud} baud")
 
 
 def _change(link: Link, servo_id: int, model: ServoModel, register: str, value: int) -> None:

@@ -33,6 +33,7 @@ from drivers.servo_bus.bench import (
     ServoFacts,
     Trial,
     TrialStep,
+    changing,
     check_change,
     check_trial,
     restored,
@@ -136,6 +137,8 @@ def set_id(
 ) -> None:
     """Give a servo another id, and another baud rate if asked; see that it took them.
 
+    A change that is broken off says what the servo is left with.
+
     Raises
     ------
     BadOptions
@@ -160,19 +163,25 @@ def set_id(
             )
         link.write(old, registers["torque_enable"], 0, model)
     link.write(old, registers["lock"], UNLOCKED, model)
-    try:
-        if old != new:
-            link.write_unanswered(old, registers["id"], new, model)
-        if new_baud is not None and new_baud != link.baud:
-            link.write_unanswered(new, registers["baud"], BAUD_RATES.index(new_baud), model)
-            link.set_baud(new_baud)
-        link.write(new, registers["lock"], LOCKED, model)
-    except BaseException:  # it has the one id or the other, and its EEPROM stays unlocked under neither
-        for servo_id in {new, old}:
-            with suppress(DriverError):
-                link.write(servo_id, registers["lock"], LOCKED, model)
-        raise
-    link.ping(new)
+    with changing(link, "feetech", old, new_baud) as change:
+        try:
+            if old != new:
+                change.ids = [old, new]
+                link.write_unanswered(old, registers["id"], new, model)
+                if change.new_baud is not None:
+                    link.ping(new)  # before its rate changes
+                    change.ids = [new]
+            if change.new_baud is not None:
+                change.bauds.append(change.new_baud)
+                link.write_unanswered(new, registers["baud"], BAUD_RATES.index(change.new_baud), model)
+                link.set_baud(change.new_baud)
+            link.write(new, registers["lock"], LOCKED, model)
+        except BaseException:  # it has the one id or the other, and its EEPROM stays unlocked under neither
+            for servo_id in {new, old}:
+                with suppress(DriverError):
+                    link.write(servo_id, registers["lock"], LOCKED, model)
+            raise
+        link.ping(new)
 
 
 def try_out(link: FeetechLink, servo_id: int, amplitude_rad: float, torque_percent: float) -> Trial:

@@ -18,8 +18,8 @@ from typing import Any
 
 from drivers.errors import BadReply, DriverError
 from drivers.goals import check_goal
-from drivers.pelco.options import DEVICE, TURN, PelcoAxisOptions, PelcoOptions, options_from
-from drivers.pelco.protocol import ASK, LENGTH, SET, STOP, TOLD, frame, take_answer
+from drivers.pelco.options import DEVICE, PelcoAxisOptions, PelcoOptions, options_from
+from drivers.pelco.protocol import ASK, LENGTH, SET, STOP, TOLD, TURN, frame, take_answer
 from drivers.ptz.head import AXES, PtzAxis, PtzHead
 
 AGAIN_S = 0.25  # a position is sent again while the axis is not there: nothing says that it arrived

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from drivers.options import OptionReader
+from drivers.pelco.protocol import TURN, place_questions
+from drivers.ptz.inquiry import Dialect
 from drivers.ptz.options import AxisOptions, PtzOptions, shared_axis, shared_options
 
 DEVICE = "pelco"
@@ -15,7 +18,15 @@ BAUDS = (2400, 4800, 9600, 19200, 38400, 115200)
 PORTS = "a serial device such as /dev/ttyUSB0, socket://HOST:PORT or rfc2217://HOST:PORT"
 SCHEMES = ("socket://", "rfc2217://")
 UNIT_RAD = math.radians(0.01)
-TURN = 36000
+HIGHEST_ADDRESS = 254
+DIALECTS = tuple(
+    Dialect(
+        DEVICE, f"Pelco-{protocol}", partial(place_questions, protocol), (2400, 4800, 9600), (1, 2),
+        BAUDS, HIGHEST_ADDRESS, SCHEMES, {"protocol": protocol},
+    )
+    for protocol in ("D", "P")
+)  # fmt: skip
+"""A Pelco-P head that takes its address as it is sent answers at one more."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +83,7 @@ def options_from(values: Mapping[str, Any]) -> PelcoOptions:
         For an unknown or missing key or a value that cannot be: which, what it is, what would be right.
     """
     read = OptionReader(values, PelcoOptions.__dataclass_fields__, ("port", "pan", "tilt"))
-    shared = shared_options(read, SCHEMES, PORTS, BAUDS, 254)
+    shared = shared_options(read, SCHEMES, PORTS, BAUDS, HIGHEST_ADDRESS)
     return PelcoOptions(
         **shared,
         pan=_axis(read, "pan"),

@@ -6,7 +6,8 @@ address and a checksum, and no number.
 
 from __future__ import annotations
 
-from functools import reduce
+from collections.abc import Callable
+from functools import partial, reduce
 from operator import xor
 
 STOP = 0x00
@@ -15,6 +16,7 @@ ASK = (0x51, 0x53)
 TOLD = (0x59, 0x5B)
 START, LENGTH = {"D": 0xFF, "P": 0xA0}, {"D": 7, "P": 8}
 END_P = 0xAF
+TURN = 36000  # hundredths of a degree
 
 
 def frame(protocol: str, address: int, command: int, value: int = 0) -> bytes:
@@ -24,6 +26,20 @@ def frame(protocol: str, address: int, command: int, value: int = 0) -> bytes:
         return bytes((START["D"],)) + body + bytes((sum(body) & 0xFF,))
     whole = bytes((START["P"],)) + body + bytes((END_P,))
     return whole + bytes((reduce(xor, whole),))
+
+
+def place_questions(
+    protocol: str, address: int
+) -> list[tuple[bytes, Callable[[bytearray], tuple[int, ...] | None]]]:
+    """Return the questions where pan and tilt are, and what takes each answer out of a buffer."""
+
+    def take(told: int, buffer: bytearray) -> tuple[int, ...] | None:
+        while (found := take_answer(protocol, address, buffer)) is not None:
+            if found[0] == told and found[1] < TURN:
+                return found[1:]
+        return None
+
+    return [(frame(protocol, address, ask), partial(take, told)) for ask, told in zip(ASK, TOLD, strict=True)]
 
 
 def take_answer(protocol: str, address: int, buffer: bytearray) -> tuple[int, int] | None:

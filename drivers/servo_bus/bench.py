@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from shlex import quote
 from typing import TypeVar
 
 from drivers.clock import Clock
@@ -122,6 +123,53 @@ def check_change(link: BusLink, old: int, new: int, new_baud: int | None, rates:
         raise BadOptions(f"{new_baud} baud cannot be; there is {', '.join(map(str, rates))}")
     if old == new and new_baud in (None, link.baud):
         raise BadOptions(f"servo {old} already has this id and baud rate; there is nothing to do")
+
+
+@dataclass
+class Change:
+    """A change of a servo's id and rate that is under way.
+
+    Attributes
+    ----------
+    line
+        The command's words for the line.
+    ids, bauds
+        Those under which the servo may answer now.
+    new_baud
+        The rate that it is to have in the end, if another.
+    """
+
+    line: str
+    ids: list[int]
+    bauds: list[int]
+    new_baud: int | None
+
+    def words(self) -> str:
+        """Say what the servo is left with, and how to go on."""
+        ids, bauds = " or ".join(map(str, self.ids)), " or ".join(map(str, self.bauds))
+        scan = f"'mastctl servo scan {self.line} --baud {bauds.replace(' or', '')}' shows which"
+        told = f"the servo is left with the id {ids} at {bauds} baud: {scan}"
+        if self.new_baud is None:
+            return told
+        new, old = self.ids[-1], self.bauds[0]
+        command = f"mastctl servo set-id {self.line} {new} {new} --baud {old} --new-baud {self.new_baud}"
+        return f"{told}, and '{command}' gives the id {new} its rate"
+
+
+@contextmanager
+def changing(link: BusLink, family: str, old: int, new_baud: int | None) -> Iterator[Change]:
+    """Say, if a change is broken off within, what the servo is left with. Raises what broke it off."""
+    line = quote(link.name) + ("" if family == "dynamixel" else f" --family {family}")
+    change = Change(line, [old], [link.baud], None if new_baud == link.baud else new_baud)
+    try:
+        yield change
+    except BaseException as error:
+        if change.ids == [old] and len(change.bauds) == 1:
+            raise  # nothing was changed
+        words = f"{str(error) or 'interrupted'}; {change.words()}"
+        if isinstance(error, DriverError):
+            raise type(error)(words, detail=error.detail) from error
+        raise WrongDevice(words) from error
 
 
 def check_trial(name: str, values: Mapping[str, int], limits: tuple[int, int], reach: int) -> None:

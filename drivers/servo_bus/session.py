@@ -316,7 +316,7 @@ def leave(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError]) -> Non
 
 
 def stop_error(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError]) -> DriverError:
-    """What to tell of a stop that not every axis has confirmed."""
+    """Return the error of a stop that not every axis has confirmed."""
     error = next(iter(failed.values()))
     names = " and ".join(axis.servo.name for axis in failed)
     done = "".join(f"; {axis.servo.name} brakes" for axis in pair.axes if axis not in failed)

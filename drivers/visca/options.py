@@ -6,12 +6,22 @@ from collections.abc import Mapping
 from typing import Any
 
 from drivers.options import OptionReader
+from drivers.ptz.inquiry import Dialect
 from drivers.ptz.options import AxisOptions, PtzOptions, shared_axis, shared_options
+from drivers.visca.protocol import place_questions
+from drivers.visca.udp import UdpLine
 
 DEVICE = "visca"
 BAUDS = (9600, 19200, 38400, 115200)
 PORTS = "a serial device such as /dev/ttyUSB0, udp://HOST, socket://HOST:PORT or rfc2217://HOST:PORT"
 SCHEMES = ("udp://", "socket://", "rfc2217://")
+HIGHEST_ADDRESS = 7
+DIALECTS = (
+    Dialect(
+        DEVICE, "VISCA", place_questions, (9600, 38400), tuple(range(1, HIGHEST_ADDRESS + 1)),
+        BAUDS, HIGHEST_ADDRESS, SCHEMES, udp=UdpLine,
+    ),
+)  # fmt: skip
 
 
 def options_from(values: Mapping[str, Any]) -> PtzOptions:
@@ -23,7 +33,7 @@ def options_from(values: Mapping[str, Any]) -> PtzOptions:
         For an unknown or missing key or a value that cannot be: which, what it is, what would be right.
     """
     read = OptionReader(values, PtzOptions.__dataclass_fields__, ("port", "pan", "tilt"))
-    shared = shared_options(read, SCHEMES, PORTS, BAUDS, 7)
+    shared = shared_options(read, SCHEMES, PORTS, BAUDS, HIGHEST_ADDRESS)
     return PtzOptions(**shared, pan=_axis(read, "pan"), tilt=_axis(read, "tilt"))
 
 

@@ -6,6 +6,7 @@ whose positions have four digits.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import Enum
 
 END = 0xFF
@@ -46,6 +47,18 @@ def go_command(address: int, speeds: tuple[int, int], places: tuple[int, int]) -
     """Return the command that sends both axes to positions, counts, at speeds by their codes."""
     digits = b"".join(bytes((place & 0xFFFF) >> shift & 0xF for shift in (12, 8, 4, 0)) for place in places)
     return bytes((0x80 | address, 0x01, 0x06, 0x02, *speeds)) + digits + bytes((END,))
+
+
+def place_questions(address: int) -> list[tuple[bytes, Callable[[bytearray], tuple[int, ...] | None]]]:
+    """Return the question of `place_inquiry`, and what takes its answer out of a buffer."""
+
+    def take(buffer: bytearray) -> tuple[int, ...] | None:
+        while (found := take_frame(buffer)) is not None:
+            if kind_of(found, address) is Kind.PLACE:
+                return places_of(found)
+        return None
+
+    return [(place_inquiry(address), take)]
 
 
 def take_frame(buffer: bytearray) -> bytes | None:

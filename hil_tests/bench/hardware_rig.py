@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from drivers.hardware import DeviceSettings
+from drivers.dynamixel import workshop as dynamixel
+from drivers.dynamixel.link import Link
+from drivers.feetech import workshop as feetech
+from drivers.feetech.link import FeetechLink, open_link
+from drivers.hardware import DeviceSettings, head_options
 from mastctl.config import load_config
 from mastctl.conform.devices import head_under_test
 from mastctl.conform.head_trial import HeadTrial
@@ -30,15 +34,15 @@ def hardware_trial(file: Path) -> Iterator[HeadTrial]:
 
 def error_registers(settings: DeviceSettings) -> dict[str, Any]:
     """What the device itself has noted as wrong, by name; the head has to be closed."""
-    options = settings.options
+    if settings.driver not in ("dynamixel", "feetech"):
+        return {}  # a PTU's !P and !T are in the last reading's faults; a VISCA or Pelco head notes nothing
+    options = head_options(settings)
+    link: Link | FeetechLink
     if settings.driver == "dynamixel":
-        from drivers.dynamixel.link import Link
-        from drivers.dynamixel.workshop import facts
-
-        link = Link(options["port"], options.get("baud", 1_000_000))
-        try:
-            found = {name: facts(link, options[name]["id"]).values for name in ("pan", "tilt")}
-        finally:
-            link.close()
-        return {name: values["hardware_error"] for name, values in found.items() if values["hardware_error"]}
-    return {}  # a PTU has none: what it says by itself (!P, !T) is in the last reading's faults
+        link, register, facts = Link(options.port, options.baud), "hardware_error", dynamixel.facts
+    else:
+        link, register, facts = open_link(options.port, options.baud), "status", feetech.facts
+    with closing(link):
+        axes = {"pan": options.pan, "tilt": options.tilt}
+        found = {name: facts(link, axis.servo_id).values[register] for name, axis in axes.items()}
+    return {name: value for name, value in found.items() if value}

@@ -47,7 +47,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.sim": ("sim",),
     "mastctl.cli.rig": ("rig",),
     "mastctl.cli.sentinel": ("sentinel",),
-    "mastctl.cli.servos": ("servo", "ptu"),
+    "mastctl.cli.servos": ("servo", "ptu", "ptz"),
     "mastctl.cli.ros2": ("ros2",),
 }
 
@@ -323,12 +323,13 @@ servo set-id /dev/ttyUSB0 1 2
 servo test /dev/ttyUSB0 1 --degrees 5
 ptu info /dev/ttyUSB0
 ptu home /dev/ttyUSB0
+ptz info /dev/ttyUSB0
 ros2 --url http://127.0.0.1:8420
 """
 _GROUPS = frozenset(
     (
         *("lease", "token", "track", "operations", "mast", "fault", "camera", "experiment", "record"),
-        *("sim", "servo", "ptu", "board", "sentinel", "rig"),
+        *("sim", "servo", "ptu", "ptz", "board", "sentinel", "rig"),
     )
 )
 

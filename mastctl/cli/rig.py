@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from mastctl.rig.questions import Questions
 
 
+AXES = ("pan", "tilt")
 NOTHING = "no head and no camera is plugged in; write a simulated twin, which runs"
 TWIN_DEG = {"pan": 175.0, "tilt": 90.0}
 """The reach of the simulated head to each side."""
@@ -40,6 +41,21 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     number = at_least(0)
     new.add_argument("--pan-id", type=number, metavar="ID", help="the servo that turns pan")
     new.add_argument("--tilt-id", type=number, metavar="ID", help="the servo that turns tilt")
+    new.add_argument(
+        "--baud", nargs="+", type=number, default=[], metavar="B",
+        help="ask VISCA and Pelco heads at these rates (default 9600 and 38400; 2400, 4800 and 9600)",
+    )  # fmt: skip
+    new.add_argument(
+        "--address", nargs="+", type=number, default=[], metavar="N",
+        help="ask VISCA and Pelco heads at these addresses (default 1 to 7; 1 and 2)",
+    )  # fmt: skip
+    new.add_argument(
+        "--count-deg", type=positive_number, metavar="DEG", help="one count of a VISCA head (its data sheet)"
+    )
+    new.add_argument(
+        "--fastest-deg", nargs=2, type=positive_number, metavar=("PAN", "TILT"),
+        help="speeds of a VISCA or Pelco head, degrees per second (its data sheet)",
+    )  # fmt: skip
     for axis, usual in (("pan", "-85 85"), ("tilt", "-40 30")):
         new.add_argument(
             f"--{axis}-deg", nargs=2, type=finite_number, metavar=("LOW", "HIGH"),
@@ -75,7 +91,7 @@ def _new(args: argparse.Namespace) -> int:
     check_free(args.folder)
     machine = ExaminedMachine()
     questions = Questions(terminal=False if args.json else None)
-    found = look(args.port, machine, output.tell)
+    found = look(args.port, machine, output.tell, (args.baud, args.address))
     for words in found.words:
         output.tell(f"found {words}")
     for words in found.unused:
@@ -171,7 +187,22 @@ def _answers(
         tilt_deg=ends["tilt"],
         pan_id=pan_id,
         tilt_id=tilt_id,
+        **_data_sheet(args, head, questions),
     )
+
+
+def _data_sheet(args: argparse.Namespace, head: PluggedHead | None, questions: Questions) -> dict[str, Any]:
+    """What only the data sheet of a VISCA or Pelco head tells: 0, or no option, leaves it open."""
+    if head is None or not head.ptz:
+        return {}
+    count_deg, fastest_deg = args.count_deg, args.fastest_deg
+    sheet = "by its data sheet (0: not known)"
+    if count_deg is None and head.ptz[0].dialect.driver == "visca":
+        count_deg = questions.number(f"one count of the head, degrees, {sheet}", 0.0, 0.0, 1.0) or None
+    if fastest_deg is None:
+        speeds = [questions.number(f"speed of {axis}, degrees/s, {sheet}", 0.0, 0.0, 1000.0) for axis in AXES]
+        fastest_deg = speeds if all(speeds) else None
+    return {"count_deg": count_deg, "fastest_deg": None if fastest_deg is None else tuple(fastest_deg)}
 
 
 def _axes(args: argparse.Namespace, ids: list[int], questions: Questions) -> tuple[int, int]:

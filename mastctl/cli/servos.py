@@ -1,4 +1,4 @@
-"""Real heads on their lines: ``mastctl servo`` (two families) and ``mastctl ptu``."""
+"""Real heads on their lines: ``mastctl servo`` (two families), ``mastctl ptu`` and ``mastctl ptz``."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
@@ -25,12 +26,19 @@ FAMILIES = {
 }
 """The baud rates that a scan tries, first that of the factory."""
 
+NO_SERVOS = {
+    "flir_ptu": "mastctl ptu info PORT",
+    "visca": "mastctl ptz info PORT",
+    "pelco": "mastctl ptz info PORT",
+}
+"""Heads without servos, and the command that asks one."""
+
 FARTHEST_DEG = 20.0
 
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add servo and ptu."""
-    for add in (_add_servo, _add_ptu):
+    """Add servo, ptu and ptz."""
+    for add in (_add_servo, _add_ptu, _add_ptz):
         add(subparsers)
 
 
@@ -84,8 +92,19 @@ def _add_servo(subparsers: argparse._SubParsersAction[Any]) -> None:
 def _add_port(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("port", metavar="PORT", help="serial device, or a URL such as socket://host:port")
     parser.add_argument(
-        "--family", choices=FAMILIES, default="dynamixel", help="of the servos on it (default dynamixel)"
-    )
+        "--family", type=_family, choices=FAMILIES, default="dynamixel",
+        help="of the servos on it (default dynamixel)",
+    )  # fmt: skip
+
+
+def _family(text: str) -> str:
+    """Read a family; a head without servos is told which commands are for it (argparse ``type``)."""
+    if text in NO_SERVOS:
+        raise argparse.ArgumentTypeError(
+            f"a {text} head has no servos: '{NO_SERVOS[text]}' asks it, 'mastctl conform --config FILE "
+            "--head' tries it"
+        )
+    return text
 
 
 def _add_baud(parser: argparse.ArgumentParser) -> None:
@@ -142,7 +161,12 @@ def _scan(args: argparse.Namespace) -> int:
         raise CommandError(
             "no_servo",
             f"no servo answered on {args.port} at {bauds} baud"
-            + (f"; {'; '.join(garbled)}" if garbled else f"; is its power on, is it a {args.family} servo?"),
+            + (
+                f"; {'; '.join(garbled)}; "
+                if garbled
+                else f"; is its power on, is it a {args.family} servo? "
+            )
+            + f"'mastctl ptz info {quote(args.port)}' asks for VISCA and Pelco heads",
         )
     if args.json:
         rows = [
@@ -350,3 +374,60 @@ def _show(args: argparse.Namespace, found: Facts) -> None:
     ]
     notes = [f"supply: {found.supply}"] if found.supply else []
     output.print_table(found.version, ("", "pan", "tilt"), rows, notes)
+
+
+def _add_ptz(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add ptz with its command."""
+    ptz = subparsers.add_parser("ptz", help="ask for a VISCA or Pelco head on the bench")
+    commands = ptz.add_subparsers(dest="ptz_command", metavar="WHAT", required=True)
+    info = commands.add_parser(
+        "info", help="show which VISCA or Pelco head answers, and where it stands; moves nothing"
+    )
+    info.add_argument(
+        "port", metavar="PORT", help="serial device, udp://HOST, socket://HOST:PORT or rfc2217://HOST:PORT"
+    )
+    for name, letter, usual in (
+        ("baud", "B", "VISCA 9600 and 38400, Pelco 2400, 4800 and 9600"),
+        ("address", "N", "VISCA 1 to 7, Pelco 1 and 2"),
+    ):
+        info.add_argument(
+            f"--{name}", nargs="+", type=_whole, default=[], metavar=letter,
+            help=f"to ask at (default: {usual})",
+        )  # fmt: skip
+    info.set_defaults(run=_ptz_info)
+
+
+def _ptz_info(args: argparse.Namespace) -> int:
+    """Show the heads of a line."""
+    from drivers.ptz.inquiry import find_heads
+    from mastctl.rig.plugged import PTZ_DIALECTS
+
+    found = find_heads(args.port, PTZ_DIALECTS, args.baud, args.address)
+    if not found:
+        raise CommandError(
+            "no_head",
+            f"no VISCA or Pelco head answered on {args.port}; is its power on, does it answer position "
+            "queries? --baud and --address name others than the usual ones",
+        )
+    rows = [
+        {
+            "driver": one.dialect.driver,
+            **one.dialect.options,
+            "baud": one.baud,
+            "address": one.address,
+            "pan_counts": one.places[0],
+            "tilt_counts": one.places[1],
+        }
+        for one in found
+    ]
+    if args.json:
+        output.print_json({"port": args.port, "heads": rows})
+        return 0
+    names = ("protocol", "baud", "address", "pan, counts", "tilt, counts")
+    output.print_table(
+        f"Heads on {args.port}",
+        names,
+        [(one.dialect.name, *map(str, (one.baud, one.address, *one.places))) for one in found],
+        ["A count of Pelco is 0.01 degree; that of VISCA is in the head's data sheet, like its speed."],
+    )
+    return 0

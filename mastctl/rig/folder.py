@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
@@ -18,15 +18,25 @@ import numpy as np
 from calib.files.atomic import save_bytes
 from calib.files.mast_file import load_rig
 from calib.files.yaml_text import dump_mapping
+from drivers.hardware import HEADS, head_options
 from mastctl.config import check_cameras, load_config
 from mastctl.packaged import SCHEMAS, config_folder, name_schema
-from mastctl.rig.drawing import USUAL_BAUD, RigAnswers, camera_names, configuration, drawing, soft_limits
+from mastctl.rig.drawing import (
+    USUAL_BAUD,
+    RigAnswers,
+    camera_names,
+    configuration,
+    drawing,
+    soft_limits,
+    untold,
+)
 from mastctl.rig.plugged import Plugged, PluggedCamera, PluggedHead, set_id, usb_of
 from mastctl.setup.machine import ExaminedMachine
 from mastctl.setup.new_rig import RigNumbers, built_rig, focal_of
 from mastctl.setup.rig_folder import CONFIG, MAST, TRUE_RIG, InTheWay, write_built
 
 RULES, README = "60-mastctl.rules", "README.md"
+RIG_FILES = (CONFIG, MAST, TRUE_RIG, RULES, README)
 LINE = "/dev/mast"
 """What the rules call the head's line."""
 NO_HEAD = (
@@ -67,7 +77,7 @@ class NewRigFolder:
 
 def check_free(folder: Path) -> None:
     """Refuse a folder in which a file would be replaced. Raises InTheWay with the first."""
-    for name in (CONFIG, MAST, TRUE_RIG, RULES, README, SCHEMAS):
+    for name in (*RIG_FILES, SCHEMAS):
         if os.path.lexists(folder / name):  # a link to nowhere too
             raise InTheWay(f"{folder / name} exists, and nothing is replaced; another folder is expected")
 
@@ -85,12 +95,16 @@ def write_rig(
         If the answers make no rig, or the file system refuses.
     """
     check_free(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     cameras = list(plugged.cameras)
     port = LINE if head is None or _NUMBERED.fullmatch(head.port) else head.port
     name = re.sub(r"\W+", "_", folder.resolve().name) or "rig"
+    lacks = untold(head, answers)
+    servos = head is None or head.family is not None
+    words = (
+        f"{_CONFIG_WORDS}{_SERVO_WORDS if servos else _HEAD_WORDS}{f'# {lacks}.{chr(10)}' if lacks else ''}"
+    )
     files = {
-        CONFIG: _CONFIG_WORDS.encode() + dump_mapping(configuration(head, cameras, answers, port)),
+        CONFIG: words.encode() + dump_mapping(configuration(head, cameras, answers, port)),
         MAST: _MAST_WORDS.encode() + dump_mapping(drawing(name, cameras, answers)),
     }
     names = camera_names(len(cameras))
@@ -99,9 +113,15 @@ def write_rig(
     files[RULES] = rules(head, plugged, machine, alike).encode()
     notes = [f"{' and '.join(alike)} {SAME_SERIAL}"] if alike else []
     notes += [NO_HEAD] if head is None else []
+    notes += [lacks] if lacks else []
     steps = _steps(folder, head, len(cameras))
     files[README] = _readme(plugged, steps, notes).encode()
-    return replace(_written(folder, files, steps, simulated=False), notes=tuple(notes))
+    with nothing_left(folder):
+        made = _written(folder, files, steps, simulated=False)
+        device = load_config(folder / CONFIG).hardware.pan_tilt
+        if device.driver in HEADS and not lacks:
+            head_options(device)
+    return replace(made, notes=tuple(notes))
 
 
 def write_simulated(folder: Path, plugged: Plugged, answers: RigAnswers) -> NewRigFolder:
@@ -115,15 +135,38 @@ def write_simulated(folder: Path, plugged: Plugged, answers: RigAnswers) -> NewR
     )
     simulation = {"wire": "dynamixel", "seed": TWIN_SEED}
     rig = built_rig(numbers, np.random.default_rng(TWIN_SEED))
-    write_built(rig, folder, simulation, TWIN_SEED, soft_limits(answers))
     config = f"--config {quote(str(folder / CONFIG))}"
     steps = (
         f"mastctl doctor {config}",
         f"mastctl run {config}",
         f"mastctl point {config} --camera navcam_left --at 320 300",
     )
-    made = _written(folder, {README: _readme(plugged, steps).encode()}, steps, simulated=True)
+    with nothing_left(folder):
+        write_built(rig, folder, simulation, TWIN_SEED, soft_limits(answers))
+        made = _written(folder, {README: _readme(plugged, steps).encode()}, steps, simulated=True)
     return NewRigFolder(folder, (CONFIG, MAST, TRUE_RIG, *made.files), True, steps)
+
+
+@contextmanager
+def nothing_left(folder: Path) -> Iterator[None]:
+    """Make a folder for files of a rig, and take them away again if they cannot all be written.
+
+    A second try, with other answers or more room, finds no file in its way.
+    """
+    made = next((one for one in (folder, *folder.parents) if one.parent.exists()), folder)
+    new = not made.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for name in (*RIG_FILES, *(f"{SCHEMAS}/{kind}.json" for kind in ("config", "mast"))):
+            with suppress(OSError):
+                (folder / name).unlink()
+        for one in (folder / SCHEMAS, folder, *folder.parents):
+            if one == folder / SCHEMAS or (new and one.is_relative_to(made)):
+                with suppress(OSError):
+                    one.rmdir()
+        raise
 
 
 def _written(
@@ -132,26 +175,25 @@ def _written(
     """Write the files and the schemas that their first lines name, and read configuration and drawing."""
     kinds = ((CONFIG, "config"), (MAST, "mast"))
     names = [*files, *(f"{SCHEMAS}/{kind}.json" for _, kind in kinds)]
-    try:
-        for name, data in files.items():
-            save_bytes(folder / name, data)
-        for name, kind in kinds:
-            name_schema(folder / name, kind)
-        config = load_config(folder / CONFIG)
-        check_cameras(config, load_rig(config.mast_file).rig)
-    except Exception:
-        for name in names:  # a second try, with other answers, finds no file in its way
-            (folder / name).unlink(missing_ok=True)
-        with suppress(OSError):
-            (folder / SCHEMAS).rmdir()
-        raise
+    for name, data in files.items():
+        save_bytes(folder / name, data)
+    for name, kind in kinds:
+        name_schema(folder / name, kind)
+    config = load_config(folder / CONFIG)
+    check_cameras(config, load_rig(config.mast_file).rig)
     return NewRigFolder(folder, tuple(names), simulated, steps)
 
 
 _CONFIG_WORDS = """\
 # Written by `mastctl rig new`; every key: docs/reference/configuration.md. Angles are radians.
+"""
+_SERVO_WORDS = """\
 # Check before the first move: which servo turns which axis, its sign (sign: -1), and the limits.
 # `mastctl servo test PORT ID` turns one servo by 5 degrees, slowly.
+"""
+_HEAD_WORDS = """\
+# Check before the first move: the sign of each axis (pan positive to the right, tilt up), zero_rad, and the
+# limits. `mastctl conform --config FILE --head --reach 0.1` turns the head a little.
 """
 _MAST_WORDS = """\
 # Drawn, not calibrated: `mastctl calibrate bench` replaces it. Lengths to 2 cm are enough (meters, z down).

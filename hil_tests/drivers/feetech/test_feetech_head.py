@@ -15,7 +15,15 @@ from typing import Any
 import pytest
 
 from drivers.clock import SystemClock
-from drivers.errors import BadOptions, DriverError, HardwareFault, NoReply, WatchdogTripped, WrongDevice
+from drivers.errors import (
+    BadOptions,
+    DriverError,
+    HardwareFault,
+    LineLost,
+    NoReply,
+    WatchdogTripped,
+    WrongDevice,
+)
 from drivers.faults import FaultPanel
 from drivers.feetech import workshop
 from drivers.feetech.head import FeetechHead, halt, open_head
@@ -477,6 +485,28 @@ def test_a_trial_that_a_fault_ends_stops_the_servo_under_way(monkeypatch: pytest
         ended_rad = it.pan_rad()
         it.clock.sleep(2.0)
         assert abs(it.pan_rad() - ended_rad) < 0.03 and it.pan_rad() < 0.15, "0.3 rad was its goal"
+
+
+def test_set_id_that_is_broken_off_before_the_rate_says_so(
+    cli: Bench, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cli.servos[1].memory["torque_enable"] = 0
+    plain = FeetechLink.write_unanswered
+
+    def lost(link: FeetechLink, servo_id: int, register: Any, value: int, model: Any) -> None:
+        if register.name == "baud":
+            raise LineLost("the adapter was pulled")
+        plain(link, servo_id, register, value, model)
+
+    monkeypatch.setattr(FeetechLink, "write_unanswered", lost)
+    code, told, _ = run(capsys, "set-id", cli.line.path, "2", "5", "--new-baud", "115200")
+    assert code == 1 and cli.servos[1].memory["lock"] == 1
+    assert told["error"]["message"] == (
+        "the adapter was pulled; the servo is left with the id 5 at 1000000 or 115200 baud: "
+        "'mastctl servo scan memory --family feetech --baud 1000000 115200' shows which, and "
+        "'mastctl servo set-id memory --family feetech 5 5 --baud 1000000 --new-baud 115200' "
+        "gives the id 5 its rate"
+    )
 
 
 def test_set_id_and_test_work_on_feetech_servos(cli: Bench, capsys: pytest.CaptureFixture[str]) -> None:

@@ -179,6 +179,30 @@ def test_set_id_refuses_what_cannot_be(
     assert [servo.servo_id for servo in bench.servos] == [1, 2]
 
 
+def test_set_id_that_is_broken_off_says_what_the_servo_is_left_with_and_how_to_go_on(
+    bench: Bench, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("set-id", bench.line.path, "1", "7", "--baud", BAUD, "--new-baud", "2000000", "--json")
+    plain = workshop._change
+
+    def lost(link: Link, servo_id: int, model: Any, register: str, value: int) -> None:
+        if register == "baud":
+            raise KeyboardInterrupt
+        plain(link, servo_id, model, register, value)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(workshop, "_change", lost)
+        code, told, _ = run(capsys, *words)
+    assert code == 1
+    assert told["error"]["message"] == (
+        f"interrupted; the servo is left with the id 7 at {BAUD} or 2000000 baud: 'mastctl servo scan "
+        f"{bench.line.path} --baud {BAUD} 2000000' shows which, and 'mastctl servo set-id {bench.line.path} "
+        f"7 7 --baud {BAUD} --new-baud 2000000' gives the id 7 its rate"
+    )
+    code, told, _ = run(capsys, "set-id", bench.line.path, "7", "7", *words[4:])
+    assert (code, told["id"], told["baud"]) == (0, 7, 2_000_000)
+
+
 def test_set_id_drops_torque_only_when_told_to(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     bench.servos[0].table["torque_enable"] = 1
     words = ("set-id", bench.line.path, "1", "5", "--baud", BAUD)
@@ -412,6 +436,11 @@ def test_test_stops_at_its_fence(bench: Bench, monkeypatch: pytest.MonkeyPatch) 
         (("test", "PORT", "1", "--torque-percent", "101"), "at most 100"),
         (("info", "PORT", "one"), "whole number"),
         (("info", "foo://x", "1"), "protocol 'foo' not known"),
+        (
+            ("test", "PORT", "1", "--family", "pelco"),
+            "no servos: 'mastctl ptz info PORT' asks it, 'mastctl c",
+        ),
+        (("info", "PORT", "1", "--family", "flir_ptu"), "no servos: 'mastctl ptu info PORT' asks it"),
         ((), "WHAT"),
     ],
 )

@@ -27,6 +27,8 @@ from drivers.dynamixel.workshop import FoundServo
 from drivers.feetech.settings import feetech_settings
 from drivers.flir_ptu.options import options_from
 from drivers.flir_ptu.workshop import facts as ptu_facts
+from drivers.hardware import head_options
+from drivers.ptz.inquiry import find_heads
 from drivers.sim.heads import PRESETS, HeadSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
@@ -35,7 +37,9 @@ from drivers.sim.wire.feetech_bus import FeetechBus
 from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
 from drivers.sim.wire.line import PtyLine, WireDevice
 from drivers.sim.wire.memory_line import MemoryLine
+from drivers.sim.wire.pelco import SimulatedPelco
 from drivers.sim.wire.ptu import SimulatedPtu
+from drivers.sim.wire.visca import SimulatedVisca
 from drivers.simulation_clock import SimulationClock
 from drivers.v4l2 import find
 from drivers.v4l2.options import parse_options
@@ -84,6 +88,7 @@ class Bench:
         families = tuple(replace(one, scan=partial(one.scan, **asked)) for one in FAMILIES)
         self._patch.setattr(plugged, "FAMILIES", families)
         self._patch.setattr(plugged, "flir_ptu", SimpleNamespace(facts=partial(ptu_facts, **asked)))
+        self._patch.setattr(plugged, "find_heads", partial(find_heads, **asked))
         self._patch.setattr(plugged, "examine_port", lambda port, machine: ())
         with self.clock.at_work(), line:
             yield "/dev/ttyMemory"
@@ -227,7 +232,7 @@ def test_answers_that_make_no_rig_leave_nothing_in_the_way_of_the_next_try(
     with bench.line(SimulatedPtu("d46_70", *axes)) as port:
         beyond = ("--tilt-deg", "40", "60")  # the unit's own end is at 25 degrees
         assert main(["rig", "new", str(folder), "--port", port, *beyond]) != 0
-        assert not any(folder.iterdir())
+        assert not folder.exists()
         capsys.readouterr()
         told = written(capsys, str(folder), "--port", port)
     assert f"'{folder / CONFIG}'" in told["next"][0], "a shell takes the folder as one word"
@@ -250,6 +255,73 @@ def test_a_disk_that_is_full_leaves_nothing_in_the_way_and_a_link_to_nowhere_is_
         (tmp_path / MAST).symlink_to(tmp_path / "nowhere")
         assert main(["rig", "new", str(tmp_path), "--port", port]) == 2
         assert f"{tmp_path / MAST} exists, and nothing is replaced" in capsys.readouterr().err
+
+
+def test_a_disk_that_is_full_leaves_nothing_of_the_twin_nor_of_its_folders(
+    tmp_path: Path, nothing: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, data: bytes) -> None:
+        raise BadFile(path, "", "cannot be saved: No space left on device")
+
+    monkeypatch.setattr(folder_module, "save_bytes", full)  # README, after all that the twin is made of
+    assert main(["rig", "new", str(tmp_path / "my/rig")]) == 2
+    assert "No space left on device" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+PTZ = {
+    "visca": (
+        partial(SimulatedVisca, count_rad=math.radians(0.075), address=3),
+        "a VISCA head (address 3, 9600",
+    ),
+    "pelco": (partial(SimulatedPelco, baud=2400), "a Pelco-D head (address 1, 2400 baud)"),
+    "pelco_p": (partial(SimulatedPelco, protocol="P", address=2), "a Pelco-P head (address 2, 9600 baud)"),
+}
+
+
+@pytest.mark.parametrize("name", PTZ)
+def test_a_visca_or_pelco_head_is_known_by_its_positions_alone(
+    bench: Bench, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make, words = PTZ[name]
+    axes, folder = bench.axes(), tmp_path / "rig"
+    device = make(*axes, fastest_rad_per_s=1.5)
+    sheet = ("--count-deg", "0.075", "--fastest-deg", "90", "60")
+    with bench.line(device) as port:
+        told = written(capsys, str(folder), "--port", port, *sheet)
+    now_s = bench.clock.now_s()
+    assert [(axis.angle_rad(now_s), axis.under_way(now_s)) for axis in axes] == 2 * [(0.0, False)]
+    assert words in told["heads"][0] and told["heads"][0].endswith("at 0 and 0 counts")
+    assert told["notes"] == []
+    good_by_schema(folder)
+    assert "servo" not in (folder / CONFIG).read_text()
+    head = load_config(folder / CONFIG).hardware.pan_tilt
+    options = head_options(head)
+    assert head.driver == name.removesuffix("_p") and options.address == device_address(device)
+    assert options.pan.fastest_rad_per_s == pytest.approx(math.pi / 2, abs=1e-4)
+    assert options.tilt.sign == (1 if name == "visca" else -1)
+    finding = next(
+        one for one in doctor.examine(str(folder / CONFIG), lambda url: None) if one.what == "head"
+    )
+    assert finding.level == "good" and f"mastctl ptz info {port} --baud {options.baud}" in finding.sentence
+
+
+def device_address(device: Any) -> int:
+    """The address at which a configuration names it."""
+    return int(getattr(device, "_address", 0) or device._own + (not device._is_d))
+
+
+def test_what_only_a_data_sheet_tells_is_left_open_and_named(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make, _ = PTZ["visca"]
+    with bench.line(make(*bench.axes(), fastest_rad_per_s=1.5)) as port:
+        told = written(capsys, str(tmp_path / "rig"), "--port", port)
+    assert "config.yaml lacks count_rad (one count) and fastest_rad_per_s (its speed)" in told["notes"][0]
+    assert told["notes"][0] in (tmp_path / "rig" / CONFIG).read_text().replace("\n# ", " ")
+    found = list(doctor.examine(str(tmp_path / "rig" / CONFIG), lambda url: None))
+    (bad,) = (one for one in found if one.what == "head")
+    assert bad.level == "bad" and "options.pan.count_rad is missing" in bad.sentence
 
 
 def test_without_hardware_it_writes_the_twin_that_runs(
