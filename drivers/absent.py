@@ -22,8 +22,8 @@ from drivers.interfaces import Camera, Frame
 log = logging.getLogger(__name__)
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 2.0
-LAST_STOP_S = 1.5
-"""How long the stop of a head that is closed is tried again; a line may come back meanwhile."""
+LAST_STOP_S = 1.0
+"""How long the stop of a head that is closed is tried again; all of closing may take 3 s."""
 
 Opening = Future[Any]
 

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 CALL_TIMEOUT_S = 0.8  # the service waits 1 s
-CLOSE_TIMEOUT_S = 6.0  # tries of a line that is away, a stop, an axis that comes to rest
+CLOSE_TIMEOUT_S = 3.0  # the service gives no more
 AXES = ("pan", "tilt")
 
 

@@ -28,6 +28,7 @@ ATTEMPTS, PATIENCE_S = 3, 0.15  # of a poll, before it counts as failed
 FAILED_POLLS = 2  # in a row, before the servos are set up anew
 STOP_PATIENCE_S = 0.2  # how long a stop asks for a confirmation that does not come
 STANDS_WITHIN_S = 2.5  # how long a stop waits for an axis to stand before its torque goes off
+LEFT_WITHIN_S = 1.2  # and a closing
 KEPT = "%s did not come to rest within %.1f s of a stop: its torque stays on"
 
 
@@ -306,10 +307,10 @@ def leave(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError]) -> Non
         limp = axis.settings.at_close == "torque_off"
         if limp:
             try:
-                stands, sample = rests(axis.servo.look, pair.clock, STANDS_WITHIN_S, Rest(STANDS_S))
+                stands, sample = rests(axis.servo.look, pair.clock, LEFT_WITHIN_S, Rest(STANDS_S))
                 limp = stands or not sample.values.get("torque_enable", True)
                 if not limp:
-                    log.warning(KEPT, axis.servo.name, STANDS_WITHIN_S)
+                    log.warning(KEPT, axis.servo.name, LEFT_WITHIN_S)
             except DriverError as error:
                 log.warning("%s does not say whether it stands: %s", axis.servo.name, error)
         axis.servo.release(limp)

@@ -11,13 +11,11 @@ from dataclasses import replace
 from typing import Any
 
 from drivers.clock import SystemClock
-from drivers.errors import BadOptions, DriverError
-from drivers.faults import PAN_TILT
+from drivers.errors import DriverError
 from drivers.hardware import CAMERAS as CAMERA_DRIVERS
 from drivers.hardware import HEADS as HEAD_DRIVERS
-from drivers.hardware import DeviceSettings, HardwareSettings
+from drivers.hardware import DeviceSettings, HardwareSettings, head_options
 from drivers.interfaces import Camera
-from drivers.servo_bus.settings import CountedModel
 from mastctl.conform.camera_checks import CAMERAS, CameraTrial
 from mastctl.conform.checks import (
     Check,
@@ -193,43 +191,32 @@ def check_camera(
 
 
 def count_of(device: DeviceSettings) -> float | None:
-    """Return one count of a head of this repository, radians, the coarser axis; None for another."""
-    options = device.options
-    if device.driver in ("dynamixel", "feetech"):
-        from drivers.dynamixel import models as dynamixel
-        from drivers.feetech import models as feetech
+    """Return one count of a head of this repository, radians, the coarser axis; None for another.
 
-        model_named: Callable[[str], CountedModel]
-        model_named = (feetech if device.driver == "feetech" else dynamixel).model_named
-        try:
-            return float(max(model_named(options[axis]["model"]).count_rad for axis in ("pan", "tilt")))
-        except (LookupError, TypeError):
-            raise BadOptions("pan.model and tilt.model are expected", device=PAN_TILT) from None
-    if device.driver == "visca":
-        from drivers.visca.options import options_from
-
-        read = options_from(options)
-        return max(read.pan.count_rad, read.tilt.count_rad)
-    if device.driver == "pelco":
-        from drivers.pelco.options import options_from as pelco_options_from
-
-        pelco = pelco_options_from(options)
-        return max(pelco.pan.resolution_rad, pelco.tilt.resolution_rad)
+    Raises
+    ------
+    BadOptions
+        For options that its driver refuses.
+    LineLost, NoReply, BadReply, Refused
+        If a PTU, which alone has to be asked, cannot be.
+    """
+    if device.driver not in HEAD_DRIVERS:
+        return None
+    read = head_options(device)
+    axes = read.pan, read.tilt
     if device.driver == "flir_ptu":
         from drivers.flir_ptu.workshop import facts
 
-        found = facts(str(options.get("port")), int(options.get("baud", 9600)))
+        found = facts(read.port, read.baud)
         return math.radians(max(found.pan.resolution_arcsec, found.tilt.resolution_arcsec) / 3600)
-    return None
+    if device.driver == "pelco":
+        return float(max(axis.resolution_rad for axis in axes))
+    return float(max(axis.count_rad if device.driver == "visca" else axis.model.count_rad for axis in axes))
 
 
 def step_of(device: DeviceSettings) -> float:
     """Return the way that a head makes at its own speed, whatever was asked, radians."""
-    if device.driver != "pelco":
-        return 0.0
-    from drivers.pelco.options import options_from
-
-    return options_from(device.options).step_rad
+    return float(head_options(device).step_rad) if device.driver == "pelco" else 0.0
 
 
 ALL: Mapping[str, Sequence[Check[Any]]] = {"head": HEADS.checks, "camera": CAMERAS.checks}

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import pytest
 
 from drivers.clock import SystemClock
+from drivers.sim.axis import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.line import PtyLine
 from drivers.sim.wire.pelco import SimulatedPelco
 from drivers.sim.wire.visca import SimulatedVisca
-from hil_tests.drivers.visca.test_visca import COUNT_RAD, PLAIN
 from mastctl.cli.main import main
 
+COUNT_RAD = math.radians(0.075)
+PLAIN = AxisSettings(COUNT_RAD, 0.0, -3.0, 3.0, 1.2, 10.0)
 AGO_S = 10.0
 
 

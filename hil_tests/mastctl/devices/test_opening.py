@@ -137,7 +137,8 @@ MOVING = {"camera sync", "conform", "servo test", "servo set-id", "ptu home"}
 DAEMONS = "run"  # is latched too: test_heads.py
 LINES = {
     "servo scan": ["PORT"], "servo info": ["PORT", "1"], "servo set-id": ["PORT", "1", "7", "--torque-off"],
-    "servo test": ["PORT", "1"], "ptu info": ["PORT"], "ptu home": ["PORT", "--sweep-full-range"],
+    "servo test": ["PORT", "1"], "ptu info": ["PORT"], "ptz info": ["PORT"],
+    "ptu home": ["PORT", "--sweep-full-range"],
     "rig new": ["rig", "--port", "PORT"],
 }  # fmt: skip
 WORDS = {
