@@ -76,7 +76,7 @@ def test_every_tools_parser_describes_the_tool() -> None:
         assert described or any(ast.unparse(call).startswith("options(__doc__") for call in calls), tool
 
 
-@pytest.mark.long(4, "each of 62 tools is run for its --help; the quick run looks at their parsers")
+@pytest.mark.long(4, "each of 71 tools is run for its --help; the quick run looks at their parsers")
 @pytest.mark.parametrize("tool", TOOLS)
 def test_every_tool_says_how_it_is_used(
     tool: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

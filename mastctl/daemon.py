@@ -34,18 +34,11 @@ from drivers.clock import Clock
 from drivers.faults import LOG
 from drivers.hardware import Hardware
 from mastctl import signals
-from mastctl.access.access import Access
-from mastctl.access.tokens import TokenList
 from mastctl.config import Config, Listen
 from mastctl.errors import MastctlError
 from mastctl.guided.guide import WayIn
-from mastctl.logs import stall_while
-from mastctl.safety.state_folder import StateFolder
-from mastctl.safety.stop_threads import StopsHang
-from mastctl.service.service import Service
-from mastctl.service_manager import Heartbeat, ServiceManager
-from mastctl.web.app import create_app
-from mastctl.web.connections import (
+from mastctl.http.access import Access
+from mastctl.http.connections import (
     ACCEPTED_AT_ONCE,
     WAITING_IN_KERNEL,
     Connection,
@@ -53,11 +46,18 @@ from mastctl.web.connections import (
     most_connections,
     sweep,
 )
-from mastctl.web.entrance import Entrance, Names
+from mastctl.http.entrance import Entrance, Names
+from mastctl.http.server import Server, arriving
+from mastctl.http.sockets import LARGEST_BYTES, PING_S, Socket
+from mastctl.http.tokens import TokenList
+from mastctl.http.waiting import Streams, Waiting
+from mastctl.logs import stall_while
+from mastctl.safety.state_folder import StateFolder
+from mastctl.safety.stop_threads import StopsHang
+from mastctl.service.service import Service
+from mastctl.service_manager import Heartbeat, ServiceManager
+from mastctl.web.app import create_app
 from mastctl.web.pictures import WatchedCameras
-from mastctl.web.server import Server, arriving
-from mastctl.web.sockets import LARGEST_BYTES, PING_S, Socket
-from mastctl.web.waiting import Streams, Waiting
 
 log = logging.getLogger(__name__)
 

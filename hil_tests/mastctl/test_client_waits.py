@@ -19,7 +19,7 @@ from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
 from mastctl.client import connection as connection_module
 from mastctl.daemon import RunningDaemon
-from mastctl.web import waiting as streams_module
+from mastctl.http import waiting as streams_module
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 

@@ -41,9 +41,9 @@ from mastctl.config import Listen, load_config
 from mastctl.control import operations as operations_module
 from mastctl.daemon import AddressInUse, RunningDaemon, _suspend, _tcp_socket, run
 from mastctl.devices import devices as devices_module
+from mastctl.http.server import Server
 from mastctl.safety.stop_threads import StopThreads
 from mastctl.service import service as service_module
-from mastctl.web.server import Server
 
 # A driver package from outside, for daemons in a process of their own: it writes what it is told to a file.
 OUTSIDE = """

@@ -13,7 +13,7 @@ import pytest
 from hil_tests.mastctl.service_fakes import HTTP, fake_daemon
 from mastctl.cli.main import MODULES, build_parser
 from mastctl.client import calls, jog, keeping_calls, lease, simulation_calls
-from mastctl.web import PREFIX
+from mastctl.http import PREFIX
 
 
 def plain(path: str) -> str:

@@ -13,8 +13,8 @@ from mastctl.cli import output
 from mastctl.cli.output import CommandError, WrongUse
 
 if TYPE_CHECKING:
-    from mastctl.access.tokens import TokenList
     from mastctl.client.answers import Status
+    from mastctl.http.tokens import TokenList
 
 
 SHELLS = ("bash", "zsh", "tcsh")
@@ -159,7 +159,7 @@ def _revoke(args: argparse.Namespace) -> int:
 
 def _tokens(args: argparse.Namespace) -> TokenList:
     """The list that the options name."""
-    from mastctl.access.tokens import TokenList
+    from mastctl.http.tokens import TokenList
 
     return TokenList(_folder(args))
 

@@ -1,4 +1,1 @@
-"""The HTTP interface: routes, what they take, and what stands before them."""
-
-PREFIX = "/api/v1"
-"""Where its routes begin."""
+"""The routes of the HTTP interface: what they take and answer, the event stream, pictures and the page."""

@@ -1,7 +1,7 @@
 """The HTTP interface (docs/reference/http.md): JSON under /api/v1, described by /openapi.json.
 
 The event loop only reads snapshots. Whatever takes a lock, a file or a device runs in worker threads
-(`mastctl.web.waiting`); ``POST /stop`` has threads of its own, so that it never waits behind them.
+(`mastctl.http.waiting`); ``POST /stop`` has threads of its own, so that it never waits behind them.
 Every refusal is ``{"error": {"code", "message", "detail"}}``.
 """
 
@@ -19,21 +19,20 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from typing_extensions import get_type_hints, is_typeddict
 
 from mastctl.answers import ErrorBody
+from mastctl.http.entrance import Entrance
+from mastctl.http.guard import Guard
+from mastctl.http.refusals import add_errors
+from mastctl.http.waiting import Streams, Waiting
 from mastctl.service.service import Service
-from mastctl.web.entrance import Entrance
 from mastctl.web.events import add_events
-from mastctl.web.guard import Guard
 from mastctl.web.images import add_cameras, add_images
 from mastctl.web.keeping import add_bench, add_masts, add_places, add_recordings
-from mastctl.web.page import add_page, text_answer
+from mastctl.web.page import add_page, add_site, text_answer
 from mastctl.web.parts import Here, Parts
 from mastctl.web.pictures import WatchedCameras
-from mastctl.web.refusals import add_errors
 from mastctl.web.sessions import add_sessions
 from mastctl.web.simulation import add_simulation
-from mastctl.web.site import add_site
 from mastctl.web.steering import add_estop, add_lease, add_limits, add_pointing, add_tracking
-from mastctl.web.waiting import Streams, Waiting
 from mastctl.web.watching import add_watching
 
 

@@ -17,9 +17,9 @@ from mastctl.control.caller import Caller, told_name
 from mastctl.control.entry import Command, CommandRequest
 from mastctl.control.idempotency import Answer
 from mastctl.errors import Unable
+from mastctl.http import PREFIX
 from mastctl.safety.stop_threads import StopsHang
 from mastctl.service.service import Service
-from mastctl.web import PREFIX
 from mastctl.web.models import DeadlineS
 from mastctl.web.parts import Here, Parts
 

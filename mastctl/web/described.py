@@ -18,7 +18,7 @@ from typing_extensions import get_type_hints, is_typeddict
 
 from mastctl.answers import Event, HistoryTold, TrackTold
 from mastctl.frame_facts import described_headers
-from mastctl.web import PREFIX
+from mastctl.http import PREFIX
 
 TEXTS: Mapping[str, type] = {"GET /history": HistoryTold}
 """Answers that a route makes a text of itself."""

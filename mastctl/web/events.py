@@ -2,7 +2,7 @@
 
 A listener begins with what is known and then gets the newest of each topic and key. One that reads slowly
 loses values in between and is told how many; nobody waits for it. WebSockets only tell: what a client sends
-into one ends it (`mastctl.web.sockets`).
+into one ends it (`mastctl.http.sockets`).
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from starlette.websockets import WebSocketDisconnect
 
 from mastctl.as_json import as_json, writable
 from mastctl.control.publisher import LoopSubscription, Published, Topic
+from mastctl.http import PREFIX
+from mastctl.http.connections import EVENTS
+from mastctl.http.refusals import query_of
 from mastctl.service.service import Service
 from mastctl.service.state import fault_told, joints_told, standing_told
-from mastctl.web import PREFIX
-from mastctl.web.connections import EVENTS
 from mastctl.web.models import EventsQuery
 from mastctl.web.parts import Here, Parts
-from mastctl.web.refusals import query_of
 
 ALIVE_S = 2.0  # between signs of life where nothing changes
 GOING_AWAY = 1001  # RFC 6455, 7.4.1

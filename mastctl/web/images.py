@@ -23,17 +23,17 @@ from mastctl.answers import CameraSettingsTold, SensorModeTold
 from mastctl.as_json import as_json
 from mastctl.control.entry import CAMERA_SETTINGS
 from mastctl.frame_facts import headers_of
+from mastctl.http import PREFIX
+from mastctl.http.connections import IMAGES
+from mastctl.http.refusals import query_of
+from mastctl.http.sockets import UNSUPPORTED
 from mastctl.report.pictures import encoded
 from mastctl.service.service import Service
-from mastctl.web import PREFIX
 from mastctl.web.commands import command
-from mastctl.web.connections import IMAGES
 from mastctl.web.events import GOING_AWAY
 from mastctl.web.models import CameraSettingsBody, ImagesQuery, SnapshotQuery
 from mastctl.web.parts import Here, Parts
 from mastctl.web.pictures import Picture, WatchedCameras, Watcher
-from mastctl.web.refusals import query_of
-from mastctl.web.sockets import UNSUPPORTED
 
 ASKS = "?"
 

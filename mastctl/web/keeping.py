@@ -35,10 +35,10 @@ from mastctl.control.entry import (
     RELOAD,
 )
 from mastctl.guided.runs import NAME
+from mastctl.http import PREFIX
 from mastctl.service.masts import MastInUse, Masts
 from mastctl.service.places import KeptPlace
 from mastctl.service.reload import reload
-from mastctl.web import PREFIX
 from mastctl.web.commands import Asks, command
 from mastctl.web.models import BenchBody, MastBody, PlaceBody, RecordBody
 from mastctl.web.parts import Here

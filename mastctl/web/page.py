@@ -1,10 +1,15 @@
-"""The operator page: its files, read once and compressed, and what of the rig it draws."""
+"""The operator page: its files, read once and compressed, and what of the rig it draws; the site of docs/.
+
+`tools/docs` builds the site, which comes from the wheel or from the checkout.
+"""
 
 from __future__ import annotations
 
+import base64
 import gzip
 import hashlib
 import math
+import re
 from collections.abc import Collection, Mapping
 from functools import cache
 from importlib.resources import files
@@ -13,11 +18,17 @@ from typing import Any, Literal
 
 import numpy as np
 from fastapi import FastAPI, Request, Response
+from starlette.exceptions import HTTPException
+from starlette.responses import RedirectResponse
+from starlette.staticfiles import StaticFiles
+from starlette.types import Scope
 
 from calib.geometry.rig import RigCamera
 from mastctl.answers import CameraMountTold, RigTold
+from mastctl.errors import NotKnown
+from mastctl.http import PREFIX
+from mastctl.packaged import site_folder
 from mastctl.service.service import Service
-from mastctl.web import PREFIX
 from mastctl.web.parts import Here
 
 ASK_AGAIN = "no-cache"
@@ -179,3 +190,56 @@ def _partners(name: str, stereo: Stereo) -> tuple[str | None, Literal["left", "r
         if name == right:
             return pair, "right", left
     return None, None, None
+
+
+_SCRIPT = re.compile(r"<script>(.*?)</script>", re.DOTALL)
+"""In the site of docs/."""
+
+
+def add_site(app: FastAPI) -> None:
+    """The site below ``/docs/``; where it was not built, a refusal that says how to build it."""
+
+    @app.get("/docs", include_in_schema=False)
+    async def docs() -> Response:
+        return RedirectResponse("docs/")  # relative: a proxy may serve the daemon below a path of its own
+
+    app.mount("/docs/", _Site(site_folder()))
+
+
+class _Site(StaticFiles):
+    """Files of a folder that may appear later."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(directory=folder, html=True, check_dir=False)
+        self._first = folder / "index.html"
+        self.config_checked = True  # a folder that is absent is refused in words below
+
+    async def get_response(self, path: str, scope: Scope) -> Response:
+        try:
+            return await super().get_response(path, scope)
+        except HTTPException as refused:
+            if refused.status_code == 404 and not self._first.is_file():
+                words = (
+                    "the documentation is not part of this installation; `tools/docs` in a checkout builds it"
+                )
+                raise NotKnown("no_docs", words) from None
+            raise
+
+    def file_response(self, *args: Any, **options: Any) -> Response:
+        answer = super().file_response(*args, **options)
+        answer.headers["Cache-Control"] = ASK_AGAIN
+        if answer.headers.get("Content-Type", "").startswith("text/html"):
+            answer.headers["Content-Security-Policy"] = _policy(self._first)
+        return answer
+
+
+@cache
+def _policy(first: Path) -> str:
+    """The Content-Security-Policy of the site: of scripts inside a page only the theme's, by its digest."""
+    inside = set(_SCRIPT.findall(first.read_text(encoding="utf-8")))
+    digests = (base64.b64encode(hashlib.sha256(one.encode()).digest()).decode() for one in sorted(inside))
+    scripts = " ".join(["'self'", *(f"'sha256-{one}'" for one in digests)])
+    return (
+        f"default-src 'self'; script-src {scripts}; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
+        "object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
+    )

@@ -11,10 +11,10 @@ from typing import Annotated, cast
 from fastapi import Depends
 from fastapi.requests import HTTPConnection
 
+from mastctl.http.entrance import Entrance
+from mastctl.http.waiting import Streams, Waiting
 from mastctl.service.service import Service
-from mastctl.web.entrance import Entrance
 from mastctl.web.pictures import WatchedCameras
-from mastctl.web.waiting import Streams, Waiting
 
 
 @dataclass(frozen=True)

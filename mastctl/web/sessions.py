@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from fastapi import FastAPI, Request, Response
 
-from mastctl.access.access import SESSION_S
 from mastctl.answers import LoggedOut, Role, SessionTold
 from mastctl.control.caller import Caller
 from mastctl.errors import NotNow
-from mastctl.web import PREFIX
-from mastctl.web.entrance import address_of, cookie_name, credentials
+from mastctl.http import PREFIX
+from mastctl.http.access import SESSION_S
+from mastctl.http.entrance import address_of, cookie_name, credentials
 from mastctl.web.models import LoginBody
 from mastctl.web.parts import Here
 

@@ -36,9 +36,9 @@ from mastctl.control.entry import (
     SIMULATION_TIME,
 )
 from mastctl.errors import BadRequest, NoLonger, NotKnown, NotNow
+from mastctl.http import PREFIX
 from mastctl.motion.track import RoverPose
 from mastctl.service.service import Service
-from mastctl.web import PREFIX
 from mastctl.web.commands import command
 from mastctl.web.models import BoardBody, FaultBody, FaultsQuery, StandBody, TimeBody, TruthQuery
 from mastctl.web.parts import Here

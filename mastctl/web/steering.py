@@ -48,12 +48,12 @@ from mastctl.control.entry import (
 )
 from mastctl.control.lease import Lease, LeaseTable
 from mastctl.errors import BadRequest, NotNow, Unable, one_line
+from mastctl.http import PREFIX
 from mastctl.motion.results import PointingError
 from mastctl.safety.latch import LONGEST
 from mastctl.safety.stop_threads import StopsHang
 from mastctl.service.service import Service
 from mastctl.service.steering import usual_s
-from mastctl.web import PREFIX
 from mastctl.web.commands import Asks, carried_out, command, stop_first
 from mastctl.web.models import (
     EstopBody,

@@ -10,10 +10,10 @@ from fastapi import FastAPI, Request, Response
 from mastctl.answers import CalibrationHealthTold, LiveTold, ReadyTold, SentinelTold
 from mastctl.answers.words import WELL
 from mastctl.errors import Unable
+from mastctl.http import PREFIX
 from mastctl.watch.metrics import CONTENT_TYPE
 from mastctl.watch.reference import SENTINEL_FOLDER
 from mastctl.watch.sentinel import findings
-from mastctl.web import PREFIX
 from mastctl.web.page import passing_answer
 from mastctl.web.parts import Here
 

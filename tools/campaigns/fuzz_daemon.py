@@ -43,7 +43,7 @@ from mastctl.client import Client, ClientError
 from mastctl.config import Listen, load_config
 from mastctl.control.lease import LONGEST_S
 from mastctl.daemon import RunningDaemon
-from mastctl.web import PREFIX
+from mastctl.http import PREFIX
 from tools.command import end, options
 
 LEFT_OUT = ("positive_data_acceptance",)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from mastctl.access.tokens import TokenList
 from mastctl.cli.main import main
+from mastctl.http.tokens import TokenList
 
 
 def test_a_token_is_made_listed_and_revoked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,9 +14,9 @@ import pytest
 
 from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, fake_daemon
 from hil_tests.waiting import NET_S
-from mastctl.access.tokens import TokenList
 from mastctl.answers import Role
 from mastctl.daemon import RunningDaemon
+from mastctl.http.tokens import TokenList
 
 NAME = "rover.test"
 

@@ -25,10 +25,10 @@ from hil_tests.mastctl.service_fakes import CONFIG, HTTP, PLAIN, FakeHardware, H
 from hil_tests.waiting import NET_S, joined, until
 from mastctl.daemon import RunningDaemon
 from mastctl.devices import devices as devices_module
+from mastctl.http.guard import LARGEST_BODY_BYTES
 from mastctl.service import service as service_module
 from mastctl.service import steering as steering_module
 from mastctl.web import described as described_module
-from mastctl.web.guard import LARGEST_BODY_BYTES
 
 ANGLES = {"pan_rad": 0.1, "tilt_rad": -0.1}
 

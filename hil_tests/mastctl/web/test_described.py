@@ -10,7 +10,7 @@ import pytest
 from hil_tests.mastctl.service_fakes import HTTP, fake_daemon
 from hil_tests.waiting import until
 from mastctl.client import Client
-from mastctl.web import PREFIX
+from mastctl.http import PREFIX
 from mastctl.web.app import api
 from mastctl.web.described import EVENTS, FILES, answers_of
 from tools.campaigns.fuzz_daemon import UNASKED, ask, taken_back

@@ -28,9 +28,9 @@ from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped, Unable
 from mastctl.guided.told import GuidedRun
 from mastctl.guided.told import heard as bench_heard
-from mastctl.web import connections as connections_module
-from mastctl.web import sockets as sockets_module
-from mastctl.web.waiting import Streams
+from mastctl.http import connections as connections_module
+from mastctl.http import sockets as sockets_module
+from mastctl.http.waiting import Streams
 from tools.campaigns import fuzz_daemon
 
 BOTH = tuple[RunningDaemon, FakeHardware]

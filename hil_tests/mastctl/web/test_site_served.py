@@ -12,9 +12,9 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from mastctl.web import site
-from mastctl.web.guard import Guard
-from mastctl.web.refusals import add_errors
+from mastctl.http.guard import Guard
+from mastctl.http.refusals import add_errors
+from mastctl.web import page
 
 THEME = 'document.body.dataset.theme = "auto";'
 PAGE = f'<html><script>{THEME}</script><script src="_static/furo.js"></script></html>'
@@ -23,10 +23,10 @@ PAGE = f'<html><script>{THEME}</script><script src="_static/furo.js"></script></
 @pytest.fixture
 def client(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[TestClient]:
     """A client of the routes below ``/docs`` alone, behind the guard; the folder of the site is empty."""
-    monkeypatch.setattr(site, "site_folder", lambda: tmp_path / "html")
+    monkeypatch.setattr(page, "site_folder", lambda: tmp_path / "html")
     app = FastAPI(docs_url=None)
     add_errors(app)
-    site.add_site(app)
+    page.add_site(app)
     with TestClient(Guard(app), base_url="http://127.0.0.1", follow_redirects=False) as made:
         yield made
 

@@ -29,8 +29,8 @@ from mastctl.errors import (
     TooMany,
     Unable,
 )
+from mastctl.http.refusals import GuardError, error_response, status_of
 from mastctl.motion.results import PointingError
-from mastctl.web.refusals import GuardError, error_response, status_of
 from tools import error_codes
 
 KINDS = (BadRequest, NotAllowed, NotKnown, NotLetIn, NoLonger, NotNow, TooMany, Unable)

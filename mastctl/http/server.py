@@ -17,7 +17,7 @@ from typing import Any, cast
 
 import uvicorn
 
-from mastctl.web.connections import Connection, room_for
+from mastctl.http.connections import Connection, room_for
 
 log = logging.getLogger(__name__)
 

@@ -19,12 +19,12 @@ from urllib.parse import parse_qsl
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from mastctl.access.access import neighbourhood
 from mastctl.control.caller import Caller
 from mastctl.errors import MastctlError, one_line
-from mastctl.web import PREFIX
-from mastctl.web.entrance import Entrance, Rate, changes, check_site
-from mastctl.web.refusals import GuardError, error_response, marked, told
+from mastctl.http import PREFIX
+from mastctl.http.access import neighbourhood
+from mastctl.http.entrance import Entrance, Rate, changes, check_site
+from mastctl.http.refusals import GuardError, error_response, marked, told
 
 log = logging.getLogger(__name__)
 

@@ -11,10 +11,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from drivers.clock import ManualClock
-from mastctl.access.access import Access
-from mastctl.access.tokens import TokenList
-from mastctl.web.entrance import Entrance, Names
-from mastctl.web.guard import Guard
+from mastctl.http.access import Access
+from mastctl.http.entrance import Entrance, Names
+from mastctl.http.guard import Guard
+from mastctl.http.tokens import TokenList
 
 NAME = "rover.test"
 ORIGIN = {"origin": f"http://{NAME}"}
@@ -111,7 +111,7 @@ class _Nobody(Access):
     def __init__(self) -> None:
         from collections import OrderedDict
 
-        from mastctl.access.access import Guesses
+        from mastctl.http.access import Guesses
 
         self._clock, self._tokens, self._lent = ManualClock(), (), ()
         self._guesses, self._sessions = Guesses(), OrderedDict()

@@ -11,7 +11,8 @@ from types import FunctionType, ModuleType
 import pytest
 
 from drivers.clock import ManualClock
-from mastctl.access.access import (
+from mastctl.errors import NotLetIn, TooMany
+from mastctl.http.access import (
     MOST_ADDRESSES,
     MOST_OF_ALL,
     MOST_OF_ONE,
@@ -22,8 +23,7 @@ from mastctl.access.access import (
     Guesses,
     neighbourhood,
 )
-from mastctl.access.tokens import TokenList, digest_of
-from mastctl.errors import NotLetIn, TooMany
+from mastctl.http.tokens import TokenList, digest_of
 
 HERE = "10.0.0.1"
 

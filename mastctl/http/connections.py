@@ -23,10 +23,10 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from mastctl.control.caller import Caller
-from mastctl.web import PREFIX
-from mastctl.web.guard import STOP_LINE, STOPS, TRACK_STOP, stop_named
-from mastctl.web.refusals import error_response
-from mastctl.web.waiting import Turns
+from mastctl.http import PREFIX
+from mastctl.http.guard import STOP_LINE, STOPS, TRACK_STOP, stop_named
+from mastctl.http.refusals import error_response
+from mastctl.http.waiting import Turns
 
 log = logging.getLogger(__name__)
 log.setLevel(logging.ERROR)

@@ -19,9 +19,9 @@ from websockets.sync.client import ClientConnection, connect
 from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, fake_daemon
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
 from hil_tests.waiting import NET_S, until
-from mastctl.access.access import MOST_OF_ONE
 from mastctl.answers import Role
-from mastctl.web import guard
+from mastctl.http import guard
+from mastctl.http.access import MOST_OF_ONE
 
 ANGLES = {"pan_rad": 0.1, "tilt_rad": -0.1}
 

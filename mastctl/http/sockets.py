@@ -17,7 +17,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.frames import Frame
 from websockets.protocol import State
 
-from mastctl.web.connections import IMAGES, let_in
+from mastctl.http.connections import IMAGES, let_in
 
 log = logging.getLogger(__name__)
 log.setLevel(logging.ERROR)

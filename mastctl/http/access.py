@@ -20,8 +20,8 @@ from datetime import UTC, datetime
 
 from calib.errors import BadFile
 from drivers.clock import Clock, SystemClock
-from mastctl.access.tokens import TOKEN_BYTES, Token, TokenList, digest_of
 from mastctl.errors import NotLetIn, TooMany
+from mastctl.http.tokens import TOKEN_BYTES, Token, TokenList, digest_of
 
 log = logging.getLogger(__name__)
 

@@ -20,7 +20,7 @@ from calib.errors import BadFile
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
 from hil_tests.waiting import NET_S, joined
 from mastctl.client import Client, ClientError
-from mastctl.web import connections, entrance, server
+from mastctl.http import connections, entrance, server
 
 STATUS = f"GET /api/v1/status HTTP/1.1\r\nHost: {NAME}\r\n"
 STOP = f"POST /api/v1/stop HTTP/1.1\r\nHost: {NAME}\r\nConnection: close\r\n\r\n"

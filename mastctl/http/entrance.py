@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import urlsplit
 
-from mastctl.access.access import Access, neighbourhood
-from mastctl.access.tokens import Token, digest_of
 from mastctl.config import is_loopback
 from mastctl.control.caller import NETWORK, Caller, told_name
 from mastctl.errors import NotLetIn, TooMany
-from mastctl.web.refusals import GuardError
+from mastctl.http.access import Access, neighbourhood
+from mastctl.http.refusals import GuardError
+from mastctl.http.tokens import Token, digest_of
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from hil_tests.mastctl.service_fakes import FakeHardware
 from hil_tests.waiting import NET_S, until
 from mastctl.control.publisher import Publisher
 from mastctl.daemon import RunningDaemon
+from mastctl.http import guard as guard_module
+from mastctl.http.waiting import Waiting
 from mastctl.web import events as events_module
-from mastctl.web import guard as guard_module
-from mastctl.web.waiting import Waiting
 
 CROWD = 40
 

@@ -12,8 +12,8 @@ import pytest
 
 from calib.errors import BadFile
 from hil_tests.waiting import joined
-from mastctl.access.tokens import MOST_TOKENS, TokenList, TokenRefused
 from mastctl.control.caller import ROLES
+from mastctl.http.tokens import MOST_TOKENS, TokenList, TokenRefused
 
 
 def mode(path: Path) -> int:

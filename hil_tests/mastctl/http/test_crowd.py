@@ -25,8 +25,8 @@ from hil_tests.mastctl.service_fakes import Hang, fake_daemon
 from hil_tests.waiting import NET_S, joined, until
 from mastctl import daemon as daemon_module
 from mastctl.client import Client, ClientError
-from mastctl.web import connections as connections_module
-from mastctl.web.waiting import Streams
+from mastctl.http import connections as connections_module
+from mastctl.http.waiting import Streams
 
 
 def in_threads(count: int, ask: Callable[[], Any]) -> list[threading.Thread]:

@@ -1,1 +1,0 @@
-"""Who may come in from beyond this machine: tokens, sessions of pages, and what is done about guessing."""
