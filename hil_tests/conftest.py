@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from hil_tests.left_behind import Homes, OwnFolder
+from hil_tests.left_behind import Homes, OwnFolder, end_all_of
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 VM_CONFTEST = REPOSITORY / "hil_tests" / "vm" / "conftest.py"
@@ -135,8 +135,11 @@ def pytest_runtest_logfinish(nodeid: str) -> None:
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Fail a run that leaves something behind; a worker tells the one who prints, who looks at home."""
     config = session.config
-    if not config.pluginmanager.hasplugin("dsession"):  # it runs tests itself
+    workers = config.pluginmanager.getplugin("dsession")
+    if workers is None:  # it runs tests itself
         config.stash[LEFT] += OWN.left()
+    elif session.exitstatus == pytest.ExitCode.INTERRUPTED:  # its workers are gone by now
+        end_all_of(workers.nodemanager.testrunuid, Path(os.environ["PYTEST_DEBUG_TEMPROOT"]))
     if hasattr(config, "workeroutput"):
         config.workeroutput |= {"left": config.stash[LEFT], "seen": HOMES.first_seen}
         return

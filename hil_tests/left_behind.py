@@ -11,6 +11,7 @@ import atexit
 import os
 import pwd
 import shutil
+import signal
 import tempfile
 from contextlib import suppress
 from pathlib import Path
@@ -20,6 +21,24 @@ from hil_tests.waiting import until
 ENDING_S = 10.0  # for processes that were told to end a moment ago
 OF_THIS_PROCESS = (b"multiprocessing.resource_tracker", b"multiprocessing.forkserver")
 """Commands of processes that end with the one that runs the tests, when its pipe to them closes."""
+
+
+RUN_OF_WORKERS = "PYTEST_XDIST_TESTRUNUID"
+"""xdist's name of a run, in the environment of each worker and of what that started."""
+
+
+def end_all_of(run: str, beside: Path) -> None:
+    """End what workers of a run of xdist have started, and remove their folders.
+
+    A run that is interrupted ends them in the middle of a test, which then cannot end its daemons.
+    """
+    mark = f"{RUN_OF_WORKERS}={run}".encode()
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if mark in (folder / "environ").read_bytes().split(b"\0"):
+                os.kill(int(folder.name), signal.SIGKILL)
+    for folder in beside.glob(f"mastctl-tests-{run[:8]}*"):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 class Homes:
@@ -76,7 +95,8 @@ class OwnFolder:
     """
 
     def __init__(self, beside: Path) -> None:
-        self.path = Path(tempfile.mkdtemp(prefix="mastctl-tests-", dir=beside))
+        run = os.environ.get(RUN_OF_WORKERS, "")[:8]
+        self.path = Path(tempfile.mkdtemp(prefix=f"mastctl-tests-{run}", dir=beside))
         self._first_seen: dict[str, str] = {}
         self._ours: set[str] = set()
         self._owner = os.getpid()

@@ -125,6 +125,41 @@ def test_what_is_left_behind_fails_the_run(repository: Path, tmp_path: Path, wha
         assert what == "process" or re.search(r"\(first seen after .*test_one.py::test_it\b", line)
 
 
+INTERRUPTED = """
+import pathlib, subprocess
+def test_it():
+    subprocess.Popen(["sleep", "600"], start_new_session=True, cwd=pathlib.Path(__file__).parent)
+    pathlib.Path(__file__).with_name("begun").touch()
+    subprocess.run(["sleep", "600"])
+"""
+
+
+@pytest.mark.long(2, "waits for ten seconds, after which xdist ends its workers")
+def test_a_run_that_is_interrupted_ends_what_its_workers_began(repository: Path, tmp_path: Path) -> None:
+    (tmp_path / "conftest.py").write_text(CONFTEST)
+    (tmp_path / "test_one.py").write_text(INTERRUPTED)
+    (tmp_path / "temporary").mkdir()
+    environment = {
+        **{name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")},
+        "HOME": str(tmp_path),
+        "USERS": f"{tmp_path}/user",
+        "PYTHONPATH": str(repository),
+        "PYTEST_DEBUG_TEMPROOT": f"{tmp_path}/temporary",
+    }
+    words = ["-p", "no:cacheprovider", "-c", os.devnull, "--rootdir", ".", "-n", "1", "test_one.py"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "pytest", *words], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL
+    ) as run:
+        try:
+            until((tmp_path / "begun").exists, "the test runs", 300)
+            run.send_signal(signal.SIGINT)
+            assert run.wait(300) == pytest.ExitCode.INTERRUPTED
+        finally:
+            run.kill()
+    until(lambda: not processes_with(str(tmp_path).encode()), "all its processes have ended")
+    assert [*(tmp_path / "temporary").glob("mastctl-*")] == []
+
+
 TOOL = """
 import subprocess, tempfile, time
 from tools.command import end

@@ -248,6 +248,22 @@ def test_a_name_that_packages_quarrel_about_is_refused_and_told_by_the_doctor(
     assert own.endswith("mastctl's own driver of this name is used instead")
 
 
+def test_a_driver_that_is_installed_meanwhile_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    before = installed_drivers()
+    assert installed_drivers() is before, "packages are read again only where something changed"
+    info = tmp_path / "late_rig-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: late-rig\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[mastctl.heads]\nlate_rig = late:head\n")
+    (late,) = set(installed_drivers()) - set(before)
+    assert (late.kind, late.name, late.factory, late.package) == (
+        "head", "late_rig", "late:head", "late-rig 1.0",
+    )  # fmt: skip
+
+
 def test_the_head_of_the_page_comes_to_rest_at_every_goal(installed: Path) -> None:
     """Also where sum and difference of the angles do not round back to the goal."""
     from bench_rig.head import BenchHead  # type: ignore[import-not-found]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -56,6 +58,14 @@ def rig(size_px: tuple[int, int] = SIZE_PX) -> Rig:
         },
         stereo={"navcam": ("navcam_left", "navcam_right")},
     )
+
+
+@functools.cache
+def little_mast_file() -> bytes:
+    """The rig as a mast file."""
+    with tempfile.TemporaryDirectory() as folder:
+        save_rig(rig(), Path(folder) / "little.yaml")
+        return (Path(folder) / "little.yaml").read_bytes()
 
 
 @dataclass
@@ -252,7 +262,7 @@ def fake_daemon(
         monkeypatch.setattr(devices_module, name, NET_S)
     monkeypatch.setattr(commands_module, "STOP_ANSWER_S", 2.0 * NET_S)
     hardware = FakeHardware()
-    save_rig(rig(), folder / "little.yaml")
+    (folder / "little.yaml").write_bytes(little_mast_file())
     (folder / "daemon.yaml").write_text((config or CONFIG).format(listen=listen))
     monkeypatch.setattr("mastctl.devices.opening.open_hardware", lambda settings, clock: hardware)
     monkeypatch.setattr(steering_module, "PointingLoop", loop)

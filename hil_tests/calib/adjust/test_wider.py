@@ -82,7 +82,13 @@ def test_a_defect_is_named(made: Made, name: str) -> None:
     assert words in next(model.sentence for model in fit.wider if model.name == name)
 
 
-@pytest.mark.parametrize("shift_mm", [3.0, 12.0])
+@pytest.mark.parametrize(
+    "shift_mm",
+    [
+        3.0,
+        pytest.param(12.0, marks=pytest.mark.long(2, "four times the move; a small one is in the quick run")),
+    ],
+)
 def test_a_board_that_moved_before_its_pictures_is_named(made: Made, shift_mm: float) -> None:
     moved = with_moved_board(
         *made, of_placement(made[0], "mast-4"), np.array([1e-3, 1e-3, 0.0]) * shift_mm, (0.0, 0.002, 0.003)

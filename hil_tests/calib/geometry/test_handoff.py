@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from calib.errors import CalibError, NoHandoff, NoStereoPoint
 from calib.files.mast_file import load_rig
@@ -323,6 +322,8 @@ def test_one_good_pair_of_clicks_in_a_thousand_is_refused(
     rng = np.random.default_rng(5)
     exact = clicks(rig, PAIR, TARGET, AT)
     known = uncertain.of(PAIR)
+    from scipy.stats import norm  # slow to load, and every worker loads this file
+
     root = np.linalg.cholesky(known.covariance)
     at = (AT.pan_rad, AT.tilt_rad)
     allowed = click_covariance(

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.stats import chi2
 
 from calib.errors import CalibError
 from calib.geometry.rigid import Rigid, rot_y, rot_z
@@ -227,6 +226,8 @@ def test_the_key_is_renewed_when_the_ground_looks_larger_or_otherwise_or_less_al
 
 
 def test_one_good_look_in_a_thousand_is_refused_with_both_eyes() -> None:
+    from scipy.stats import chi2  # slow to load, and every worker loads this file
+
     assert TrackSettings().worst_chi2 == pytest.approx(chi2.isf(0.001, 4), abs=0.05)
 
 

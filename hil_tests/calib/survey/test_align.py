@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from calib.calibrate.starts.station import adjust_prisms, station_poses
 from calib.geometry.rigid import Rigid
@@ -61,6 +60,8 @@ def test_pose_is_the_least_of_weighted_squares() -> None:
 
 
 def test_covariance_and_chi_square_hold_over_many_measurements() -> None:
+    from scipy.stats import chi2  # slow to load, and every worker loads this file
+
     rng = np.random.default_rng(8)
     pose = some_pose(rng)
     sigma = np.array([0.001, 0.001, 0.002, 0.001])

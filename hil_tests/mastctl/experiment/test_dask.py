@@ -12,10 +12,8 @@ from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
-import dask
 import numpy as np
 import pytest
-from distributed import LocalCluster
 
 from calib.files.mast_file import load_rig
 from calib.survey.records import Sigma
@@ -36,6 +34,9 @@ PLAN = SurveyPlan(sigma=Sigma(0.002, 0.1))
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     """The scheduler of a cluster of this machine: two workers in processes of their own."""
+    import dask  # slow to load, and every worker loads this file
+    from distributed import LocalCluster
+
     with (
         tempfile.TemporaryDirectory() as folder,
         dask.config.set(temporary_directory=folder),  # the scheduler's

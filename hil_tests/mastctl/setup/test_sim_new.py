@@ -10,7 +10,6 @@ import jsonschema_rs
 import numpy as np
 import pytest
 import yaml
-from scipy import stats
 
 from calib.files.mast_file import load_rig, save_rig
 from calib.files.yaml_text import parse_mapping
@@ -149,6 +148,8 @@ def test_a_folder_without_a_name_is_refused_and_nothing_is_written(
 def test_a_twin_believes_the_file_to_the_byte_and_is_drawn_from_its_covariance(
     repository: Path, tmp_path: Path
 ) -> None:
+    from scipy.stats import chi2  # slow to load, and every worker loads this file
+
     file = repository / "configs" / "masts" / "rocky8_simulated.yaml"
     fit = load_rig(file).rig.fit
     weight = np.linalg.inv(np.array(fit["covariance"]))
@@ -159,7 +160,7 @@ def test_a_twin_believes_the_file_to_the_byte_and_is_drawn_from_its_covariance(
         apart = parameters(folder / "mast.yaml", folder / "true_rig.yaml")
         step = np.array([apart[name] for name in fit["parameters"]])
         squares.append(float(step @ weight @ step))
-    low, high = stats.chi2.ppf([0.001, 0.999], 6 * len(fit["parameters"]))
+    low, high = chi2.ppf([0.001, 0.999], 6 * len(fit["parameters"]))
     assert low < sum(squares) < high, squares
 
 

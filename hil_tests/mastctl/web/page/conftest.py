@@ -6,16 +6,17 @@ import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
 from hil_tests.waiting import NET_S
 from mastctl.web import pictures
 from mastctl.web.page import page_files
+
+if TYPE_CHECKING:  # slow to load, and every worker loads this file
+    from playwright.sync_api import Browser, BrowserContext, Page
 
 BOUND_MS = 1e3 * NET_S
 STALE = "const STALE_S = 1.0;"
@@ -32,6 +33,8 @@ def _few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def browser(request: pytest.FixtureRequest) -> Iterator[Browser]:
     """One for a file: where Playwright runs no other test may run an event loop of its own."""
+    from playwright.sync_api import sync_playwright
+
     found = shutil.which("chromium") or shutil.which("chromium-browser")
     if found is None:
         words = "the page's tests need chromium: python -m tools.browser installs it on Debian"
@@ -88,6 +91,8 @@ class Visit:
 
     def serious(self, context: str | None = None) -> list[Any]:
         """What axe finds that shuts somebody out, in a part of the page or all of it."""
+        from axe_playwright_python.sync_playwright import Axe
+
         return [
             (each["id"], each["nodes"][0]["html"][:160], each["nodes"][0].get("failureSummary"))
             for each in Axe().run(self.page, context=context).response["violations"]
