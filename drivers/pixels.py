@@ -87,6 +87,8 @@ FORMATS = MappingProxyType(
         "UYVY": Layout("uyvy"),
         "NV12": Layout("nv12"),
         "NM12": Layout("nv12"),  # luma and chroma in planes of their own
+        "RGB3": Layout("rgb"),
+        "BGR3": Layout("bgr"),
         "MJPG": Layout("jpeg"),
         "JPEG": Layout("jpeg"),
         "BA81": Layout("bayer", 8, "BGGR"),

@@ -89,7 +89,7 @@ class BenchFolder:
         except OSError as error:
             raise NotWritten(self.path, "", f"cannot be written: {error.strerror or error}") from None
         survey = read_survey(self.path)
-        place, words = _other(bench_document(survey), bench_document(header))
+        place, words = _other(bench_document(survey), bench_document(_as_known(header, survey)))
         if words:
             raise BadFile(there, place, f"{words}; another folder (--survey) is expected")
         self._images = list(survey.images)
@@ -140,6 +140,16 @@ class BenchFolder:
             raise BadFile(self.path, str(file), "the picture lies outside the folder")
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_bytes(path, picture, 0o644)
+
+
+def _as_known(header: Survey, there: Survey) -> Survey:
+    """The header, with sensor modes as a folder has them where either does not know one."""
+    cameras = {}
+    for name, camera in header.cameras.items():
+        kept = there.cameras[name].sensor_mode if name in there.cameras else camera.sensor_mode
+        known = kept is not None and camera.sensor_mode is not None
+        cameras[name] = camera if known else replace(camera, sensor_mode=kept)
+    return replace(header, cameras=cameras)
 
 
 def _other(there: Any, wanted: Any, place: str = "") -> tuple[str, str]:

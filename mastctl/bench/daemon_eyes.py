@@ -231,7 +231,9 @@ class DaemonEyes:
 
 def _sensor_mode(client: Client, camera: str) -> SensorMode | None:
     """Which pixels of its sensor a camera's pictures show, as the daemon tells it."""
-    told: Any = client.camera_settings(camera).get("sensor_mode")
+    told: Any = None
+    with suppress(ClientError):  # a camera that does not answer now may do later
+        told = client.camera_settings(camera).get("sensor_mode")
     if told is None:
         return None
     size: Any

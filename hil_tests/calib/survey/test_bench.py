@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -167,6 +168,20 @@ def test_a_folder_of_another_bench_is_not_gone_on_with(tmp_path: Path) -> None:
     grown(tmp_path)
     with pytest.raises(BadFile, match="another folder"):
         BenchFolder(tmp_path, {"wall": BOARD}, Sigma(0, 0, corner_px=0.2), {CAMERA.name: CAMERA}, {})
+
+
+def test_a_folder_goes_on_where_either_knows_no_sensor_mode_and_not_in_another(tmp_path: Path) -> None:
+    def begun(name: str, mode: SensorMode | None) -> BenchFolder:
+        eye, path = replace(CAMERA, sensor_mode=mode), tmp_path / name
+        return BenchFolder(path, {"wall": BOARD}, Sigma(0, 0, corner_px=0.1), {CAMERA.name: eye}, {})
+
+    plain, flipped = SensorMode((1024, 768)), SensorMode((1024, 768), flip=(True, False))
+    begun("unknown", None)
+    assert begun("unknown", flipped).survey().cameras[CAMERA.name].sensor_mode is None
+    begun("known", plain)
+    assert begun("known", None).survey().cameras[CAMERA.name].sensor_mode == plain
+    with pytest.raises(BadFile, match="another folder"):
+        begun("known", flipped)
 
 
 class Killed(BaseException):

@@ -112,6 +112,15 @@ def test_colour_follows_the_standard(code: str, y: int, u: int, v: int) -> None:
     assert (pixels.grey(picture_format(code), raw) == y).all()
 
 
+def test_red_first_and_blue_first_show_the_same_with_padded_rows() -> None:
+    blue_first = np.random.default_rng(8).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    for code, rows in (("BGR3", blue_first), ("RGB3", blue_first[:, :, ::-1])):
+        raw = np.pad(rows.reshape(HEIGHT, -1), ((0, 0), (0, 8))).ravel()
+        form = PictureFormat(code, (WIDTH, HEIGHT), 3 * WIDTH + 8, len(raw))
+        assert np.array_equal(pixels.colour(form, raw), blue_first)
+        assert np.array_equal(pixels.grey(form, raw), cv2.cvtColor(blue_first, cv2.COLOR_BGR2GRAY))
+
+
 @pytest.mark.parametrize("padding", [0, 64])
 @pytest.mark.parametrize("stride", [WIDTH, WIDTH + 8])
 def test_planes_of_their_own_show_what_one_plane_shows(stride: int, padding: int) -> None:
