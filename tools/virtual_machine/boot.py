@@ -18,14 +18,16 @@ from pathlib import Path
 INIT = Path(__file__).resolve().parents[2] / "hil_tests" / "vm" / "init"
 
 CAMERAS = {
-    "webcams": "n_devs=2 node_types=0x20001,0x1 num_inputs=1,1 input_types=0x0,0x0 multiplanar=1,2",
+    "webcams": "n_devs=2 node_types=0x20001,0x1 num_inputs=1,2 input_types=0x0,0xc multiplanar=1,2",
     "hdmi": "n_devs=2 node_types=0x101,0x101 num_inputs=1,1 input_types=0x3,0x3 "
     "num_outputs=1,1 output_types=0x1,0x1",
     "three": "n_devs=3 node_types=0x1,0x1,0x1 num_inputs=1,1,1 input_types=0x3,0x3,0x3",
+    "vimc": "",
 }
-"""Layouts of the virtual cameras, as options of vivid: two webcams, the first with a metadata
-node, the second multi-planar; two HDMI
-inputs, each with an output that can be looped into it; or three HDMI inputs."""
+"""Layouts of the virtual cameras, as options of vivid: two webcams, the first with a metadata node, the
+second multi-planar and with an HDMI input beside; two HDMI inputs, each with an output that can be looped
+into it; or three HDMI inputs. Without options there is no vivid, but vimc: sensors behind a media
+controller."""
 
 
 class VmFailed(Exception):
@@ -68,7 +70,7 @@ def run(
     folder
         Where the command runs; the present folder when left out.
     cameras
-        Options of vivid, separated by spaces.
+        Options of vivid, separated by spaces; none: vimc in its place.
     timeout_s
         After which the machine is killed.
     environment
@@ -92,6 +94,7 @@ def run(
     }
     (out / ".job.json").write_text(json.dumps(job))
     vivid = [f"vivid.{option}" for option in cameras.split()]
+    vivid.append(f"initcall_blacklist={'vimc' if vivid else 'vivid'}_init")
     clock = [] if real_time else ["time-travel=inf-cpu"]
     with tempfile.TemporaryDirectory(prefix="mastctl-vm-") as name:
         arguments = [
