@@ -22,11 +22,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from calib.adjust.solver import Normal
-from calib.adjust.terms import DRAWING, JOINTS, ImageTerm, StationTerm, lens_knowledge, widened_images
+from calib.adjust.stacks import AnyStack, ImageStack, StationStack, image_stack, station_stack
+from calib.adjust.terms import (
+    DRAWING,
+    JOINTS,
+    ImageTerm,
+    StationTerm,
+    lens_knowledge,
+    widened_images,
+)
 from calib.adjust.unknowns import (
     JOINT_ERRORS,
     MAST,
@@ -38,7 +48,6 @@ from calib.adjust.unknowns import (
     Unknowns,
 )
 from calib.geometry.parameters import (
-    Prediction,
     camera_numbers,
     parameter_names,
     parameter_part,
@@ -52,15 +61,16 @@ from calib.geometry.rig import (
     AxisJoint,
     Gimbal,
     gimbal,
-    gimbal_rates,
 )
-from calib.geometry.rigid import FloatArray, moved_rigid, rigid_rates
+from calib.geometry.rigid import FloatArray, crossed, crossed_rows, moved_rigid, rigid_rates, rigid_twists
 
 HUBER = 3.0
 """Length of a residual, in sigmas, from which its pull no longer grows while blunders are looked for."""
 
 USUAL_JOINT_RAD = 0.01
 """A joint's usual harmonics and backlash, one sigma, radians; hobby servos have 6 to 9 mrad."""
+
+NO_BOW = np.zeros(2)
 
 USUAL_BOW_M = 0.005
 """How far a board's edges are usually from flat, one sigma, metres."""
@@ -190,6 +200,7 @@ class Adjustment:
     def _copy(self, **changed: object) -> Adjustment:
         other = object.__new__(type(self))
         other.__dict__.update(self.__dict__, **changed)
+        other.__dict__.pop("_stacks", None)
         return other
 
     def stepped(self, state: Estimate, step: FloatArray) -> Estimate:
@@ -231,17 +242,15 @@ class Adjustment:
 
     def cost(self, state: Estimate) -> float:
         """Return the weighted sum of squares (pulls bounded if asked); infinite where a dot has no pixel."""
-        total = 0.0
-        for residual, width in self._residuals(state):
-            if not np.isfinite(residual).all():
-                return float("inf")
-            total += self._loss(residual, width)
-        return total
+        total = sum(self._loss(self._off(state, stack)) for stack in self._stacks)
+        total += sum(float(block.residual @ block.residual) for _, block in self.known(state))
+        return total if np.isfinite(total) else float("inf")
 
-    def _loss(self, residual: FloatArray, width: int) -> float:
-        if self.huber is None or width == 1:
-            return float(residual @ residual)
-        length = np.linalg.norm(residual.reshape(-1, width), axis=1)
+    def _loss(self, off: FloatArray) -> float:
+        """What the measurements (n, width) of a stack cost."""
+        if self.huber is None:
+            return float(np.sum(off * off))
+        length = np.linalg.norm(off, axis=1)
         bounded = np.where(length <= self.huber, length**2, self.huber * (2 * length - self.huber))
         return float(bounded.sum())
 
@@ -249,158 +258,260 @@ class Adjustment:
         """Return cost and normal equations of everything that counts."""
         size = len(self.names)
         cost, matrix, gradient = 0.0, np.zeros((size, size)), np.zeros(size)
-        for _, block in self.blocks(state):
-            if not np.isfinite(block.residual).all():
+        for stack in self._stacks:
+            rows = self._rows(state, stack)
+            cost += self._loss(rows[:, -1].T)
+            if not np.isfinite(cost):
                 return Normal(float("inf"), matrix, gradient)
-            residual, jacobian = block.residual, block.jacobian
-            cost += self._loss(residual, block.width)
-            if self.huber is not None and block.width > 1:
-                weight = np.sqrt(bounded_weights(residual, block.width, self.huber))
-                residual, jacobian = residual * weight, jacobian * weight[:, None]
-            columns = block.columns
-            matrix[np.ix_(columns, columns)] += jacobian.T @ jacobian
-            gradient[columns] += jacobian.T @ residual
+            if self.huber is not None:
+                rows *= np.sqrt(bounded_weights(rows[:, -1].T.ravel(), len(rows), self.huber)[:: len(rows)])
+            for part, columns in zip(stack.parts, stack.columns, strict=True):
+                mine = rows[..., part]
+                both = (mine @ mine.transpose(0, 2, 1)).sum(axis=0)
+                matrix[columns[:, None], columns] += both[:-1, :-1]
+                gradient[columns] += both[:-1, -1]
+        for _, block in self.known(state):
+            cost += float(block.residual @ block.residual)
+            matrix[block.columns[:, None], block.columns] += block.jacobian.T @ block.jacobian
+            gradient[block.columns] += block.jacobian.T @ block.residual
         return Normal(cost, matrix, gradient)
 
     def blocks(self, state: Estimate) -> Iterator[tuple[ImageTerm | StationTerm | Known, ResidualBlock]]:
         """Yield every group that counts, residuals and Jacobian."""
-        for _, images in self._by_camera():
-            yield from zip(images, self.image_blocks(state, images), strict=True)
-        for point in self.station:
-            if point.keep:
-                yield point, self.station_block(state, point)
+        for stack in self._stacks:
+            yield from zip(stack.terms, self._blocks(state, stack), strict=True)
         yield from self.known(state)
 
-    def _by_camera(self) -> Iterator[tuple[str, list[ImageTerm]]]:
-        """The images that count, by camera: one call for the points of many is far quicker."""
-        for name in dict.fromkeys(t.camera for t in self.images):
-            yield name, [t for t in self.images if t.camera == name and t.keep.any()]
+    @cached_property
+    def _stacks(self) -> tuple[AnyStack, ...]:
+        """Everything that counts, but what is known beforehand."""
+        images = [t for t in self.images if t.keep.any()]
+        return *self._of_images(images), *self._of_station([p for p in self.station if p.keep])
 
-    def _residuals(self, state: Estimate) -> Iterator[tuple[FloatArray, int]]:
-        for name, images in self._by_camera():
-            if not images:
-                continue
-            pixels, _ = state.cameras[name].project(
-                np.concatenate([self.in_camera(state, t)[t.keep] for t in images])
-            )
-            measured = np.concatenate([t.pixels_px[t.keep] for t in images])
-            sigma = np.concatenate([t.sigma_px[t.keep] for t in images])
-            yield ((pixels - measured) / sigma[:, None]).ravel(), 2
-        for point in self.station:
-            if point.keep:
-                yield self.station_residual(state, point), 3
-        for _, block in self.known(state):
-            yield block.residual, 1
+    def _of_images(self, images: Sequence[ImageTerm]) -> list[ImageStack]:
+        """Stacks of images with the same camera and kinds of unknowns."""
+        groups: dict[tuple[object, ...], list[ImageTerm]] = {}
+        for term in images:
+            kind = (
+                term.camera, term.attitude is None, self._own_reading(term),
+                term.board[0] in self.bowed, term.board in self.held,
+            )  # fmt: skip
+            groups.setdefault(kind, []).append(term)
+        return [image_stack(mine, self.unknowns, self._image_keys) for mine in groups.values()]
+
+    def _image_keys(self, image: ImageTerm) -> Iterator[Key]:
+        """The unknowns that an image depends on: a camera's first, a bow's last, between them what moves the
+        board before the camera."""
+        yield "camera", image.camera
+        if image.attitude is not None:
+            yield MAST
+            yield JOINT_ERRORS
+            if self._own_reading(image):
+                yield "attitude", image.attitude
+        if image.board not in self.held:
+            yield "board", image.board
+        if image.board[0] in self.bowed:
+            yield "bow", image.board[0]
+
+    def _own_reading(self, image: ImageTerm) -> bool:
+        """Whether the readings of an image are unknowns: they are fitted, and not exact."""
+        return self.joint_rad > 0 and image.attitude is not None and image.attitude >= 0
+
+    def _of_station(self, points: Sequence[StationTerm]) -> list[StationStack]:
+        """Stacks of the station's prisms, and of its tapes."""
+        groups = ([p for p in points if (p.board is None) is prism] for prism in (True, False))
+        return [station_stack(mine, self.unknowns, self._station_keys) for mine in groups if mine]
+
+    def _station_keys(self, point: StationTerm) -> Iterator[Key]:
+        """The unknowns that a point of the station depends on."""
+        yield "setup", point.setup
+        if point.board is not None:
+            yield "board", point.board
+        elif self.prism_cad_m > 0:
+            yield "prism", point.point
 
     def reading(self, state: Estimate, image: ImageTerm) -> tuple[float, float]:
         """The joints' readings of an image without noise, by the state."""
-        if image.attitude is None or image.attitude < 0 or not len(state.joints_rad):
-            return image.pan_rad, image.tilt_rad
-        pan, tilt = state.joints_rad[image.attitude]
-        return image.pan_rad + float(pan), image.tilt_rad + float(tilt)
+        pan, tilt = self._readings(state, [image])[0].tolist()
+        return pan, tilt
 
-    def joints(self, state: Estimate, image: ImageTerm) -> tuple[float, float]:
-        """The true joint angles of an image as the state has them."""
-        reading = self.reading(state, image)
-        if image.attitude is None or not state.joint_errors.any():
-            return reading
-        return state.as_joints.true_rad(reading, image.approach)
+    def _readings(self, state: Estimate, images: Sequence[ImageTerm]) -> FloatArray:
+        """The same of head images (k, 2)."""
+        found = np.array([(t.pan_rad, t.tilt_rad) for t in images])
+        if len(state.joints_rad):
+            attitude = np.array([-1 if t.attitude is None else t.attitude for t in images])
+            found[attitude >= 0] += state.joints_rad[attitude[attitude >= 0]]
+        return found
+
+    def _joints(self, state: Estimate, images: Sequence[ImageTerm]) -> list[tuple[AxisJoint, Any, Any]]:
+        """Both joints, what they read at head images (k,), and from which side they came there (k,)."""
+        joints, sides = state.as_joints, np.array([t.approach for t in images], dtype=np.float64)
+        return list(zip((joints.pan, joints.tilt), self._readings(state, images).T, sides.T, strict=True))
+
+    def head(self, state: Estimate, images: Sequence[ImageTerm]) -> Gimbal:
+        """Where the head was at some of its images (k,), as the state has it."""
+        pan, tilt = (joint.true_rad(read, side) for joint, read, side in self._joints(state, images))
+        return gimbal(state.mast, pan, tilt)
 
     def image_residual(self, state: Estimate, image: ImageTerm) -> FloatArray:
         """Predicted less measured pixels of the dots that count, in sigmas, (2n,)."""
-        keep = image.keep
-        pixels, _ = state.cameras[image.camera].project(self.in_camera(state, image)[keep])
-        return np.asarray(((pixels - image.pixels_px[keep]) / image.sigma_px[keep, None]).ravel())
+        return self.image_residuals(state, [image])[0]
 
-    def in_camera(self, state: Estimate, image: ImageTerm) -> FloatArray:
-        """All the points (n, 3) of an image in its camera's frame, metres, as the state has them."""
-        points = state.rover_from_board[image.board].points(bowed_points(state, image))
-        if image.attitude is not None:
-            head = gimbal(state.mast, *self.joints(state, image))
-            points = (points - head.translation_m) @ head.rotation
-        return np.asarray(points)
+    def image_residuals(self, state: Estimate, images: Sequence[ImageTerm]) -> list[FloatArray]:
+        """The same of some images; all at once is far quicker than one by one."""
+        found: dict[int, FloatArray] = {}
+        for stack in self._of_images(images):
+            off = self._off(state, stack)
+            found |= {id(t): off[part].ravel() for t, part in zip(stack.terms, stack.parts, strict=True)}
+        return [found[id(image)] for image in images]
 
-    def _axes(self, state: Estimate) -> tuple[AxisJoint, AxisJoint]:
-        """Both joints as the state has them."""
-        return state.as_joints.pan, state.as_joints.tilt
+    def unseen(self, state: Estimate) -> set[str]:
+        """The images in which a dot that counts has no pixel, by name."""
+        off = self.image_residuals(state, self.images)
+        return {
+            t.name for t, residual in zip(self.images, off, strict=True) if not np.isfinite(residual).all()
+        }
 
-    def image_block(self, state: Estimate, image: ImageTerm) -> ResidualBlock:
-        """The dots of an image."""
-        return next(self.image_blocks(state, [image]))
+    def away_m(self, state: Estimate, images: Sequence[ImageTerm]) -> dict[str, FloatArray]:
+        """How far the dots that count (n,) are from their cameras, by image, as the state has them."""
+        found: dict[str, FloatArray] = {}
+        for stack in self._of_images(images):
+            camera = state.cameras[stack.terms[0].camera]
+            away = np.linalg.norm(self._in_camera(state, stack)[0] - camera.C, axis=1)
+            found |= {t.name: away[part] for t, part in zip(stack.terms, stack.parts, strict=True)}
+        return found
 
-    def image_blocks(self, state: Estimate, images: Sequence[ImageTerm]) -> Iterator[ResidualBlock]:
-        """The dots of some images of one camera."""
-        if not images:
-            return
-        points, heads = [], []
-        for image in images:
-            board = state.rover_from_board[image.board]
-            points.append(board.points(bowed_points(state, image)[image.keep]))
-            heads.append(None if image.attitude is None else gimbal(state.mast, *self.joints(state, image)))
-        in_camera = [
-            p if head is None else (p - head.translation_m) @ head.rotation
-            for p, head in zip(points, heads, strict=True)
-        ]
-        every = predict(state.cameras[images[0].camera], np.concatenate(in_camera))
-        first = 0
-        for image, there, head in zip(images, points, heads, strict=True):
-            mine = slice(first, first + len(there))
-            first += len(there)
-            yield self._block(state, image, there, head, Prediction(*(array[mine] for array in every)))
-
-    def _block(
-        self, state: Estimate, image: ImageTerm, points: FloatArray, head: Gimbal | None, seen: Prediction
-    ) -> ResidualBlock:
-        """One image whose points (n, 3) of the rover frame are seen so."""
-        keep = image.keep
-        board = state.rover_from_board[image.board]
-        rates: dict[Key, FloatArray] = {("camera", image.camera): seen.d_step}
-        in_rover = seen.d_points
-        if head is not None:
-            in_rover = in_rover @ head.rotation.T
-            turned = self.joint_rad > 0 or len(self.joint_errors) > 0
-            wanted = np.array([*self.mast_free, *((8, 9) if turned else ())], dtype=int)
-            by_head = -gimbal_rates(in_rover, points, head, wanted)
-            rates[MAST], by_angles = np.split(by_head, [len(self.mast_free)], axis=2)
-            both = list(zip(self._axes(state), self.reading(state, image), image.approach, strict=True))
-            if len(self.joint_errors):
-                per_number = np.stack([joint.rates(read, side) for joint, read, side in both])
-                per_joint = by_angles[..., None] * per_number
-                rates[JOINT_ERRORS] = per_joint.reshape(*by_head.shape[:2], -1)[..., self.joint_errors]
-            if self.joint_rad > 0:
-                slopes = np.array([joint.slope(read, side) for joint, read, side in both])
-                rates["attitude", image.attitude] = by_angles * slopes
-        if image.board[0] in self.bowed:
-            behind = (in_rover @ board.rotation[:, 2])[..., None]
-            rates["bow", image.board[0]] = behind * image.bend[keep][:, None, :]
-        if image.board not in self.held:
-            rates["board", image.board] = rigid_rates(in_rover, points, board.translation_m)
-        sigma = image.sigma_px[keep]
-        residual = (seen.pixels_px - image.pixels_px[keep]) / sigma[:, None]
-        return ResidualBlock.of(self.unknowns, residual.ravel(), rates, 2, sigma[:, None, None])
+    def image_blocks(self, state: Estimate, images: Sequence[ImageTerm]) -> list[ResidualBlock]:
+        """The dots of some images that count, and their Jacobians."""
+        return self._in_order(state, self._of_images(images), images)
 
     def station_residual(self, state: Estimate, point: StationTerm) -> FloatArray:
         """Measured less expected place of a prism or tape, in the rover frame and in sigmas, (3,)."""
-        measured = state.rover_from_station[point.setup].points(point.position_m)
-        if point.board is None:
-            expected = state.prisms_in_rover_m[point.point]
-        else:
-            expected = state.rover_from_board[point.board].points(point.in_board_m)
-        return np.asarray((measured - expected) / point.sigma_m)
+        return np.asarray(self._off(state, self._of_station([point])[0])[0])
 
-    def station_block(self, state: Estimate, point: StationTerm) -> ResidualBlock:
-        """One point of the station."""
-        setup = state.rover_from_station[point.setup]
+    def station_blocks(self, state: Estimate, points: Sequence[StationTerm]) -> list[ResidualBlock]:
+        """Some points of the station."""
+        return self._in_order(state, self._of_station(points), points)
+
+    def _in_order(
+        self, state: Estimate, stacks: Sequence[AnyStack], terms: Sequence[ImageTerm | StationTerm]
+    ) -> list[ResidualBlock]:
+        """The blocks of some terms, one each."""
+        found: dict[int, ResidualBlock] = {}
+        for stack in stacks:
+            blocks = self._blocks(state, stack)
+            found |= {id(t): block for t, block in zip(stack.terms, blocks, strict=True)}
+        return [found[id(term)] for term in terms]
+
+    def _blocks(self, state: Estimate, stack: AnyStack) -> Iterator[ResidualBlock]:
+        """The terms of a stack, each by itself."""
+        rows = self._rows(state, stack)
+        for at, part in enumerate(stack.parts):
+            mine = rows[..., part].transpose(2, 0, 1).reshape(-1, rows.shape[1])
+            yield ResidualBlock(mine[:, -1], mine[:, :-1], stack.columns[at], len(rows), stack.places_of(at))
+
+    def _off(self, state: Estimate, stack: AnyStack) -> FloatArray:
+        """Predicted less measured pixels (n, 2), or measured less expected places (n, 3), in sigmas."""
+        if isinstance(stack, StationStack):
+            measured, expected = self._places(state, stack)
+            return np.asarray((measured - expected) / stack.sigma_m[:, None])
+        model = state.cameras[stack.terms[0].camera]
+        pixels, _ = model.project(self._in_camera(state, stack)[0])
+        return np.asarray((pixels - stack.pixels_px) / stack.sigma_px[:, None])
+
+    def _rows(self, state: Estimate, stack: AnyStack) -> FloatArray:
+        """The Jacobian of a stack's residuals and, last, these themselves, in sigmas, (width, k + 1, n)."""
+        if isinstance(stack, StationStack):
+            return self._station_rows(state, stack)
+        in_camera, head = self._in_camera(state, stack)
+        seen = predict(state.cameras[stack.terms[0].camera], in_camera)
+        by_step, by_point = seen.d_step.transpose(1, 2, 0), seen.d_points.transpose(1, 2, 0)
+        # What turns and shifts points before the camera moves pixels by its twist, at the same rates for all.
+        by_twist = np.concatenate([crossed_rows(in_camera.T, by_point), by_point], axis=1)
+        rows = np.empty((2, sum(stack.sizes) + 1, len(in_camera)))
+        first, bow = by_step.shape[1], 2 if stack.terms[0].board[0] in self.bowed else 0
+        rows[:, :first] = by_step
+        for part, twists in zip(stack.parts, self._twists(state, stack, head), strict=True):
+            moved = twists @ by_twist[..., part]
+            last = first + len(twists) - (1 if bow else 0)
+            rows[:, first:last, part] = moved[:, : last - first]
+            if bow:
+                rows[:, last:-1, part] = moved[:, -1:] * stack.bend[part].T
+        rows[:, -1] = (seen.pixels_px - stack.pixels_px).T
+        rows /= stack.sigma_px
+        return rows
+
+    def _in_camera(self, state: Estimate, stack: ImageStack) -> tuple[FloatArray, Gimbal | None]:
+        """Points (n, 3) in the frame that the camera is in, head or rover, metres, and where the head was."""
+        boards = [state.rover_from_board[t.board] for t in stack.terms]
+        turns, shifts = np.array([b.rotation for b in boards]), np.array([b.translation_m for b in boards])
+        head = None
+        if stack.terms[0].attitude is not None:
+            head = self.head(state, stack.terms)
+            shifts = ((shifts - head.translation_m)[:, None] @ head.rotation)[:, 0]
+            turns = head.rotation.transpose(0, 2, 1) @ turns
+        points = stack.in_board_m
+        bows = [state.bows_m.get(t.board[0], NO_BOW) for t in stack.terms]
+        if np.any(bows):
+            points = points.copy()
+            for part, bow in zip(stack.parts, bows, strict=True):
+                points[part, 2] += stack.bend[part] @ bow
+        found = np.empty_like(points)
+        for part, turn, shift in zip(stack.parts, turns, shifts, strict=True):
+            found[part] = points[part] @ turn.T + shift
+        return found, head
+
+    def _twists(self, state: Estimate, stack: ImageStack, head: Gimbal | None) -> FloatArray:
+        """Twists (images, k, 6) by which unknowns move the points of each image in the frame that its camera
+        is in: a turn, and the shift of what is carried through the origin; last, of a bow, the board's z."""
+        boards = [state.rover_from_board[t.board] for t in stack.terms]
+        parts = [np.zeros((len(boards), 0, 6))]
+        if head is not None:
+            by_angles, joints = -head.twists[:, 8:], self._joints(state, stack.terms)
+            by_number = np.stack([joint.rates(read, side) for joint, read, side in joints], axis=1)
+            by_errors = (by_angles[:, :, None] * by_number[..., None]).reshape(len(boards), -1, 6)
+            parts += [-head.twists[:, self.mast_free], by_errors[:, self.joint_errors]]
+            if self._own_reading(stack.terms[0]):
+                slopes = np.stack([joint.slope(read, side) for joint, read, side in joints], axis=1)
+                parts.append(by_angles * slopes[..., None])
+        if stack.terms[0].board not in self.held:
+            parts.append(rigid_twists(np.array([board.translation_m for board in boards])))
+        if stack.terms[0].board[0] in self.bowed:
+            parts.append(np.array([[[0.0, 0.0, 0.0, *board.rotation[:, 2]]] for board in boards]))
+        twists = np.concatenate(parts, axis=1)
+        if head is not None:
+            turns, shifts = twists[..., :3], twists[..., 3:]
+            shifts = shifts + crossed(turns, head.translation_m[:, None])
+            twists = np.concatenate([turns @ head.rotation, shifts @ head.rotation], axis=2)
+        return twists
+
+    def _places(self, state: Estimate, stack: StationStack) -> tuple[FloatArray, FloatArray]:
+        """Where points of the station were measured and are expected (n, 3), metres in the rover frame."""
+        measured = [state.rover_from_station[p.setup].points(p.position_m) for p in stack.terms]
+        expected = [
+            state.prisms_in_rover_m[p.point]
+            if p.board is None
+            else state.rover_from_board[p.board].points(p.in_board_m)
+            for p in stack.terms
+        ]
+        return np.array(measured), np.array(expected)
+
+    def _station_rows(self, state: Estimate, stack: StationStack) -> FloatArray:
+        """The same of points of the station."""
+        measured, expected = self._places(state, stack)
         eye = np.eye(3)
-        measured = rigid_rates(eye[None], setup.points(point.position_m)[None], setup.translation_m)[0]
-        rates: dict[Key, FloatArray] = {("setup", point.setup): measured}
-        if point.board is not None:
-            board = state.rover_from_board[point.board]
-            expected = rigid_rates(eye[None], board.points(point.in_board_m)[None], board.translation_m)[0]
-            rates["board", point.board] = -expected
+        rows = np.empty((3, sum(stack.sizes) + 1, len(measured)))
+        origins = np.array([state.rover_from_station[p.setup].translation_m for p in stack.terms])
+        rows[:, :6] = rigid_rates(eye[None], measured, origins).transpose(1, 2, 0)
+        boards = [state.rover_from_board[p.board] for p in stack.terms if p.board is not None]
+        if boards:
+            origins = np.array([board.translation_m for board in boards])
+            rows[:, 6:-1] = -rigid_rates(eye[None], expected, origins).transpose(1, 2, 0)
         elif self.prism_cad_m > 0:
-            rates["prism", point.point] = -eye
-        return ResidualBlock.of(self.unknowns, self.station_residual(state, point), rates, 3, point.sigma_m)
+            rows[:, 6:-1] = -eye[..., None]
+        rows[:, -1] = (measured - expected).T
+        rows /= stack.sigma_m
+        return rows
 
     def known(self, state: Estimate) -> Iterator[tuple[Known, ResidualBlock]]:
         """The priors: usual lenses, joints and boards, prisms from CAD, joint readings."""
@@ -410,7 +521,8 @@ class Adjustment:
                 model = state.cameras[str(which[0])]
                 if model.kind != "CAHV":
                     residual, rates = lens_knowledge(model)
-                    yield Known(key, None), ResidualBlock.of(self.unknowns, residual, {key: rates}, width=1)
+                    part = {key: slice(0, rates.shape[1])}
+                    yield Known(key, None), ResidualBlock(residual, rates, self.at(key), 1, part)
             elif unknown.prior is not None and unknown.sigma is not None and len(unknown.names):
                 if kind == "attitude" and not self.joint_rad:
                     continue
@@ -470,13 +582,3 @@ def bounded_weights(residual: FloatArray, width: int, huber: float | None) -> Fl
         return np.ones(len(residual))
     length = np.linalg.norm(residual.reshape(-1, width), axis=1)
     return np.repeat(np.minimum(1.0, huber / np.maximum(length, 1e-300)), width)
-
-
-def bowed_points(state: Estimate, image: ImageTerm) -> FloatArray:
-    """Return the points (n, 3) of an image's board, metres, bent as the state has it."""
-    bow = state.bows_m.get(image.board[0])
-    if bow is None or not bow.any():
-        return image.in_board_m
-    bent = image.in_board_m.copy()
-    bent[:, 2] += image.bend @ bow
-    return bent

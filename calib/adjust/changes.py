@@ -10,8 +10,9 @@ nothing and does no harm.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -132,7 +133,7 @@ def find_change(problem: Adjustment, state: Estimate) -> BenchChange | None:
     problem, state
         A fit with pulls bounded.
     """
-    rows = [rows_of(problem, state, image) for image in problem.images if image.keep.any()]
+    rows = rows_of(problem, state)
     # Of this very state: what is left of a change that others nearly take up is a small difference.
     chi2, matrix, gradient = problem.normal(state)
     covariance = covariance_of(matrix, problem.weak)
@@ -214,30 +215,31 @@ def _standstills(rows: Sequence[Rows]) -> int:
     return len({r.image.name if r.image.attitude is None else r.image.attitude for r in rows})
 
 
-def rows_of(problem: Adjustment, state: Estimate, image: ImageTerm) -> Rows:
-    """Return one image as the fit weighs it."""
-    block = problem.image_block(state, image)
-    weight = np.sqrt(bounded_weights(block.residual, 2, problem.huber))
-    rates: dict[str, FloatArray] = {}
-    if image.board not in problem.held:
-        rates["board"] = block.rates(("board", image.board))
-    if image.attitude is not None:
-        both = reading_rates(problem, state, image)
-        rates["pan"], rates["tilt"] = both[:, :1], both[:, 1:]
-    camera = state.cameras[image.camera]
-    rates["focus"] = _difference(
-        problem, state, _with(state, image, camera.zoomed(STEP)), image, block.residual
-    )[:, None]
-    turned = [
-        _difference(problem, state, _with(state, image, camera.turned(STEP * axis)), image, block.residual)
-        for axis in np.eye(3)
-    ]
-    rates["knock"] = np.stack(turned, axis=1)
-    return Rows(
-        image,
-        replace(block, residual=weight * block.residual, jacobian=weight[:, None] * block.jacobian),
-        {what: weight[:, None] * rate for what, rate in rates.items()},
-    )
+def rows_of(problem: Adjustment, state: Estimate) -> list[Rows]:
+    """Return every image that counts as the fit weighs it."""
+    images = [image for image in problem.images if image.keep.any()]
+    blocks = problem.image_blocks(state, images)
+    here = [block.residual for block in blocks]
+
+    def with_cameras(moved: Callable[[CameraModel], CameraModel]) -> list[FloatArray]:
+        cameras = {name: moved(camera) for name, camera in state.cameras.items()}
+        return _differences(problem, replace(state, cameras=cameras), images, here)
+
+    zoomed = with_cameras(lambda camera: camera.zoomed(STEP))
+    turned = [with_cameras(partial(CameraModel.turned, turn_rad=STEP * axis)) for axis in np.eye(3)]
+    readings = reading_rates(problem, state, images, here)
+    found = []
+    for image, block, zoom, read, *turns in zip(images, blocks, zoomed, readings, *turned, strict=True):
+        weight = np.sqrt(bounded_weights(block.residual, 2, problem.huber))
+        rates = {"focus": zoom[:, None], "knock": np.stack(turns, axis=1)}
+        if image.board not in problem.held:
+            rates["board"] = block.rates(("board", image.board))
+        if image.attitude is not None:
+            rates |= {"pan": read[:, :1], "tilt": read[:, 1:]}
+        weighed = replace(block, residual=weight * block.residual, jacobian=weight[:, None] * block.jacobian)
+        rates = {what: weight[:, None] * rate for what, rate in rates.items()}
+        found.append(Rows(image, weighed, rates))
+    return found
 
 
 def reading_rows(problem: Adjustment, state: Estimate, rows: Sequence[Rows]) -> list[Rows]:
@@ -279,20 +281,21 @@ def scatter(readings: Sequence[Rows], axis: str, covariance: FloatArray, gain: f
     return (squares - gain) / max(redundancy - 1.0, 1.0)
 
 
-def reading_rates(problem: Adjustment, state: Estimate, image: ImageTerm) -> FloatArray:
-    """Return how the residuals of a head image change with what pan and tilt read, (m, 2), sigmas a
+def reading_rates(
+    problem: Adjustment, state: Estimate, images: Sequence[ImageTerm], here: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Return how the residuals of images, ``here``, change with what pan and tilt read, (m, 2), sigmas a
     radian."""
-    here = problem.image_residual(state, image)
-    moved = (replace(image, pan_rad=image.pan_rad + STEP), replace(image, tilt_rad=image.tilt_rad + STEP))
-    return np.stack([_difference(problem, state, state, one, here) for one in moved], axis=1)
+    by_pan, by_tilt = (
+        _differences(problem, state, [replace(t, **{axis: getattr(t, axis) + STEP}) for t in images], here)
+        for axis in ("pan_rad", "tilt_rad")
+    )
+    return [np.stack(both, axis=1) for both in zip(by_pan, by_tilt, strict=True)]
 
 
-def _difference(
-    problem: Adjustment, state: Estimate, moved: Estimate, image: ImageTerm, residual: FloatArray
-) -> FloatArray:
+def _differences(
+    problem: Adjustment, moved: Estimate, images: Sequence[ImageTerm], here: Sequence[FloatArray]
+) -> list[FloatArray]:
     """How residuals change with something that was moved by a small step."""
-    return np.asarray((problem.image_residual(moved, image) - residual) / STEP)
-
-
-def _with(state: Estimate, image: ImageTerm, camera: CameraModel) -> Estimate:
-    return replace(state, cameras={**state.cameras, image.camera: camera})
+    there = problem.image_residuals(moved, images)
+    return [(after - before) / STEP for before, after in zip(here, there, strict=True)]

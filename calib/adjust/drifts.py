@@ -77,7 +77,7 @@ def find_drifts(problem: Adjustment, state: Estimate) -> tuple[BenchDrift, ...]:
     problem, state
         A fit at its minimum.
     """
-    rows = [rows_of(problem, state, image) for image in problem.images if image.keep.any()]
+    rows = rows_of(problem, state)
     passed = {row.image.name: k / max(len(rows) - 1, 1) for k, row in enumerate(rows)}
     chi2, matrix, gradient = problem.normal(state)
     covariance = covariance_of(matrix, problem.weak)
@@ -147,7 +147,7 @@ def by_other_placements(problem: Adjustment, state: Estimate) -> tuple[OtherPlac
     boards = list(dict.fromkeys(image.board for image in images))
     found = []
     for board in boards if len(boards) > 1 else ():
-        blocks = [problem.image_block(state, image) for image in images if image.board == board]
+        blocks = problem.image_blocks(state, [image for image in images if image.board == board])
         columns = np.unique(np.concatenate([block.columns for block in blocks]))
         residual = np.concatenate([block.residual for block in blocks])
         jacobian = np.zeros((len(residual), len(columns)))

@@ -26,7 +26,7 @@ from calib.adjust.adjustment import Adjustment
 from calib.adjust.left_out import REDUNDANT, LeftOut, dot_statistics, left_out
 from calib.adjust.significance import typical_scale
 from calib.adjust.terms import ImageTerm, StationTerm
-from calib.adjust.unknowns import Estimate
+from calib.adjust.unknowns import Estimate, ResidualBlock
 from calib.geometry.rigid import FloatArray, moved_rigid
 
 
@@ -177,6 +177,8 @@ def name_outliers(
 ) -> tuple[Outlier, ...]:
     """Return everything that the problem leaves out, with the statistic it was left out for and its limit."""
     found: list[Outlier] = []
+    if all(t.keep.all() for t in problem.images) and all(p.keep for p in problem.station):
+        return ()
     seen, points, limits = _tested(problem, state, covariance, all_images)
     for whole, term, judged in zip(all_images, problem.images, seen, strict=True):
         if term.keep.all():
@@ -230,10 +232,13 @@ def _tested(
 ) -> tuple[list[JudgedImage], list[JudgedPoint], _Limits]:
     """Every image and every station point, and the limits."""
     seen = [
-        _image(problem, state, covariance, whole, term)
-        for whole, term in zip(all_images, problem.images, strict=True)
+        _image(covariance, block, term, problem.huber)
+        for block, term in zip(problem.image_blocks(state, all_images), problem.images, strict=True)
     ]
-    points = [_point(problem, state, covariance, term) for term in problem.station]
+    points = [
+        _point(covariance, block, term)
+        for block, term in zip(problem.station_blocks(state, problem.station), problem.station, strict=True)
+    ]
     kept = [one.dots[t.keep] for one, t in zip(seen, problem.images, strict=True) if t.keep.any()]
     whole = [
         np.array([p.statistic])
@@ -247,21 +252,17 @@ def _tested(
     return seen, points, _Limits(count, len(seen), len(points), *scales)
 
 
-def _image(
-    problem: Adjustment, state: Estimate, covariance: FloatArray, whole: ImageTerm, term: ImageTerm
-) -> JudgedImage:
+def _image(covariance: FloatArray, block: ResidualBlock, term: ImageTerm, huber: float | None) -> JudgedImage:
     """An image with all its dots, of which some may be fitted."""
-    block = problem.image_block(state, whole)
     mine = covariance[np.ix_(block.columns, block.columns)]
     return JudgedImage(
         dot_statistics(block.residual, block.jacobian, mine, term.keep),
-        left_out(block, mine, term.keep, problem.huber),
+        left_out(block, mine, term.keep, huber),
     )
 
 
-def _point(problem: Adjustment, state: Estimate, covariance: FloatArray, term: StationTerm) -> JudgedPoint:
+def _point(covariance: FloatArray, block: ResidualBlock, term: StationTerm) -> JudgedPoint:
     """The statistic of a prism or tape, in the directions in which the rest of the survey checks it."""
-    block = problem.station_block(state, term)
     mine = covariance[np.ix_(block.columns, block.columns)]
     spread = block.jacobian @ mine @ block.jacobian.T
     values, vectors = np.linalg.eigh(np.eye(3) + (-spread if term.keep else spread))
@@ -291,8 +292,8 @@ def _board_misfit(
     tapes = [p for p in problem.station if p.board == board and p.keep]
     cost = float("inf")
     for _ in range(BOARD_STEPS):
-        blocks = [problem.image_block(state, problem.images[i]) for i in images]
-        blocks += [problem.station_block(state, p) for p in tapes]
+        blocks = problem.image_blocks(state, [problem.images[i] for i in images])
+        blocks += problem.station_blocks(state, tapes)
         cost = float(sum(b.residual @ b.residual for b in blocks))
         if not np.isfinite(cost):
             return float("inf")

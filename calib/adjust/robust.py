@@ -131,6 +131,6 @@ def typical_length(
     sigma counts as less than ``least_px``."""
     own_px = np.concatenate([t.sigma_px[t.keep] for t in images])
     told_px = np.maximum(own_px, least_px)
-    residuals = np.concatenate([problem.image_residual(state, t).reshape(-1, 2) for t in images])
+    residuals = np.concatenate([r.reshape(-1, 2) for r in problem.image_residuals(state, images)])
     lengths = np.linalg.norm(residuals, axis=1) * own_px / told_px
     return float(np.sqrt(typical_scale(lengths**2))), float(np.median(told_px))

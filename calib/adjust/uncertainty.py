@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,11 +36,12 @@ def image_residuals(
     """Return what remains of every image with dots; for a check image, the joint angles as read."""
     used = {t.name: t.keep for t in problem.images}
     by_name = {i.name: i for i in survey.images}
+    terms = [replace(t, keep=np.ones_like(t.keep)) for t in (*all_images, *checks)]
     found = []
-    for term in (*all_images, *checks):
+    for term, off in zip(terms, problem.image_residuals(state, terms), strict=True):
         image = by_name[term.name]
         keep = used.get(term.name)
-        residual = residual_px(problem, state, term)
+        residual = off.reshape(-1, 2) * term.sigma_px[:, None]
         centre, facing = _seen_from(problem, state, term)
         found.append(
             ImageResiduals(
@@ -63,19 +65,13 @@ def image_residuals(
     return tuple(found)
 
 
-def residual_px(problem: Adjustment, state: Estimate, term: ImageTerm) -> FloatArray:
-    """Return predicted less measured pixels (n, 2) of every dot of an image."""
-    pixels, _ = state.cameras[term.camera].project(problem.in_camera(state, term))
-    return np.asarray(pixels - term.pixels_px)
-
-
 def _seen_from(problem: Adjustment, state: Estimate, term: ImageTerm) -> tuple[FloatArray, FloatArray]:
     """The board's centre from the camera's C, and its normal; rover-frame directions."""
     board = state.rover_from_board[term.board]
     centre = state.cameras[term.camera].C
     if term.attitude is not None:
-        head = gimbal(state.mast, *problem.joints(state, term))
-        centre = head.rotation @ centre + head.translation_m
+        head = problem.head(state, [term])
+        centre = head.rotation[0] @ centre + head.translation_m[0]
     return board.translation_m - centre, board.rotation[:, 2]
 
 

@@ -168,24 +168,6 @@ class ResidualBlock:
     width: int
     parts: Mapping[Key, slice] = field(default_factory=dict)
 
-    @classmethod
-    def of(
-        cls,
-        unknowns: Unknowns,
-        residual: FloatArray,
-        rates: Mapping[Key, FloatArray],
-        width: int,
-        sigma: float | FloatArray = 1.0,
-    ) -> ResidualBlock:
-        """Return the block of residuals (m,) that change at ``rates`` over ``sigma``, (..., k) by unknown."""
-        parts, first = {}, 0
-        for key, one in rates.items():
-            parts[key] = slice(first, first + one.shape[-1])
-            first += one.shape[-1]
-        columns = np.concatenate([unknowns.at(key) for key in rates])
-        jacobian = np.concatenate(list(rates.values()), axis=-1) / sigma
-        return cls(residual, jacobian.reshape(len(residual), first), columns, width, parts)
-
     def rates(self, key: Key) -> FloatArray:
         """Return how the residuals change with one unknown, (m, k)."""
         return self.jacobian[:, self.parts[key]]

@@ -21,7 +21,7 @@ from calib.adjust.score import Beside, Gain, Score, scored
 from calib.adjust.significance import chance
 from calib.adjust.terms import DRAWING, ImageTerm
 from calib.adjust.unknowns import Estimate, ResidualBlock
-from calib.geometry.rig import MAST_NAMES, Gimbal, gimbal, gimbal_rates
+from calib.geometry.rig import MAST_NAMES, Gimbal, gimbal_rates
 from calib.geometry.rigid import FloatArray, rigid_rates
 
 FALSE_ALARMS = 0.0003
@@ -93,7 +93,9 @@ def wider_models(
     covariance, gradient
         (p, p) and (p,) of its unknowns there.
     """
-    views = [_View.of(problem, state, image) for image in problem.images if image.keep.any()]
+    images = [image for image in problem.images if image.keep.any()]
+    blocks = problem.image_blocks(state, images)
+    views = [_View.of(problem, state, *one) for one in zip(images, blocks, strict=True)]
     if not views:
         return ()
     tests = _Tests(problem, state, covariance, gradient, views)
@@ -137,11 +139,12 @@ class _View:
     head: Gimbal | None
 
     @classmethod
-    def of(cls, problem: Adjustment, state: Estimate, image: ImageTerm) -> _View:
-        block = problem.image_block(state, image)
+    def of(cls, problem: Adjustment, state: Estimate, image: ImageTerm, block: ResidualBlock) -> _View:
         board = state.rover_from_board[image.board]
         in_board = image.in_board_m[image.keep]
-        head = None if image.attitude is None else gimbal(state.mast, *problem.joints(state, image))
+        head = None
+        if image.attitude is not None:
+            head = Gimbal(*(part[0] for part in problem.head(state, [image])))
         # A board's shift, after its turn, moves every point alike.
         per_point = block.rates(("board", image.board))[:, 3:].reshape(len(in_board), 2, 3)
         return cls(image, block, per_point, board.points(in_board), board.rotation, in_board, head)
@@ -355,7 +358,7 @@ class _Tests:
             score = Score(6, len(self.gradient))
             for point in mine:
                 rates = rigid_rates(eye, pose.points(point.in_board_m)[None], pose.translation_m)[0]
-                block = self.problem.station_block(self.state, point)
+                block = self.problem.station_blocks(self.state, [point])[0]
                 score.add(block, -rates / point.sigma_m)
             gains[key] = score.beside(self.covariance, self.gradient).gain()
         if not gains:
@@ -378,7 +381,7 @@ class _Tests:
         names = list(dict.fromkeys(point.point for point in mine))
         score = Score(3 * len(names), len(self.gradient))
         for point in mine:
-            block = self.problem.station_block(self.state, point)
+            block = self.problem.station_blocks(self.state, [point])[0]
             score.add(block, -np.eye(3) / point.sigma_m, 3 * names.index(point.point) + np.arange(3))
         # All prisms moved as one body are another rover frame, which no survey tells.
         places = np.array([self.state.prisms_in_rover_m[name] for name in names])

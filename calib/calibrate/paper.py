@@ -106,7 +106,7 @@ class TwoSteps:
         for point in problem.station:
             if not point.keep:
                 continue
-            block = problem.station_block(self.state, point)
+            block = problem.station_blocks(self.state, [point])[0]
             matrix[np.ix_(block.columns, block.columns)] += block.jacobian.T @ block.jacobian
         for what, block in problem.known(self.state):
             if what.kind is not None:

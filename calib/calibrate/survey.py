@@ -82,9 +82,7 @@ def joint_problem(survey: Survey, from_here: Start, mast_parameters: int) -> Adj
         joint_rad=survey.sigma.joint_rad,
         huber=HUBER,
     )
-    unseen = {
-        t.name for t in problem.images if not np.isfinite(problem.image_residual(from_here.estimate, t)).all()
-    }
+    unseen = problem.unseen(from_here.estimate)
     return problem.with_terms(with_kept(problem.images, unseen), problem.station)
 
 

@@ -31,7 +31,7 @@ from calib.geometry.lenses import fisheye, opencv
 from calib.geometry.lenses.fisheye import FisheyeLens
 from calib.geometry.lenses.opencv import OpencvLens
 from calib.geometry.lenses.projection import FreeLens
-from calib.geometry.rigid import FloatArray, tangents
+from calib.geometry.rigid import FloatArray, crossed_rows, tangents
 
 _LETTERS = {
     "C": ("C.x", "C.y", "C.z"),
@@ -112,141 +112,115 @@ def stepped(model: CameraModel, step: FloatArray) -> CameraModel:
 def predict(model: CameraModel, points_m: FloatArray) -> Prediction:
     """Return pixels of points (n, 3), metres in the model's frame, with derivatives.
 
-    Points that have no pixel come out as not-a-number.
+    Points that have no pixel come out as not-a-number. Each number's values of all points lie side by side in
+    memory, so that numpy's loops run along them.
     """
-    if model.free_lens is not None:
-        return _predict_free(model, model.free_lens, points_m)
-    o, axis = model.O, model.A
-    lens = model.lens
-    d = points_m - model.C
-    zeta = d @ o
-    lam = d - zeta[:, None] * o
+    points = np.array(np.asarray(points_m).T, order="C")
+    points -= model.C[:, None]
     with np.errstate(all="ignore"):
-        bent = bend(lens, np.stack([*_across(lam, o), zeta]), True)
-        if bent.derivatives is None:
-            raise AssertionError("bend was asked for derivatives")
-        m, n, k, _ = bent.derivatives
-        # dm = n lambda . d lambda + k d zeta; bend gives its rates to a point scaled to unit length.
-        unit = np.maximum(np.linalg.norm(lam, axis=1), TINY) if lens.curved else zeta
-        n, k = n / (unit * unit), k / unit
-        q = o + m[:, None] * lam
-        depth = q @ axis
-        pixels = np.stack([q @ model.H, q @ model.V], axis=-1) / depth[:, None]
-        valid = bent.valid & (depth > 0.0) & np.isfinite(pixels).all(axis=-1)
-        if not lens.curved:
-            valid = valid & (d @ axis > 0.0)
-        # d pixel / d q: (H - x A) / depth and (V - y A) / depth
-        d_q = np.stack(
-            [model.H - pixels[:, :1] * axis, model.V - pixels[:, 1:] * axis], axis=1
-        ) / depth[:, None, None]  # fmt: skip
-        along = d_q @ o
-        across = np.einsum("nij,nj->ni", d_q, lam)
-        d_points = (
-            m[:, None, None] * (d_q - along[..., None] * o)
-            + across[..., None] * (n[:, None] * lam + k[:, None] * o)[:, None, :]
-        )
-        d_step = _to_step(
-            model, lens, Slopes(d_q, q / depth[:, None], pixels, along, across), lam, zeta, m, n, k
-        )
+        if model.free_lens is not None:
+            pixels, d_step, d_points, valid = _predict_free(model, model.free_lens, points)
+        else:
+            pixels, d_step, d_points, valid = _predict_radial(model, points)
     if not valid.all():
         for array in (pixels, d_step, d_points):
-            array[~valid] = np.nan
-    return Prediction(pixels, d_step, d_points, valid)
+            array[..., ~valid] = np.nan
+    return Prediction(pixels.T, d_step.transpose(2, 0, 1), d_points.transpose(2, 0, 1), valid)
 
 
-def _predict_free(model: CameraModel, lens: FreeLens, points_m: FloatArray) -> Prediction:
-    """The same for a camera of OpenCV's families."""
+_Predicted = tuple[FloatArray, FloatArray, FloatArray, np.ndarray]
+"""Pixels (2, n), d pixel / d step (2, p, n), d pixel / d point (2, 3, n), and which are valid (n,)."""
+
+
+def _predict_radial(model: CameraModel, d: FloatArray) -> _Predicted:
+    """CAHV, CAHVOR and CAHVORE of points (3, n) from C."""
+    kind, lens, o, axis = model.kind, model.lens, model.O, model.A
+    on_a, on_o = tangents(axis), tangents(o)
+    both = np.stack([model.H, model.V])
+    zeta = o @ d
+    lam = d - o[:, None] * zeta
+    across_o = on_o @ lam
+    bent = bend(lens, np.concatenate([across_o, zeta[None]]), True)
+    if bent.derivatives is None:
+        raise AssertionError("bend was asked for derivatives")
+    m, n, k, _ = bent.derivatives
+    # dm = n lambda . d lambda + k d zeta; bend gives its rates to a point scaled to unit length.
+    unit = np.maximum(np.sqrt(_dot(lam, lam)), TINY) if lens.curved else zeta
+    n, k = n / (unit * unit), k / unit
+    q = o[:, None] + m * lam
+    depth = axis @ q
+    pixels = (both @ q) / depth
+    valid = bent.valid & (depth > 0.0) & np.isfinite(pixels).all(axis=0)
+    if not lens.curved:
+        valid &= axis @ d > 0.0
+    # d pixel / d q: (H - x A) / depth and (V - y A) / depth
+    d_q = (both[..., None] - pixels[:, None] * axis[:, None]) / depth
+    along, across = o @ d_q, _dot(d_q, lam)
+    d_points = m * (d_q - along[:, None] * o[:, None])
+    d_points += across[:, None] * (n * lam + k * o[:, None])
+    d_step = np.zeros((2, len(parameter_names(kind)), len(zeta)))
+
+    def to(letter: str) -> FloatArray:
+        return d_step[:, parameter_part(kind, letter)]
+
+    q /= depth
+    np.negative(d_points, out=to("C"))
+    np.multiply(-pixels[:, None], on_a @ q, out=to("A"))
+    to("H")[0] = to("V")[1] = q
+    if "O" in kind:  # a CAHV camera keeps O = A, but a step along O moves no pixel of it
+        turn = (k - n * zeta) * across - m * along
+        np.multiply(1.0 - m * zeta, on_o @ d_q, out=to("O"))
+        to("O")[...] += turn[:, None] * across_o
+        per_r, per_e = _lens_rates(lens, lam, zeta)
+        np.multiply(across[:, None], per_r, out=to("R"))
+        if "E" in kind:
+            np.multiply(across[:, None], per_e, out=to("E"))
+    return pixels, d_step, d_points, valid
+
+
+def _predict_free(model: CameraModel, lens: FreeLens, d: FloatArray) -> _Predicted:
+    """The same of OpenCV's families."""
     kind, axes, matrix = model.kind, model.rotation, model.camera_matrix
     x, _, z = axes
-    d = points_m - model.C
-    local = np.ascontiguousarray((d @ axes.T).T)
-    d_step = np.zeros((len(d), 2, len(parameter_names(kind))))
-    with np.errstate(all="ignore"):
-        bent = lens.bend(local, True)
-        if bent.rates is None:
-            raise AssertionError("bend was asked for derivatives")
-        pixels = (matrix[:2, :2] @ bent.slopes + matrix[:2, 2:]).T
-        valid = bent.valid & np.isfinite(pixels).all(axis=-1)
-        d_points = np.einsum("ij,jkn->nik", matrix[:2, :2], bent.rates) @ axes
-        q = bent.slopes.T @ axes[:2] + z
-        d_q = np.stack([model.H - pixels[:, :1] * z, model.V - pixels[:, 1:] * z], axis=1)
-        d_turn = np.cross(q[:, None], d_q) - np.cross(d[:, None], d_points)
-        d_step[..., parameter_part(kind, "C")] = -d_points
-        on_a, (_, fy, cy) = tangents(model.A), matrix[1]
-        turns = np.stack([-on_a @ axes[1], on_a @ x, cy / fy * (on_a @ x)], axis=1) @ axes
-        d_step[..., parameter_part(kind, "A")] = (
-            d_turn @ turns.T - pixels[..., None] * (q @ on_a.T)[:, None, :]
-        )
-        d_step[:, 0, parameter_part(kind, "H")] = q
-        d_step[..., parameter_part(kind, "V")] = (d_turn @ z)[..., None] * (-x / fy)
-        d_step[:, 1, parameter_part(kind, "V")] += q
-        if isinstance(lens, (OpencvLens, FisheyeLens)):  # splines are read, not fitted
-            d_step[..., parameter_part(kind, "D")] = np.einsum(
-                "ij,jkn->nik", matrix[:2, :2], lens.coefficient_rates(local)
-            )
-    if not valid.all():
-        for array in (pixels, d_step, d_points):
-            array[~valid] = np.nan
-    return Prediction(pixels, d_step, d_points, valid)
+    focal = matrix[:2, :2]
+    local = axes @ d
+    bent = lens.bend(local, True)
+    if bent.rates is None:
+        raise AssertionError("bend was asked for derivatives")
+    pixels = focal @ bent.slopes + matrix[:2, 2:]
+    valid = bent.valid & np.isfinite(pixels).all(axis=0)
+    d_points = axes.T @ np.tensordot(focal, bent.rates, 1)
+    q = axes[:2].T @ bent.slopes + z[:, None]
+    d_q = np.stack([model.H, model.V])[..., None] - pixels[:, None] * z[:, None]
+    d_turn = crossed_rows(q, d_q) - crossed_rows(d, d_points)
+    d_step = np.zeros((2, len(parameter_names(kind)), d.shape[1]))
+
+    def to(letter: str) -> FloatArray:
+        return d_step[:, parameter_part(kind, letter)]
+
+    np.negative(d_points, out=to("C"))
+    on_a, (_, fy, cy) = tangents(model.A), matrix[1]
+    turns = np.stack([-on_a @ axes[1], on_a @ x, cy / fy * (on_a @ x)], axis=1) @ axes
+    np.subtract(turns @ d_turn, pixels[:, None] * (on_a @ q), out=to("A"))
+    to("H")[0] = q
+    np.multiply((z @ d_turn)[:, None], (-x / fy)[:, None], out=to("V"))
+    to("V")[1] += q
+    if isinstance(lens, (OpencvLens, FisheyeLens)):  # splines are read, not fitted
+        to("D")[...] = np.tensordot(focal, lens.coefficient_rates(local), 1)
+    return pixels, d_step, d_points, valid
 
 
-class Slopes(NamedTuple):
-    """d pixel / d q (n, 2, 3), q / (A.q) (n, 3), pixels (n, 2), and d_q along O and times lambda (n, 2)."""
-
-    d_q: FloatArray
-    q: FloatArray
-    pixels: FloatArray
-    along: FloatArray
-    across: FloatArray
-
-
-def _across(lam: FloatArray, o: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Lambda's two coordinates across O."""
-    one, two = tangents(o)
-    return lam @ one, lam @ two
-
-
-def _to_step(
-    model: CameraModel,
-    lens: Lens,
-    s: Slopes,
-    lam: FloatArray,
-    zeta: FloatArray,
-    m: FloatArray,
-    n: FloatArray,
-    k: FloatArray,
-) -> FloatArray:
-    """d pixel / d step (n, 2, p)."""
-    kind, o = model.kind, model.O
-    count = len(lam)
-    out = np.zeros((count, 2, len(parameter_names(kind))))
-    out[..., parameter_part(kind, "C")] = -(
-        m[:, None, None] * (s.d_q - s.along[..., None] * o)
-        + s.across[..., None] * (n[:, None] * lam + k[:, None] * o)[:, None, :]
-    )
-    on_a = tangents(model.A)
-    out[..., parameter_part(kind, "A")] = -s.pixels[..., None] * (s.q @ on_a.T)[:, None, :]
-    out[:, 0, parameter_part(kind, "H")] = s.q
-    out[:, 1, parameter_part(kind, "V")] = s.q
-    if "O" not in kind:
-        # A CAHV camera keeps O = A, but a step along O moves no pixel of it.
-        return out
-    on_o = tangents(o)
-    turn = ((k - n * zeta)[:, None] * s.across - m[:, None] * s.along)[..., None] * (lam @ on_o.T)[:, None, :]
-    out[..., parameter_part(kind, "O")] = (1.0 - m * zeta)[:, None, None] * (s.d_q @ on_o.T) + turn
-    per_r, per_e = _lens_rates(lens, lam, zeta)
-    out[..., parameter_part(kind, "R")] = s.across[..., None] * per_r[:, None, :]
-    if "E" in kind:
-        out[..., parameter_part(kind, "E")] = s.across[..., None] * per_e[:, None, :]
-    return out
+def _dot(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Products (..., n) of vectors (..., 3, n)."""
+    return np.asarray((one * other).sum(axis=-2))
 
 
 def _lens_rates(lens: Lens, lam: FloatArray, zeta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """dm / d(r1, r2) (n, 2) and dm / d(e0, e1, e2) (n, 3); none of the latter for CAHVOR."""
-    length = np.sqrt(np.einsum("ni,ni->n", lam, lam))
+    """dm / d(r1, r2) (2, n) and dm / d(e0, e1, e2) (3, n); none of the latter for CAHVOR."""
+    length = np.sqrt(_dot(lam, lam))
     if not lens.curved:
         tau = (length / zeta) ** 2
-        return np.stack([tau / zeta, tau * tau / zeta], axis=-1), np.zeros((len(lam), 0))
+        return np.stack([tau / zeta, tau * tau / zeta]), np.zeros((0, len(zeta)))
     length = np.maximum(length, 1e-150)
     theta, sine, _, slope, _ = ray_angle(lens, length, zeta, True)
     line = lens.linearity
@@ -264,6 +238,6 @@ def _lens_rates(lens: Lens, lam: FloatArray, zeta: FloatArray) -> tuple[FloatArr
     per_e = (theta - sine) / slope * rate
     turn = theta * theta
     return (
-        np.stack([chi * y, chi * y * y], axis=-1) / length[:, None],
-        np.stack([per_e, per_e * turn, per_e * turn * turn], axis=-1),
+        np.stack([chi * y, chi * y * y]) / length,
+        np.stack([per_e, per_e * turn, per_e * turn * turn]),
     )

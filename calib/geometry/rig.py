@@ -30,6 +30,7 @@ from calib.geometry.rigid import (
     crossed,
     finite_float,
     frozen_array,
+    rigid_rates,
     rot_x,
     rot_y,
     rot_z,
@@ -351,31 +352,44 @@ def numbers_of(mast: Mast) -> FloatArray:
 
 
 class Gimbal(NamedTuple):
-    """rover_from_head and its rates: what turns about which axis through which point, in the rover frame."""
+    """rover_from_head, of one pair of joint angles or of many (...), and what moves it.
+
+    ``twists`` (..., 10, 6) say how it moves with the eight numbers of the mast, pan and tilt: a turn, and the
+    shift of what is carried through the rover's origin.
+    """
 
     rotation: FloatArray
     translation_m: FloatArray
-    axes: FloatArray
-    """(10, 3): the eight numbers of the mast, pan, tilt; for a shift its direction, for an angle its axis."""
-    mast_origin_m: FloatArray
+    twists: FloatArray
 
 
-_ABOUT_MAST, _ABOUT_HEAD = (3, 4, 5, 8), (7, 9)
-"""Which of a gimbal's ten numbers are angles about axes through the mast's or the head's origin."""
-
-
-def gimbal(mast: FloatArray, pan_rad: float, tilt_rad: float) -> Gimbal:
-    """Return rover_from_head of the mast's eight numbers at joint angles, with its rates."""
+def gimbal(mast: FloatArray, pan_rad: float | FloatArray, tilt_rad: float | FloatArray) -> Gimbal:
+    """Return rover_from_head of the mast's eight numbers at joint angles (...), with its rates."""
     x = rot_x(mast[3])
     xy = x @ rot_y(mast[4])
     xyz = xy @ rot_z(mast[5])
-    panned = xyz @ rot_z(pan_rad)
-    twisted = panned @ rot_x(mast[7])
+    ahead, beside, down = xyz.T
+    along, across = _turned(ahead, beside, pan_rad)
+    lying, standing = _turned(across, np.broadcast_to(down, across.shape), mast[7])
+    lowered, forward = _turned(standing, along, tilt_rad)
     origin = mast[:3]
-    place = origin + mast[6] * panned[:, 0]
-    eye = np.eye(3)
-    axes = np.array([*eye, eye[0], x[:, 1], xy[:, 2], panned[:, 0], panned[:, 0], xyz[:, 2], twisted[:, 1]])
-    return Gimbal(twisted @ rot_y(tilt_rad), place, axes, origin)
+    place = origin + mast[6] * along
+    twists = np.zeros((*along.shape[:-1], 10, 6))
+    twists[..., [0, 1, 2], [3, 4, 5]] = 1.0
+    twists[..., 6, 3:] = along
+    axes = ((3, x[:, 0], origin), (4, x[:, 1], origin), (5, xy[:, 2], origin), (7, along, place))
+    for number, axis, through in (*axes, (8, down, origin), (9, lying, place)):
+        twists[..., number, :3] = axis
+        twists[..., number, 3:] = crossed(through, axis)
+    return Gimbal(np.stack([forward, lying, lowered], axis=-1), place, twists)
+
+
+def _turned(
+    one: FloatArray, other: FloatArray, angle_rad: float | FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Two vectors (..., 3) at right angles, turned from the first to the second."""
+    c, s = np.asarray(np.cos(angle_rad))[..., None], np.asarray(np.sin(angle_rad))[..., None]
+    return c * one + s * other, c * other - s * one
 
 
 def gimbal_rates(per_point: FloatArray, points_m: FloatArray, head: Gimbal, wanted: np.ndarray) -> FloatArray:
@@ -383,10 +397,4 @@ def gimbal_rates(per_point: FloatArray, points_m: FloatArray, head: Gimbal, want
 
     ``wanted`` (k,) picks from a gimbal's ten numbers.
     """
-    about_mast = crossed((points_m - head.mast_origin_m)[:, None, :], per_point)
-    about_head = crossed((points_m - head.translation_m)[:, None, :], per_point)
-    columns = []
-    for index in wanted:
-        kind = about_head if index in _ABOUT_HEAD else about_mast if index in _ABOUT_MAST else per_point
-        columns.append(kind @ head.axes[index])
-    return np.stack(columns, axis=-1) if columns else np.zeros((*per_point.shape[:2], 0))
+    return np.asarray(rigid_rates(per_point, points_m, np.zeros(3)) @ head.twists[wanted].T)

@@ -247,3 +247,16 @@ def rigid_rates(per_point: FloatArray, points_m: FloatArray, origin_m: FloatArra
     arm = (points_m - origin_m)[:, None, :]
     moment = crossed(arm, per_point)
     return np.concatenate([moment, np.broadcast_to(per_point, moment.shape)], axis=2)
+
+
+def rigid_twists(origin_m: FloatArray) -> FloatArray:
+    """Return (..., 6, 6) turns about ``origin_m`` (..., 3) and shifts, each as a turn about 0 and a shift."""
+    twists = np.zeros((*origin_m.shape[:-1], 6, 6)) + np.eye(6)
+    twists[..., :3, 3:] = crossed(origin_m[..., None, :], np.eye(3))
+    return twists
+
+
+def crossed_rows(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return the cross products (..., 3, n) of vectors (3, n) and (..., 3, n)."""
+    (a, b, c), (d, e, f) = one, np.moveaxis(other, -2, 0)
+    return np.stack([b * f - c * e, c * d - a * f, a * e - b * d], axis=-2)

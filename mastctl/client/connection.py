@@ -18,10 +18,11 @@ from abc import ABC, abstractmethod
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 from urllib.parse import unquote, urlsplit
 
-import httpx
+if TYPE_CHECKING:
+    import httpx
 
 T = TypeVar("T")
 
@@ -209,6 +210,8 @@ class DaemonConnection(ABC):
     @contextmanager
     def _failures(self, silent: str) -> Iterator[None]:
         """What a connection may meet, as ClientError."""
+        import httpx
+
         try:
             yield
         except ValueError as error:  # numbers that JSON does not have
@@ -236,6 +239,8 @@ class DaemonConnection(ABC):
 
     def _made(self, kind: Callable[..., T], transport: Callable[..., object]) -> T:
         """Make the client of httpx. Raises ClientError ``bad_url``."""
+        import httpx
+
         path = self.socket_path
         base = "http://localhost" if path is not None else self.url.rstrip("/")
         try:
@@ -295,6 +300,8 @@ class DaemonHttp(DaemonConnection):
 
     def __init__(self, url: str, timeout_s: float, name: str | None = None, token: str | None = None) -> None:
         super().__init__(url, timeout_s, name, token)
+        import httpx  # slow to load: it brings rich and click along where they are installed
+
         self._http = self._made(httpx.Client, httpx.HTTPTransport)
 
     async def _request(self, method: str, path: str, options: Mapping[str, Any]) -> httpx.Response:
@@ -329,6 +336,8 @@ class AsyncDaemonHttp(DaemonConnection):
 
     def __init__(self, url: str, timeout_s: float, name: str | None = None, token: str | None = None) -> None:
         super().__init__(url, timeout_s, name, token)
+        import httpx
+
         self._http = self._made(httpx.AsyncClient, httpx.AsyncHTTPTransport)
 
     async def _request(self, method: str, path: str, options: Mapping[str, Any]) -> httpx.Response:

@@ -94,11 +94,12 @@ def drawn_squares(
     """Return the sums of squares, px², of a camera's check pictures (benches,)."""
     squares = np.zeros(len(steps))
     exact, state = weighed.problem.at_rest(), weighed.fit.state
-    for term in terms:
-        block = exact.image_block(state, term)
+    blocks = exact.image_blocks(state, terms)
+    by_reading = reading_rates(exact, state, terms, [block.residual for block in blocks])
+    for term, block, read in zip(terms, blocks, by_reading, strict=True):
         readings = rng.uniform(-(3**0.5), 3**0.5, (len(steps), 2)) * weighed.problem.joint_rad
         off = rng.standard_normal((len(steps), len(block.residual)))
-        off += steps[:, block.columns] @ block.jacobian.T + readings @ reading_rates(exact, state, term).T
+        off += steps[:, block.columns] @ block.jacobian.T + readings @ read.T
         squares += np.sum((off * np.repeat(term.sigma_px, 2)) ** 2, axis=1)
     return squares
 

@@ -190,11 +190,11 @@ def _refuse_slip(bench: BenchProblem, state: Estimate) -> None:
 def _without_lone_strays(problem: Adjustment, state: Estimate) -> Adjustment:
     """Leave out corners far off in images of which most corners are less so."""
     terms = []
-    for t in problem.images:
+    for t, residual in zip(problem.images, problem.image_residuals(state, problem.images), strict=True):
         if not t.keep.any():
             terms.append(t)
             continue
-        length = np.linalg.norm(problem.image_residual(state, t).reshape(-1, 2), axis=1)
+        length = np.linalg.norm(residual.reshape(-1, 2), axis=1)
         keep = t.keep.copy()
         keep[keep] = length < LONE * max(float(np.median(length)), 1.0)
         terms.append(replace(t, keep=keep))

@@ -305,8 +305,7 @@ class BenchProblem:
     def seen(self, chosen: Sequence[str], start: Estimate) -> Adjustment:
         """The problem without images whose corners have no pixel at the start."""
         problem = self.problem(chosen, start)
-        unseen = {t.name for t in problem.images if not np.isfinite(problem.image_residual(start, t)).all()}
-        return problem.with_terms(with_kept(problem.images, unseen), ())
+        return problem.with_terms(with_kept(problem.images, problem.unseen(start)), ())
 
     def allow_inexact(self, problem: Adjustment, state: Estimate) -> bool:
         """Take corners for as inexact on the board as a fit shows them, where their own sigmas are less.
@@ -315,14 +314,13 @@ class BenchProblem:
         What is added stays below ``corner_px``: more is no print. Returns whether sigmas changed.
         """
         every = (*self.terms.images, *self.terms.checks)
-        per_m = {t.name: _px_per_m(problem, state, t) for t in every}
+        per_m = _px_per_m(problem, state, every)
         kept = [t for t in problem.images if t.keep.any()]
         own = np.concatenate([self.own_px[t.name][t.keep] for t in kept])
         scale = np.concatenate([per_m[t.name][t.keep] for t in kept])
-        off_px = np.concatenate(
-            [problem.image_residual(state, t).reshape(-1, 2) * t.sigma_px[t.keep, None] for t in kept]
-        )
-        square = np.sum(off_px**2, axis=1)
+        sigma_px = np.concatenate([t.sigma_px[t.keep] for t in kept])
+        off = np.concatenate(problem.image_residuals(state, kept)).reshape(-1, 2)
+        square = np.sum(off**2, axis=1) * sigma_px**2
 
         def typical(inexact_m: float) -> float:
             return typical_scale(square / (own**2 + (inexact_m * scale) ** 2))
@@ -362,11 +360,10 @@ class BenchProblem:
         return tuple(found)
 
 
-def _px_per_m(problem: Adjustment, state: Estimate, term: ImageTerm) -> FloatArray:
-    """How many pixels (n,) a metre across the line of sight is where each corner of an image is."""
-    camera = state.cameras[term.camera]
-    away_m = np.linalg.norm(problem.in_camera(state, term) - camera.C, axis=1)
-    return np.asarray(camera.focal_px[0] / away_m)
+def _px_per_m(problem: Adjustment, state: Estimate, terms: Sequence[ImageTerm]) -> dict[str, FloatArray]:
+    """By image how many pixels (n,) a metre across the line of sight is where each of its corners is."""
+    away_m = problem.away_m(state, [replace(t, keep=np.ones_like(t.keep)) for t in terms])
+    return {t.name: state.cameras[t.camera].focal_px[0] / away_m[t.name] for t in terms}
 
 
 def _one_sided(term: str, joint: str, sides: set[int]) -> str:

@@ -134,15 +134,16 @@ def check_weights(weighed: Weighed, terms: Sequence[ImageTerm]) -> FloatArray:
     exact = problem.at_rest()
     standstills = list(dict.fromkeys((t.pan_rad, t.tilt_rad, t.approach) for t in terms))
     by_all, by_readings, own_px = [], [], []
-    for term in terms:
-        block = exact.image_block(state, term)
+    blocks = exact.image_blocks(state, terms)
+    by_reading = reading_rates(exact, state, terms, [block.residual for block in blocks])
+    for term, block, read in zip(terms, blocks, by_reading, strict=True):
         sigma_px = np.repeat(term.sigma_px[term.keep], 2)[:, None]
         rates = np.zeros((len(sigma_px), len(covariance)))
         rates[:, block.columns] = sigma_px * block.jacobian
         readings = np.zeros((len(sigma_px), len(standstills), 2))
         if term.attitude is not None and problem.joint_rad > 0:
             at = standstills.index((term.pan_rad, term.tilt_rad, term.approach))
-            readings[:, at] = sigma_px * problem.joint_rad * reading_rates(exact, state, term)
+            readings[:, at] = sigma_px * problem.joint_rad * read
         by_all.append(rates)
         by_readings.append(readings.reshape(len(rates), -1))
         own_px.append(scatter.get(term.kind, 1.0) * sigma_px)

@@ -155,8 +155,7 @@ def _image_sizes(residuals_px: FloatArray, images: np.ndarray) -> FloatArray:
 
     By the median: an image in which some points are found elsewhere is judged by the others.
     """
-    count = int(images.max()) + 1
-    return np.array([typical_px(residuals_px[images == i]) for i in range(count)])
+    return typical_px(residuals_px, images, int(images.max()) + 1)
 
 
 def _starts(

@@ -16,8 +16,8 @@ from calib.adjust.significance import typical_px
 from calib.adjust.solver import Normal, minimise
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.rig import MAST_FREE, gimbal, gimbal_rates
-from calib.geometry.rigid import FloatArray
+from calib.geometry.rig import MAST_FREE, gimbal
+from calib.geometry.rigid import FloatArray, crossed, rigid_rates
 
 LEAN_STARTS_RAD = ((0.0, 0.0), (0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3))
 """θx and θy of the starts tried in turn, until one fits."""
@@ -143,21 +143,25 @@ class _Images:
 
     def normal(self, state: FloatArray) -> Normal:
         cost, matrix, gradient = 0.0, np.zeros((len(self.free),) * 2), np.zeros(len(self.free))
-        for view, sigma in zip(self.views, self.sigmas, strict=True):
-            carried, rates = _carried(view, state, self.free)
-            pixels, d_points, _ = view.camera.project_jacobian(carried)
-            residual = ((pixels - view.pixels_px) / sigma[:, None]).ravel()
-            jacobian = np.einsum("nij,njk->nik", d_points, rates) / sigma[:, None, None]
-            jacobian = jacobian.reshape(len(residual), -1)
+        carried, twists = _carried(self.views, state)
+        for mine in _by_camera(self.views):
+            points, sigma = (np.concatenate([parts[i] for i in mine]) for parts in (carried, self.sigmas))
+            pixels, d_points, _ = self.views[mine[0]].camera.project_jacobian(points)
+            off = pixels - np.concatenate([self.views[i].pixels_px for i in mine])
+            by_twist = rigid_rates(d_points, points, np.zeros(3)) / sigma[:, None, None]
+            moving = twists[np.repeat(mine, [len(carried[i]) for i in mine])][:, self.free]
+            residual = (off / sigma[:, None]).ravel()
+            jacobian = (by_twist @ moving.transpose(0, 2, 1)).reshape(len(residual), -1)
             cost += float(residual @ residual)
             matrix += jacobian.T @ jacobian
             gradient += jacobian.T @ residual
         return Normal(cost if np.isfinite(cost) else float("inf"), matrix, gradient)
 
     def cost(self, state: FloatArray) -> float:
+        residuals = _residuals(self.views, state)
         cost = sum(
-            float(np.sum((mast_residual(view, state) / sigma[:, None]) ** 2))
-            for view, sigma in zip(self.views, self.sigmas, strict=True)
+            float(np.sum((off / sigma[:, None]) ** 2))
+            for off, sigma in zip(residuals, self.sigmas, strict=True)
         )
         return cost if np.isfinite(cost) else float("inf")
 
@@ -167,23 +171,35 @@ class _Images:
         return moved
 
 
-def mast_residual(view: MastView, mast: FloatArray) -> FloatArray:
-    """Return predicted less measured pixels (n, 2) of an image, not-a-number where there is no pixel."""
-    pixels, _ = view.camera.project(_carried(view, mast, np.zeros(0, dtype=int))[0])
-    return np.asarray(pixels - view.pixels_px)
+def _by_camera(views: Sequence[MastView]) -> list[list[int]]:
+    """Which images each camera took."""
+    found: dict[int, list[int]] = {}
+    for at, view in enumerate(views):
+        found.setdefault(id(view.camera), []).append(at)
+    return list(found.values())
 
 
-def _carried(view: MastView, mast: FloatArray, free: np.ndarray) -> tuple[FloatArray, FloatArray]:
-    """Points as they would lie in the rover frame were the head at its reference; d / d mast (n, 3, k)."""
-    now, then = gimbal(mast, *view.joints_rad), gimbal(mast, *view.reference_rad)
-    back_from_now = then.rotation @ now.rotation.T
-    carried = (view.points_m - now.translation_m) @ back_from_now.T + then.translation_m
-    if not len(free):
-        return carried, np.zeros((len(carried), 3, 0))
-    eye = np.broadcast_to(np.eye(3), (len(carried), 3, 3))
-    back = np.broadcast_to(back_from_now, (len(carried), 3, 3))
-    rates = gimbal_rates(eye, carried, then, free) - gimbal_rates(back, view.points_m, now, free)
-    return carried, rates
+def _residuals(views: Sequence[MastView], mast: FloatArray) -> list[FloatArray]:
+    """Predicted less measured pixels (n, 2) of each image, not-a-number where there is no pixel."""
+    carried, found = _carried(views, mast)[0], dict[int, FloatArray]()
+    for mine in _by_camera(views):
+        pixels, _ = views[mine[0]].camera.project(np.concatenate([carried[i] for i in mine]))
+        ends = np.cumsum([len(carried[i]) for i in mine])[:-1]
+        found |= dict(zip(mine, np.split(pixels, ends), strict=True))
+    return [found[at] - view.pixels_px for at, view in enumerate(views)]
+
+
+def _carried(views: Sequence[MastView], mast: FloatArray) -> tuple[list[FloatArray], FloatArray]:
+    """Points (n, 3) of each image as they would lie in the rover frame were the head at its reference, and
+    how the mast's eight numbers move them there: twists (images, 10, 6), of which the joints' are none."""
+    now = gimbal(mast, *np.array([view.joints_rad for view in views]).T)
+    then = gimbal(mast, *np.array([view.reference_rad for view in views]).T)
+    turn = then.rotation @ now.rotation.transpose(0, 2, 1)
+    shift = then.translation_m - (turn @ now.translation_m[..., None])[..., 0]
+    carried = [v.points_m @ r.T + t for v, r, t in zip(views, turn, shift, strict=True)]
+    turns, shifts = (part @ turn.transpose(0, 2, 1) for part in np.split(now.twists, 2, axis=2))
+    moved = np.concatenate([turns, shifts + crossed(shift[:, None], turns)], axis=2)
+    return carried, then.twists - moved
 
 
 def _fit_from(
@@ -211,14 +227,15 @@ def _fit_from(
         typical = float(np.median(_typical_px(views, mast))) if last.settled else np.inf
     else:
         kept = list(views)
-    residuals = np.concatenate([mast_residual(view, mast) for view in kept])
+    residuals = np.concatenate(_residuals(kept, mast))
     left_out = tuple(view.name for view, keep in zip(views, good, strict=True) if not keep)
     return typical, MastFit(mast, left_out, np.sqrt((residuals**2).mean(axis=0)), limit_px)
 
 
 def _seen(views: Sequence[MastView], mast: FloatArray) -> Sequence[MastView]:
     """The images whose points all have a pixel, if they are most: another board may lie behind the camera."""
-    seen = [view for view in views if np.isfinite(mast_residual(view, mast)).all()]
+    residuals = _residuals(views, mast)
+    seen = [view for view, off in zip(views, residuals, strict=True) if np.isfinite(off).all()]
     return seen if 2 * len(seen) > len(views) else views
 
 
@@ -232,7 +249,8 @@ def _thinned(view: MastView) -> MastView:
 
 def _typical_px(views: Sequence[MastView], mast: FloatArray) -> FloatArray:
     """What a coordinate of each image is typically off by (n,), infinite where most have no pixel."""
-    return np.array([typical_px(mast_residual(view, mast)) for view in views])
+    images = np.repeat(np.arange(len(views)), [len(view.points_m) for view in views])
+    return typical_px(np.concatenate(_residuals(views, mast)), images, len(views))
 
 
 def _cauchy(views: Sequence[MastView], mast: FloatArray, expected_px: float) -> list[FloatArray]:

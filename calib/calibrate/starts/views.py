@@ -199,12 +199,10 @@ def _lens(images: Sequence[ImageTerm], start: CameraModel, most: int) -> tuple[f
     fit = minimise(problem, state, weak=problem.weak, steps=60, gain=1e-6)
     if not np.isfinite(fit.normal.cost):
         return None
-    lengths = [
-        np.linalg.norm(problem.image_residual(fit.state, t).reshape(-1, 2), axis=1) for t in problem.images
-    ]
+    off = np.concatenate(problem.image_residuals(fit.state, problem.images)).reshape(-1, 2)
     model = fit.state.cameras[terms[0].camera]
     # Boards that are free leave the camera's place open: put it back to where it began.
-    return float(np.median(np.concatenate(lengths))), model.moved(model.pose.inverse)
+    return float(np.median(np.linalg.norm(off, axis=1))), model.moved(model.pose.inverse)
 
 
 def _spread(images: Sequence[ImageTerm], most: int) -> list[ImageTerm]:

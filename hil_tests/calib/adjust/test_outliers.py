@@ -213,4 +213,10 @@ def test_an_image_left_out_is_judged_by_what_its_dots_share_and_by_what_they_do_
 
 
 def problem_of(term: ImageTerm, block: ResidualBlock) -> Any:
-    return SimpleNamespace(images=[term], station=[], huber=None, image_block=lambda state, whole: block)
+    return SimpleNamespace(
+        images=[term],
+        station=[],
+        huber=None,
+        image_blocks=lambda state, images: [block],
+        station_blocks=lambda state, points: [],
+    )

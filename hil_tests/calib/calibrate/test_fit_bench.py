@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -324,10 +325,13 @@ def test_check_images_of_a_camera_share_the_error_of_its_calibration() -> None:
     ]  # fmt: skip
     block = ResidualBlock(np.zeros(4), np.full((4, 1), 10.0), np.arange(1), 2)  # in sigmas
 
-    def residual(state: None, image: ImageTerm) -> np.ndarray:
-        return np.full(4, 1e4 * image.pan_rad)  # 2 px for 2 mrad
+    def residuals(state: None, images: Sequence[ImageTerm]) -> list[np.ndarray]:
+        return [
+            np.full(4, 1e4 * (image.pan_rad - term.pan_rad))
+            for image, term in zip(images, terms, strict=True)
+        ]
 
-    exact = SimpleNamespace(image_block=lambda state, term: block, image_residual=residual)
+    exact = SimpleNamespace(image_blocks=lambda state, terms: [block] * len(terms), image_residuals=residuals)
     problem = SimpleNamespace(at_rest=lambda: exact, joint_rad=0.002)
     weighed: Any = SimpleNamespace(
         problem=problem, fit=SimpleNamespace(state=None), covariance=np.array([[0.25]]), components=()
