@@ -119,10 +119,17 @@ def minimise(
                 damping = damping / 10
         if moved is None:
             # No step of any size lowers the cost any more: rounding, or a place where it has a kink.
-            return Minimum(state, normal, expected <= 1e-6 * normal.cost + 1e6 * NOTHING, count)
-        state = moved
-        normal = problem.normal(state)
+            return Minimum(state, normal, _as_good(expected, normal), count)
+        before, state, normal = normal, moved, problem.normal(moved)
+        if normal.cost >= before.cost and _as_good(expected, before):
+            # The trial's cost was lower by rounding alone, and would be again and again.
+            return Minimum(state, normal, True, count)
     return Minimum(state, normal, False, steps)
+
+
+def _as_good(expected: float, normal: Normal) -> bool:
+    """Whether what a step was expected to gain, and did not, is as little as rounding may hide."""
+    return expected <= 1e-6 * normal.cost + 1e6 * NOTHING
 
 
 def _step(matrix: FloatArray, gradient: FloatArray, damping: float) -> tuple[FloatArray, float]:

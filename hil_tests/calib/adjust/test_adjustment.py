@@ -147,6 +147,21 @@ def test_minimum_is_found_and_what_nothing_depends_on_stays() -> None:
     assert np.abs(found.state - [1.0, 1.0, 7.0]).max() < 1e-8
 
 
+class Rounded(Valley):
+    """The lowest place of a cost of 1, but for rounding: a gradient is left, and each trial looks lower."""
+
+    def normal(self, state: np.ndarray) -> Normal:
+        return Normal(1.0, np.eye(3), np.full(3, 3e-5))
+
+    def cost(self, state: np.ndarray) -> float:
+        return 1.0 - 1e-12
+
+
+def test_a_fit_that_gains_by_rounding_alone_has_settled() -> None:
+    found = minimise(Rounded(), np.zeros(3))
+    assert found.settled and found.steps < 5
+
+
 @pytest.mark.parametrize("gain", [1e-1, 1e-4, 1e-10])
 def test_normal_equations_are_those_of_the_state_where_a_fit_ended(gain: float) -> None:
     valley = Valley()
