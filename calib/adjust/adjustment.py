@@ -337,7 +337,7 @@ class Adjustment:
 
     def _readings(self, state: Estimate, images: Sequence[ImageTerm]) -> FloatArray:
         """The same of head images (k, 2)."""
-        found = np.array([(t.pan_rad, t.tilt_rad) for t in images])
+        found = np.array([(t.pan_rad, t.tilt_rad) for t in images], dtype=np.float64)
         if len(state.joints_rad):
             attitude = np.array([-1 if t.attitude is None else t.attitude for t in images])
             found[attitude >= 0] += state.joints_rad[attitude[attitude >= 0]]

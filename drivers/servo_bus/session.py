@@ -312,7 +312,9 @@ def leave(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError]) -> Non
                 if not limp:
                     log.warning(KEPT, axis.servo.name, LEFT_WITHIN_S)
             except DriverError as error:
-                log.warning("%s does not say whether it stands: %s", axis.servo.name, error)
+                limp = False
+                words = "%s keeps its torque, for it does not say whether it stands: %s"
+                log.warning(words, axis.servo.name, error)
         axis.servo.release(limp)
 
 

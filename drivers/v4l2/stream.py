@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from calib.geometry.sensor_mode import SensorMode
 from drivers.clock import Clock
-from drivers.errors import UnsupportedFormat
+from drivers.errors import DriverError, NoCamera, UnsupportedFormat
 from drivers.pixels import FORMATS, PictureFormat
 from drivers.v4l2 import abi, find
 from drivers.v4l2.controls import (
@@ -203,9 +203,15 @@ def sensor_mode_of(node: Node, size_px: tuple[int, int]) -> SensorMode:
     controls = list_controls(node)
     flips = (first_of(controls, (control,)) for control in (abi.CID_HFLIP, abi.CID_VFLIP))
     horizontal, vertical = (one is not None and bool(get_value(node, one)) for one in flips)
-    crop = node.selection(abi.SEL_TGT_CROP)
-    whole = node.selection(abi.SEL_TGT_NATIVE_SIZE) or node.selection(abi.SEL_TGT_CROP_BOUNDS)
-    composed = node.selection(abi.SEL_TGT_COMPOSE) or (0, 0, *size_px)
+    try:
+        crop = node.selection(abi.SEL_TGT_CROP)
+        whole = node.selection(abi.SEL_TGT_NATIVE_SIZE) or node.selection(abi.SEL_TGT_CROP_BOUNDS)
+        composed = node.selection(abi.SEL_TGT_COMPOSE) or (0, 0, *size_px)
+    except NoCamera:
+        raise
+    except DriverError as error:
+        log.info("%s: its driver does not report its crop: %s", node.path, error)
+        return SensorMode(size_px, flip=(horizontal, vertical))
     if crop is not None and whole is not None and composed == (0, 0, *size_px):
         x, y = crop[0] - whole[0], crop[1] - whole[1]
         try:

@@ -21,7 +21,6 @@ from tools.campaigns import (
     refine,
     render_bias,
     residuals,
-    stop,
 )
 from tools.campaigns.motion import Tally, together
 
@@ -58,7 +57,6 @@ def test_a_campaign_tells_the_same_of_one_process_two_and_its_tasks_one_by_one(
         (pointing, ["--cases", "2500"], 3),
         (handoff, ["--cases", "100", "--good", "30"], 5 + 2),
         (motion, ["--cases", "4"], 4),
-        (stop, ["--cases", "3"], 8 * 2 * 3),
         (dots, ["--cases", "2"], 8 * 4),
         (refine, ["--rig", str(RIG_FILE), "--cases", "25"], 4 * 3),
         (render_bias, ["--samples", "1", "2", "--ranges", "3"], 2 * 5 * 2),

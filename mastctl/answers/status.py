@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 from annotated_types import Len
 from typing_extensions import TypedDict
 
-from calib.geometry.sensor_mode import FlipName
 from mastctl.answers.words import Angles, Count, Json, Pixel, Point, Quaternion, Seconds, TrackState, Word
 
 
@@ -115,7 +114,7 @@ class SensorModeTold(TypedDict):
     size_px: Annotated[list[Count], Len(2, 2)]
     sensor_px: Annotated[list[Count], Len(2, 2)] | None
     crop_px: Annotated[list[Count], Len(4, 4)] | None
-    flip: FlipName
+    flip: Literal["none", "horizontal", "vertical", "both"]
 
 
 class CameraSettingsTold(TypedDict):

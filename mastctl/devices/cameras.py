@@ -103,6 +103,7 @@ class Cameras:
         self._time = time
         self._grace_s = CAMERA_GRACE_S if grace_s is None else grace_s
         self.sensor_modes: dict[str, SensorMode] = {}
+        self._refused: dict[str, BadFrame] = {}
         self._calibrated: dict[str, RigCamera] = {}
         if rig is not None:
             self.use_rig(rig)
@@ -407,7 +408,12 @@ class Cameras:
         if isinstance(place, AbsentCamera):
             self._cameras[name] = place.appeared()
             log.warning("%s is here", name)
-        self._check_as_calibrated(name)
+        try:
+            self._check_as_calibrated(name)
+        except BadFrame as refused:
+            self._refused[name] = refused
+            raise
+        self._refused.pop(name, None)
 
     def _check_sizes(self) -> None:
         """Pass cameras that are as calibrated, or do not tell it now. Raises BadFrame."""
@@ -473,6 +479,8 @@ class Cameras:
             newest = self._store.newest(camera)
             if newest is not None and newest.exposure_began_s > exposed_after_s:
                 return newest  # somebody else's request brought it a moment ago
+            if camera in self._refused:
+                raise BadFrame(str(self._refused[camera]))
             answer = self._cameras[camera].next_frame(
                 exposed_after_s, max(0.0, deadline_s - self._time.now_s())
             )

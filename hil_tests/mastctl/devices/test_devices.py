@@ -9,12 +9,13 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from calib.geometry.sensor_mode import SensorMode
+from drivers.absent import AbsentCamera
 from drivers.clock import SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, LineLost, NoFreshFrame, NoReply
 from drivers.interfaces import AxisReport, Frame, FrameTime, Reading
@@ -796,6 +797,24 @@ def test_a_camera_in_another_mode_than_the_mast_files_is_refused_at_the_start_wi
     devices = Devices(hardware, LIMITS, DIGEST, SystemClock(), modal)
     assert devices.sensor_modes == {"navcam_left": ModalCamera.sensor_mode}
     devices.close()
+
+
+def test_a_late_camera_in_another_mode_gives_no_picture() -> None:
+    hardware, little = FakeHardware(), rig()
+    late = AbsentCamera("navcam_left", "fake", lambda: ModalCamera("navcam_left", 0), error=NoReply("away"))
+    hardware.fake_cameras["navcam_left"] = cast(FakeCamera, late)
+    held = replace(
+        little.cameras["navcam_left"], sensor_mode=SensorMode((64, 48), (40, 24, 64, 48), (128, 96))
+    )
+    modal = replace(little, cameras={**little.cameras, "navcam_left": held})
+    devices = Devices(hardware, LIMITS, DIGEST, SystemClock(), modal)
+    try:
+        until(lambda: "navcam_left" in devices.sensor_modes, "the camera is there")
+        for _ in range(3):
+            with pytest.raises(BadFrame, match="more of the sensor along x than was calibrated"):
+                devices.frames(["navcam_left"], now(devices), 1.0)
+    finally:
+        devices.close()
 
 
 @pytest.mark.parametrize(
