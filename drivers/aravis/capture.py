@@ -98,8 +98,9 @@ class GenicamCapture:
         self._thread.start()
 
     def take(self, exposed_after_s: float, timeout_s: float) -> tuple[ArrivedGenicam, Image, bytes] | None:
-        """Return the newest frame exposed after that moment, as `drivers.newest.Newest.take`; a camera with
-        the trigger ``Software`` exposes it now.
+        """Return the newest frame exposed after that moment, as `drivers.newest.Newest.take`.
+
+        A camera with the trigger ``Software`` exposes it now, and again after one that came damaged or not.
         """
         if self._options.trigger_source != SOFTWARE:
             return self.newest.take(exposed_after_s, timeout_s, self._is_young)
@@ -109,9 +110,18 @@ class GenicamCapture:
         try:
             if found := self.newest.take(exposed_after_s, 0.0, lambda frame: True):
                 return found
-            if not self._fire(until_s):
-                return None
-            return self.newest.take(exposed_after_s, until_s - time.monotonic(), lambda frame: True)
+            while self._fire(until_s):
+                while True:
+                    now_s = time.monotonic()
+                    next_s = min(until_s, now_s + SETTLE_S)
+                    found = self.newest.take(exposed_after_s, next_s - now_s, lambda frame: True)
+                    if (
+                        found or next_s == until_s or time.monotonic() < next_s
+                    ):  # the camera is lost or closed
+                        return found
+                    if not self._unanswered():
+                        break
+            return None
         finally:
             self._triggering.release()
 

@@ -170,6 +170,14 @@ def test_after_a_trigger_without_a_frame_the_next_request_has_its_own(
     assert fresh(camera, device).driver_sequence == device.frames
 
 
+def test_a_request_with_time_left_triggers_again_after_a_damaged_frame(either_clock: GigeCamera) -> None:
+    device = either_clock
+    camera = opened(rate_hz=None, trigger_source="Software")
+    gone = fresh(camera, device).driver_sequence + 1
+    device.lose = lambda frame, packet: frame == gone
+    assert fresh(camera, device).driver_sequence > gone
+
+
 def test_a_request_that_is_too_short_to_be_sure_of_its_frame_triggers_none() -> None:
     device = GigeCamera(ADDRESS, clock_readable=False)
     try:
