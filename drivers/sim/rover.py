@@ -116,7 +116,8 @@ class SimulatedRover:
         except BadFile as error:
             raise BadOptions(f"simulation.rover: {error}") from None
         self.sensor_modes = {
-            name: SensorMode(camera.model.size_px, (0, 0, *camera.model.size_px), camera.model.size_px)
+            name: camera.sensor_mode
+            or SensorMode(camera.model.size_px, (0, 0, *camera.model.size_px), camera.model.size_px)
             for name, camera in self.rig.cameras.items()
         }
         for name, mode in settings.sensor_modes.items():

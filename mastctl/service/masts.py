@@ -100,13 +100,21 @@ def read_next(name: str, config: Config, now: MastInUse, sensor_modes: Mapping[s
         raise BadMastFile(str(error)) from None
     for camera in config.hardware.cameras:
         _check_camera(camera, stored, now.stored)
-        mode, calibrated = sensor_modes.get(camera), stored.rig.cameras[camera].sensor_mode
-        if mode is not None and calibrated is not None:
+    found = MastInUse(stored, data, path)
+    if stored.digest != now.stored.digest:  # the one in use is no change, whatever joined since
+        _check_modes(found, sensor_modes)
+    return found
+
+
+def _check_modes(mast: MastInUse, sensor_modes: Mapping[str, SensorMode]) -> None:
+    """Pass a mast file that has the modes of the cameras that know theirs. Raises BadMastFile."""
+    for camera, mode in sensor_modes.items():
+        calibrated = mast.stored.rig.cameras[camera].sensor_mode
+        if calibrated is not None:
             try:
                 check_mode(camera, mode, calibrated)
             except BadFrame as error:
-                raise BadMastFile(f"{name}: {error}") from None
-    return MastInUse(stored, data, path)
+                raise BadMastFile(f"{mast.path.name}: {error}") from None
 
 
 def configured(rig: Rig, cameras: Iterable[str]) -> Rig:
@@ -216,12 +224,14 @@ class Masts:
 
         Raises
         ------
-        NotNow, DriverError
-            ``no_former_mast`` if none was loaded since the start; else as for `load`.
+        NotNow, DriverError, BadMastFile
+            ``no_former_mast`` if none was loaded since the start; else as for `load`, for a camera may
+            have joined in another mode.
         """
         former = self.former
         if former is None:
             raise NotNow("no_former_mast", "no other mast file was in use since the daemon started")
+        _check_modes(former, self._devices.sensor_modes)
         return self._use(former)
 
     @contextmanager

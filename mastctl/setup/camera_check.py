@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from calib.files.mast_file import sensor_mode_keys
+from calib.geometry.sensor_mode import SensorMode
 from drivers.clock import Clock
 from drivers.errors import DriverError, NoFreshFrame
 from drivers.interfaces import Camera, Frame, HoldsExposure, Image, KnowsSensorMode, KnowsSize, Paced
@@ -171,7 +172,7 @@ class CameraCheck:
             "abilities": [word for word, protocol in abilities if isinstance(camera, protocol)],
             "problems": self.problems(),
         }
-        if isinstance(camera, KnowsSensorMode):
+        if isinstance(camera, KnowsSensorMode) and isinstance(camera.sensor_mode, SensorMode):
             told |= sensor_mode_keys(camera.sensor_mode)
         if frames:
             image = frames[-1].image

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.rigid import Rigid
 from calib.geometry.sensor_mode import SensorMode
 from drivers.clock import ManualClock
@@ -288,3 +289,14 @@ def test_clocks_and_days_that_cannot_be_are_refused_in_words(
 ) -> None:
     with pytest.raises(BadOptions, match=words):
         rover(small_rig, **section)
+
+
+def test_a_rig_calibrated_in_a_part_of_its_sensor_is_simulated_in_that_mode(
+    small_rig: Path, tmp_path: Path
+) -> None:
+    rig = load_rig(small_rig).rig
+    size_px = rig.cameras[LEFT].model.size_px
+    part = SensorMode(size_px, (40, 24, *size_px), (2 * size_px[0], 2 * size_px[1]))
+    there = replace(rig.cameras[LEFT], sensor_mode=part)
+    save_rig(replace(rig, cameras={**rig.cameras, LEFT: there}), tmp_path / "part.yaml")
+    assert rover(tmp_path / "part.yaml")[0].sensor_modes[LEFT] == part

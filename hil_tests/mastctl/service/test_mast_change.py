@@ -214,6 +214,13 @@ def test_bad_files_are_refused_with_the_reason(
         told = refusal(web.post("/mast", json={"file": f"{name}.yaml"}), 422, "bad_mast_file")
         assert words[name] in told
     assert in_use(web) == before
+    # A camera that joins in another mode after two files were in use: neither comes back unasked.
+    daemon.service.devices.sensor_modes.pop("navcam_left")  # type: ignore[attr-defined]
+    assert web.post("/mast", json={"file": "mode.yaml"}).status_code == 200
+    save_rig(little, folder / "plain.yaml")
+    assert web.post("/mast", json={"file": "plain.yaml"}).status_code == 200
+    daemon.service.devices.sensor_modes["navcam_left"] = SensorMode((64, 48))  # type: ignore[index]
+    assert "--flip horizontal" in refusal(web.post("/mast/back"), 422, "bad_mast_file")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
