@@ -6,7 +6,7 @@ Drivers read the mode, mast files keep it with the calibration, and the daemon c
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from calib.errors import CalibError
@@ -166,6 +166,8 @@ def sensor_mode_after(then: SensorMode, mode: Mode) -> SensorMode | None:
     from fractions import Fraction
 
     crop = mode.crop_px or (0, 0, *then.size_px)
+    if crop == (0, 0, *then.size_px):
+        mode = replace(mode, crop_px=None)
     size_px = crop[2] // mode.binning[0], crop[3] // mode.binning[1]
     flip = then.flip[0] != mode.flip[0], then.flip[1] != mode.flip[1]
     if then.crop_px is None or then.sensor_px is None:

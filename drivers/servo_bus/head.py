@@ -22,7 +22,7 @@ from drivers.interfaces import AxisMotion, AxisReport, Reading, Reporting
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.bus import Bus
 from drivers.servo_bus.pair import ServoPair, SessionWatch
-from drivers.servo_bus.session import GivenUp, ServoSession, confirmed, leave, stop_error
+from drivers.servo_bus.session import LEFT_WITHIN_S, GivenUp, ServoSession, confirmed, leave, stop_error
 from drivers.servo_bus.settings import HeadSettings
 
 log = logging.getLogger(__name__)
@@ -227,8 +227,10 @@ class BusHead(Reporting):
         self._session, self._motions = session, [axis.motion for axis in session.pair.axes]
         self._absence.end()
         if self._stop_owed:  # as at_stop says
-            self._stop_owed = False
-            self._within(ServoSession.stop)
+            try:
+                self._within(ServoSession.stop)
+            finally:
+                self._stop_owed = self._session is None
 
     def _give_up(self, session: ServoSession, error: DriverError) -> None:
         """Have both axes brake, close the line, and try again when the watchdogs must have stopped them."""
@@ -240,10 +242,11 @@ class BusHead(Reporting):
         self._absence.note(error, now_s, self.settings.silence_s)
         log.warning("%s; trying again in %.1f s", error, self._absence.again_s - now_s)
 
-    def _stop_away(self, closes: bool = False) -> None:
+    def _stop_away(self, left_until_s: float | None = None) -> None:
         """Command both axes to stand over a line that is away, opened for that alone.
 
         To make them ready takes longer than a stop may; that comes next, and ends with the stop once more.
+        With ``left_until_s``, as of `leave`, both axes are left.
         """
         try:
             pair: ServoPair[Any, Any] = self._open()
@@ -252,8 +255,8 @@ class BusHead(Reporting):
             raise
         try:
             failed = confirmed(pair.axes, pair.stood, self._clock)
-            if closes:
-                leave(pair, failed)
+            if left_until_s is not None:
+                leave(pair, failed, left_until_s)
         finally:
             pair.close()
         if failed:
@@ -262,6 +265,7 @@ class BusHead(Reporting):
 
     def _close_now(self) -> None:
         session, self._session = self._session, None
-        failed = session is None or session.end()
+        until_s = self._clock.now_s() + LEFT_WITHIN_S
+        failed = session is None or session.end(until_s)
         if failed and not self.settings.silence_s:
-            stop_at_last(lambda: self._stop_away(closes=True), self._clock, self.settings.port)
+            stop_at_last(lambda: self._stop_away(until_s), self._clock, self.settings.port)

@@ -28,7 +28,7 @@ ATTEMPTS, PATIENCE_S = 3, 0.15  # of a poll, before it counts as failed
 FAILED_POLLS = 2  # in a row, before the servos are set up anew
 STOP_PATIENCE_S = 0.2  # how long a stop asks for a confirmation that does not come
 STANDS_WITHIN_S = 2.5  # how long a stop waits for an axis to stand before its torque goes off
-LEFT_WITHIN_S = 1.2  # and a closing
+LEFT_WITHIN_S = 1.5  # and a closing, for both axes together
 KEPT = "%s did not come to rest within %.1f s of a stop: its torque stays on"
 
 
@@ -265,13 +265,14 @@ class ServoSession:
         elif held != told or not motion.braking_well(told, axis.acceleration_rad_per_s2):
             axis.brake()
 
-    def end(self) -> bool:
+    def end(self, until_s: float) -> bool:
         """Stop, leave each servo as its ``at_close`` says, and close the line; never raises.
 
-        A servo that does not confirm the stop keeps its watchdog. Returns whether one did not.
+        A servo that does not confirm the stop keeps its watchdog. Returns whether one did not. ``until_s``
+        as of `leave`.
         """
         failed = self._stop_each()
-        leave(self.pair, failed)
+        leave(self.pair, failed, until_s)
         self.pair.close()
         return bool(failed)
 
@@ -295,10 +296,11 @@ def confirmed(
     return failed
 
 
-def leave(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError]) -> None:
+def leave(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError], until_s: float) -> None:
     """Leave each axis that has confirmed the last stop as its ``at_close`` says; never raises.
 
-    Its torque goes off only when it stands.
+    Its torque goes off only when it stands, which is waited for until ``until_s`` of the line's clock; an axis
+    that stands by then is seen to stand also if the other used up the time.
     """
     for axis in pair.axes:
         if axis in failed:
@@ -307,10 +309,11 @@ def leave(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError]) -> Non
         limp = axis.settings.at_close == "torque_off"
         if limp:
             try:
-                stands, sample = rests(axis.servo.look, pair.clock, LEFT_WITHIN_S, Rest(STANDS_S))
+                within_s = max(until_s - pair.clock.now_s(), 2 * STANDS_S)
+                stands, sample = rests(axis.servo.look, pair.clock, within_s, Rest(STANDS_S))
                 limp = stands or not sample.values.get("torque_enable", True)
                 if not limp:
-                    log.warning(KEPT, axis.servo.name, LEFT_WITHIN_S)
+                    log.warning(KEPT, axis.servo.name, within_s)
             except DriverError as error:
                 limp = False
                 words = "%s keeps its torque, for it does not say whether it stands: %s"

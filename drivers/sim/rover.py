@@ -25,7 +25,7 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.mode import rig_in_mode
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
-from calib.geometry.sensor_mode import BadMode, Mode, SensorMode
+from calib.geometry.sensor_mode import BadMode, Mode, SensorMode, sensor_mode_after
 from calib.targets.boards import FLAT, AnyBoard
 from drivers.clock import Clock
 from drivers.errors import BadOptions, NoFreshFrame
@@ -176,11 +176,12 @@ class SimulatedRover:
             self.rig = rig_in_mode(self.rig, name, mode)
         except BadMode as error:
             raise BadOptions(f"{place}.{name}: {error}") from None
-        sensor = self.sensor_modes[name]
+        sensor, plain = self.sensor_modes[name], (False, False)
+        flip = sensor.flip[0] != mode.flip[0], sensor.flip[1] != mode.flip[1]
+        # Its maker counts the crop of a flipped picture from the side that the picture begins with.
+        after = sensor_mode_after(replace(sensor, flip=plain), replace(mode, flip=plain))
         size_px = self.rig.cameras[name].model.size_px
-        self.sensor_modes[name] = replace(
-            sensor, size_px=size_px, crop_px=mode.crop_px or sensor.crop_px, flip=mode.flip
-        )
+        self.sensor_modes[name] = replace(after or SensorMode(size_px), flip=flip)
 
     def _check_over_ground(self) -> None:
         """Refuse a map whose ground rises over a camera."""

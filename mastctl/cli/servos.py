@@ -399,9 +399,18 @@ def _add_ptz(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def _ptz_info(args: argparse.Namespace) -> int:
     """Show the heads of a line."""
+    from drivers.errors import BadOptions
     from drivers.ptz.inquiry import find_heads
     from mastctl.rig.plugged import PTZ_DIALECTS
 
+    bauds = sorted({baud for dialect in PTZ_DIALECTS for baud in dialect.possible_bauds})
+    highest = max(dialect.highest_address for dialect in PTZ_DIALECTS)
+    for baud in args.baud:
+        if baud not in bauds:
+            raise BadOptions(f"--baud is {baud}, expected one of {', '.join(map(str, bauds))}")
+    for address in args.address:
+        if not 1 <= address <= highest:
+            raise BadOptions(f"--address is {address}, expected 1 to {highest}")
     found = find_heads(args.port, PTZ_DIALECTS, args.baud, args.address)
     if not found:
         raise CommandError(

@@ -413,6 +413,8 @@ class Cameras:
         except BadFrame as refused:
             self._refused[name] = refused
             raise
+        except BadReply as error:  # a defect of the driver that no wait mends: as at the start
+            log.warning("%s; the size is seen in its pictures", error)
         self._refused.pop(name, None)
 
     def _check_sizes(self) -> None:
@@ -445,12 +447,14 @@ class Cameras:
             If it tells something else than a sensor mode.
         """
         camera, calibrated = self._cameras[name], self._calibrated.get(name)
+        if isinstance(camera, KnowsSensorMode):  # it says more than the size: what mends it, in full
+            self._check_mode(name, camera.sensor_mode, calibrated)
         if isinstance(camera, KnowsSize) and calibrated is not None:
             width, height = camera.size_px
             frame_checks.check_size(name, (int(width), int(height)), calibrated.model.size_px)
-        if not isinstance(camera, KnowsSensorMode):
-            return
-        mode = camera.sensor_mode
+
+    def _check_mode(self, name: str, mode: object, calibrated: RigCamera | None) -> None:
+        """Note a camera's sensor mode and pass the mast file's; raises as `_check_as_calibrated`."""
         if not isinstance(mode, SensorMode):
             words = f"sensor_mode is {type(mode).__name__} where a SensorMode is expected"
             raise BadReply(words, device=name)

@@ -255,6 +255,7 @@ def test_what_a_driver_does_not_tell_is_not_compared_and_flips_are() -> None:
     assert mode_between(FULL, untold) == mode_between(untold, FULL) == Mode(flip=(False, True))
     assert mode_between(untold, untold) == Mode()
     assert sensor_mode_after(untold, Mode(binning=(2, 2))) == SensorMode((48, 32), flip=(False, True))
+    assert sensor_mode_after(FULL, Mode(crop_px=(0, 0, *FULL.size_px))) == FULL
     off_middle = replace(SENSOR_MODES[5], flip=(True, False))
     assert mode_between(off_middle, off_middle) == Mode(), "the same is the same, from whatever side"
     assert sensor_mode_after(off_middle, Mode(crop_px=(0, 0, 20, 20))) is None

@@ -18,6 +18,7 @@ from drivers.dynamixel.pair import Pair
 from drivers.dynamixel.servo import Servo
 from drivers.errors import DriverError, LineLost, NoReply, WrongDevice
 from drivers.servo_bus.bus import Bus
+from drivers.servo_bus.session import GivenUp, ServoSession
 from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.dynamixel_packets import BROADCAST, Instruction
 from drivers.sim.wire.dynamixel_servo import VOLTAGE
@@ -294,6 +295,58 @@ def test_closing_beside_a_silent_servo_leaves_the_other_as_configured(silent: in
         assert it.servos[1 - silent].table["bus_watchdog"] == 0
         assert it.servos[silent].table["bus_watchdog"] != 0  # nobody knows what it does: that stops it
         assert goals_after(it, closing_s)[silent + 1], "the silent one was not told to brake"
+
+
+def test_closing_keeps_the_torque_of_a_servo_that_does_not_say_whether_it_stands(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with rig() as it:
+        it.options["pan"]["at_close"] = it.options["tilt"]["at_close"] = "torque_off"
+        head = it.open()
+        under_way(it, head)
+        true_look = Servo.look
+
+        def look(servo: Servo) -> Any:
+            if servo.name.startswith("pan"):
+                raise NoReply("its answer is garbled")
+            return true_look(servo)
+
+        monkeypatch.setattr(Servo, "look", look)
+        head.close()
+        assert [servo.table["torque_enable"] for servo in it.servos] == [1, 0]
+
+
+def test_a_closing_ends_in_its_time_beside_an_axis_that_never_stands_and_a_silent_one() -> None:
+    with rig() as it:
+        it.options["pan"]["at_close"] = it.options["tilt"]["at_close"] = "torque_off"
+        head = it.open(watchdog_s=0)
+        under_way(it, head)
+        mute(it, 1)
+        it.axes[0]._take = lambda *_: None  # type: ignore[method-assign]
+        closing_s = it.now_s()
+        head.close()
+        assert it.now_s() - closing_s < 3.0
+        assert it.servos[0].table["torque_enable"] == 1
+
+
+def test_a_stop_owed_at_a_return_is_owed_again_if_it_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    with opened(options={"watchdog_s": 0}) as (it, head):
+        it.line.hang_up()
+        it.until(lambda: failed(head) and head._session is None, "the line to be given up")
+        head._stop_owed = True
+        tries: list[float] = []
+        true_stop = ServoSession.stop
+
+        def stop(session: ServoSession) -> None:
+            tries.append(it.now_s())
+            if len(tries) == 1:
+                raise GivenUp(NoReply("no confirmation"))
+            true_stop(session)
+
+        monkeypatch.setattr(ServoSession, "stop", stop)
+        it.line.come_back()
+        it.until(lambda: not failed(head), "an answer")
+        assert len(tries) == 2 and not head._stop_owed
 
 
 def test_a_stop_breaks_off_what_is_under_way_and_its_caller_is_told() -> None:

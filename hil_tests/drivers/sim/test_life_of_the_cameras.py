@@ -59,6 +59,21 @@ def test_a_camera_in_another_mode_shows_that_part_of_its_picture(small_rig: Path
     assert device.cameras[RIGHT].next_frame(1000.0, 1.0).image.shape == (48, 128)
 
 
+@pytest.mark.parametrize("flip", [(False, False), (True, False)])
+def test_a_part_of_a_rig_that_reads_a_part_of_its_sensor_counts_from_the_sensor(
+    small_rig: Path, tmp_path: Path, flip: tuple[bool, bool]
+) -> None:
+    rig = load_rig(small_rig).rig
+    width, height = rig.cameras[LEFT].model.size_px
+    own = SensorMode((width, height), (100, 60, 2 * width, 2 * height), (1000, 900), flip)
+    modal = replace(rig, cameras={**rig.cameras, LEFT: replace(rig.cameras[LEFT], sensor_mode=own)})
+    save_rig(modal, tmp_path / "modal.yaml")
+    modes = {LEFT: {"crop_px": [32, 24, 160, 128], "binning": [2, 1], "flip": "horizontal"}}
+    device, _ = rover(tmp_path / "modal.yaml", sensor_modes=modes)
+    told = SensorMode((80, 128), (164, 108, 320, 256), (1000, 900), (not flip[0], False))
+    assert device.sensor_modes[LEFT] == told
+
+
 def test_a_camera_exposes_by_its_own_clock_and_stamps_by_it(small_rig: Path) -> None:
     """200 ppm fast: after 500 s a stamp is 0.1 s ahead, and by then the camera has taken one frame more."""
     device, clock = rover(small_rig, clocks={RIGHT: {"offset_s": 0.03, "drift_ppm": 200}})

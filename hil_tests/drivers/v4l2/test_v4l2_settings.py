@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import pytest
 
 from calib.geometry.sensor_mode import SensorMode
-from drivers.errors import BadSetting
+from drivers.errors import BadSetting, DriverError, NoCamera
 from drivers.interfaces import Adjustable
 from drivers.v4l2 import abi, settings, stream
 from drivers.v4l2.controls import CameraControl, ControlProblem
@@ -80,6 +82,22 @@ def test_the_sensors_mode_is_as_far_as_the_driver_tells_it(
     use(monkeypatch, node)
     found = stream.sensor_mode_of(node, (16, 8))  # type: ignore[arg-type]
     assert found == SensorMode((16, 8), crop_px, sensor_px, (False, True))
+
+
+def test_a_driver_that_fails_to_tell_its_crop_is_used_without_and_one_that_is_gone_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    node = SensorNode("start", controls=(HFLIP, VFLIP))
+    node.values[HFLIP.id], node.values[VFLIP.id] = 1, 0
+    use(monkeypatch, node)
+    for error in (DriverError("cannot tell its crop: Input/output error"), NoCamera("it is gone")):
+        monkeypatch.setattr(node, "selection", Mock(side_effect=error))
+        if isinstance(error, NoCamera):
+            with pytest.raises(NoCamera):
+                stream.sensor_mode_of(node, (16, 8))  # type: ignore[arg-type]
+        else:
+            found = stream.sensor_mode_of(node, (16, 8))  # type: ignore[arg-type]
+            assert found == SensorMode((16, 8), flip=(True, False))
 
 
 def test_a_hold_waits_until_a_change_shows(monkeypatch: pytest.MonkeyPatch) -> None:

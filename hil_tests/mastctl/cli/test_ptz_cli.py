@@ -93,3 +93,19 @@ def test_a_line_on_which_no_head_answers_is_told_with_what_to_name(
     head = SimulatedPelco(*axes(clock, 0.0, 0.0), fastest_rad_per_s=1.2, address=17)
     told = asked(capsys, head, clock, "--baud", "9600", "--address", "1")
     assert told["code"] == "no_head" and "--baud and --address name others" in told["message"]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--baud", "9600", "57600"], "--baud is 57600, expected one of 2400, 4800, 9600, 19200, 38400, 115200"),
+        (["--address", "300"], "--address is 300, expected 1 to 254"),
+        (["--address", "0"], "--address is 0, expected 1 to 254"),
+    ],
+)
+def test_a_rate_or_an_address_that_no_head_has_is_refused_before_the_line_is_opened(
+    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["ptz", "info", "/dev/not-there", *words, "--json"]) == 2
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert (error["code"], error["message"]) == ("bad_options", told)

@@ -817,6 +817,22 @@ def test_a_late_camera_in_another_mode_gives_no_picture() -> None:
         devices.close()
 
 
+def test_a_late_camera_whose_sensor_mode_is_none_gives_pictures_as_at_the_start(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(ModalCamera, "sensor_mode", None)
+    hardware = FakeHardware()
+    late = AbsentCamera("navcam_left", "fake", lambda: ModalCamera("navcam_left", 0), error=NoReply("away"))
+    hardware.fake_cameras["navcam_left"] = cast(FakeCamera, late)
+    devices = Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
+    try:
+        until(lambda: "sensor_mode is NoneType where a SensorMode is expected" in caplog.text, "it is told")
+        assert devices.frames(["navcam_left"], now(devices), NET_S)
+        until(lambda: not devices.faults(), "no fault stands")
+    finally:
+        devices.close()
+
+
 @pytest.mark.parametrize(
     ("mode", "words"),
     [
