@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ import pytest
 from hil_tests.waiting import NET_S
 from mastctl.web import pictures
 from mastctl.web.page import page_files
+from tools.browser import chromium
 
 if TYPE_CHECKING:  # slow to load, and every worker loads this file
     from playwright.sync_api import Browser, BrowserContext, Page
@@ -35,7 +35,7 @@ def browser(request: pytest.FixtureRequest) -> Iterator[Browser]:
     """One for a file: where Playwright runs no other test may run an event loop of its own."""
     from playwright.sync_api import sync_playwright
 
-    found = shutil.which("chromium") or shutil.which("chromium-browser")
+    found = chromium()
     if found is None:
         words = "the page's tests need chromium: python -m tools.browser installs it on Debian"
         (pytest.fail if request.config.getoption("--require-vm") else pytest.skip)(words)
