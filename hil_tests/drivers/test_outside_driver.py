@@ -21,6 +21,7 @@ from drivers.errors import BadOptions, NoFreshFrame, NoReply
 from drivers.hardware import DeviceSettings, Hardware, HardwareSettings, installed_drivers
 from drivers.interfaces import Camera, Frame, PanTilt
 from drivers.open_hardware import open_hardware
+from hil_tests.waiting import NET_S
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
 from mastctl.motion.loop import PointingLoop
@@ -66,7 +67,7 @@ def test_the_package_comes_from_outside_the_repository(
 
 
 def wait_until_still(head: PanTilt) -> None:
-    deadline_s = time.monotonic() + 20
+    deadline_s = time.monotonic() + NET_S
     while head.read().moving:
         assert time.monotonic() < deadline_s, "the head never settled"
         time.sleep(0.01)
@@ -206,7 +207,7 @@ def test_it_keeps_the_promises_of_the_page(hardware: Hardware) -> None:
     assert head.read().moving
     head.stop()
     while (stopped := head.read()).moving:  # it brakes, the longer the later the stop came
-        assert time.monotonic() < asked_s + 30.0
+        assert time.monotonic() < asked_s + NET_S
     assert stopped.pan_rad < 0.4
     head.close()
     with pytest.raises(NoReply):

@@ -311,7 +311,7 @@ def test_a_hold_on_a_camera_that_gives_no_frames_begins_all_the_same_and_holds(
         wanted.exposure_s = 0.002
         began_s = time.monotonic()
         with seen.camera.exposure_held():
-            assert time.monotonic() - began_s < 10.0
+            assert time.monotonic() - began_s < NET_S
             for _ in range(5):
                 seen.arrive(sensor.shoot(PERIOD_S, 0.036))
             assert len(seen.node.sets) == sets
