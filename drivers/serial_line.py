@@ -46,10 +46,11 @@ def stable_name(port: str) -> str:
     moment at which it was made belongs to its name.
     """
     if "://" in port:
-        parts = urlsplit(port)
-        host = "127.0.0.1" if parts.hostname == "localhost" else parts.hostname or ""
-        with contextlib.suppress(ValueError):
-            return f"{f'[{host}]' if ':' in host else host}:{parts.port}"
+        with contextlib.suppress(ValueError):  # what is no URL is refused where it is opened
+            parts = urlsplit(port)
+            host = "127.0.0.1" if parts.hostname == "localhost" else parts.hostname
+            if host:
+                return f"{f'[{host}]' if ':' in host else host}{f':{parts.port}' if parts.port else ''}"
         return port
     path = Path(os.path.realpath(port))
     with contextlib.suppress(OSError):

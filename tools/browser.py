@@ -1,4 +1,4 @@
-"""Installs the browser of the page's tests and pictures, Debian's chromium without a screen, unless one is there.
+"""Installs the browser of the page's tests and pictures if there is none: Debian's chromium without a screen.
 
 .venv/bin/python -m tools.browser
 """

@@ -265,7 +265,8 @@ class Publisher:
         """Return a subscription for a thread; without topics to all of them.
 
         It begins with the newest value of each key that is known already, unless ``known`` is False. With
-        ``every`` no value takes another one's place, and none is forgotten before it was read.
+        ``every`` no value takes another one's place and `forget` takes none back. Beyond ``MOST_UNREAD``
+        unread values the oldest is lost, and counted in ``lost``.
         """
         return self._added(ThreadSubscription(_checked(topics), self._leave, every), known)
 

@@ -133,19 +133,20 @@ def _built_camera(numbers: RigNumbers, place_m: FloatArray, rng: np.random.Gener
     )
 
 
-# What a survey leaves open, one sigma. Mast: four prisms half a metre apart, 1 mm each. Cameras: so that
-# what they see 5 m away is some 0.1 to 0.3 px off, as with the packaged mast file.
-MAST_PLACE_M = 1e-3
-MAST_ANGLE_RAD = 1.4e-3
-PLACE_M = 2e-4
-ANGLE_RAD = 5e-5
-FOCAL = 1e-4
-MIDDLE_PX = 0.1
-BENDS = (5e-4, 1e-3)
+# LEFT_...: what a survey leaves open, one sigma. Mast: four prisms half a metre apart, 1 mm each. Cameras: so
+# that what they see 5 m away is some 0.1 to 0.3 px off, as with the packaged mast file.
+LEFT_MAST_PLACE_M = 1e-3
+LEFT_MAST_ANGLE_RAD = 1.4e-3
+LEFT_PLACE_M = 2e-4
+LEFT_ANGLE_RAD = 5e-5
+LEFT_FOCAL = 1e-4
+LEFT_MIDDLE_PX = 0.1
+LEFT_BENDS = (5e-4, 1e-3)
 STATED = (
-    f"mast {MAST_PLACE_M * 1e3:g} mm and {MAST_ANGLE_RAD * 1e3:g} mrad; each camera {PLACE_M * 1e3:g} mm, "
-    f"{ANGLE_RAD * 1e3:g} mrad, focal length {FOCAL * 1e2:g} %, middle of the picture {MIDDLE_PX:g} px, "
-    f"R1 {BENDS[0]:g}, R2 {BENDS[1]:g} (one sigma, independent)"
+    f"mast {LEFT_MAST_PLACE_M * 1e3:g} mm and {LEFT_MAST_ANGLE_RAD * 1e3:g} mrad; "
+    f"each camera {LEFT_PLACE_M * 1e3:g} mm, {LEFT_ANGLE_RAD * 1e3:g} mrad, "
+    f"focal length {LEFT_FOCAL * 1e2:g} %, middle of the picture {LEFT_MIDDLE_PX:g} px, "
+    f"R1 {LEFT_BENDS[0]:g}, R2 {LEFT_BENDS[1]:g} (one sigma, independent)"
 )
 
 _SMALL = 1e-6  # of a sigma: steps of the differences that turn these into a camera's own parameters
@@ -174,6 +175,9 @@ class Twin:
 
 def true_twin(believed: Rig, rng: np.random.Generator) -> Twin:
     """Return a true rig that ``believed`` could be the calibration of.
+
+    It is drawn from a normal distribution about ``believed`` with the covariance of the file's fit, or with
+    that of a usual calibration (``STATED``) where the file has none.
 
     Raises
     ------
@@ -205,7 +209,7 @@ def true_twin(believed: Rig, rng: np.random.Generator) -> Twin:
 def usual_covariance(rig: Rig) -> RigCovariance:
     """Return what a usual calibration leaves open of a rig, in the parameters of a fit; see ``STATED``."""
     names = [f"mast.{kind}.{axis}" for kind in ("translation_m", "rotation_rad") for axis in "xyz"]
-    blocks = [np.diag([MAST_PLACE_M] * 3 + [MAST_ANGLE_RAD] * 3) ** 2]
+    blocks = [np.diag([LEFT_MAST_PLACE_M] * 3 + [LEFT_MAST_ANGLE_RAD] * 3) ** 2]
     for name, camera in rig.cameras.items():
         names += [f"cameras.{name}.{part}" for part in parameter_names(camera.model.kind)]
         rates = _rates(camera.model)
@@ -231,26 +235,26 @@ def _errors(model: CameraModel) -> list[Callable[[float], CameraModel]]:
     """One function a usual error: the camera with so many sigmas of it."""
 
     def shifted(axis: int) -> Callable[[float], CameraModel]:
-        return lambda t: model.moved(Rigid(np.eye(3), t * PLACE_M * np.eye(3)[axis]))
+        return lambda t: model.moved(Rigid(np.eye(3), t * LEFT_PLACE_M * np.eye(3)[axis]))
 
     def turned(turn: Callable[[float], FloatArray]) -> Callable[[float], CameraModel]:
         def error(t: float) -> CameraModel:
-            rotation = turn(t * ANGLE_RAD)
+            rotation = turn(t * LEFT_ANGLE_RAD)
             return model.moved(Rigid(rotation, model.C - rotation @ model.C))
 
         return error
 
     def zoomed(t: float) -> CameraModel:
-        h, v = (part + t * FOCAL * (part - (part @ model.A) * model.A) for part in (model.H, model.V))
+        h, v = (part + t * LEFT_FOCAL * (part - (part @ model.A) * model.A) for part in (model.H, model.V))
         return replace(model, H=h, V=v)
 
     def bent(place: int) -> Callable[[float], CameraModel]:
-        return lambda t: model.bent(place, t * BENDS[place])
+        return lambda t: model.bent(place, t * LEFT_BENDS[place])
 
     found = [shifted(axis) for axis in range(3)] + [turned(turn) for turn in (rot_x, rot_y, rot_z)] + [zoomed]
     found += [
-        lambda t: replace(model, H=model.H + t * MIDDLE_PX * model.A),
-        lambda t: replace(model, V=model.V + t * MIDDLE_PX * model.A),
+        lambda t: replace(model, H=model.H + t * LEFT_MIDDLE_PX * model.A),
+        lambda t: replace(model, V=model.V + t * LEFT_MIDDLE_PX * model.A),
     ]
     if model.kind != "CAHV":
         found += [bent(0), bent(1)]

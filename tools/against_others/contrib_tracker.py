@@ -1,4 +1,4 @@
-"""Follow the target of stored sequences with a tracker of opencv-contrib: the worker of compare_trackers.py.
+"""Follow the target of stored sequences with a tracker of opencv-contrib: a worker of `trackers`.
 
 Runs in an environment of its own, which has NumPy and opencv-contrib and nothing of this project:
 

@@ -1,4 +1,4 @@
-"""The trackers that compare_trackers.py puts side by side, each fed one stop of a sequence at a time.
+"""The trackers that `trackers` puts side by side, each fed one stop of a sequence at a time.
 
 All track both eyes of a stereo pair. The others know nothing of stereo and track the left and the right
 pixel each for itself, from the true pixels of the first stop. Their two kinds of rows:

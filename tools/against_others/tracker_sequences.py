@@ -1,4 +1,4 @@
-"""Picture sequences with exact truth for compare_trackers.py: a stereo pair nears one target in twenty steps.
+"""Picture sequences with exact truth for the trackers: a stereo pair nears one target in twenty steps.
 
 Settings B (10 to 6 m, 2.5 % of the range a step) and C (10 to 1.2 m, 10 % a step) of a bench that others were
 measured on, in two worlds:

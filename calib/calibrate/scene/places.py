@@ -1,8 +1,8 @@
 """Where features are: unknown places, settled for given cameras, and what no place can explain.
 
-A place is a bearing and an inverse range from the mast's origin, so that what is far away stays finite. An
-inverse range is below 0 where a rig that is wrong yet sees lines of sight diverge: nothing bounds it but that
-each camera has the feature before it. Where one has not, the feature is *lost*: its numbers are infinite.
+A place is a bearing and an inverse range from the mast's origin, so that what is far away stays finite. A
+rig that is still wrong may see lines of sight diverge; the inverse range is below 0 then. Its only bound is
+that each camera has the feature before it. Where one has not, the feature is *lost*: its numbers are infinite.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ PRIOR_INVERSE_M = (0.2, 1.0)
 
 NEAREST_INVERSE_M, TRIED = 0.7, 24
 LEAST_INVERSE_M = 1e-3
-_STEPS, _LEAST = 3, 1e-9
+_STEPS = 3
+_HELD = 1e-9  # of a bearing: a lost feature has no rates, and its normal matrix stays solvable
 
 
 class Sights:
@@ -114,11 +115,10 @@ class Sights:
         self, off: FloatArray, by_place: FloatArray, places: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return each place's normal matrix (n, 3, 3) and gradient (n, 3)."""
-        mean, sigma = PRIOR_INVERSE_M
         matrix = self.sums(by_place.transpose(0, 2, 1) @ by_place)
         gradient = self.sums(np.einsum("nij,ni->nj", by_place, off))
-        matrix[:, [0, 1, 2], [0, 1, 2]] += [_LEAST, _LEAST, sigma**-2]
-        gradient[:, 2] += (places[:, 2] - mean) / sigma**2
+        matrix[:, [0, 1, 2], [0, 1, 2]] += [_HELD, _HELD, PRIOR_INVERSE_M[1] ** -2]
+        gradient[:, 2] += _off_prior(places) / PRIOR_INVERSE_M[1]
         return matrix, gradient
 
     def sums(self, by_sight: FloatArray) -> FloatArray:
@@ -149,8 +149,7 @@ class Sights:
 
     def _cost(self, off: FloatArray, places: FloatArray) -> FloatArray:
         """What each feature (n,) costs at its place, its prior among it; infinite where it is lost."""
-        mean, sigma = PRIOR_INVERSE_M
-        return self.sums((off**2).sum(axis=1)) + ((places[:, 2] - mean) / sigma) ** 2
+        return self.sums((off**2).sum(axis=1)) + _off_prior(places) ** 2
 
     def rest(self, models: Sequence[CameraModel], places: FloatArray) -> tuple[FloatArray, np.ndarray]:
         """Return what no place explains (q,), 2 m - 3 numbers of a feature in m pictures, and whose (q,).
@@ -173,5 +172,10 @@ class Sights:
 
     def prior_cost(self, places: FloatArray) -> float:
         """Return what the places' priors cost."""
-        mean, sigma = PRIOR_INVERSE_M
-        return float(np.sum(((places[:, 2] - mean) / sigma) ** 2))
+        return float(np.sum(_off_prior(places) ** 2))
+
+
+def _off_prior(places: FloatArray) -> FloatArray:
+    """How far each inverse range (n,) is off the mean of its prior, sigmas."""
+    mean, sigma = PRIOR_INVERSE_M
+    return (places[:, 2] - mean) / sigma

@@ -98,7 +98,10 @@ def test_a_line_on_which_no_head_answers_is_told_with_what_to_name(
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--baud", "9600", "57600"], "--baud is 57600, expected one of 2400, 4800, 9600, 19200, 38400, 115200"),
+        (
+            ["--baud", "9600", "57600"],
+            "--baud is 57600, expected one of 2400, 4800, 9600, 19200, 38400, 115200",
+        ),
         (["--address", "300"], "--address is 300, expected 1 to 254"),
         (["--address", "0"], "--address is 0, expected 1 to 254"),
     ],

@@ -1,4 +1,4 @@
-"""A simulated camera that reads a part of its sensor: refused, carried over by the command told, and pointed."""
+"""A simulated camera that reads a part of its sensor: refused, carried over by the command, and pointed."""
 
 from __future__ import annotations
 
