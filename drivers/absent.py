@@ -61,9 +61,13 @@ class Absence:
             raise copy.copy(error)
 
 
-def stop_at_last(stop: Callable[[], object], clock: Clock, device: str) -> None:
-    """Stop a head that is closed, which no silence stops; tried again for `LAST_STOP_S`. Never raises."""
-    until_s = clock.now_s() + LAST_STOP_S
+def stop_at_last(stop: Callable[[], object], clock: Clock, device: str, until_s: float | None = None) -> None:
+    """Stop a head that is closed, which no silence stops. Never raises.
+
+    It is tried again until ``until_s``, by default for `LAST_STOP_S`; the last try begins then at the latest.
+    """
+    if until_s is None:
+        until_s = clock.now_s() + LAST_STOP_S
     while True:
         try:
             stop()

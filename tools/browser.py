@@ -27,15 +27,19 @@ def main() -> int:
         if shutil.which("apt-get") is None:
             print("no chromium, and no apt-get to install it by", file=sys.stderr)
             return 1
-        for arguments in (("update",), ("install", "-y", "--no-install-recommends", NAMES[0])):
+        install = "install", "-y", "--no-install-recommends"
+        for arguments in (("update",), (*install, NAMES[0]), (*install, NAMES[1])):
             try:
                 done = apt_get(*arguments, tell=lambda words: print(words, file=sys.stderr))
             except Busy as busy:
                 print(busy, file=sys.stderr)
                 return 1
+            if chromium() is not None:
+                break
             if done.returncode != 0:
                 print(f"apt-get {' '.join(arguments)}: {done.stderr.strip()[-400:]}", file=sys.stderr)
-                return 1
+        if chromium() is None:
+            return 1
     print(chromium())
     return 0
 

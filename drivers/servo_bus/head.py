@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, TypeVar
 
-from drivers.absent import Absence, stop_at_last
+from drivers.absent import LAST_STOP_S, Absence, stop_at_last
 from drivers.approach import rising_below_rad
 from drivers.clock import Clock, SystemClock, deadlines_on
 from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
@@ -30,6 +30,7 @@ T = TypeVar("T")
 
 CALL_TIMEOUT_S = 0.8  # the service waits 1 s
 CLOSE_TIMEOUT_S = 3.0  # the service gives no more
+LAST_TRY_S = 2.0  # when the last try of the last stop begins: one takes up to 0.8 s
 AXES = ("pan", "tilt")
 
 
@@ -101,7 +102,12 @@ class BusHead(Reporting):
                 f"speed {speed:g} rad/s is less than the {slowest:.4f} rad/s that the servos know"
             )
         capped = min(speed, self.settings.speed_rad_per_s)
-        self._call("move", lambda session: session.move((pan_rad, tilt_rad), capped), moves=True)
+
+        def move(session: ServoSession) -> None:
+            session.move((pan_rad, tilt_rad), capped)
+            self._stop_owed = False
+
+        self._call("move", move, moves=True)
 
     def stop(self) -> None:
         """Brake both axes; each then holds, or lets go when it stands, as its ``at_stop`` says.
@@ -119,7 +125,7 @@ class BusHead(Reporting):
             a stop tries a line that is away at once.
         """
         away = None if self.settings.silence_s else self._stop_away
-        self._call("stop", ServoSession.stop, first=True, away=away)
+        self._call("stop", self._stop_now, first=True, away=away)
 
     def close(self) -> None:
         """Stop, leave each servo as its ``at_close`` says, and let go of the line; never raises.
@@ -223,14 +229,21 @@ class BusHead(Reporting):
                 log.warning("%s: still away: %s", self.settings.port, error)
             self._absence.note(error, self._clock.now_s())
             return
-        log.warning("%s is back: limits and modes checked, the head stands still", self.settings.port)
         self._session, self._motions = session, [axis.motion for axis in session.pair.axes]
-        self._absence.end()
-        if self._stop_owed:  # as at_stop says
-            try:
-                self._within(ServoSession.stop)
-            finally:
-                self._stop_owed = self._session is None
+        try:
+            if self._stop_owed:  # as at_stop says
+                self._stop_now(session)
+        except GivenUp as given_up:
+            self._give_up(session, given_up.error)
+            return
+        finally:
+            if self._session is not None:
+                self._absence.end()
+        log.warning("%s is back: limits and modes checked, the head stands still", self.settings.port)
+
+    def _stop_now(self, session: ServoSession) -> None:
+        session.stop()
+        self._stop_owed = False
 
     def _give_up(self, session: ServoSession, error: DriverError) -> None:
         """Have both axes brake, close the line, and try again when the watchdogs must have stopped them."""
@@ -238,7 +251,7 @@ class BusHead(Reporting):
             session.pair.brake()
         session.pair.close()
         now_s = self._clock.now_s()
-        self._session, self._stop_owed = None, session.lets_go
+        self._session, self._stop_owed = None, self._stop_owed or session.lets_go
         self._absence.note(error, now_s, self.settings.silence_s)
         log.warning("%s; trying again in %.1f s", error, self._absence.again_s - now_s)
 
@@ -265,7 +278,9 @@ class BusHead(Reporting):
 
     def _close_now(self) -> None:
         session, self._session = self._session, None
-        until_s = self._clock.now_s() + LEFT_WITHIN_S
+        began_s = self._clock.now_s()
+        until_s = began_s + LEFT_WITHIN_S
         failed = session is None or session.end(until_s)
         if failed and not self.settings.silence_s:
-            stop_at_last(lambda: self._stop_away(until_s), self._clock, self.settings.port)
+            last_s = began_s + (LAST_STOP_S if session is None else LAST_TRY_S)
+            stop_at_last(lambda: self._stop_away(until_s), self._clock, self.settings.port, last_s)

@@ -28,8 +28,8 @@ ATTEMPTS, PATIENCE_S = 3, 0.15  # of a poll, before it counts as failed
 FAILED_POLLS = 2  # in a row, before the servos are set up anew
 STOP_PATIENCE_S = 0.2  # how long a stop asks for a confirmation that does not come
 STANDS_WITHIN_S = 2.5  # how long a stop waits for an axis to stand before its torque goes off
-LEFT_WITHIN_S = 1.5  # and a closing, for both axes together
-KEPT = "%s did not come to rest within %.1f s of a stop: its torque stays on"
+LEFT_WITHIN_S = 1.2  # and a closing, for both axes together
+KEPT = "%s did not come to rest after a stop: its torque stays on"
 
 
 class GivenUp(Exception):
@@ -234,7 +234,7 @@ class ServoSession:
                 axis.let_go()  # also where a move that was broken off has taken hold
                 self._to_let_go.remove(axis)
             elif now_s > self._let_go_until_s:
-                log.warning(KEPT, axis.servo.name, STANDS_WITHIN_S)
+                log.warning(KEPT, axis.servo.name)
                 self._to_let_go.remove(axis)
 
     def _stop_each(self) -> dict[Axis, DriverError]:
@@ -313,7 +313,7 @@ def leave(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError], until_
                 stands, sample = rests(axis.servo.look, pair.clock, within_s, Rest(STANDS_S))
                 limp = stands or not sample.values.get("torque_enable", True)
                 if not limp:
-                    log.warning(KEPT, axis.servo.name, within_s)
+                    log.warning(KEPT, axis.servo.name)
             except DriverError as error:
                 limp = False
                 words = "%s keeps its torque, for it does not say whether it stands: %s"

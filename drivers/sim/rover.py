@@ -178,7 +178,7 @@ class SimulatedRover:
             raise BadOptions(f"{place}.{name}: {error}") from None
         sensor, plain = self.sensor_modes[name], (False, False)
         flip = sensor.flip[0] != mode.flip[0], sensor.flip[1] != mode.flip[1]
-        # Its maker counts the crop of a flipped picture from the side that the picture begins with.
+        # A maker's choice: the crop counts from the side with which the calibrated picture begins.
         after = sensor_mode_after(replace(sensor, flip=plain), replace(mode, flip=plain))
         size_px = self.rig.cameras[name].model.size_px
         self.sensor_modes[name] = replace(after or SensorMode(size_px), flip=flip)

@@ -403,8 +403,10 @@ def _ptz_info(args: argparse.Namespace) -> int:
     from drivers.ptz.inquiry import find_heads
     from mastctl.rig.plugged import PTZ_DIALECTS
 
-    bauds = sorted({baud for dialect in PTZ_DIALECTS for baud in dialect.possible_bauds})
-    highest = max(dialect.highest_address for dialect in PTZ_DIALECTS)
+    asked = [one for one in PTZ_DIALECTS if "://" not in args.port or args.port.startswith(one.schemes)]
+    asked = asked or list(PTZ_DIALECTS)
+    bauds = sorted({baud for dialect in asked for baud in dialect.possible_bauds})
+    highest = max(dialect.highest_address for dialect in asked)
     for baud in args.baud:
         if baud not in bauds:
             raise BadOptions(f"--baud is {baud}, expected one of {', '.join(map(str, bauds))}")

@@ -413,8 +413,6 @@ class Cameras:
         except BadFrame as refused:
             self._refused[name] = refused
             raise
-        except BadReply as error:  # a defect of the driver that no wait mends: as at the start
-            log.warning("%s; the size is seen in its pictures", error)
         self._refused.pop(name, None)
 
     def _check_sizes(self) -> None:
@@ -437,27 +435,37 @@ class Cameras:
                 log.warning("%s; the size is seen in its pictures", error)
 
     def _check_as_calibrated(self, name: str) -> None:
-        """Pass a camera whose size and sensor mode, as far as it knows them, are the mast file's.
+        """Pass a camera whose sensor mode and size, as far as it knows them, are the mast file's.
+
+        What is no sensor mode or no size is a defect of its driver: it is told, and not compared.
 
         Raises
         ------
         BadFrame
             If one is not.
-        BadReply
-            If it tells something else than a sensor mode.
+        DriverError
+            If the driver fails to say it now.
         """
         camera, calibrated = self._cameras[name], self._calibrated.get(name)
         if isinstance(camera, KnowsSensorMode):  # it says more than the size: what mends it, in full
             self._check_mode(name, camera.sensor_mode, calibrated)
-        if isinstance(camera, KnowsSize) and calibrated is not None:
-            width, height = camera.size_px
-            frame_checks.check_size(name, (int(width), int(height)), calibrated.model.size_px)
+        if not isinstance(camera, KnowsSize) or calibrated is None:
+            return
+        told = camera.size_px
+        try:
+            width, height = (int(side) for side in told)
+        except (TypeError, ValueError):
+            words = "%s: size_px is %s where (width, height) is expected; the size is seen in its pictures"
+            log.warning(words, name, type(told).__name__)
+        else:
+            frame_checks.check_size(name, (width, height), calibrated.model.size_px)
 
     def _check_mode(self, name: str, mode: object, calibrated: RigCamera | None) -> None:
-        """Note a camera's sensor mode and pass the mast file's; raises as `_check_as_calibrated`."""
+        """Note a camera's sensor mode and pass the mast file's. Raises BadFrame."""
         if not isinstance(mode, SensorMode):
-            words = f"sensor_mode is {type(mode).__name__} where a SensorMode is expected"
-            raise BadReply(words, device=name)
+            words = "%s: sensor_mode is %s where a SensorMode is expected; it is not compared"
+            log.warning(words, name, type(mode).__name__)
+            return
         self.sensor_modes[name] = mode
         if calibrated is not None and (then := calibrated.sensor_mode) is not None:
             frame_checks.check_mode(name, mode, then)

@@ -71,8 +71,10 @@ def check_size(camera: str, size_px: tuple[int, int], wanted_px: tuple[int, int]
 def check_mode(camera: str, now: SensorMode, then: SensorMode) -> None:
     """Raise BadFrame if a camera's pictures are not of the sensor mode that the mast file was calibrated in.
 
-    A crop that either lacks is not compared.
+    A crop that either lacks is not compared, and their sizes have to be equal.
     """
+    if now.crop_px is None or then.crop_px is None:
+        check_size(camera, now.size_px, then.size_px)
     try:
         change = mode_between(then, now)
     except BadMode as error:

@@ -2,7 +2,7 @@
 
 A place is a bearing and an inverse range from the mast's origin, so that what is far away stays finite. A
 rig that is still wrong may see lines of sight diverge; the inverse range is below 0 then. Its only bound is
-that each camera has the feature before it. Where one has not, the feature is *lost*: its numbers are infinite.
+that each camera has the feature before it. Where one has not, the feature is *lost*: infinite numbers.
 """
 
 from __future__ import annotations

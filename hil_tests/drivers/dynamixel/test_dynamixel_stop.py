@@ -12,12 +12,14 @@ from typing import Any
 
 import pytest
 
+from drivers.absent import FIRST_WAIT_S
 from drivers.dynamixel.head import DynamixelHead
 from drivers.dynamixel.link import Link
 from drivers.dynamixel.pair import Pair
 from drivers.dynamixel.servo import Servo
 from drivers.errors import DriverError, LineLost, NoReply, WrongDevice
 from drivers.servo_bus.bus import Bus
+from drivers.servo_bus.head import CLOSE_TIMEOUT_S
 from drivers.servo_bus.session import GivenUp, ServoSession
 from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.dynamixel_packets import BROADCAST, Instruction
@@ -316,17 +318,22 @@ def test_closing_keeps_the_torque_of_a_servo_that_does_not_say_whether_it_stands
         assert [servo.table["torque_enable"] for servo in it.servos] == [1, 0]
 
 
-def test_a_closing_ends_in_its_time_beside_an_axis_that_never_stands_and_a_silent_one() -> None:
+@pytest.mark.parametrize("reply_timeout_s", [0.05, 0.1, 0.2, 0.3])
+@pytest.mark.parametrize("fault", [mute, garbage, late])
+def test_a_closing_ends_in_its_time_beside_an_axis_that_never_stands_and_a_silent_one(
+    fault: Callable[[Rig, int], None], reply_timeout_s: float, caplog: pytest.LogCaptureFixture
+) -> None:
     with rig() as it:
         it.options["pan"]["at_close"] = it.options["tilt"]["at_close"] = "torque_off"
-        head = it.open(watchdog_s=0)
+        head = it.open(watchdog_s=0, reply_timeout_s=reply_timeout_s)
         under_way(it, head)
-        mute(it, 1)
+        fault(it, 1)
+        it.axes[0].velocity(it.now_s(), 0.2, 10.0)
         it.axes[0]._take = lambda *_: None  # type: ignore[method-assign]
         closing_s = it.now_s()
         head.close()
-        assert it.now_s() - closing_s < 3.0
-        assert it.servos[0].table["torque_enable"] == 1
+        assert it.now_s() - closing_s < CLOSE_TIMEOUT_S and "left behind" not in caplog.text
+        assert it.servos[0].table["torque_enable"] == 1 and it.speed_rad_per_s(0) > 0.1
 
 
 def test_a_stop_owed_at_a_return_is_owed_again_if_it_fails(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -347,6 +354,7 @@ def test_a_stop_owed_at_a_return_is_owed_again_if_it_fails(monkeypatch: pytest.M
         it.line.come_back()
         it.until(lambda: not failed(head), "an answer")
         assert len(tries) == 2 and not head._stop_owed
+        assert tries[1] - tries[0] > 2 * FIRST_WAIT_S, "the waits grow"
 
 
 def test_a_stop_breaks_off_what_is_under_way_and_its_caller_is_told() -> None:

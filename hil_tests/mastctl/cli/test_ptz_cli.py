@@ -104,11 +104,12 @@ def test_a_line_on_which_no_head_answers_is_told_with_what_to_name(
         ),
         (["--address", "300"], "--address is 300, expected 1 to 254"),
         (["--address", "0"], "--address is 0, expected 1 to 254"),
+        (["udp://127.0.0.1", "--address", "9"], "--address is 9, expected 1 to 7"),
     ],
 )
 def test_a_rate_or_an_address_that_no_head_has_is_refused_before_the_line_is_opened(
     words: list[str], told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["ptz", "info", "/dev/not-there", *words, "--json"]) == 2
+    assert main(["ptz", "info", *([] if "://" in words[0] else ["/dev/not-there"]), *words, "--json"]) == 2
     error = json.loads(capsys.readouterr().out)["error"]
     assert (error["code"], error["message"]) == ("bad_options", told)

@@ -779,6 +779,11 @@ PART = "64x48 px from (32, 24) of 128x96 px as 64x48 px"
         (SensorMode((64, 48), (40, 24, 64, 48), (128, 96)), "more of the sensor along x than was calibrated"),
         (SensorMode((64, 48), (32, 24, 64, 48), (128, 96)), ""),
         (SensorMode((64, 48)), ""),
+        (
+            SensorMode((128, 96)),
+            "the image is 64x48 px where the mast file has 128x96 px; for a crop or binning of the "
+            "calibrated picture 'mastctl camera mode' writes",
+        ),
         (None, ""),
     ],
 )
@@ -817,16 +822,26 @@ def test_a_late_camera_in_another_mode_gives_no_picture() -> None:
         devices.close()
 
 
-def test_a_late_camera_whose_sensor_mode_is_none_gives_pictures_as_at_the_start(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(
+    ("attribute", "words"),
+    [
+        ("sensor_mode", "sensor_mode is NoneType where a SensorMode is expected; it is not compared"),
+        (
+            "size_px",
+            "size_px is NoneType where (width, height) is expected; the size is seen in its pictures",
+        ),
+    ],
+)
+def test_a_late_camera_whose_driver_tells_nonsense_gives_pictures_as_at_the_start(
+    attribute: str, words: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(ModalCamera, "sensor_mode", None)
+    monkeypatch.setattr(ModalCamera, attribute, None, raising=False)
     hardware = FakeHardware()
     late = AbsentCamera("navcam_left", "fake", lambda: ModalCamera("navcam_left", 0), error=NoReply("away"))
     hardware.fake_cameras["navcam_left"] = cast(FakeCamera, late)
     devices = Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
     try:
-        until(lambda: "sensor_mode is NoneType where a SensorMode is expected" in caplog.text, "it is told")
+        until(lambda: words in caplog.text, "it is told")
         assert devices.frames(["navcam_left"], now(devices), NET_S)
         until(lambda: not devices.faults(), "no fault stands")
     finally:
