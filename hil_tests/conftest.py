@@ -37,6 +37,10 @@ with suppress(ValueError):  # not the main thread
         if signal.getsignal(_number) is signal.SIG_IGN:
             signal.signal(_number, _usual)
 
+# A second thread of the small matrices here only waits, in as much processor time as the first one works.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
 # What tests make in the temporary folder, and the state of daemons that they start, is in a folder of this
 # process alone. pytest's own folders stay beside it.
 os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())

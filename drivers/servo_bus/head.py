@@ -278,9 +278,12 @@ class BusHead(Reporting):
 
     def _close_now(self) -> None:
         session, self._session = self._session, None
+        last_s, until_s = LAST_STOP_S, LAST_STOP_S + LEFT_WITHIN_S  # where the line is away now
+        if session is not None:
+            last_s, until_s = LAST_TRY_S, LEFT_WITHIN_S
         began_s = self._clock.now_s()
-        until_s = began_s + LEFT_WITHIN_S
-        failed = session is None or session.end(until_s)
+        failed = session is None or session.end(began_s + until_s)
         if failed and not self.settings.silence_s:
-            last_s = began_s + (LAST_STOP_S if session is None else LAST_TRY_S)
-            stop_at_last(lambda: self._stop_away(until_s), self._clock, self.settings.port, last_s)
+            stop_at_last(
+                lambda: self._stop_away(began_s + until_s), self._clock, self.settings.port, began_s + last_s
+            )

@@ -299,8 +299,8 @@ def confirmed(
 def leave(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError], until_s: float) -> None:
     """Leave each axis that has confirmed the last stop as its ``at_close`` says; never raises.
 
-    Its torque goes off only when it stands, which is waited for until ``until_s`` of the line's clock; for
-    0.2 s at least, so that it does not depend on how long the other one took.
+    Its torque goes off only when it stands. Each has until ``until_s`` of the line's clock for that, and at
+    least 0.2 s: the other one may have taken long.
     """
     for axis in pair.axes:
         if axis in failed:
