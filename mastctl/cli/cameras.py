@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drivers.interfaces import SETTINGS
 from mastctl.cli import camera_mode, camera_sync, output
 from mastctl.cli.camera_sync import (
     FRAME_TIMEOUT_S,
@@ -65,6 +64,8 @@ def add_actions(actions: Any) -> None:
 
 def _change(text: str) -> tuple[str, float]:
     """A change as it is typed. Raises ArgumentTypeError."""
+    from drivers.interfaces import SETTINGS  # brings numpy, which no --help needs
+
     name, sign, value = text.partition("=")
     if not sign or name not in SETTINGS:
         words = f"{text!r} where NAME=VALUE is expected, with the name one of {', '.join(SETTINGS)}"

@@ -453,6 +453,17 @@ def test_a_geometry_command_does_not_load_what_it_does_not_need(folder: Path) ->
     assert done.returncode == 0, done.stderr
 
 
+def test_the_whole_help_loads_nothing_that_is_slow() -> None:
+    script = (
+        "import sys; from mastctl.cli.main import build_parser\n"
+        "build_parser([])\n"
+        "slow = {'numpy', 'yaml', 'cv2', 'numba', 'fastapi', 'httpx', 'rich', 'scipy'} & set(sys.modules)\n"
+        "sys.exit(f'loaded {slow}' if slow else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_a_reader_that_goes_away_ends_the_command_quietly(folder: Path) -> None:
     Path("many.csv").write_text("x_m,y_m,z_m\n" + "10,1,1\n" * 100_000)
     command = [sys.executable, "-m", "mastctl", "camera", "project", "camera.yaml", "--points", "many.csv"]
