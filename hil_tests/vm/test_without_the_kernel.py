@@ -12,7 +12,17 @@ import pytest
 from tools.virtual_machine import kernel
 
 
-@pytest.mark.parametrize("how", [["-p", "no:xdist"], ["-n", "1"]], ids=["in one process", "in several"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        pytest.param(["-p", "no:xdist"], id="in one process"),
+        pytest.param(
+            *(["-n", "1"],),
+            id="in several",
+            marks=pytest.mark.long(2, "pytest in a worker of its own; one without is in the quick run"),
+        ),
+    ],
+)
 def test_the_last_line_before_the_counts_says_what_did_not_run(
     how: list[str], repository: Path, tmp_path: Path
 ) -> None:

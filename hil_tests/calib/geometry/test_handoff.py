@@ -314,7 +314,14 @@ def test_a_rig_that_says_how_wrong_it_is_may_be(rig: Rig) -> None:
         )
 
 
-@pytest.mark.parametrize(("calibrated", "draws"), [(False, 10_000), (True, 3_000)])
+@pytest.mark.parametrize(
+    ("calibrated", "draws"),
+    [
+        (False, 3_000),
+        (True, 3_000),
+        pytest.param(False, 10_000, marks=pytest.mark.long(4, "more draws; 3,000 are in the quick run")),
+    ],
+)
 def test_one_good_pair_of_clicks_in_a_thousand_is_refused(
     rig: Rig, uncertain: RigCovariance, calibrated: bool, draws: int
 ) -> None:

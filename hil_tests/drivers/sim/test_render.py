@@ -16,8 +16,9 @@ from drivers.sim import ground, render
 from drivers.sim import render as ray_tables
 from drivers.sim.kept import is_compiled
 from drivers.sim.kernels.light import stretched_brightness
+from drivers.sim.quick_start import kept_scene
 from drivers.sim.render import Renderer, Stills, compile_renderer, ray_table
-from drivers.sim.scene import Scene, SceneSettings, build_scene
+from drivers.sim.scene import Scene, SceneSettings
 from tools.campaigns import render_bias as bias
 
 MOST_BIAS_PX = 0.01
@@ -28,7 +29,7 @@ TABLE_PX = 1e-4
 
 @pytest.fixture(scope="module")
 def flat() -> Renderer:
-    return Renderer(build_scene(SceneSettings(seed=2, relief_m=0.0, rocks=0)))
+    return Renderer(kept_scene(SceneSettings(seed=2, relief_m=0.0, rocks=0)))
 
 
 @pytest.fixture(scope="module")

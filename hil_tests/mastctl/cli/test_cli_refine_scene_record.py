@@ -63,10 +63,8 @@ def turned_back(model: CameraModel) -> CameraModel:
     return model
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    """What a daemon recorded while its head looked round: true rig and mast file differ by a known turn."""
-    folder = tmp_path_factory.mktemp("scene")
+def recorded_of(folder: Path, *rounds: list[tuple[float, float]]) -> tuple[Path, list[Path]]:
+    """The mast file, and what a daemon recorded of each round of rests: the true rig has a known turn."""
     true = load_rig(ROOT / "configs" / "sim" / "one_camera.yaml").rig
     camera = RigCamera("head", turned_back(true.cameras[CAMERA].model))
     mast = save_rig(Rig("bumped", true.mast, {CAMERA: camera}), folder / "mast.yaml").path
@@ -80,19 +78,38 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     )
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
         runs = []
-        for rests in (RESTS, OTHER_RESTS):
+        for rests in rounds:
             client.start_recording("round")
             for pan, tilt in rests:
                 client.wait(client.point(pan_rad=pan, tilt_rad=tilt))
                 client.snapshot(CAMERA)
             runs.append(Path(client.stop_recording()["file"]))
+    return mast, runs
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """A look all round, and one at other rests."""
+    mast, runs = recorded_of(tmp_path_factory.mktemp("scene"), RESTS, OTHER_RESTS)
     return Recorded(mast, *runs)
 
 
 @pytest.fixture(scope="module")
+def briefly(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """The first five rests: enough to be spoilt."""
+    mast, (run,) = recorded_of(tmp_path_factory.mktemp("brief"), RESTS[:5])
+    return Recorded(mast, run, run)
+
+
+def pictures_of(run: Path) -> list[tuple[float, float, np.ndarray]]:
+    """The pictures of a run: pan, tilt, image."""
+    return [(one.pan_rad, one.tilt_rad, one.frames[CAMERA].image()) for one in read_recording(run)]
+
+
+@pytest.fixture(scope="module")
 def pictures(recorded: Recorded) -> list[tuple[float, float, np.ndarray]]:
-    """The pictures of the run: pan, tilt, image."""
-    return [(one.pan_rad, one.tilt_rad, one.frames[CAMERA].image()) for one in read_recording(recorded.run)]
+    """The pictures of the whole look."""
+    return pictures_of(recorded.run)
 
 
 def refined(recorded: Recorded, record: Path, out: Path, mast: Path | None = None) -> int:
@@ -219,12 +236,12 @@ def test_a_record_that_cannot_tell_anything_is_refused_in_one_sentence(
     spoil: Spoil,
     status: int,
     phrase: str,
-    recorded: Recorded,
-    pictures: list[tuple[float, float, np.ndarray]],
+    briefly: Recorded,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert refined(recorded, spoil(recorded, pictures, tmp_path), tmp_path / "new.yaml") == status
+    record = spoil(briefly, pictures_of(briefly.run), tmp_path)
+    assert refined(briefly, record, tmp_path / "new.yaml") == status
     message = json.loads(capsys.readouterr().out)["error"]["message"]
     assert phrase in message and "\n" not in message
     assert not (tmp_path / "new.yaml").exists()
