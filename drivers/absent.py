@@ -25,6 +25,8 @@ FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 2.0
 LAST_STOP_S = 1.0
 """How long the stop of a head that is closed is tried again; all of closing may take 3 s."""
 
+UNCONFIRMED = "the last stop was not confirmed, the head may still move; 'mastctl halt' stops it"
+
 Opening = Future[Any]
 
 
@@ -61,13 +63,12 @@ class Absence:
             raise copy.copy(error)
 
 
-def stop_at_last(stop: Callable[[], object], clock: Clock, device: str, until_s: float | None = None) -> None:
-    """Stop a head that is closed, which no silence stops. Never raises.
+def stop_at_last(stop: Callable[[], object], clock: Clock, device: str) -> None:
+    """Stop a head that is closed, which no silence stops; tried again for `LAST_STOP_S`.
 
-    It is tried again until ``until_s``, by default for `LAST_STOP_S`; the last try begins then at the latest.
+    Raises nothing but what ``stop`` raises beside DriverError.
     """
-    if until_s is None:
-        until_s = clock.now_s() + LAST_STOP_S
+    until_s = clock.now_s() + LAST_STOP_S
     while True:
         try:
             stop()
@@ -75,8 +76,7 @@ def stop_at_last(stop: Callable[[], object], clock: Clock, device: str, until_s:
             if clock.now_s() < until_s:
                 clock.sleep(FIRST_WAIT_S)
                 continue
-            words = "the last stop was not confirmed, the head may still move; 'mastctl halt' stops it"
-            log.warning("%s: %s: %s", device, words, error)
+            log.warning("%s: %s: %s", device, UNCONFIRMED, error)
         return
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from operator import index
 from typing import Literal
 
 from calib.errors import CalibError
@@ -77,7 +78,7 @@ class SensorMode:
     Raises
     ------
     ValueError
-        If the crop is not inside the sensor, or one of the two is missing.
+        If the size is none, the crop is not inside the sensor, or one of the two is missing.
     """
 
     size_px: tuple[int, int]
@@ -86,6 +87,13 @@ class SensorMode:
     flip: tuple[bool, bool] = (False, False)
 
     def __post_init__(self) -> None:
+        try:
+            width, height = (index(side) for side in self.size_px)
+        except (TypeError, ValueError):
+            width = height = 0
+        if min(width, height) < 1:
+            raise ValueError(f"size_px is {self.size_px!r}, expected (width, height) of 1 px and more")
+        object.__setattr__(self, "size_px", (width, height))
         if self.crop_px is None or self.sensor_px is None:
             if self.crop_px is not None or self.sensor_px is not None:
                 raise ValueError("crop_px and sensor_px are expected together")

@@ -10,6 +10,7 @@ was called before it begins after it.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -20,6 +21,8 @@ from drivers.errors import DriverError, NoReply
 from drivers.servo_bus.port import Overtaken
 
 log = logging.getLogger(__name__)
+
+BREAK_OFF_S = 0.2  # for what is broken off to end
 T = TypeVar("T")
 
 
@@ -80,6 +83,7 @@ class Bus:
         self._serving_urgent = False
         self._last_stop = object()  # replaced by each
         self._closing: _Job | None = None
+        self._closing_until_s = math.inf
         self._clock = clock or SystemClock()
         self._called = self._clock.signal()
         self._thread = self._clock.thread(self._serve, f"bus {name}")
@@ -89,7 +93,9 @@ class Bus:
         self._thread.start()
 
     def urgent(self) -> bool:
-        """Whether a call with ``first`` waits for the line while something else has it."""
+        """Whether what has the line is to break off: a call with ``first`` waits, or all time is over."""
+        if self._clock.now_s() > self._closing_until_s:
+            return True
         return bool(self._urgent_jobs) and not self._serving_urgent
 
     def call(
@@ -143,11 +149,13 @@ class Bus:
     def close(self, last: Callable[[], None], timeout_s: float) -> None:
         """Run ``last`` in the thread as the last call of all and end the thread; never raises.
 
-        A second call waits for the first one's ``last``.
+        It is broken off `BREAK_OFF_S` before ``timeout_s`` is over (see `urgent`). A second call waits for
+        the first one's ``last``.
         """
         with self._called:
             job = self._closing
             if job is None:
+                self._closing_until_s = self._clock.now_s() + timeout_s - BREAK_OFF_S
                 self._closing = job = _Job(last, self._clock, first=True)
                 self._last_stop = object()
                 self._urgent_jobs.append(job)

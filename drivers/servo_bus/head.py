@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, TypeVar
 
-from drivers.absent import LAST_STOP_S, Absence, stop_at_last
+from drivers.absent import LAST_STOP_S, UNCONFIRMED, Absence, stop_at_last
 from drivers.approach import rising_below_rad
 from drivers.clock import Clock, SystemClock, deadlines_on
 from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
@@ -22,6 +22,7 @@ from drivers.interfaces import AxisMotion, AxisReport, Reading, Reporting
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.bus import Bus
 from drivers.servo_bus.pair import ServoPair, SessionWatch
+from drivers.servo_bus.port import Overtaken
 from drivers.servo_bus.session import LEFT_WITHIN_S, GivenUp, ServoSession, confirmed, leave, stop_error
 from drivers.servo_bus.settings import HeadSettings
 
@@ -30,7 +31,6 @@ T = TypeVar("T")
 
 CALL_TIMEOUT_S = 0.8  # the service waits 1 s
 CLOSE_TIMEOUT_S = 3.0  # the service gives no more
-LAST_TRY_S = 2.0  # when the last try of the last stop begins: one takes up to 0.8 s
 AXES = ("pan", "tilt")
 
 
@@ -239,11 +239,18 @@ class BusHead(Reporting):
         finally:
             if self._session is not None:
                 self._absence.end()
-        log.warning("%s is back: limits and modes checked, the head stands still", self.settings.port)
+                log.warning("%s is back: limits and modes checked, the head stands still", self.settings.port)
 
     def _stop_now(self, session: ServoSession) -> None:
-        session.stop()
-        self._stop_owed = False
+        """Stop, which is owed no longer once both axes have confirmed it; raises as `ServoSession.stop`."""
+        owed = False
+        try:
+            session.stop()
+        except (GivenUp, Overtaken):
+            owed = self._stop_owed
+            raise
+        finally:
+            self._stop_owed = owed
 
     def _give_up(self, session: ServoSession, error: DriverError) -> None:
         """Have both axes brake, close the line, and try again when the watchdogs must have stopped them."""
@@ -278,12 +285,11 @@ class BusHead(Reporting):
 
     def _close_now(self) -> None:
         session, self._session = self._session, None
-        last_s, until_s = LAST_STOP_S, LAST_STOP_S + LEFT_WITHIN_S  # where the line is away now
-        if session is not None:
-            last_s, until_s = LAST_TRY_S, LEFT_WITHIN_S
-        began_s = self._clock.now_s()
-        failed = session is None or session.end(began_s + until_s)
-        if failed and not self.settings.silence_s:
-            stop_at_last(
-                lambda: self._stop_away(began_s + until_s), self._clock, self.settings.port, began_s + last_s
-            )
+        away_s = LAST_STOP_S if session is None else 0.0  # for the line to come back
+        until_s = self._clock.now_s() + away_s + LEFT_WITHIN_S
+        try:
+            failed = session is None or session.end(until_s)
+            if failed and not self.settings.silence_s:
+                stop_at_last(lambda: self._stop_away(until_s), self._clock, self.settings.port)
+        except Overtaken:
+            log.warning("%s: %s: its time was over", self.settings.port, UNCONFIRMED)

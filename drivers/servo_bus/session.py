@@ -266,14 +266,16 @@ class ServoSession:
             axis.brake()
 
     def end(self, until_s: float) -> bool:
-        """Stop, leave each servo as its ``at_close`` says, and close the line; never raises.
+        """Stop, leave each servo as its ``at_close`` says, and close the line. Raises `Overtaken` alone.
 
         A servo that does not confirm the stop keeps its watchdog. Returns whether one did not. ``until_s``
         as of `leave`.
         """
-        failed = self._stop_each()
-        leave(self.pair, failed, until_s)
-        self.pair.close()
+        try:
+            failed = self._stop_each()
+            leave(self.pair, failed, until_s)
+        finally:
+            self.pair.close()
         return bool(failed)
 
 
@@ -297,7 +299,7 @@ def confirmed(
 
 
 def leave(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError], until_s: float) -> None:
-    """Leave each axis that has confirmed the last stop as its ``at_close`` says; never raises.
+    """Leave each axis that has confirmed the last stop as its ``at_close`` says. Raises `Overtaken` alone.
 
     Its torque goes off only when it stands. Each has until ``until_s`` of the line's clock for that, and at
     least 0.2 s: the other one may have taken long.

@@ -413,6 +413,8 @@ class Cameras:
         except BadFrame as refused:
             self._refused[name] = refused
             raise
+        except Exception as error:  # the driver's; as at the start
+            log.warning("%s: %s; the size is seen in its pictures", name, error)
         self._refused.pop(name, None)
 
     def _check_sizes(self) -> None:
@@ -443,18 +445,23 @@ class Cameras:
         ------
         BadFrame
             If one is not.
-        DriverError
-            If the driver fails to say it now.
+        Exception
+            That of a driver that fails to say its size.
         """
         camera, calibrated = self._cameras[name], self._calibrated.get(name)
-        if isinstance(camera, KnowsSensorMode):  # it says more than the size: what mends it, in full
-            self._check_mode(name, camera.sensor_mode, calibrated)
+        try:
+            if isinstance(camera, KnowsSensorMode):  # first: it says more of what mends it than the size
+                self._check_mode(name, camera.sensor_mode, calibrated)
+        except BadFrame:
+            raise
+        except Exception as error:
+            log.warning("%s: its sensor mode is not known: %s", name, error)
         if not isinstance(camera, KnowsSize) or calibrated is None:
             return
         told = camera.size_px
         try:
             width, height = (int(side) for side in told)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             words = "%s: size_px is %s where (width, height) is expected; the size is seen in its pictures"
             log.warning(words, name, type(told).__name__)
         else:

@@ -259,3 +259,13 @@ def test_what_a_driver_does_not_tell_is_not_compared_and_flips_are() -> None:
     off_middle = replace(SENSOR_MODES[5], flip=(True, False))
     assert mode_between(off_middle, off_middle) == Mode(), "the same is the same, from whatever side"
     assert sensor_mode_after(off_middle, Mode(crop_px=(0, 0, 20, 20))) is None
+
+
+@pytest.mark.parametrize("size_px", [None, (64,), (64, 0), (64.0, 48), "64"])
+def test_a_sensor_mode_of_no_size_is_refused(size_px: object) -> None:
+    with pytest.raises(ValueError, match="size_px is .*, expected .width, height. of 1 px and more"):
+        SensorMode(size_px)  # type: ignore[arg-type]
+
+
+def test_a_size_is_kept_as_a_tuple() -> None:
+    assert SensorMode([64, 48]) == SensorMode((64, 48))  # type: ignore[arg-type]

@@ -6,7 +6,7 @@ it knows for every moment of the turned clock.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -318,22 +318,45 @@ def test_closing_keeps_the_torque_of_a_servo_that_does_not_say_whether_it_stands
         assert [servo.table["torque_enable"] for servo in it.servos] == [1, 0]
 
 
-@pytest.mark.parametrize("reply_timeout_s", [0.05, 0.1, 0.2, 0.3])
-@pytest.mark.parametrize("fault", [mute, garbage, late])
-def test_a_closing_ends_in_its_time_beside_an_axis_that_never_stands_and_a_silent_one(
-    fault: Callable[[Rig, int], None], reply_timeout_s: float, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("reply_timeout_s", [0.05, 0.1, 0.3])
+@pytest.mark.parametrize("bad", [(1,), (0, 1)], ids=["tilt", "both"])
+@pytest.mark.parametrize("fault", [mute, garbage, late, babble])
+def test_a_closing_ends_in_its_time_beside_an_axis_that_never_stands(
+    fault: Callable[[Rig, int], None],
+    bad: Sequence[int],
+    reply_timeout_s: float,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     with rig() as it:
         it.options["pan"]["at_close"] = it.options["tilt"]["at_close"] = "torque_off"
         head = it.open(watchdog_s=0, reply_timeout_s=reply_timeout_s)
         under_way(it, head)
-        fault(it, 1)
+        for axis in bad:
+            fault(it, axis)
         it.axes[0].velocity(it.now_s(), 0.2, 10.0)
         it.axes[0]._take = lambda *_: None  # type: ignore[method-assign]
         closing_s = it.now_s()
         head.close()
         assert it.now_s() - closing_s < CLOSE_TIMEOUT_S and "left behind" not in caplog.text
         assert it.servos[0].table["torque_enable"] == 1 and it.speed_rad_per_s(0) > 0.1
+        assert "may still move" in caplog.text or "did not come to rest" in caplog.text
+
+
+@pytest.mark.parametrize("watchdog_s", [0, 0.4])
+def test_a_closing_during_which_the_power_goes_ends_in_its_time(
+    watchdog_s: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    with rig() as it:
+        it.options["pan"]["at_close"] = it.options["tilt"]["at_close"] = "torque_off"
+        head = it.open(watchdog_s=watchdog_s)
+        under_way(it, head)
+        closing = it.beside(head.close)
+        closing_s = it.now_s()
+        it.until(lambda: it.now_s() > closing_s + 0.2, "the axes brake")
+        for axis in (0, 1):
+            unpowered(it, axis)
+        closing.wait()
+        assert it.now_s() - closing_s < CLOSE_TIMEOUT_S and "left behind" not in caplog.text
 
 
 def test_a_stop_owed_at_a_return_is_owed_again_if_it_fails(monkeypatch: pytest.MonkeyPatch) -> None:

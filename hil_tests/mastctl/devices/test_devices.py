@@ -804,6 +804,21 @@ def test_a_camera_in_another_mode_than_the_mast_files_is_refused_at_the_start_wi
     devices.close()
 
 
+def test_a_camera_that_fails_to_tell_its_mode_is_refused_for_its_size(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fails(camera: object) -> SensorMode:
+        raise NotImplementedError("not in this model")
+
+    monkeypatch.setattr(ModalCamera, "sensor_mode", property(fails))
+    monkeypatch.setattr(ModalCamera, "size_px", (64, 47), raising=False)
+    hardware = FakeHardware()
+    hardware.fake_cameras["navcam_left"] = ModalCamera("navcam_left", 0)
+    with pytest.raises(BadFrame, match="the image is 64x47 px where the mast file has 64x48 px"):
+        Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
+    assert "navcam_left: its sensor mode is not known: not in this model" in caplog.text
+
+
 def test_a_late_camera_in_another_mode_gives_no_picture() -> None:
     hardware, little = FakeHardware(), rig()
     late = AbsentCamera("navcam_left", "fake", lambda: ModalCamera("navcam_left", 0), error=NoReply("away"))
