@@ -263,7 +263,7 @@ def test_what_a_driver_does_not_tell_is_not_compared_and_flips_are() -> None:
 
 @pytest.mark.parametrize("size_px", [None, (64,), (64, 0), (64.0, 48), "64"])
 def test_a_sensor_mode_of_no_size_is_refused(size_px: object) -> None:
-    with pytest.raises(ValueError, match="size_px is .*, expected .width, height. of 1 px and more"):
+    with pytest.raises(ValueError, match=r"size_px is .*, expected .width, height. of 1 px and more"):
         SensorMode(size_px)  # type: ignore[arg-type]
 
 
