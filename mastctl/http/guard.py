@@ -49,8 +49,9 @@ MOST_HEADERS = 100
 
 ATTACKS = frozenset({"wrong_token", "too_many_guesses", "foreign_host", "foreign_origin"})
 """Refusals that are recorded of reading too; of what changes something each one is."""
-RECORDED = 100  # refusals of one party in a minute; then each RARELY-th
+RECORDED = 100  # refusals of one party in COUNTED_S; then each RARELY-th
 RARELY = 1000
+COUNTED_S = 60.0
 MOST_PARTIES = 1000
 
 _ONCE = frozenset(
@@ -194,7 +195,7 @@ class Guard:
         if self._records is None or state.get("recorded") or not (changes(scope) or error["code"] in ATTACKS):
             return
         caller = state.get("caller") or self._entrance.stranger(scope, _headers(scope)[0])
-        minute = int(asyncio.get_running_loop().time() // 60.0)
+        minute = int(asyncio.get_running_loop().time() // COUNTED_S)
         if minute != self._minute or len(self._refused) > MOST_PARTIES:
             self._minute, self._refused = minute, {}
         token = caller.name.partition("/")[0] if caller.credential else ""  # one, in all of its sessions

@@ -482,18 +482,21 @@ def test_each_refusal_is_recorded_with_the_address_it_came_from(
 
 
 def test_refusals_in_a_flood_are_counted_instead(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(guard, "RARELY", 150)
+    monkeypatch.setattr(guard, "RECORDED", 10)
+    monkeypatch.setattr(guard, "RARELY", 15)
+    monkeypatch.setattr(guard, "COUNTED_S", 1e9)  # however long they take
     with network_daemon(monkeypatch, tmp_path) as net:
-        for _ in range(160):
+        for _ in range(16):
             net.ask("POST", "/point", "view", json=ANGLES)
         net.ask("POST", "/nothing", "operate")
-        assert [line.get("times") for line in recorded(net)] == [None] * guard.RECORDED + [150, None]
+        assert [line.get("times") for line in recorded(net)] == [None] * guard.RECORDED + [15, None]
 
 
 def test_a_token_has_its_refusals_counted_over_all_of_its_sessions(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(guard, "RECORDED", 5)
+    monkeypatch.setattr(guard, "COUNTED_S", 1e9)
     with network_daemon(monkeypatch, tmp_path) as net:
         for _ in range(4):
             jar = net.ask("POST", "/login", json={"token": net.token("view")}).headers["set-cookie"]

@@ -102,13 +102,14 @@ def test_the_clicked_picture_stays_known_while_it_is_shown_however_many_another_
     pair: BOTH,
 ) -> None:
     daemon, _ = pair
+    before = set(threading.enumerate())
     with watching(daemon.url, LEFT) as slow, watching(daemon.url, LEFT) as quick:
         shown = received(slow)[0]["frame_id"]
         for _ in range(20):
             received(quick)
             quick.send(LEFT)
         assert daemon.service.devices.frame_by_id(shown).frame_id == shown
-    until(nobody_watches, "both have left")
+    until(lambda: nobody_watches(before), "both have left")
     assert not [key for key in daemon.service.devices._store._held if key[0] != "asked"]
 
 
@@ -162,16 +163,18 @@ def test_a_camera_that_fails_holds_no_other_up_and_comes_back(
             line.send(name)
 
 
-def nobody_watches() -> bool:
-    """Whether no camera is asked for pictures any more."""
-    return not any(thread.name.startswith("pictures of ") for thread in threading.enumerate())
+def nobody_watches(before: set[threading.Thread]) -> bool:
+    """Whether no thread but those of before, which are other daemons', asks a camera for pictures."""
+    now = set(threading.enumerate()) - before
+    return not any(thread.name.startswith("pictures of ") for thread in now)
 
 
 def test_nobody_watching_asks_no_camera(pair: BOTH) -> None:
     daemon, hardware = pair
+    before = set(threading.enumerate())
     with watching(daemon.url, LEFT) as line:
         received(line)
-    until(nobody_watches, "the camera's thread has ended")
+    until(lambda: nobody_watches(before), "the camera's thread has ended")
     asked = len(hardware.fake_cameras[LEFT].asked)
     with watching(daemon.url, RIGHT) as line:
         received(line)
