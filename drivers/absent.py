@@ -25,8 +25,6 @@ FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 2.0
 LAST_STOP_S = 1.0
 """How long the stop of a head that is closed is tried again; all of closing may take 3 s."""
 
-UNCONFIRMED = "the last stop was not confirmed, the head may still move; 'mastctl halt' stops it"
-
 Opening = Future[Any]
 
 
@@ -76,7 +74,8 @@ def stop_at_last(stop: Callable[[], object], clock: Clock, device: str) -> None:
             if clock.now_s() < until_s:
                 clock.sleep(FIRST_WAIT_S)
                 continue
-            log.warning("%s: %s: %s", device, UNCONFIRMED, error)
+            words = "the last stop was not confirmed, the head may still move; 'mastctl halt' stops it"
+            log.warning("%s: %s: %s", device, words, error)
         return
 
 

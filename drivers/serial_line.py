@@ -50,7 +50,8 @@ def stable_name(port: str) -> str:
             parts = urlsplit(port)
             host = "127.0.0.1" if parts.hostname == "localhost" else parts.hostname
             if host:
-                return f"{f'[{host}]' if ':' in host else host}{f':{parts.port}' if parts.port else ''}"
+                host = f"[{host}]" if ":" in host else host
+                return host if parts.port is None else f"{host}:{parts.port}"
         return port
     path = Path(os.path.realpath(port))
     with contextlib.suppress(OSError):

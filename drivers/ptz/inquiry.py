@@ -52,6 +52,10 @@ class Dialect:
     options: Mapping[str, Any] = field(default_factory=dict)
     udp: OpenLine | None = None
 
+    def takes(self, port: str) -> bool:
+        """Return whether the driver opens such a line."""
+        return "://" not in port or port.startswith(self.schemes)
+
 
 @dataclass(frozen=True)
 class FoundHead:
@@ -98,7 +102,7 @@ def find_heads(
     """
     time = deadlines_on(clock or SystemClock())
     for dialect in dialects:
-        if "://" in port and not port.startswith(dialect.schemes):
+        if not dialect.takes(port):
             continue
         opens = dialect.udp if dialect.udp is not None and port.startswith("udp://") else open_line
         rates = [baud for baud in bauds or dialect.bauds if baud in dialect.possible_bauds]

@@ -22,7 +22,7 @@ from drivers.servo_bus.port import Overtaken
 
 log = logging.getLogger(__name__)
 
-BREAK_OFF_S = 0.2  # for what is broken off to end
+BREAK_OFF_S = 0.6  # for what is broken off to end; the opening of a line (0.5 s) cannot be
 T = TypeVar("T")
 
 

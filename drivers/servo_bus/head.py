@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, TypeVar
 
-from drivers.absent import LAST_STOP_S, UNCONFIRMED, Absence, stop_at_last
+from drivers.absent import LAST_STOP_S, Absence, stop_at_last
 from drivers.approach import rising_below_rad
 from drivers.clock import Clock, SystemClock, deadlines_on
 from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
@@ -266,8 +266,10 @@ class BusHead(Reporting):
         """Command both axes to stand over a line that is away, opened for that alone.
 
         To make them ready takes longer than a stop may; that comes next, and ends with the stop once more.
-        With ``left_until_s``, as of `leave`, both axes are left.
+        With ``left_until_s``, as of `leave`, both axes are left. Raises `Overtaken` where closing is to end.
         """
+        if self._bus.urgent():  # to open a network's line takes half a second
+            raise Overtaken
         try:
             pair: ServoPair[Any, Any] = self._open()
         except DriverError as error:
@@ -292,4 +294,7 @@ class BusHead(Reporting):
             if failed and not self.settings.silence_s:
                 stop_at_last(lambda: self._stop_away(until_s), self._clock, self.settings.port)
         except Overtaken:
-            log.warning("%s: %s: its time was over", self.settings.port, UNCONFIRMED)
+            words = (
+                "closing was broken off when its time was over: an axis may still move, or keep its torque"
+            )
+            log.warning("%s: %s; 'mastctl halt' stops the head", self.settings.port, words)

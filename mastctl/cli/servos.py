@@ -403,8 +403,7 @@ def _ptz_info(args: argparse.Namespace) -> int:
     from drivers.ptz.inquiry import find_heads
     from mastctl.rig.plugged import PTZ_DIALECTS
 
-    asked = [one for one in PTZ_DIALECTS if "://" not in args.port or args.port.startswith(one.schemes)]
-    asked = asked or list(PTZ_DIALECTS)
+    asked = [one for one in PTZ_DIALECTS if one.takes(args.port)] or PTZ_DIALECTS
     bauds = sorted({baud for dialect in asked for baud in dialect.possible_bauds})
     highest = max(dialect.highest_address for dialect in asked)
     for baud in args.baud:

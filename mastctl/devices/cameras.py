@@ -40,6 +40,7 @@ SIZE_TIMEOUT_S = 1.0
 CAMERA_GRACE_S = 3.0  # beyond the time given to next_frame: copying and decoding on a busy machine
 GLANCES_SHARE = 0.1  # of real time that glances hold up a simulation's clock, at most
 GLANCE_PATIENCE_S, GLANCE_AGAIN_S = 20.0, 0.5  # of real time, for pictures that are needed
+UNTOLD = "%s; the camera is used, and not compared with the mast file in this"
 MOVED_RAD = 1e-5  # a head camera's picture that stays the same to the last bit beyond this is frozen
 WORDS = {
     "next_frame": FaultWords("a picture comes"),
@@ -413,8 +414,10 @@ class Cameras:
         except BadFrame as refused:
             self._refused[name] = refused
             raise
-        except Exception as error:  # the driver's; as at the start
-            log.warning("%s: %s; the size is seen in its pictures", name, error)
+        except Exception as error:
+            if name in self._refused:  # until it is seen to be right
+                raise
+            log.warning(UNTOLD, error if isinstance(error, DriverError) else f"{name}: {error!r}")
         self._refused.pop(name, None)
 
     def _check_sizes(self) -> None:
@@ -434,45 +437,50 @@ class Cameras:
                     thread.end()
                 raise
             except DriverError as error:
-                log.warning("%s; the size is seen in its pictures", error)
+                log.warning(UNTOLD, error)
 
     def _check_as_calibrated(self, name: str) -> None:
         """Pass a camera whose sensor mode and size, as far as it knows them, are the mast file's.
-
-        What is no sensor mode or no size is a defect of its driver: it is told, and not compared.
 
         Raises
         ------
         BadFrame
             If one is not.
+        BadReply
+            If it returns something else than a sensor mode, or than a size.
         Exception
-            That of a driver that fails to say its size.
+            That of a driver that fails to answer.
         """
-        camera, calibrated = self._cameras[name], self._calibrated.get(name)
+        calibrated = self._calibrated.get(name)
         try:
-            if isinstance(camera, KnowsSensorMode):  # first: it says more of what mends it than the size
-                self._check_mode(name, camera.sensor_mode, calibrated)
+            self._check_mode(name, calibrated)  # first: it says more of what mends it than the size
         except BadFrame:
             raise
-        except Exception as error:
-            log.warning("%s: its sensor mode is not known: %s", name, error)
+        except Exception:
+            self._check_size(name, calibrated)
+            raise
+        self._check_size(name, calibrated)
+
+    def _check_size(self, name: str, calibrated: RigCamera | None) -> None:
+        camera = self._cameras[name]
         if not isinstance(camera, KnowsSize) or calibrated is None:
             return
         told = camera.size_px
         try:
             width, height = (int(side) for side in told)
         except (TypeError, ValueError, OverflowError):
-            words = "%s: size_px is %s where (width, height) is expected; the size is seen in its pictures"
-            log.warning(words, name, type(told).__name__)
-        else:
-            frame_checks.check_size(name, (width, height), calibrated.model.size_px)
+            words = f"size_px is {type(told).__name__} where (width, height) is expected"
+            raise BadReply(words, device=name) from None
+        frame_checks.check_size(name, (width, height), calibrated.model.size_px)
 
-    def _check_mode(self, name: str, mode: object, calibrated: RigCamera | None) -> None:
-        """Note a camera's sensor mode and pass the mast file's. Raises BadFrame."""
-        if not isinstance(mode, SensorMode):
-            words = "%s: sensor_mode is %s where a SensorMode is expected; it is not compared"
-            log.warning(words, name, type(mode).__name__)
+    def _check_mode(self, name: str, calibrated: RigCamera | None) -> None:
+        camera = self._cameras[name]
+        if not isinstance(camera, KnowsSensorMode):
             return
+        mode = camera.sensor_mode
+        if not isinstance(mode, SensorMode):
+            words = f"sensor_mode is {type(mode).__name__} where a SensorMode is expected"
+            raise BadReply(words, device=name)
         self.sensor_modes[name] = mode
         if calibrated is not None and (then := calibrated.sensor_mode) is not None:
             frame_checks.check_mode(name, mode, then)

@@ -20,6 +20,7 @@ from drivers.dynamixel.servo import Servo
 from drivers.errors import DriverError, LineLost, NoReply, WrongDevice
 from drivers.servo_bus.bus import Bus
 from drivers.servo_bus.head import CLOSE_TIMEOUT_S
+from drivers.servo_bus.port import Overtaken
 from drivers.servo_bus.session import GivenUp, ServoSession
 from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.dynamixel_packets import BROADCAST, Instruction
@@ -359,6 +360,35 @@ def test_a_closing_during_which_the_power_goes_ends_in_its_time(
         assert it.now_s() - closing_s < CLOSE_TIMEOUT_S and "left behind" not in caplog.text
 
 
+@pytest.mark.parametrize("reply_timeout_s", [0.05, 0.3])
+def test_a_closing_whose_line_goes_and_is_slow_to_fail_ends_in_its_time(
+    reply_timeout_s: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    with rig() as it:
+        head = it.open(watchdog_s=0, reply_timeout_s=reply_timeout_s)
+        under_way(it, head)
+        for axis in (0, 1):
+            mute(it, axis)
+
+        opened_s: list[float] = []
+
+        def away(*_: Any) -> Any:
+            opened_s.append(it.now_s())
+            it.clock.sleep(0.5)  # as a network's line whose host is away
+            raise LineLost("no route to it")
+
+        head._open_line = away
+        closing_s = it.now_s()
+        head.close()
+        assert it.now_s() - closing_s < CLOSE_TIMEOUT_S and "left behind" not in caplog.text
+        assert "may still move" in caplog.text and opened_s
+        head._bus._closing_until_s = it.now_s() - 0.1
+        tries = len(opened_s)
+        with pytest.raises(Overtaken):
+            head._stop_away(it.now_s())
+        assert len(opened_s) == tries, "no line is opened when the time is over"
+
+
 def test_a_stop_owed_at_a_return_is_owed_again_if_it_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     with opened(options={"watchdog_s": 0}) as (it, head):
         it.line.hang_up()
@@ -378,6 +408,9 @@ def test_a_stop_owed_at_a_return_is_owed_again_if_it_fails(monkeypatch: pytest.M
         it.until(lambda: not failed(head), "an answer")
         assert len(tries) == 2 and not head._stop_owed
         assert tries[1] - tries[0] > 2 * FIRST_WAIT_S, "the waits grow"
+        head._stop_owed = True
+        head.move(0.2, 0.1)
+        assert not head._stop_owed, "who moves the head wants no former stop"
 
 
 def test_a_stop_breaks_off_what_is_under_way_and_its_caller_is_told() -> None:

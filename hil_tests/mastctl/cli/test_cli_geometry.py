@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -462,6 +463,23 @@ def test_the_whole_help_loads_nothing_that_is_slow() -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3"), ({"OMP_NUM_THREADS": "2"}, "None")],
+)
+def test_a_command_computes_with_one_thread_unless_it_is_told_otherwise(
+    given: dict[str, str], told: str
+) -> None:
+    script = (
+        "import os; from mastctl.cli import main as door\n"
+        "door.main = lambda: print(os.environ.get('OPENBLAS_NUM_THREADS')) or 0\n"
+        "door.process()"
+    )
+    usual = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=usual | given)
+    assert done.stdout == f"{told}\n", done.stderr
 
 
 def test_a_reader_that_goes_away_ends_the_command_quietly(folder: Path) -> None:
