@@ -24,6 +24,7 @@ from typing import Any
 
 import rclpy
 from rclpy.action import ActionClient
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 
@@ -78,6 +79,9 @@ class Peer:
         self.node = Node("peer")
         self._heard: dict[str, list[tuple[float, Any]]] = {}
         self._publishers: dict[str, Any] = {}
+        self._spinning = SingleThreadedExecutor()
+        self._spinning.add_node(self.node)
+        threading.Thread(target=self._spinning.spin, daemon=True).start()
 
     def listen(self, topic: str, kind: str, qos: str) -> None:
         """Keep what is published."""
@@ -129,7 +133,7 @@ class Peer:
             time.sleep(cancel_after_s)
             self._done(taken.cancel_goal_async())
         ended = self._done(taken.get_result_async())
-        client.destroy()
+        self._destroy(client)
         return {"status": ended.status, "result": told(ended.result), "feedback": len(feedback)}
 
     def leave(self, action: str, kind: str, fields: dict[str, Any]) -> None:
@@ -139,9 +143,13 @@ class Peer:
             raise TimeoutError(action)
         self._done(client.send_goal_async(filled(type_of(kind).Goal(), fields)))
         time.sleep(3.0 * MATCHED_S)  # until the server has seen the client
-        client.destroy()
+        self._destroy(client)
         time.sleep(MATCHED_S)  # until the others have been told
         rclpy.shutdown()
+
+    def _destroy(self, client: ActionClient) -> None:
+        """Destroy a client in the thread that spins, which would end if another did."""
+        self._done(self._spinning.create_task(client.destroy))
 
     def _done(self, future: Any) -> Any:
         self._until(future.done, NET_S)
@@ -159,7 +167,6 @@ def main() -> None:
     """Do what the lines say until there are no more."""
     rclpy.init()
     peer = Peer()
-    threading.Thread(target=rclpy.spin, args=(peer.node,), daemon=True).start()
     for line in sys.stdin:
         verb, *arguments = json.loads(line)
         try:
