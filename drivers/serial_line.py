@@ -30,6 +30,9 @@ SLICE_S = 0.01
 """pyserial's own timeout of one read, where there is no file to wait on. It never changes while the line is
 open, since changing it makes pyserial set up the port anew (over the network with rfc2217)."""
 
+USUAL_UDP_PORT = 52381
+"""Where ``udp://HOST`` goes: VISCA over IP alone takes datagrams."""
+
 BY_ID = Path("/dev/serial/by-id")
 """Where udev names USB adapters by maker, model and serial number."""
 
@@ -42,8 +45,8 @@ def stable_name(port: str) -> str:
     """Return a line's name, the same whatever path leads there: what is kept of a head is kept by it.
 
     A USB adapter's is that of udev (with its serial number), at any port. That of another device is its path
-    without links; of a URL, host and port. A pseudo terminal's number is given again to the next one, so the
-    moment at which it was made belongs to its name.
+    without links; of a URL, host and port, the usual port left out. A pseudo terminal's number is given again
+    to the next one, so the moment at which it was made belongs to its name.
     """
     if "://" in port:
         with contextlib.suppress(ValueError):  # what is no URL is refused where it is opened
@@ -51,7 +54,8 @@ def stable_name(port: str) -> str:
             host = "127.0.0.1" if parts.hostname == "localhost" else parts.hostname
             if host:
                 host = f"[{host}]" if ":" in host else host
-                return host if parts.port is None else f"{host}:{parts.port}"
+                usual = parts.port is None or (parts.scheme, parts.port) == ("udp", USUAL_UDP_PORT)
+                return host if usual else f"{host}:{parts.port}"
         return port
     path = Path(os.path.realpath(port))
     with contextlib.suppress(OSError):

@@ -8,8 +8,8 @@ import socket
 from urllib.parse import urlsplit
 
 from drivers.errors import BadOptions, LineLost
+from drivers.serial_line import USUAL_UDP_PORT
 
-USUAL_PORT = 52381
 COMMAND, INQUIRY, CONTROL = b"\x01\x00", b"\x01\x10", b"\x02\x00"
 RESET_NUMBER = b"\x01"
 
@@ -42,7 +42,7 @@ class UdpLine:
         self._name, self._device, self._number = port, device, 0
         try:
             parts = urlsplit(port)
-            place = (parts.hostname or "", parts.port or USUAL_PORT)
+            place = (parts.hostname or "", parts.port or USUAL_UDP_PORT)
         except ValueError:
             place = ("", 0)
         if not place[0]:

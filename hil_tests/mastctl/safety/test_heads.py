@@ -285,7 +285,8 @@ def test_a_line_has_one_name_whatever_path_leads_to_it(tmp_path: Path) -> None:
         os.close(secondary)
     assert stable_name("socket://LOCALHOST:4001") == stable_name("socket://127.0.0.1:4001")
     assert stable_name("socket://127.0.0.1:4001") != stable_name("socket://127.0.0.1:4002")
-    assert stable_name("udp://localhost") == "127.0.0.1"
+    assert stable_name("udp://localhost") == stable_name("udp://localhost:52381") == "127.0.0.1"
+    assert stable_name("socket://127.0.0.1:52381") == "127.0.0.1:52381"
     assert stable_name("socket://[::1:4001") == "socket://[::1:4001", "its opening refuses it"
 
 
