@@ -22,7 +22,8 @@ from scipy.spatial import cKDTree
 
 from calib.geometry.rigid import FloatArray, IntArray
 from calib.targets.boards import Board
-from calib.targets.dot_spots import UNEVEN_AT_MOST, Candidates, Image, centred, contrasts
+from calib.targets.dot_middles import centred
+from calib.targets.dot_spots import UNEVEN_AT_MOST, Candidates, Image, contrasts
 
 DEGREES = (0, 3, 5)
 """Of the polynomial; the number of dots decides which."""

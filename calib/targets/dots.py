@@ -2,7 +2,8 @@
 
 Spots that look like dots (`calib.targets.dot_spots`) are grown into a grid, out of which the board is cut
 (`calib.targets.dot_grid`). They are counted in the predicted order (`calib.targets.dot_order`) and fitted to
-the grey levels. A correction leads from the middle of a circle's image to the image of its centre.
+the grey levels (`calib.targets.dot_middles`). A correction leads from the middle of a circle's image to the
+image of its centre.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from calib.geometry.rigid import FloatArray, IntArray
 from calib.targets.boards import Board, Dots
 from calib.targets.dot_grid import MOST_MISSING, BoardGrid, DetectionFailure, best_grid, fit_plane_map
+from calib.targets.dot_middles import Levels, bias_through, fit_ellipses
 from calib.targets.dot_order import (
     Ordered,
     PredictedBoard,
@@ -24,7 +26,7 @@ from calib.targets.dot_order import (
     order_by_steps,
     searches,
 )
-from calib.targets.dot_spots import Candidates, Image, Levels, bias_through, dot_candidates, fit_ellipses
+from calib.targets.dot_spots import Candidates, Image, dot_candidates
 
 SMALLEST_DOT_PX = 3.5
 

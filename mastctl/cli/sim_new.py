@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
             f"{made.believed.name}: what the mast file is off by", ("camera", "at most, px at 5 m"), rows
         )
     if made.twin.by != "fit.covariance":
-        from mastctl.setup.new_rig import STATED
+        from mastctl.setup.true_twin import STATED
 
         where = "" if args.mast_file is None else ", the mast file has no covariance"
         sys.stdout.write(f"drawn by stated sigmas{where}: {STATED}\n")

@@ -62,6 +62,46 @@ class Published:
     value: Any
 
 
+class _NewestOfEach:
+    """What a listener has not read: a newer value takes the place of one of the same topic and key."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[Topic, str], Published] = {}
+
+    def put(self, one: Published) -> int:
+        """Keep a value, or forget the one before; return how many are lost by that."""
+        lost = self._kept.pop((one.topic, one.key), None) is not None
+        if one.value is not GONE:
+            self._kept[one.topic, one.key] = one
+        return int(lost)
+
+    def take(self) -> list[Published]:
+        """Hand over all, oldest first."""
+        kept, self._kept = self._kept, {}
+        return sorted(kept.values(), key=lambda one: one.sequence)
+
+
+class _EveryValue:
+    """What a listener has not read of all values; the oldest gives way beyond ``MOST_UNREAD``."""
+
+    def __init__(self) -> None:
+        self._kept = deque[Published](maxlen=MOST_UNREAD)
+
+    def put(self, one: Published) -> int:
+        """Keep a value, unless it is none; return how many are lost by that."""
+        if one.value is GONE:
+            return 0
+        lost = len(self._kept) == self._kept.maxlen
+        self._kept.append(one)
+        return int(lost)
+
+    def take(self) -> list[Published]:
+        """Hand over all, oldest first."""
+        kept = list(self._kept)
+        self._kept.clear()
+        return kept
+
+
 class Subscription:
     """What one listener has not read yet. A context manager; one thread, or one coroutine, reads it.
 
@@ -71,12 +111,11 @@ class Subscription:
         How many values were replaced by newer ones before they were read, or found no room.
     """
 
-    _every = False
-
     def __init__(
         self,
         topics: frozenset[Topic],
         keys: frozenset[str] | None,
+        unread: _NewestOfEach | _EveryValue,
         wake: Callable[[], None],
         end: Callable[[Subscription], None],
     ) -> None:
@@ -85,8 +124,8 @@ class Subscription:
         self._keys = keys
         self._wake = wake
         self._end = end
-        self._lock = threading.Lock()  # held while a mapping is changed or handed over, never for longer
-        self._unread: dict[tuple[Topic, str] | int, Published] = {}
+        self._lock = threading.Lock()  # held while a value is put in or all are taken, never for longer
+        self._unread = unread
         self._closed = False
 
     @property
@@ -109,23 +148,15 @@ class Subscription:
 
     def _take_unread(self) -> list[Published]:
         with self._lock:
-            unread, self._unread = self._unread, {}
-        return sorted(unread.values(), key=lambda one: one.sequence)
+            return self._unread.take()
 
     def _put(self, one: Published) -> None:
         if one.topic not in self._topics or (self._keys is not None and one.key not in self._keys):
             return
-        place = one.sequence if self._every else (one.topic, one.key)
         with self._lock:
-            if one.value is GONE:
-                self.lost += self._unread.pop(place, None) is not None
-                return
-            if self._every and len(self._unread) >= MOST_UNREAD:
-                del self._unread[next(iter(self._unread))]  # the oldest gives way
-                self.lost += 1
-            self.lost += place in self._unread
-            self._unread[place] = one
-        self._wake()
+            self.lost += self._unread.put(one)
+        if one.value is not GONE:
+            self._wake()
 
     def _ended(self) -> None:
         self._closed = True
@@ -139,8 +170,8 @@ class ThreadSubscription(Subscription):
         self, topics: frozenset[Topic], end: Callable[[Subscription], None], every: bool = False
     ) -> None:
         self._something = threading.Event()
-        self._every = every
-        super().__init__(topics, None, self._something.set, end)
+        unread = _EveryValue() if every else _NewestOfEach()
+        super().__init__(topics, None, unread, self._something.set, end)
 
     def wait(self, timeout_s: float | None = None) -> list[Published]:
         """Return what is new since the last call, oldest first; wait for it for ``timeout_s`` real seconds.
@@ -167,7 +198,7 @@ class LoopSubscription(Subscription):
         self._wakes = _Wakes.of(self._loop)
         self._something = asyncio.Event()
         self._woken = False
-        super().__init__(topics, keys, self._wake_loop, end)
+        super().__init__(topics, keys, _NewestOfEach(), self._wake_loop, end)
 
     async def wait(self, timeout_s: float | None = None) -> list[Published]:
         """Return what is new since the last call, oldest first; wait for it for ``timeout_s`` seconds.

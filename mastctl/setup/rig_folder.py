@@ -21,7 +21,7 @@ from mastctl.calibration.mast_file import rounded_matrix
 from mastctl.config import CONFIG_SCHEMA, check_cameras, load_config
 from mastctl.errors import MastctlError
 from mastctl.packaged import name_schema
-from mastctl.setup.new_rig import STATED, Twin, true_twin, usual_covariance
+from mastctl.setup.true_twin import STATED, Twin, true_twin, usual_covariance
 
 CONFIG, MAST, TRUE_RIG = "config.yaml", "mast.yaml", "true_rig.yaml"
 

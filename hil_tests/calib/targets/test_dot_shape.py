@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
-from calib.targets.dot_spots import area_centroids, bias_through
+from calib.targets.dot_middles import area_centroids, bias_through
 from hil_tests.calib.targets.boards import BOARD, COLUMNS, NAVCAM_PX, ROWS, camera, pose
 
 RADIUS_M = BOARD.dot_diameter_m / 2

@@ -20,7 +20,7 @@ from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.simulated import own_config
-from mastctl.setup.new_rig import true_twin
+from mastctl.setup.true_twin import true_twin
 
 FILES = ("config.yaml", "mast.yaml", "true_rig.yaml")
 
