@@ -21,7 +21,7 @@ from tools.campaigns import fuzz_readers
 from tools.campaigns.fuzz_readers import COMMANDS, READERS, VALID, broken, check_command, check_reader
 
 # Generous: a case takes milliseconds; only a hang or a blow-up comes near.
-no_hang = settings(deadline=timedelta(seconds=10), max_examples=100)
+no_hang = settings(deadline=timedelta(seconds=60), max_examples=100)
 
 KEYS = [
     *("schema", "name", "mast", "cameras", "stereo", "fit", "translation_m", "rotation_rad", "axis_offset_m"),

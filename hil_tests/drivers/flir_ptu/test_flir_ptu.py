@@ -776,7 +776,7 @@ def test_a_serial_server_by_rfc2217_serves_as_well() -> None:
         head.move(0.5, 0.2)
         assert settled(head)[0] == pytest.approx(0.5, abs=PAN_STEP_RAD / 2)
         head.close()
-        server.join(10)
+        server.join(60)
         assert not server.is_alive()
         assert unit.heard[-1] == "H"
 

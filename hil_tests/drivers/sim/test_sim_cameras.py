@@ -164,7 +164,7 @@ def test_frames_may_be_fetched_from_many_threads() -> None:
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(30)
+        thread.join(60)
     assert len(found) == 80 and all(found)
 
 
@@ -185,5 +185,5 @@ def test_closing_ends_a_waiting_call() -> None:
     thread = threading.Thread(target=wait)
     thread.start()
     device.close()
-    thread.join(10)
+    thread.join(60)
     assert said == ["cam_left: it is closed"]

@@ -56,7 +56,7 @@ def test_a_placement_waits_for_the_answer_and_for_none_that_came_before_it() -> 
     waiting.join(0.2)
     assert waiting.is_alive(), "the answer of before is none"
     pipe.say("stands")
-    waiting.join(10.0)
+    waiting.join(60.0)
     assert not waiting.is_alive()
     asked, stands = told(out)
     assert (

@@ -165,7 +165,7 @@ class Proxy:
 
     def ask(self, told: Passing, headers: dict[str, str]) -> None:
         """Pass a request on, and take the answer."""
-        line = http.client.HTTPConnection(self.target, timeout=30)
+        line = http.client.HTTPConnection(self.target, timeout=60)
         try:
             line.request(told.method, told.path, told.body or None, headers)
             answer = line.getresponse()

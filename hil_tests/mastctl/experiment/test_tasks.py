@@ -205,7 +205,7 @@ def test_a_killed_run_keeps_what_was_done_and_leaves_no_process(tmp_path: Path) 
         assert run.stdout is not None and run.stdout.readline() == b"kept\n"
         workers = psutil.Process(run.pid).children(recursive=True)
         run.send_signal(signal.SIGKILL)
-        run.wait(10)
+        run.wait(60.0)
         gone, left = psutil.wait_procs(workers, timeout=60)
     assert gone and not left
     done = Work(drawn_or_stuck, [Draw(1), Draw(2, scale=1e9)], str)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -63,14 +62,6 @@ def recorder(folder: Path, **settings: Any) -> Recorder:
     return Recorder(
         RecordSettings(**wanted), folder, mast(), [CONFIG], {"hardware": "simulated"}, SystemClock()
     )
-
-
-def until(true: Callable[[], Any], what: str, seconds: float = 20.0) -> None:
-    """Wait for something that another thread does."""
-    end_s = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end_s, what
-        time.sleep(0.01)
 
 
 def files(folder: Path) -> list[Path]:

@@ -11,7 +11,8 @@ import httpx
 import pytest
 
 from drivers.recordings.mcap_file import McapEntry, read_items
-from hil_tests.mastctl.recorder.recorder_world import files, told, until
+from hil_tests.mastctl.recorder.recorder_world import files, told
+from hil_tests.waiting import until
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.config import Config, Listen, load_config

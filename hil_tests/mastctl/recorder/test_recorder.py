@@ -24,8 +24,8 @@ from hil_tests.mastctl.recorder.recorder_world import (
     reading,
     recorder,
     told,
-    until,
-)  # fmt: skip
+)
+from hil_tests.waiting import until
 from mastctl.control.standing import StandingFault
 from mastctl.errors import NotNow, Unable
 from mastctl.recorder import recorder as module
@@ -214,7 +214,7 @@ def test_a_disk_that_hangs_holds_nobody_and_what_was_dropped_is_told(
     monkeypatch.setattr(module, "QUEUE_BYTES", 5 * picture(0, (100, 100)).nbytes)
     one = recorder(tmp_path)
     one.tell("command", "0", {"number": 0})
-    assert hangs.wait(20.0)
+    assert hangs.wait(60.0)
     for number in range(20):
         one.tell("frame", "navcam_left", frame(number, picture(0, (100, 100))))
     until(lambda: one.faults(), "it says that the disk does not answer")
