@@ -367,7 +367,7 @@ def test_a_part_that_cannot_be_closed_keeps_no_other_open(
                     raise RuntimeError(f"a defect of {name}")
 
             monkeypatch.setattr(part, "close", close)
-        service.close()
+        daemon.close()
         assert closed == list(named) and hardware.closed
     assert "a defect of guide" in caplog.text and "a defect of recording" in caplog.text
 
