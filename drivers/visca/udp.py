@@ -42,7 +42,7 @@ class UdpLine:
         self._name, self._device, self._number = port, device, 0
         try:
             parts = urlsplit(port)
-            place = (parts.hostname or "", parts.port or USUAL_UDP_PORT)
+            place = (parts.hostname or "", USUAL_UDP_PORT if parts.port is None else parts.port)
         except ValueError:
             place = ("", 0)
         if not place[0]:

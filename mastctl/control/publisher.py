@@ -75,30 +75,30 @@ class _NewestOfEach:
             self._kept[one.topic, one.key] = one
         return int(lost)
 
-    def take(self) -> list[Published]:
-        """Hand over all, oldest first."""
+    def take(self) -> Iterable[Published]:
+        """Hand over all."""
         kept, self._kept = self._kept, {}
-        return sorted(kept.values(), key=lambda one: one.sequence)
+        return kept.values()
 
 
 class _EveryValue:
     """What a listener has not read of all values; the oldest gives way beyond ``MOST_UNREAD``."""
 
     def __init__(self) -> None:
-        self._kept = deque[Published](maxlen=MOST_UNREAD)
+        self._most = MOST_UNREAD
+        self._kept = deque[Published](maxlen=self._most)
 
     def put(self, one: Published) -> int:
         """Keep a value, unless it is none; return how many are lost by that."""
         if one.value is GONE:
             return 0
-        lost = len(self._kept) == self._kept.maxlen
+        lost = len(self._kept) == self._most
         self._kept.append(one)
         return int(lost)
 
-    def take(self) -> list[Published]:
-        """Hand over all, oldest first."""
-        kept = list(self._kept)
-        self._kept.clear()
+    def take(self) -> Iterable[Published]:
+        """Hand over all."""
+        kept, self._kept = self._kept, deque[Published](maxlen=self._most)
         return kept
 
 
@@ -124,7 +124,7 @@ class Subscription:
         self._keys = keys
         self._wake = wake
         self._end = end
-        self._lock = threading.Lock()  # held while a value is put in or all are taken, never for longer
+        self._lock = threading.Lock()  # held while a value is put in or all are handed over, never for longer
         self._unread = unread
         self._closed = False
 
@@ -148,7 +148,8 @@ class Subscription:
 
     def _take_unread(self) -> list[Published]:
         with self._lock:
-            return self._unread.take()
+            unread = self._unread.take()
+        return sorted(unread, key=lambda one: one.sequence)
 
     def _put(self, one: Published) -> None:
         if one.topic not in self._topics or (self._keys is not None and one.key not in self._keys):

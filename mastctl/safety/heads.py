@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 SYSTEM = Path("/var/lib/mastctl")
 VARIABLE = "MASTCTL_HEADS"
 READABLE = 0o755  # another user who opens the same line has to find the latch
-_SIMULATED = re.compile(r"pts-|127\.|\[?::1\]?:|[\w.:-]+ \{")
+_SIMULATED = re.compile(r"pts-|127\.|\[?::1\]?(?::|$)|[\w.:-]+ \{")
 _PTS = re.compile(r"pts-\d+-")
 
 

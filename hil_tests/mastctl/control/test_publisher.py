@@ -60,6 +60,22 @@ def test_who_comes_later_begins_with_what_is_known_unless_it_wants_changes_only(
         assert publisher.newest("joints", "head") == 2 and publisher.newest("track", "track") is None
 
 
+def test_who_counts_hears_every_value_in_order_and_loses_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mastctl.control.publisher.MOST_UNREAD", 4)
+    publisher = Publisher()
+    for key, value in (("a", 1), ("b", 2), ("a", 3)):
+        publisher.publish("operation", key, value)
+    with publisher.subscribe(every=True) as counts:
+        assert [one.value for one in counts.wait(0)] == [2, 3]  # what is known, the oldest first
+        for number in range(4, 8):
+            publisher.publish("operation", "a", number)
+        publisher.forget("operation", "a")
+        assert counts.lost == 0
+        publisher.publish("operation", "a", 8)
+        assert [one.value for one in counts.wait(0)] == [5, 6, 7, 8]
+        assert counts.lost == 1 and counts.wait(0) == []
+
+
 def test_what_is_forgotten_is_held_for_nobody() -> None:
     class Record:
         pass

@@ -162,4 +162,4 @@ def world(folder: Path, script: str, simulated: bool = True) -> Iterator[World]:
     finally:
         guide.close()
         publisher.close()
-        thread.join(5.0)
+        thread.join(60.0)
