@@ -326,6 +326,8 @@ def test_a_true_line_has_its_place_by_no_environment(tmp_path: Path, monkeypatch
         places.append(head_folders("10.0.0.5:4001"))
     assert places[:2] == places[2:]
     assert all(one[0].is_relative_to(tmp_path / "home") for one in places)
+    for name in ("127.0.0.1", "127.0.0.1:4001", "[::1]", "[::1]:4001"):
+        assert [one.parent for one in head_folders(name)] == [tmp_path / "two"], name
 
 
 def test_the_systems_place_comes_before_a_users_and_a_latch_in_either_holds(
