@@ -526,6 +526,8 @@ def test_without_a_word_the_angles_nearest_to_zero_come_first() -> None:
     panned, tilted = solve(straight_mast(-0.05), pinhole((0.0, 0.1, 0.0)), above)
     assert max(panned.pan_rad, panned.tilt_rad) < max(tilted.pan_rad, tilted.tilt_rad) < np.pi / 2
     assert max(panned.pan_rad, panned.tilt_rad - 1.0) > max(tilted.pan_rad, tilted.tilt_rad - 1.0)
+    by_ray = solve_ray(straight_mast(-0.05), [0.0, 0.1, 0.0], FORWARD, above)
+    assert [one.pan_rad for one in by_ray] == pytest.approx([panned.pan_rad, tilted.pan_rad])
     low, high = Solution(0.0, -0.5, 5.0), Solution(0.0, 0.7, 5.0)
     assert choose([high, low], (-2.0, 2.0), (-1.0, 1.0)) == low
     left, right = Solution(-0.5, 0.0, 5.0), Solution(0.7, 0.0, 5.0)

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy import ndimage
+from scipy.interpolate import RectBivariateSpline
 
 from calib.errors import CalibError
 from calib.matching.least_squares import LeastSquaresMatch
@@ -21,7 +22,7 @@ from calib.matching.verdict import (
     judged,
     texture_lacks,
 )
-from calib.matching.warp import Plane, Relief, Template, carry, facing_plane, grey
+from calib.matching.warp import Plane, Relief, Surface, Template, carry, facing_plane, grey
 from hil_tests.calib.matching.textured_planes import Edge, Pinhole, TexturedPlane, picture, random_texture
 
 FOCAL_PX = 1290.0  # the paper's Navcam
@@ -505,3 +506,15 @@ def test_a_wide_eye_looks_for_what_a_narrow_pair_saw_of_a_rocks_edge_and_no_furt
         matches.append((found, wide.pixel(scene.hit(narrow.position_m, narrow.rays(pixel)))))
     _, normalised = errors_of(matches)
     assert np.sqrt((normalised**2).mean()) < 1.5
+
+
+def test_a_surface_goes_through_the_grey_values_of_its_pixels_and_between_them_as_scipys_spline() -> None:
+    image = np.random.default_rng(3).integers(0, 256, (40, 50)).astype(np.uint8)
+    surface = Surface.around(image, (12.0, 11.0), (30.0, 24.0))
+    places = np.stack(np.meshgrid(np.arange(12.0, 31.0), np.arange(11.0, 25.0)), axis=-1)
+    np.testing.assert_allclose(
+        surface.at(places), image[11:25, 12:31], atol=0.2
+    )  # its cut ends some pixels off
+    outside = RectBivariateSpline(np.arange(40.0), np.arange(50.0), image.astype(np.float64))
+    between = places + (0.37, 0.61)
+    np.testing.assert_allclose(surface.at(between), outside.ev(between[..., 1], between[..., 0]), atol=0.5)

@@ -300,3 +300,18 @@ def test_a_board_with_a_quarter_of_its_dots_covered_is_refused_though_its_rim_is
     for x, y in shot.true_px(rows, columns):
         cv2.circle(image, (round(x), round(y)), 11, 200, -1)
     assert "10 x 10 are expected" in reason(find_dots(image, BOARD, shot.roughly(rng)))
+
+
+def test_a_spot_is_told_by_the_ellipse_that_was_drawn() -> None:
+    """An ellipse of 8 by 5 px at 0.4 rad, drawn by its share of each pixel's 16 by 16 points."""
+    x, y = np.meshgrid(np.arange(0.0, 64.0, 1 / 16) - 15 / 32, np.arange(0.0, 48.0, 1 / 16) - 15 / 32)
+    turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
+    shape = turn @ np.diag([8.0, 5.0])
+    inside = (
+        np.linalg.norm((np.stack([x, y], axis=-1) - [31.3, 23.8]) @ np.linalg.inv(shape).T, axis=-1) < 1.0
+    )
+    image = (220 - 180 * inside.reshape(48, 16, 64, 16).mean(axis=(1, 3))).astype(np.uint8)
+    spots = dot_candidates(image, 16.0, (40.0, 400.0))
+    np.testing.assert_allclose(spots.middles_px, [[31.3, 23.8]], atol=0.25)  # the fit begins there
+    [found] = spots.shapes_px
+    np.testing.assert_allclose(found @ found.T, shape @ shape.T, atol=0.05 * 64.0)
