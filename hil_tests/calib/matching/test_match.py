@@ -516,5 +516,5 @@ def test_a_surface_goes_through_the_grey_values_of_its_pixels_and_between_them_a
         surface.at(places), image[11:25, 12:31], atol=0.2
     )  # its cut ends some pixels off
     outside = RectBivariateSpline(np.arange(40.0), np.arange(50.0), image.astype(np.float64))
-    between = places + (0.37, 0.61)
+    between = places + np.array([0.37, 0.61])
     np.testing.assert_allclose(surface.at(between), outside.ev(between[..., 1], between[..., 0]), atol=0.5)
