@@ -52,6 +52,11 @@ def test_wide_grey_keeps_its_upper_eight_bits(code: str, bits: int) -> None:
     assert np.array_equal(image, words // 2 ** (bits - 8))
 
 
+def test_a_sample_with_more_bits_than_its_format_has_is_white() -> None:
+    words = np.full((HEIGHT, WIDTH), 2**10, dtype="<u2")
+    assert (pixels.grey(picture_format("Y10"), words.view(np.uint8).ravel()) == 255).all()
+
+
 def test_grey_of_yuyv_is_its_luma() -> None:
     raw = np.stack([NOISE, NOISE[::-1]], axis=-1)
     assert np.array_equal(pixels.grey(picture_format("YUYV"), raw.ravel()), NOISE)
