@@ -69,6 +69,12 @@ class Filled(NamedTuple):
     sent: Mapping[str, float]
 
 
+PACKET_SOCKET_DISABLED = 1
+"""ARV_GV_STREAM_OPTION_PACKET_SOCKET_DISABLED. For a program that may have packet sockets (root) Aravis opens
+one per stream and filters it later. Until then it hears every camera of the network: in 8 of 360 openings
+beside another camera's stream it gave that camera's frame."""
+
+
 class Device:
     """A camera that streams. Closing it gives everything back.
 
@@ -271,6 +277,8 @@ class Device:
         arv, camera = self._arv, self._camera
         payload = arv("camera_get_payload", camera)
         self.format = PictureFormat(self._options.format, self._options.size_px, 0, payload)
+        if self._is_gige:
+            arv("camera_gv_set_stream_options", camera, PACKET_SOCKET_DISABLED)
         self._stream = arv("camera_create_stream", camera, None, None, None)
         if not self._stream:
             raise StreamFailed("Aravis made no stream", device=self._name)

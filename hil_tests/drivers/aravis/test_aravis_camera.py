@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 import os
+import socket
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -52,6 +54,21 @@ def truly_inside(frame: TimedFrame, device: GigeCamera) -> bool:
     assert set(frame.image.ravel().tolist()) == {frame.driver_sequence % 251}
     window_end_s = frame.exposure_began_s + frame.exposure_s
     return frame.exposure_began_s <= began_s + ROUNDING_S and ended_s <= window_end_s + ROUNDING_S
+
+
+def test_a_stream_hears_no_packet_that_is_not_sent_to_it(device: GigeCamera) -> None:
+    """A packet socket, which root may have, hears other cameras until it is filtered."""
+    try:
+        socket.socket(socket.AF_PACKET, socket.SOCK_RAW).close()
+    except PermissionError:
+        pytest.skip("this user may have no packet sockets, so that Aravis opens none")
+    opened().next_frame(time.monotonic(), NET_S)
+    inodes = {line.split()[-1] for line in Path("/proc/self/net/packet").read_text().splitlines()[1:]}
+    mine = set[str]()
+    for link in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):  # the one by which it looks
+            mine.add(str(link.readlink()))
+    assert not {f"socket:[{inode}]" for inode in inodes} & mine
 
 
 def test_a_frame_is_exposed_after_the_asked_moment_in_the_window_that_it_states(device: GigeCamera) -> None:

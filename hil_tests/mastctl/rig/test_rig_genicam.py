@@ -10,7 +10,6 @@ import pytest
 from drivers.aravis import library
 from drivers.aravis.find import FoundGenicam, list_cameras
 from drivers.aravis.options import parse_options
-from hil_tests.drivers.aravis import conftest as cameras
 from hil_tests.drivers.aravis.gige_camera import GigeCamera
 from hil_tests.drivers.aravis.test_aravis_camera import ADDRESS
 from hil_tests.drivers.aravis.test_aravis_own_fake import fakes
@@ -20,8 +19,6 @@ from mastctl.rig.drawing import RigAnswers
 from mastctl.rig.folder import RULES, write_rig
 from mastctl.setup.machine import ExaminedMachine
 from mastctl.setup.rig_folder import CONFIG
-
-one_file_at_a_time = cameras.one_file_at_a_time
 
 
 @pytest.fixture(autouse=True)
