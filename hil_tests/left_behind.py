@@ -1,4 +1,4 @@
-"""What a run of the tests leaves behind: processes, temporary files, and daemons' state in the user's home.
+"""What tests leave behind: threads, descriptors, processes, temporary files, and daemons' state at home.
 
 Each process that runs tests has a folder of its own as ``TMPDIR``, which all that it starts inherits. So what
 it left can be told from what others do on the same machine at the same time. Where daemons keep the state of
@@ -13,6 +13,7 @@ import pwd
 import shutil
 import signal
 import tempfile
+import threading
 from contextlib import suppress
 from pathlib import Path
 
@@ -39,6 +40,19 @@ def end_all_of(run: str, beside: Path) -> None:
                 os.kill(int(folder.name), signal.SIGKILL)
     for folder in beside.glob(f"mastctl-tests-{run[:8]}*"):
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def held() -> set[object]:
+    """Running threads of this process, and its open descriptors, each with what it is open on.
+
+    What a test leaves is what is new: ``held() <= before``. Two counts tell nothing, since what earlier tests
+    of the same process made hang may end at any moment.
+    """
+    found: set[object] = set(threading.enumerate())
+    for link in list(Path("/proc/self/fd").iterdir()):
+        with suppress(FileNotFoundError):  # the descriptor of this very look
+            found.add((link.name, link.readlink()))
+    return found
 
 
 class Homes:

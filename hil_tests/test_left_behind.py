@@ -7,12 +7,14 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from hil_tests.waiting import until
+from hil_tests.left_behind import held
+from hil_tests.waiting import NET_S, until
 
 CONFTEST = """
 import os, pwd
@@ -123,6 +125,28 @@ def test_what_is_left_behind_fails_the_run(repository: Path, tmp_path: Path, wha
         assert done.returncode == 1
         assert LEFT_BY_IT[what] in line
         assert what == "process" or re.search(r"\(first seen after .*test_one.py::test_it\b", line)
+
+
+def test_what_a_test_holds_is_new_and_what_others_let_go_is_not_missed(tmp_path: Path) -> None:
+    ends = threading.Event()
+    other = threading.Thread(target=ends.wait, args=(NET_S,))
+    other.start()
+    file = (tmp_path / "file").open("w")
+    before = held()
+    assert held() <= before
+    ends.set()
+    other.join()
+    file.close()
+    assert held() <= before and held() != before
+    with (tmp_path / "another").open("w") as another:
+        (left,) = held() - before
+        assert left == (str(another.fileno()), tmp_path / "another")  # perhaps of the number that was let go
+    mine = threading.Timer(NET_S, bool)
+    mine.start()
+    assert held() - before == {mine}
+    mine.cancel()
+    mine.join()
+    assert held() <= before
 
 
 INTERRUPTED = """

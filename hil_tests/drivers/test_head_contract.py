@@ -8,17 +8,16 @@ pointing loop.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import TypeVar
 
 import pytest
 
 from drivers.errors import DriverError, LineLost, NoReply
 from drivers.interfaces import Reading
+from hil_tests.left_behind import held
 from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.config import load_config
@@ -293,7 +292,7 @@ def test_replies_lost_now_and_then_cost_errors_but_no_wrong_angle(rig: HeadRig) 
 
 @pytest.mark.parametrize("name", list(MADE))
 def test_close_stops_the_head_and_leaves_no_thread_and_no_descriptor(name: str) -> None:
-    threads, descriptors = set(threading.enumerate()), len(list(Path("/proc/self/fd").iterdir()))
+    before = held()
     with MADE[name]() as rig:
         attempt(lambda: rig.head.move(0.9, 0.3, 0.5))
         until(lambda: (r := attempt(rig.head.read)) and r.pan_rad > 0.05, "motion", clock=rig.clock)
@@ -304,8 +303,7 @@ def test_close_stops_the_head_and_leaves_no_thread_and_no_descriptor(name: str) 
                 call()
         until(lambda: _stands(rig), "standing", clock=rig.clock)
         assert rig.true_rad(rig.clock.now_s())[0] < (0.6 if name in TURNED else 0.89)
-    until(lambda: set(threading.enumerate()) <= threads, "the end of every thread")
-    assert len(list(Path("/proc/self/fd").iterdir())) == descriptors
+    until(lambda: held() <= before, "the end of every thread, and no descriptor")
 
 
 def test_close_of_a_head_that_is_gone_does_not_raise(wired: HeadRig) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +20,7 @@ from drivers.sim.render import Renderer
 from drivers.sim.rover import SimulatedRover
 from drivers.sim.scene import Scene
 from drivers.sim.settings import simulation_settings
+from hil_tests.left_behind import held
 from hil_tests.waiting import NET_S, until
 
 pytestmark = pytest.mark.usefixtures("one_scene")
@@ -71,7 +71,7 @@ def fails(device: SimulatedRover) -> bool:
 def test_pictures_are_taken_from_where_the_bytes_sent_the_axes(
     small_rig: Path, scene: Scene, head: str, speed: int | str
 ) -> None:
-    threads, descriptors = set(threading.enumerate()), sum(1 for _ in Path("/proc/self/fd").iterdir())
+    before = held()
     with wired(small_rig, head, speed) as (device, clock):
         reading = settled(device, clock, 0.3, -0.4)
         now_s = clock.now_s()
@@ -87,8 +87,7 @@ def test_pictures_are_taken_from_where_the_bytes_sent_the_axes(
             errors.append(float(np.sqrt(np.mean((clean - frame.image) ** 2))))
         renderer.close()
         assert errors[0] < NOISE_DN < 4 * NOISE_DN < errors[1]
-    assert set(threading.enumerate()) <= threads  # those of other tests may have ended meanwhile
-    assert sum(1 for _ in Path("/proc/self/fd").iterdir()) == descriptors
+    assert held() <= before
 
 
 @pytest.mark.parametrize("head", ["dynamixel_x", "ptu_d46_70"])

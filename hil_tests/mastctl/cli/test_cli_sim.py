@@ -16,6 +16,7 @@ import serial
 from dynamixel_sdk import PacketHandler, PortHandler
 
 from hil_tests import forks
+from hil_tests.left_behind import held
 from hil_tests.waiting import NET_S
 from mastctl.cli.main import main
 
@@ -172,14 +173,14 @@ def test_the_end_of_standard_input_ends_it_only_when_asked_to(repository: Path) 
 def test_wrong_use_is_one_line_and_exit_code_2(
     capsys: pytest.CaptureFixture[str], words: list[str], message: str
 ) -> None:
-    descriptors = len(list(Path("/proc/self/fd").iterdir()))
+    before = held()
     handler = signal.getsignal(signal.SIGTERM)
     assert main(["sim", *words]) == 2
     out, log = capsys.readouterr()
     assert out == "" and message in log and log.count("\n") == 1
     assert main(["sim", *words, "--json"]) == 2
     assert message in json.loads(capsys.readouterr().out)["error"]["message"]
-    assert len(list(Path("/proc/self/fd").iterdir())) == descriptors
+    assert held() <= before
     assert signal.getsignal(signal.SIGTERM) == handler
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.controls import get_value, list_controls, set_by_name
 from drivers.v4l2.find import Address, open_node
 from drivers.v4l2.node import Node, NotACamera
+from hil_tests.left_behind import held
 from hil_tests.waiting import NET_S, until
 
 from .conftest import BUS, VIVID, inject, options
@@ -24,10 +24,6 @@ PERIOD_S = 0.04
 
 def fresh(camera: V4l2Camera) -> None:
     camera.next_frame(time.monotonic(), NET_S)
-
-
-def held() -> tuple[int, int]:
-    return len(list(Path("/proc/self/fd").iterdir())), threading.active_count()
 
 
 def test_dropped_frames_are_counted(camera: V4l2Camera) -> None:
@@ -74,11 +70,11 @@ def test_a_refusal_while_opening_is_told_and_leaves_nothing(control: str, words:
     inject(0, control)
     with pytest.raises(StreamFailed, match=words):
         open_camera(options(), name="left")
-    assert held() == before
+    assert held() <= before
     camera = open_camera(options(), name="left")
     fresh(camera)
     camera.close()
-    assert held() == before
+    assert held() <= before
 
 
 def test_a_stream_error_while_it_is_opened_again_is_tried_again(camera: V4l2Camera) -> None:
@@ -221,4 +217,4 @@ def test_opening_and_closing_again_and_again_leaves_nothing() -> None:
         if index % 4 == 3:
             inject(0, "inject_fatal_streaming_error")
         camera.close()
-    assert held() == before
+    assert held() <= before

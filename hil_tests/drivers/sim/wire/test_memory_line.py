@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator, Sequence
 
 import pytest
@@ -13,6 +12,7 @@ from drivers.serial_line import ByteLine, OpenLine, SerialLine
 from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.memory_line import MemoryLine
 from drivers.simulation_clock import SimulationClock
+from hil_tests.left_behind import held
 
 BAUD = 9600
 BYTE_S = 10 / BAUD
@@ -40,10 +40,10 @@ class Parrot:
 
 @pytest.fixture
 def clock() -> Iterator[SimulationClock]:
-    clock, before = SimulationClock(start_s=10.0), threading.active_count()
+    clock, before = SimulationClock(start_s=10.0), held()
     with clock.at_work():
         yield clock
-    assert threading.active_count() == before
+    assert held() <= before
 
 
 def opened(line: MemoryLine, baud: int = BAUD) -> ByteLine:
