@@ -92,3 +92,10 @@ def test_a_flaky_test_is_named_and_the_run_has_failed(tmp_path: Path) -> None:
     assert "flaky (passes alone): test_one.py::test_first_time_only" in done.stdout
     assert "fails alone too: test_one.py::test_always" in done.stdout
     assert done.returncode == pytest.ExitCode.TESTS_FAILED
+
+
+def test_a_file_that_is_not_there_is_said_before_anything_is_set_up(repository: Path) -> None:
+    words = ["tools/test", "-q", "hil_tests/test_long_run.py", "hil_tests/nosuch.py::test_it"]
+    done = subprocess.run(words, cwd=repository, capture_output=True, text=True, check=False)
+    assert done.stderr == "tools/test: there is no hil_tests/nosuch.py\n" and not done.stdout
+    assert done.returncode == pytest.ExitCode.USAGE_ERROR

@@ -121,6 +121,34 @@ def test_a_board_that_reaches_out_of_the_picture_is_found_where_it_is_inside() -
     assert float(rim.min()) > 2 * 0.7, "a corner of which the blur reaches out of the picture"
 
 
+@pytest.mark.parametrize("board", [CHARUCO, APRILGRID], ids=lambda board: board.kind)
+@pytest.mark.parametrize("place", [(0.12, 0.08, 0.55), (-0.12, -0.08, 0.55), (0.0, 0.0, 0.36)])
+def test_each_side_of_a_picture_is_as_good_as_the_other(
+    board: AnyBoard, place: tuple[float, float, float]
+) -> None:
+    image = drawn((board, TURN, place))
+    found, turned = (corners_of(board, np.ascontiguousarray(one)) for one in (image, image[::-1, ::-1]))
+    np.testing.assert_array_equal(turned.ids, found.ids)
+    np.testing.assert_allclose(turned.pixels_px, np.array(SIZE_PX) - 1 - found.pixels_px, atol=1e-6)
+    np.testing.assert_allclose(turned.sigma_px, found.sigma_px, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("astray_px", "kept"), [(0.6, True), (1.0, False), (3.5, False)])
+def test_a_corner_is_left_out_by_how_far_off_the_others_are(astray_px: float, kept: bool) -> None:
+    """Each corner of a print is 0.1 px off, far beyond what its picture tells, in no pattern."""
+    image = drawn((CHARUCO, (0.1, 0.1, 0.0), (0.0, 0.0, 0.7)))
+    true = corners_of(CHARUCO, image)
+    shift = np.random.default_rng(8).normal(0.0, 0.1, (len(true), 2))
+    shift[20] = np.array([0.6, 0.8]) * astray_px
+    pixels = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float64) for n in SIZE_PX)), axis=-1)
+    for middle, by in zip(true.pixels_px, shift, strict=True):
+        # a corner's window moves as a whole, the next corner not at all
+        pixels -= np.exp(-((np.linalg.norm(pixels - middle, axis=-1, keepdims=True) / 14.0) ** 8)) * by
+    found = corners_of(CHARUCO, cv2.remap(image, pixels.astype(np.float32), None, cv2.INTER_CUBIC))
+    assert set(true.ids) - set(found.ids) == (set() if kept else {true.ids[20]})
+    assert float(found.sigma_px.max()) < 0.02
+
+
 def test_a_board_upside_down_or_on_its_side_keeps_its_ids() -> None:
     place = (0.0, 0.0, 0.9)
     for board in (CHARUCO, APRILGRID, Checkerboard(10, 7, 0.03)):

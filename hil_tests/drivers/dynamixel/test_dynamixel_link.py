@@ -338,6 +338,14 @@ def test_a_fast_group_read_checks_every_block() -> None:
         assert not link.group_read(BOTH, fast=True).statuses
 
 
+def test_behind_a_block_of_another_servo_nothing_counts_and_the_line_is_listened_to() -> None:
+    blocks = b"".join(fast_status_packets([(0, 1, number(-3)), (0, 7, number(5))], 16))
+    with scripted(lambda *_: [Reply(blocks)]) as (line, _):
+        link = line.link(PATIENT_S)
+        assert [*link.group_read(BOTH, fast=True).statuses] == [1]
+        assert link._port.suspect  # whoever spoke for servo 2 may go on
+
+
 def test_calls_of_many_threads_queue_instead_of_failing() -> None:  # defect 11
     with scripted(lambda i, n: [says(i.packet_id, number(i.packet_id), delay_s=0.001)]) as (line, _):
         link = line.link(PATIENT_S)
