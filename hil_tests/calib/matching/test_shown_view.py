@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Mast, Rig, RigCamera
 from calib.matching.patch_search import HALF, Reduced, agreed_view, cut, found
 from calib.matching.same_patches import Posed
@@ -42,6 +45,37 @@ def test_the_shown_view_is_found_near_the_told_one_and_far_off(
     seen = shown_view(RIG, "eye", posed((0.0, 0.0)), posed((0.15, 0.08), shown))
     assert seen.verdict == verdict
     assert (seen.pan_rad, seen.tilt_rad) == pytest.approx(shown, abs=SAME_RAD)
+
+
+FOLD = 1.05
+"""A lens that bends so much that nothing farther from its axis than this slope is in its image's circle."""
+
+
+class Barrel(Pinhole):
+    """The same camera with a lens x' = x (1 - r² / (3 FOLD²)), which the pixels in the corners lie beyond."""
+
+    def rays(self, pixels_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        offsets = (pixels_px - self.middle_px) / self.focal_px
+        bent = np.linalg.norm(offsets, axis=-1, keepdims=True)
+        slopes = np.linspace(0.0, FOLD, 4000)
+        straight = np.interp(bent, slopes * (1 - slopes**2 / 3 / FOLD**2), slopes)
+        straight += np.maximum(bent - 2 / 3 * FOLD, 0.0)  # corners show the wall too, but not where it is
+        return super().rays(self.middle_px + self.focal_px * offsets * straight / np.maximum(bent, 1e-9))
+
+
+def test_what_lies_beyond_the_circle_of_a_lens_has_no_say() -> None:
+    views = {told: Barrel(np.zeros(3), *told, 220.0, SIZE_PX) for told in ((0.0, 0.0), (0.12, 0.11))}
+    level = views[0.0, 0.0]
+    matrix = np.array([[220.0, 0, level.middle_px[0]], [0, 220.0, level.middle_px[1]], [0, 0, 1]])
+    distortion = [-1 / 3 / FOLD**2, 0.0, 0.0, 0.0, 0.0]
+    model = CameraModel.of_matrix("OPENCV5", SIZE_PX, matrix, distortion, level.axes, np.zeros(3))
+    assert not model.ray([[0.0, 0.0]]).valid.any()
+    rig = replace(RIG, cameras={"eye": RigCamera("head", model)})
+    before, after = (picture(view, wall(1), samples=2, noise_dn=1.0) for view in views.values())
+    for told, verdict in (((0.12, 0.11), "seen"), ((0.15, 0.08), "contradicted")):
+        seen = shown_view(rig, "eye", Posed(before, 0.0, 0.0), Posed(after, *told))
+        assert seen.verdict == verdict
+        assert (seen.pan_rad, seen.tilt_rad) == pytest.approx((0.12, 0.11), abs=SAME_RAD)
 
 
 def test_a_picture_of_something_else_is_no_view_of_the_wall() -> None:
