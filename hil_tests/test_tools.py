@@ -1,4 +1,4 @@
-"""The tools' arguments: what makes no sense, or is not there, is one sentence and exit code 2."""
+"""The tools' arguments: what makes no sense, or is not there, is one sentence and exit code 2; and Ctrl-C."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import runpy
 import sys
 
 import pytest
+
+from tools.command import end
 
 CASES = {
     "campaigns.refine --rig /nosuch": "/nosuch: cannot be read: No such file or directory",
@@ -33,3 +35,12 @@ def test_what_a_tool_cannot_use_is_one_sentence(
         runpy.run_module(f"tools.{name}", run_name="__main__")
     assert ended.value.code == 2
     assert capsys.readouterr().err.rstrip("\n").endswith(CASES[words])
+
+
+def test_an_interrupted_tool_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted() -> int:
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as ended:
+        end(interrupted)
+    assert ended.value.code == 130 and capsys.readouterr().err == ""

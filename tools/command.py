@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import signal
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -183,8 +184,8 @@ def end(main: Callable[[], int | None]) -> None:
     try:
         with signals.raised():
             sys.exit(_by_its_name(main)())
-    except signals.Ended as ended:
-        sys.exit(128 + ended.number)
+    except KeyboardInterrupt as ended:
+        sys.exit(128 + (ended.number if isinstance(ended, signals.Ended) else signal.SIGINT))
     except (CalibError, DriverError, MastctlError, CommandError) as error:
         words, code = str(error), as_command_error(error).exit_code
     except OSError as error:

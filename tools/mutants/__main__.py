@@ -141,7 +141,9 @@ def _all_tried(chosen: list[MutantSite], args: argparse.Namespace, copies: list[
     with ProcessPoolExecutor(len(copies), context, _begin, (own,)) as pool:
         try:
             near = [nearest(REPOSITORY, graph, site.file, args.tests, args.among) for site in chosen]
-            yield from pool.map(_tried, chosen, near, [args.longest] * len(chosen))
+            # and no pool.map: it cancels what waits, and the pool of ended workers stumbles over that
+            tried = [pool.submit(_tried, *one, args.longest) for one in zip(chosen, near, strict=True)]
+            yield from (one.result() for one in tried)
         except BaseException:  # a signal too: nobody waits for what runs
             for worker in active_children():
                 worker.terminate()
