@@ -26,7 +26,7 @@ import signal
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import active_children, get_context
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
@@ -143,7 +143,7 @@ def _all_tried(chosen: list[MutantSite], args: argparse.Namespace, copies: list[
             near = [nearest(REPOSITORY, graph, site.file, args.tests, args.among) for site in chosen]
             # and no pool.map: it cancels what waits, and the pool of ended workers stumbles over that
             tried = [pool.submit(_tried, *one, args.longest) for one in zip(chosen, near, strict=True)]
-            yield from (one.result() for one in tried)
+            yield from (one.result() for one in as_completed(tried))
         except BaseException:  # a signal too: nobody waits for what runs
             for worker in active_children():
                 worker.terminate()
