@@ -133,8 +133,9 @@ def test_torque_may_be_dropped_at_the_start_where_the_configuration_allows_it() 
         assert head.read().faults == ()
 
 
-def test_silent_servos_are_told_to_answer() -> None:
-    with opened(pan={"status_return_level": 0}) as (it, head):
+@pytest.mark.parametrize("level", [0, 1])  # 1 answers what is read, and nothing else
+def test_silent_servos_are_told_to_answer(level: int) -> None:
+    with opened(pan={"status_return_level": level}) as (it, head):
         assert it.servos[0].table["status_return_level"] == 2
         assert head.read().faults == ()
 

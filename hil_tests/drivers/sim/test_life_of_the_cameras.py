@@ -182,6 +182,8 @@ def test_the_day_is_a_sine_in_small_steps() -> None:
     found = np.array([day.change_k(t) for t in times_s])
     assert np.abs(found - 10 * np.sin(2 * np.pi * times_s / 400)).max() <= STEP_K / 2
     assert day.change_k(0.0) == 0.0
+    from_noon = replace(day, phase_rad=np.pi / 2)
+    assert [from_noon.change_k(t) for t in (0.0, 100.0, 200.0, 400.0)] == [10.0, 0.0, -10.0, 10.0]
 
 
 def test_a_warm_lens_has_another_focal_length_and_centre(small_rig: Path) -> None:
