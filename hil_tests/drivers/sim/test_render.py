@@ -15,7 +15,7 @@ from drivers.errors import BadOptions
 from drivers.sim import ground, render
 from drivers.sim import render as ray_tables
 from drivers.sim.kept import is_compiled
-from drivers.sim.kernels.light import stretched_brightness
+from drivers.sim.kernels.light import hits_light, stretched_brightness
 from drivers.sim.quick_start import kept_scene
 from drivers.sim.render import Renderer, Stills, compile_renderer, ray_table
 from drivers.sim.scene import Scene, SceneSettings
@@ -109,6 +109,19 @@ def test_no_level_of_a_texture_is_shifted_against_another(axis: int) -> None:
             )
             expected = 0.2 + 1.6 * place[axis] / (size * texel_m)
             assert value == pytest.approx(expected, abs=1.6 / size * 0.02), (width, stretch)
+
+
+def test_hits_close_together_are_looked_up_at_their_middle(rough: Renderer) -> None:
+    world, look = rough.scene.world, numba.njit(hits_light.py_func)
+    rng, middle_m = np.random.default_rng(14), world.inner.cells * world.inner.cell_m / 2
+    for _ in range(20):
+        place = [*(middle_m + rng.uniform(-8.0, 8.0, 2)), rng.uniform(3.0, 20.0)]
+        hits = np.array([*place, *rng.normal(size=3)]) + rng.normal(0.0, 1e-5, (4, 6))
+        one_by_one, together = (
+            look(world.inner, world.broad, world.detail, hits.copy(), 4, way, 0.002, 0.002)
+            for way in (False, True)
+        )
+        assert together == pytest.approx(one_by_one, rel=1e-3)
 
 
 # ------------------------------------------------------------- the same geometry as Scene.cast

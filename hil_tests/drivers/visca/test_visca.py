@@ -100,6 +100,19 @@ def test_a_move_is_no_faster_than_asked_and_a_speed_that_no_code_has_is_refused(
             head.move(0.0, 0.0, 0.01)
 
 
+def test_how_far_from_its_goal_an_axis_is_held_is_told() -> None:
+    with opened() as (it, head):
+        head.move(-0.3, 0.0)
+        it.until(lambda: not head.read().moving, "the place")
+        it.panel.set("pan_tilt", "stuck")
+        head.move(0.3, 0.0)
+        it.until(lambda: head.read().faults, "words")
+        counts = 2 * round(0.3 / COUNT_RAD)
+        assert head.read().faults == (
+            f"pan stands still {counts * COUNT_RAD:.4f} rad from its goal: something holds it",
+        )
+
+
 def test_the_heads_own_words_are_told_and_nothing_moves() -> None:
     with opened(limits=((-100, 100), (-100, 100))) as (it, head):
         with pytest.raises(Refused, match="the head refuses: not executable now"):

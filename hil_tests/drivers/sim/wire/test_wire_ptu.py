@@ -187,9 +187,19 @@ def test_a_step_mode_comes_into_force_with_a_reset_of_its_axis(unit: Unit) -> No
     assert unit.ask("PR") == "* 46.2857 seconds arc per Pan position"
     assert unit.ask("PX") == "* Maximum Pan position is 12360"
     assert unit.ask("PU") == "* Maximum Pan speed is 11608 positions/sec"
+    for query in ("S", "A", "B"):  # a quarter of the step: four times as many for the same turn
+        pan, tilt = (float(unit.ask(axis + query).split()[-2]) for axis in "PT")
+        assert pan == 4 * tilt, query
     assert unit.ask("TR") == "* 185.1428 seconds arc per Tilt position", "the other axis is as it was"
     unit.ask("PP1000", 3.0)
     assert unit.pan.angle_rad(unit.clock.now_s()) == pytest.approx(-1000 * math.radians(1296 / 28 / 3600))
+
+
+def test_a_unit_that_starts_in_another_step_mode_turns_as_fast() -> None:
+    half, eighth = Unit(step_mode="H"), Unit(step_mode="E")
+    for query in ("PS", "PA", "PB", "PU"):
+        slow, fine = (float(one.ask(query).split()[-2]) for one in (half, eighth))
+        assert fine == 4 * slow, query
 
 
 def test_an_e46_does_not_know_its_gears_before_a_reset() -> None:
