@@ -100,6 +100,13 @@ def test_a_run_says_who_objected(checkout: Path) -> None:
     assert (killed.outcome, killed.test) == ("killed", "test_code.py::test_two")
 
 
+def test_tests_run_in_a_process_that_looks_like_pytests_own(checkout: Path) -> None:
+    (checkout / "test_code.py").write_text(
+        "import sys\n\n\ndef test_it():\n    assert sys.modules['__main__'].__spec__.name == 'pytest'\n"
+    )
+    assert run(checkout, ["test_code.py"], 30.0, 120.0).outcome == "passed"
+
+
 @OFTEN
 @pytest.mark.parametrize(
     ("code", "outcome"),

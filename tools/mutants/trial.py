@@ -149,8 +149,9 @@ def _in_the_fork(
         for stream in (0, 1, 2):
             os.dup2(silence, stream)
         for name in [*sys.modules]:
-            if name.partition(".")[0] in (*PACKAGES, TESTS, "__main__"):
+            if name.partition(".")[0] in (*PACKAGES, TESTS):
                 del sys.modules[name]
+        sys.modules["__main__"] = pytest  # this one's is the tool, not of the copy
         sys.path.insert(0, str(copy))
         sys.dont_write_bytecode = True
         with said.open("a", buffering=1) as file:
