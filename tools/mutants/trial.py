@@ -20,6 +20,7 @@ from typing import NamedTuple, NoReturn
 
 import pytest
 
+from mastctl import signals
 from tools.mutants.sites import PACKAGES, TESTS
 
 LIBRARIES = ("cv2", "fastapi", "httpx", "hypothesis", "numba", "numpy.testing", "scipy.interpolate")
@@ -138,7 +139,8 @@ def _in_the_fork(
     """Be the process that runs the tests."""
     code = 4
     try:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number in signals.ENDING:  # the tool's own handlers, which would end pytest in order
+            signal.signal(number, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         os.setsid()
         os.chdir(copy)
