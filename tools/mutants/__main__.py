@@ -3,9 +3,9 @@
     .venv/bin/python -m tools.mutants calib/geometry drivers/flir_ptu/head.py --mutants 40 --seed 1
 
 Each mutant is one change in one line of a copy of the checkout. Up to --tests test files run against it,
-those nearest to the module first (by imports, then by how often they mention its names), until the first
-failure, which counts if the same test fails again with the change and passes without it. A mutant that no
-test objects to has survived: either the tests lack something, or the line decides nothing.
+those nearest to the module first (by imports and by place), until the first failure, which counts if the
+same test fails again with the change and passes without it. A mutant that no test objects to has survived:
+either the tests lack something, or the line decides nothing.
 Each mutant's end is printed with its place, survivors to be looked at one by one.
 
 N mutants are drawn from each place named. Told apart from what a test objected to are those that only took

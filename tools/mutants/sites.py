@@ -1,5 +1,4 @@
-"""Where a small change of the code is tried, and which test files stand nearest to it: by imports, then by
-names."""
+"""Where a small change of the code is tried, and which test files stand nearest to it."""
 
 from __future__ import annotations
 
@@ -8,6 +7,7 @@ import re
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain, takewhile
 from pathlib import Path
 
 COMPARISONS: dict[type[ast.cmpop], type[ast.cmpop]] = {
@@ -185,7 +185,11 @@ def imports(repository: Path) -> dict[str, frozenset[str]]:
 def nearest(
     repository: Path, graph: Mapping[str, frozenset[str]], file: str, count: int, among: str = TESTS
 ) -> list[str]:
-    """Return up to ``count`` test files of a folder: fewest imports away first, then most mentions of it."""
+    """Return up to ``count`` test files of a folder, in turn the nearest by imports and the nearest by place.
+
+    By imports are first those that reach the file by the fewest; by place, those in the folder of the same
+    name, with words of the file's own name in theirs. Among equals, who mentions more of what it defines.
+    """
     users: dict[str, set[str]] = {}
     for user, used in graph.items():
         for name in used:
@@ -203,7 +207,16 @@ def nearest(
     ]
     words = _defined(repository / file)
     mentions = {name: len(words.findall((repository / name).read_text())) for name in tests}
-    return sorted(tests, key=lambda name: (away[name], -mentions[name], name))[:count]
+    by_imports = sorted(tests, key=lambda name: (away[name], -mentions[name], name))
+    by_place = sorted(by_imports, key=lambda name: -_alike(Path(file), Path(name).relative_to(TESTS)))
+    return list(dict.fromkeys(chain.from_iterable(zip(by_imports, by_place, strict=True))))[:count]
+
+
+def _alike(file: Path, test: Path) -> int:
+    """How many folders from the top on, and words of their names, a module and a test have in common."""
+    folders = takewhile(lambda pair: pair[0] == pair[1], zip(file.parts[:-1], test.parts[:-1], strict=False))
+    words = set(file.stem.split("_")) & set(test.stem.split("_"))
+    return len(list(folders)) + len(words)
 
 
 def _module(path: Path) -> str:
@@ -219,8 +232,8 @@ def _wanted(path: Path) -> set[str]:
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            found.add(node.value)  # importlib is told a name
+        elif isinstance(node, ast.Constant) and "." in str(node.value):
+            found.add(str(node.value))  # importlib is told a name
     return found
 
 
