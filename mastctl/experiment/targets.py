@@ -194,7 +194,7 @@ class TargetViews:
     def _ground_ahead(self, distance_m: float) -> FloatArray:
         """A point (3,) of level ground at the range from the head, anywhere ahead, rover frame."""
         head_in_rover_m = self._rig.mast.rover_from_head(0.0, 0.0).translation_m
-        height_m = -float(head_in_rover_m[2])
+        height_m = float(head_in_rover_m[2])
         along_m = math.sqrt(max(distance_m**2 - height_m**2, 0.0))
         azimuth_rad = self._rng.uniform(-self._pan_range_rad, self._pan_range_rad)
         return np.array(

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig, save_rig
@@ -78,6 +79,15 @@ def test_a_head_whose_mast_file_has_joints_is_turned_to_the_readings_that_are_wa
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
         look = DaemonEyes(client, CAMERAS, BOARD).look(0.05, -0.02)
     assert (look.pan_rad, look.tilt_rad) == (pytest.approx(0.05, abs=1e-4), pytest.approx(-0.02, abs=1e-4))
+
+
+def test_a_head_that_comes_from_both_sides_is_told_as_such(repository: Path) -> None:
+    config = bench(repository)
+    simulation = {**config.hardware.simulation, "head": "dynamixel_x"}
+    config = replace(config, hardware=replace(config.hardware, simulation=simulation))
+    with RunningDaemon(config) as daemon, Client(daemon.url) as client:
+        head = DaemonEyes(client, CAMERAS, BOARD).head
+    assert not head.one_sided and head.count_rad == pytest.approx(2 * np.pi / 4096)
 
 
 def test_a_camera_that_is_pulled_out_is_named_and_the_other_still_looks(

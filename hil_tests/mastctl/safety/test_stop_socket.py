@@ -24,6 +24,7 @@ from mastctl.cli.main import main
 from mastctl.client import Client
 from mastctl.errors import MastctlError
 from mastctl.safety import stop_socket as stop_socket_module
+from mastctl.safety import stop_threads as stop_threads_module
 from mastctl.safety.state_folder import StateFolder, usual_folder
 from mastctl.safety.stop_line import NoAnswer, ask
 from mastctl.safety.stop_socket import SILENT_PEERS, StopSocket
@@ -152,6 +153,24 @@ def test_a_stop_that_hangs_is_told_in_time_and_the_next_still_latches(
     assert "may still move" in said(door.path, b"estop Ana: sparks\n")
     assert stops.latched == [("sparks", "Ana")]
     hang.let_go()
+
+
+def test_a_stop_that_no_thread_can_send_any_more_is_told_at_once(
+    door: StopSocket, stops: Stops, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hang = Hang()
+    monkeypatch.setattr(stops, "stop_told", hang)
+    monkeypatch.setattr(stop_threads_module, "OVERDUE_S", -1.0)
+    senders = [peer(door.path) for _ in range(stop_socket_module.THREADS)]
+    for count, sender in enumerate(senders, 1):
+        sender.sendall(b"stop\n")
+        until(lambda count=count: len(door._threads._began_s) == count, "the stop is under way")
+    told = said(door.path, b"estop Ana: sparks\n")
+    assert told.startswith(f"failed: {len(senders)} stops are under way") and "switch its power off" in told
+    assert stops.latched == [("sparks", "Ana")]
+    hang.let_go()
+    for sender in senders:
+        sender.close()
 
 
 def test_who_goes_before_the_answer_hurts_nobody(
