@@ -121,8 +121,10 @@ def test_a_board_that_reaches_out_of_the_picture_is_found_where_it_is_inside() -
     assert float(rim.min()) > 2 * 0.7, "a corner of which the blur reaches out of the picture"
 
 
-@pytest.mark.parametrize("board", [CHARUCO, APRILGRID], ids=lambda board: board.kind)
-@pytest.mark.parametrize("place", [(0.12, 0.08, 0.55), (-0.12, -0.08, 0.55), (0.0, 0.0, 0.36)])
+@pytest.mark.parametrize(
+    ("board", "place"),
+    [(APRILGRID, (0.12, 0.08, 0.55)), (APRILGRID, (-0.12, -0.08, 0.55)), (CHARUCO, (0.0, 0.0, 0.36))],
+)
 def test_each_side_of_a_picture_is_as_good_as_the_other(
     board: AnyBoard, place: tuple[float, float, float]
 ) -> None:
@@ -133,7 +135,7 @@ def test_each_side_of_a_picture_is_as_good_as_the_other(
     np.testing.assert_allclose(turned.sigma_px, found.sigma_px, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("astray_px", "kept"), [(0.6, True), (1.0, False), (3.5, False)])
+@pytest.mark.parametrize(("astray_px", "kept"), [(0.6, True), (1.0, False)])
 def test_a_corner_is_left_out_by_how_far_off_the_others_are(astray_px: float, kept: bool) -> None:
     """Each corner of a print is 0.1 px off, far beyond what its picture tells, in no pattern."""
     image = drawn((CHARUCO, (0.1, 0.1, 0.0), (0.0, 0.0, 0.7)))
