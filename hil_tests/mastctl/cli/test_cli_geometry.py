@@ -303,6 +303,18 @@ def test_budget_is_the_papers_table_1(folder: Path, capsys: pytest.CaptureFixtur
     assert "202.17" in Run("budget", capsys).out
 
 
+def test_convert_names_the_lens_it_took_and_how_far_that_is_off(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = json.loads(Run("camera convert mast.yaml eye.ros.yaml --camera eye_left --json", capsys).out)
+    assert (
+        told["cameras"]["eye_left"]["lens"] == "plumb_bob" and told["cameras"]["eye_left"]["worst_px"] < 1e-9
+    )
+    lines = Run("camera convert mast.yaml again.ros.yaml --camera eye_left", capsys).out.splitlines()
+    assert lines[1].startswith("eye_left, plumb_bob: worst ") and lines[1].endswith(" px rms over the image")
+    assert "cameras" not in Run("camera convert mast.yaml eye.yaml --camera eye_left --json", capsys).json
+
+
 def test_convert_says_what_the_target_cannot_hold(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = Run("camera convert mast.yaml eye.cahvor --camera eye_left --json", capsys)
     assert run.code == 0
