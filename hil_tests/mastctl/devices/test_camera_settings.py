@@ -14,6 +14,7 @@ from drivers.errors import BadReply, BadSetting, Refused
 from drivers.interfaces import CameraSetting
 from hil_tests.mastctl.service_fakes import HTTP, FakeCamera, FakeHardware, ScriptedLoop
 from hil_tests.waiting import NET_S, until
+from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.devices import camera_settings
@@ -280,3 +281,31 @@ def test_a_bound_as_it_is_shown_is_the_bound() -> None:
     for value in (0.00029999, 0.0166668):
         with pytest.raises(BadSetting, match=r"0\.0003 to 0\.0166667 s is expected"):
             check_wanted(known, {"exposure_s": value}, "eye")
+
+
+def test_the_command_shows_settings_with_their_bounds_and_changes_them(
+    pair: Pair, left: SetCamera, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def said(*words: str) -> tuple[list[list[str]], str]:
+        capsys.readouterr()
+        assert main(["camera", "settings", *words, "--url", pair[0].url]) == 0
+        out, log = capsys.readouterr()
+        return [line.replace("│", " ").split() for line in out.splitlines()], log
+
+    left.told = CameraSetting("gain", 8.0, 0.0, 100.0, 0.0)
+    assert ["gain", "8", "0", "to", "100"] in said("navcam_left")[0], "any number: no step"
+    left.told = None
+    shown, _ = said("navcam_left")
+    assert ["exposure_s", "0.01", "0.001", "to", "0.04,", "step", "0.0001", "s"] in shown
+    assert ["gain", "8", "0", "to", "100,", "step", "4"] in shown
+    white = "white_balance_k automatic 2000 to 6500, step 1 K is set by something else"
+    assert white.split() in shown
+    changed, log = said("navcam_left", "gain=21", "exposure_s=0.004")
+    assert left.sets == [{"gain": 21.0, "exposure_s": 0.004}]
+    assert ["gain", "20", "0", "to", "100,", "step", "4"] in changed and "where 21 was asked for" in log
+    (nothing,), _ = said("navcam_right")
+    assert " ".join(nothing) == "nothing of navcam_right can be changed while it runs"
+    assert main(["camera", "settings", "navcam_left", "zoom=2", "--url", pair[0].url]) == 2
+    assert "'zoom=2' where NAME=VALUE is expected, with the name one of" in capsys.readouterr().err
