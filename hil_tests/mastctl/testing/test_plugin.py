@@ -174,10 +174,17 @@ REFUSED = {
 }
 
 
-def test_a_bad_option_fails_its_test_with_a_sentence_and_no_other(tmp_path: Path) -> None:
-    tests = ["import pytest", "mark = pytest.mark.mastctl"]
+def test_a_bad_option_fails_its_test_with_a_sentence_and_no_other_and_a_daemon_ends_with_its_test(
+    tmp_path: Path,
+) -> None:
+    tests = ["import pytest, urllib.request", "mark = pytest.mark.mastctl"]
     tests += [f"@{mark}\ndef test_{number}(mast_daemon): pass" for number, mark in enumerate(REFUSED)]
-    tests += ["def test_alive(simulated_rover): assert simulated_rover._ask", ""]
+    tests += ["def test_alive(mast_daemon): globals()['URL'] = mast_daemon"]
+    tests += [
+        "def test_ended():",
+        "    with pytest.raises(OSError, match='refused'): urllib.request.urlopen(URL)",
+        "",
+    ]
     (tmp_path / "test_them.py").write_text("\n".join(tests))
     (tmp_path / "calib.py").write_text("raise SystemExit('this is the project's own')\n")
     (tmp_path / "pytest.ini").write_text("[pytest]\nmastctl_picture_width_px = 64\nmastctl_seed = 1\n")
@@ -193,7 +200,7 @@ def test_a_bad_option_fails_its_test_with_a_sentence_and_no_other(tmp_path: Path
         "--strict-markers",
     ]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert "1 passed, 4 errors" in done.stdout, done.stdout
+    assert "2 passed, 4 errors" in done.stdout, done.stdout
     assert "Traceback" not in done.stdout and "During handling" not in done.stdout
     for words in REFUSED.values():
         assert words in done.stdout
