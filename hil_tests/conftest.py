@@ -43,7 +43,9 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 
 # What tests make in the temporary folder, and the state of daemons that they start, is in a folder of this
 # process alone. pytest's own folders stay beside it.
-os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())
+# A socket's path has 100 bytes, of which pytest's folders and the names of tests take 82.
+TEMPORARY = tempfile.gettempdir() if len(os.fsencode(tempfile.gettempdir())) <= 16 else "/tmp"
+os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", TEMPORARY)
 OWN = OwnFolder(Path(os.environ["PYTEST_DEBUG_TEMPROOT"]))
 os.environ["TMPDIR"] = str(OWN.path)
 tempfile.tempdir = None  # asks the environment again
