@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,7 +15,7 @@ from drivers.simulation_clock import SimulationClock
 from hil_tests.mastctl.service_fakes import FakePointing, FakeResult
 from hil_tests.waiting import NET_S, joined, until
 from mastctl.control.operations import KEPT_OPERATIONS, STOP_ASKED, OperationRunner
-from mastctl.control.records import Operation
+from mastctl.control.records import Operation, last_frame
 from mastctl.control.standing import CLOSING, Residual
 from mastctl.errors import NotKnown, NotNow, Stopped, Unable, error_body
 
@@ -471,3 +472,14 @@ def test_a_deadline_on_the_simulations_clock_takes_no_real_time_and_lets_none_pa
     operations.end_within(name, 600.0, 600.0)
     ended(operations, name)
     assert clock.now_s() < 610.0
+
+
+@pytest.mark.parametrize(
+    ("frame_ids", "last"), [(("a-1", "a-2"), "a-2"), (("a-1", ""), None), (("a-1", None), None), ((), None)]
+)
+def test_the_picture_that_a_result_ends_with_is_that_of_its_last_pointing(
+    frame_ids: tuple[str | None, ...], last: str | None
+) -> None:
+    pointings = [SimpleNamespace(frame_id=frame_id) for frame_id in frame_ids]
+    assert last_frame(SimpleNamespace(pointings=pointings)) == last
+    assert last_frame(None) is None
