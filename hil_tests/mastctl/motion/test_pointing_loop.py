@@ -88,12 +88,12 @@ def test_a_position_is_told_as_sure_as_the_pixels_and_the_match_it_comes_from() 
         steps: list[Step] = []
         loop = PointingLoop(rig(), world, LIMITS, world.clock, settings)
         loop.run(click(frame, 150.0, 120.0), steps.append, threading.Event())
-        stereo, place = (
-            next(s.detail for s in steps if s.name == name) for name in ("stereo", "triangulate")
+        frames, stereo, place = (
+            next(s.detail for s in steps if s.name == name) for name in ("frames", "stereo", "triangulate")
         )
         match_px = max(stereo["sigma_px"])
         assert match_px > 0.04, "where the match adds nothing, nothing is shown"
-        assert stereo["dt_s"] == {"navcam_right": 0.0}, "that both eyes saw one moment was looked at"
+        assert frames["dt_s"] == stereo["dt_s"] == {"navcam_right": 0.0}, "both eyes saw one moment"
         disparity_px = np.sqrt(2 * pixel_sigma_px**2 + match_px**2)
         expected_m = disparity_px * place["range_m"] ** 2 / (645.0 * 0.2)
         assert np.linalg.norm(place["sigma_m"]) == pytest.approx(expected_m, rel=0.05)
