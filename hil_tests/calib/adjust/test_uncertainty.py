@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from calib.adjust.result import Calibration
-from calib.adjust.uncertainty import pixel_covariance, pointing_covariance, rig_moved_along
+from calib.adjust.uncertainty import _reason, pixel_covariance, pointing_covariance, rig_moved_along
 from calib.calibrate.paper import fit_paper
 from calib.calibrate.survey import fit_joint
 from calib.geometry.covariance import pixel_rates
@@ -196,3 +199,26 @@ def test_stated_pointing_uncertainty_is_that_of_the_clicks_and_the_fit(joint: Ca
     clicked = pointing_covariance(joint, pair, 0.3, -0.3, pixel, 4.0, click_px=CLICK_PX)
     assert 0 < np.sqrt(alone[0, 0]) < 0.1 and 0 < np.sqrt(alone[1, 1]) < 0.15
     assert CLICK_PX / 2 < np.sqrt(clicked[0, 0]) < POINTING_PX
+
+
+@pytest.mark.parametrize(
+    ("owner", "advice"),
+    [
+        (
+            ("camera", "left"),
+            ": camera left sees 2 boards; take more at two distances and over the whole image",
+        ),
+        (("mast",), "; take more images of purpose mast, spread over pan and tilt"),
+    ],
+)
+def test_what_is_open_though_the_head_moved_is_told_with_what_would_fix_it(
+    owner: tuple[str, ...], advice: str
+) -> None:
+    def image(camera: str, board: str, angle_rad: float, used: bool = True) -> Any:
+        angles = {"pan_rad": angle_rad, "tilt_rad": angle_rad}
+        return SimpleNamespace(camera=camera, board=board, attitude=0, keep=np.array([used]), **angles)
+
+    images = [image("left", "b1", 0.0), image("left", "b2", 1.0), image("left", "b3", 2.0, used=False)]
+    images += [image("right", f"b{number}", 0.5) for number in range(4)]
+    problem: Any = SimpleNamespace(images=images, unknowns=SimpleNamespace(owner=lambda name: owner))
+    assert _reason(problem, ["cameras.left.C.x"]) == f"the survey does not fix C of left{advice}"
