@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from calib.calibrate.scene.features import Feature
-from calib.calibrate.scene.fit import fit_scene
+from calib.calibrate.scene.fit import fit_scene, white_px
 from calib.calibrate.scene.places import Sights
 from calib.calibrate.scene.terms import PRIOR, SceneView, terms_of
 from calib.errors import NoCorrection
@@ -292,3 +294,11 @@ def test_too_few_features_are_refused_with_what_would_help() -> None:
     ) as refused:
         fit_scene(believed(), views, features[:11])
     assert refused.value.code == "too_few"
+
+
+def test_a_sigma_of_features_in_pixels_is_per_axis() -> None:
+    def feature(*sigmas_px: float) -> Any:
+        return SimpleNamespace(covariances_px2=np.array([np.eye(2), np.diag(np.square(sigmas_px))]))
+
+    assert white_px([feature(0.3, 0.3)]) == pytest.approx(0.3)
+    assert white_px([feature(0.1, 0.7), feature(1.0, 1.0)]) == pytest.approx((0.5 + 1.0) / 2)
