@@ -9,6 +9,8 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +28,7 @@ from calib.survey.reader import read_survey
 from mastctl.bench.eyes import BenchLook
 from mastctl.bench.folder import looks_of
 from mastctl.bench.looks import BenchGoal, BoardLost
+from mastctl.bench.run import BenchRun
 from mastctl.bench.search import BoardNotFound
 
 
@@ -289,3 +292,13 @@ def test_a_head_that_slipped_ends_the_run_with_the_placement_and_names_it(
         run.run()
     assert run.known.placements() == ["p1"]
     assert len(run.known.of("p1")) == 9  # six before, two after, and the first one taken again
+
+
+@pytest.mark.parametrize("untied", [(), ("hazcam_left",)])
+def test_the_board_is_asked_for_where_it_ties_body_cameras_only_while_some_are_not_tied(
+    monkeypatch: pytest.MonkeyPatch, untied: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr("mastctl.bench.run.advise_for_body", lambda *known: known[-1])
+    known = SimpleNamespace(now=None, sought=None, shots=[], untied=lambda: untied)
+    run: Any = SimpleNamespace(known=known)
+    assert BenchRun._body_advice(run) == (untied or None)
