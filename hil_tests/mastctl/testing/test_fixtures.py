@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import signal
+import time
 import urllib.request
 from collections.abc import Callable
 from contextlib import suppress
@@ -42,6 +43,7 @@ def points_again(client: Client) -> None:
             client.stop()
             return ended(client, clicked(client)) == "done"
         except ClientError:  # the head still moves, or has just come back
+            time.sleep(0.3)  # a servo that was silent does not come back among stops 60 times a second
             return False
 
     until(done, "it points again")
