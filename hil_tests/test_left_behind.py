@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from contextlib import suppress
 from pathlib import Path
@@ -147,6 +148,22 @@ def test_what_a_test_holds_is_new_and_what_others_let_go_is_not_missed(tmp_path:
     mine.cancel()
     mine.join()
     assert held() <= before
+
+
+@pytest.mark.parametrize(("name", "used"), [("t", None), ("a_name_that_leaves_no_room_for_sockets", "/tmp")])
+def test_a_long_temporary_folder_leaves_room_for_sockets(
+    repository: Path, name: str, used: str | None
+) -> None:
+    with tempfile.TemporaryDirectory(prefix=name, dir="/tmp") as folder:
+        environment = {**os.environ, "TMPDIR": folder}
+        environment.pop("PYTEST_DEBUG_TEMPROOT", None)
+        code = "import os, hil_tests.conftest; print(os.environ['PYTEST_DEBUG_TEMPROOT'])"
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=repository, env=environment, capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        assert done.stdout.strip() == (used or folder)
+        assert not [*Path(folder).iterdir()]
 
 
 INTERRUPTED = """

@@ -19,6 +19,7 @@ from drivers.aravis.camera import AravisCamera, open_camera
 from drivers.errors import DriverError, NoCamera, NoFreshFrame, UnsupportedFormat
 from drivers.newest import TimedFrame
 from hil_tests.drivers.aravis.gige_camera import GigeCamera
+from hil_tests.left_behind import held
 from hil_tests.waiting import NET_S, until
 
 pytestmark = pytest.mark.skipif(
@@ -64,10 +65,7 @@ def test_a_stream_hears_no_packet_that_is_not_sent_to_it(device: GigeCamera) -> 
         pytest.skip("this user may have no packet sockets, so that Aravis opens none")
     opened().next_frame(time.monotonic(), NET_S)
     inodes = {line.split()[-1] for line in Path("/proc/self/net/packet").read_text().splitlines()[1:]}
-    mine = set[str]()
-    for link in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):  # the one by which it looks
-            mine.add(str(link.readlink()))
+    mine = {str(one[1]) for one in held() if isinstance(one, tuple)}
     assert not {f"socket:[{inode}]" for inode in inodes} & mine
 
 

@@ -307,9 +307,8 @@ def test_convert_names_the_lens_it_took_and_how_far_that_is_off(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     told = json.loads(Run("camera convert mast.yaml eye.ros.yaml --camera eye_left --json", capsys).out)
-    assert (
-        told["cameras"]["eye_left"]["lens"] == "plumb_bob" and told["cameras"]["eye_left"]["worst_px"] < 1e-9
-    )
+    taken = told["cameras"]["eye_left"]
+    assert taken["lens"] == "plumb_bob" and taken["worst_px"] < 1e-9
     lines = Run("camera convert mast.yaml again.ros.yaml --camera eye_left", capsys).out.splitlines()
     assert lines[1].startswith("eye_left, plumb_bob: worst ") and lines[1].endswith(" px rms over the image")
     assert "cameras" not in Run("camera convert mast.yaml eye.yaml --camera eye_left --json", capsys).json

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import signal
-import time
 import urllib.request
 from collections.abc import Callable
 from contextlib import suppress
@@ -38,14 +37,23 @@ def ended(client: Client, pixel: tuple[str, str, float, float]) -> str:
 def points_again(client: Client) -> None:
     """Stop, which also arms a bus watchdog that has tripped, and point, until that is done."""
 
-    def done() -> bool:
+    def stopped() -> bool:
         try:
             client.stop()
-            return ended(client, clicked(client)) == "done"
-        except ClientError:  # the head still moves, or has just come back
-            time.sleep(0.3)  # a servo that was silent does not come back among stops 60 times a second
+        except ClientError:  # it is not back yet
             return False
+        return True
 
+    def done() -> bool:
+        try:
+            code = ended(client, clicked(client))
+        except ClientError as error:
+            code = error.code
+        if code not in ("done", "frame_moving"):  # another stop would keep it from being seen at rest
+            stopped()
+        return code == "done"
+
+    until(stopped, "a stop is confirmed")
     until(done, "it points again")
 
 
