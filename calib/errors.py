@@ -71,10 +71,9 @@ class NoHandoff(CalibError):
 
 
 class NoCorrection(CalibError):
-    """Hand-offs or a scene that give no correction of a rig; ``code`` names the cause for programs.
+    """Hand-offs that give no correction of a rig; ``code`` names the cause for programs.
 
-    Codes: ``too_few``, ``one_sided``, ``inconsistent``, ``not_significant``, ``not_settled``,
-    ``not_predictive``, ``changed_halfway``, ``errs_by_reading``.
+    Codes: ``too_few``, ``one_sided``, ``inconsistent``, ``not_significant``, ``not_settled``.
     """
 
     def __init__(self, code: str, message: str) -> None:

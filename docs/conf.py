@@ -20,9 +20,11 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
+    "tools.site_tables",
 ]
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 4
+smartquotes = False  # "--option" in a table would become an en dash, which a shell does not take
 exclude_patterns = ["_build"]
 copybutton_prompt_text = "$ "  # commands are copied without it, and without what they print
 html_theme = "furo"

@@ -17,7 +17,7 @@ from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import DriverError
-from drivers.interfaces import Camera, Frame
+from drivers.interfaces import Camera, CameraInfo, Frame, FrameCounts
 
 log = logging.getLogger(__name__)
 
@@ -103,19 +103,13 @@ def let_go(opening: Opening) -> None:
     opening.add_done_callback(close)
 
 
-class AbsentCamera:
+class AbsentCamera(Camera):
     """Stands for a camera until it can be opened.
 
     Parameters
     ----------
-    name, driver
-        Its name, and its driver's.
-    make
-        Opens it. Raises DriverError.
     opening
         An opening that is under way already; or
-    error
-        why the first one failed.
     """
 
     def __init__(
@@ -148,10 +142,8 @@ class AbsentCamera:
     def appeared(self) -> Camera:
         """Return the camera if it is open by now, and see to it that it is tried; never waits.
 
-        Raises
-        ------
-        DriverError
-            Why it is not, and that it joins by itself; with the code of the driver's own error.
+        Raises DriverError (why it is not, and that it joins by itself; with the code of the driver's own
+        error).
         """
         with self._lock:
             if self.camera is None and not self._closed:
@@ -163,6 +155,16 @@ class AbsentCamera:
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
         """Return a frame if the camera is there by now. Raises DriverError as `appeared`."""
         return self.appeared().next_frame(exposed_after_s, timeout_s)
+
+    @property
+    def info(self) -> CameraInfo:
+        """What the camera states of itself, once it is open."""
+        return CameraInfo() if self.camera is None else self.camera.info
+
+    @property
+    def counters(self) -> FrameCounts | None:
+        """The camera's counts of its frames, once it is open."""
+        return None if self.camera is None else self.camera.counters
 
     def close(self) -> None:
         """Close the camera, also one that is opened later yet."""

@@ -19,8 +19,6 @@ def last_turn(approach: Approach, goal_rad: float, gravity_turnover_rad: float) 
     approach
         ``positive``, ``negative``, ``none``, or ``gravity``: against the weight, so that gear and weight
         press on the same flank.
-    goal_rad
-        Where the axis is to stand.
     gravity_turnover_rad
         The angle at which the weight changes sides: below it the weight pulls the axis down, so that the
         last stretch turns positive, above it up.

@@ -38,8 +38,6 @@ class Word:
 
     Attributes
     ----------
-    does
-        One plain sentence.
     parameters
         Parameter names with their defaults; the unit is in the name.
     """
@@ -132,7 +130,7 @@ CAMERA_WORDS: Mapping[str, Word] = MappingProxyType(
         "frozen": Word("the picture before the fault again and again, with new sequence and time", {}),
         "hang": Word(
             "the call does not return until the fault is over: 0 any, 1 next_frame, 2 close, 3 recent_times, "
-            "4 size_px, 5 exposure_held, 6 settings",
+            "4 info, 5 exposure_held, 6 settings",
             {"call": 0},
         ),
     }
@@ -174,10 +172,7 @@ BOUNDS = {
 def read_script(path: Path) -> list[Any]:
     """Return the list of a fault script, a YAML file with the one key ``faults``, for ``FaultPanel.set_all``.
 
-    Raises
-    ------
-    BadOptions
-        If the file cannot be read.
+    Raises BadOptions if the file cannot be read.
     """
     try:
         document = parse_mapping(read_bytes(path, _MAX_SCRIPT_BYTES), path)
@@ -232,8 +227,6 @@ class FaultPanel:
 
     Parameters
     ----------
-    now_s
-        The simulation's clock.
     cameras
         Names of the cameras; the head is ``pan_tilt``, the daemon's log ``log``.
     """
@@ -258,6 +251,9 @@ class FaultPanel:
     def set(self, device: str, word: str, **parameters: Any) -> Fault:
         """Set a fault, in place of one with the same word on the same device.
 
+        Raises BadOptions for an unknown device, word or parameter, or a value that is not a number within its
+        bounds.
+
         Parameters
         ----------
         device
@@ -266,11 +262,6 @@ class FaultPanel:
             A key of ``HEAD_WORDS``, ``CAMERA_WORDS`` or ``LOG_WORDS``.
         **parameters
             Those of the word, and ``after_s`` and ``for_s`` of every word.
-
-        Raises
-        ------
-        BadOptions
-            For an unknown device, word or parameter, or a value that is not a number within its bounds.
         """
         fault = self._fault(device, word, parameters)
         with self._lock:
@@ -306,19 +297,14 @@ class FaultPanel:
     def set_all(self, faults: Any, origin: str = "simulation.faults") -> None:
         """Set the faults of a script, beside those that are set.
 
+        Raises BadOptions as ``set``, or when it is not such a list; then nothing was set.
+
         Parameters
         ----------
         faults
             A list of mappings with ``device``, ``word`` and the word's parameters. ``at_s`` says the same
             as ``after_s``: seconds from now. The same word may come more than once; where two of them are in
             force, the later one of the list is.
-        origin
-            The name of the list in messages.
-
-        Raises
-        ------
-        BadOptions
-            As ``set``, or when it is not such a list; then nothing was set.
         """
         if not isinstance(faults, list | tuple):
             raise BadOptions(f"{origin} is {faults!r}, expected a list of {{device, word, ...}}")
@@ -342,10 +328,7 @@ class FaultPanel:
     def clear(self, device: str | None = None, word: str | None = None) -> None:
         """Take back all faults of one device, or of every device; with a word only those of that word.
 
-        Raises
-        ------
-        BadOptions
-            For an unknown device.
+        Raises BadOptions for an unknown device.
         """
         if device is not None and device not in self._words:
             raise BadOptions(f"there is no device {device!r}{nearest(device, self._words)}")

@@ -18,18 +18,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from calib.geometry.sensor_mode import SensorMode
-from drivers.interfaces import (
-    Adjustable,
-    Camera,
-    CameraSetting,
-    Frame,
-    FrameTime,
-    HoldsExposure,
-    KnowsSensorMode,
-    KnowsSize,
-    Paced,
-)
+from drivers.interfaces import Camera, CameraInfo, CameraSetting, Frame, FrameCounts, FrameTime
 
 MOST_OFFSET_S = 1.0
 """No camera's stamps are further off than a fault of its driver."""
@@ -43,28 +32,14 @@ COUNTED_FROM = 5
 
 
 def corrected(camera: Camera, offset_s: float) -> Camera:
-    """Return a camera whose frames' ``mid_exposure_s`` are later by ``offset_s``; itself for 0.
-
-    It is `KnowsSize`, `KnowsSensorMode`, `HoldsExposure`, `Adjustable` and `Paced` if the camera is.
-    """
-    if offset_s == 0.0:
-        return camera
-    can = (
-        (KnowsSize, _KnowingSize),
-        (KnowsSensorMode, _KnowingSensorMode),
-        (HoldsExposure, _HoldingExposure),
-        (Adjustable, _Adjusting),
-        (Paced, _Pacing),
-    )
-    abilities = [ours for protocol, ours in can if isinstance(camera, protocol)]
-    kind: type[CorrectedCamera] = type("CorrectedCamera", (*abilities, CorrectedCamera), {})
-    return kind(camera, offset_s)
+    """Return a camera whose frames' ``mid_exposure_s`` are later by ``offset_s``; itself for 0."""
+    return camera if offset_s == 0.0 else CorrectedCamera(camera, offset_s)
 
 
-class CorrectedCamera:
+class CorrectedCamera(Camera):
     """Made by `corrected`. What it is asked beside pictures and their times goes to the camera."""
 
-    def __init__(self, camera: Any, offset_s: float) -> None:
+    def __init__(self, camera: Camera, offset_s: float) -> None:
         self._camera = camera
         self._offset_s = offset_s
         self._narrower_s = 0.0  # by how much a frame's span was narrowed at either end
@@ -72,7 +47,7 @@ class CorrectedCamera:
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
         """Return the camera's next frame that by the corrected time began after ``exposed_after_s``.
 
-        A driver that tells how uncertain its times are (``mid_uncertainty_s``) tells a span longer than the
+        A driver that states how uncertain its times are (``mid_uncertainty_s``) gives a span longer than the
         exposure. That mid-exposure is known by measurement takes as much off either end: the exposure lay
         in the driver's own span, and nothing becomes later than the frame's arrival.
         """
@@ -91,66 +66,38 @@ class CorrectedCamera:
                 return dataclasses.replace(frame, **changes)
             return Frame(frame.image, frame.sequence, **changes)
         except (AttributeError, TypeError, ValueError):
-            return frame  # no frame at all: whoever asked refuses it in its own words
+            return frame  # no frame at all: the service refuses it in its own words
 
     def close(self) -> None:
         """Let go of the camera."""
         self._camera.close()
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._camera, name)
-
-
-class _KnowingSize(CorrectedCamera):
     @property
-    def size_px(self) -> tuple[int, int]:
-        """(width, height) of every picture."""
-        size_px: tuple[int, int] = self._camera.size_px
-        return size_px
+    def info(self) -> CameraInfo:
+        """What the camera states of itself."""
+        return self._camera.info
 
-
-class _KnowingSensorMode(CorrectedCamera):
     @property
-    def sensor_mode(self) -> SensorMode:
-        """Which pixels of its sensor its pictures show."""
-        mode: SensorMode = self._camera.sensor_mode
-        return mode
+    def counters(self) -> FrameCounts | None:
+        """The camera's counts of its frames."""
+        return self._camera.counters
 
+    def recent_times(self) -> list[FrameTime]:
+        """Return the corrected times of the frames that came last."""
+        later_s = self._offset_s + self._narrower_s
+        return [FrameTime(sequence, began_s + later_s) for sequence, began_s in self._camera.recent_times()]
 
-class _HoldingExposure(CorrectedCamera):
     def exposure_held(self) -> AbstractContextManager[None]:
-        """Return a context in which the exposure does not change."""
-        held: AbstractContextManager[None] = self._camera.exposure_held()
-        return held
+        """Return the camera's context in which the exposure does not change."""
+        return self._camera.exposure_held()
 
-
-class _Adjusting(CorrectedCamera):
     def settings(self) -> Sequence[CameraSetting]:
         """Return the camera's settings."""
-        told: Sequence[CameraSetting] = self._camera.settings()
-        return told
+        return self._camera.settings()
 
     def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
         """Change some of them."""
-        notes: Sequence[str] = self._camera.adjust(wanted)
-        return notes
-
-
-class _Pacing(CorrectedCamera):
-    @property
-    def period_s(self) -> float:
-        """From frame to frame, seconds."""
-        return float(self._camera.period_s)
-
-    @property
-    def trigger(self) -> str:
-        """The name of what exposes its frames."""
-        return str(self._camera.trigger)
-
-    def recent_times(self) -> list[FrameTime]:
-        """Return the corrected times of the frames that came last, as `next_frame` tells them."""
-        later_s = self._offset_s + self._narrower_s
-        return [FrameTime(sequence, began_s + later_s) for sequence, began_s in self._camera.recent_times()]
+        return self._camera.adjust(wanted)
 
 
 class Stamped(Protocol):
@@ -184,15 +131,30 @@ class Offset:
     began_s: float | None = None
 
 
-def learned(one: object, other: object, before: Offset | None = None) -> Offset:
-    """Return what two cameras' last frames tell; of cameras that are not `Paced`, nothing.
+@dataclass(frozen=True)
+class Pace:
+    """What a camera's driver says of its frames' times.
+
+    Attributes
+    ----------
+    period_s, trigger
+        As `drivers.interfaces.CameraInfo` has them.
+    """
+
+    period_s: float
+    trigger: str
+    recent: Sequence[FrameTime]
+
+
+def learned(one: Pace | None, other: Pace | None, before: Offset | None = None) -> Offset:
+    """Return what two cameras' last frames say; nothing where one has no pace (None).
 
     ``before`` is what was learned the last time: near half a period, where two partners are equally good, the
     choice stays the same.
     """
-    if not isinstance(one, Paced) or not isinstance(other, Paced):
+    if one is None or other is None:
         return Offset()
-    ones, others = one.recent_times(), other.recent_times()
+    ones, others = one.recent, other.recent
     if min(len(ones), len(others)) < LEAST_TO_LEARN:
         return Offset(max(one.period_s, other.period_s))
     period_s = max(_measured_period_s(one.period_s, ones), _measured_period_s(other.period_s, others))

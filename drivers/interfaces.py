@@ -1,4 +1,4 @@
-"""The protocols of devices (docs/drivers.md) and the records that travel through them.
+"""The classes of devices (docs/drivers.md) and the records that travel through them.
 
 Times are seconds of CLOCK_MONOTONIC. Calls may block; the service gives each device a thread of its own.
 """
@@ -8,15 +8,16 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.geometry.sensor_mode import SensorMode
+from calib.geometry.mode import SensorMode
+from drivers.errors import BadSetting
 
 Image = NDArray[np.uint8]
 
@@ -161,113 +162,69 @@ class AxisMotion:
         return 1 if goal_rad < self.rising_below_rad else -1
 
 
-@runtime_checkable
-class StatesMotion(Protocol):
-    """A head that says how its axes move; not every head does."""
-
-    def axis_motion(self) -> Mapping[str, AxisMotion]:
-        """Return ``pan`` and ``tilt``. Asks no device, never fails."""
-        ...
-
-
-@runtime_checkable
-class StopsBeside(Protocol):
-    """A head whose ``stop`` is confirmed sooner beside a call under way than after it; not every head's is.
+@dataclass(frozen=True)
+class HeadInfo:
+    """What a head states of itself; whatever it does not know keeps its default.
 
     Attributes
     ----------
+    simulated
+        Whether it only plays a head.
     stops_beside
-        True: then a stop does not wait for the call.
+        Whether its ``stop`` is confirmed sooner beside a call under way than after it: then a stop does not
+        wait for the call.
+    motion
+        How ``pan`` and ``tilt`` move; empty where that is not known.
+    settles_within_counts
+        How many counts from its goal an axis may stand when it calls itself settled.
     """
 
-    stops_beside: bool
+    simulated: bool = False
+    stops_beside: bool = False
+    motion: Mapping[str, AxisMotion] = field(default_factory=dict)
+    settles_within_counts: int = 1
 
 
-class Reporting(ABC):
-    """A head may fulfill this beside a `PanTilt`: one that knows its counts."""
+class PanTilt(ABC):
+    """A two-axis head. Derive a driver from it and write the four abstract methods."""
 
     @abstractmethod
-    def report(self) -> Mapping[str, AxisReport]:
-        """Return ``pan`` and ``tilt`` as last read; empty before that. Asks no device, never fails."""
-
-
-@runtime_checkable
-class PanTilt(Protocol):
-    """A two-axis head."""
-
     def read(self) -> Reading:
-        """Return the measured joint state. Raises DriverError."""
-        ...
+        """Return the measured joint state; moves nothing. Raises DriverError."""
 
+    @abstractmethod
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         """Start towards the angles and return at once. Raises DriverError."""
-        ...
 
+    @abstractmethod
     def stop(self) -> None:
         """Halt both axes where they are and hold. Raises DriverError."""
-        ...
 
+    @abstractmethod
     def close(self) -> None:
         """Make safe and let go of the device; never raises for a device that is already gone."""
-        ...
 
+    @property
+    def info(self) -> HeadInfo:
+        """What it states of itself. Asks no device, never fails."""
+        return HeadInfo()
 
-@runtime_checkable
-class Camera(Protocol):
-    """A source of frames."""
-
-    def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
-        """Return a frame whose exposure began after ``exposed_after_s``, within ``timeout_s`` seconds.
-
-        Raises
-        ------
-        NoFreshFrame
-            If none came in time; the message says what came instead.
+    def report(self) -> Mapping[str, AxisReport]:
+        """Return the counts of ``pan`` and ``tilt`` as last read; empty for a head that has none. Asks no
+        device, never fails.
         """
-        ...
-
-    def close(self) -> None:
-        """Let go of the device."""
-        ...
+        return {}
 
 
-@runtime_checkable
-class SaysSimulated(Protocol):
-    """A head or camera that says whether it only plays one; a driver that does not say is taken as real."""
+class FrameCounts(Protocol):
+    """Counts of a camera's frames since it was opened: good ones, damaged ones, and those that never came."""
 
     @property
-    def simulated(self) -> bool:
-        """True of a simulator, False of a real device."""
-        ...
-
-
-@runtime_checkable
-class KnowsSize(Protocol):
-    """A camera that knows the size of its pictures before the first one; not every camera has this."""
-
+    def good(self) -> int: ...
     @property
-    def size_px(self) -> tuple[int, int]:
-        """(width, height) of every picture that it gives."""
-        ...
-
-
-@runtime_checkable
-class KnowsSensorMode(Protocol):
-    """A camera that knows which pixels of its sensor its pictures show; not every camera has this."""
-
+    def damaged(self) -> int: ...
     @property
-    def sensor_mode(self) -> SensorMode:
-        """As it was when the camera was opened; no picture of another mode is given."""
-        ...
-
-
-@runtime_checkable
-class HoldsExposure(Protocol):
-    """A camera with an automatic exposure that can be made to wait; not every camera has this."""
-
-    def exposure_held(self) -> AbstractContextManager[None]:
-        """Return a context in which the exposure does not change: a measurement compares its pictures."""
-        ...
+    def dropped(self) -> int: ...
 
 
 SETTINGS: Mapping[str, str] = MappingProxyType(
@@ -303,13 +260,79 @@ class CameraSetting:
     refusal: str = ""
 
 
-@runtime_checkable
-class Adjustable(Protocol):
-    """A camera whose settings can be changed while it runs; not every camera's can."""
+class FrameTime(NamedTuple):
+    """A frame's count, as `Frame` has it, and when its exposure began, seconds of CLOCK_MONOTONIC."""
+
+    sequence: int
+    exposure_began_s: float
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """What a camera states of itself; whatever it does not know keeps its default.
+
+    Attributes
+    ----------
+    simulated
+        Whether it only plays a camera.
+    size_px
+        (width, height) of every picture that it gives.
+    sensor_mode
+        Which pixels of its sensor its pictures show, as it was when the camera was opened; no picture of
+        another mode is given.
+    period_s
+        From frame to frame, seconds, of a camera that takes frames at a steady rate, asked or not.
+    trigger
+        The name of what exposes its frames; cameras of one trigger expose together. Empty: free-running.
+    """
+
+    simulated: bool = False
+    size_px: tuple[int, int] | None = None
+    sensor_mode: SensorMode | None = None
+    period_s: float | None = None
+    trigger: str = ""
+
+
+class Camera(ABC):
+    """A source of frames. Derive a driver from it and write the two abstract methods."""
+
+    @abstractmethod
+    def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
+        """Return a frame whose exposure began after ``exposed_after_s``, within ``timeout_s`` seconds.
+
+        Raises
+        ------
+        NoFreshFrame
+            If none came in time; the message says what came instead.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of the device."""
+
+    @property
+    def info(self) -> CameraInfo:
+        """What it states of itself now."""
+        return CameraInfo()
+
+    @property
+    def counters(self) -> FrameCounts | None:
+        """The counts of all its frames, requested or not, so far; None for a camera that does not count."""
+        return None
+
+    def recent_times(self) -> Sequence[FrameTime]:
+        """Return the times of the frames that came last, all of one count, oldest first; empty where it does
+        not keep them.
+        """
+        return ()
+
+    def exposure_held(self) -> AbstractContextManager[None]:
+        """Return a context in which the exposure does not change: a measurement compares its pictures."""
+        return nullcontext()
 
     def settings(self) -> Sequence[CameraSetting]:
-        """Return those that it has. Raises DriverError."""
-        ...
+        """Return the settings that it has. Raises DriverError."""
+        return ()
 
     def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
         """Change some, each with its automatic turned off; return a sentence for each that became another.
@@ -322,34 +345,4 @@ class Adjustable(Protocol):
         BadSetting, DriverError
             If the camera refuses one; those before it have changed.
         """
-        ...
-
-
-class FrameTime(NamedTuple):
-    """A frame's count, as `Frame` has it, and when its exposure began, seconds of CLOCK_MONOTONIC."""
-
-    sequence: int
-    exposure_began_s: float
-
-
-@runtime_checkable
-class Paced(Protocol):
-    """A camera that takes frames at a steady rate, asked or not; not every camera does.
-
-    Attributes
-    ----------
-    period_s
-        From frame to frame, seconds.
-    trigger
-        The name of what exposes its frames; cameras of one trigger expose together. Empty: free-running.
-    """
-
-    @property
-    def period_s(self) -> float: ...
-    @property
-    def trigger(self) -> str: ...
-    def recent_times(self) -> Sequence[FrameTime]:
-        """Return the times of the frames that came last, all of one count, oldest first; empty where it does
-        not keep them.
-        """
-        ...
+        raise BadSetting(f"this camera has no {min(wanted)} that can be changed while it runs")

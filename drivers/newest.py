@@ -78,10 +78,6 @@ class Counters:
         Frames that never came, by gaps in the camera's count.
     late
         Good frames that came more than a period and 5 ms after their stamp.
-    reopened
-        How often the camera was lost and opened again.
-    last_damage
-        Why the last one was refused.
     """
 
     good: int = 0

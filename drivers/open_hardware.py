@@ -1,41 +1,22 @@
-"""The one entry point to hardware: from a configuration's driver names to open devices.
-
-Nothing else knows real and simulated drivers both. A name is ``dynamixel``, ``flir_ptu``, ``v4l2``, ``sim``,
-``replay``, or for a driver from outside this repository ``package.module:factory`` or the name that an
-installed package gives it (`drivers.hardware.factory_of`).
-"""
+"""From a configuration's driver names to open devices; nothing else knows real and simulated drivers both."""
 
 from __future__ import annotations
 
-import importlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import wait
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from drivers.absent import AbsentCamera, Opening, begin_opening, let_go
 from drivers.clock import Clock, SystemClock
 from drivers.errors import BadOptions, DriverError, NoReply
-from drivers.faults import PAN_TILT, nearest
+from drivers.faults import PAN_TILT
 from drivers.frame_times import corrected
-from drivers.hardware import (
-    CAMERAS,
-    HEADS,
-    OURS,
-    DeviceSettings,
-    Hardware,
-    HardwareKind,
-    HardwareSettings,
-    close_devices,
-    factory_of,
-)
+from drivers.hardware import DeviceSettings, Hardware, HardwareSettings, closable, close_devices
 from drivers.interfaces import Camera, PanTilt
-from drivers.outside import device_from_outside
-
-if TYPE_CHECKING:
-    from drivers.sim.rover import SimulatedRover
+from drivers.registry import METHODS, Context, HardwareKind, Kind, driver_of, one_line, whole
 
 log = logging.getLogger(__name__)
 
@@ -54,8 +35,6 @@ def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Har
 
     Parameters
     ----------
-    settings
-        Drivers and their options.
     clock
         Time for simulated and replayed devices, as a rule that of `drivers.hardware.clock_for`; the machine's
         monotonic clock when left out.
@@ -75,33 +54,29 @@ def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Har
         for name, device in settings.cameras.items():
             devices[name] = opener.camera(name, device)
     except BaseException:
-        close_devices(devices if opener.rover is None else {**devices, "simulated rover": opener.rover})
+        close_devices({**devices, **closable(opener.shared)})
         raise
     pan_tilt = devices.pop(PAN_TILT)
-    return Hardware(pan_tilt, devices, opener.kinds, opener.rover)
+    return Hardware(pan_tilt, devices, opener.kinds, opener.shared)
 
 
 def halt_head(settings: HardwareSettings) -> list[str]:
-    """Stop a head of which no daemon lives: open its line, say stop, and leave it holding.
+    """Stop a head that no daemon drives: open its line, say stop, and leave it holding.
 
-    Nothing is set up, no other device is opened. A head from outside is opened, stopped and closed.
+    Nothing is set up, no other device is opened. A head whose driver has no ``halt`` is opened, stopped and
+    closed. Raises BadOptions if the settings say too little; DriverError if the head did not confirm; it may
+    still move.
 
     Returns
     -------
     list of str
         The actions on each axis, in plain words.
-
-    Raises
-    ------
-    BadOptions
-        If the settings say too little.
-    DriverError
-        If the head did not confirm; it may still move.
     """
     device = settings.pan_tilt
-    if device.driver in HEADS:
-        return list(importlib.import_module(HEADS[device.driver]).halt(device.options))
-    if device.driver in OURS:
+    driver = driver_of("head", device.driver, PAN_TILT)
+    if driver.halt is not None:
+        return list(driver.halt(device.options))
+    if driver.hardware != "real":
         return [f"driver {device.driver!r} has no head that moves without its daemon; nothing to halt"]
     head = _Opener(settings, SystemClock()).head(device)
     try:
@@ -115,10 +90,7 @@ def halt_head(settings: HardwareSettings) -> list[str]:
 def open_one_camera(settings: HardwareSettings, name: str, clock: Clock | None = None) -> Iterator[Camera]:
     """Open one camera of the settings by itself, without the head, and close it at the end.
 
-    Raises
-    ------
-    BadOptions, DriverError
-        As `open_hardware`; but a camera that cannot be reached is an error here.
+    Raises BadOptions, DriverError.
     """
     opener = _Opener(settings, clock or SystemClock())
     try:
@@ -128,26 +100,24 @@ def open_one_camera(settings: HardwareSettings, name: str, clock: Clock | None =
         finally:
             close_devices({name: camera})
     finally:
-        if opener.rover is not None:
-            close_devices({"simulated rover": opener.rover})
+        close_devices(closable(opener.shared))
 
 
 class _Opener:
-    """Opens the devices of one configuration; those of a shared rover or replay share it."""
+    """Opens the devices of one configuration."""
 
     def __init__(self, settings: HardwareSettings, clock: Clock) -> None:
         self._settings = settings
         self._clock = clock
-        self.kinds: dict[str, HardwareKind | None] = {}
-        """By device; None for one that says so itself, or not at all."""
-        self._replays: dict[str, Any] = {}
-        self.rover: SimulatedRover | None = None
+        self.kinds: dict[str, HardwareKind] = {}
+        self.shared: dict[str, Any] = {}
 
-    def head(self, device: DeviceSettings) -> Any:
+    def head(self, device: DeviceSettings) -> PanTilt:
         """Open the head, and wait for it."""
-        make = partial(self._open, PAN_TILT, device, PanTilt)
-        if device.driver in OURS:
-            return make()
+        make = partial(self._open, "head", PAN_TILT, device)
+        if self._opens_at_once("head", PAN_TILT, device):
+            opened: PanTilt = make()
+            return opened
         opening = begin_opening(PAN_TILT, make)
         try:
             if not _ended(opening, OPENING_PATIENCE_S):
@@ -158,16 +128,16 @@ class _Opener:
                 if not _ended(opening, HEAD_OPENING_S - OPENING_PATIENCE_S):
                     words = f"driver {device.driver!r} did not open it within {HEAD_OPENING_S:g} s"
                     raise NoReply(f"{words}: its factory has not returned", device=PAN_TILT)
-            return opening.result()
+            head: PanTilt = opening.result()
+            return head
         except BaseException:
             let_go(opening)
             raise
 
-    def camera(self, name: str, device: DeviceSettings) -> Any:
+    def camera(self, name: str, device: DeviceSettings) -> Camera:
         """Open a camera, or leave it absent."""
-
         make = partial(self.one, name, device)
-        if device.driver in OURS:
+        if self._opens_at_once("camera", name, device):
             return make()
         opening = begin_opening(name, make)
         try:
@@ -177,7 +147,8 @@ class _Opener:
                     name, device.driver, OPENING_PATIENCE_S,
                 )  # fmt: skip
                 return AbsentCamera(name, device.driver, make, opening=opening)
-            return opening.result()
+            camera: Camera = opening.result()
+            return camera
         except BadOptions:
             raise
         except DriverError as error:
@@ -186,80 +157,48 @@ class _Opener:
             let_go(opening)
             raise
 
-    def one(self, name: str, device: DeviceSettings) -> Any:
-        """A camera with its stamps corrected. Raises DriverError."""
-        return corrected(self._open(name, device, Camera), device.offset_s)
+    def one(self, name: str, device: DeviceSettings) -> Camera:
+        """Open a camera; its stamps are corrected. Raises DriverError."""
+        return corrected(self._open("camera", name, device), device.offset_s)
 
-    def _open(self, name: str, device: DeviceSettings, protocol: type) -> Any:
-        """Open one device and check that it does what the protocol asks."""
-        if device.driver == "sim":
-            self.kinds[name] = "simulated"
-            return self._simulated(name, device)
-        if device.driver == "replay":
-            self.kinds[name] = "replayed"
-            return self._replayed(name, device)
-        if device.driver in HEADS:
-            if protocol is not PanTilt:
-                raise BadOptions(f"driver {device.driver!r} is for a pan/tilt head", device=name)
-            self.kinds[name] = "real"
-            return self._head(name, device)
-        if device.driver in CAMERAS:
-            if protocol is not Camera:
-                words = f"driver {device.driver!r} is for cameras, it moves nothing"
-                raise BadOptions(words, device=name)
-            self.kinds[name] = "real"
-            module = importlib.import_module(CAMERAS[device.driver])
-            return module.open_camera(device.options, self._clock, name)
-        factory = factory_of("head" if protocol is PanTilt else "camera", device.driver, name)
-        self.kinds[name] = None
-        return device_from_outside(name, factory, device.options, protocol)
+    def _opens_at_once(self, kind: Kind, name: str, device: DeviceSettings) -> bool:
+        """Note what a device is; return whether it is in memory, so that it neither fails nor blocks."""
+        self.kinds[name] = driver_of(kind, device.driver, name).hardware
+        return self.kinds[name] != "real"
 
-    def _head(self, name: str, device: DeviceSettings) -> Any:
-        """A real head; what it raises is told with the device's name in front."""
-        module = importlib.import_module(HEADS[device.driver])
-        try:
-            return module.open_head(device.options, clock=self._clock)
-        except BadOptions as error:
-            raise BadOptions(f"driver {device.driver!r}: {error}", device=name) from None
+    def _open(self, kind: Kind, name: str, device: DeviceSettings) -> Any:
+        settings = self._settings
+        context = Context(name, self._clock, settings.folder, settings.simulation, self.shared)
+        return open_device(kind, device.driver, device.options, context)
 
-    def _simulated(self, name: str, device: DeviceSettings) -> Any:
-        """The head or a camera of the one simulated rover."""
-        if device.options:
-            raise BadOptions(
-                f"driver 'sim' has no option {next(iter(device.options))!r}; "
-                "the simulated rover is set up in the section 'simulation'",
-                device=name,
-            )
-        if self.rover is None:
-            from drivers.sim.rover import SimulatedRover
-            from drivers.sim.settings import simulation_settings
 
-            simulation = simulation_settings(self._settings.simulation, self._settings.folder)
-            self.rover = SimulatedRover(simulation, self._clock)
-        if name == PAN_TILT:
-            return self.rover.pan_tilt
-        if name not in self.rover.cameras:
-            raise BadOptions(
-                f"the simulated rover has no such camera{nearest(name, self.rover.cameras)}", device=name
-            )
-        from drivers.sim.cameras import HangingCamera
+def open_device(kind: Kind, name: str, options: Mapping[str, Any], context: Context) -> Any:
+    """Open one device by its driver's name; return a whole `PanTilt` or `Camera`.
 
-        mode = self.rover.sensor_modes[name]
-        return HangingCamera(self.rover.cameras[name], mode, self._clock, self.rover.faults)
+    Raises BadOptions if there is no such driver, it refuses the options, or what it opens lacks a method;
+    DriverError from the driver, as it is.
+    """
+    driver = driver_of(kind, name, context.name)
+    try:
+        made = driver.open(options, context)
+    except BadOptions as error:
+        raise _named(error, name, context.name) from None
+    except DriverError:
+        raise
+    except (Exception, SystemExit) as error:  # a foreign driver may raise anything: one sentence reports it
+        words = f"driver {name!r} refuses the options {dict(options)!r} ({one_line(error)})"
+        raise BadOptions(words, device=context.name) from error
+    wanted = PanTilt if kind == "head" else Camera
+    missing = [method for method in METHODS[wanted] if not callable(getattr(made, method, None))]
+    if missing:
+        words = f"driver {name!r} made a {type(made).__name__} without {', '.join(missing)}"
+        raise BadOptions(words, device=context.name)
+    return whole(made, wanted)
 
-    def _replayed(self, name: str, device: DeviceSettings) -> Any:
-        """The head or a camera of a recording; devices with the same options share one."""
-        from drivers.recordings.replay import open_replay
 
-        key = repr(sorted(device.options.items()))
-        if key not in self._replays:
-            self._replays[key] = open_replay(device.options, self._settings.folder, self._clock)
-        replay = self._replays[key]
-        if name == PAN_TILT:
-            return replay.pan_tilt
-        if name not in replay.cameras:
-            raise BadOptions(f"the recording has no such camera{nearest(name, replay.cameras)}", device=name)
-        return replay.cameras[name]
+def _named(error: BadOptions, driver: str, device: str) -> BadOptions:
+    """A refusal with the device's name in front; one that has a name already is as it is."""
+    return error if error.device else BadOptions(f"driver {driver!r}: {error}", device=device)
 
 
 def _ended(opening: Opening, within_s: float) -> bool:

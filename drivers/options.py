@@ -28,21 +28,12 @@ def is_whole(value: object) -> TypeGuard[int]:
 class OptionReader:
     """One mapping of options; a refusal names the key, the value and what would be right.
 
+    Raises BadOptions if a key is unknown or missing; its methods raise it for a value that cannot be.
+
     Parameters
     ----------
-    values
-        What the configuration holds.
-    known, needed
-        The keys that may, and that must, be there.
     place
         The text before a key in a refusal, such as ``options.pan.``.
-    device
-        The device's name in refusals.
-
-    Raises
-    ------
-    BadOptions
-        If a key is unknown or missing; its methods raise it for a value that cannot be.
     """
 
     def __init__(

@@ -32,8 +32,6 @@ class PictureFormat:
         (width, height).
     stride_bytes
         From one row to the next, of the first plane; 0 for compressed formats.
-    length_bytes
-        The most that one picture takes, of all planes together.
     field
         1 for whole pictures; other values are interlaced.
     planes_bytes
@@ -58,14 +56,10 @@ class Layout:
 
     Attributes
     ----------
-    bits
-        Of a sample.
     order
         Of a Bayer format: the colours of the first two by two samples.
     packed
         The samples that share one byte more than they are; 0 for samples that stand in whole bytes.
-    packing
-        Where the bits of those samples are.
     """
 
     kind: Kind

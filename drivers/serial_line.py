@@ -30,9 +30,6 @@ SLICE_S = 0.01
 """pyserial's own timeout of one read, where there is no file to wait on. It never changes while the line is
 open, since changing it makes pyserial set up the port anew (over the network with rfc2217)."""
 
-USUAL_UDP_PORT = 52381
-"""Where ``udp://HOST`` goes: VISCA over IP alone takes datagrams."""
-
 BY_ID = Path("/dev/serial/by-id")
 """Where udev names USB adapters by maker, model and serial number."""
 
@@ -45,7 +42,7 @@ def stable_name(port: str) -> str:
     """Return a line's name, the same whatever path leads there: what is kept of a head is kept by it.
 
     A USB adapter's is that of udev (with its serial number), at any port. That of another device is its path
-    without links; of a URL, host and port, the usual port left out. A pseudo terminal's number is given again
+    without links; of a URL, host and port. A pseudo terminal's number is given again
     to the next one, so the moment at which it was made belongs to its name.
     """
     if "://" in port:
@@ -54,8 +51,7 @@ def stable_name(port: str) -> str:
             host = "127.0.0.1" if parts.hostname == "localhost" else parts.hostname
             if host:
                 host = f"[{host}]" if ":" in host else host
-                usual = parts.port is None or (parts.scheme, parts.port) == ("udp", USUAL_UDP_PORT)
-                return host if usual else f"{host}:{parts.port}"
+                return host if parts.port is None else f"{host}:{parts.port}"
         return port
     path = Path(os.path.realpath(port))
     with contextlib.suppress(OSError):
@@ -129,23 +125,13 @@ class _SocketPort(protocol_socket.Serial):  # type: ignore[misc]
 class SerialLine:
     """An open line; closing twice does no harm.
 
-    One thread reads; any may write beside it.
+    One thread reads; any may write beside it. Raises LineLost if it cannot be opened: no such device, no
+    permission, or held by another program; BadOptions for a URL or a baud rate that cannot be.
 
     Parameters
     ----------
-    port
-        A serial device, or a URL that pyserial understands.
     baud
         Bits per second, any that the adapter can do; means nothing to ``socket://``.
-    device
-        The device's name in errors.
-
-    Raises
-    ------
-    LineLost
-        If it cannot be opened: no such device, no permission, or held by another program.
-    BadOptions
-        For a URL or a baud rate that cannot be.
     """
 
     def __init__(self, port: str, baud: int, device: str = "") -> None:
@@ -181,10 +167,7 @@ class SerialLine:
     def read(self, wait_s: float) -> bytes:
         """Return the bytes that have come or come within ``wait_s``, as soon as there are any; else none.
 
-        Raises
-        ------
-        LineLost
-            If the line is gone.
+        Raises LineLost.
         """
         try:
             if self._descriptor is None or self._poll is None:
@@ -224,7 +207,7 @@ class SerialLine:
             words = f"{self.port} at {self.baud} baud: {_words(error)}"
             raise BadOptions(words, device=self._device) from error
         except (OSError, EOFError, termios.error) as error:
-            words = f"{self.port} cannot be opened: {_words(error)}"
+            words = f"{self.port} cannot be opened: {_words(error)}{_unit_hint(self.port)}"
             raise LineLost(words, device=self._device, detail=self._at("opening it")) from error
 
     def _read_of_object(self, wait_s: float) -> bytes:
@@ -242,6 +225,13 @@ class SerialLine:
 
     def _at(self, doing: str) -> dict[str, object]:
         return {"port": self.port, "while": doing}
+
+
+def _unit_hint(port: str) -> str:
+    """What an address that is not reached may lack in a service: systemd drops its packets without a word."""
+    if "://" not in port or "INVOCATION_ID" not in os.environ:
+        return ""
+    return "; if it is on and answers elsewhere, the unit has to allow its address (IPAddressAllow)"
 
 
 def _written(descriptor: int, data: bytes) -> int:

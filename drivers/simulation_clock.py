@@ -39,10 +39,7 @@ MAX = "max"
 def simulation_speed(value: Any) -> float:
     """Return the speed that ``simulation.speed`` asks for: seconds in a second, infinite for ``max``.
 
-    Raises
-    ------
-    BadOptions
-        For anything but a number from 0.1 to 1000 or ``max``.
+    Raises BadOptions for anything but a number from 0.1 to 1000 or ``max``.
     """
     if value == MAX:
         return math.inf

@@ -6,8 +6,6 @@ import ctypes
 import gc
 import os
 import signal
-import subprocess
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Generator
@@ -16,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from hil_tests.left_behind import Homes, OwnFolder, end_all_of
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 VM_CONFTEST = REPOSITORY / "hil_tests" / "vm" / "conftest.py"
-SHARED_DATA = REPOSITORY.parent / "shared" / "data"
-MOST_ALONE = 12  # failed tests that are tried alone: more than these are no matter of chance
+DATA = REPOSITORY / "hil_tests" / "data"
 GIVE_BACK = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's: what was freed goes to the machine
 LONG_PARTS = (1, 2, 3, 4)  # of the long run; CI takes them in turns
 
@@ -36,6 +34,10 @@ with suppress(ValueError):  # not the main thread
     ):
         if signal.getsignal(_number) is signal.SIG_IGN:
             signal.signal(_number, _usual)
+
+# How long an example takes says how busy the machine is.
+settings.register_profile("no deadline", deadline=None)
+settings.load_profile("no deadline")
 
 # A second thread of the small matrices here only waits, in as much processor time as the first one works.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
@@ -69,11 +71,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--long-part", type=int, choices=LONG_PARTS, help="with --long: only those of one part", metavar="N"
     )
-    parser.addoption(
-        "--tell-flaky",
-        action="store_true",
-        help="run each failed test once more by itself and name those that then pass; the run still fails",
-    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -89,8 +86,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 FIRST = (
     "test_on_a_real_driver", "test_closed_loop", "test_bench_suite", "test_packaging", "test_camera_sync",
-    "test_campaign_tasks", "test_guided_bench", "test_page_bench", "test_soak_and_faults",
-    "test_health_end_to_end",
+    "test_campaign_tasks", "test_guided_bench", "test_page_bench", "test_soak",
 )  # fmt: skip
 
 
@@ -98,7 +94,8 @@ FIRST = (
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Keep the quick tests or the long ones; put the few files that take longest first."""
     wanted_part = config.getoption("--long-part")
-    kept, left = [], []
+    kept: list[pytest.Item] = []
+    left: list[pytest.Item] = []
     for item in items:
         marker = item.get_closest_marker("long")
         if marker is None:
@@ -166,8 +163,6 @@ def pytest_testnodedown(node: Any) -> None:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Generator[None]:
     """Say in the last line before the counts what did not run for want of the kernel, and what mends it."""
     yield
-    if terminalreporter.config.getoption("--tell-flaky"):
-        _tell_flaky(terminalreporter)
     for thing in terminalreporter.config.stash[LEFT]:
         terminalreporter.write_line(f"LEFT BEHIND, so the run fails: {thing}", red=True)
     skipped = terminalreporter.getreports("skipped")
@@ -179,19 +174,6 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Genera
         terminalreporter.write_line(f"not run: {what}: {reason.removeprefix('Skipped: ')}")
 
 
-def _tell_flaky(terminalreporter: pytest.TerminalReporter) -> None:
-    """Run the failed tests one by one and name those that pass alone. What failed has failed nevertheless."""
-    bad = [*terminalreporter.getreports("failed"), *terminalreporter.getreports("error")]
-    config = terminalreporter.config
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
-    command += ["--long"] if config.getoption("--long") else []
-    for test in sorted({report.nodeid for report in bad if "::" in report.nodeid})[:MOST_ALONE]:
-        alone = subprocess.run([*command, test], cwd=config.rootpath, stdout=subprocess.DEVNULL, check=False)
-        terminalreporter.write_line(
-            f"{'fails alone too' if alone.returncode else 'flaky (passes alone)'}: {test}"
-        )
-
-
 @pytest.fixture(scope="session")
 def repository() -> Path:
     """The checkout that holds these tests."""
@@ -199,8 +181,6 @@ def repository() -> Path:
 
 
 @pytest.fixture(scope="session")
-def shared_data() -> Path:
-    """The folder of reference data beside the checkout; tests that need it skip without it."""
-    if not SHARED_DATA.is_dir():
-        pytest.skip("the reference data folder shared/data is not beside this checkout")
-    return SHARED_DATA
+def reference_data() -> Path:
+    """Return the folder of reference data; its SOURCES.md says where each file comes from."""
+    return DATA

@@ -7,21 +7,14 @@ import re
 import signal
 import subprocess
 import sys
-import tempfile
-import threading
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
-
-from hil_tests.left_behind import held
-from hil_tests.waiting import NET_S, until
 
 CONFTEST = """
 import os, pwd
 pwd.getpwuid = lambda user, was=pwd.getpwuid: pwd.struct_passwd([*was(user)[:5], os.environ["USERS"], "sh"])
 from hil_tests.conftest import *
-from hil_tests.conftest import _tell_flaky
 """
 
 TESTS = {
@@ -71,17 +64,11 @@ LEFT_BY_IT = {
 }
 
 
-IN_WORKERS = pytest.mark.long(2, "four cases in workers of xdist; one is in the quick run")
-
-
 @pytest.mark.parametrize(
     ("what", "workers"),
     [
-        ("nothing", 0), ("folder", 0), ("process", 0), ("place of a head", 0), ("state folder", 0),
-        ("nothing of ours", 0), ("folder", 1), pytest.param("nothing", 1, marks=IN_WORKERS),
-        pytest.param("place of a head", 2, marks=IN_WORKERS),
-        pytest.param("state folder", 1, marks=IN_WORKERS),
-        pytest.param("nothing of ours", 1, marks=IN_WORKERS),
+        ("nothing", 0), ("process", 0), ("place of a head", 0), ("state folder", 0),
+        ("nothing of ours", 0), ("folder", 1),
     ],
 )  # fmt: skip
 def test_what_is_left_behind_fails_the_run(repository: Path, tmp_path: Path, what: str, workers: int) -> None:
@@ -128,79 +115,6 @@ def test_what_is_left_behind_fails_the_run(repository: Path, tmp_path: Path, wha
         assert what == "process" or re.search(r"\(first seen after .*test_one.py::test_it\b", line)
 
 
-def test_what_a_test_holds_is_new_and_what_others_let_go_is_not_missed(tmp_path: Path) -> None:
-    ends = threading.Event()
-    other = threading.Thread(target=ends.wait, args=(NET_S,))
-    other.start()
-    file = (tmp_path / "file").open("w")
-    before = held()
-    assert held() <= before
-    ends.set()
-    other.join()
-    file.close()
-    assert held() <= before and held() != before
-    with (tmp_path / "another").open("w") as another:
-        (left,) = held() - before
-        assert left == (str(another.fileno()), tmp_path / "another")  # perhaps of the number that was let go
-    mine = threading.Timer(NET_S, bool)
-    mine.start()
-    assert held() - before == {mine}
-    mine.cancel()
-    mine.join()
-    assert held() <= before
-
-
-@pytest.mark.parametrize(("name", "used"), [("t", None), ("a_name_that_leaves_no_room_for_sockets", "/tmp")])
-def test_a_long_temporary_folder_leaves_room_for_sockets(
-    repository: Path, name: str, used: str | None
-) -> None:
-    with tempfile.TemporaryDirectory(prefix=name, dir="/tmp") as folder:
-        environment = {**os.environ, "TMPDIR": folder}
-        environment.pop("PYTEST_DEBUG_TEMPROOT", None)
-        code = "import os, hil_tests.conftest; print(os.environ['PYTEST_DEBUG_TEMPROOT'])"
-        done = subprocess.run(
-            [sys.executable, "-c", code],
-            cwd=repository, env=environment, capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        assert done.stdout.strip() == (used or folder)
-        assert not [*Path(folder).iterdir()]
-
-
-INTERRUPTED = """
-import pathlib, subprocess
-def test_it():
-    subprocess.Popen(["sleep", "600"], start_new_session=True, cwd=pathlib.Path(__file__).parent)
-    pathlib.Path(__file__).with_name("begun").touch()
-    subprocess.run(["sleep", "600"])
-"""
-
-
-@pytest.mark.long(2, "waits for ten seconds, after which xdist ends its workers")
-def test_a_run_that_is_interrupted_ends_what_its_workers_began(repository: Path, tmp_path: Path) -> None:
-    (tmp_path / "conftest.py").write_text(CONFTEST)
-    (tmp_path / "test_one.py").write_text(INTERRUPTED)
-    (tmp_path / "temporary").mkdir()
-    environment = {
-        **{name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")},
-        "HOME": str(tmp_path),
-        "USERS": f"{tmp_path}/user",
-        "PYTHONPATH": str(repository),
-        "PYTEST_DEBUG_TEMPROOT": f"{tmp_path}/temporary",
-    }
-    words = ["-p", "no:cacheprovider", "-c", os.devnull, "--rootdir", ".", "-n", "1", "test_one.py"]
-    with subprocess.Popen(
-        [sys.executable, "-m", "pytest", *words], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL
-    ) as run:
-        try:
-            until((tmp_path / "begun").exists, "the test runs", 300)
-            run.send_signal(signal.SIGINT)
-            assert run.wait(300) == pytest.ExitCode.INTERRUPTED
-        finally:
-            run.kill()
-    until(lambda: not processes_with(str(tmp_path).encode()), "all its processes have ended")
-    assert [*(tmp_path / "temporary").glob("mastctl-*")] == []
-
-
 TOOL = """
 import subprocess, tempfile, time
 from tools.command import end
@@ -228,28 +142,3 @@ def test_a_tool_that_a_signal_ends_leaves_nothing_behind(
         tool.send_signal(number)
         assert tool.wait(60) == 128 + number
     assert [*tmp_path.iterdir()] == [] and not sleeping.exists()
-
-
-@pytest.mark.long(2, "copies and compiles the checkout for the sampler of mutants")
-def test_mutants_that_a_signal_ends_leave_nothing_behind(repository: Path, tmp_path: Path) -> None:
-    environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    command = [sys.executable, "-m", "tools.mutants", "calib/geometry", "--mutants", "2", "--jobs", "1"]
-    with subprocess.Popen(
-        command, cwd=repository, env=environment, stdout=subprocess.DEVNULL, start_new_session=True
-    ) as tool:
-        until(lambda: [one for one in tmp_path.glob("*/*/said") if one.read_text()], "a test runs", 300)
-        tool.send_signal(signal.SIGTERM)
-        assert tool.wait(60) == 128 + signal.SIGTERM
-    mark = str(tmp_path).encode()
-    until(lambda: not [*processes_with(mark)], "all its processes have ended")
-    assert [*tmp_path.iterdir()] == []
-
-
-def processes_with(mark: bytes) -> list[Path]:
-    """Processes that work in a folder."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            if mark in bytes((folder / "cwd").readlink()):
-                found.append(folder)
-    return found

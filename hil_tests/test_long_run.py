@@ -9,10 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tools import long_tests
-
 REPOSITORY = Path(__file__).resolve().parent.parent
-PAGE = REPOSITORY / "docs" / "contribute" / "testing.md"
 
 CASES = """\
 from pathlib import Path
@@ -29,23 +26,6 @@ def test_longer():
 def test_quick():
     pass
 """
-FAILING = """\
-from pathlib import Path
-
-def test_first_time_only():
-    mark = Path(__file__).with_suffix(".ran")
-    ran = mark.exists()
-    mark.touch()
-    assert ran
-
-def test_always():
-    assert False
-"""
-
-
-def test_the_page_lists_every_long_test_with_its_reason() -> None:
-    text = PAGE.read_text()
-    assert text == long_tests.with_table(text), "python -m tools.long_tests --page docs/contribute/testing.md"
 
 
 def _run(folder: Path, text: str, *options: str) -> subprocess.CompletedProcess[str]:
@@ -85,13 +65,6 @@ def test_a_marker_without_a_part_or_a_reason_is_refused(marker: str, tmp_path: P
     done = _run(tmp_path, f"import pytest\n\n@pytest.mark.long{marker}\ndef test_it():\n    pass\n")
     assert done.returncode == pytest.ExitCode.USAGE_ERROR
     assert "long needs a part of (1, 2, 3, 4) and a reason" in done.stdout + done.stderr
-
-
-def test_a_flaky_test_is_named_and_the_run_has_failed(tmp_path: Path) -> None:
-    done = _run(tmp_path, FAILING, "--tell-flaky")
-    assert "flaky (passes alone): test_one.py::test_first_time_only" in done.stdout
-    assert "fails alone too: test_one.py::test_always" in done.stdout
-    assert done.returncode == pytest.ExitCode.TESTS_FAILED
 
 
 def test_a_file_that_is_not_there_is_said_before_anything_is_set_up(repository: Path) -> None:

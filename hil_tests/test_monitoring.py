@@ -27,8 +27,9 @@ pytestmark = pytest.mark.mastctl(speed=1)
 FOLDER = Path(__file__).resolve().parent.parent / "configs" / "monitoring"
 TIMEOUT_S = 300.0
 LIVE = pytest.mark.long(2, "fetches Debian's Prometheus, and an alert waits ten seconds before it fires")
-ONLY_SOMETIMES = {"mastctl_sentinel_drift", "mastctl_frames_missed_total", "mastctl_lease"}
-"""No reference look, no missed frame and no lease: then there is nothing to show."""
+COUNTED = {"mastctl_frames_missed_total", "mastctl_frames_received_total"}
+ONLY_SOMETIMES = {"mastctl_sentinel_drift", *COUNTED, "mastctl_lease"}
+"""No reference look, no camera that counts its frames and no lease: then there is nothing to show."""
 
 Query = Callable[[str], list[dict[str, Any]]]
 
@@ -135,9 +136,7 @@ def test_a_fault_fires_its_alert_and_every_panel_shows_something(
     assert (
         mast_client.wait(mast_client.point(pixel=("navcam_left", shot.frame_id, 400, 300)))["state"] == "done"
     )
-    until(
-        lambda: not prometheus("ALERTS"), "no alert is pending"
-    )  # on a busy machine one may be, for a moment
+    until(lambda: not prometheus("ALERTS"), "no alert is pending")
     with mast_client.lease():
         mute = fault("pan_tilt", "mute", replies=1e9)
         firing = until(lambda: prometheus('ALERTS{alertstate="firing"}'), "an alert fires")
@@ -177,13 +176,6 @@ def paths(layout: Any) -> Iterator[str]:
 @pytest.fixture
 def layout() -> dict[str, Any]:
     return dict(json.loads((FOLDER / "foxglove-layout.json").read_text()))
-
-
-def test_each_panel_of_the_layout_has_its_place(layout: dict[str, Any]) -> None:
-    def leaves(node: Any) -> list[str]:
-        return [node] if isinstance(node, str) else [*leaves(node["first"]), *leaves(node["second"])]
-
-    assert sorted(leaves(layout["layout"])) == sorted(layout["configById"])
 
 
 @pytest.mark.long(2, "a daemon records itself, pointed and with a fault")
@@ -283,7 +275,16 @@ json.dump({"plots": plots, "topics": sorted(topics)}, sys.stdout)
 def test_rerun_reads_back_what_the_recording_holds(recording: Path, tmp_path: Path) -> None:
     python = tmp_path / "environment" / "bin" / "python"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", python.parent.parent], check=True)
-    install = [sys.executable, "-m", "pip", "--python", python, "install", "-q", "--no-compile"]
+    install: list[str | Path] = [
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        python,
+        "install",
+        "-q",
+        "--no-compile",
+    ]
     install += ["rerun-sdk>=0.41,<0.42", "mcap"]
     fetched = subprocess.run(install, capture_output=True, text=True)
     if fetched.returncode != 0:

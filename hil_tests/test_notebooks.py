@@ -51,7 +51,14 @@ def test_a_cell_that_fails_is_named_by_its_number(tmp_path: Path) -> None:
 def test_a_notebook_shows_what_it_kept(name: str, repository: Path, tmp_path: Path) -> None:
     kept = notebooks.read(notebooks.FOLDER / f"{name}.ipynb")
     with tempfile.TemporaryDirectory(dir="/tmp", prefix="n") as short:  # sockets
-        words = [sys.executable, "-c", RUN, notebooks.FOLDER / f"{name}.ipynb", short, tmp_path / "done.json"]
+        words: list[str | Path] = [
+            sys.executable,
+            "-c",
+            RUN,
+            notebooks.FOLDER / f"{name}.ipynb",
+            short,
+            tmp_path / "done.json",
+        ]
         ran = subprocess.run(words, cwd=repository, capture_output=True, text=True, timeout=3600.0)
     assert ran.returncode == 0, ran.stderr
     done = json.loads((tmp_path / "done.json").read_text())

@@ -74,6 +74,12 @@ def test_what_was_interrupted_is_taken_up_again(checkout: Path) -> None:
     assert fetched(set_up(checkout)) == ["requirements.lock"]
 
 
+def test_a_demo_with_other_packages_leaves_developers_their_tools(checkout: Path) -> None:
+    set_up(checkout)
+    (checkout / "requirements.lock").write_text("# other packages\n")
+    assert fetched(set_up(checkout, "demo")) == ["requirements.lock"]
+
+
 @pytest.mark.parametrize("changed", INPUTS)
 def test_with_other_packages_it_begins_anew(checkout: Path, changed: str) -> None:
     set_up(checkout)

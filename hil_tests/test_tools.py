@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import runpy
+import shutil
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -12,16 +15,11 @@ from tools.command import end
 CASES = {
     "campaigns.refine --rig /nosuch": "/nosuch: cannot be read: No such file or directory",
     "campaigns.refine --rig /nosuch --click-px 0": "--click-px: '0' where a number above zero is expected",
-    "against_others.trackers --work /dev/null/x": "/dev/null/x: Not a directory",
     "campaigns.handoff --cases 0": "--cases: '0' where a whole number of at least 1 is expected",
-    "campaigns.handoff --out /dev/null/x.csv": "--out: /dev/null/x.csv: Not a directory",
-    "campaigns.life head --minutes 0": "--minutes: '0' where a number above zero is expected",
-    "campaigns.motion --moves 0": "--moves: '0' where a whole number of at least 1 is expected",
-    "campaigns.provoked_surveys --cases 0": "--cases: '0' where a whole number of at least 1 is expected",
-    "campaigns.provoked_surveys --pairs eye": "has no stereo pair 'eye'",
-    "campaigns.soak --minutes 0": "--minutes: '0' where a number above zero is expected",
-    "benchmarks.load --rounds 0": "--rounds: '0' where a whole number of at least 1 is expected",
-    "campaigns.coverage --joint-sigma-rad -1": "--joint-sigma-rad: '-1' where zero or more is expected",
+    "campaigns.provocations survey --cases 0": "--cases: '0' where a whole number of at least 1 is expected",
+    "campaigns.provocations survey --pairs eye": "has no stereo pair 'eye'",
+    "benchmarks.daemon start --rounds 0": "--rounds: '0' where a whole number of at least 1 is expected",
+    "campaigns.coverage survey --gross -1": "--gross: '-1' where zero or more is expected",
 }
 
 
@@ -44,3 +42,15 @@ def test_an_interrupted_tool_says_nothing(capsys: pytest.CaptureFixture[str]) ->
     with pytest.raises(SystemExit) as ended:
         end(interrupted)
     assert ended.value.code == 130 and capsys.readouterr().err == ""
+
+
+def test_the_help_of_the_demo_names_the_operator_page(repository: Path, tmp_path: Path) -> None:
+    (tmp_path / "tools").mkdir()
+    (tmp_path / ".venv" / "bin").mkdir(parents=True)
+    demo = shutil.copy(repository / "tools" / "demo", tmp_path / "tools")
+    for file, text in (("tools/setup", "exit 0"), (".venv/bin/mastctl", 'echo "mastctl $*"')):
+        (tmp_path / file).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / file).chmod(0o755)
+    for option in ("--help", "-h"):
+        said = subprocess.run([demo, option], capture_output=True, text=True, check=True).stdout
+        assert "--page" in said and f"mastctl demo {option}" in said

@@ -39,3 +39,9 @@ def until(holds: Callable[[], T], what: str, within_s: float = NET_S, clock: Clo
 def joined(*threads: Thread) -> None:
     """Wait until threads have ended; `Thread.join` with a timeout returns also when they have not."""
     until(lambda: not any(one.is_alive() for one in threads), "the end of " + ", ".join(map(str, threads)))
+
+
+def present(value: T | None) -> T:
+    """Return a value that must not be None."""
+    assert value is not None
+    return value

@@ -16,7 +16,7 @@ def as_json(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: as_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {str(key): as_json(entry) for key, entry in value.items()}
+        return {readable(str(key)): as_json(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray):
         return as_json(value.tolist())
     if isinstance(value, (list, tuple, set, frozenset)):
@@ -27,8 +27,15 @@ def as_json(value: Any) -> Any:
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, (int, bool)):
         return value
-    text = str(value)  # a file's name may hold what no JSON can
-    return text if text.isascii() else text.encode("utf-8", "replace").decode()
+    return readable(str(value))
+
+
+def readable(text: str) -> str:
+    """Return a text that JSON and every terminal can hold.
+
+    A byte outside UTF-8, which the name of a file may have, is written ``\\udcff``.
+    """
+    return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode()
 
 
 TOO_DEEP = "nested too deeply to be shown"

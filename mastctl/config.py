@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ipaddress
 import math
+import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,7 +30,6 @@ from mastctl.devices.limits import (
     SunDirection,
     direction_of,
 )
-from mastctl.live.settings import LiveSettings
 from mastctl.motion.settings import HandoffRules, PairBounds, TrackingSettings
 from mastctl.packaged import default_config
 from mastctl.recorder.settings import RecordSettings
@@ -50,14 +50,6 @@ LONGEST_SOCKET_PATH = 100  # bytes; the kernel's own bound is 108
 
 
 @dataclass(frozen=True)
-class Tls:
-    """The files by which a daemon speaks TLS: a certificate with its chain, and its key, both PEM."""
-
-    certificate: Path
-    key: Path
-
-
-@dataclass(frozen=True)
 class Listen:
     """Where the daemon listens, and to which names it answers.
 
@@ -69,15 +61,12 @@ class Listen:
         A Unix socket instead, if not None.
     hosts
         Names that it answers to beside the loopback ones, in lower case.
-    tls
-        None for plain HTTP.
     """
 
     host: str = DEFAULT_HOST
     port: int = DEFAULT_PORT
     socket: Path | None = None
     hosts: tuple[str, ...] = ()
-    tls: Tls | None = None
 
     @property
     def url(self) -> str:
@@ -88,8 +77,7 @@ class Listen:
         if self.socket is not None:
             return f"unix:{quote(str(self.socket))}"
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
-        scheme = "http" if self.tls is None else "https"
-        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.port}"
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
 
     @property
     def needs_token(self) -> bool:
@@ -113,7 +101,6 @@ class Config:
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     repeat_after_s: float | None = None
     record: RecordSettings = field(default_factory=RecordSettings)
-    live: LiveSettings | None = None
     data: bytes = field(default=b"", repr=False)
     state_folder: Path | None = None
 
@@ -148,7 +135,7 @@ def parse_config(data: bytes, path: str | Path) -> Config:
         "",
         document,
         ("schema", "mast_file", "pan_tilt", "limits"),
-        ("cameras", "foxglove", "listen", "pointing", "record", "simulation", "tracking", "state"),
+        ("cameras", "listen", "pointing", "record", "simulation", "tracking", "state"),
     )
     folder = Path(path).resolve().parent
     cameras = {name: _camera(top, name) for name in top.mapping("cameras")}
@@ -167,7 +154,6 @@ def parse_config(data: bytes, path: str | Path) -> Config:
         tracking=_tracking(top, folder),
         repeat_after_s=_repeat_after_s(top),
         record=_record(top, folder),
-        live=_live(top),
         data=data,
         state_folder=_state_folder(top, folder),
     )
@@ -230,7 +216,7 @@ def parse_address(text: str) -> Listen:
         In words that say what is expected.
     """
     if "/" in text:
-        if len(text.encode()) > LONGEST_SOCKET_PATH:
+        if len(os.fsencode(text)) > LONGEST_SOCKET_PATH:
             raise ValueError(f"'{text[:40]}...' is longer than {LONGEST_SOCKET_PATH} bytes, a socket's most")
         return Listen(socket=Path(text).absolute())
     host, colon, port = text.rpartition(":")
@@ -244,26 +230,22 @@ def parse_address(text: str) -> Listen:
 
 
 def _listen(top: Section, folder: Path) -> Listen:
-    """Read ``{host, port}`` or ``{socket: PATH}``, with ``hosts`` and ``tls``."""
+    """Read ``{host, port}`` or ``{socket: PATH}``, with ``hosts``."""
     if "listen" not in top:
         return Listen()
-    section = top.section("listen", (), ("host", "port", "socket", "hosts", "tls"))
+    section = top.section("listen", (), ("host", "port", "socket", "hosts"))
     hosts = _hosts(section)
     if "socket" in section:
-        for other in ("host", "port", "tls"):
+        for other in ("host", "port"):
             if other in section:
                 raise section.bad(other, "stands beside 'socket'; one or the other is expected")
         socket = folder / section.text("socket")
-        if len(str(socket).encode()) > LONGEST_SOCKET_PATH:
+        if len(os.fsencode(socket)) > LONGEST_SOCKET_PATH:
             raise section.bad("socket", f"{socket} is longer than {LONGEST_SOCKET_PATH} bytes")
         return Listen(socket=socket, hosts=hosts)
     host = section.text("host") if "host" in section else DEFAULT_HOST
     port = section.integer("port", 0, 65535) if "port" in section else DEFAULT_PORT
-    tls = None
-    if "tls" in section:
-        files = section.section("tls", ("certificate", "key"), ())
-        tls = Tls(folder / files.text("certificate"), folder / files.text("key"))
-    return Listen(host, port, hosts=hosts, tls=tls)
+    return Listen(host, port, hosts=hosts)
 
 
 def _hosts(section: Section) -> tuple[str, ...]:
@@ -379,19 +361,6 @@ def _state_folder(top: Section, folder: Path) -> Path | None:
     if "state" not in top:
         return None
     return folder / top.section("state", ("folder",), ()).text("folder")
-
-
-def _live(top: Section) -> LiveSettings | None:
-    """Read ``{port: PORT}`` of the live view; without it there is none."""
-    if "foxglove" not in top:
-        return None
-    usual = LiveSettings()
-    section = top.section("foxglove", (), ("host", "port"))
-    host = section.text("host") if "host" in section else usual.host
-    if not is_loopback(host):
-        words = f"'{host[:60]}' where a loopback address is expected: the live view requires no token"
-        raise section.bad("host", words)
-    return LiveSettings(host, section.integer("port", 0, 65535) if "port" in section else usual.port)
 
 
 def _record(top: Section, folder: Path) -> RecordSettings:

@@ -15,7 +15,6 @@ import logging
 import os
 import signal
 import socket
-import ssl
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -28,8 +27,6 @@ from typing import Any
 import uvicorn
 from starlette.types import ASGIApp
 
-from calib.errors import BadFile
-from calib.files import read_bytes
 from drivers.clock import Clock
 from drivers.faults import LOG
 from drivers.hardware import Hardware
@@ -46,8 +43,8 @@ from mastctl.http.connections import (
     most_connections,
     sweep,
 )
-from mastctl.http.entrance import Entrance, Names
-from mastctl.http.server import Server, arriving
+from mastctl.http.entrance import EntryRules, HostNames
+from mastctl.http.server import Server
 from mastctl.http.sockets import LARGEST_BYTES, PING_S, Socket
 from mastctl.http.tokens import TokenList
 from mastctl.http.waiting import Streams, Waiting
@@ -65,7 +62,6 @@ GRACE_S = 2  # for answers under way, when the daemon ends; what waits for a dev
 SWITCH_S = 0.0005  # a stop goes through five threads and may wait so long for each; 5 ms by default
 START_TIMEOUT_S = 600.0  # the first start compiles the simulator's kernels
 END_TIMEOUT_S = 20.0
-MOST_PEM_BYTES = 1_000_000
 
 
 class AddressInUse(MastctlError):
@@ -104,7 +100,6 @@ def run(
     BadFile, DriverError
         From opening the service.
     """
-    _check_tls(config.listen)
     sys.setswitchinterval(SWITCH_S)
     with _listening(config.listen) as (listener, url):
         service = _opened(config, clock, _state_folder(config), url)
@@ -140,7 +135,6 @@ class RunningDaemon:
     """
 
     def __init__(self, config: Config, clock: Clock | None = None) -> None:
-        _check_tls(config.listen)
         self._exit = contextlib.ExitStack()
         listener, self.url = self._exit.enter_context(_listening(config.listen))
         try:
@@ -160,13 +154,16 @@ class RunningDaemon:
         self._exit.callback(stall_while, lambda: False)
         self._ready = threading.Event()
         self._ended = threading.Event()
+        self._closing = False
         self._stop: Callable[[], None] = lambda: None
         self._thread = threading.Thread(target=self._work, args=(listener,), name="daemon", daemon=True)
         self._thread.start()
-        self._ready.wait(START_TIMEOUT_S)
-        if self._ended.is_set():
+        started = self._ready.wait(START_TIMEOUT_S)
+        if self._ended.is_set() or not started:
+            ended = self._ended.is_set()
             self.close()
-            raise MastctlError("the daemon ended while it started; its log says why")
+            how = "ended while it started" if ended else f"did not answer within {START_TIMEOUT_S:g} s"
+            raise MastctlError(f"the daemon {how}; its log says why")
 
     @property
     def hardware(self) -> Hardware:
@@ -175,6 +172,7 @@ class RunningDaemon:
 
     def close(self) -> None:
         """Stop the mast, end the daemon, let go of everything; bounded. Does nothing the second time."""
+        self._closing = True  # first: a daemon that is only now ready sees it
         self._stop()
         self._thread.join(END_TIMEOUT_S)
         self._exit.close()
@@ -194,6 +192,8 @@ class RunningDaemon:
         def ready(stop: Callable[[], None]) -> None:
             self._stop = stop
             self._ready.set()
+            if self._closing:
+                stop()
 
         try:
             asyncio.run(_serve(self.service, listener, ready, self._entrance, in_process=False))
@@ -255,7 +255,7 @@ async def _serve(
     service: Service,
     listener: socket.socket,
     on_ready: Callable[[Callable[[], None]], None],
-    entrance: Entrance,
+    entrance: EntryRules,
     *,
     in_process: bool,
 ) -> None:
@@ -339,9 +339,8 @@ async def _tell_state(service: Service, manager: ServiceManager) -> None:
 
 
 def _settings(service: Service, app: ASGIApp, kind: type[Connection]) -> uvicorn.Config:
-    """How uvicorn serves. TLS is made by its options, and spoken by connections that are counted."""
-    tls = service.config.listen.tls
-    settings = uvicorn.Config(
+    """How uvicorn serves."""
+    return uvicorn.Config(
         app,
         http=kind,
         backlog=ACCEPTED_AT_ONCE,
@@ -356,53 +355,31 @@ def _settings(service: Service, app: ASGIApp, kind: type[Connection]) -> uvicorn
         access_log=False,
         log_config=None,
         timeout_graceful_shutdown=GRACE_S,
-        ssl_certfile=None if tls is None else tls.certificate,
-        ssl_keyfile=None if tls is None else tls.key,
     )
-    if tls is not None:
-        settings.load()
-        assert settings.ssl is not None
-        context, settings.ssl = settings.ssl, None
-        settings.http_protocol_class = arriving(kind, context)
-    return settings
 
 
 @contextlib.contextmanager
-def _entrance(service: Service, url: str) -> Iterator[Entrance]:
+def _entrance(service: Service, url: str) -> Iterator[EntryRules]:
     """Say who comes in, by where the daemon listens. Raises BadFile."""
     listen = service.config.listen
-    names = Names(frozenset(listen.hosts), any_address=listen.needs_token, secure=listen.tls is not None)
-    certificate = None if listen.tls is None else listen.tls.certificate
-    service.guide.door = WayIn(url, None, certificate)
+    names = HostNames(frozenset(listen.hosts), any_address=listen.needs_token)
+    service.guide.door = WayIn(url)
     if not listen.needs_token:
-        yield Entrance(names, None, "loopback" if listen.socket is None else "unix")
+        yield EntryRules(names, None, "loopback" if listen.socket is None else "unix")
         return
     tokens = TokenList(service.folder.path)
     access = Access(tokens)
-    service.guide.door = WayIn(url, access.lend, certificate)
+    service.guide.door = WayIn(url, access.lend)
     service.leases.stands = access.stands
     try:
         log.warning("%s asks everybody for a token, but for a stop; tokens lie in %s", url, tokens.folder)
-        if listen.tls is None and listen.socket is None:
-            log.warning("%s speaks plain HTTP: tokens and pictures can be read on the way (listen.tls)", url)
-        yield Entrance(names, access, "token")
+        if listen.socket is None:
+            log.warning(
+                "%s speaks plain HTTP: others can read tokens and images unless a proxy encrypts", url
+            )
+        yield EntryRules(names, access, "token")
     finally:
         access.close()
-
-
-def _check_tls(listen: Listen) -> None:
-    """Pass a certificate and a key that belong together. Raises BadFile."""
-    if listen.tls is None:
-        return
-    for path in (listen.tls.certificate, listen.tls.key):
-        read_bytes(path, MOST_PEM_BYTES)
-    try:
-        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(
-            listen.tls.certificate, listen.tls.key, password=lambda: b""
-        )
-    except (ssl.SSLError, OSError, ValueError) as error:
-        words = f"it and {listen.tls.certificate} are no key and certificate that belong together ({error})"
-        raise BadFile(listen.tls.key, "", words) from None
 
 
 def _leave(connections: Iterable[Any]) -> None:

@@ -49,14 +49,6 @@ class NotLetIn(_Family):
     """The client has shown no valid token."""
 
 
-class TooMany(_Family):
-    """The client asks too often; it may ask again after ``retry_after_s`` seconds."""
-
-    def __init__(self, code: str, message: str, retry_after_s: float = 1.0) -> None:
-        self.retry_after_s = retry_after_s
-        super().__init__(code, message)
-
-
 class NotAllowed(_Family):
     """The client's role does not permit the request; another role may."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -91,10 +91,13 @@ def _settings_in(text: str) -> dict[str, float | None]:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """Whether it is a number within the range of floats; `drivers.options` has the same and loads NumPy."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return abs(value) <= sys.float_info.max
 
 
-_HEADERS = {one.name: "X-Mastctl-" + one.name.replace("_", "-").title() for one in fields(FrameFacts)}
+_HEADERS = {one.name: "Mastctl-" + one.name.replace("_", "-").title() for one in fields(FrameFacts)}
 _READ: Mapping[str, Callable[[str], Any]] = {
     "str": str,
     "int": int,

@@ -7,6 +7,8 @@ import json
 import os
 from pathlib import Path
 
+from calib.files import open_plain
+
 LONGEST_LINE = 1 << 20
 
 
@@ -71,7 +73,7 @@ def _mended(descriptor: int, begins: bytes) -> bytes:
         return b""
     try:
         json.loads(last)
-    except ValueError:
+    except (ValueError, RecursionError):
         os.ftruncate(descriptor, size - len(last))
         return b""
     return b"\n"
@@ -80,7 +82,7 @@ def _mended(descriptor: int, begins: bytes) -> bytes:
 def read_lines(path: Path, most_bytes: int) -> list[bytes]:
     """Return a file's lines, of the newest so many bytes; none without a file. Raises OSError."""
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             start = max(0, os.fstat(file.fileno()).st_size - most_bytes)
             file.seek(start)
             return file.read(most_bytes).splitlines()[1 if start else 0 :]

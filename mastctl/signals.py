@@ -1,8 +1,13 @@
-"""Signals that end a process: which they are, and an end in order instead of a death on the spot."""
+"""Signals that end a process: which they are, and an end in order instead of a death on the spot.
+
+Also the two that stop a job in the background when it uses its terminal: SIGTTIN and SIGTTOU.
+"""
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NoReturn
@@ -28,6 +33,27 @@ class Ended(KeyboardInterrupt):
     def __init__(self, number: int) -> None:
         self.number = number
         super().__init__(f"ended by signal {number}")
+
+
+def may_read_stdin() -> bool:
+    """Return whether stdin can be read: not a terminal while this job is in its background (SIGTTIN)."""
+    try:
+        return not sys.stdin.isatty() or os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
+    except (OSError, ValueError, AttributeError):  # closed, no file, or another session's terminal
+        return False
+
+
+def can_ask() -> bool:
+    """Return whether a person at a terminal can see a question on stderr and answer it on stdin."""
+    try:
+        return sys.stdin.isatty() and sys.stderr.isatty() and may_read_stdin()
+    except (ValueError, AttributeError):  # a stream is closed
+        return False
+
+
+def write_from_background() -> None:
+    """Let a job in the background write to its terminal whatever ``stty tostop`` says."""
+    signal.signal(signal.SIGTTOU, signal.SIG_IGN)
 
 
 def wanted() -> tuple[int, ...]:

@@ -8,8 +8,8 @@ from __future__ import annotations
 import shutil
 import sys
 
+from hil_tests.support.virtual_machine.apt import Busy, apt_get
 from tools.command import end, options
-from tools.virtual_machine.apt import Busy, apt_get
 
 NAMES = ("chromium-headless-shell", "chromium", "chromium-browser")
 """The first draws no window of its own, in a third less processor time, and is half the download."""

@@ -13,8 +13,7 @@ import json
 import signal
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,13 +21,21 @@ from numpy.typing import ArrayLike
 from calib.errors import CalibError
 from drivers.errors import DriverError
 from mastctl import signals
-from mastctl.cli.output import CommandError, as_command_error, at_least, one_line, positive_number
+from mastctl.cli.output import CommandError, WrongUse, as_command_error, at_least, one_line, positive_number
 from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.errors import MastctlError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 Row = Mapping[str, Any]
+
+
+class _Options(argparse.ArgumentParser):
+    """A parser whose refusal `end` prints, as JSON where that is wanted."""
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse wrong use."""
+        raise WrongUse(f"{self.prog}: {message}")
 
 
 def options(
@@ -56,10 +63,10 @@ def options(
     as_json
         Whether there is ``--json``.
     tasks
-        Whether its cases are tasks (docs/how-to/campaigns.md).
+        Whether its cases are tasks (docs/how-to/simulation.md).
     """
     started = getattr(sys.modules["__main__"].__spec__, "name", "").removesuffix(".__main__")
-    parser = argparse.ArgumentParser(
+    parser = _Options(
         prog=f"python -m {started}" if started.startswith("tools.") else None,
         description=doc,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -137,15 +144,10 @@ def _cell(form: str, row: Row) -> str:
         return ""
 
 
-def rms(values: ArrayLike) -> float:
+def rms(values: Any) -> float:
     """Return the root mean square of all numbers; not-a-number of none."""
     numbers = np.asarray(values, dtype=float)
     return float(np.sqrt(np.mean(numbers**2))) if numbers.size else float("nan")
-
-
-def percent(held: Sequence[bool]) -> float | None:
-    """Return how many of a hundred hold; None of nothing."""
-    return 100.0 * sum(held) / len(held) if held else None
 
 
 def held_percent(by_case: Sequence[ArrayLike]) -> tuple[float, float]:
@@ -153,7 +155,7 @@ def held_percent(by_case: Sequence[ArrayLike]) -> tuple[float, float]:
 
     Errors of one case go together, so that the scatter of whole cases is what tells how sure a rate is.
     """
-    rates = 100 * np.array([np.mean(held) for held in by_case])
+    rates = 100 * np.array([np.asarray(held).mean() for held in by_case])
     return float(rates.mean()), float(rates.std(ddof=1) / np.sqrt(len(rates))) if len(rates) > 1 else np.nan
 
 
@@ -163,16 +165,6 @@ def numbers(words: str) -> tuple[float, ...]:
     if not all(0.0 <= value < np.inf for value in values):
         raise argparse.ArgumentTypeError(f"{words!r} where numbers of 0 or more are expected")
     return values
-
-
-def new_file(text: str) -> Path:
-    """Read the name of a file that can be written, before minutes are spent on it (argparse ``type``)."""
-    path = Path(text)
-    try:
-        path.touch()
-    except OSError as error:
-        raise argparse.ArgumentTypeError(f"{path}: {error.strerror}") from None
-    return path
 
 
 def end(main: Callable[[], int | None]) -> None:
@@ -187,13 +179,16 @@ def end(main: Callable[[], int | None]) -> None:
     except KeyboardInterrupt as ended:
         sys.exit(128 + (ended.number if isinstance(ended, signals.Ended) else signal.SIGINT))
     except (CalibError, DriverError, MastctlError, CommandError) as error:
-        words, code = str(error), as_command_error(error).exit_code
+        refusal = as_command_error(error)
     except OSError as error:
         if error.filename is None:
             raise
-        words, code = f"{error.filename}: {error.strerror}", 2
-    sys.stderr.write(f"{one_line(words)}\n")
-    sys.exit(code)
+        refusal = CommandError("file_system", f"{error.filename}: {error.strerror}", exit_code=2)
+    if "--json" in sys.argv:
+        sys.stdout.write(json.dumps({"error": {"code": refusal.code, "message": str(refusal)}}) + "\n")
+    else:
+        sys.stderr.write(f"{one_line(str(refusal))}\n")
+    sys.exit(refusal.exit_code)
 
 
 def _by_its_name(main: Callable[[], int | None]) -> Callable[[], int | None]:

@@ -16,6 +16,7 @@ import sys
 import tempfile
 import tomllib
 from pathlib import Path
+from typing import Any
 
 from tools.command import end, options
 
@@ -68,7 +69,11 @@ def build(out: Path, at: str | None = None) -> list[Path]:
         readme = copy / "README.md"
         readme.write_text(for_an_index(readme.read_text(), at, f"v{version}"))
         when = os.environ.get("SOURCE_DATE_EPOCH") or _said("git", "log", "-1", "--format=%ct").strip()
-        how = {"env": {**os.environ, "SOURCE_DATE_EPOCH": when}, "check": True, "capture_output": True}
+        how: dict[str, Any] = {
+            "env": {**os.environ, "SOURCE_DATE_EPOCH": when},
+            "check": True,
+            "capture_output": True,
+        }
         command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out)]
         subprocess.run([*command, str(copy)], **how)  # the wheel is built from the sdist
         subprocess.run([*command, "--wheel", str(copy / CLIENT)], **how)

@@ -73,8 +73,8 @@ def _outputs(source: str, names: dict[str, Any], count: int) -> Iterator[dict[st
     for number in pyplot.get_fignums():
         png = io.BytesIO()
         pyplot.figure(number).savefig(png, format="png", dpi=FIGURE_DPI, metadata={"Software": None})
-        data = {"image/png": base64.b64encode(png.getvalue()).decode()}
-        yield {"output_type": "display_data", "data": data, "metadata": {}}
+        figure = {"image/png": base64.b64encode(png.getvalue()).decode()}
+        yield {"output_type": "display_data", "data": figure, "metadata": {}}
     pyplot.close("all")
 
 

@@ -1,4 +1,4 @@
-"""Pages of the reference, written from the code at each build: commands, HTTP, error codes, Python names.
+"""Pages of the reference, written from the code at each build: commands, HTTP, codes, states, Python names.
 
 `write_pages` fills ``docs/reference/generated``, `write_notebooks` ``docs/tutorials/generated``. Git
 ignores both. Nothing here states a fact of its own.
@@ -14,10 +14,19 @@ from pathlib import Path
 from typing import Any
 
 import calib
+from calib.errors import CalibError
+from drivers import faults
+from drivers.errors import DriverError
+from mastctl.answers import Word
 from mastctl.cli.main import build_parser
+from mastctl.conform.devices import ALL
+from mastctl.conform.rig_checks import RIG
+from mastctl.control.table import CHOICES, EVENTS, HAPPENS, MEANINGS, TABLE, WORDS, Event
+from mastctl.errors import MastctlError
 from mastctl.web.app import api
 from mastctl.web.described import description
-from tools import error_codes, notebooks
+from tools import notebooks
+from tools.page_tables import page_text
 
 PYTHON = {
     "Pointing, calibration and cameras: `calib`": ["calib"],
@@ -27,6 +36,11 @@ PYTHON = {
 }
 """Titles of the pages of Python names, and the modules whose public names stand on each."""
 
+ROOT = Path(__file__).parents[1]
+REFUSALS = ROOT / "docs" / "reference" / "http.md"
+PACKAGES = ("calib", "drivers", "mastctl")
+RAISED = re.compile(r'(raise \w+\(\s*)?"([a-z]+(?:_[a-z]+)*)",\s*f?"([^"]* [^"]* [^"]*)"')
+"""A code and its message, where an error is raised or answered."""
 BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 
 
@@ -36,6 +50,9 @@ def write_pages(folder: Path) -> None:
         "commands.md": commands_page(),
         "http-api.md": http_page(json.loads(description(api()))),
         "error-codes.md": error_codes_page(),
+        "states.md": states_page(),
+        "fault-words.md": fault_words_page(),
+        "checks.md": checks_page(),
     }
     for title, modules in PYTHON.items():
         pages[f"python-{modules[0].replace('.', '-')}.md"] = python_page(title, modules)
@@ -150,8 +167,10 @@ def http_page(openapi: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _table(first: str, rows: list[tuple[str, str, str]]) -> list[str]:
-    lines = [f"| {first} | type | meaning |", "| --- | --- | --- |"]
+def _table(
+    first: str, rows: list[tuple[str, str, str]], second: str = "type", third: str = "meaning"
+) -> list[str]:
+    lines = [f"| {first} | {second} | {third} |", "| --- | --- | --- |"]
     return [*lines, *(f"| {name} | {_cell(kind)} | {_cell(words)} |" for name, kind, words in rows), ""]
 
 
@@ -198,32 +217,101 @@ def _kind(schema: dict[str, Any]) -> str:
 
 
 def error_codes_page() -> str:
-    """Return every error code with its meaning; those of commands alone stand apart."""
-    rows = [
-        (f"`{code}`", status, _cell(meaning), remedy) for code, status, meaning, remedy in error_codes.rows()
-    ]
-    lines = [
-        "# Error codes",
-        "",
-        "For programs that read `error.code`. Written from the code and from",
-        "[the table of refusals](../http.md#refusals). A value that a message fills in is shown as …;",
-        "*or* separates two messages of one code.",
-        "",
-        "## In answers and operations",
-        "",
-        "| code | status | meaning | remedy |",
-        "| --- | --- | --- | --- |",
-        *(f"| {' | '.join(row)} |" for row in rows if row[1]),
-        "",
-        "## In commands and Python calls alone",
-        "",
-        "The daemon answers those of the geometry, such as `blind_cone`, with status 422.",
-        "",
-        "| code | meaning |",
-        "| --- | --- |",
-        *(f"| {code} | {meaning} |" for code, status, meaning, _ in rows if not status),
-        "",
-    ]
+    """Return every error code: status and remedy of the table of refusals, the meaning from the code."""
+    meanings, raised = _meanings()
+    section = page_text(REFUSALS).split("## Refusals", 1)[1].split("\n## ", 1)[0]
+    listed: dict[str, list[tuple[str, str]]] = {}
+    for status, codes, remedy in re.findall(
+        r"^\| (\w+) \| ([^|]*`[^|]*) \| ([^|]*) \|", section, re.MULTILINE
+    ):
+        remedy = "" if status == "operation" else remedy.replace("](../", "](../../").strip()
+        for code in re.findall(r"`(\w+)`", codes):
+            listed.setdefault(code, []).append((status, remedy))
+    lines = ["# Error codes", "", "For programs that read `error.code`. Written from the code and from"]
+    lines += ["[the table of refusals](../http.md#refusals).", ""]
+    lines += ["## In answers and operations", ""]
+    lines += ["| code | status | meaning | remedy |", "| --- | --- | --- | --- |"]
+    for code, rows in sorted(listed.items()):
+        status, remedy = (", ".join(filter(None, dict.fromkeys(one))) for one in zip(*rows, strict=True))
+        lines.append(f"| `{code}` | {status} | {meanings.get(code, '')} | {remedy} |")
+    lines += ["", "## In commands and Python calls alone", ""]
+    lines += ["The daemon answers those of the geometry, such as `blind_cone`, with status 422.", ""]
+    lines += ["| code | meaning |", "| --- | --- |"]
+    alone = sorted(raised - {*listed})
+    return "\n".join([*lines, *(f"| `{code}` | {meanings[code]} |" for code in alone), ""])
+
+
+def _meanings() -> tuple[dict[str, str], set[str]]:
+    """What each code means, by its class or a message that is raised with it; and which codes are raised."""
+    sources = (file.read_text(encoding="utf-8") for one in PACKAGES for file in (ROOT / one).rglob("*.py"))
+    places = [found for text in sources for found in RAISED.findall(text)]
+    classes = {one.code: one for one in _errors() if "code" in vars(one)}
+    meanings = {code: _cell(re.sub(r"{[^}]*}", "…", message)) for _, code, message in reversed(places)}
+    meanings |= {code: _cell((one.__doc__ or "").split("\n\n")[0]) for code, one in classes.items()}
+    return meanings, {code for raised, code, _ in places if raised} | {*classes}
+
+
+def _errors(*bases: Any) -> Iterator[Any]:
+    """The errors of all modules that are imported."""
+    for base in bases or (CalibError, DriverError, MastctlError):
+        for kind in base.__subclasses__():
+            yield kind
+            yield from _errors(kind)
+
+
+def states_page() -> str:
+    """Return the states of the daemon, the events and the transitions."""
+    intro = "Written from the daemon's table; [How a stop is built](../../explanation/safety.md) explains it."
+    lines = ["# States and events", "", intro, "", "| state | meaning |", "| --- | --- |"]
+    lines += [f"| `{word}` | {MEANINGS[word]} |" for word in WORDS]
+    lines += ["", "| event | what happened | leads to |", "| --- | --- | --- |"]
+    lines += [f"| `{event}` | {HAPPENS[event]} | {_leads_to(event)} |" for event in EVENTS]
+    lines += ["", "| choice | the first that is true |", "| --- | --- |"]
+    for choice, (follows, words) in CHOICES.items():
+        summary = (follows.__doc__ or "").partition("\n")[0].removeprefix("Return the state ").rstrip(".")
+        lines.append(f"| *{choice}* | {', '.join(f'`{word}`' for word in words)}: {summary} |")
+    return "\n".join([*lines, ""])
+
+
+def _leads_to(event: Event) -> str:
+    """The states that an event leads to, those with the same answer together."""
+    froms: dict[str, list[Word]] = {}
+    for word in WORDS:
+        if (to := TABLE[word].get(event)) is not None:
+            froms.setdefault(to, []).append(word)
+    answers = []
+    for answer, words in froms.items():
+        states = "every state" if len(words) == len(WORDS) else ", ".join(f"`{word}`" for word in words)
+        refusal, shown = (
+            answer.removeprefix("refused: "),
+            f"*{answer}*" if answer in CHOICES else f"`{answer}`",
+        )
+        name = f"refused with `{refusal}`" if refusal != answer else shown
+        answers.append(f"{name} from {states}")
+    return "; ".join(answers)
+
+
+def fault_words_page() -> str:
+    """Return the fault words of each simulated device with their parameters."""
+    explained = "[Faults on purpose](../../drivers.md#faults-on-purpose) explains them."
+    lines = ["# Fault words", "", f"Written from the code; {explained}", ""]
+    kinds = {"a head": faults.HEAD_WORDS, "a camera": faults.CAMERA_WORDS, "the log": faults.LOG_WORDS}
+    for kind, words in kinds.items():
+        rows = []
+        for name, word in words.items():
+            parameters = ", ".join(f"{key} {value:g}" for key, value in word.parameters.items())
+            rows.append((f"`{name}`", parameters, word.does))
+        lines += [f"## Of {kind}", "", *_table("word", rows, "parameters and their defaults", "effect")]
+    return "\n".join(lines)
+
+
+def checks_page() -> str:
+    """Return the checks of ``mastctl conform`` with their promises."""
+    explained = "[Accept a rig or a driver](../../how-to/conform.md) explains them."
+    lines = ["# Checks of `mastctl conform`", "", f"Written from the code; {explained}", ""]
+    for kind, checks in {"rig": RIG.checks, **ALL}.items():
+        rows = [(f"`{one.name}`", "moves" if one.moves else "", one.promise) for one in checks]
+        lines += [f"## Of a {kind}", "", *_table("check", rows, "head", "promise")]
     return "\n".join(lines)
 
 
@@ -232,15 +320,12 @@ def python_page(title: str, modules: list[str]) -> str:
     lines = [f"# {title}", ""]
     for module in modules:
         lines += ["```{eval-rst}", f".. automodule:: {module}", "   :no-members:", ""]
-        names = calib.__all__ if module == "calib" else None
-        if names is None:
+        if module != "calib":
             lines += [f".. automodule:: {module}", "   :members:", "   :noindex:", ""]
         else:
-            for name in names:
-                is_class = isinstance(getattr(calib, name), type)
-                members = ["   :members:"] if is_class else []
-                kind = "autoclass" if is_class else "autofunction"
-                lines += [f".. {kind}:: {module}.{name}", *members, ""]
+            for name in vars(calib)["__all__"]:
+                kind = "autoclass" if isinstance(getattr(calib, name), type) else "autofunction"
+                lines += [f".. {kind}:: {module}.{name}", *(["   :members:"] * (kind == "autoclass")), ""]
         lines += ["```", ""]
     return "\n".join(lines)
 

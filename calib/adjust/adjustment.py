@@ -23,7 +23,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -47,22 +46,22 @@ from calib.adjust.unknowns import (
     Unknown,
     Unknowns,
 )
+from calib.geometry.covariance import camera_rates
 from calib.geometry.parameters import (
     camera_numbers,
     parameter_names,
     parameter_part,
-    predict,
     stepped,
 )
 from calib.geometry.rig import (
     JOINTS_NAMES,
     MAST_FREE,
     MAST_NAMES,
-    AxisJoint,
     Gimbal,
     gimbal,
+    joint_twists,
 )
-from calib.geometry.rigid import FloatArray, crossed, crossed_rows, moved_rigid, rigid_rates, rigid_twists
+from calib.geometry.rigid import FloatArray, moved_rigid, rigid_rates, rigid_twists
 
 HUBER = 3.0
 """Length of a residual, in sigmas, from which its pull no longer grows while blunders are looked for."""
@@ -330,28 +329,19 @@ class Adjustment:
         elif self.prism_cad_m > 0:
             yield "prism", point.point
 
-    def reading(self, state: Estimate, image: ImageTerm) -> tuple[float, float]:
-        """The joints' readings of an image without noise, by the state."""
-        pan, tilt = self._readings(state, [image])[0].tolist()
-        return pan, tilt
-
-    def _readings(self, state: Estimate, images: Sequence[ImageTerm]) -> FloatArray:
-        """The same of head images (k, 2)."""
-        found = np.array([(t.pan_rad, t.tilt_rad) for t in images], dtype=np.float64)
+    def readings(self, state: Estimate, images: Sequence[ImageTerm]) -> tuple[FloatArray, FloatArray]:
+        """What pan and tilt read (2, k) at head images, without noise, and from which side they came."""
+        read = np.array([(t.pan_rad, t.tilt_rad) for t in images], dtype=np.float64)
         if len(state.joints_rad):
             attitude = np.array([-1 if t.attitude is None else t.attitude for t in images])
-            found[attitude >= 0] += state.joints_rad[attitude[attitude >= 0]]
-        return found
-
-    def _joints(self, state: Estimate, images: Sequence[ImageTerm]) -> list[tuple[AxisJoint, Any, Any]]:
-        """Both joints, what they read at head images (k,), and from which side they came there (k,)."""
-        joints, sides = state.as_joints, np.array([t.approach for t in images], dtype=np.float64)
-        return list(zip((joints.pan, joints.tilt), self._readings(state, images).T, sides.T, strict=True))
+            read[attitude >= 0] += state.joints_rad[attitude[attitude >= 0]]
+        return read.T, np.array([t.approach for t in images], dtype=np.float64).T
 
     def head(self, state: Estimate, images: Sequence[ImageTerm]) -> Gimbal:
         """Where the head was at some of its images (k,), as the state has it."""
-        pan, tilt = (joint.true_rad(read, side) for joint, read, side in self._joints(state, images))
-        return gimbal(state.mast, pan, tilt)
+        (pan, tilt), (from_pan, from_tilt) = self.readings(state, images)
+        joints = state.as_joints
+        return gimbal(state.mast, joints.pan.true_rad(pan, from_pan), joints.tilt.true_rad(tilt, from_tilt))
 
     def image_residual(self, state: Estimate, image: ImageTerm) -> FloatArray:
         """Predicted less measured pixels of the dots that count, in sigmas, (2n,)."""
@@ -371,15 +361,6 @@ class Adjustment:
         return {
             t.name for t, residual in zip(self.images, off, strict=True) if not np.isfinite(residual).all()
         }
-
-    def away_m(self, state: Estimate, images: Sequence[ImageTerm]) -> dict[str, FloatArray]:
-        """How far the dots that count (n,) are from their cameras, by image, as the state has them."""
-        found: dict[str, FloatArray] = {}
-        for stack in self._of_images(images):
-            camera = state.cameras[stack.terms[0].camera]
-            away = np.linalg.norm(self._in_camera(state, stack)[0] - camera.C, axis=1)
-            found |= {t.name: away[part] for t, part in zip(stack.terms, stack.parts, strict=True)}
-        return found
 
     def image_blocks(self, state: Estimate, images: Sequence[ImageTerm]) -> list[ResidualBlock]:
         """The dots of some images that count, and their Jacobians."""
@@ -424,20 +405,17 @@ class Adjustment:
         if isinstance(stack, StationStack):
             return self._station_rows(state, stack)
         in_camera, head = self._in_camera(state, stack)
-        seen = predict(state.cameras[stack.terms[0].camera], in_camera)
-        by_step, by_point = seen.d_step.transpose(1, 2, 0), seen.d_points.transpose(1, 2, 0)
-        # What turns and shifts points before the camera moves pixels by its twist, at the same rates for all.
-        by_twist = np.concatenate([crossed_rows(in_camera.T, by_point), by_point], axis=1)
+        pixels_px, by_step, by_motion = camera_rates(state.cameras[stack.terms[0].camera], in_camera)
         rows = np.empty((2, sum(stack.sizes) + 1, len(in_camera)))
         first, bow = by_step.shape[1], 2 if stack.terms[0].board[0] in self.bowed else 0
         rows[:, :first] = by_step
         for part, twists in zip(stack.parts, self._twists(state, stack, head), strict=True):
-            moved = twists @ by_twist[..., part]
+            moved = twists @ by_motion[..., part]
             last = first + len(twists) - (1 if bow else 0)
             rows[:, first:last, part] = moved[:, : last - first]
             if bow:
                 rows[:, last:-1, part] = moved[:, -1:] * stack.bend[part].T
-        rows[:, -1] = (seen.pixels_px - stack.pixels_px).T
+        rows[:, -1] = (pixels_px - stack.pixels_px).T
         rows /= stack.sigma_px
         return rows
 
@@ -467,23 +445,16 @@ class Adjustment:
         boards = [state.rover_from_board[t.board] for t in stack.terms]
         parts = [np.zeros((len(boards), 0, 6))]
         if head is not None:
-            by_angles, joints = -head.twists[:, 8:], self._joints(state, stack.terms)
-            by_number = np.stack([joint.rates(read, side) for joint, read, side in joints], axis=1)
-            by_errors = (by_angles[:, :, None] * by_number[..., None]).reshape(len(boards), -1, 6)
-            parts += [-head.twists[:, self.mast_free], by_errors[:, self.joint_errors]]
+            joints = joint_twists(head, state.as_joints, *self.readings(state, stack.terms))
+            parts += [-head.twists[:, self.mast_free], -joints[:, self.joint_errors]]
             if self._own_reading(stack.terms[0]):
-                slopes = np.stack([joint.slope(read, side) for joint, read, side in joints], axis=1)
-                parts.append(by_angles * slopes[..., None])
+                parts.append(-joints[:, 10:])
         if stack.terms[0].board not in self.held:
             parts.append(rigid_twists(np.array([board.translation_m for board in boards])))
         if stack.terms[0].board[0] in self.bowed:
             parts.append(np.array([[[0.0, 0.0, 0.0, *board.rotation[:, 2]]] for board in boards]))
         twists = np.concatenate(parts, axis=1)
-        if head is not None:
-            turns, shifts = twists[..., :3], twists[..., 3:]
-            shifts = shifts + crossed(turns, head.translation_m[:, None])
-            twists = np.concatenate([turns @ head.rotation, shifts @ head.rotation], axis=2)
-        return twists
+        return twists if head is None else head.in_head(twists)
 
     def _places(self, state: Estimate, stack: StationStack) -> tuple[FloatArray, FloatArray]:
         """Where points of the station were measured and are expected (n, 3), metres in the rover frame."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from calib.adjust.adjustment import Adjustment, bounded_weights
 from calib.adjust.goodness import goodness
-from calib.adjust.score import Score
+from calib.adjust.score import MADE_UP, Score
 from calib.adjust.significance import chance
 from calib.adjust.solver import covariance_of
 from calib.adjust.terms import ImageTerm
@@ -43,7 +43,8 @@ SIDE = 2
 """Pictures at least on either side of a change, at different standstills: one is a blunder."""
 
 UNSEEN = 1e-3
-"""A direction of a change is not looked at if the other unknowns take up all but this part of it."""
+"""A direction of a change is not looked at if the other unknowns take up all but this part of it, unless a
+station ties boards to the rover: tapes show a slip that sharp images alone leave to their boards."""
 
 LARGEST = 0.5
 """Radians, or part of the focal length: what is larger is no slip, knock or other focus."""
@@ -140,7 +141,8 @@ def find_change(problem: Adjustment, state: Estimate) -> BenchChange | None:
     found: list[BenchChange] = []
     count = 0
     for what, board, camera, mine in _subjects(problem, state, rows):
-        changes = _tried(what, board, camera, mine, covariance, gradient)
+        least = MADE_UP if problem.station else UNSEEN
+        changes = _tried(what, board, camera, mine, covariance, gradient, least)
         count += len(changes)
         found += [change for change in changes if change.chi2 < chi2]
     if not found:
@@ -186,6 +188,7 @@ def _tried(
     rows: Sequence[Rows],
     covariance: FloatArray,
     gradient: FloatArray,
+    least: float,
 ) -> list[BenchChange]:
     """The gain of every picture from which something may have changed."""
     score = Score(rows[0].rates[what].shape[1], len(gradient))
@@ -197,7 +200,7 @@ def _tried(
             continue
         if min(_standstills(rows[:index]), _standstills(rows[index:])) < SIDE:
             continue
-        gain = score.beside(covariance, gradient).gain(least=UNSEEN)
+        gain = score.beside(covariance, gradient).gain(least=least)
         if what != "board" and np.linalg.norm(gain.values) > LARGEST:
             continue
         names = before.image.name, row.image.name

@@ -12,7 +12,8 @@ whether the image was fitted or not.
 A whole placement L (dots of its images, its tapes) leaves the others with a minimum M⁻¹ g away, with M = N -
 J_LᵀJ_L and g = J_Lᵀr_L. The board adds r_Lᵀr_L + gᵀ M⁻¹ g to the sum of squares, as a fit without it would
 find: chi-square with as many degrees of freedom as it has numbers beyond its own pose. Cameras, mast and
-set-ups come from the others alone; only the board's pose is its own.
+set-ups come from the others alone; only the board's pose is its own. Dots that scatter in their images more
+than their sigma says contradict nothing: the chance is by what they scatter (`calib.adjust.scatter`).
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from calib.adjust.adjustment import Adjustment, bounded_weights
+from calib.adjust.scatter import Scatter, scattering
 from calib.adjust.significance import chance
 from calib.adjust.solver import Minimum
 from calib.adjust.terms import ImageTerm, StationTerm
@@ -187,10 +189,14 @@ def left_out_boards(
     mast = problem.at(MAST)
     of_mast = covariance[np.ix_(mast, mast)]
     whole = fit.normal.matrix + np.diag(problem.weak)
+    noise = scattering(problem, fit.state, [t for t in problem.images if t.keep.any()]).values()
     found = [
-        _left_out(board, group, whole, problem.at(("board", board)), of_mast, mast)
+        _left_out(
+            board, group, whole, problem.at(("board", board)), of_mast, mast,
+            [one for image, one in noise if image.board == board],
+        )
         for board, group in groups.items()
-    ]
+    ]  # fmt: skip
     return tuple(sorted(found, key=lambda one: one.least_chance))
 
 
@@ -201,8 +207,9 @@ def _left_out(
     own: np.ndarray,
     of_mast: FloatArray,
     mast: np.ndarray,
+    noise: list[Scatter],
 ) -> LeftOutBoard:
-    """One board by the others."""
+    """One board by the others; its images scatter by ``noise``."""
     rest, pull, squares, count = whole.copy(), np.zeros(len(whole)), 0.0, 0
     for _, block in group:
         rest[np.ix_(block.columns, block.columns)] -= block.jacobian.T @ block.jacobian
@@ -211,21 +218,23 @@ def _left_out(
         count += len(block.residual)
     dots = sum(int(what.keep.sum()) for what, _ in group if isinstance(what, ImageTerm))
     others = np.setdiff1d(np.arange(len(whole)), own)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(rest)[others], 1e-300))
+    size = 1.0 / np.sqrt(np.maximum(np.diag(rest)[others], 1e-300))
     step = np.zeros(len(whole))
     try:
-        factor = cho_factor(rest[np.ix_(others, others)] * np.outer(scale, scale), check_finite=False)
-        step[others] = scale * cho_solve(factor, scale * pull[others], check_finite=False)
+        factor = cho_factor(rest[np.ix_(others, others)] * np.outer(size, size), check_finite=False)
+        step[others] = size * cho_solve(factor, size * pull[others], check_finite=False)
         to_mast = np.zeros((len(others), len(mast)))
         to_mast[np.searchsorted(others, mast), np.arange(len(mast))] = 1.0
-        without = scale[:, None] * cho_solve(factor, scale[:, None] * to_mast, check_finite=False)
+        without = size[:, None] * cho_solve(factor, size[:, None] * to_mast, check_finite=False)
     except np.linalg.LinAlgError:  # the others leave open what this board alone tells
         nan = float("nan")
         return LeftOutBoard(board, dots, nan, nan, nan, 0, 1.0, nan, 1.0)
     chi2, freedom = squares + float(pull @ step), max(count - len(own), 1)
     fitted, predicted = _dots(board, group, step)
     moved, by_luck = _pull(step[mast], without.T @ to_mast, of_mast)
-    return LeftOutBoard(board, dots, fitted, predicted, chi2, freedom, chance(chi2, freedom), moved, by_luck)
+    scale = float(np.average([n.square for n in noise], weights=[n.freedom for n in noise])) if noise else 1.0
+    likely = chance(chi2, freedom, scale)
+    return LeftOutBoard(board, dots, fitted, predicted, chi2, freedom, likely, moved, by_luck)
 
 
 def _pull(step: FloatArray, without: FloatArray, of_mast: FloatArray) -> tuple[float, float]:

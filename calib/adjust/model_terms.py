@@ -262,7 +262,8 @@ def _by_joint(problem: Adjustment, state: Estimate, terms: Sequence[ModelTerm]) 
     rates, focal = [], []
     for image in problem.images:
         if image.attitude is not None and image.keep.any():
-            rates.append(joint.rates(problem.reading(state, image)[which], image.approach[which]))
+            read, side = problem.readings(state, [image])
+            rates.append(joint.rates(read[which, 0], side[which, 0]))
             focal.append(float(np.linalg.norm(state.cameras[image.camera].H)))
     numbers = [number % len(AXIS_NAMES) for term in terms for number in term.numbers]
     apart = np.array(rates)[:, numbers]

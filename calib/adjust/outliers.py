@@ -8,14 +8,21 @@ any image.
 A whole image is judged by all its dots at once, against what the other measurements predict of it: the error
 of that prediction moves the dots together, and counts once. The statistic is what the sum of squares falls by
 if the image is left out, whether it was fitted or not, so that every image is asked again whenever the fit
-has changed. Stated sigmas may be too small: the typical dot and the typical station point then say by how
-much, and limits widen with them. Blunders hide one another, so the worst goes first and the fit is done
+has changed. The station's stated sigma may be too small: its typical point then says by how much, and limits
+widen with it. Blunders hide one another, so the worst goes first and the fit is done
 again.
+
+A dot counts by its image's own sigma (`calib.adjust.scatter`), so that a noisy image fails nothing. A whole
+image fails by a coherent shift alone: what its dots scatter about a smooth map widens its limit, for some of
+them may be noisier than others, as corners whose edges run along rows of pixels are. Where a camera's typical
+dot is off by more than that, as with a lens that its model does not fit or a camera that changed, its limits
+widen by as much, up to a bound: it is not single images that are wrong there, and the tests of wider models
+say what is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -24,6 +31,7 @@ from scipy.special import chdtri
 
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.left_out import REDUNDANT, LeftOut, dot_statistics, left_out
+from calib.adjust.scatter import MOST, scatter
 from calib.adjust.significance import typical_scale
 from calib.adjust.terms import ImageTerm, StationTerm
 from calib.adjust.unknowns import Estimate, ResidualBlock
@@ -95,21 +103,24 @@ class OutlierVerdict:
 
 @dataclass(frozen=True, eq=False)
 class JudgedImage:
-    """An image: chi-square of each dot by itself (n,), and the dots as the other measurements predict them,
+    """An image, chi-square of each dot by itself (n,), and the dots as the other measurements predict them,
     together."""
 
+    term: ImageTerm
     dots: FloatArray
     predicted: LeftOut
 
     def whole(self, fitted: bool, limits: _Limits) -> tuple[np.ndarray, float, float, bool]:
         """Which dots (n,) are good; chi-square of these together, or of all if too many are not, and its
         limit; and whether the image fails."""
-        good = self.dots <= limits.dot
+        most = limits.dot(self.term.camera)
+        good = self.dots <= most
         if not fitted:
-            good = self.predicted.agreeing(good, limits.dot)
+            good = self.predicted.agreeing(good, most)
         many_bad = bool(good.mean() < 1 - BAD_IMAGE)
         statistic, freedom = self.predicted.statistic(np.isfinite(self.dots) if many_bad else good)
-        limit = limits.image(freedom)
+        own = scatter(self.term, self.predicted.residual, good)
+        limit = limits.image(self.term.camera, freedom, min(own.square, MOST**2) if own else 1.0)
         return good, statistic, limit, many_bad or statistic > limit
 
 
@@ -192,7 +203,7 @@ def name_outliers(
         for row in np.flatnonzero(~term.keep):
             name = f"image {term.name} {term.part(int(row))}"
             size = float(np.linalg.norm(residual[row]))
-            found.append(Outlier("dot", name, float(judged.dots[row]), limits.dot, size))
+            found.append(Outlier("dot", name, float(judged.dots[row]), limits.dot(term.camera), size))
     for point, tested in zip(problem.station, points, strict=True):
         if point.keep:
             continue
@@ -213,15 +224,15 @@ class _Limits:
     dots: int
     images: int
     points: int
-    dot_scale: float
+    dot_scales: Mapping[str, float]
     point_scale: float
 
-    @property
-    def dot(self) -> float:
-        return float(chdtri(2, FALSE_ALARMS / max(self.dots, 1))) * self.dot_scale
+    def dot(self, camera: str) -> float:
+        return float(chdtri(2, FALSE_ALARMS / max(self.dots, 1))) * self.dot_scales[camera]
 
-    def image(self, freedom: int) -> float:
-        return float(chdtri(max(freedom, 1), FALSE_IMAGES / max(self.images, 1))) * self.dot_scale
+    def image(self, camera: str, freedom: int, own: float) -> float:
+        limit = float(chdtri(max(freedom, 1), FALSE_IMAGES / max(self.images, 1)))
+        return limit * max(self.dot_scales[camera], own)
 
     def point(self, freedom: int) -> float:
         return float(chdtri(freedom, FALSE_ALARMS / max(self.points, 1))) * self.point_scale
@@ -239,23 +250,37 @@ def _tested(
         _point(covariance, block, term)
         for block, term in zip(problem.station_blocks(state, problem.station), problem.station, strict=True)
     ]
-    kept = [one.dots[t.keep] for one, t in zip(seen, problem.images, strict=True) if t.keep.any()]
     whole = [
         np.array([p.statistic])
         for p, t in zip(points, problem.station, strict=True)
         if t.keep and p.freedom == 3
     ]
     count = sum(len(one.dots) for one in seen)
-    scales = (
-        max(1.0, typical_scale(np.concatenate(s or [np.ones(0)]), n)) for s, n in ((kept, 2), (whole, 3))
-    )
-    return seen, points, _Limits(count, len(seen), len(points), *scales)
+    dot_scales = _typical_dots(zip(seen, problem.images, strict=True))
+    point_scale = max(1.0, typical_scale(np.concatenate(whole or [np.ones(0)]), 3))
+    return seen, points, _Limits(count, len(seen), len(points), dot_scales, point_scale)
+
+
+def _typical_dots(seen: Iterable[tuple[JudgedImage, ImageTerm]]) -> dict[str, float]:
+    """By camera how much larger the square of its typical dot that was fitted is than its sigma makes it."""
+    by_camera: dict[str, list[FloatArray]] = {}
+    for judged, term in seen:
+        mine = by_camera.setdefault(term.camera, [])
+        if term.keep.any():
+            mine.append(judged.dots[term.keep])
+    every = [dots for mine in by_camera.values() for dots in mine]
+    whole = max(1.0, typical_scale(np.concatenate(every or [np.ones(0)])))
+    return {
+        camera: max(whole, min(typical_scale(np.concatenate(mine or [np.ones(0)])), MOST**2))
+        for camera, mine in by_camera.items()
+    }
 
 
 def _image(covariance: FloatArray, block: ResidualBlock, term: ImageTerm, huber: float | None) -> JudgedImage:
     """An image with all its dots, of which some may be fitted."""
     mine = covariance[np.ix_(block.columns, block.columns)]
     return JudgedImage(
+        term,
         dot_statistics(block.residual, block.jacobian, mine, term.keep),
         left_out(block, mine, term.keep, huber),
     )
@@ -288,12 +313,32 @@ def _culprit(problem: Adjustment, state: Estimate, suspect: int) -> int:
 def _board_misfit(
     problem: Adjustment, state: Estimate, board: tuple[str, str], images: Sequence[int]
 ) -> float:
-    """Sum of squares of a board's tapes and some of its images with its pose fitted to these alone."""
+    """Sum of squares of a board's tapes and some of its images with its pose fitted to these alone.
+
+    A tape may be the wrong one as well: without it the sum counts, and what a good tape may be off by.
+    """
     tapes = [p for p in problem.station if p.board == board and p.keep]
+    shown = [problem.images[i] for i in images]
+    allowed = float(chdtri(3, FALSE_ALARMS / max(len(problem.station), 1)))
+    without = ([p for p in tapes if p is not one] for one in tapes)
+    return min(
+        _misfit(problem, state, board, shown, tapes),
+        *(_misfit(problem, state, board, shown, rest) + allowed for rest in without),
+        float("inf"),
+    )
+
+
+def _misfit(
+    problem: Adjustment,
+    state: Estimate,
+    board: tuple[str, str],
+    images: Sequence[ImageTerm],
+    tapes: Sequence[StationTerm],
+) -> float:
+    """Sum of squares of some images and tapes of a board with its pose fitted to them."""
     cost = float("inf")
     for _ in range(BOARD_STEPS):
-        blocks = problem.image_blocks(state, [problem.images[i] for i in images])
-        blocks += problem.station_blocks(state, tapes)
+        blocks = problem.image_blocks(state, images) + problem.station_blocks(state, tapes)
         cost = float(sum(b.residual @ b.residual for b in blocks))
         if not np.isfinite(cost):
             return float("inf")

@@ -18,7 +18,7 @@ from calib.adjust.unknowns import Estimate
 from calib.adjust.wider import WiderModel
 from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import FloatArray, Rigid
-from calib.survey.records import Survey
+from calib.survey.records import Click, Survey
 
 HELD_FIXED = (
     "R0 of every camera is held at 0: whatever it does, A, H and V do as well",
@@ -33,7 +33,8 @@ class ImageResiduals:
     """One image after the fit: predicted less measured pixels (n, 2) of its dots, in pixels.
 
     ``used`` (n,) says which dots were fitted: none of a check image. ``range_m`` and ``incidence_rad`` are of
-    the board as seen from the camera (0: face on). ``sigma_px`` (n,) is each dot's stated sigma.
+    the board as seen from the camera (0: face on). ``sigma_px`` (n,) is each dot's stated sigma,
+    ``scatter`` what it counts times in this image beside what it does in all of the camera.
     """
 
     name: str
@@ -51,6 +52,7 @@ class ImageResiduals:
     used: np.ndarray
     range_m: float
     incidence_rad: float
+    scatter: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +156,8 @@ class Calibration(FittedRig):
         By set-up.
     prisms_in_rover_m
         Refined where the CAD has a sigma.
+    unseen_clicks
+        Check clicks on points that their camera, as fitted, cannot see.
     """
 
     method: Literal["paper", "joint"]
@@ -164,6 +168,7 @@ class Calibration(FittedRig):
     prisms_in_rover_m: Mapping[str, FloatArray]
     wider: tuple[WiderModel, ...] = ()
     left_out_boards: tuple[LeftOutBoard, ...] = ()
+    unseen_clicks: tuple[Click, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +253,7 @@ class BenchCalibration(FittedRig):
     joint_rad
         The error of one joint reading, besides its joint's errors.
     inexact_m
-        The error of corners on the board beyond their own sigmas; 0 where these explain them.
+        How far corners are printed beside their places, as all pictures show it alike; 0 if none do.
     bows_m
         By board its bow (across, down), metres.
     """

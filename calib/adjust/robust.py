@@ -1,23 +1,25 @@
 """A fit without its blunders, every kind of measurement weighed by what its residuals show.
 
-Pulls are bounded first (Huber), so that blunders can be found by the tests of `calib.adjust.outliers`; then
-plain least squares without them. Where residuals show that a kind of measurement is worse than stated, the
-fit is done again with the sigma that they show (`calib.adjust.goodness`), and so is its covariance.
+Pulls are bounded first (Huber). Every image then says how noisy its dots are (`calib.adjust.scatter`), so
+that blunders can be found by the tests of `calib.adjust.outliers`; then plain least squares without them.
+Where residuals show that a kind of measurement is worse than stated, the fit is done again with the sigma
+that they show (`calib.adjust.goodness`), and so is its covariance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.adjust.adjustment import HUBER, Adjustment
 from calib.adjust.goodness import Component, found_sigmas, variance_components
 from calib.adjust.outliers import judge
+from calib.adjust.scatter import with_scales
 from calib.adjust.significance import typical_scale
 from calib.adjust.solver import Minimum, Normal, covariance_of, minimise
-from calib.adjust.terms import ImageTerm, StationTerm, widened_images
+from calib.adjust.terms import ImageTerm, StationTerm, scattered_images, widened_images
 from calib.adjust.unknowns import Estimate
 from calib.errors import CalibError
 from calib.geometry.rigid import FloatArray
@@ -38,11 +40,34 @@ WEIGHED = 0.02
 
 
 @dataclass(frozen=True, eq=False)
+class Cleaned:
+    """A fit without blunders, by sigmas as large as each image's scatter shows them.
+
+    ``images`` are all that were to be fitted, with every dot and these sigmas; ``cameras`` is by what the
+    stated sigmas of each kind were multiplied, without what single images have besides.
+    """
+
+    problem: Adjustment
+    fit: Minimum[Estimate]
+    images: tuple[ImageTerm, ...]
+    cameras: Mapping[str, float]
+
+    def as_stated(self) -> tuple[Adjustment, Minimum[Estimate]]:
+        """Return the same with the sigmas that were stated, and its fit."""
+        back = {kind: 1.0 / factor for kind, factor in self.cameras.items()}
+        if all(factor == 1.0 for factor in back.values()) and all(t.scatter == 1.0 for t in self.images):
+            return self.problem, self.fit
+        images = scattered_images(self.problem.images, {t.name: 1.0 / t.scatter for t in self.images})
+        problem = self.problem.with_terms(images, self.problem.station).with_sigmas(back)
+        return problem, minimise(problem, self.fit.state, weak=problem.weak, gain=1e-11)
+
+
+@dataclass(frozen=True, eq=False)
 class Weighed:
     """A fit with sigmas as large as residuals show them.
 
     ``images`` are all that were fitted, with every dot and these sigmas. ``excess`` is how far the squared
-    residuals of the widened kinds, in the first fit, exceeded what stated sigmas allow.
+    residuals of the widened kinds, in the first fit, exceeded what their scatter allows.
     """
 
     problem: Adjustment
@@ -52,22 +77,19 @@ class Weighed:
     components: tuple[Component, ...]
     excess: float
 
+    @property
+    def factors(self) -> dict[str, float]:
+        """By kind what stated sigmas count times."""
+        return {c.kind: c.weighed for c in self.components}
 
-def weigh(
-    problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTerm], *, narrows: bool = True
-) -> Weighed:
+
+def weigh(cleaned: Cleaned, *, narrows: bool = True) -> Weighed:
     """Return the fit with the sigma of each kind of measurement that is worse, or better, than stated.
 
-    Parameters
-    ----------
-    problem, fit
-        Fitted with the stated sigmas, blunders left out.
-    images
-        All that were fitted, with every dot.
-    narrows
-        Whether a sigma may become smaller than stated.
+    ``narrows`` says whether a sigma may become smaller than stated.
     """
-    weighed: dict[str, float] = {}
+    problem, fit, images = cleaned.problem, cleaned.fit, cleaned.images
+    weighed = dict(cleaned.cameras)
     first: tuple[Component, ...] = ()
     for count in range(WEIGHINGS + 1):
         covariance = covariance_of(fit.normal.matrix, problem.weak)
@@ -79,36 +101,57 @@ def weigh(
             break
         weighed |= wanted
         images = widened_images(images, change)
-        problem, fit = without_blunders(problem.with_sigmas(change), fit.state, images, bounded=False)
+        problem, fit = _judged(problem.with_sigmas(change), fit, images)
     wrong = {c.kind for c in components if c.wrong}
-    excess = sum((c.factor**2 - 1) * c.redundancy for c in first if c.kind in wrong)
+    excess = sum(((c.factor / c.weighed) ** 2 - 1) * c.redundancy for c in first if c.kind in wrong)
     return Weighed(problem, fit, covariance, tuple(images), components, excess)
 
 
 def without_blunders(
-    problem: Adjustment, start: Estimate, all_images: Sequence[ImageTerm], *, bounded: bool = True
-) -> tuple[Adjustment, Minimum[Estimate]]:
-    """Fit, judge, and fit again until nothing fails; the last fit is plain least squares.
+    problem: Adjustment, start: Estimate, all_images: Sequence[ImageTerm], order_px: float
+) -> Cleaned:
+    """Fit with pulls bounded, find each image's sigma, judge, and fit again until nothing fails.
 
-    ``bounded`` begins with pulls bounded: for a start that blunders may have moved.
+    Parameters
+    ----------
+    problem, all_images
+        With stated sigmas; all images with every dot.
+    start
+        A state that blunders may have moved.
+    order_px
+        What the survey states of all dots, one sigma (`calib.adjust.scatter.scales`).
     """
-    fit = Minimum(start, Normal(np.inf, np.zeros((0, 0)), np.zeros(0)), False, 0)
-    if bounded:
-        fit = minimise(problem, start, weak=problem.weak, gain=1e-7)
+    fit = minimise(problem, start, weak=problem.weak, gain=1e-7)
+    _refuse_lost(fit)
+    problem, images, found = with_scales(problem, fit.state, all_images, order_px)
+    for huber in (HUBER, None):
+        problem, fit = _judged(problem.with_huber(huber), fit, images)
+    return Cleaned(problem, fit, images, found.cameras)
+
+
+def judged_again(cleaned: Cleaned, problem: Adjustment, start: Estimate) -> Cleaned:
+    """Return what comes of another problem of the same images, whose sigmas are those of ``cleaned``."""
+    began = Minimum(start, Normal(np.inf, np.zeros((0, 0)), np.zeros(0)), False, 0)
+    problem, fit = _judged(problem.with_huber(None), began, cleaned.images)
+    return replace(cleaned, problem=problem, fit=fit)
+
+
+def _judged(
+    problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTerm]
+) -> tuple[Adjustment, Minimum[Estimate]]:
+    """Fit, judge, and fit again until nothing fails."""
+    gain = 1e-7 if problem.huber else 1e-11
+    fit = minimise(problem, fit.state, weak=problem.weak, gain=gain)
+    kept = {_kept(problem.images, problem.station)}
+    for _ in range(ROUNDS):
+        verdict = judge(problem, fit.state, covariance_of(fit.normal.matrix, problem.weak), images)
+        pattern = _kept(verdict.images, verdict.station)
+        if pattern in kept:  # nothing new, or a measurement on its limit that comes and goes
+            break
+        kept.add(pattern)
+        problem = problem.with_terms(verdict.images, verdict.station)
+        fit = minimise(problem, fit.state, weak=problem.weak, gain=gain)
         _refuse_lost(fit)
-    for huber in (HUBER, None) if bounded else (None,):
-        problem = problem.with_huber(huber)
-        fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-7 if huber else 1e-11)
-        kept = {_kept(problem.images, problem.station)}
-        for _ in range(ROUNDS):
-            verdict = judge(problem, fit.state, covariance_of(fit.normal.matrix, problem.weak), all_images)
-            pattern = _kept(verdict.images, verdict.station)
-            if pattern in kept:  # nothing new, or a measurement on its limit that comes and goes
-                break
-            kept.add(pattern)
-            problem = problem.with_terms(verdict.images, verdict.station)
-            fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-7 if huber else 1e-11)
-            _refuse_lost(fit)
     return problem, fit
 
 

@@ -103,17 +103,3 @@ def typical_scale(squares: FloatArray, freedom: int = 2) -> float:
 
     median = MEDIAN_OF_TWO if freedom == 2 else float(chdtri(freedom, 0.5))
     return float(np.median(squares) / median) if len(squares) else 1.0
-
-
-def typical_px(residuals_px: FloatArray, images: np.ndarray, count: int) -> FloatArray:
-    """Return by image the sigma of a coordinate (count,), pixels, that the median length of residuals gives.
-
-    ``residuals_px`` is (n, 2), ``images`` (n,) says whose each is, from 0. Infinite for an image without any,
-    or with mostly such as are not finite.
-    """
-    square = np.nan_to_num(np.sum(residuals_px**2, axis=1), nan=np.inf)
-    ordered = np.append(square[np.lexsort((square, images))], np.inf)
-    sizes = np.bincount(images, minlength=count)
-    first = np.cumsum(sizes) - sizes
-    middle = 0.5 * (ordered[first + np.maximum(sizes - 1, 0) // 2] + ordered[first + sizes // 2])
-    return np.where(sizes > 0, np.sqrt(middle / MEDIAN_OF_TWO), np.inf)

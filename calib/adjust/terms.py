@@ -26,7 +26,8 @@ class ImageTerm:
     ``board`` is set-up and placement, of a bench board and placement; ``attitude`` the index of the head's
     standstill, None for a body camera and -1 where it is not fitted. ``approach`` says from where pan and
     tilt came to rest (+1: from smaller readings, -1: from larger, 0: not known). ``bend`` (n, 2) is what a
-    bow of one moves each point by, back from the board; ``ids`` (n,) are a bench's corners.
+    bow of one moves each point by, back from the board; ``ids`` (n,) are a bench's corners. ``scatter`` is by
+    what ``sigma_px`` was multiplied for this image beside others of its camera (``calib.adjust.scatter``).
     """
 
     name: str
@@ -44,6 +45,7 @@ class ImageTerm:
     approach: tuple[int, int] = (0, 0)
     bend: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     ids: np.ndarray | None = None
+    scatter: float = 1.0
 
     def part(self, index: int) -> str:
         """One of the dots or corners as a person says it."""
@@ -148,6 +150,16 @@ def with_kept(images: Sequence[ImageTerm], left_out: frozenset[str] | set[str]) 
 def widened_images(images: Sequence[ImageTerm], factors: Mapping[str, float]) -> tuple[ImageTerm, ...]:
     """Return the terms with sigmas times ``factors``, by kind."""
     return tuple(replace(t, sigma_px=t.sigma_px * factors.get(t.kind, 1.0)) for t in images)
+
+
+def scattered_images(images: Sequence[ImageTerm], scales: Mapping[str, float]) -> tuple[ImageTerm, ...]:
+    """Return the terms with the sigmas of some images times ``scales``, by name."""
+    return tuple(
+        replace(t, sigma_px=t.sigma_px * scales[t.name], scatter=t.scatter * scales[t.name])
+        if t.name in scales
+        else t
+        for t in images
+    )
 
 
 O_SIGMA_RAD = 0.02

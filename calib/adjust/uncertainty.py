@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import approx_fprime
 
 from calib.adjust.adjustment import Adjustment
-from calib.adjust.result import Calibration, Degenerate, ImageResiduals, StationResidual
+from calib.adjust.result import Calibration, Degenerate, FittedRig, ImageResiduals, StationResidual
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import MAST, Estimate
-from calib.errors import CalibError
-from calib.geometry import covariance as rig_covariance
 from calib.geometry.covariance import pixel_rates
+from calib.geometry.landing import landing_rates
 from calib.geometry.parameters import parameter_names, parameter_part
-from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig, gimbal
 from calib.geometry.rigid import FloatArray, tangents
-from calib.geometry.stereo import triangulate
-from calib.survey.records import Survey
+from calib.survey.records import Click, Survey
 
 Rms = dict[str, tuple[float, float]]
 
@@ -32,8 +28,12 @@ def image_residuals(
     state: Estimate,
     all_images: Sequence[ImageTerm],
     checks: Sequence[ImageTerm],
+    scatter: Mapping[str, float] | None = None,
 ) -> tuple[ImageResiduals, ...]:
-    """Return what remains of every image with dots; for a check image, the joint angles as read."""
+    """Return what remains of every image with dots; for a check image, the joint angles as read.
+
+    ``all_images`` and ``checks`` are with stated sigmas, ``scatter`` by image what these count times.
+    """
     used = {t.name: t.keep for t in problem.images}
     by_name = {i.name: i for i in survey.images}
     terms = [replace(t, keep=np.ones_like(t.keep)) for t in (*all_images, *checks)]
@@ -60,6 +60,7 @@ def image_residuals(
                 np.zeros(len(residual), dtype=bool) if keep is None else keep,
                 float(np.linalg.norm(centre)),
                 float(np.arccos(np.clip(abs(facing @ centre) / np.linalg.norm(centre), 0.0, 1.0))),
+                (scatter or {}).get(term.name, 1.0),
             )
         )
     return tuple(found)
@@ -83,6 +84,17 @@ def rms_by_camera(images: Iterable[ImageResiduals]) -> Rms:
 def check_rms(survey: Survey, state: Estimate, images: Iterable[ImageResiduals]) -> Rms:
     """Return the (x, y) rms over check images and clicks of each camera, pixels: none was fitted."""
     parts = [(i.camera, i.residuals_px) for i in images if i.purpose == "check"]
+    parts += [(camera, off) for _, camera, off in _check_clicks(survey, state)]
+    return _rms((camera, residual) for camera, residual in parts if np.isfinite(residual).all())
+
+
+def unseen_clicks(survey: Survey, state: Estimate) -> tuple[Click, ...]:
+    """Return the check clicks on points that their camera, as fitted, cannot see; no rms has them."""
+    return tuple(click for click, _, off in _check_clicks(survey, state) if not np.isfinite(off).all())
+
+
+def _check_clicks(survey: Survey, state: Estimate) -> Iterator[tuple[Click, str, FloatArray]]:
+    """Each click on a check point with its camera and what it is off by (1, 2), pixels."""
     points = {(p.setup, p.point): p.position_m for p in survey.station if p.kind == "check"}
     by_name = {i.name: i for i in survey.images}
     for click in survey.clicks:
@@ -93,9 +105,8 @@ def check_rms(survey: Survey, state: Estimate, images: Iterable[ImageResiduals])
         if image.pan_rad is not None and image.tilt_rad is not None:
             head = gimbal(state.mast, image.pan_rad, image.tilt_rad)
             in_rover = (in_rover - head.translation_m) @ head.rotation
-        pixel, _ = state.cameras[image.camera].project(in_rover)
-        parts.append((image.camera, pixel - click.pixel_px))
-    return _rms((camera, residual) for camera, residual in parts if np.isfinite(residual).all())
+        pixel, valid = state.cameras[image.camera].project(in_rover)
+        yield click, image.camera, np.where(valid[:, None], pixel, np.nan) - click.pixel_px
 
 
 def _rms(parts: Iterable[tuple[str, FloatArray]]) -> Rms:
@@ -169,7 +180,7 @@ def sigma_by_key(rig: Rig, names: Sequence[str], covariance: FloatArray) -> dict
 
 
 def pixel_covariance(
-    calibration: Calibration, camera: str, pan_rad: float, tilt_rad: float, points_m: FloatArray
+    calibration: FittedRig, camera: str, pan_rad: float, tilt_rad: float, points_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return predicted pixels (n, 2) of rover-frame points (n, 3), metres, and covariances (n, 2, 2), px².
 
@@ -177,7 +188,7 @@ def pixel_covariance(
     out as not-a-number.
     """
     rig, names = calibration.rig, calibration.parameter_names
-    pixels, rates = pixel_rates(rig, names, camera, pan_rad, tilt_rad, points_m)
+    pixels, rates, _ = pixel_rates(rig, names, camera, pan_rad, tilt_rad, points_m)
     return pixels, np.einsum("nip,pq,njq->nij", rates, calibration.covariance, rates)
 
 
@@ -189,21 +200,14 @@ def pointing_covariance(
     left_px: FloatArray,
     range_m: float,
     *,
-    aim: str | None = None,
-    aim_px: FloatArray | None = None,
     click_px: float = 0.0,
 ) -> FloatArray:
     """Return the covariance (2, 2), px², of where a target lands that was clicked in a stereo pair.
 
-    The target is ``range_m`` along the ray of ``left_px`` in the left image at the given joint angles.
-    It is found by stereo with the calibrated rig, the head is pointed so that it should land on ``aim_px``
-    (the image centre by default) of camera ``aim`` (the left one by default), and the true rig differs from
-    the calibrated one as the covariance says: errors that stereo and pointing share cancel.
-
-    Parameters
-    ----------
-    click_px
-        Sigma of a click coordinate, both images; 0 leaves the calibration alone.
+    The target is ``range_m`` along the ray of ``left_px`` in the left image at the given joint angles. It is
+    found by stereo with the calibrated rig, and the head is pointed so that it should land in the middle of
+    the left image (`calib.geometry.landing`). ``click_px`` is the sigma of a click coordinate in both images;
+    0 leaves the calibration alone.
 
     Raises
     ------
@@ -211,43 +215,11 @@ def pointing_covariance(
         If the target is not seen by both cameras, or cannot be pointed at.
     """
     rig = calibration.rig
-    aim = aim or pair[0]
-    model = rig.cameras[aim].model
-    wanted = np.array(model.image_center_px) if aim_px is None else np.asarray(aim_px, dtype=np.float64)
     rays = rig.camera_in_rover(pair[0], pan_rad, tilt_rad).ray(left_px)
     target = rays.origins_m + range_m * rays.directions
-    clicks = np.zeros((2, 2))
-    for row, name in enumerate(pair):
-        clicks[row], valid = rig.camera_in_rover(name, pan_rad, tilt_rad).project(target)
-        if not valid:
-            raise CalibError(f"camera {name} does not see the target at {target.round(3).tolist()} m")
-    moving = [calibration.part("mast.")]
-    moving += [calibration.part(f"cameras.{name}.") for name in dict.fromkeys((*pair, aim))]
-    columns = np.concatenate(moving)
-
-    def landed(step: FloatArray) -> FloatArray:
-        believed = rig_moved_along(calibration, columns, step[: len(columns)])
-        left, right = (believed.camera_in_rover(name, pan_rad, tilt_rad) for name in pair)
-        shift = step[len(columns) :].reshape(2, 2)
-        found = triangulate(left, right, clicks[0] + shift[0], clicks[1] + shift[1])
-        solution = solve(
-            believed.mast, believed.cameras[aim].model, found.position_m, wanted,
-            from_pan_rad=pan_rad, from_tilt_rad=tilt_rad,
-        )[0]  # fmt: skip
-        pixel, _ = rig.camera_in_rover(aim, solution.pan_rad, solution.tilt_rad).project(target)
-        return np.asarray(pixel)
-
-    spread = np.concatenate([np.sqrt(np.diag(calibration.covariance)[columns]), np.full(4, 0.1)])
-    rates = np.asarray(approx_fprime(np.zeros(len(spread)), landed, 1e-3 * np.maximum(spread, 1e-12)))
-    total = np.zeros((len(spread),) * 2)
-    total[: len(columns), : len(columns)] = calibration.covariance[np.ix_(columns, columns)]
-    total[len(columns) :, len(columns) :] = np.eye(4) * click_px**2
-    return np.asarray(rates @ total @ rates.T)
-
-
-def rig_moved_along(calibration: Calibration, columns: np.ndarray, step: FloatArray) -> Rig:
-    """Return the rig with the parameters at ``columns`` moved by ``step``."""
-    return rig_covariance.moved_rig(calibration.rig, [calibration.parameter_names[i] for i in columns], step)
+    rates = landing_rates(rig, calibration.parameter_names, pair, pan_rad, tilt_rad, target)
+    by_rig, by_clicks = rates.to_rig, click_px * rates.to_clicks
+    return np.asarray(by_rig @ calibration.covariance @ by_rig.T + by_clicks @ by_clicks.T)
 
 
 def open_parameters(

@@ -58,7 +58,7 @@ class WiderModel:
         ``mast``, ``harmonics of pan``, ``slip of tilt``, ``drift of tilt``, ``attitude``,
         ``joint readings``, ``lens of CAMERA``, ``change of CAMERA``, ``drift of CAMERA``,
         ``bow of the board``, ``spacing of the board``,
-        ``board moved`` or ``drawing`` (of the prisms).
+        ``board moved`` or ``drawing`` (of the prisms); ``images left out for a change of`` a camera or joint.
     sentence
         What it says.
     numbers, gain

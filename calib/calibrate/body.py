@@ -13,31 +13,29 @@ which they were corrected by.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri
 
-from calib.adjust.significance import chance, sigmas
-from calib.calibrate.body_sights import (
-    PRIOR_SHIFT_M,
-    PRIOR_TURN_RAD,
-    WORDS,
-    BodyPose,
-    BodySights,
-    Equations,
-    EyesApart,
-    LeftOutHandoff,
-    body_sights,
-)
+from calib.adjust.significance import THREE_SIGMAS, chance, sigmas
+from calib.calibrate.body_sights import BodySights, Equations, body_sights
 from calib.errors import NoCorrection
-from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import MOST_SIGMAS, RigCovariance, click_rates, pixel_rates
-from calib.geometry.parameters import parameter_names, parameter_part
+from calib.geometry.parameters import carried_errors, parameter_names, twist_rates
 from calib.geometry.rig import Rig
-from calib.geometry.rigid import FloatArray, rigid_rates, tangents
+from calib.geometry.rigid import FloatArray, Rigid, rigid_twists
 from calib.matching.handed_over import MatchedHandoff
+
+PRIOR_SHIFT_M, PRIOR_TURN_RAD = 0.005, 0.005
+"""Sigma an axis of how far two prism set-ups disagree: the paper's 5 mrad (2 mm at prisms 40 to 60 cm apart),
+and what that and the 2 mm themselves do at a camera some 0.7 m from the prisms."""
+
+STEP_NAMES = ("roll", "pitch", "yaw", "shift forward", "shift right", "shift down")
+"""A step's six numbers: about and along the rover's x (forward), y (right), z (down)."""
+
 
 SEEN = 4.0
 """A direction is seen if the hand-offs say four times as much of it as the prior."""
@@ -52,6 +50,100 @@ FALSE_ALARMS = 0.01
 """Chance that a record without blunders loses a hand-off."""
 
 MOST_OUTLIERS = 1 / 3
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOutHandoff:
+    """A hand-off that was not used, and the test it failed.
+
+    It contradicts the rest, by ``off_px`` in the worst camera; or, if it is not ``one_point``, its clicks
+    contradict each other, by ``off_px`` across the epipolar line.
+    """
+
+    name: str
+    off_px: float
+    statistic: float
+    limit: float
+    one_point: bool = True
+
+    @property
+    def sentence(self) -> str:
+        """The outlier for a person."""
+        if not self.one_point:
+            return (
+                f"{self.name} was not used: its two clicks do not mean one point, they are "
+                f"{self.off_px:.1f} px apart across the epipolar line, {math.sqrt(self.statistic):.1f} sigma"
+            )
+        return f"{self.name} is off by {self.off_px:.1f} px after the correction and was not used"
+
+
+@dataclass(frozen=True, eq=False)
+class CamerasApart:
+    """The remainder between the two cameras of a pair: mean of right less left, px, covariance, sigmas.
+
+    One rigid motion cannot explain it: one camera moved by itself, or its model is off.
+    """
+
+    offset_px: FloatArray
+    covariance_px2: FloatArray
+    sigmas: float
+
+
+@dataclass(frozen=True, eq=False)
+class BodyPose:
+    """A proposed correction of a body pair, and how sure it is.
+
+    Attributes
+    ----------
+    cameras, origin_m
+        Which move, and (3,) the middle of their centres before, rover frame: the turn is about it.
+    step
+        (6,) rotation vector, radians, and shift, metres, rover axes.
+    covariance
+        (6, 6) of the step, with the prior.
+    gain
+        (6, n, 2k): by the residuals of the used hand-offs the step is gain times these.
+    motion
+        The same motion of the cameras as a transform in the rover frame.
+    used, outliers
+        The hand-offs that were, and those that were not.
+    rms_px
+        Camera to ((x, y) before, (x, y) after), over the used hand-offs.
+    chi2_before, chi2_after, degrees_of_freedom
+        Weighted sum of squares of what is found less what is predicted, and what it is expected to be after.
+    scale
+        ``chi2_after`` over its degrees of freedom where that is above 1: the covariance is widened by it.
+    chance, sigmas
+        Of hand-offs without any motion that look as moved as these, and the same in sigmas.
+    seen, unseen
+        How many of the six directions the hand-offs see, and a sentence for each that they do not.
+    cameras_apart
+        For a pair that both found a target of.
+    """
+
+    cameras: tuple[str, ...]
+    origin_m: FloatArray
+    step: FloatArray
+    covariance: FloatArray
+    gain: FloatArray
+    motion: Rigid
+    used: BodySights
+    outliers: tuple[LeftOutHandoff, ...]
+    rms_px: dict[str, tuple[tuple[float, float], tuple[float, float]]]
+    chi2_before: float
+    chi2_after: float
+    degrees_of_freedom: float
+    scale: float
+    chance: float
+    sigmas: float
+    seen: int
+    unseen: tuple[str, ...]
+    cameras_apart: CamerasApart | None
+
+    @property
+    def significant(self) -> bool:
+        """Whether chance alone does so less often than three sigma."""
+        return self.chance < THREE_SIGMAS
 
 
 def fit_body_pose(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHandoff]) -> BodyPose:
@@ -79,16 +171,17 @@ def fit_body_pose(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHa
     if np.mean(~keep) > MOST_OUTLIERS:
         raise NoCorrection(
             "inconsistent",
-            f"{np.sum(~keep)} of {len(keep)} hand-offs to {_named(cameras)} contradict the rest; look "
+            f"{np.sum(~keep)} of {len(keep)} hand-offs to {' and '.join(cameras)} contradict the rest; look "
             "at them before anything is corrected by them",
         )
-    used = _part(every, keep)
+    used = every.part(keep)
     _enough(used)
     fit = _fit(used)
     if not fit.settled:
         raise NoCorrection(
             "not_settled",
-            f"the fit of {_named(cameras)} did not settle in {_STEPS} steps; the hand-offs hardly fix it",
+            f"the fit of {' and '.join(cameras)} did not settle in {_STEPS} steps; the hand-offs hardly "
+            "fix it",
         )
     left_out = [
         LeftOutHandoff(one.name, gap.across_px, gap.sigmas**2, MOST_SIGMAS**2, one_point=False)
@@ -98,7 +191,7 @@ def fit_body_pose(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHa
     for i in np.flatnonzero(~keep):
         off = float(np.linalg.norm(at.residual_px[i].reshape(-1, 2), axis=1).max())
         left_out.append(LeftOutHandoff(every.handoffs[i].name, off, float(statistics[i]), float(limits[i])))
-    return _told(used, fit, tuple(left_out))
+    return _correction(used, fit, tuple(left_out))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +221,7 @@ _ENOUGH = 1e-3
 
 def _enough(sights: BodySights) -> None:
     """Refuse too few hand-offs, and those from one corner of the picture."""
-    named = _named(sights.cameras)
+    named = " and ".join(sights.cameras)
     count = len(sights.handoffs)
     if count < FEWEST:
         raise NoCorrection(
@@ -136,8 +229,8 @@ def _enough(sights: BodySights) -> None:
             f"{count} usable hand-offs to {named}; at least {FEWEST} that were accepted are needed",
         )
     spans = []
-    for eye, name in enumerate(sights.cameras):
-        found = sights.found_px[sights.seen[:, eye], eye]
+    for k, name in enumerate(sights.cameras):
+        found = sights.found_px[sights.seen[:, k], k]
         if len(found) > 1:
             main = np.linalg.svd(found - found.mean(axis=0), full_matrices=False)[2][0]
             spans.append((float(np.ptp(found @ main)), sights.rig.cameras[name].model.size_px[0], name))
@@ -165,7 +258,7 @@ def _fit(sights: BodySights, robust: bool = False) -> _BodyFit:
     step, scale, settled = np.zeros(6), 1.0, False
     before = at = sights.equations(step)
     numbers = 2 * sights.seen.sum(axis=1)
-    bend = chdtri(numbers, 0.05)
+    bend, middle = chdtri(numbers, 0.05), chdtri(numbers, 0.5)
     for _ in range(_ROBUST_STEPS if robust else _STEPS):
         weights = np.ones(len(numbers))
         if robust:
@@ -180,17 +273,13 @@ def _fit(sights: BodySights, robust: bool = False) -> _BodyFit:
         statistics = _normal(at, weights)[2]
         fitted = np.trace(np.linalg.solve(information / scale + _PRIOR, information / scale))
         freedom = max(float(numbers.sum() - fitted), 1.0)
-        typical = _typical(statistics, numbers) if robust else float(statistics.sum()) / freedom
-        scale = max(1.0, typical)
+        # of the typical statistic: blunders do not move it
+        typical = np.median(statistics / middle) if robust else float(statistics.sum()) / freedom
+        scale = max(1.0, float(typical))
         if settled:
             break
     information, _, statistics = _normal(at, np.ones(len(numbers)))
     return _BodyFit(step, before, at, information, scale, freedom, float(statistics.sum()), settled)
-
-
-def _typical(statistics: FloatArray, numbers: np.ndarray) -> float:
-    """How many times larger the typical statistic is than its sigmas say; blunders do not move it."""
-    return float(np.median(statistics / chdtri(numbers, 0.5)))
 
 
 def _keep(sights: BodySights) -> tuple[np.ndarray, FloatArray, FloatArray]:
@@ -204,7 +293,7 @@ def _keep(sights: BodySights) -> tuple[np.ndarray, FloatArray, FloatArray]:
     for _ in range(count):
         if np.mean(~keep) > MOST_OUTLIERS:
             break
-        fit = _fit(_part(sights, keep))
+        fit = _fit(sights.part(keep))
         at = sights.equations(fit.step)
         spread = np.einsum("nij,jk,nlk->nil", at.rates, fit.covariance, at.rates)
         # A fitted residual is less sure than its noise by what the fit took; one left out, more.
@@ -221,16 +310,7 @@ def _keep(sights: BodySights) -> tuple[np.ndarray, FloatArray, FloatArray]:
     return keep, statistics, limits
 
 
-def _part(sights: BodySights, keep: np.ndarray) -> BodySights:
-    return BodySights(
-        sights.rig, sights.cameras, sights.origin_m,
-        tuple(one for one, good in zip(sights.handoffs, keep, strict=True) if good),
-        sights.positions_m[keep], sights.covariances_m2[keep], sights.rates_m_per_px[keep],
-        sights.found_px[keep], sights.noise_px2[keep], sights.seen[keep],
-    )  # fmt: skip
-
-
-def _told(used: BodySights, fit: _BodyFit, outliers: tuple[LeftOutHandoff, ...]) -> BodyPose:
+def _correction(used: BodySights, fit: _BodyFit, outliers: tuple[LeftOutHandoff, ...]) -> BodyPose:
     """Significance, open directions, and what becomes of the residuals."""
     information, gradient, statistics = _normal(fit.before, np.ones(len(used.handoffs)))
     # In units of the prior's sigma: what the hand-offs say of each direction, against 1 that the prior says.
@@ -242,11 +322,11 @@ def _told(used: BodySights, fit: _BodyFit, outliers: tuple[LeftOutHandoff, ...])
     inverse = np.linalg.inv(fit.after.covariance_px2)
     gain = np.einsum("ij,nkj,nkl->inl", fit.covariance / fit.scale, fit.after.rates, inverse)
     rms = {}
-    for eye, name in enumerate(used.cameras):
-        on = used.seen[:, eye]
+    for k, name in enumerate(used.cameras):
+        on = used.seen[:, k]
         if on.any():
             sizes = [
-                np.sqrt(np.mean(at.residual_px[on, 2 * eye : 2 * eye + 2] ** 2, axis=0)).tolist()
+                np.sqrt(np.mean(at.residual_px[on, 2 * k : 2 * k + 2] ** 2, axis=0)).tolist()
                 for at in (fit.before, fit.after)
             ]
             rms[name] = ((sizes[0][0], sizes[0][1]), (sizes[1][0], sizes[1][1]))
@@ -268,22 +348,22 @@ def _told(used: BodySights, fit: _BodyFit, outliers: tuple[LeftOutHandoff, ...])
         sigmas=sigmas(probability),
         seen=int(seen.sum()),
         unseen=tuple(_sentence(direction) for direction in directions.T[~seen]),
-        eyes_apart=_eyes_apart(used, fit),
+        cameras_apart=_cameras_apart(used, fit),
     )
 
 
 def _sentence(direction: FloatArray) -> str:
     """A direction that the hand-offs leave to the prior, in words."""
     toward = direction * np.sign(direction[np.argmax(np.abs(direction))])
-    large = sorted(zip(-np.abs(toward), toward, WORDS, strict=True))
-    parts = [f"{weight:+.2f} {word}" for size, weight, word in large if size < -0.3]
+    large = sorted(zip(-np.abs(toward), toward, STEP_NAMES, strict=True))
+    parts = [f"{weight:+.2f} {name}" for size, weight, name in large if size < -0.3]
     return (
         f"not determined by these hand-offs: {' with '.join(parts)}, in units of {1e3 * PRIOR_SHIFT_M:g} mm "
         f"and {1e3 * PRIOR_TURN_RAD:g} mrad; only the prior holds it"
     )
 
 
-def _eyes_apart(used: BodySights, fit: _BodyFit) -> EyesApart | None:
+def _cameras_apart(used: BodySights, fit: _BodyFit) -> CamerasApart | None:
     """What is left between left and right, over hand-offs that both found."""
     if len(used.cameras) != 2:
         return None
@@ -299,11 +379,7 @@ def _eyes_apart(used: BodySights, fit: _BodyFit) -> EyesApart | None:
     # What the fit explains whole has no noise left; half a thousandth of the noise is none.
     covariance += 5e-4 * noise
     probability = chance(float(offset @ np.linalg.solve(covariance, offset)), 2)
-    return EyesApart(offset, covariance, sigmas(probability))
-
-
-def _named(cameras: Sequence[str]) -> str:
-    return " and ".join(cameras)
+    return CamerasApart(offset, covariance, sigmas(probability))
 
 
 def corrected_rig(rig: Rig, correction: BodyPose) -> Rig:
@@ -327,14 +403,16 @@ def corrected_covariance(rig: Rig, known: RigCovariance, correction: BodyPose) -
     size = len(known.names)
     per_step, carried = np.zeros((size, 6)), np.eye(size)
     at = {name: i for i, name in enumerate(known.names)}
+    twists = rigid_twists(correction.origin_m + correction.step[3:]).T
     for camera in correction.cameras:
         model = rig.cameras[camera].model
         names = [f"cameras.{camera}.{part}" for part in parameter_names(model.kind)]
         mine = [i for i, name in enumerate(names) if name in at]
         rows = [at[names[i]] for i in mine]
-        step, turn = _moved_parameters(model, correction)
-        per_step[rows] = step[mine]
-        carried[np.ix_(rows, rows)] = turn[np.ix_(mine, mine)]
+        moved = model.moved(correction.motion)
+        per_step[rows] = (twist_rates(moved) @ twists)[mine]
+        errors = carried_errors(model, moved, correction.motion.rotation)
+        carried[np.ix_(rows, rows)] = errors[np.ix_(mine, mine)]
     by_residual = np.einsum("pi,inl->pnl", per_step, correction.gain)  # L K
     stays = carried - np.einsum("pnl,nlq->pq", by_residual, _parameter_rates(rig, known, correction))
     noise = correction.scale * correction.used.equations(correction.step).covariance_px2
@@ -342,38 +420,15 @@ def corrected_covariance(rig: Rig, known: RigCovariance, correction: BodyPose) -
     return RigCovariance(known.names, (total + total.T) / 2)
 
 
-def _moved_parameters(model: CameraModel, correction: BodyPose) -> tuple[FloatArray, FloatArray]:
-    """A camera's parameters' rates to the step (p, 6), and what its errors turn into by the motion (p, p)."""
-    moved = model.moved(correction.motion)
-    rotation = correction.motion.rotation
-    size = len(parameter_names(model.kind))
-    rates, turn = np.zeros((size, 6)), np.eye(size)
-    for letter in dict.fromkeys(model.letters):
-        part = parameter_part(model.kind, letter)
-        if letter in "RED":
-            continue
-        now: FloatArray = getattr(moved, letter)
-        about = correction.origin_m + correction.step[3:] if letter == "C" else np.zeros(3)
-        follows = rigid_rates(np.eye(3)[None], now[None], about)[0]
-        if letter != "C":
-            follows[:, 3:] = 0.0  # no place: it turns, and a shift leaves it
-        if letter in "AO":
-            on, before = tangents(now), tangents(getattr(model, letter))
-            rates[part], turn[part, part] = on @ follows, on @ rotation @ before.T
-        else:
-            rates[part], turn[part, part] = follows, rotation
-    return rates, turn
-
-
 def _parameter_rates(rig: Rig, known: RigCovariance, correction: BodyPose) -> FloatArray:
     """(n, 2k, p): predicted pixels' rates to the rig's parameters, those of the source pair included."""
     used, equations = correction.used, correction.used.equations(np.zeros(6))
-    count, eyes = used.seen.shape
-    rates = np.zeros((count, eyes, 2, len(known.names)))
-    for eye, name in enumerate(used.cameras):
-        on = used.seen[:, eye]
-        rates[on, eye] = pixel_rates(rig, known.names, name, 0.0, 0.0, used.positions_m[on])[1]
-    flat = rates.reshape(count, 2 * eyes, -1)
+    count, cameras = used.seen.shape
+    rates = np.zeros((count, cameras, 2, len(known.names)))
+    for k, name in enumerate(used.cameras):
+        on = used.seen[:, k]
+        rates[on, k] = pixel_rates(rig, known.names, name, 0.0, 0.0, used.positions_m[on]).to_rig
+    flat = rates.reshape(count, 2 * cameras, -1)
     for i, one in enumerate(used.handoffs):
         joints = (one.joints.pan_rad, one.joints.tilt_rad)
         clicked = click_rates(rig, known.names, one.pair, *joints, used.positions_m[i])

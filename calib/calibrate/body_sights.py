@@ -1,7 +1,7 @@
 """Accepted hand-offs as equations for the pose of a body pair: what is off, by which rates, how surely.
 
-The mast cameras define the rover frame here; the body's cameras move as one rigid body by a *step*: a shift
-(3, metres) and a turn (3, radians, a rotation vector) about the middle of their centres, rover axes.
+The mast cameras define the rover frame here; the body's cameras move as one rigid body by a *step*: a turn
+(3, radians, a rotation vector) about the middle of their centres and a shift (3, metres), rover axes.
 Clicks and joint readings err once per hand-off, so the cameras of one hand-off share that part of the noise.
 
 `calib.calibrate.body` makes a correction of them, with what was left out.
@@ -9,20 +9,17 @@ Clicks and joint readings err once per hand-off, so the cameras of one hand-off 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from calib.adjust.significance import THREE_SIGMAS
 from calib.errors import NoStereoPoint
 from calib.geometry.covariance import (
     MOST_SIGMAS,
     RIG_PX,
     RayGap,
-    RigCovariance,
     click_covariance,
     ray_gap,
     silent_cameras,
@@ -30,7 +27,7 @@ from calib.geometry.covariance import (
 )
 from calib.geometry.rig import Rig, gimbal, gimbal_rates, numbers_of
 from calib.geometry.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
-from calib.geometry.stereo import Triangulation, triangulate
+from calib.geometry.stereo import triangulate
 from calib.matching.handed_over import MODEL_PX, MatchedHandoff
 
 _JOINTS = np.array([8, 9])
@@ -82,6 +79,12 @@ class BodySights:
     seen: np.ndarray
     apart: tuple[tuple[MatchedHandoff, RayGap], ...] = ()
 
+    def part(self, keep: np.ndarray) -> BodySights:
+        """Return the same with some (n,) of the hand-offs."""
+        arrays = ("positions_m", "covariances_m2", "rates_m_per_px", "found_px", "noise_px2", "seen")
+        handoffs = tuple(one for one, good in zip(self.handoffs, keep, strict=True) if good)
+        return replace(self, handoffs=handoffs, **{name: getattr(self, name)[keep] for name in arrays})
+
     def pose(self, step: FloatArray) -> Rigid:
         """Return the rigid motion that a step is, in the rover frame."""
         return moved_rigid(Rigid(np.eye(3), self.origin_m), step) @ Rigid(np.eye(3), -self.origin_m)
@@ -89,24 +92,26 @@ class BodySights:
     def equations(self, step: FloatArray) -> Equations:
         """Return the equations with the body's cameras moved by a step (6,)."""
         moved = self.pose(step)
-        count, eyes = self.seen.shape
-        residual = np.zeros((count, eyes, 2))
-        rates, point_rates = np.zeros((count, eyes, 2, 6)), np.zeros((count, eyes, 2, 3))
-        covariance = np.zeros((count, eyes, 2, eyes, 2))
-        for eye, name in enumerate(self.cameras):
-            on = self.seen[:, eye]
+        count, cameras = self.seen.shape
+        residual = np.zeros((count, cameras, 2))
+        rates, point_rates = np.zeros((count, cameras, 2, 6)), np.zeros((count, cameras, 2, 3))
+        covariance = np.zeros((count, cameras, 2, cameras, 2))
+        for k, name in enumerate(self.cameras):
+            on = self.seen[:, k]
             model = self.rig.cameras[name].model.moved(moved)
             pixels, per_point, _ = model.project_jacobian(self.positions_m[on])
-            residual[on, eye] = self.found_px[on, eye] - pixels
-            point_rates[on, eye] = per_point
+            residual[on, k] = self.found_px[on, k] - pixels
+            point_rates[on, k] = per_point
             # A camera that moves one way sees its targets go the other.
-            rates[on, eye] = -rigid_rates(per_point, self.positions_m[on], self.origin_m + step[3:])
-            covariance[on, eye, :, eye] = self.noise_px2[on, eye]
-            covariance[~on, eye, :, eye] = np.eye(2)
-        flat = point_rates.reshape(count, 2 * eyes, 3)
-        total = covariance.reshape(count, 2 * eyes, 2 * eyes)
+            rates[on, k] = -rigid_rates(per_point, self.positions_m[on], self.origin_m + step[3:])
+            covariance[on, k, :, k] = self.noise_px2[on, k]
+            covariance[~on, k, :, k] = np.eye(2)
+        flat = point_rates.reshape(count, 2 * cameras, 3)
+        total = covariance.reshape(count, 2 * cameras, 2 * cameras)
         total += np.einsum("nij,njk,nlk->nil", flat, self.covariances_m2, flat)
-        return Equations(residual.reshape(count, 2 * eyes), rates.reshape(count, 2 * eyes, 6), flat, total)
+        return Equations(
+            residual.reshape(count, 2 * cameras), rates.reshape(count, 2 * cameras, 6), flat, total
+        )
 
 
 def body_groups(rig: Rig) -> dict[str, tuple[str, ...]]:
@@ -135,179 +140,52 @@ def body_sights(
         If the rig's stored covariance is none of it.
     """
     known = stored_covariance(rig)
-    origin = np.mean([rig.cameras[name].model.C for name in cameras], axis=0)
-    used, rows, apart = [], [], []
+    used, rows, apart = (
+        list[MatchedHandoff](),
+        list[tuple[FloatArray, ...]](),
+        list[tuple[MatchedHandoff, RayGap]](),
+    )
     for one in handoffs:
         if not all(name in rig.cameras and rig.cameras[name].on == "head" for name in one.pair):
             continue
-        seen = _seen(rig, one)
-        row = None if seen is None else _row(rig, cameras, one, seen, model_px)
-        if seen is None or row is None:
+        pan_rad, tilt_rad, sigma_rad = one.joints.pan_rad, one.joints.tilt_rad, one.joints.sigma_rad
+        left, right = (rig.camera_in_rover(name, pan_rad, tilt_rad) for name in one.pair)
+        try:
+            target = triangulate(left, right, one.clicks_px[0], one.clicks_px[1], one.sigma_px)
+        except NoStereoPoint:
             continue
-        gap = ray_gap(seen, _allowed_px2(rig, one, seen, known, model_px))
+        found, noise = np.zeros((len(cameras), 2)), np.zeros((len(cameras), 2, 2))
+        seen = np.zeros(len(cameras), dtype=bool)
+        for k, name in enumerate(cameras):
+            match = one.found.get(name)
+            if match is None or not rig.cameras[name].model.project(target.position_m)[1]:
+                continue
+            assert match.found_px is not None and match.found_covariance_px2 is not None
+            found[k], seen[k] = match.found_px, True
+            noise[k] = match.found_covariance_px2 + model_px**2 * np.eye(2)
+        if not seen.any():
+            continue
+        allowed_px2 = click_covariance(
+            rig, one.pair, pan_rad, tilt_rad, target.position_m,
+            sigma_px=one.sigma_px, sigma_rad=sigma_rad, calibration=known,
+        )  # fmt: skip
+        unknown = silent_cameras(one.pair, known)
+        model_px2 = [RIG_PX**2 if name in unknown else model_px**2 for name in one.pair]
+        gap = ray_gap(target, allowed_px2 + np.diag(np.repeat(model_px2, 2)))
         if gap.sigmas > MOST_SIGMAS:
             apart.append((one, gap))
-        else:
-            used.append(one)
-            rows.append(row)
+            continue
+        head = gimbal(numbers_of(rig.mast), pan_rad, tilt_rad)
+        turned = gimbal_rates(np.eye(3)[None], target.position_m[None], head, _JOINTS)[0]
+        covariance = target.covariance_m2 + sigma_rad**2 * turned @ turned.T
+        used.append(one)
+        rows.append((target.position_m, covariance, target.rates_m_per_px, found, noise, seen))
     k = len(cameras)
     shapes = ((3,), (3, 3), (3, 4), (k, 2), (k, 2, 2), (k,))
-    position, covariance, rates, found, noise, there = (
+    position, covariance, rates, found, noise, seen = (
         np.array([row[i] for row in rows]).reshape(len(rows), *shape) for i, shape in enumerate(shapes)
     )
     return BodySights(
-        rig, tuple(cameras), origin, tuple(used), position, covariance, rates, found, noise,
-        there.astype(bool), tuple(apart),
+        rig, tuple(cameras), np.mean([rig.cameras[name].model.C for name in cameras], axis=0), tuple(used),
+        position, covariance, rates, found, noise, seen.astype(bool), tuple(apart),
     )  # fmt: skip
-
-
-def _seen(rig: Rig, one: MatchedHandoff) -> Triangulation | None:
-    """The point of a hand-off's clicks by this rig; None if there is none."""
-    left, right = (rig.camera_in_rover(n, one.joints.pan_rad, one.joints.tilt_rad) for n in one.pair)
-    try:
-        return triangulate(left, right, one.clicks_px[0], one.clicks_px[1], one.sigma_px)
-    except NoStereoPoint:
-        return None
-
-
-def _allowed_px2(
-    rig: Rig, one: MatchedHandoff, seen: Triangulation, known: RigCovariance | None, model_px: float
-) -> FloatArray:
-    """Covariance (4, 4) of a hand-off's clicks that a gap of its rays is judged by."""
-    allowed = click_covariance(
-        rig, one.pair, one.joints.pan_rad, one.joints.tilt_rad, seen.position_m,
-        sigma_px=one.sigma_px, sigma_rad=one.joints.sigma_rad, calibration=known,
-    )  # fmt: skip
-    unknown = silent_cameras(one.pair, known)
-    model_px2 = [RIG_PX**2 if name in unknown else model_px**2 for name in one.pair]
-    return np.asarray(allowed + np.diag(np.repeat(model_px2, 2)))
-
-
-def _row(
-    rig: Rig, cameras: Sequence[str], one: MatchedHandoff, seen: Triangulation, model_px: float
-) -> tuple[FloatArray, ...] | None:
-    """One hand-off's position, covariance, rates, found pixels, their noise, and which are there."""
-    at = (one.joints.pan_rad, one.joints.tilt_rad)
-    turned = gimbal_rates(np.eye(3)[None], seen.position_m[None], gimbal(numbers_of(rig.mast), *at), _JOINTS)[
-        0
-    ]
-    covariance = seen.covariance_m2 + one.joints.sigma_rad**2 * turned @ turned.T
-    found, noise = np.zeros((len(cameras), 2)), np.zeros((len(cameras), 2, 2))
-    there = np.zeros(len(cameras), dtype=bool)
-    accepted = one.found
-    for eye, name in enumerate(cameras):
-        match = accepted.get(name)
-        if match is None or not rig.cameras[name].model.project(seen.position_m)[1]:
-            continue
-        assert match.found_px is not None and match.found_covariance_px2 is not None
-        found[eye], there[eye] = match.found_px, True
-        noise[eye] = match.found_covariance_px2 + model_px**2 * np.eye(2)
-    if not there.any():
-        return None
-    return seen.position_m, covariance, seen.rates_m_per_px, found, noise, there
-
-
-PRIOR_SHIFT_M, PRIOR_TURN_RAD = 0.005, 0.005
-"""Sigma an axis of how far two prism set-ups disagree: the paper's 5 mrad (2 mm at prisms 40 to 60 cm apart),
-and what that and the 2 mm themselves do at a camera some 0.7 m from the prisms."""
-
-WORDS = ("roll", "pitch", "yaw", "shift forward", "shift right", "shift down")
-"""A step's six numbers: about and along the rover's x (forward), y (right), z (down)."""
-
-
-@dataclass(frozen=True, eq=False)
-class LeftOutHandoff:
-    """A hand-off that was not used: which, by how much (px), and the failed test.
-
-    It contradicts the rest, by ``off_px`` in the worst camera; or, if it is not ``one_point``, its clicks
-    contradict each other, by ``off_px`` across the epipolar line.
-    """
-
-    name: str
-    off_px: float
-    statistic: float
-    limit: float
-    one_point: bool = True
-
-    @property
-    def sentence(self) -> str:
-        """The outlier in words."""
-        if not self.one_point:
-            return (
-                f"{self.name} was not used: its two clicks do not mean one point, they are "
-                f"{self.off_px:.1f} px apart across the epipolar line, {math.sqrt(self.statistic):.1f} sigma"
-            )
-        return f"{self.name} is off by {self.off_px:.1f} px after the correction and was not used"
-
-
-@dataclass(frozen=True, eq=False)
-class EyesApart:
-    """The remainder between the two cameras of a pair: mean of right less left, px, covariance, sigmas.
-
-    One rigid motion cannot explain it: one camera moved by itself, or its model is off.
-    """
-
-    offset_px: FloatArray
-    covariance_px2: FloatArray
-    sigmas: float
-
-
-@dataclass(frozen=True, eq=False)
-class BodyPose:
-    """A proposed correction of a body pair, and how sure it is.
-
-    Attributes
-    ----------
-    cameras
-        Which move.
-    origin_m
-        (3,) the middle of their centres before, rover frame: the turn is about it.
-    step
-        (6,) rotation vector, radians, and shift, metres, rover axes.
-    covariance
-        (6, 6) of the step, with the prior.
-    gain
-        (6, n, 2k): the step is the sum of gain times residual over the used hand-offs' pixels.
-    motion
-        The same motion of the cameras as a transform in the rover frame.
-    used, outliers
-        Names of the hand-offs that were, and those that were not.
-    rms_px
-        Camera to ((x, y) before, (x, y) after), over the used hand-offs.
-    chi2_before, chi2_after, degrees_of_freedom
-        Weighted sum of squares of what is found less what is predicted, and what it is expected to be after.
-    scale
-        ``chi2_after`` over its degrees of freedom where that is above 1: the covariance is widened by it.
-    chance, sigmas
-        Of hand-offs without any motion that look as moved as these, and the same in sigmas.
-    seen
-        How many of the six directions the hand-offs see.
-    unseen
-        A sentence for each that they do not see.
-    eyes_apart
-        For a pair that both found a target of.
-    """
-
-    cameras: tuple[str, ...]
-    origin_m: FloatArray
-    step: FloatArray
-    covariance: FloatArray
-    gain: FloatArray
-    motion: Rigid
-    used: BodySights
-    outliers: tuple[LeftOutHandoff, ...]
-    rms_px: dict[str, tuple[tuple[float, float], tuple[float, float]]]
-    chi2_before: float
-    chi2_after: float
-    degrees_of_freedom: float
-    scale: float
-    chance: float
-    sigmas: float
-    seen: int
-    unseen: tuple[str, ...]
-    eyes_apart: EyesApart | None
-
-    @property
-    def significant(self) -> bool:
-        """Whether chance alone does so less often than three sigma."""
-        return self.chance < THREE_SIGMAS

@@ -12,14 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.adjust.adjustment import HUBER, Adjustment
-from calib.adjust.solver import minimise
+from calib.adjust.significance import MEDIAN_OF_TWO
 from calib.adjust.terms import ImageTerm
-from calib.adjust.unknowns import Estimate
-from calib.calibrate.starts.views import ViewPoses, ViewsTooFew, poses_of, view_poses
+from calib.calibrate.starts.agreeing import thinned
+from calib.calibrate.starts.views import ViewsTooFew, poses_of, view_poses
 from calib.geometry.cahvor import CameraModel, Kind
-from calib.geometry.parameters import parameter_names, predict
-from calib.geometry.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
+from calib.geometry.parameters import parameter_names
 
 FAMILIES: tuple[Kind, ...] = ("CAHV", "OPENCV4", "CAHVOR", "OPENCV5", "OPENCV8", "OPENCV_FISHEYE", "CAHVORE")
 FOLDS = 5
@@ -31,8 +29,6 @@ LEAST_PART = 0.02
 
 MOST_IMAGES, MOST_POINTS = 20, 40
 """As many pictures, spread over all, and points of each, separate families."""
-
-_STEPS = 8
 
 
 @dataclass(frozen=True)
@@ -74,21 +70,20 @@ def compare_families(
         Families; one that explains no images is left out.
     """
     some = np.unique(np.linspace(0, len(images) - 1, min(MOST_IMAGES, len(images))).astype(int))
-    images = [_thinned(images[at]) for at in some]
+    images = [thinned(images[at], MOST_POINTS) for at in some]
     scores = []
     for kind in kinds:
         found = np.full(len(images), np.nan)
         for fold in range(FOLDS):
             seen = [term for at, term in enumerate(images) if at % FOLDS != fold]
             try:
-                views = view_poses(seen, kind, size_px, focal_px)
-                model = fitted_alone(seen, views)
+                model = view_poses(seen, kind, size_px, focal_px, images_for_lens=len(seen)).model
             except ViewsTooFew:
                 continue
             for at in range(fold, len(images), FOLDS):
                 found[at] = _predicted_px2(model, images[at])
-        if np.isfinite(found).any():
-            left_out_px = float(np.sqrt(np.nanmedian(found)))
+        if np.isfinite(found).any():  # a picture that a family cannot predict counts as infinitely far off
+            left_out_px = float(np.sqrt(np.median(np.nan_to_num(found, nan=np.inf))))
             scores.append(FamilyScore(kind, len(parameter_names(kind)), left_out_px, tuple(found.tolist())))
     return tuple(scores)
 
@@ -102,6 +97,8 @@ def earned(scores: Sequence[FamilyScore], now: Kind) -> FamilyScore:
     best = next((one for one in ordered if one.kind == now), ordered[0])
     for other in ordered:
         gain = np.log(np.array(best.by_image_px2)) - np.log(np.array(other.by_image_px2))
+        if (np.isnan(other.by_image_px2) & np.isfinite(best.by_image_px2)).any():
+            continue  # it loses a picture that the smaller one predicts
         gain = gain[np.isfinite(gain)]
         if len(gain) < 2 or other.left_out_px > (1.0 - LEAST_PART) * best.left_out_px:
             continue
@@ -110,62 +107,14 @@ def earned(scores: Sequence[FamilyScore], now: Kind) -> FamilyScore:
     return best
 
 
-def fitted_alone(images: Sequence[ImageTerm], views: ViewPoses) -> CameraModel:
-    """Return the camera that images with free boards say, begun where ``view_poses`` ended.
-
-    Raises
-    ------
-    ViewsTooFew
-        If fewer than three of them can be used.
-    """
-    terms = [term for term in images if term.name in views.poses and term.name not in views.doubtful]
-    if len(terms) < 3:
-        raise ViewsTooFew(f"{len(terms)} images can be used where at least 3 are expected")
-    terms = [_alone(term, term.keep & ~views.strays[term.name]) for term in terms]
-    poses = {term.board: views.poses[term.name][0] for term in terms}
-    start = Estimate({terms[0].camera: views.model}, np.zeros(8), {}, poses, {}, np.zeros((0, 2)))
-    problem = Adjustment(terms, (), start, mast_parameters=0, huber=HUBER)
-    return minimise(problem, start, weak=problem.weak, steps=60).state.cameras[terms[0].camera]
-
-
-def _thinned(term: ImageTerm) -> ImageTerm:
-    """The picture with some of its points, spread over all."""
-    kept = np.flatnonzero(term.keep)
-    few = kept[np.linspace(0, len(kept) - 1, min(MOST_POINTS, len(kept))).astype(int)]
-    keep = np.zeros_like(term.keep)
-    keep[few] = True
-    return replace(term, keep=keep)
-
-
-def _alone(term: ImageTerm, keep: np.ndarray) -> ImageTerm:
-    return replace(term, board=(term.name, ""), attitude=None, keep=keep)
-
-
 def _predicted_px2(model: CameraModel, term: ImageTerm) -> float:
     """Typical square of a picture's odd points, its board placed by the even ones; not-a-number if lost."""
-    found = poses_of(model, term)
-    if not found:
+    kept = np.flatnonzero(term.keep)
+    even, odd = np.zeros_like(term.keep), kept[1::2]
+    even[kept[::2]] = True
+    poses = poses_of(model, replace(term, keep=even))
+    if not poses or not len(odd):
         return float("nan")
-    points, pixels, sigma = term.in_board_m[term.keep], term.pixels_px[term.keep], term.sigma_px[term.keep]
-    even = np.arange(len(points)) % 2 == 0
-    pose = _placed(model, found[0][1], points[even], pixels[even], sigma[even])
-    off = model.project(pose.points(points[~even]))[0] - pixels[~even]
-    squares = np.square(off[np.isfinite(off).all(axis=1)])
-    return float(np.median(squares.sum(axis=1)) / (2.0 * np.log(2.0))) if len(squares) else float("nan")
-
-
-def _placed(
-    model: CameraModel, pose: Rigid, points_m: FloatArray, pixels_px: FloatArray, sigma_px: FloatArray
-) -> Rigid:
-    """The pose by Gauss and Newton's steps from one near it."""
-    for _ in range(_STEPS):
-        there = pose.points(points_m)
-        seen = predict(model, there)
-        good = seen.valid
-        rates = rigid_rates(seen.d_points[good], there[good], pose.translation_m) / sigma_px[good, None, None]
-        off = (seen.pixels_px[good] - pixels_px[good]) / sigma_px[good, None]
-        step = -np.linalg.lstsq(rates.reshape(-1, 6), off.ravel(), rcond=None)[0]
-        pose = moved_rigid(pose, step)
-        if np.abs(step).max() < 1e-10:
-            break
-    return pose
+    off = model.project(poses[0][1].points(term.in_board_m[odd]))[0] - term.pixels_px[odd]
+    typical = float(np.median(np.nan_to_num(np.square(off).sum(axis=1), nan=np.inf)))
+    return typical / MEDIAN_OF_TWO if np.isfinite(typical) else float("nan")

@@ -13,12 +13,14 @@ import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from calib.adjust.adjustment import HUBER, Adjustment
+from calib.adjust.changes import BenchChange, find_change
 from calib.adjust.goodness import goodness
 from calib.adjust.left_out import left_out_boards
 from calib.adjust.outliers import name_outliers
 from calib.adjust.result import Calibration, rig_of
-from calib.adjust.robust import SurveyNotFitted, Weighed, typical_length, weigh, without_blunders
-from calib.adjust.solver import Minimum, covariance_of
+from calib.adjust.robust import Cleaned, SurveyNotFitted, Weighed, weigh, without_blunders
+from calib.adjust.scatter import own_scales
+from calib.adjust.solver import Minimum, covariance_of, minimise
 from calib.adjust.terms import lens_notes, with_kept
 from calib.adjust.uncertainty import (
     check_rms,
@@ -27,16 +29,23 @@ from calib.adjust.uncertainty import (
     rms_by_camera,
     sigma_by_key,
     station_residuals,
+    unseen_clicks,
 )
 from calib.adjust.unknowns import Estimate
 from calib.adjust.wider import WiderModel, explaining, wider_models
+from calib.calibrate.refusals import refuse_far, refuse_unsettled
 from calib.calibrate.starts.survey import Start, start_values
+from calib.geometry.rig import MAST_FREE
 from calib.survey.records import Survey
 
+FEW_LEFT_OUT = 3
+"""So many images, tapes and prisms that are left out may have a common cause."""
+
+SCAN_HUBER = 100.0
+"""Length in sigmas from which pulls are bounded while changes are looked for: these are no blunders."""
+
 WRONG_MINIMUM = 6.0
-"""A fit is refused if the typical dot is this many times farther off than its sigma, or than ``dot_px`` of
-the survey where that is more (a dot's own sigma has no print). Stated sigmas are wrong by two or three, wrong
-minima by a hundred."""
+"""A fit is refused if the typical dot is this many times farther off than its sigma."""
 
 MANY = 0.15
 """More than this part of the tapes left out (and more than three) are no blunders: the model fails."""
@@ -59,80 +68,117 @@ def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
         reported as done.
     """
     began = time.perf_counter()
-    from_here = start_values(survey, mast_parameters)
-    problem = joint_problem(survey, from_here, mast_parameters)
-    problem, fit = without_blunders(problem, from_here.estimate, from_here.images)
-    _refuse_wrong_minimum(problem, fit.state, survey.sigma.dot_px)
-    _refuse_unsettled(fit)
-    weighed = weigh(problem, fit, from_here.images)
-    _refuse_unsettled(weighed.fit)
-    return _calibration(survey, mast_parameters, from_here, (problem, fit), weighed, began)
+    start = start_values(survey, mast_parameters)
+    problem = joint_problem(survey, start, mast_parameters)
+    cleaned = without_blunders(problem, start.estimate, start.images, survey.sigma.dot_px)
+    change = _what_changed(cleaned)
+    _refuse_wrong_minimum(cleaned.problem, cleaned.fit.state, survey.sigma.dot_px, change)
+    refuse_unsettled(cleaned.fit, "joint angles and distances")
+    weighed = weigh(cleaned)
+    refuse_unsettled(weighed.fit, "joint angles and distances")
+    return _calibration(survey, mast_parameters, start, cleaned, weighed, change, began)
 
 
-def joint_problem(survey: Survey, from_here: Start, mast_parameters: int) -> Adjustment:
+def joint_problem(survey: Survey, start: Start, mast_parameters: int) -> Adjustment:
     """Return the least-squares problem of a survey, without images that disagree with the start."""
-    images = [replace(t, keep=from_here.kept.get(t.name, t.keep)) for t in from_here.images]
     problem = Adjustment(
-        with_kept(images, from_here.doubtful),
-        from_here.station,
-        from_here.estimate,
-        mast_parameters=mast_parameters if from_here.reference_rad else 0,
+        start.fitted,
+        start.station,
+        start.estimate,
+        mast_parameters=mast_parameters if start.references.joints_rad else 0,
         prisms_cad_m=survey.prisms_in_rover_m,
         prism_cad_m=survey.sigma.prism_cad_m,
         joint_rad=survey.sigma.joint_rad,
         huber=HUBER,
     )
-    unseen = problem.unseen(from_here.estimate)
+    unseen = problem.unseen(start.estimate)
     return problem.with_terms(with_kept(problem.images, unseen), problem.station)
 
 
-def _refuse_unsettled(fit: Minimum[Estimate]) -> None:
-    if not fit.settled:
-        raise SurveyNotFitted(
-            f"the fit did not settle: after {fit.steps} steps it was still finding better values, so that "
-            "neither they nor their sigmas are good. Take more images, at more joint angles and distances"
-        )
+def _what_changed(cleaned: Cleaned) -> BenchChange | None:
+    """A joint that slipped or a camera that was refocused or knocked, where images were left out for that.
+
+    Images and tapes were left out because they contradict others; whether they do since something changed is
+    another question, put to all of them: a board whose tapes all went follows its images, and hides a slip.
+    """
+    kept = [*(bool(t.keep.any()) for t in cleaned.problem.images), *(p.keep for p in cleaned.problem.station)]
+    if len(kept) - sum(kept) < FEW_LEFT_OUT:
+        return None
+    station = [replace(point, keep=True) for point in cleaned.problem.station]
+    every = cleaned.problem.with_terms(cleaned.images, station)
+    whole = with_kept(every.images, every.unseen(cleaned.fit.state))
+    every = every.with_terms(whole, every.station).with_huber(SCAN_HUBER)
+    fit = minimise(every, cleaned.fit.state, weak=every.weak, gain=1e-6)
+    change = find_change(every, fit.state) if np.isfinite(fit.normal.cost) else None
+    if change is None or not change.sure or change.board is not None:
+        return None
+    return None if _skew_axes_explain(every, fit, change.chi2) else change
 
 
-def _refuse_wrong_minimum(problem: Adjustment, state: Estimate, dot_px: float) -> None:
+def _skew_axes_explain(every: Adjustment, fit: Minimum[Estimate], chi2: float) -> bool:
+    """Whether axes that do not meet at a right angle explain twice as much as a change does."""
+    if every.upright or not 0 < len(every.mast_free) < len(MAST_FREE[8]):
+        return False
+    skew = Adjustment(
+        every.images, every.station, fit.state, mast_parameters=8, prisms_cad_m=every.prisms_cad_m,
+        prism_cad_m=every.prism_cad_m, joint_rad=every.joint_rad, huber=every.huber,
+    )  # fmt: skip
+    wider = minimise(skew, fit.state, weak=skew.weak, gain=1e-6)
+    return fit.normal.cost - wider.normal.cost > chi2  # the cost is half a sum of squares
+
+
+def _as_wider(change: BenchChange | None) -> tuple[WiderModel, ...]:
+    """A change as the wider model that it is; how far it moves dots is not bounded by those that are left."""
+    if change is None:
+        return ()
+    name = f"images left out for a change of {change.camera or change.what}"
+    return (
+        WiderModel(name, change.sentence, len(change.step), change.chi2, change.chance, True, float("inf")),
+    )
+
+
+def _refuse_wrong_minimum(
+    problem: Adjustment, state: Estimate, dot_px: float, change: BenchChange | None
+) -> None:
     """Raise if a camera's typical dot is far above its noise, or if the station contradicts the rest."""
     tapes = [p for p in problem.station if p.board is not None]
     left_out = sum(not p.keep for p in tapes)
     if left_out > max(3, MANY * len(tapes)) and not problem.upright:
+        said = f"{left_out} of {len(tapes)} tapes do not agree with the images"
+        if change is not None:
+            raise SurveyNotFitted(f"{said}: {change.sentence}")
         raise SurveyNotFitted(
-            f"{left_out} of {len(tapes)} tapes do not agree with the images: too many for blunders. Check "
-            "the sigmas and the joint angles, and whether the mast's axes meet at a right angle (else fit "
-            "eight parameters)"
+            f"{said}: too many for blunders. Check the sigmas and the joint angles, and whether the mast's "
+            "axes meet at a right angle (else fit eight parameters)"
         )
-    for name in state.cameras:
-        mine = [t for t in problem.images if t.camera == name]
-        kept = [t for t in mine if t.keep.any()]
-        if len(kept) < max(2, len(mine) // 2):
-            raise SurveyNotFitted(
-                f"camera {name}: {len(mine) - len(kept)} of its {len(mine)} images do not agree with the "
-                "rest; check which placement each belongs to and the joint angles"
-            )
-        typical, noise_px = typical_length(problem, state, kept, dot_px)
-        if typical > WRONG_MINIMUM:
-            raise SurveyNotFitted(
-                f"camera {name}: the fit leaves {typical:.1f} times the stated noise of a dot "
-                f"({noise_px:g} px); either it ended in a wrong "
-                "minimum or the sigmas in survey.yaml are too small"
-            )
+    refuse_far(
+        problem,
+        state,
+        dot_px,
+        most=WRONG_MINIMUM,
+        dot="dot",
+        disagree=f": {change.sentence}"
+        if change is not None
+        else ", and no slipped joint, knock or other focus between two images explains it. Check which "
+        "placement each belongs to, and the joint angles",
+        scatter="they are found badly, or dot_px in survey.yaml is far too small",
+        coherent="station_m or joint_rad in survey.yaml is far too small",
+    )
 
 
 def _calibration(
     survey: Survey,
     mast_parameters: int,
-    from_here: Start,
-    as_stated: tuple[Adjustment, Minimum[Estimate]],
+    start: Start,
+    cleaned: Cleaned,
     weighed: Weighed,
+    change: BenchChange | None,
     began: float,
 ) -> Calibration:
     """Put together what the fit says, with the stated sigmas and with those that were found."""
     problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
     rig_numbers = problem.unknowns.of_kinds("camera", "mast")
-    notes = list(from_here.notes)
+    notes = list(start.notes)
     order = problem.unknowns.of_kinds("mast", "camera")
     mine = covariance[np.ix_(order, order)]
     chi_square, freedom = goodness(problem, state, covariance)
@@ -142,13 +188,16 @@ def _calibration(
             f"(chi-square {chi_square:.0f} for {freedom:.0f}); uncertainties are scaled up by as much"
         )
         mine = mine * chi_square / freedom
-    stated, first = as_stated
+    stated, first = cleaned.as_stated()
     notes += _prism_notes(stated, first.state, mast_parameters)
     chi_square, freedom = goodness(stated, first.state, covariance_of(first.normal.matrix, stated.weak))
     rig, values = rig_of(survey, state), problem.values(state, "mast", "camera")
     sigma = sigma_by_key(rig, tuple(values), mine)
     notes += lens_notes(rig, sigma)
-    images = image_residuals(survey, problem, state, from_here.images, from_here.checks)
+    scatter = {t.name: t.scatter for t in weighed.images} | own_scales(
+        problem, state, start.checks, weighed.factors, survey.sigma.dot_px
+    )
+    images = image_residuals(survey, problem, state, start.images, start.checks, scatter)
     return Calibration(
         method="joint",
         mast_parameters=mast_parameters,
@@ -159,7 +208,15 @@ def _calibration(
         sigma=sigma,
         rms_px=rms_by_camera(images),
         check_rms_px=check_rms(survey, state, images),
-        outliers=(*name_outliers(problem, state, covariance, weighed.images), *from_here.stray_checks),
+        unseen_clicks=unseen_clicks(survey, state),
+        outliers=(
+            *name_outliers(problem, state, covariance, weighed.images),
+            *(
+                o
+                for o in start.wrong
+                if o.name.startswith(tuple(f"image {t.name} dot " for t in start.checks))
+            ),
+        ),
         degenerate=open_directions(problem, covariance[np.ix_(rig_numbers, rig_numbers)]),
         notes=tuple(notes),
         chi2=chi_square,
@@ -168,7 +225,7 @@ def _calibration(
         images=images,
         station=station_residuals(problem, state),
         components=weighed.components,
-        wider=_wider(stated, first, weighed),
+        wider=(*_as_wider(change), *_wider(cleaned, weighed)),
         left_out_boards=left_out_boards(problem, weighed.fit, covariance),
         rover_from_station=state.rover_from_station,
         rover_from_board=state.rover_from_board,
@@ -177,14 +234,14 @@ def _calibration(
     )
 
 
-def _wider(stated: Adjustment, first: Minimum[Estimate], weighed: Weighed) -> tuple[WiderModel, ...]:
-    """Wider models beside the fit, those first that explain why sigmas had to be widened."""
+def _wider(cleaned: Cleaned, weighed: Weighed) -> tuple[WiderModel, ...]:
+    """Wider models beside the fit, those first that explain why sigmas had to be widened beyond scatter."""
     found = wider_models(weighed.problem, weighed.fit.state, weighed.covariance, weighed.fit.normal.gradient)
     if not any(component.wrong for component in weighed.components):
         return found
-    covariance = covariance_of(first.normal.matrix, stated.weak)
-    tried = wider_models(stated, first.state, covariance, first.normal.gradient)
-    causes = explaining(tried, weighed.excess)
+    problem, fit = cleaned.problem, cleaned.fit
+    covariance = covariance_of(fit.normal.matrix, problem.weak)
+    causes = explaining(wider_models(problem, fit.state, covariance, fit.normal.gradient), weighed.excess)
     named = {model.name for model in causes}
     return (*causes, *(model for model in found if model.name not in named))
 

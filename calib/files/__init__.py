@@ -6,12 +6,15 @@ Every reader refuses with `calib.errors.BadFile` and nothing else; every writer 
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import os
+import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,8 +22,8 @@ from numpy.typing import ArrayLike
 from calib.errors import BadFile
 from calib.geometry.cahvor import CameraModel, Kind
 
-#: A shift of a pixel by the normalisation of A and O is told from this size on.
-TOLD_SHIFT_PX = 0.01
+#: A shift of a pixel by the normalisation of A and O is noted from this size on.
+SHIFT_NOTE_PX = 0.01
 #: No component of a camera model or a mast is larger; beyond it the arithmetic would overflow.
 LARGEST_COMPONENT = 1e9
 LARGEST_IMAGE_PX = 65536
@@ -63,7 +66,8 @@ class CameraFile:
 def read_bytes(path: str | Path, limit_bytes: int) -> bytes:
     """Return the whole file, or raise BadFile if it cannot be read, is empty, or is larger than the limit."""
     try:
-        with Path(path).open("rb") as file:
+        with open(path, "rb", opener=_opened_at_once) as file:
+            os.set_blocking(file.fileno(), True)
             data = file.read(limit_bytes + 1)
     except OSError as error:
         raise BadFile(path, "", f"cannot be read: {error.strerror or error}") from None
@@ -74,6 +78,31 @@ def read_bytes(path: str | Path, limit_bytes: int) -> bytes:
     if not data:
         raise BadFile(path, "", "is empty")
     return data
+
+
+def _opened_at_once(path: str, flags: int) -> int:
+    """Open a file; a pipe that nothing writes to does not wait for a writer, and is empty."""
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
+def open_plain(path: str | Path) -> BinaryIO:
+    """Open a file to be read; waits for nothing. Raises OSError, also for a pipe, a socket or a device."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(descriptor)
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        raise OSError(errno.EINVAL, "it is a pipe or a device; a plain file is expected")
+    return os.fdopen(descriptor, "rb")
+
+
+def is_plain_file(path: Path) -> bool:
+    """Return whether there is a file, or a link to one: no folder, pipe or device, and a name that exists."""
+    try:
+        return path.is_file()
+    except OSError:  # of a name that no disk takes
+        return False
 
 
 def digest_of(data: bytes) -> str:
@@ -150,7 +179,7 @@ def build_model(
             )
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         raise BadFile(path, place, f"is no usable camera model: {error}") from None
-    if not shift_px <= TOLD_SHIFT_PX:
+    if not shift_px <= SHIFT_NOTE_PX:
         sizes = " and ".join(
             f"|{letter}| = {np.linalg.norm(arrays[letter]):.6g}" for letter in "AO" if letter in arrays
         )
@@ -179,7 +208,7 @@ def blind_notes(model: CameraModel, path: str | Path, place: str) -> tuple[str, 
         blind = blind_part(model)
     except ValueError as problem:
         raise BadFile(path, place, f"is no usable camera: {problem}") from None
-    why = model.limit_words or "the lens looks sideways"
+    why = model.limit_reason or "the lens looks sideways"
     if blind > MOST_BLIND:
         raise BadFile(path, place, f"{100 * blind:.0f} %, more than half of the image has no ray: {why}")
     where = f"{place}: " if place else ""

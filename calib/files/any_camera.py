@@ -12,48 +12,47 @@ from calib.errors import BadFile
 from calib.files import CameraFile, read_bytes
 from calib.files.atomic import save_bytes
 from calib.files.cahvor_text import internal_parameters, looks_like_cahvor, parse_cahvor, save_cahvor
-from calib.files.mast_file import CAMERA_SCHEMA, MAST_SCHEMA, StoredRig, parse_camera, parse_rig, save_camera
-from calib.files.mrcal_kalibr_colmap import (
-    format_colmap,
+from calib.files.file_storage import looks_like_storage, unzipped
+from calib.files.mast_file import CAMERA_SCHEMA, StoredRig, parse_camera, parse_rig, save_camera
+from calib.files.mrcal_kalibr import (
     format_kalibr,
     format_mrcal,
-    looks_like_colmap,
     looks_like_kalibr,
     looks_like_mrcal,
-    parse_colmap,
     parse_kalibr,
     parse_mrcal,
     refuse_mirrored,
 )
 from calib.files.opencv_ros import (
+    Reading,
     format_camera_info,
     format_opencv,
     lens_pose,
-    looks_like_camera_info,
-    looks_like_opencv,
-    parse_camera_info,
-    parse_opencv,
-    without_last_mark,
+    looks_like_calibration,
+    parse_calibration,
+    read_document,
 )
-from calib.files.pds3 import MAX_FILE_BYTES, load_pds3_camera, looks_like_pds3
 from calib.files.twin import (
     FISHEYE,
     GOOD_PX,
     TwinError,
-    error_words,
-    held_as,
+    as_kind,
+    error_sentence,
     nearest_cahvor,
     nearest_opencv,
     nearest_square,
+    plainest,
     twin_error,
 )
-from calib.files.yaml_text import parse_mapping
-from calib.geometry.cahvor import FREE, SPLINED, CameraModel, Kind
+from calib.geometry.cahvor import FREE, CameraModel, Kind
 
 KNOWN_FORMATS = (
-    "a mast file, a camera file, a .cahvor file, a PDS3 label, OpenCV's or ROS's YAML, Kalibr's camchain, "
-    "mrcal's .cameramodel or COLMAP's cameras.txt"
+    "a mast file, a camera file, a .cahvor file, OpenCV's YAML, XML or JSON, ROS's "
+    "camera_info, Kalibr's camchain or mrcal's .cameramodel"
 )
+
+MAX_FILE_BYTES = 1 << 28
+"""mrcal keeps all its measurements in a camera's file."""
 
 LIMIT_PX = 0.25
 """A conversion that moves a pixel by more than this is refused unless the caller sets another limit."""
@@ -61,11 +60,10 @@ LIMIT_PX = 0.25
 _BY_SUFFIX = {
     ".cahvor": "cahvor",
     ".cameramodel": "mrcal",
-    ".txt": "colmap",
     ".yaml": "mastctl",
     ".yml": "mastctl",
 }
-FORMATS = ("mastctl", "cahvor", "opencv", "ros", "kalibr", "mrcal", "colmap")
+FORMATS = ("mastctl", "cahvor", "opencv", "ros", "kalibr", "mrcal")
 
 LENSES: dict[str, Kind] = {
     "radtan": "OPENCV4",
@@ -82,28 +80,36 @@ _OFFERED: dict[str, tuple[str, ...]] = {
     "ros": ("plumb_bob", "rational_polynomial", "equidistant"),
     "kalibr": ("radtan", "equidistant"),
     "mrcal": ("cahvor", "plumb_bob", "rational_polynomial"),
-    "colmap": ("radtan", "rational_polynomial", "equidistant"),
 }
 """Each format's lenses that a camera of another family is fitted as, the plainest first."""
 
-_HELD: dict[str, tuple[str, ...]] = {
+_STORED: dict[str, tuple[str, ...]] = {
     "opencv": ("radtan", "plumb_bob", "rational_polynomial", "thin_prism", "tilted", "equidistant"),
     "ros": ("plumb_bob", "rational_polynomial", "equidistant"),
     "kalibr": ("radtan", "equidistant"),
     "mrcal": ("radtan", "plumb_bob", "rational_polynomial", "thin_prism"),
-    "colmap": ("radtan", "rational_polynomial", "equidistant"),
 }
 """Each format's lenses that hold a camera of the same family as it is, the shortest first."""
-
-_NO_POSE = {"ros": "a camera_info", "colmap": "a cameras.txt"}
 
 
 @dataclass(frozen=True)
 class CameraFiles:
-    """Several cameras of one file, by name."""
+    """Several cameras of one file, by name, and the refusal of each that cannot be read."""
 
     cameras: Mapping[str, CameraFile]
+    refusals: Mapping[str, BadFile]
     path: Path
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The cameras of the file, read or not."""
+        return (*self.cameras, *self.refusals)
+
+    def camera(self, name: str) -> CameraFile:
+        """Return one of the cameras. Raises BadFile if it cannot be read."""
+        if name in self.refusals:
+            raise self.refusals[name]
+        return self.cameras[name]
 
 
 def load_any(path: str | Path) -> StoredRig | CameraFile | CameraFiles:
@@ -116,43 +122,37 @@ def load_any(path: str | Path) -> StoredRig | CameraFile | CameraFiles:
     BadFile
         If the file is none of these, or is one but malformed.
     """
-    data = read_bytes(path, MAX_FILE_BYTES)
-    suffix = Path(path).suffix.lower()
-    if looks_like_pds3(data) or suffix in (".lbl", ".img"):
-        return load_pds3_camera(path)
+    data = unzipped(read_bytes(path, MAX_FILE_BYTES), MAX_FILE_BYTES, path)
+    suffix = Path(str(path).lower().removesuffix(".gz")).suffix
     if looks_like_mrcal(data) or suffix == ".cameramodel":
         return parse_mrcal(data, path)
-    document = _document(data)
+    refusal = None
+    try:
+        document, _ = read_document(data, path)
+    except BadFile as error:
+        document, refusal = {}, error
     schema = document.get("schema")
     if schema == CAMERA_SCHEMA:
         return parse_camera(data, path)
-    if schema == MAST_SCHEMA:
+    if schema is not None or len({"mast", "cameras", "stereo"} & set(document)) > 1:
         return parse_rig(data, path)
     if looks_like_kalibr(document):
         return _one_or_all(parse_kalibr(data, path), path)
-    if looks_like_camera_info(document):
-        return parse_camera_info(data, path)
-    if looks_like_opencv(data) or "camera_matrix" in document:
-        return parse_opencv(data, path)
-    if suffix in (".yaml", ".yml"):
-        return parse_rig(data, path)
+    if looks_like_calibration(document):
+        return _one_or_all(parse_calibration(data, path), path)
     if suffix == ".cahvor" or looks_like_cahvor(data):
         return parse_cahvor(data, path)
-    if looks_like_colmap(data):
-        return _one_or_all(parse_colmap(data, path), path)
-    raise BadFile(path, "", f"is not {KNOWN_FORMATS}")
+    if refusal is not None and (looks_like_storage(data) or suffix in (".yaml", ".yml", ".xml", ".json")):
+        raise refusal
+    raise BadFile(path, "", f"is not one of these formats: {KNOWN_FORMATS}")
 
 
-def _document(data: bytes) -> dict[str, object]:
-    """The keys of a YAML file, none if the bytes are no YAML of ours or ROS's or Kalibr's."""
-    try:
-        return parse_mapping(without_last_mark(data.removeprefix(b"%YAML:1.0")), "")
-    except BadFile:
-        return {}
-
-
-def _one_or_all(cameras: Mapping[str, CameraFile], path: str | Path) -> CameraFile | CameraFiles:
-    return next(iter(cameras.values())) if len(cameras) == 1 else CameraFiles(cameras, Path(path))
+def _one_or_all(readings: Mapping[str, Reading], path: str | Path) -> CameraFile | CameraFiles:
+    cameras = {name: one for name, one in readings.items() if isinstance(one, CameraFile)}
+    refusals = {name: one for name, one in readings.items() if isinstance(one, BadFile)}
+    if not cameras:
+        raise next(iter(refusals.values()))
+    return next(iter(cameras.values())) if len(readings) == 1 else CameraFiles(cameras, refusals, Path(path))
 
 
 @dataclass(frozen=True)
@@ -212,15 +212,15 @@ def save_any(
     Parameters
     ----------
     camera
-        One camera, or several by name for a format that holds several: ``kalibr``, ``colmap``.
+        One camera, or several by name for a format that holds several: ``kalibr``.
     path
         The file.
     format
         One of ``FORMATS``; '' takes what the name asks for.
     lens
         The lens to take where the format has several (``radtan``, ``plumb_bob``, ``rational_polynomial``,
-        ``equidistant``, ``tilted``, ``cahvor``); '' takes the plainest that comes near enough, else the one
-        that comes nearest.
+        ``equidistant``, ``tilted``, ``cahvor``); '' takes the plainest within the limit
+        that is at most twice as far off as the nearest, else the nearest.
     limit_px
         The largest distance between a pixel of the camera and of what is written, anywhere in the image.
 
@@ -234,10 +234,8 @@ def save_any(
     to = format or format_of(path)
     if to not in FORMATS:
         raise BadFile(path, "", f"format '{to[:20]}' where one of {', '.join(FORMATS)} is expected")
-    if len(cameras) != 1 and to not in ("kalibr", "colmap"):
-        raise BadFile(
-            path, "", f"{len(cameras)} cameras where one is expected; kalibr and colmap hold several"
-        )
+    if len(cameras) != 1 and to != "kalibr":
+        raise BadFile(path, "", f"{len(cameras)} cameras where one is expected; kalibr holds several")
     if len({one.frame for one in cameras.values()}) > 1 and to == "kalibr":
         raise BadFile(path, "", "the cameras are in several frames; a camchain places them in one")
     if to in ("mastctl", "cahvor"):
@@ -261,17 +259,17 @@ def _as_cahvor(
         return camera, ()
     try:
         with np.errstate(all="ignore"):
-            model = nearest_cahvor(camera.model)
+            model = nearest_cahvor(camera.model, limit_px)
             error = twin_error(camera.model, model)
     except (ValueError, np.linalg.LinAlgError) as problem:
         raise BadFile(path, "", f"the camera has no twin in this format: {problem}") from None
-    _hold(error, limit_px, f"'{name}' as {model.kind}", "", path)
+    _within(error, limit_px, f"'{name}' as {model.kind}", "", path)
     return replace(camera, model=model, fit={}), (error,)
 
 
-def _hold(error: TwinError, limit_px: float, what: str, why: str, path: str | Path) -> None:
+def _within(error: TwinError, limit_px: float, what: str, why: str, path: str | Path) -> None:
     if not error.worst_px <= limit_px:
-        far = "does not see all of the image" if np.isinf(error.worst_px) else f"is {error_words(error)}"
+        far = "does not see all of the image" if np.isinf(error.worst_px) else f"is {error_sentence(error)}"
         raise BadFile(path, "", f"{what} {far}; the limit is {limit_px:g} px{why}")
 
 
@@ -279,23 +277,24 @@ def _save_twins(
     cameras: Mapping[str, CameraFile], path: str | Path, to: str, lens: str, limit_px: float
 ) -> Conversion:
     """Write the nearest cameras that a format of other lenses holds."""
-    offered = tuple(dict.fromkeys((*_OFFERED[to], *_HELD[to])))
+    offered = tuple(dict.fromkeys((*_OFFERED[to], *_STORED[to])))
     if lens and lens not in offered:
         raise BadFile(path, "", f"lens '{lens[:20]}' where one of {', '.join(offered)} is expected for {to}")
     found: dict[str, tuple[str, CameraModel, TwinError]] = {}
     for name, camera in cameras.items():
         refuse_mirrored(camera.model, path)
-        found[name] = _nearest(camera.model, to, lens, path)
+        try:
+            found[name] = nearest_lens(camera.model, to, lens, limit_px)
+        except ValueError as problem:
+            raise BadFile(path, "", f"the camera has no twin in this format: {problem}") from None
         taken, _, error = found[name]
-        _hold(error, limit_px, f"'{name}' as {taken}", _why(camera.model), path)
+        _within(error, limit_px, f"'{name}' as {taken}", _why(camera.model), path)
     frame = next(iter(cameras.values())).frame
     twins = {name: twin for name, (_, twin, _) in found.items()}
     first = next(iter(twins.values()))
     match to:
         case "kalibr":
             data = format_kalibr(twins, frame)
-        case "colmap":
-            data = format_colmap(twins)
         case "ros":
             ((name, (taken, _, _)),) = found.items()
             data = format_camera_info(first, taken, name)
@@ -314,38 +313,49 @@ def _save_twins(
     )
 
 
-def _nearest(model: CameraModel, to: str, lens: str, path: str | Path) -> tuple[str, CameraModel, TwinError]:
-    """Lens, twin and error: the camera itself where the format holds it, else the plainest lens that is good
-    enough, else the nearest of them."""
-    if model.kind == SPLINED and to == "mrcal" and not lens and abs(model.camera_matrix[0, 1]) < 1e-9:
-        return "splined", model, twin_error(model, model)
-    for name in (lens,) if lens else _HELD[to]:
-        if name in LENSES and model.kind != "CAHV" and (same := held_as(model, LENSES[name])) is not None:
+def nearest_lens(
+    model: CameraModel, to: str, lens: str = "", limit_px: float = np.inf
+) -> tuple[str, CameraModel, TwinError]:
+    """Return the lens of a format that serves a camera, the camera with that lens, and its error.
+
+    The camera keeps its numbers where the format holds them; else its lens is the `plainest` that serves.
+
+    Raises
+    ------
+    ValueError
+        If its image is mirrored, or no lens of the format sees most of it.
+    """
+    if np.cross(model.H, model.V) @ model.A < 0.0:
+        raise ValueError("its image is mirrored (H x V is against A)")
+    for name in (lens,) if lens else _STORED[to]:
+        if name in LENSES and model.kind != "CAHV" and (same := as_kind(model, LENSES[name])) is not None:
             return name, same, twin_error(model, same)
-    best: tuple[str, CameraModel, TwinError] | None = None
+    names: list[str] = []
+    tried: list[tuple[CameraModel, TwinError]] = []
     problem = ""
     for name in (lens,) if lens else _OFFERED[to]:
         try:
             with np.errstate(all="ignore"):
-                twin = _twin(model, name)
+                twin = _twin(model, name, limit_px)
                 error = twin_error(model, twin, model.moving)
         except (ValueError, np.linalg.LinAlgError) as reason:
             problem = str(reason)
             continue
-        if best is None or error.worst_px < 0.5 * best[2].worst_px:
-            best = name, twin, error
+        names.append(name)
+        tried.append((twin, error))
         if error.worst_px <= GOOD_PX:
-            break
-    if best is None:
-        raise BadFile(path, "", f"the camera has no twin in this format: {problem}")
-    return best
+            return name, twin, error
+    if not tried:
+        raise ValueError(problem)
+    at = plainest(tried, limit_px)
+    return names[at], *tried[at]
 
 
-def _twin(model: CameraModel, lens: str) -> CameraModel:
+def _twin(model: CameraModel, lens: str, limit_px: float) -> CameraModel:
     """The nearest camera of a lens; the camera itself where that is one."""
     if lens != "cahvor":
         return nearest_opencv(model, LENSES[lens])
-    near = nearest_cahvor(model)
+    near = nearest_cahvor(model, limit_px)
     return near if _is_square(near) else nearest_square(near)
 
 
@@ -372,13 +382,13 @@ def _lost(
 ) -> tuple[str, ...]:
     """What a format of other lenses cannot hold, a sentence each."""
     lost = []
-    if to in _NO_POSE:
+    if to == "ros":
         for name, twin in twins.items():
             pose = lens_pose(twin)
             rows = ", ".join(f"[{', '.join(f'{value:.9g}' for value in row)}]" for row in pose.rotation)
             where = ", ".join(f"{value:.9g}" for value in pose.translation_m)
             lost.append(
-                f"{_NO_POSE[to]} cannot hold where '{name}' is: in '{frame}' at [{where}] m, its x, y, z the "
+                f"a camera_info cannot hold where '{name}' is: in '{frame}' at [{where}] m, its x, y, z the "
                 f"columns of [{rows}]"
             )
     elif to in ("mrcal", "kalibr"):

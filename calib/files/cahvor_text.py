@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, cast
 
@@ -197,7 +198,21 @@ def _lines(text: str, path: str | Path) -> tuple[Values, dict[str, Rows], list[s
             values[key] = (value, number)
             if key not in ("Model", "Dimensions", *"CAHVORE", *_SCALARS):
                 unread.append(f"line {number}, '{key[:40]} =',")
+    _refuse_misread(values, path)
     return values, matrices, unread
+
+
+def _refuse_misread(values: Values, path: str | Path) -> None:
+    """Refuse a key that is not read and may change the camera: misspelled, or one letter as a vector's."""
+    known = ("Model", "Dimensions", *"CAHVORE", *_SCALARS)
+    missing = {name.lower(): name for name in known if name not in values}
+    for key, (_, line) in values.items():
+        if key in known:
+            continue
+        near = get_close_matches(key.lower(), missing, n=1, cutoff=0.8)
+        if near or len(key) == 1:
+            hint = f"the nearest known is '{missing[near[0]]} ='" if near else f"known are {', '.join(known)}"
+            raise BadFile(path, f"line {line}", f"unknown key '{key} ='; {hint}")
 
 
 def _kind(values: Values, path: str | Path) -> tuple[Kind, int, float | None]:

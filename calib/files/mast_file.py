@@ -8,17 +8,18 @@ Contract section 2. A and O are normalised on load; a note says so when that mov
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from calib.errors import BadFile
 from calib.files import (
     LARGEST_IMAGE_PX,
-    TOLD_SHIFT_PX,
+    SHIFT_NOTE_PX,
     CameraFile,
     blind_notes,
     build_model,
@@ -26,11 +27,11 @@ from calib.files import (
     read_bytes,
 )
 from calib.files.atomic import save_bytes
+from calib.files.records import Free, Number, Record, Text, Vector, problem, read_record
 from calib.files.yaml_text import MAX_BYTES, Section, dump_mapping, kind_of, parse_mapping
-from calib.geometry.cahvor import COEFFICIENTS, FREE, KINDS, SPLINED, CameraModel, Kind
-from calib.geometry.lenses.spline import SplineGrid
+from calib.geometry.cahvor import COEFFICIENTS, FREE, KINDS, CameraModel, Kind
+from calib.geometry.mode import FLIPS, FlipName, SensorMode, flip_name
 from calib.geometry.rig import MOST_HARMONICS, AxisJoint, JointErrors, Mast, Rig, RigCamera
-from calib.geometry.sensor_mode import FLIPS, FlipName, SensorMode, flip_name
 
 MAST_SCHEMA = "mastctl/mast/1"
 CAMERA_SCHEMA = "mastctl/camera/1"
@@ -38,12 +39,235 @@ CAMERA_SCHEMA = "mastctl/camera/1"
 CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """``<pair>_left`` and ``<pair>_right`` for the cameras of a pair; a single camera has no side."""
 CAMERA_NAME_WORDS = "a camera's name is letters, digits, '_' and '-'"
-_PAIR_NAME = CAMERA_NAME
 _ROUNDED, _NO_ROTATION = 1e-15, 1e-3
-_MODEL_KEYS = ("size_px", "model", "C")
-CAHVORE_KEYS = ("A", "H", "V", "O", "R", "E", "type", "linearity")
-OPENCV_KEYS = ("camera_matrix", "distortion", "rotation")
-_MODEL_OPTIONS = (*CAHVORE_KEYS, *OPENCV_KEYS, "spline")
+_ABSENT: Any = None
+"""The value of a key that a file may leave out; the key itself takes no null."""
+
+_Size = Annotated[int, Field(ge=1, le=LARGEST_IMAGE_PX)]
+_Offset = Annotated[int, Field(ge=0, le=LARGEST_IMAGE_PX)]
+_Row = Annotated[list[Number], Field(min_length=3, max_length=3)]
+_Turn = Annotated[float, Field(ge=-1.001, le=1.001)]
+_TurnRow = Annotated[list[_Turn], Field(min_length=3, max_length=3)]
+_Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
+_Harmonic = Annotated[list[Number], Field(min_length=2, max_length=2)]
+
+
+def _name_of(what: str) -> Callable[[str], str]:
+    def check(name: str) -> str:
+        if not CAMERA_NAME.fullmatch(name):
+            raise problem("", f"a {what}'s name is letters, digits, '_' and '-'")
+        return name
+
+    return check
+
+
+def _pair(names: object) -> object:
+    if not isinstance(names, list) or len(names) != 2 or not all(isinstance(name, str) for name in names):
+        raise problem("", f"{kind_of(names)} where [left camera, right camera] is expected")
+    for name, side in zip(names, ("_left", "_right"), strict=True):
+        if not name.endswith(side):
+            raise problem("", f"'{name}' where a camera named ...{side} is expected")
+    return names
+
+
+_NAMED = WithJsonSchema({"type": "string", "pattern": f"^{CAMERA_NAME.pattern}$"})
+_CameraName = Annotated[str, AfterValidator(_name_of("camera")), _NAMED]
+_PairName = Annotated[str, AfterValidator(_name_of("pair")), _NAMED]
+_SIDES = [{"type": "string", "pattern": "_left$"}, {"type": "string", "pattern": "_right$"}]
+_Pair = Annotated[
+    Any,
+    AfterValidator(_pair),
+    WithJsonSchema({"type": "array", "minItems": 2, "maxItems": 2, "prefixItems": _SIDES}),
+]
+
+
+class SensorModeRecord(Record):
+    """``sensor_mode`` of a camera."""
+
+    flip: FlipName = Field(description="how the camera turns its pictures")
+    sensor_px: Annotated[list[_Size], Field(min_length=2, max_length=2)] = Field(
+        default=_ABSENT, description="all that the sensor can give"
+    )
+    crop_px: Annotated[list[_Offset], Field(min_length=4, max_length=4)] = Field(
+        default=_ABSENT, description="the part that makes a picture"
+    )
+
+
+_OPENCV_KEYS = ("camera_matrix", "distortion", "rotation")
+_CAHVORE_KEYS = (*"AHVORE", "type", "linearity")
+
+
+def _keys_of(kind: str) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """Keys that a kind of camera needs, that it may have as zeros only, and that it must not have."""
+    if kind in COEFFICIENTS:
+        return _OPENCV_KEYS, (), _CAHVORE_KEYS
+    needed = tuple(letter for letter in "AHVORE" if letter in kind)
+    if kind == "CAHVORE":
+        return (*needed, "type"), (), _OPENCV_KEYS
+    return needed, tuple(set("RE") - set(kind)), ("type", "linearity", *_OPENCV_KEYS)
+
+
+def _schema_by_kind(schema: dict[str, Any]) -> None:
+    """Add to a camera's JSON Schema which keys go with which kind."""
+    cases = []
+    for kind in KINDS:
+        needed, zeros, refused = _keys_of(kind)
+        keys: dict[str, Any] = {key: {"items": {"const": 0}} for key in sorted(zeros)}
+        keys |= dict.fromkeys(refused, False)
+        if kind in COEFFICIENTS:
+            keys["distortion"] = {"minItems": COEFFICIENTS[kind], "maxItems": COEFFICIENTS[kind]}
+        cases.append(_case("model", kind, {"properties": keys, "required": list(needed)}))
+    schema["allOf"] = [*cases, _case("type", 3, {"required": ["linearity"]})]
+
+
+def _case(key: str, value: object, then: dict[str, Any]) -> dict[str, Any]:
+    return {"if": {"required": [key], "properties": {key: {"const": value}}}, "then": then}
+
+
+class CameraRecord(Record, json_schema_extra=_schema_by_kind):
+    """The keys of one camera model."""
+
+    size_px: Annotated[list[_Size], Field(min_length=2, max_length=2)]
+    model: Kind = Field(description="the family of its lens")
+    C: Vector = Field(description="projection center")
+    A: Vector = Field(default=_ABSENT, description="unit vector along the optical axis")
+    H: Vector = Field(default=_ABSENT, description="image columns and rows")
+    V: Vector = Field(default=_ABSENT, description="image columns and rows")
+    O: Vector = Field(default=_ABSENT, description="unit vector, axis of the distortion")  # noqa: E741
+    R: Vector = Field(default=_ABSENT, description="radial distortion")
+    E: Vector = Field(default=_ABSENT, description="moving entrance pupil")
+    type: Annotated[int, Field(ge=1, le=3)] = Field(
+        default=_ABSENT, description="perspective, fisheye, general"
+    )
+    linearity: Annotated[float, Field(ge=-100.0, le=100.0)] = Field(default=_ABSENT)
+    camera_matrix: Annotated[list[_Row], Field(min_length=3, max_length=3)] = Field(
+        default=_ABSENT, description="[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"
+    )
+    distortion: list[_Coefficient] = Field(
+        default=_ABSENT,
+        description="k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 τx τy, as many as the model's name says; "
+        "OPENCV_FISHEYE: k1 k2 k3 k4 of cv2.fisheye",
+    )
+    rotation: Annotated[list[_TurnRow], Field(min_length=3, max_length=3)] = Field(
+        default=_ABSENT,
+        description="OpenCV's R: rows are the camera's x right, y down and z ahead in the frame of on",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_no_keys_of_other_kinds(cls, keys: Any) -> Any:
+        kind = keys.get("model") if isinstance(keys, dict) else None
+        for key in _keys_of(kind)[2] if kind in KINDS else ():
+            if key in keys:
+                raise problem(key, f"{kind} has no '{key}'; another 'model' has it")
+        return keys
+
+    @model_validator(mode="after")
+    def _has_the_keys_of_its_kind(self) -> CameraRecord:
+        kind, count = self.model, COEFFICIENTS.get(self.model)
+        needed, zeros, _ = _keys_of(kind)
+        for key in needed:
+            if key not in self.model_fields_set:
+                raise problem(key, f"the key is missing; {kind} has it")
+        for key in zeros:
+            if any(getattr(self, key) or ()):
+                raise problem(key, f"{kind} has no {key}; expected zeros or another 'model'")
+        if count is not None and len(self.distortion) != count:
+            reason = f"{kind_of(self.distortion)} where a list of {count} numbers is expected"
+            raise problem("distortion", reason)
+        if self.type == 3 and self.linearity is None:
+            raise problem("linearity", "the key is missing; CAHVORE type 3 has it")
+        return self
+
+
+class RigCameraRecord(CameraRecord, json_schema_extra=_schema_by_kind):
+    """A camera of a mast file."""
+
+    on: Literal["head", "rover"] = Field(description="the frame of its vectors")
+    sensor_mode: SensorModeRecord = Field(
+        default=_ABSENT,
+        description="which pixels of the sensor the calibrated pictures show: the daemon compares it",
+    )
+
+
+class CameraFileRecord(CameraRecord, json_schema_extra=_schema_by_kind):
+    """A camera file."""
+
+    schema_: Literal["mastctl/camera/1"] = Field(alias="schema")
+    frame: Text
+    fit: Free = Field(default={})
+    provenance: Free = Field(default={})
+
+
+class MastRecord(Record):
+    """The numbers of the mast."""
+
+    translation_m: Vector = Field(description="t: from the rover frame's origin to the mast's")
+    rotation_rad: Vector = Field(description="θx, θy, θz")
+    axis_offset_m: Number = Field(default=0.0, description="a: distance between the two axes")
+    axis_twist_rad: Number = Field(default=0.0, description="k: angle of the tilt axis to the horizontal")
+
+
+class AxisRecord(Record):
+    """Errors of one joint's readings."""
+
+    harmonics_rad: Annotated[list[_Harmonic], Field(max_length=MOST_HARMONICS)] = Field(
+        default=[], description="true = read + Σ (c_i cos(i read) + s_i sin(i read))"
+    )
+    backlash_rad: Annotated[float, Field(ge=0.0, le=1e9)] = Field(
+        default=0.0,
+        description="full width of the play: half of it is subtracted from the reading of an axis that came "
+        "from smaller angles, and added from larger ones",
+    )
+
+    @property
+    def joint(self) -> AxisJoint:
+        """The joint. Raises ValueError as `AxisJoint`."""
+        return AxisJoint(tuple((c, s) for c, s in self.harmonics_rad), self.backlash_rad)
+
+
+class JointsRecord(Record):
+    """Errors of both joints' readings."""
+
+    pan: AxisRecord = Field(default=AxisRecord())
+    tilt: AxisRecord = Field(default=AxisRecord())
+
+    @model_validator(mode="after")
+    def _are_joints(self) -> JointsRecord:
+        for axis in ("pan", "tilt"):
+            try:
+                _ = getattr(self, axis).joint
+            except ValueError as error:
+                raise problem(axis, str(error)) from None
+        return self
+
+
+class StereoRecord(Record):
+    """The key ``stereo`` of a file."""
+
+    stereo: dict[_PairName, _Pair] = Field(default={}, description="the cameras of each pair")
+
+
+class MastFileRecord(StereoRecord):
+    """A mast file."""
+
+    schema_: Literal["mastctl/mast/1"] = Field(alias="schema")
+    name: Text
+    mast: MastRecord
+    cameras: dict[_CameraName, RigCameraRecord] = Field(
+        description="cameras by name: <pair>_left and <pair>_right; one alone has a name without a side"
+    )
+    joints: JointsRecord = Field(
+        default=JointsRecord(), description="errors of the head's readings: Read and true angles"
+    )
+    fit: Free = Field(default={}, description="residuals, covariance with its parameter order")
+    provenance: Free = Field(default={}, description="origin of the file")
+
+    @model_validator(mode="after")
+    def _has_the_cameras_of_its_pairs(self) -> MastFileRecord:
+        for key, reason in _without_camera(self.stereo, self.cameras):
+            raise problem(key, reason)
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,36 +293,30 @@ def load_rig(path: str | Path) -> StoredRig:
 
 def parse_rig(data: bytes, path: str | Path) -> StoredRig:
     """Read a mast file's bytes; ``path`` is for messages only. Raises BadFile as ``load_rig``."""
-    document = parse_mapping(data, path)
-    _check_schema(document, path, MAST_SCHEMA)
-    optional: tuple[str, ...] = ("stereo", "joints", "fit", "provenance")
-    top = Section(path, "", document, ("schema", "name", "mast", "cameras"), optional)
-    mast = top.section("mast", ("translation_m", "rotation_rad"), ("axis_offset_m", "axis_twist_rad"))
+    record = read_record(MastFileRecord, _of_schema(data, path, MAST_SCHEMA), path)
     cameras: dict[str, RigCamera] = {}
     notes: tuple[str, ...] = ()
-    for name in top.mapping("cameras"):
-        if not CAMERA_NAME.fullmatch(name):
-            raise top.bad(f"cameras.{name}", CAMERA_NAME_WORDS)
+    for name, camera in record.cameras.items():
         place = f"cameras.{name}"
-        optional = (*_MODEL_OPTIONS, "sensor_mode")
-        section = Section(path, place, top.mapping("cameras")[name], ("on", *_MODEL_KEYS), optional)
-        on = cast(Literal["head", "rover"], section.choice("on", ("head", "rover")))
-        model, camera_notes = _model(section)
-        cameras[name] = RigCamera(on, model, read_sensor_mode(section, model.size_px))
+        model, camera_notes = _model(camera, path, place)
+        mode = camera.sensor_mode
+        sensor_mode = _sensor_mode(mode, model.size_px, path, place) if mode else None
+        cameras[name] = RigCamera(camera.on, model, sensor_mode)
         notes += camera_notes
+    mast = record.mast
     rig = Rig(
-        name=top.text("name"),
+        name=record.name,
         mast=Mast(
-            translation_m=mast.vector("translation_m"),
-            rotation_rad=mast.vector("rotation_rad"),
-            axis_offset_m=mast.number("axis_offset_m") if "axis_offset_m" in mast else 0.0,
-            axis_twist_rad=mast.number("axis_twist_rad") if "axis_twist_rad" in mast else 0.0,
+            np.array(mast.translation_m),
+            np.array(mast.rotation_rad),
+            mast.axis_offset_m,
+            mast.axis_twist_rad,
         ),
         cameras=cameras,
-        stereo=read_stereo(top, cameras),
-        fit=top.free("fit"),
-        provenance=top.free("provenance"),
-        joints=_joints(top.section("joints", (), ("pan", "tilt"))) if "joints" in top else JointErrors(),
+        stereo={pair: (left, right) for pair, (left, right) in record.stereo.items()},
+        fit=record.fit,
+        provenance=record.provenance,
+        joints=JointErrors(record.joints.pan.joint, record.joints.tilt.joint),
     )
     return StoredRig(rig, digest_of(data), Path(path), notes)
 
@@ -136,28 +354,11 @@ def save_rig(rig: Rig, path: str | Path) -> StoredRig:
     return stored
 
 
-def load_camera(path: str | Path) -> CameraFile:
-    """Read a camera file (``mastctl/camera/1``). Raises BadFile as ``load_rig``."""
-    return parse_camera(read_bytes(path, MAX_BYTES), path)
-
-
 def parse_camera(data: bytes, path: str | Path) -> CameraFile:
     """Read a camera file's bytes; ``path`` is for messages only. Raises BadFile as ``load_rig``."""
-    document = parse_mapping(data, path)
-    _check_schema(document, path, CAMERA_SCHEMA)
-    top = Section(
-        path, "", document, ("schema", "frame", *_MODEL_KEYS), (*_MODEL_OPTIONS, "fit", "provenance")
-    )
-    model, notes = _model(top)
-    return CameraFile(
-        model=model,
-        frame=top.text("frame"),
-        fit=top.free("fit"),
-        provenance=top.free("provenance"),
-        notes=notes,
-        path=Path(path),
-        digest=digest_of(data),
-    )
+    record = read_record(CameraFileRecord, _of_schema(data, path, CAMERA_SCHEMA), path)
+    model, notes = _model(record, path, "")
+    return CameraFile(model, record.frame, record.fit, record.provenance, notes, Path(path), digest_of(data))
 
 
 def save_camera(camera: CameraFile, path: str | Path) -> CameraFile:
@@ -172,107 +373,58 @@ def save_camera(camera: CameraFile, path: str | Path) -> CameraFile:
     return stored
 
 
-def _check_schema(document: dict[str, Any], path: str | Path, expected: str) -> None:
-    """Refuse another schema before its keys are looked at."""
+def _of_schema(data: bytes, path: str | Path, expected: str) -> dict[str, Any]:
+    """The keys of a file, one of another schema refused before any of them is read."""
+    document = parse_mapping(data, path)
     if "schema" not in document:
         raise BadFile(path, "schema", f"the key is missing; 'schema: {expected}' is expected")
     if document["schema"] != expected:
         raise BadFile(path, "schema", f"{kind_of(document['schema'])} where '{expected}' is expected")
+    return document
 
 
-def _model(section: Section) -> tuple[CameraModel, tuple[str, ...]]:
-    """Read the keys of one camera model."""
-    kind = cast(Kind, section.choice("model", KINDS))
-    size = section.integers("size_px", 2, 1, LARGEST_IMAGE_PX)
-    opencv = kind in FREE
-    for key in (*(CAHVORE_KEYS if opencv else OPENCV_KEYS), *(("spline",) if kind != SPLINED else ())):
-        if key in section:
-            raise section.bad(key, f"{kind} has no '{key}'; another 'model' has it")
-    if opencv:
-        model, notes = build_opencv(section, kind, (size[0], size[1]))
-        return model, (*notes, *blind_notes(model, section.path, section.place))
-    letters = str(kind)
-    for letter in letters:
-        if letter not in section:
-            raise section.bad(letter, f"the key is missing; {kind} has it")
-    vectors = {letter: section.vector(letter) for letter in letters}
-    for letter in "ORE":
-        # A vector that the kind has no use for is harmless only while it says nothing.
-        if letter not in letters and letter in section and section.vector(letter).any() and letter != "O":
-            raise section.bad(letter, f"{kind} has no {letter}; expected zeros or another 'model'")
-    cahvore_type, linearity = 0, None
-    if kind == "CAHVORE":
-        if "type" not in section:
-            raise section.bad("type", "the key is missing; CAHVORE has type 1, 2 or 3")
-        cahvore_type = section.integer("type", 1, 3)
-        linearity = section.number("linearity", 100.0) if "linearity" in section else None
-        if cahvore_type == 3 and linearity is None:
-            raise section.bad("linearity", "the key is missing; CAHVORE type 3 has it")
-    else:
-        for key in ("type", "linearity"):
-            if key in section:
-                raise section.bad(key, f"{kind} has no '{key}'; CAHVORE has it")
-    return build_model(
-        section.path, section.place, kind, (size[0], size[1]), vectors, cahvore_type, linearity
-    )
+def _model(record: CameraRecord, path: str | Path, place: str) -> tuple[CameraModel, tuple[str, ...]]:
+    """The camera of a record, with notes for the user."""
+    size_px = record.size_px[0], record.size_px[1]
+    if record.model in FREE:
+        model, notes = _opencv_model(record, size_px, path, place)
+        return model, (*notes, *blind_notes(model, path, place))
+    vectors = {letter: getattr(record, letter) for letter in record.model}
+    return build_model(path, place, record.model, size_px, vectors, record.type or 0, record.linearity)
 
 
-def build_opencv(
-    section: Section, kind: Kind, size_px: tuple[int, int]
+def _opencv_model(
+    record: CameraRecord, size_px: tuple[int, int], path: str | Path, place: str
 ) -> tuple[CameraModel, tuple[str, ...]]:
-    """Return the camera of a section with ``camera_matrix``, ``distortion``, ``rotation`` and ``C``.
+    """A camera of OpenCV's families; a rotation of few digits is made one."""
 
-    A rotation of few digits is made one, with a note if that moves a pixel by more than 0.01.
+    def at(key: str) -> str:
+        return f"{place}.{key}" if place else key
 
-    Raises
-    ------
-    BadFile
-        If a key is missing or the numbers are no camera.
-    """
-    for key in (*OPENCV_KEYS, *(("spline",) if kind == SPLINED else ())):
-        if key not in section:
-            raise section.bad(key, f"the key is missing; {kind} has it")
-    matrix = section.rows("camera_matrix", 3, 3)
-    given = section.rows("rotation", 3, 3, 1.001)
-    grid = _spline(section) if kind == SPLINED else None
-    count = COEFFICIENTS[kind] if grid is None else 2 * grid.columns * grid.rows
-    distortion = section.vector("distortion", 1e6, count)
+    matrix, given = np.array(record.camera_matrix), np.array(record.rotation)
     rotation, notes = given, tuple[str, ...]()
     if np.abs(given @ given.T - np.eye(3)).max() > _ROUNDED:
         turn, _, other = np.linalg.svd(given)
         rotation = turn @ other
     off = float(np.abs(rotation - given).max())
     if not off < _NO_ROTATION or np.linalg.det(rotation) < 0.0:
-        raise section.bad("rotation", f"{given.tolist()} where a rotation is expected")
+        raise BadFile(path, at("rotation"), f"{given.tolist()} where a rotation is expected")
     try:
-        model = CameraModel.of_matrix(kind, size_px, matrix, distortion, rotation, section.vector("C"), grid)
+        model = CameraModel.of_matrix(record.model, size_px, matrix, record.distortion, rotation, record.C)
     except (ValueError, ArithmeticError) as error:
-        raise section.bad("", f"is no usable camera: {error}") from None
+        raise BadFile(path, place, f"is no usable camera: {error}") from None
     if not model.project(model.C + model.A)[1]:
-        raise section.bad("distortion", "the lens folds at its axis: no image can be formed")
-    if (shift_px := off * max(abs(matrix[0, 0]), abs(matrix[1, 1]))) > TOLD_SHIFT_PX:
-        where = section.place or "camera"
-        notes = (f"{where}: 'rotation' made one, which moves pixels by up to {shift_px:.2g} px",)
+        raise BadFile(path, at("distortion"), "the lens folds at its axis: no image can be formed")
+    if (shift_px := off * max(abs(matrix[0, 0]), abs(matrix[1, 1]))) > SHIFT_NOTE_PX:
+        notes = (f"{place or 'camera'}: 'rotation' made one, which moves pixels by up to {shift_px:.2g} px",)
     return model, notes
-
-
-def _spline(section: Section) -> SplineGrid:
-    """Read how a camera's control points stand."""
-    inner = section.section("spline", ("order", "columns", "rows", "fov_x_deg"))
-    columns, rows = (inner.integer(key, 3, 1000) for key in ("columns", "rows"))
-    try:
-        return SplineGrid(inner.integer("order", 2, 3), columns, rows, inner.number("fov_x_deg", 360.0))
-    except ValueError as error:
-        raise section.bad("spline", str(error)) from None
 
 
 def _model_keys(model: CameraModel) -> dict[str, Any]:
     """Return one camera model's keys in the order of docs/reference/configuration.md."""
     keys: dict[str, Any] = {"size_px": list(model.size_px), "model": model.kind}
-    if model.spline is not None:
-        keys["spline"] = asdict(model.spline)
     if model.kind in FREE:
-        return keys | {"C": model.C, **{key: getattr(model, key) for key in OPENCV_KEYS}}
+        return keys | {"C": model.C, **{key: getattr(model, key) for key in _OPENCV_KEYS}}
     keys.update({letter: getattr(model, letter) for letter in model.letters})
     if model.kind == "CAHVORE":
         keys.update(type=int(model.cahvore_type), linearity=float(model.linearity))
@@ -289,14 +441,21 @@ def read_sensor_mode(camera: Section, size_px: tuple[int, int]) -> SensorMode | 
     """
     if "sensor_mode" not in camera:
         return None
-    section = camera.section("sensor_mode", ("flip",), ("sensor_px", "crop_px"))
-    flip = FLIPS[cast(FlipName, section.choice("flip", tuple(FLIPS)))]
-    crop: Any = section.integers("crop_px", 4, 0, LARGEST_IMAGE_PX) if "crop_px" in section else None
-    sensor: Any = section.integers("sensor_px", 2, 1, LARGEST_IMAGE_PX) if "sensor_px" in section else None
+    record = read_record(
+        SensorModeRecord, camera.values["sensor_mode"], camera.path, camera.at("sensor_mode")
+    )
+    return _sensor_mode(record, size_px, camera.path, camera.place)
+
+
+def _sensor_mode(
+    record: SensorModeRecord, size_px: tuple[int, int], path: str | Path, place: str
+) -> SensorMode:
+    crop: Any = tuple(record.crop_px) if record.crop_px else None
+    sensor: Any = tuple(record.sensor_px) if record.sensor_px else None
     try:
-        return SensorMode(size_px, crop, sensor, flip)
+        return SensorMode(size_px, crop, sensor, FLIPS[record.flip])
     except ValueError as error:
-        raise camera.bad("sensor_mode", str(error)) from None
+        raise BadFile(path, f"{place}.sensor_mode", str(error)) from None
 
 
 def sensor_mode_keys(mode: SensorMode | None) -> dict[str, Any]:
@@ -307,22 +466,6 @@ def sensor_mode_keys(mode: SensorMode | None) -> dict[str, Any]:
     if mode.crop_px is not None and mode.sensor_px is not None:
         keys = {"sensor_px": list(mode.sensor_px), "crop_px": list(mode.crop_px), **keys}
     return {"sensor_mode": keys}
-
-
-def _joints(section: Section) -> JointErrors:
-    """Read what the joints' readings are wrong by; an axis that is not there reads true."""
-    axes: dict[str, AxisJoint] = {}
-    for axis in section.values:
-        one = section.section(axis, (), ("harmonics_rad", "backlash_rad"))
-        pairs = one.pairs("harmonics_rad", MOST_HARMONICS) if "harmonics_rad" in one else ()
-        backlash = one.number("backlash_rad") if "backlash_rad" in one else 0.0
-        if backlash < 0.0:
-            raise one.bad("backlash_rad", f"{backlash:g} where a width of 0 rad or more is expected")
-        try:
-            axes[axis] = AxisJoint(pairs, backlash)
-        except ValueError as error:
-            raise section.bad(axis, str(error)) from None
-    return JointErrors(**axes)
 
 
 def joint_keys(joints: JointErrors) -> dict[str, Any]:
@@ -344,22 +487,19 @@ def read_stereo(top: Section, cameras: Mapping[str, object]) -> dict[str, tuple[
     BadFile
         For a pair that is not two known cameras, left and right.
     """
-    pairs: dict[str, tuple[str, str]] = {}
-    for pair, names in top.mapping("stereo").items():
-        key = f"stereo.{pair}"
-        if not _PAIR_NAME.fullmatch(pair):
-            raise top.bad(key, "a pair's name is letters, digits, '_' and '-'")
-        if not isinstance(names, list) or len(names) != 2 or not all(isinstance(n, str) for n in names):
-            raise top.bad(key, f"{kind_of(names)} where [left camera, right camera] is expected")
-        for name, side in zip(names, ("_left", "_right"), strict=True):
+    stereo = read_record(StereoRecord, {"stereo": top.mapping("stereo")}, top.path).stereo
+    for key, reason in _without_camera(stereo, cameras):
+        raise top.bad(key, reason)
+    return {pair: (left, right) for pair, (left, right) in stereo.items()}
+
+
+def _without_camera(stereo: Mapping[str, Any], cameras: Mapping[str, object]) -> Iterator[tuple[str, str]]:
+    """Yield the key of each pair that names a camera which is not there, and the reason."""
+    for pair, names in stereo.items():
+        for name in names:
             if name not in cameras:
-                raise top.bad(
-                    key, f"'{name}' is no camera of this file; there are {', '.join(cameras) or 'none'}"
-                )
-            if not name.endswith(side):
-                raise top.bad(key, f"'{name}' where a camera named ...{side} is expected")
-        pairs[pair] = (names[0], names[1])
-    return pairs
+                there = ", ".join(cameras) or "none"
+                yield f"stereo.{pair}", f"'{name}' is no camera of this file; there are {there}"
 
 
 def _dump(document: dict[str, Any], path: str | Path) -> bytes:

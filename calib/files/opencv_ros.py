@@ -1,21 +1,25 @@
 """Cameras as OpenCV and ROS write them, and what the files of all other programs share.
 
-ROS's ``camera_info`` is camera_calibration_parsers' YAML, or a message as ``ros2 topic echo`` prints it.
-Lenses ``plumb_bob`` (5 coefficients), ``rational_polynomial`` (8) and ``equidistant`` (4; ``fisheye`` too).
-The file holds no pose: frame ``camera``, x right, y down, z ahead, as ROS's optical frames. R and P are those
-of a camera that is not rectified; of a rectified one they are not read, for they do not change what the lens
-sees.
+ROS's ``camera_info`` is camera_calibration_parsers' YAML, or messages of one topic as ``ros2 topic echo``
+prints them. The file holds no pose: frame ``camera``, x right, y down, z ahead, as ROS's optical frames. R
+and P are those of a camera that is not rectified; of a rectified one they are not read, for they do not
+change what the lens sees.
 
-OpenCV's ``FileStorage``, in YAML: ``image_width``, ``image_height``, ``camera_matrix`` and
-``distortion_coefficients`` as the calibration samples write them (``K`` and ``D`` too), ``fisheye_model`` (or
-``camera_model: fisheye``) for cv2.fisheye's lens. OpenCV has no keys for where a camera is: this writer adds
-``frame`` and ``camera_from_frame`` (4, 4), points of the frame to camera axes, and this reader knows them.
+OpenCV's ``FileStorage`` (`calib.files.file_storage`) holds ``image_width``, ``image_height``,
+``camera_matrix`` and ``distortion_coefficients`` as the calibration samples write them, ``fisheye_model`` for
+cv2.fisheye's lens, ``M1``, ``D1``, ``M2``, ``D2`` for a stereo pair (whose R and T have no stated unit and
+are not read). OpenCV has no keys for where a camera is: this writer adds ``frame`` and ``camera_from_frame``
+(4, 4), points of the frame to camera axes, and this reader knows them.
+
+The lens is the family that the file names and as many coefficients as it holds: 0, 4, 5, 8, 12 or 14 of
+cv2.projectPoints (``plumb_bob``, ``rational_polynomial``), 4 of cv2.fisheye (``equidistant``).
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +27,7 @@ import numpy as np
 
 from calib.errors import BadFile
 from calib.files import LARGEST_COMPONENT, LARGEST_IMAGE_PX, CameraFile, blind_notes, digest_of
+from calib.files.file_storage import looks_like_storage, parse_storage
 from calib.files.twin import FISHEYE, ODD, LensFamily, kind_of_lens
 from calib.files.yaml_text import Section, dump_mapping, kind_of, parse_mapping
 from calib.geometry.cahvor import CameraModel
@@ -34,9 +39,18 @@ CAMERA_FRAME = "camera"
 
 LARGEST_COEFFICIENT = 1e6
 
+_LENS_KEY = re.compile(
+    r"fish_?eye|omni|distor|dist_?coef|lens|model|(?:^|_)(?:xi|skew|alpha|mirror\w*)$", re.I
+)
+_SPREAD_KEY = re.compile(r"std|dev|sigma|cov|err", re.I)
+"""Unknown keys that may change what a lens does, but for those that say how well it is known."""
+
+_NEAR = 0.8
+"""How alike (difflib's ratio) a key that is not read and a known one must be for a misspelling."""
+
 
 class Loose(Section):
-    """A mapping whose unknown keys are noted, not refused: other programs write more than they need."""
+    """A mapping of another program, whose unknown keys are noted unless they may change the camera."""
 
     def __init__(self, path: str | Path, place: str, value: Any) -> None:
         if not isinstance(value, dict):
@@ -44,11 +58,16 @@ class Loose(Section):
         super().__init__(path, place, value, (), tuple(value))
 
     def need(self, *names: str) -> str:
-        """Return the first of the names that is a key here; they are other programs' words for one thing."""
-        for name in names:
-            if name in self.values:
-                return name
-        raise self.bad(names[0], "the key is missing")
+        """Return the first of the names that is a key; they are other programs' names of one thing."""
+        present = [name for name in names if name in self.values]
+        if not present:
+            near = [key for name in names for key in get_close_matches(name, self.values, n=1, cutoff=_NEAR)]
+            hint = f"; rename '{near[0]}', if that is it" if near else ""
+            raise self.bad(names[0], f"the key is missing{hint}")
+        for other in present[1:]:
+            if self.values[other] != self.values[present[0]]:
+                raise self.bad(other, f"has other values than '{present[0]}'; keep the one that is right")
+        return present[0]
 
     def numbers(self, key: str, counts: Sequence[int] = (), limit: float = LARGEST_COMPONENT) -> FloatArray:
         """Return a list of numbers (n,), n one of ``counts`` if given."""
@@ -58,23 +77,66 @@ class Loose(Section):
             raise self.bad(key, f"{kind_of(value)} where a list of {expected}numbers is expected")
         return self.vector(key, limit, len(value))
 
-    def matrix(self, key: str, shapes: Sequence[tuple[int, int]]) -> FloatArray:
-        """Return ``{rows, cols, data}`` as an array of one of the shapes."""
-        inner = Loose(self.path, self.at(key), self.values[key])
-        rows, columns = (inner.integer(inner.need(name), 0, 10_000) for name in ("rows", "cols"))
-        if (rows, columns) not in shapes:
-            expected = " or ".join(f"{a} x {b}" for a, b in shapes[:6])
-            raise self.bad(key, f"{rows} x {columns} where {expected} is expected")
-        return inner.numbers(inner.need("data"), (rows * columns,)).reshape(rows, columns)
+    def matrix(self, key: str, notes: list[str]) -> FloatArray:
+        """Return the numbers (n,) of ``{rows, cols, data}``, of a list of rows, or of a list.
+
+        The data count, not ``rows`` and ``cols``; where these contradict, a note is added.
+        """
+        value = self.values[key]
+        if isinstance(value, dict):
+            inner = Loose(self.path, self.at(key), value)
+            data = value[inner.need("data")]
+            inner.values = {"data": [data] if isinstance(data, (int, float)) else data or []}
+            found = inner.numbers("data")
+            rows, columns = value.get("rows"), value.get("cols")
+            if isinstance(rows, int) and isinstance(columns, int) and rows * columns != len(found):
+                notes.append(
+                    f"{self.at(key)}: {len(found)} numbers, and rows and cols say {rows} x {columns}; "
+                    "the numbers are read"
+                )
+            return found
+        if not isinstance(value, list):
+            raise self.bad(
+                key, f"{kind_of(value)} where {{rows, cols, data}} or [[a, b, c], ...] is expected"
+            )
+        rows_of = [row if isinstance(row, list) else [row] for row in value]
+        if len({len(row) for row in rows_of}) > 1:
+            raise self.bad(key, "rows of several lengths where a matrix is expected")
+        flat = Loose(self.path, self.place, {key: [number for row in rows_of for number in row]})
+        return flat.numbers(key)
 
     def size(self, width: str, height: str) -> tuple[int, int]:
         """Return the image's size from two keys."""
+        for key in (width, height):
+            if isinstance(self.values[key], float) and self.values[key].is_integer():
+                self.values[key] = int(self.values[key])
         return self.integer(width, 1, LARGEST_IMAGE_PX), self.integer(height, 1, LARGEST_IMAGE_PX)
 
     def unread(self, known: Sequence[str]) -> tuple[str, ...]:
-        """Return a note that names the keys that were not read."""
+        """Return a note that names the keys that were not read.
+
+        Raises
+        ------
+        BadFile
+            If one of them may change the camera, or is nearly one of the known keys that are not in the file.
+        """
         left = [key for key in self.values if key not in known]
+        for key in left:
+            near = get_close_matches(key, [name for name in known if name not in self.values], 1, _NEAR)
+            if near:
+                raise self.bad(
+                    key, f"unknown key; the nearest known is '{near[0]}': rename it or take it out"
+                )
+            if _LENS_KEY.search(key) and not _SPREAD_KEY.search(key):
+                raise self.bad(
+                    key,
+                    "this key may change the lens and is not read; take it out if it does not, else write "
+                    f"the lens as {_LENS_KEYS}",
+                )
         return (f"{', '.join(f'{self.at(key)!s}' for key in left[:8])} not read",) if left else ()
+
+
+_LENS_KEYS = "distortion_model (plumb_bob, rational_polynomial or equidistant) and distortion_coefficients"
 
 
 def camera_matrix(section: Section, key: str, matrix: FloatArray) -> FloatArray:
@@ -161,77 +223,238 @@ def matrix44(pose: Rigid) -> FloatArray:
     return whole
 
 
+Reading = CameraFile | BadFile
+"""One camera of a file of several: read, or the refusal for when it is requested."""
+
 LENSES: dict[str, tuple[LensFamily, tuple[int, ...]]] = {
     "plumb_bob": ("pinhole", (0, 4, 5)),
     "rational_polynomial": ("pinhole", (8,)),
     "equidistant": ("equidistant", (4,)),
     "fisheye": ("equidistant", (4,)),
+    "kannala_brandt": ("equidistant", (4,)),
+    "radtan": ("pinhole", (4,)),
+    "pinhole": ("pinhole", (0, *opencv.COUNTS)),
     "none": ("pinhole", (0,)),
     "": ("pinhole", (0,)),
 }
+"""Each name of a lens: its family, and how many coefficients it says there are."""
 
-_FILE_KEYS = ("camera_matrix", "distortion_coefficients", "rectification_matrix", "projection_matrix")
-_KNOWN = (*_FILE_KEYS, *"kdrpKDRP", "image_width", "image_height", "width", "height", "camera_name", "header")
-_ALSO = ("distortion_model", "binning_x", "binning_y", "roi")
+_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M", "k")
+_COEFFICIENTS = (
+    *("distortion_coefficients", "dist_coeffs", "dist_coeff", "distCoeffs", "Distortion_Coefficients"),
+    *("D", "d"),
+)
+_WIDTH, _HEIGHT = ("image_width", "image_Width", "width"), ("image_height", "image_Height", "height")
+_RESOLUTION = "cameraResolution"
+_LENS_NAMES = ("distortion_model", "camera_model")
+_RECTIFIED = ("rectification_matrix", "r", "R")
+_HARMLESS = (*_RECTIFIED, "projection_matrix", "p", "P", "camera_name", "header")
+_BINNING = ("binning_x", "binning_y")
+_PAIR = {
+    side: (
+        tuple(f"{name}{number}" for name in ("M", "K", "cameraMatrix", "camera_matrix")),
+        tuple(f"{name}{number}" for name in ("D", "distCoeffs", "dist_coeffs", "distortion_coefficients")),
+    )
+    for side, number in (("left", 1), ("right", 2))
+}
 
 
-def looks_like_camera_info(document: dict[str, object]) -> bool:
-    """Return whether a YAML file's keys are those of a camera_info."""
-    return "distortion_model" in document and ("camera_matrix" in document or "height" in document)
+def looks_like_calibration(document: Mapping[str, object]) -> bool:
+    """Return whether a file's keys are those of OpenCV's calibrations or of a camera_info."""
+    long = {name for name in (*_MATRIX, *_COEFFICIENTS, *_WIDTH[:2], *_HEIGHT[:2]) if len(name) > 6}
+    keys = {key for matrix, coefficients in _PAIR.values() for key in (*matrix, *coefficients)}
+    return (
+        any(
+            name in document
+            for name in ("camera_matrix", "distortion_model", "Camera_Matrix", "cameraMatrix")
+        )
+        or len(long & set(document)) > 1
+        or len(keys & set(document)) > 1
+        or ({"K", "width"} <= set(document))
+    )
 
 
-def without_last_mark(data: bytes) -> bytes:
-    """Return the bytes without the ``---`` that ``ros2 topic echo`` ends a message with."""
-    return re.sub(rb"\n---\s*\Z", b"\n", data)
+def read_document(data: bytes, path: str | Path) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return the keys of a FileStorage, of a YAML file, or of messages of one topic that agree; with notes.
+
+    Raises
+    ------
+    BadFile
+        If it cannot be parsed, or two messages say different things of the camera.
+    """
+    if looks_like_storage(data):
+        return parse_storage(data, path), ()
+    parts = [part for part in _BETWEEN.split(data) if _CONTENT.search(part)]
+    if len(parts) < 2:
+        return parse_mapping(parts[0] if parts else data, path), ()
+    first = parse_mapping(parts[0], path)
+    for number, part in enumerate(parts[1:], 2):
+        try:
+            other = parse_mapping(part, path)
+        except BadFile:
+            if number < len(parts):
+                raise
+            return first, (f"message {number}, the last, is cut and not read",)
+        for key in first:
+            if key != "header" and key in other and other[key] != first[key]:
+                raise BadFile(
+                    path, key, f"message {number} differs from the first; one camera is expected: keep one"
+                )
+    return first, (f"{len(parts)} messages, which agree; the first is read",)
 
 
-def parse_camera_info(data: bytes, path: str | Path) -> CameraFile:
-    """Read a camera_info; ``path`` is for messages only.
+_BETWEEN = re.compile(rb"^---[ \t]*\r?$", re.MULTILINE)
+_CONTENT = re.compile(rb"^[ \t]*[^\s#]", re.MULTILINE)
+
+
+def parse_calibration(data: bytes, path: str | Path) -> dict[str, Reading]:
+    """Read the camera of OpenCV's or ROS's file, or the pair ``left`` and ``right``.
+
+    Returns
+    -------
+    readings
+        By name, ``camera`` where there is one. Of a pair each is read or refused by itself.
 
     Raises
     ------
     BadFile
         If it is no camera: which key, what it holds, what is expected.
     """
-    top = Loose(path, "", parse_mapping(without_last_mark(data), path))
-    model = top.values[top.need("distortion_model")]
-    if model not in LENSES or not isinstance(model, str):
-        raise top.bad(
-            "distortion_model", f"'{model!s:.40}' where one of {', '.join(LENSES)[:-2]} is expected"
+    document, notes = read_document(data, path)
+    top = Loose(path, "", document)
+    if not any(key in top for matrix, _ in _PAIR.values() for key in matrix):
+        return {"camera": _calibration(top, _MATRIX, _COEFFICIENTS, digest_of(data), notes)}
+    names = [key for matrix, coefficients in _PAIR.values() for key in (*matrix, *coefficients)]
+    found: dict[str, Reading] = {}
+    for side, (matrix, coefficients) in _PAIR.items():
+        one = Loose(
+            path,
+            "",
+            {key: value for key, value in top.values.items() if key not in names}
+            | {key: top.values[key] for key in (*matrix, *coefficients) if key in top},
         )
-    lens, counts = LENSES[model]
-    size = top.size(top.need("image_width", "width"), top.need("image_height", "height"))
-    if "camera_matrix" in top:
-        key = "camera_matrix"
-        matrix = top.matrix(key, ((3, 3),))
-        shapes = [shape for count in counts for shape in ((1, count), (count, 1))]
-        distortion = top.matrix(top.need("distortion_coefficients"), shapes).ravel()
-    else:
-        key = top.need("k", "K")
-        matrix = top.numbers(key, (9,)).reshape(3, 3)
-        distortion = top.numbers(top.need("d", "D"), counts)
-    for name in ("binning_x", "binning_y"):
+        try:
+            found[side] = _calibration(one, matrix, coefficients, digest_of(data), notes)
+        except BadFile as refusal:
+            found[side] = refusal
+    return found
+
+
+def _calibration(
+    top: Loose,
+    matrix_names: Sequence[str],
+    coefficient_names: Sequence[str],
+    digest: str,
+    notes_before: Sequence[str],
+) -> CameraFile:
+    """The camera of a mapping, its matrix and coefficients under one of the names."""
+    notes = list(notes_before)
+    key, distortion_key = top.need(*matrix_names), top.need(*coefficient_names)
+    numbers = top.matrix(key, notes)
+    if len(numbers) != 9:
+        raise top.bad(key, f"{len(numbers)} numbers where 3 x 3 are expected")
+    matrix = camera_matrix(top, key, numbers.reshape(3, 3))
+    size = _size(top)
+    family, distortion = _lens(top, distortion_key, top.matrix(distortion_key, notes), notes)
+    for name in _BINNING:
         if name in top and top.integer(name, 0, 64) > 1:
             raise top.bad(name, "the picture is binned; the camera of the whole picture is expected (0 or 1)")
-    notes = list(top.unread((*_KNOWN, *_ALSO)))
+    frame, pose = CAMERA_FRAME, None
+    known = [*matrix_names, *coefficient_names, *_WIDTH, *_HEIGHT, _RESOLUTION, *_LENS_NAMES, "fisheye_model"]
+    known += [*_HARMLESS, *_BINNING, "roi"]
+    if "camera_from_frame" in top:
+        numbers = top.matrix("camera_from_frame", notes)
+        if len(numbers) != 16:
+            raise top.bad("camera_from_frame", f"{len(numbers)} numbers where 4 x 4 are expected")
+        pose = pose_of(top, "camera_from_frame", numbers.reshape(4, 4)).inverse
+        frame = top.text(top.need("frame"))
+        known += ["frame", "camera_from_frame"]
+    notes += top.unread(known)
     if "roi" in top:
-        roi = Loose(path, "roi", top.values["roi"])
+        roi = Loose(top.path, "roi", top.values["roi"])
         if any(name in roi and roi.integer(name, 0, 65536) for name in ("x_offset", "y_offset")):
             notes.append("roi: not read; the camera is that of the whole picture")
-    if _is_rectified(top):
+    if _is_rectified(top, notes):
         notes.append("R or P turn or scale the picture for rectification; they are not read")
-    camera = lens_camera(top, lens, size, camera_matrix(top, key, matrix), distortion)
-    return as_camera_file(camera, top, CAMERA_FRAME, digest_of(data), notes)
+    return as_camera_file(lens_camera(top, family, size, matrix, distortion, pose), top, frame, digest, notes)
 
 
-def _is_rectified(top: Loose) -> bool:
+def _size(top: Loose) -> tuple[int, int]:
+    """The image's size in pixels: two keys, or OpenCV's ``cameraResolution``."""
+    if _RESOLUTION in top and not any(name in top for name in (*_WIDTH, *_HEIGHT)):
+        width, height = top.integers(_RESOLUTION, 2, 1, LARGEST_IMAGE_PX)
+        return width, height
+    try:
+        return top.size(top.need(*_WIDTH), top.need(*_HEIGHT))
+    except BadFile as refusal:
+        if not refusal.reason.startswith("the key is missing"):
+            raise
+        raise BadFile(
+            top.path,
+            refusal.place,
+            f"{refusal.reason}; add the image's size in pixels, as '{refusal.place}: 640'",
+        ) from None
+
+
+def _lens(top: Loose, key: str, numbers: FloatArray, notes: list[str]) -> tuple[LensFamily, FloatArray]:
+    """The family that the file names and the coefficients that it holds; of a name alone cv2 decides."""
+    names = {at: top.values[at] for at in _LENS_NAMES if at in top}
+    for at, name in names.items():
+        if not isinstance(name, str) or name.lower() not in LENSES:
+            known = ", ".join(filter(None, LENSES))
+            raise top.bad(at, f"{kind_of(name)} where one of {known} is expected")
+    if "distortion_model" in names and names.get("camera_model") == "pinhole":
+        del names["camera_model"]  # the projection; the other key names the lens
+    families: dict[str, LensFamily] = {at: LENSES[name.lower()][0] for at, name in names.items()}
+    if "fisheye_model" in top:
+        families["fisheye_model"] = "equidistant" if top.integer("fisheye_model", 0, 1) else "pinhole"
+    if len(set(families.values())) > 1:
+        raise top.bad(
+            "", f"{' and '.join(families)} name two lenses; keep the one that belongs to the coefficients"
+        )
+    family: LensFamily = next(iter(families.values()), "pinhole")
+    name = next(iter(names.values()), "pinhole" if family == "pinhole" else "equidistant").lower()
+    return family, coefficients(top, key, name, numbers, notes)
+
+
+def coefficients(section: Section, key: str, name: str, numbers: FloatArray, notes: list[str]) -> FloatArray:
+    """Return the coefficients (n,) that cv2 takes of the numbers under a lens's name; a note if these differ.
+
+    Raises
+    ------
+    BadFile
+        If cv2 takes no such number of them.
+    """
+    family, counts = LENSES[name]
+    if name in ("none", "") and numbers.any():
+        raise section.bad(
+            key,
+            f"{len(numbers)} coefficients, and distortion_model '{name}'; name it: plumb_bob or equidistant",
+        )
+    found = numbers
+    if family == "equidistant":
+        if len(numbers) not in (0, 4) and (len(numbers) < 4 or numbers[4:].any()):
+            raise section.bad(key, f"{len(numbers)} coefficients where 4 are expected for '{name}'")
+        found = np.zeros(4) if not len(numbers) else numbers[:4]
+    elif len(numbers) not in (0, *opencv.COUNTS):
+        expected = ", ".join(map(str, (0, *opencv.COUNTS)))
+        raise section.bad(key, f"{len(numbers)} coefficients where one of {expected} is expected")
+    if len(numbers) not in counts and name not in ("none", ""):
+        usual = " or ".join(map(str, counts))
+        notes.append(
+            f"{section.at(key)}: {len(numbers)} coefficients where '{name}' has {usual}; read as cv2 does"
+        )
+    return found
+
+
+def _is_rectified(top: Loose, notes: list[str]) -> bool:
     """Whether R is another rotation than none."""
-    for key in ("rectification_matrix", "r", "R"):
+    for key in _RECTIFIED:
         if key in top:
-            matrix = (
-                top.numbers(key, (9,)) if isinstance(top.values[key], list) else top.matrix(key, ((3, 3),))
+            matrix = top.matrix(key, notes)
+            return len(matrix) == 9 and bool(
+                np.abs(matrix - np.eye(3).ravel()).max() > 1e-9 and np.any(matrix)
             )
-            return bool(np.abs(matrix.ravel() - np.eye(3).ravel()).max() > 1e-9 and np.any(matrix))
     return False
 
 
@@ -256,66 +479,6 @@ def format_camera_info(camera: CameraModel, lens: str, name: str) -> bytes:
             "projection_matrix": matrix(np.hstack([camera.camera_matrix, np.zeros((3, 1))])),
         }
     )
-
-
-_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M")
-_COEFFICIENTS = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "Distortion_Coefficients", "D")
-_WIDTH, _HEIGHT = ("image_width", "image_Width", "width"), ("image_height", "image_Height", "height")
-_TAG = re.compile(rb"!!opencv-(?:matrix|nd-matrix)\b")
-_HEAD = re.compile(rb"\A\s*%YAML[: ]1\.[0-9]\s*?\n(?:---[^\n]*\n)?")
-
-
-def looks_like_opencv(data: bytes) -> bool:
-    """Return whether the bytes are of OpenCV's FileStorage in YAML."""
-    return data.startswith(b"%YAML:") or _TAG.search(data) is not None
-
-
-def parse_opencv(data: bytes, path: str | Path) -> CameraFile:
-    """Read a camera of OpenCV's YAML; ``path`` is for messages only.
-
-    Raises
-    ------
-    BadFile
-        If it is no camera: which key, what it holds, what is expected.
-    """
-    top = Loose(path, "", parse_mapping(_TAG.sub(b"", _HEAD.sub(b"", data)), path))
-    matrix_key, distortion_key = top.need(*_MATRIX), top.need(*_COEFFICIENTS)
-    matrix = camera_matrix(top, matrix_key, top.matrix(matrix_key, ((3, 3),)))
-    width_key, height_key = top.need(*_WIDTH), top.need(*_HEIGHT)
-    size = top.size(width_key, height_key)
-    fisheye = _is_fisheye(top)
-    counts = (4,) if fisheye else (0, *opencv.COUNTS)
-    shapes = [shape for count in counts for shape in ((1, count), (count, 1))]
-    distortion = top.matrix(distortion_key, shapes).ravel()
-    frame, pose = CAMERA_FRAME, None
-    known = [
-        matrix_key,
-        distortion_key,
-        width_key,
-        height_key,
-        "fisheye_model",
-        "camera_model",
-        "distortion_model",
-    ]
-    if "camera_from_frame" in top:
-        pose = pose_of(top, "camera_from_frame", top.matrix("camera_from_frame", ((4, 4),))).inverse
-        frame = top.text(top.need("frame"))
-        known += ["frame", "camera_from_frame"]
-    camera = lens_camera(top, "equidistant" if fisheye else "pinhole", size, matrix, distortion, pose)
-    return as_camera_file(camera, top, frame, digest_of(data), top.unread(known))
-
-
-_FISHEYE_WORDS = ("equidistant", "fisheye")
-
-
-def _is_fisheye(top: Loose) -> bool:
-    """Whether the file says that its lens is cv2.fisheye's."""
-    if "camera_model" in top:
-        return top.choice("camera_model", ("pinhole", "fisheye")) == "fisheye"
-    if "distortion_model" in top:  # OpenCV writes none, but calibrators with ROS's words do
-        words = ("plumb_bob", "rational_polynomial", *_FISHEYE_WORDS)
-        return top.choice("distortion_model", words) in _FISHEYE_WORDS
-    return bool(top.integer("fisheye_model", 0, 1)) if "fisheye_model" in top else False
 
 
 def format_opencv(camera: CameraModel, frame: str) -> bytes:

@@ -8,16 +8,16 @@ twin.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.geometry.cahvor import COEFFICIENTS, FREE, SPLINED, CameraModel, Kind
+from calib.geometry.cahvor import COEFFICIENTS, FREE, CameraModel, Kind
 from calib.geometry.parameters import parameter_names, parameter_part, predict, stepped
-from calib.geometry.rigid import FloatArray, Rigid, moved_rigid, tangents
+from calib.geometry.rigid import FloatArray, tangents
 
 FIT_GRID = (25, 19)
 """Columns and rows of the pixels that a twin is fitted at, from corner to corner of the image."""
@@ -34,14 +34,14 @@ EXACT_PX = 1e-6
 GOOD_PX = 0.005
 """A twin this near is looked for no further."""
 
-_HELD_PX = 1e-3
+_COEFFICIENT_PX = 1e-3
 """What a coefficient of 1 costs in a fit: nothing, except where the pixels do not tell it."""
 
 _STEPS = 60
 """How many steps a fit may take."""
 
 _LOST_PX = 1e3
-"""What a fit is told of a point that its camera does not see."""
+"""The residual of a point that the camera of a fit does not see."""
 
 _SQUARE = 1e-12
 """Skew below this part of the focal length is none."""
@@ -61,7 +61,7 @@ def kind_of_lens(family: LensFamily, distortion: ArrayLike) -> Kind:
     return f"OPENCV{len(numbers)}" if numbers.any() else "CAHV"  # type: ignore[return-value]  # checked by the class
 
 
-def held_as(model: CameraModel, kind: Kind) -> CameraModel | None:
+def as_kind(model: CameraModel, kind: Kind) -> CameraModel | None:
     """Return the same camera as one of another of OpenCV's kinds; None if that cannot hold it.
 
     A longer list of coefficients holds a shorter one, and a shorter one those of a longer that are not zero.
@@ -77,8 +77,8 @@ def held_as(model: CameraModel, kind: Kind) -> CameraModel | None:
     count, used = COEFFICIENTS[kind], np.flatnonzero(model.distortion)
     if len(used) and used[-1] >= count:
         return None
-    told = np.concatenate([model.distortion, np.zeros(14)])[:count]
-    return CameraModel.of_matrix(kind, model.size_px, _no_skew(model), told, model.rotation, model.C)
+    numbers = np.concatenate([model.distortion, np.zeros(14)])[:count]
+    return CameraModel.of_matrix(kind, model.size_px, _no_skew(model), numbers, model.rotation, model.C)
 
 
 def _no_skew(model: CameraModel) -> FloatArray:
@@ -106,7 +106,7 @@ class TwinError:
     blind: float
 
 
-def error_words(error: TwinError) -> str:
+def error_sentence(error: TwinError) -> str:
     """Return how far a twin is, in words."""
     if error.worst_px < EXACT_PX:
         return "exact"
@@ -156,24 +156,14 @@ def twin_error(camera: CameraModel, twin: CameraModel, near: bool = False) -> Tw
     )
 
 
-def lens_axes(model: CameraModel) -> FloatArray:
-    """Return (3, 3): columns are x, y, z in the model's frame; z along O, x and y as H and V say.
+def even_axes(model: CameraModel, z: FloatArray | None = None) -> FloatArray:
+    """Return (3, 3): columns are the camera's x, y, z in the model's frame; z along A, or as given.
 
-    Where H and V are not at right angles, each has half a say.
+    Where H and V are not at right angles, each has half a say of x.
     """
-    z = model.O
+    z = model.A if z is None else z
     right, down = model.H - (model.H @ z) * z, model.V - (model.V @ z) * z
     x = right / np.linalg.norm(right) + np.cross(down / np.linalg.norm(down), z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
-
-
-def even_axes(model: CameraModel) -> FloatArray:
-    """Return (3, 3): columns are the camera's x, y, z in the model's frame; z along A, x as H and V say."""
-    z = model.A
-    right = model.H - (model.H @ z) * z
-    down = model.V - (model.V @ z) * z
-    x = right / np.linalg.norm(right) + np.cross(down / np.linalg.norm(down), z)  # each has half a say
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z], axis=1)
 
@@ -192,21 +182,39 @@ def nearest_opencv(model: CameraModel, kind: Kind) -> CameraModel:
         the entrance point moves.
     """
     pixels, points = _what_it_sees(model)
-    if (same := held_as(model, kind)) is not None:
+    if (same := as_kind(model, kind)) is not None:
         return same
     if kind == "OPENCV14":
         return _nearest_tilted(model, pixels, points)
-    return _fit(_plain_start(model, kind), pixels, points, range(COEFFICIENTS[kind]), model.moving)
+    found = []
+    for start in _starts(model, kind, pixels, points):
+        found.append(_fit(start, pixels, points, range(COEFFICIENTS[kind]), model.moving))
+        if twin_error(model, found[-1], model.moving).worst_px <= GOOD_PX:
+            break
+    return min(found, key=lambda one: twin_error(model, one, model.moving).worst_px)
+
+
+def _starts(model: CameraModel, kind: Kind, pixels: FloatArray, points: FloatArray) -> Iterator[CameraModel]:
+    """Yield where fits of a kind begin: as plain as can be, and where a shorter list of coefficients ended.
+
+    From the plain start a fraction's poles may come to lie in the image, and no step leads out again.
+    """
+    plain = _plain_start(model, kind)
+    yield plain
+    if kind in ("OPENCV8", "OPENCV12"):
+        five = _fit(_plain_start(model, "OPENCV5"), pixels, points, range(5), model.moving)
+        numbers = np.concatenate([five.distortion, np.zeros(COEFFICIENTS[kind] - 5)])
+        yield CameraModel.of_matrix(kind, model.size_px, five.camera_matrix, numbers, five.rotation, five.C)
 
 
 def _plain_start(model: CameraModel, kind: Kind) -> CameraModel:
     """A camera of the kind to begin with: axes, focal lengths and the first coefficients of the model."""
     free = model.kind in FREE
-    axes = even_axes(model) if free else lens_axes(model)
+    axes = even_axes(model, None if free else model.O)
     focal = np.array([model.H @ axes[:, 0], model.V @ axes[:, 1]]) * (1.0 + model.R[0]) / (model.A @ model.O)
     center = np.array([model.H @ model.O, model.V @ model.O]) / (model.A @ model.O)
     distortion = np.zeros(COEFFICIENTS[kind])
-    if free and model.kind != SPLINED and (model.kind == FISHEYE) == (kind == FISHEYE):
+    if free and (model.kind == FISHEYE) == (kind == FISHEYE):
         count = min(len(distortion), len(model.distortion))
         distortion[:count] = model.distortion[:count]
     elif not free and (kind == FISHEYE) == (model.cahvore_type == 2):
@@ -225,19 +233,27 @@ def _nearest_tilted(model: CameraModel, pixels: FloatArray, points: FloatArray) 
     turn = max(np.sqrt(abs(lean)), 1e-3)
     found = []
     for sign in (1.0, -1.0):
-        told = np.concatenate([plain.distortion, np.zeros(7), [turn, sign * turn]])
+        numbers = np.concatenate([plain.distortion, np.zeros(7), [turn, sign * turn]])
         start = CameraModel.of_matrix(
-            "OPENCV14", model.size_px, plain.camera_matrix, told, plain.rotation, plain.C
+            "OPENCV14", model.size_px, plain.camera_matrix, numbers, plain.rotation, plain.C
         )
         found.append(_fit(start, pixels, points, (0, 1, 2, 3, 4, 12, 13), False))
     return min(found, key=lambda camera: twin_error(model, camera).worst_px)
 
 
-def nearest_cahvor(camera: CameraModel) -> CameraModel:
-    """Return the camera of the CAHV family whose pixels come nearest to one of OpenCV's, in the same frame.
+def plainest(tried: Sequence[tuple[CameraModel, TwinError]], limit_px: float) -> int:
+    """Return which of several twins to take, the plainest first: one within the limit that is at most twice
+    as far off as the nearest, else the nearest."""
+    worst = [error.worst_px for _, error in tried]
+    near = [at for at, px in enumerate(worst) if px <= min(limit_px, 2.0 * min(worst))]
+    return near[0] if near else int(np.argmin(worst))
 
-    CAHVOR of a pinhole lens, or CAHVORE of type 3 without E where that comes nearer; CAHVORE of type 2 of an
-    equidistant one, or type 3. One of the CAHV family is its own.
+
+def nearest_cahvor(camera: CameraModel, limit_px: float = np.inf) -> CameraModel:
+    """Return a camera of the CAHV family whose pixels come near to one of OpenCV's, in the same frame.
+
+    CAHVOR of a pinhole lens, or CAHVORE of type 3 without E; CAHVORE of type 2 of an equidistant one, or type
+    3; which of the two, `plainest` says. One of the CAHV family is its own.
 
     Raises
     ------
@@ -248,11 +264,11 @@ def nearest_cahvor(camera: CameraModel) -> CameraModel:
         return camera
     pixels, points = _what_it_sees(camera)
     fisheye = camera.kind == FISHEYE
-    r = np.zeros(3) if camera.kind == SPLINED else np.array([0.0, *camera.distortion[:2]])
+    r = np.array([0.0, *camera.distortion[:2]])
     tries: list[tuple[Kind, int]] = (
         [("CAHVORE", 2), ("CAHVORE", 3)] if fisheye else [("CAHVOR", 0), ("CAHVORE", 3)]
     )
-    best: tuple[float, CameraModel] | None = None
+    tried: list[tuple[CameraModel, TwinError]] = []
     for kind, cahvore_type in tries:
         start = CameraModel(
             kind,
@@ -267,13 +283,10 @@ def nearest_cahvor(camera: CameraModel) -> CameraModel:
             linearity=0.0 if fisheye else 1.0,
         )
         found = _fit(start, pixels, points, (), False)
-        worst_px = twin_error(camera, found).worst_px
-        if best is None or worst_px < 0.5 * best[0]:
-            best = worst_px, found
-        if worst_px < GOOD_PX:
-            break
-    assert best is not None
-    return best[1]
+        tried.append((found, twin_error(camera, found)))
+        if tried[-1][1].worst_px <= GOOD_PX:
+            return found
+    return tried[plainest(tried, limit_px)][0]
 
 
 def nearest_square(model: CameraModel) -> CameraModel:
@@ -282,68 +295,30 @@ def nearest_square(model: CameraModel) -> CameraModel:
     E, R0 and linearity stay what they are.
     """
     pixels, points = _what_it_sees(model)
-    place = Rigid(even_axes(model), model.C)
-    start = np.zeros(7 if model.kind == "CAHV" else 11)
-    start[3:7] = (
-        model.H @ place.rotation[:, 0],
-        model.V @ place.rotation[:, 1],
-        model.H @ model.A,
-        model.V @ model.A,
-    )
-    scale = np.concatenate([np.full(3, 0.001), np.full(4, 10.0), np.full(len(start) - 7, 0.01)])
-
-    def build(numbers: FloatArray) -> CameraModel:
-        x, y, z = moved_rigid(place, np.r_[numbers[:3], 0.0, 0.0, 0.0]).rotation.T
-        fx, fy, cx, cy, *lens = numbers[3:].tolist()
-        told = {"A": z, "H": fx * x + cx * z, "V": fy * y + cy * z, "O": None}
-        if lens:
-            axis = model.O + lens[0] * x + lens[1] * y
-            told |= {"O": axis / np.linalg.norm(axis), "R": model.R + np.array([0.0, *lens[2:]])}
-        return replace(model, **told)
-
-    return _fitted(build, start, scale, pixels, points)
-
-
-def _fitted(
-    build: Callable[[FloatArray], CameraModel],
-    start: FloatArray,
-    scale: FloatArray,
-    pixels: FloatArray,
-    points: FloatArray,
-) -> CameraModel:
-    """The camera whose pixels of the points come nearest, least squares from ``start``."""
-    from scipy.optimize import least_squares  # slow to load
-
-    def off_px(numbers: FloatArray) -> FloatArray:
-        try:
-            seen, valid = build(numbers).project(points)
-        except ValueError:
-            return np.full(2 * len(pixels), _LOST_PX)
-        return np.where(valid[:, None], seen - pixels, _LOST_PX).ravel()
-
-    if np.abs(off_px(start)).max() < EXACT_PX:
-        return build(start)
-    found = least_squares(
-        off_px, start, x_scale=scale, method="lm", xtol=1e-12, ftol=1e-12, max_nfev=_STEPS * len(start)
-    )
-    return build(found.x)
+    return _fit(_squared(model), pixels, points, (), False, square=True)
 
 
 def _fit(
-    start: CameraModel, pixels: FloatArray, points: FloatArray, coefficients: Sequence[int], placed: bool
+    start: CameraModel,
+    pixels: FloatArray,
+    points: FloatArray,
+    coefficients: Sequence[int],
+    placed: bool,
+    square: bool = False,
 ) -> CameraModel:
-    """The camera of the kind of ``start`` that comes nearest; of OpenCV's kinds without skew.
+    """The camera of the kind of ``start`` that comes nearest; ``square`` or of OpenCV's kinds without skew.
 
     Levenberg and Marquardt's steps, each about the camera that the last one led to. ``coefficients`` are
     those of OpenCV's that may change, ``placed`` whether C may; E stays, which is zero.
     """
+    square = square or start.kind in COEFFICIENTS
     names = parameter_names(start.kind)
     free = [at for at, name in enumerate(names) if name[0] not in ("E" if placed else "CE") + "D"]
     if "D" in start.letters:
         free += [parameter_part(start.kind, "D").start + at for at in coefficients]
     general = start.cahvore_type == 3
-    camera, damping = start, 1e-6
-    off, rates, basis = _off_and_rates(camera, pixels, points, free, general)
+    camera, damping, whole = start, 1e-6, _sees_corners(start, pixels)
+    off, rates, basis = _off_and_rates(camera, pixels, points, free, general, square)
     for _ in range(_STEPS):
         if np.abs(off[: 2 * len(points)]).max() < EXACT_PX * 1e-3:
             break
@@ -351,13 +326,14 @@ def _fit(
         normal = rates.T @ rates / np.outer(scale, scale)
         step = -np.linalg.solve(normal + damping * np.eye(len(scale)), rates.T @ off / scale) / scale
         try:
-            moved = _squared(stepped(camera, basis @ step[: basis.shape[1]]))
+            moved = stepped(camera, basis @ step[: basis.shape[1]])
+            moved = _squared(moved) if square else moved
             if general:
                 moved = replace(moved, linearity=moved.linearity + float(step[-1]))
-            moved_off, moved_rates, moved_basis = _off_and_rates(moved, pixels, points, free, general)
+            moved_off, moved_rates, moved_basis = _off_and_rates(moved, pixels, points, free, general, square)
         except ValueError:  # the step led to no camera
             moved_off = np.full(1, np.inf)
-        if not moved_off @ moved_off < off @ off:
+        if not moved_off @ moved_off < off @ off or (whole and not _sees_corners(moved, pixels)):
             damping *= 10.0
             if damping > 1e6:
                 break
@@ -370,22 +346,35 @@ def _fit(
             moved_basis,
             max(0.1 * damping, 1e-12),
         )
+        whole = whole or _sees_corners(camera, pixels)
         if settled:
             break
     return camera
 
 
+def _sees_corners(camera: CameraModel, pixels: FloatArray) -> bool:
+    """Whether the corners of a fit's pixels have rays: a lens may fold just there, and no point shows it."""
+    corners = np.stack(np.meshgrid(*zip(pixels.min(axis=0), pixels.max(axis=0), strict=True)), axis=-1)
+    return bool(camera.ray(corners.reshape(-1, 2)).valid.all())
+
+
 def _squared(model: CameraModel) -> CameraModel:
-    """A camera of OpenCV's kinds without its skew; another as it is."""
-    if model.kind not in COEFFICIENTS:
-        return model
-    return CameraModel.of_matrix(
-        model.kind, model.size_px, _no_skew(model), model.distortion, model.rotation, model.C
-    )
+    """A camera without its skew."""
+    if model.kind in COEFFICIENTS:
+        return CameraModel.of_matrix(
+            model.kind, model.size_px, _no_skew(model), model.distortion, model.rotation, model.C
+        )
+    x, y, z = even_axes(model).T
+    return replace(model, H=(model.H @ x) * x + (model.H @ z) * z, V=(model.V @ y) * y + (model.V @ z) * z)
 
 
 def _off_and_rates(
-    camera: CameraModel, pixels: FloatArray, points: FloatArray, free: Sequence[int], general: bool
+    camera: CameraModel,
+    pixels: FloatArray,
+    points: FloatArray,
+    free: Sequence[int],
+    general: bool,
+    square: bool,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Pixels off (n,), their rates (n, f) to what is free, the linearity last, and what is free (p, f).
 
@@ -393,16 +382,16 @@ def _off_and_rates(
     """
     seen = predict(camera, points)
     basis = np.eye(seen.d_step.shape[2])[:, free]
-    if "D" in camera.letters:
-        a, h, v, d = (parameter_part(camera.kind, letter) for letter in "AHVD")
-        x, y, z = camera.rotation
-        square = np.zeros((seen.d_step.shape[2], 7))  # turns about x, y, z; H along x and z, V along y and z
+    if square:
+        a, h, v = (parameter_part(camera.kind, letter) for letter in "AHV")
+        x, y, z = even_axes(camera).T
+        kept = np.zeros((seen.d_step.shape[2], 7))  # turns about x, y, z; H along x and z, V along y and z
         for column, axis in enumerate((x, y, z)):
-            square[a, column] = tangents(z) @ np.cross(axis, z)
-            square[h, column], square[v, column] = np.cross(axis, camera.H), np.cross(axis, camera.V)
-        square[h, 3], square[h, 4], square[v, 5], square[v, 6] = x, z, y, z
+            kept[a, column] = tangents(z) @ np.cross(axis, z)
+            kept[h, column], kept[v, column] = np.cross(axis, camera.H), np.cross(axis, camera.V)
+        kept[h, 3], kept[h, 4], kept[v, 5], kept[v, 6] = x, z, y, z
         others = [at for at in free if not a.start <= at < v.stop]
-        basis = np.hstack([np.eye(len(square))[:, others], square])
+        basis = np.hstack([np.eye(len(kept))[:, others], kept])
     off = np.where(seen.valid[:, None], seen.pixels_px - pixels, _LOST_PX).ravel()
     rates = np.nan_to_num(seen.d_step @ basis).reshape(len(off), -1)
     if general:
@@ -410,8 +399,8 @@ def _off_and_rates(
         other = replace(camera, linearity=camera.linearity + bit).project(points)[0]
         rates = np.column_stack([rates, np.nan_to_num((other - seen.pixels_px) / bit).ravel()])
     if "D" in camera.letters:
-        off = np.concatenate([off, _HELD_PX * camera.distortion])
-        rates = np.concatenate([rates, _HELD_PX * basis[d]])
+        off = np.concatenate([off, _COEFFICIENT_PX * camera.distortion])
+        rates = np.concatenate([rates, _COEFFICIENT_PX * basis[parameter_part(camera.kind, "D")]])
     return off, rates, basis
 
 

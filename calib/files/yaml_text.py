@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,7 @@ def parse_mapping(data: bytes, path: str | Path) -> dict[str, Any]:
         line = data.count(b"\n", 0, error.start) + 1
         raise BadFile(path, f"line {line}", f"byte 0x{data[error.start]:02x} is not UTF-8 text") from None
     try:
-        document = _build(yaml.parse(text, Loader=_PARSER), path)
+        document = _Builder(yaml.parse(text, Loader=_PARSER), path).document()
     except yaml.YAMLError as error:
         raise BadFile(path, _line_of(error), f"is not YAML: {_problem_of(error)}") from None
     if not isinstance(document, dict):
@@ -85,77 +86,55 @@ def kind_of(value: Any) -> str:
             return str(value) if not isinstance(value, int) or abs(value) < 1e20 else "a huge integer"
 
 
-class _Node:
-    """A mapping or list under construction: ``key`` is what the next value belongs to."""
+@dataclass
+class _Builder:
+    """Builds the one document's data of PyYAML's events."""
 
-    def __init__(self, holder: dict[str, Any] | list[Any], place: str) -> None:
-        self.holder = holder
-        self.place = place
-        self.key: str | None = None
+    events: Iterator[Any]
+    path: str | Path
 
-    def inner_place(self) -> str:
-        step = f"[{len(self.holder)}]" if isinstance(self.holder, list) else str(self.key or "")
-        return f"{self.place}.{step}" if self.place and not step.startswith("[") else self.place + step
+    def document(self) -> Any:
+        next(self.events)  # the stream begins
+        if isinstance(next(self.events), yaml.StreamEndEvent):
+            raise BadFile(self.path, "", "holds no keys, only blanks or comments")
+        document = self._value(next(self.events), "", 0)
+        next(self.events)  # the document ends
+        if not isinstance(event := next(self.events), yaml.StreamEndEvent):
+            raise BadFile(self.path, _line(event), "a second document begins; one is expected")
+        return document
 
-
-def _build(events: Iterator[Any], path: str | Path) -> Any:
-    """Build the one document's data; a stack instead of recursion, so depth is counted, not suffered."""
-    document: Any = None
-    documents = 0
-    stack: list[_Node] = []
-    for event in events:
-        line = f"line {event.start_mark.line + 1}"
-        if isinstance(event, yaml.DocumentStartEvent):
-            documents += 1
-            if documents > 1:
-                raise BadFile(path, line, "a second document begins; one is expected")
-        elif isinstance(event, yaml.AliasEvent):
-            raise BadFile(path, line, f"alias *{event.anchor}; write the value out, aliases are not read")
-        elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
-            stack.pop()
-        elif isinstance(event, (yaml.ScalarEvent, yaml.MappingStartEvent, yaml.SequenceStartEvent)):
-            if event.tag not in (None, "!"):
-                raise BadFile(path, line, f"tag {event.tag}; plain values are expected, tags are not read")
-            top = stack[-1] if stack else None
-            if top is not None and isinstance(top.holder, dict) and top.key is None:
-                top.key = _key(event, top, path, line)
-                continue
-            value = _value(event, path, line)
-            place = top.inner_place() if top is not None else ""
-            if top is None:
-                document = value
-            elif isinstance(top.holder, dict):
-                top.holder[str(top.key)] = value
-                top.key = None
-            else:
-                top.holder.append(value)
-            if isinstance(value, (dict, list)):
-                if len(stack) == MAX_DEPTH:
-                    raise BadFile(path, line, f"is nested deeper than {MAX_DEPTH} levels")
-                stack.append(_Node(value, place))
-    if documents == 0:
-        raise BadFile(path, "", "holds no keys, only blanks or comments")
-    return document
+    def _value(self, event: Any, place: str, depth: int) -> Any:
+        """What an event and those that belong to it stand for."""
+        if isinstance(event, yaml.AliasEvent):
+            reason = f"alias *{event.anchor}; write the value out, aliases are not read"
+            raise BadFile(self.path, _line(event), reason)
+        if event.tag not in (None, "!"):
+            hint = " (of NumPy's arrays write array.tolist())" if "python/" in event.tag else ""
+            reason = f"tag {event.tag}; plain values are expected, tags are not read{hint}"
+            raise BadFile(self.path, _line(event), reason)
+        if isinstance(event, yaml.ScalarEvent):
+            return _scalar(event, self.path)
+        if depth == MAX_DEPTH:
+            raise BadFile(self.path, _line(event), f"is nested deeper than {MAX_DEPTH} levels")
+        if isinstance(event, yaml.SequenceStartEvent):
+            items: list[Any] = []
+            while not isinstance(event := next(self.events), yaml.SequenceEndEvent):
+                items.append(self._value(event, f"{place}[{len(items)}]", depth + 1))
+            return items
+        keys: dict[str, Any] = {}
+        while not isinstance(event := next(self.events), yaml.MappingEndEvent):
+            if isinstance(event, (yaml.SequenceStartEvent, yaml.MappingStartEvent)):
+                raise BadFile(self.path, _line(event), "a list or mapping stands where a key is expected")
+            self._value(event, place, depth)  # refuses an alias or a tag
+            at = f"{place}.{event.value}" if place else event.value
+            if event.value in keys:
+                raise BadFile(self.path, at, f"the key is there twice, again on {_line(event)}")
+            keys[event.value] = self._value(next(self.events), at, depth + 1)
+        return keys
 
 
-def _key(event: Any, node: _Node, path: str | Path, line: str) -> str:
-    """Return a mapping's key, which must be a word that is not there yet."""
-    if not isinstance(event, yaml.ScalarEvent):
-        raise BadFile(path, line, "a list or mapping stands where a key is expected")
-    key: str = event.value
-    assert isinstance(node.holder, dict)
-    if key in node.holder:
-        place = f"{node.place}.{key}" if node.place else key
-        raise BadFile(path, place, f"the key is there twice, again on {line}")
-    return key
-
-
-def _value(event: Any, path: str | Path, line: str) -> Any:
-    """Return what an event stands for: an empty holder, or the scalar's value."""
-    if isinstance(event, yaml.MappingStartEvent):
-        return {}
-    if isinstance(event, yaml.SequenceStartEvent):
-        return []
+def _scalar(event: Any, path: str | Path) -> Any:
+    """A scalar's value by the core schema."""
     text: str = event.value
     if not event.implicit[0]:
         return text
@@ -163,9 +142,13 @@ def _value(event: Any, path: str | Path, line: str) -> Any:
         return _WORDS[text]
     if _INT.fullmatch(text):
         if len(text) > _MAX_DIGITS:
-            raise BadFile(path, line, f"a number of {len(text)} digits")
+            raise BadFile(path, _line(event), f"a number of {len(text)} digits")
         return int(text)
     return float(text) if _FLOAT.fullmatch(text) else text
+
+
+def _line(event: Any) -> str:
+    return f"line {event.start_mark.line + 1}"
 
 
 def _line_of(error: yaml.YAMLError) -> str:
@@ -360,29 +343,6 @@ class Section:
         items = self._list(key, count, "numbers")
         return np.array([self._number(f"{key}[{i}]", item, limit) for i, item in enumerate(items)])
 
-    def rows(self, key: str, rows: int, columns: int, limit: float = 1e9) -> FloatArray:
-        """Return a value that must be ``rows`` lists of ``columns`` finite numbers, as (rows, columns)."""
-        items = self._list(key, rows, f"lists of {columns} numbers")
-        found = np.empty((rows, columns))
-        for i, item in enumerate(items):
-            if not isinstance(item, list) or len(item) != columns:
-                raise self.bad(f"{key}[{i}]", f"{kind_of(item)} where {columns} numbers are expected")
-            found[i] = [self._number(f"{key}[{i}][{j}]", part, limit) for j, part in enumerate(item)]
-        return found
-
-    def pairs(self, key: str, most: int, limit: float = 1e9) -> tuple[tuple[float, float], ...]:
-        """Return a value that must be a list of at most ``most`` pairs of finite numbers."""
-        value = self.values[key]
-        if not isinstance(value, list) or len(value) > most:
-            raise self.bad(key, f"{kind_of(value)} where a list of up to {most} pairs of numbers is expected")
-        found = []
-        for i, pair in enumerate(value):
-            if not isinstance(pair, list) or len(pair) != 2:
-                raise self.bad(f"{key}[{i}]", f"{kind_of(pair)} where a pair of numbers is expected")
-            one, other = (self._number(f"{key}[{i}][{j}]", part, limit) for j, part in enumerate(pair))
-            found.append((one, other))
-        return tuple(found)
-
     def covariance(self, key: str, count: int, limit: float = 1e9) -> FloatArray:
         """Return a value that must be ``count`` lists of as many numbers, and a covariance."""
         rows = Section(self.path, self.place, {}, (), ())
@@ -428,7 +388,7 @@ class Section:
     def _number(self, key: str, value: Any, limit: float) -> float:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise self.bad(key, f"{kind_of(value)} where a number is expected")
-        if not math.isfinite(value) or abs(value) > limit:
+        if not abs(value) <= limit:  # an integer may be larger than any float
             raise self.bad(key, f"{kind_of(value)} where a finite number up to {limit:g} is expected")
         return float(value)
 

@@ -13,20 +13,17 @@ library as published with VICAR (``cmod_cahv*.c``).
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from math import inf, isfinite, nan, sqrt
+from math import inf, isfinite, sqrt
 from numbers import Integral
-from typing import Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.geometry.lens import Lens
-from calib.geometry.lenses.fisheye import FisheyeLens
+from calib.geometry.lenses import Lens
 from calib.geometry.lenses.opencv import OpencvLens
-from calib.geometry.lenses.projection import FreeLens, FreeProjection
-from calib.geometry.lenses.spline import SplineGrid, SplineLens
-from calib.geometry.projection import PixelMap, Place, Projection, project_as_published
+from calib.geometry.lenses.round import RoundLens
+from calib.geometry.projection import Projection, project_as_published
 from calib.geometry.rigid import FloatArray, ReadOnlyArrays, Rigid, frozen_array, tangents, turning
 
 Kind = Literal[
@@ -39,18 +36,14 @@ Kind = Literal[
     "OPENCV12",
     "OPENCV14",
     "OPENCV_FISHEYE",
-    "SPLINED_STEREOGRAPHIC",
 ]
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
-SPLINED: Kind = "SPLINED_STEREOGRAPHIC"
-FITTED: tuple[Kind, ...] = tuple(kind for kind in KINDS if kind != SPLINED)
-"""Kinds that pictures are fitted with; splines are read only."""
 
 COEFFICIENTS: dict[str, int] = {f"OPENCV{n}": n for n in (4, 5, 8, 12, 14)} | {"OPENCV_FISHEYE": 4}
 """How many coefficients each of OpenCV's families has."""
 
-FREE: tuple[str, ...] = (*COEFFICIENTS, SPLINED)
+FREE: tuple[str, ...] = tuple(COEFFICIENTS)
 """Kinds that are a camera matrix with a lens in front."""
 
 _UNIT = 1e-9
@@ -80,7 +73,7 @@ WIDE: tuple[str, ...] = ("CAHVORE", "OPENCV_FISHEYE")
 
 def letters_of(kind: str) -> str:
     """Return the letters of what a kind has numbers for; D stands for OpenCV's coefficients."""
-    return "CAHV" if kind == SPLINED else "CAHVD" if kind in COEFFICIENTS else kind
+    return "CAHVD" if kind in COEFFICIENTS else kind
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,10 +93,7 @@ class CameraModel(ReadOnlyArrays):
         1 (perspective, linearity 1), 2 (fisheye, linearity 0) or 3 (``linearity`` as given); 0 for CAHV
         and CAHVOR.
     distortion
-        (n,) OpenCV's coefficients in its order, 4 to 14 as the kind says; none of the CAHV family. Of splines
-        the control points' x, y, row after row.
-    spline
-        How the control points stand; None but for SPLINED_STEREOGRAPHIC.
+        (n,) OpenCV's coefficients in its order, 4 to 14 as the kind says; none of the CAHV family.
 
     Raises
     ------
@@ -116,7 +106,7 @@ class CameraModel(ReadOnlyArrays):
     A and along O. For CAHVORE its ray is within the angle that the linearity allows (a right angle over
     ``linearity``, at most half a turn), and for both it is nearer to O than where the polynomial of R first
     folds. Points so near a CAHVORE lens that two rays of the image pass through them have none. A lens of
-    OpenCV's reaches what is nearer to A than where it first folds (``limit_words``). Everything else comes
+    OpenCV's reaches what is nearer to A than where it first folds (``limit_reason``). Everything else comes
     out as not-a-number and False. A point outside the image keeps its numbers.
 
     Examples
@@ -140,12 +130,29 @@ class CameraModel(ReadOnlyArrays):
     cahvore_type: int = 0
     linearity: float = 1.0
     distortion: FloatArray = None  # type: ignore[assignment]  # 0 if not given
-    spline: SplineGrid | None = None
     _rows: FloatArray = field(init=False, repr=False)  # C, H, V, A, and the lens frame's x, y, z = O
-    _projection: PixelMap = field(init=False, repr=False)
+    _projection: Projection = field(init=False, repr=False)
+
+    if TYPE_CHECKING:  # vectors may be given as lists
+
+        def __init__(
+            self,
+            kind: Kind,
+            size_px: tuple[int, int],
+            C: ArrayLike,
+            A: ArrayLike,
+            H: ArrayLike,
+            V: ArrayLike,
+            O: ArrayLike | None = None,  # noqa: E741
+            R: ArrayLike | None = None,
+            E: ArrayLike | None = None,
+            cahvore_type: int = 0,
+            linearity: float = 1.0,
+            distortion: ArrayLike | None = None,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
-        self._set_words()
+        self._check_kind()
         for letter in "CAHV":
             self._set(letter, _vector(letter, getattr(self, letter)))
         for letter, default in (("O", self.A), ("R", np.zeros(3)), ("E", np.zeros(3))):
@@ -164,19 +171,18 @@ class CameraModel(ReadOnlyArrays):
         lengths = np.sqrt(np.einsum("ij,ij->i", hva, hva))
         if not lengths.all() or not abs(np.linalg.det(hva / lengths[:, None])) > _FLAT:
             raise ValueError("H, V and A lie in one plane where three directions are expected")
-        free = self.kind in FREE
-        axes = _axes_of(self.A, self.V) if free else np.array([*tangents(self.O), self.O])
+        axes = _axes_of(self.A, self.V) if self.kind in FREE else np.array([*tangents(self.O), self.O])
         self._set("_rows", np.array([self.C, *hva, *axes]))
         self._rows.setflags(write=False)
-        if free:
-            self._set_projection(np.triu(np.vstack([hva[:2] @ axes.T, [0.0, 0.0, 1.0]])))
-        else:
-            self._set("_projection", self._make_projection(hva @ axes.T))
+        plane = hva @ axes.T
+        if self.kind in FREE:
+            plane = np.triu(np.vstack([plane[:2], [0.0, 0.0, 1.0]]))
+        self._set_projection(plane)
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
 
-    def _set_words(self) -> None:
+    def _check_kind(self) -> None:
         """Check and settle what is not a vector: kind, size, type and linearity."""
         if self.kind not in KINDS:
             raise ValueError(f"the kind is {self.kind!r} where one of {', '.join(KINDS)} is expected")
@@ -198,45 +204,25 @@ class CameraModel(ReadOnlyArrays):
             raise ValueError(f"the linearity is {linearity} where a finite number is expected")
         self._set("linearity", linearity)
         count = COEFFICIENTS.get(self.kind, 0)
-        if (self.kind == SPLINED) != (self.spline is not None):
-            raise ValueError(f"{SPLINED} has a grid of splines, and no other kind has one")
-        if self.spline is not None:
-            count = 2 * self.spline.columns * self.spline.rows
         given = np.zeros(count) if self.distortion is None else self.distortion
         self._set("distortion", _vector("distortion", given, count))
 
-    def _set_projection(self, camera_matrix: FloatArray) -> None:
-        """Set what stays when a camera of OpenCV's families moves."""
-        (fx, skew, cx), (_, fy, cy), _ = camera_matrix.tolist()
-        back = np.array(
-            [[1 / fx, -skew / fx / fy, (skew * cy / fy - cx) / fx], [0, 1 / fy, -cy / fy], [0, 0, 1]]
-        )
-        lens: FreeLens
-        told, image_slope = tuple(self.distortion.tolist()), _largest_slope(self.size_px, back)
-        if self.spline is not None:
-            lens = SplineLens(self.spline, told, image_slope)
-        else:
-            fisheye = self.kind == "OPENCV_FISHEYE"
-            lens = FisheyeLens(told, image_slope) if fisheye else OpencvLens(told, image_slope)
-        for matrix in (camera_matrix, back):
-            matrix.setflags(write=False)
-        self._set("_projection", FreeProjection(lens, camera_matrix, back))
-
-    def _make_projection(self, pixel_from_slope: FloatArray) -> Projection:
-        """Return what stays when the camera moves."""
-        r0, r1, r2 = self.R.tolist()
-        e0, e1, e2 = self.E.tolist()
+    def _set_projection(self, pixel_from_slope: FloatArray) -> None:
+        """Set what stays when the camera moves."""
         slope_from_pixel = np.asarray(np.linalg.inv(pixel_from_slope), dtype=np.float64)
         for matrix in (pixel_from_slope, slope_from_pixel):
             matrix.setflags(write=False)
-        lens = Lens(
-            (r0, r1, r2),
-            (e0, e1, e2),
-            self.kind == "CAHVORE",
-            self.linearity,
-            _largest_slope(self.size_px, slope_from_pixel),
-        )
-        return Projection(lens, pixel_from_slope, slope_from_pixel)
+        numbers = tuple(self.distortion.tolist())
+        slope = _largest_slope(self.size_px, slope_from_pixel)
+        lens: Lens
+        if self.kind == "OPENCV_FISHEYE":
+            lens = RoundLens((0.0, *numbers), curved=True, linearity=0.0, image_slope=slope)
+        elif self.kind in FREE:
+            lens = OpencvLens(numbers)
+        else:
+            r, e = tuple(self.R.tolist()), tuple(self.E.tolist())
+            lens = RoundLens(r, e, self.kind == "CAHVORE", self.linearity, slope)
+        self._set("_projection", Projection(lens, pixel_from_slope, slope_from_pixel))
 
     @classmethod
     def normalised(
@@ -303,7 +289,6 @@ class CameraModel(ReadOnlyArrays):
         distortion: ArrayLike,
         rotation: ArrayLike,
         C: ArrayLike,
-        spline: SplineGrid | None = None,
     ) -> CameraModel:
         """Return a camera of OpenCV's numbers; they come back from it to the last bit.
 
@@ -321,8 +306,6 @@ class CameraModel(ReadOnlyArrays):
             (3, 3) OpenCV's R: rows are the camera's x right, y down and z ahead in the frame of C.
         C
             (3,) where the camera is, metres: -R^T t of OpenCV's t.
-        spline
-            Of SPLINED_STEREOGRAPHIC: how its control points stand, which are ``distortion``.
 
         Raises
         ------
@@ -346,7 +329,7 @@ class CameraModel(ReadOnlyArrays):
         if kind == "CAHV":
             return cls(kind, size_px, _vector("C", C), axes[2], h, v)
         numbers = _vector("distortion", distortion, -1)
-        model = cls(kind, size_px, _vector("C", C), axes[2], h, v, distortion=numbers, spline=spline)
+        model = cls(kind, size_px, _vector("C", C), axes[2], h, v, distortion=numbers)
         rows = model._rows.copy()
         rows[4:] = axes
         rows.setflags(write=False)
@@ -361,44 +344,31 @@ class CameraModel(ReadOnlyArrays):
 
     @property
     def lens(self) -> Lens:
-        """The round lens of a CAHV, CAHVOR or CAHVORE camera: what stays when the camera moves.
-
-        Raises
-        ------
-        AttributeError
-            If the camera is of another family.
-        """
-        if not isinstance(self._projection, Projection):
-            raise AttributeError(f"{self.kind} has no round lens")
+        """The lens: what stays, with the plane of the image behind it, when the camera moves."""
         return self._projection.lens
-
-    @property
-    def free_lens(self) -> FreeLens | None:
-        """The lens of a camera of OpenCV's families; None for the CAHV family."""
-        return self._projection.lens if isinstance(self._projection, FreeProjection) else None
 
     @property
     def moving(self) -> bool:
         """Whether rays begin elsewhere the more they bend: only a CAHVORE's do."""
-        return self._projection.moving
+        return self.lens.moving
 
     @property
-    def limit_words(self) -> str:
+    def limit_reason(self) -> str:
         """Where the lens ends, as a sentence's end: "the lens folds at 61.2 degrees from its axis".
 
         Empty if it has no end but that of its family.
         """
-        return self._projection.limit_words
+        return self.lens.limit_reason
 
     @property
     def why_no_ray(self) -> str:
-        """``limit_words`` as what follows "has no ray in this camera"; empty if it has one."""
-        return f": {self.limit_words}" if self.limit_words else ""
+        """``limit_reason`` as what follows "has no ray in this camera"; empty if it has one."""
+        return f": {self.limit_reason}" if self.limit_reason else ""
 
     @property
     def camera_matrix(self) -> FloatArray:
         """(3, 3) [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] of a CAHV camera or one of OpenCV's families."""
-        if isinstance(self._projection, FreeProjection):
+        if self.kind in FREE:
             return self._projection.pixel_from_slope
         inner = np.stack([self.H, self.V]) @ self.rotation.T
         return np.triu(np.vstack([inner, [0.0, 0.0, 1.0]]))
@@ -406,7 +376,7 @@ class CameraModel(ReadOnlyArrays):
     @property
     def rotation(self) -> FloatArray:
         """(3, 3) OpenCV's R: rows are x right, y down (as V says) and z along A, in the model's frame."""
-        return self._axes if self.kind in FREE else _axes_of(self.A, self.V)
+        return self.lens_axes if self.kind in FREE else _axes_of(self.A, self.V)
 
     @property
     def image_center_px(self) -> tuple[float, float]:
@@ -430,7 +400,6 @@ class CameraModel(ReadOnlyArrays):
         model = object.__new__(CameraModel)
         letters = {"C": rows[0], "H": rows[1], "V": rows[2], "A": rows[3], "O": rows[6]}
         model.__dict__.update(self.__dict__, _rows=rows, **letters)
-        model.__dict__.pop("_place", None)
         return model
 
     def turned(self, turn_rad: ArrayLike) -> CameraModel:
@@ -447,10 +416,8 @@ class CameraModel(ReadOnlyArrays):
         """Return the camera whose lens bends otherwise: R1 or R2, OpenCV's k1 or k2, larger by ``by``.
 
         ``place`` is 0 for the term that grows with the square of the slope, 1 for that of its fourth power.
-        A CAHV camera and one of splines stay what they are.
+        A CAHV camera stays what it is.
         """
-        if self.kind == SPLINED:
-            return self
         if self.kind in FREE:
             return replace(self, distortion=self.distortion + by * np.eye(len(self.distortion))[place])
         return replace(self, R=self.R + by * np.eye(3)[place + 1])
@@ -465,7 +432,7 @@ class CameraModel(ReadOnlyArrays):
     def axes(self) -> FloatArray:
         """(3, 3): columns are x right, y down and z along A, in the model's frame."""
         if self.kind in FREE:
-            return self._axes.T
+            return self.lens_axes.T
         across = self.H - (self.H @ self.A) * self.A
         x = across / np.linalg.norm(across)
         return np.stack([x, np.cross(self.A, x), self.A], axis=-1)
@@ -480,67 +447,57 @@ class CameraModel(ReadOnlyArrays):
 
         Points that have no pixel (see the class) come out as not-a-number.
         """
-        points = _as_rows(points_m, 3, "points")
-        if points.ndim == 1:
-            x_m, y_m, z_m = points.tolist()
-            x_px, y_px = self._projection.project_point(x_m, y_m, z_m, self._place)
-            return np.array([x_px, y_px]), np.array(x_px == x_px)
-        pixels, _, valid = self._projection.project(points.reshape(-1, 3), self.C, self._rows[3:], False)
-        return pixels.reshape(*points.shape[:-1], 2), valid.reshape(points.shape[:-1])
+        pixels, _, valid = self._project(points_m, False)
+        return pixels, valid
 
     def project_jacobian(self, points_m: ArrayLike) -> tuple[FloatArray, FloatArray, np.ndarray]:
         """Return pixels (..., 2), d pixel / d point (..., 2, 3) in px/m, and which are valid (...).
 
         Points that have no pixel (see the class) come out as not-a-number.
         """
+        return self._project(points_m, True)
+
+    def _project(self, points_m: ArrayLike, derivatives: bool) -> tuple[FloatArray, FloatArray, np.ndarray]:
         points = _as_rows(points_m, 3, "points")
         shape = points.shape[:-1]
         pixels, jacobian, valid = self._projection.project(
-            points.reshape(-1, 3), self.C, self._rows[3:], True
+            points.reshape(-1, 3), self.C, self.lens_axes, derivatives
         )
-        return pixels.reshape(*shape, 2), jacobian.reshape(*shape, 2, 3), valid.reshape(shape)
+        return (
+            pixels.reshape(*shape, 2),
+            jacobian.reshape(*shape, 2, 3) if derivatives else jacobian,
+            valid.reshape(shape),
+        )
 
     def ray(self, pixels_px: ArrayLike) -> Rays:
         """Return the rays through pixels (..., 2); a CAHVORE ray begins at the moved entrance point.
 
         Pixels that no ray of the lens lands on come out as not-a-number.
         """
-        pixels = _as_rows(pixels_px, 2, "pixels")
-        if pixels.ndim == 1:
-            x_px, y_px = pixels.tolist()
-            ray = self._projection.ray_of_pixel(x_px, y_px, self._place)
-            if ray is None:
-                return Rays(np.full(3, nan), np.full(3, nan), np.array(False))
-            return Rays(np.array(ray[0]), np.array(ray[1]), np.array(True))
-        shape = pixels.shape[:-1]
-        origins, directions, valid, _, _ = self._projection.rays(
-            pixels.reshape(-1, 2), self.C, self._axes, False
-        )
-        return Rays(origins.reshape(*shape, 3), directions.reshape(*shape, 3), valid.reshape(shape))
+        return self._ray(pixels_px, False)[0]
 
     def ray_jacobian(self, pixels_px: ArrayLike) -> tuple[Rays, FloatArray, FloatArray]:
         """Return the rays, d direction / d pixel (..., 3, 2) per px and d origin / d pixel (..., 3, 2), m/px.
 
         Pixels that no ray of the lens lands on come out as not-a-number.
         """
+        rays, d_directions, d_origins = self._ray(pixels_px, True)
+        shape = rays.valid.shape
+        return rays, d_directions.reshape(*shape, 3, 2), d_origins.reshape(*shape, 3, 2)
+
+    def _ray(self, pixels_px: ArrayLike, derivatives: bool) -> tuple[Rays, FloatArray, FloatArray]:
         pixels = _as_rows(pixels_px, 2, "pixels")
         shape = pixels.shape[:-1]
         origins, directions, valid, d_directions, d_origins = self._projection.rays(
-            pixels.reshape(-1, 2), self.C, self._axes, True
+            pixels.reshape(-1, 2), self.C, self.lens_axes, derivatives
         )
         rays = Rays(origins.reshape(*shape, 3), directions.reshape(*shape, 3), valid.reshape(shape))
-        return rays, d_directions.reshape(*shape, 3, 2), d_origins.reshape(*shape, 3, 2)
+        return rays, d_directions, d_origins
 
     @property
-    def _axes(self) -> FloatArray:
-        """The lens frame's x, y and z = O, as rows."""
+    def lens_axes(self) -> FloatArray:
+        """(3, 3): the lens frame's x, y and z as rows; z is O, or A of OpenCV's families."""
         return self._rows[4:]
-
-    @cached_property
-    def _place(self) -> Place:
-        """C and the lens frame's axes as plain floats, for one point at a time."""
-        c, _, _, _, x, y, o = self._rows.tolist()
-        return c, x, y, o
 
 
 def _vector(letter: str, given: ArrayLike, shape: int | tuple[int, ...] = 3) -> FloatArray:

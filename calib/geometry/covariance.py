@@ -1,7 +1,7 @@
 """The covariance that a mast file carries, and a rig moved along it.
 
 A calibration leaves ``fit.parameters`` and ``fit.covariance`` in the mast file
-(docs/how-to/survey-calibration.md). The parameters are ``mast.KEY.x``, ``joints.pan.c1``
+(docs/how-to/calibrate.md). The parameters are ``mast.KEY.x``, ``joints.pan.c1``
 (`calib.geometry.rig`) and ``cameras.NAME.C.x``, as `calib.geometry.parameters` orders a camera's step.
 
 How pixels, and the clicks of a point, depend on these parameters and on the joints (``JOINT_NAMES``) is in
@@ -19,27 +19,29 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.errors import CalibError, NoStereoPoint
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.mode import Mode, in_mode, mode_rates, sensor_mode_after
 from calib.geometry.parameters import parameter_names, predict, stepped
 from calib.geometry.rig import (
-    AXIS_NAMES,
     JOINTS_NAMES,
     MAST_NAMES,
     UNKNOWN,
     Approach,
     Rig,
     gimbal,
-    gimbal_rates,
     joint_numbers_of,
+    joint_twists,
     joints_of,
     mast_of,
     numbers_of,
 )
-from calib.geometry.rigid import FloatArray, ReadOnlyArrays, frozen_array
+from calib.geometry.rigid import FloatArray, ReadOnlyArrays, crossed_rows, frozen_array
 from calib.geometry.stereo import Triangulation, triangulate
 
 ROUNDING = 1e-4
@@ -148,8 +150,33 @@ def moved_rig(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:
 
 JOINT_NAMES = ("pan_rad", "tilt_rad")
 
-_GIMBAL_NAMES = (*(f"mast.{name}" for name in MAST_NAMES), *JOINT_NAMES)
-"""A gimbal's ten numbers."""
+_HEAD_NAMES = (*_MAST, *JOINT_NAMES, *JOINTS_NAMES)
+"""What moves a head."""
+
+
+class CameraRates(NamedTuple):
+    """Pixels (n, 2) of points, d pixel / d step of the camera (2, s, n), and d pixel / d motion (2, 6, n) of
+    all points: a turn about the origin of the frame that the camera is in, and a shift."""
+
+    pixels_px: FloatArray
+    to_step: FloatArray
+    to_motion: FloatArray
+
+
+def camera_rates(model: CameraModel, points_m: FloatArray) -> CameraRates:
+    """Return pixels of points (n, 3), in the frame that a camera is in, and what they depend on."""
+    seen = predict(model, points_m)
+    by_point = seen.d_points.transpose(1, 2, 0)
+    by_motion = np.concatenate([crossed_rows(points_m.T, by_point), by_point], axis=1)
+    return CameraRates(seen.pixels_px, seen.d_step.transpose(1, 2, 0), by_motion)
+
+
+class PixelRates(NamedTuple):
+    """Pixels (n, 2) of points (n, 3), d pixel / d parameter (n, 2, p) and d pixel / d point (n, 2, 3)."""
+
+    pixels_px: FloatArray
+    to_rig: FloatArray
+    to_points: FloatArray
 
 
 def pixel_rates(
@@ -160,8 +187,8 @@ def pixel_rates(
     tilt_rad: float,
     points_m: FloatArray,
     approach: Approach = UNKNOWN,
-) -> tuple[FloatArray, FloatArray]:
-    """Return pixels (n, 2) of rover-frame points (n, 3) and their derivatives (n, 2, p) to named parameters.
+) -> PixelRates:
+    """Return pixels of rover-frame points (n, 3) and how they depend on named parameters and the points.
 
     ``names`` (p,) are ``mast.KEY.x``, ``joints.pan.c1`` (the readings held), ``cameras.NAME.C.x``,
     ``pan_rad`` and ``tilt_rad``; what is not among them is held. The angles are true ones; from which side
@@ -169,38 +196,25 @@ def pixel_rates(
     """
     held = rig.cameras[camera]
     at = {name: i for i, name in enumerate(names)}
-    out = np.zeros((len(points_m), 2, len(names)))
+    out = np.zeros((2, len(names), len(points_m)))
     if held.on == "rover":
-        seen = predict(held.model, points_m)
+        seen = camera_rates(held.model, points_m)
+        to_points = seen.to_motion[:, 3:].transpose(2, 0, 1)
     else:
         head = gimbal(numbers_of(rig.mast), pan_rad, tilt_rad)
-        seen = predict(held.model, (points_m - head.translation_m) @ head.rotation)
-        erring = [name for name in JOINTS_NAMES if name in at]
-        free = np.array(
-            [i for i, name in enumerate(_GIMBAL_NAMES) if name in at or (erring and name in JOINT_NAMES)],
-            dtype=int,
-        )
-        rates = -gimbal_rates(seen.d_points @ head.rotation.T, points_m, head, free)
-        for column, i in enumerate(free):
-            if _GIMBAL_NAMES[i] in at:
-                out[..., at[_GIMBAL_NAMES[i]]] = rates[..., column]
-        if erring:  # the last two columns are then those of pan and tilt
-            by_joints = _joint_rates(rig, (pan_rad, tilt_rad), approach)
-            for name in erring:
-                number = JOINTS_NAMES.index(name)
-                axis = number // len(AXIS_NAMES)
-                out[..., at[name]] = rates[..., axis - 2] * by_joints[number]
+        seen = camera_rates(held.model, (points_m - head.translation_m) @ head.rotation)
+        to_points = seen.to_motion[:, 3:].transpose(2, 0, 1) @ head.rotation.T
+        twists = head.twists
+        if any(name in at for name in JOINTS_NAMES):
+            read_rad = rig.joints.read_rad((pan_rad, tilt_rad), approach)
+            twists = np.concatenate([twists, joint_twists(head, rig.joints, read_rad, approach)[:-2]])
+        free = [i for i, name in enumerate(_HEAD_NAMES) if name in at]
+        # The head carries the camera: points move the other way before it.
+        out[:, [at[_HEAD_NAMES[i]] for i in free]] = -head.in_head(twists[free]) @ seen.to_motion
     mine = [f"cameras.{camera}.{part}" for part in parameter_names(held.model.kind)]
     known = [i for i, name in enumerate(mine) if name in at]
-    out[..., [at[mine[i]] for i in known]] = seen.d_step[..., known]
-    return seen.pixels_px, out
-
-
-def _joint_rates(rig: Rig, true_rad: tuple[float, float], approach: Approach) -> FloatArray:
-    """(10,) how each joint's true angle changes with the numbers of `JOINTS_NAMES`, its reading held."""
-    read = rig.joints.read_rad(true_rad, approach)
-    axes = zip((rig.joints.pan, rig.joints.tilt), read, approach, strict=True)
-    return np.concatenate([joint.rates(at, side) for joint, at, side in axes])
+    out[:, [at[mine[i]] for i in known]] = seen.to_step[:, known]
+    return PixelRates(seen.pixels_px, out.transpose(2, 0, 1), to_points)
 
 
 def click_rates(
@@ -220,7 +234,7 @@ def click_rates(
     """
     point = position_m[None]
     return -np.concatenate(
-        [pixel_rates(rig, names, camera, pan_rad, tilt_rad, point, approach)[1][0] for camera in cameras]
+        [pixel_rates(rig, names, camera, pan_rad, tilt_rad, point, approach).to_rig[0] for camera in cameras]
     )
 
 
@@ -390,3 +404,31 @@ def clicked_point(
         by += f", which knows nothing of {' and '.join(unknown)},"
     refuse_two_points(gap, pair, by)
     return seen, gap
+
+
+def rig_in_mode(rig: Rig, camera: str, mode: Mode) -> Rig:
+    """Return a rig one of whose cameras is in another mode, with its covariance and the sensor's mode.
+
+    Of ``fit`` the covariance stays. Other figures there are of the calibrated picture and go.
+
+    Raises
+    ------
+    BadMode, CalibError
+        As `in_mode`, and if the covariance does not fit the rig.
+    """
+    before = rig.cameras[camera]
+    model = in_mode(before.model, mode)
+    fit: dict[str, object] = {}
+    if (known := stored_covariance(rig)) is not None:
+        names = [f"cameras.{camera}.{name}" for name in parameter_names(model.kind)]
+        rates = mode_rates(before.model, mode)
+        whole = np.eye(len(known.names))
+        at = {name: i for i, name in enumerate(known.names)}
+        has = [i for i, name in enumerate(names) if name in at]
+        place = [at[names[i]] for i in has]
+        whole[np.ix_(place, place)] = rates[np.ix_(has, has)]
+        covariance = whole @ known.covariance @ whole.T
+        fit = {"parameters": list(known.names), "covariance": covariance.tolist()}
+    sensor = None if before.sensor_mode is None else sensor_mode_after(before.sensor_mode, mode)
+    after = replace(before, model=model, sensor_mode=sensor)
+    return replace(rig, cameras={**rig.cameras, camera: after}, fit=fit)

@@ -233,10 +233,9 @@ def _other_covariance(
     at, point = readings[-1], seen.position_m[None]
     for row, name in enumerate(to):
         part = slice(3 + 2 * row, 5 + 2 * row)
-        model = rig.camera_in_rover(name, at.pan_rad, at.tilt_rad)
-        rates[part] = model.project_jacobian(seen.position_m)[1] @ rates[:3]
         seen_by = pixel_rates(rig, names, name, at.pan_rad, at.tilt_rad, point, at.approach)
-        rates[part, then] += seen_by[1][0]
+        rates[part] = seen_by.to_points[0] @ rates[:3]
+        rates[part, then] += seen_by.to_rig[0]
     turned = np.repeat([reading.sigma_rad for reading in readings], 2) * rates[:, calibrated:]
     by_rig = rates[:, :calibrated]
     return np.asarray(by_rig @ known.covariance @ by_rig.T + turned @ turned.T)

@@ -1,4 +1,6 @@
-"""A calibration carried over to another mode of its camera: a crop, binning or flip of its picture.
+"""Modes of a camera: which pixels of its sensor its pictures show, and its calibration in another mode.
+
+Drivers read the mode, mast files keep it with the calibration, and the daemon compares the two.
 
 The center of the top-left pixel is (0, 0). So a crop that begins at (x, y) subtracts x; binning by n makes
 u' = (u + 0.5)/n - 0.5, and a flip of a picture w pixels wide u' = w - 1 - u. Each is u' = s u + t along an
@@ -6,28 +8,214 @@ axis, hence H' = s H + t A and V' likewise for every model: a pixel is (H.q, V.q
 H x V against A, which is right: the picture is a mirror image.
 
 The lens of OpenCV's families stands in the camera's axes, y of which is V's part across A. Where V is turned
-over, these axes are turned by half a turn about A. Coefficients whose terms are even change their sign then,
-and control points of splines, which stand around A, change their places and signs.
+over, these axes are turned by half a turn about A. Coefficients whose terms are even change their sign then.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from operator import index
+from typing import Any, Literal
 
 import numpy as np
 
+from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.covariance import stored_covariance
 from calib.geometry.lenses.opencv import NAMES
 from calib.geometry.parameters import parameter_names, parameter_part
-from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, tangents
-from calib.geometry.sensor_mode import BadMode, Mode, sensor_mode_after
+
+FlipName = Literal["none", "horizontal", "vertical", "both"]
+FLIPS: Mapping[FlipName, tuple[bool, bool]] = {
+    "none": (False, False),
+    "horizontal": (True, False),
+    "vertical": (False, True),
+    "both": (True, True),
+}
+"""Names of flips (left to right, upside down), in files and commands."""
 
 EVEN = ("p1", "p2", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 """Coefficients of OpenCV's that change their sign when the lens is turned by half a turn."""
+
+
+class BadMode(CalibError):
+    """A mode that a calibration cannot be carried over to."""
+
+    code = "bad_mode"
+
+
+@dataclass(frozen=True)
+class Mode:
+    """The changes of the calibrated picture, in this order.
+
+    Attributes
+    ----------
+    crop_px
+        (x, y, width, height) of the part that is read, calibrated pixels; None: all of it.
+    binning
+        (across, down): so many pixels make one.
+    flip
+        (left to right, upside down).
+    """
+
+    crop_px: tuple[int, int, int, int] | None = None
+    binning: tuple[int, int] = (1, 1)
+    flip: tuple[bool, bool] = (False, False)
+
+    @property
+    def words(self) -> str:
+        """It in words; empty for the calibrated mode itself."""
+        found = []
+        if self.crop_px is not None:
+            found.append("crop {2}x{3} px from ({0}, {1})".format(*self.crop_px))
+        if self.binning != (1, 1):
+            found.append("binning {}x{}".format(*self.binning))
+        if any(self.flip):
+            found.append(_flip_words(self.flip))
+        return ", ".join(found)
+
+
+@dataclass(frozen=True)
+class SensorMode:
+    """Which pixels of a sensor a camera's pictures show, as its driver reads it.
+
+    Attributes
+    ----------
+    size_px
+        (width, height) of the pictures.
+    crop_px
+        (x, y, width, height) of the part of the sensor that makes a picture, the sensor's pixels; None if the
+        driver does not report it.
+    sensor_px
+        (width, height) of all that can be read; None without ``crop_px``.
+    flip
+        Whether the camera turns its pictures (left to right, upside down).
+
+    Raises
+    ------
+    ValueError
+        If the size is none, the crop is not inside the sensor, or one of the two is missing.
+    """
+
+    size_px: tuple[int, int]
+    crop_px: tuple[int, int, int, int] | None = None
+    sensor_px: tuple[int, int] | None = None
+    flip: tuple[bool, bool] = (False, False)
+
+    def __post_init__(self) -> None:
+        try:
+            width, height = (index(side) for side in self.size_px)
+        except (TypeError, ValueError):
+            width = height = 0
+        if min(width, height) < 1:
+            raise ValueError(f"size_px is {self.size_px!r}, expected (width, height) of 1 px and more")
+        object.__setattr__(self, "size_px", (width, height))
+        if self.crop_px is None or self.sensor_px is None:
+            if self.crop_px is not None or self.sensor_px is not None:
+                raise ValueError("crop_px and sensor_px are expected together")
+            return
+        x, y, width, height = self.crop_px
+        across, down = self.sensor_px
+        if min(x, y) < 0 or min(width, height) < 1 or x + width > across or y + height > down:
+            raise ValueError(
+                f"crop_px {list(self.crop_px)} is not inside the sensor's {across}x{down} px ([x, y, width, "
+                "height] is expected)"
+            )
+
+    @property
+    def words(self) -> str:
+        """It in words."""
+        part = "an unknown part of its sensor"
+        if self.crop_px is not None and self.sensor_px is not None:
+            part = "{2}x{3} px from ({0}, {1}) of {4}x{5} px".format(*self.crop_px, *self.sensor_px)
+        flip = f", {_flip_words(self.flip)}" if any(self.flip) else ""
+        return f"{part} as {self.size_px[0]}x{self.size_px[1]} px{flip}"
+
+    def centered(self, axis: int) -> bool:
+        """Return whether a known crop is in the middle of the sensor along x (0) or y (1)."""
+        assert self.crop_px is not None and self.sensor_px is not None
+        return 2 * self.crop_px[axis] + self.crop_px[axis + 2] == self.sensor_px[axis]
+
+
+def mode_between(then: SensorMode, now: SensorMode) -> Mode:
+    """Return how pictures of one mode differ from those of another of the same camera.
+
+    A crop that either lacks counts as equal. Some makers count the crop of a flipped picture from the one
+    side of the sensor, and some from the other. So such a crop has to be in the middle.
+
+    Raises
+    ------
+    BadMode
+        If no crop, binning and flip of the former pictures makes the present ones.
+    """
+    from fractions import Fraction  # brings `decimal`, which no command needs at its start
+
+    flip = then.flip[0] != now.flip[0], then.flip[1] != now.flip[1]
+    if then.crop_px is None or now.crop_px is None:
+        if then.size_px != now.size_px:
+            raise BadMode("which part of the sensor they show is not known")
+        return Mode(flip=flip)
+    if then.sensor_px != now.sensor_px:
+        sizes = ["{}x{} px".format(*one.sensor_px) for one in (now, then) if one.sensor_px]
+        raise BadMode(f"the camera has a sensor of {sizes[0]} where the calibrated one had {sizes[1]}")
+    begins, lengths, binnings = [], [], []
+    for axis, side in enumerate("xy"):
+        (then_begin, then_px), (begin, length) = then.crop_px[axis::2], now.crop_px[axis::2]
+        moved = flip[axis] or (then_begin, then_px) != (begin, length)
+        if moved and then.flip[axis] | now.flip[axis] and not (then.centered(axis) and now.centered(axis)):
+            raise BadMode(
+                "the crop is not in the middle, and from which side of the sensor it counts in flipped "
+                "pictures is the maker's choice"
+            )
+        one = Fraction(then_px, then.size_px[axis])
+        at, span, by = (begin - then_begin) / one, length / one, Fraction(length, now.size_px[axis]) / one
+        if at < 0 or at + span > then.size_px[axis]:
+            raise BadMode(f"they show more of the sensor along {side} than was calibrated")
+        if at.denominator != 1 or span.denominator != 1:
+            raise BadMode(f"their part of the calibrated picture begins or ends amid a pixel along {side}")
+        if by.denominator != 1:
+            raise BadMode(f"a scale of {1 / by} along {side} is no binning")
+        begins.append(int(at))
+        lengths.append(int(span))
+        binnings.append(int(by))
+    crop = begins[0], begins[1], lengths[0], lengths[1]
+    return Mode(None if crop == (0, 0, *then.size_px) else crop, (binnings[0], binnings[1]), flip)
+
+
+def sensor_mode_after(then: SensorMode, mode: Mode) -> SensorMode | None:
+    """Return the sensor's mode whose pictures are changed ones of another.
+
+    None where that is not known: a crop of a flipped picture that is not in its middle (`mode_between`).
+    """
+    from fractions import Fraction
+
+    crop = mode.crop_px or (0, 0, *then.size_px)
+    if crop == (0, 0, *then.size_px):
+        mode = replace(mode, crop_px=None)
+    size_px = crop[2] // mode.binning[0], crop[3] // mode.binning[1]
+    flip = then.flip[0] != mode.flip[0], then.flip[1] != mode.flip[1]
+    if then.crop_px is None or then.sensor_px is None:
+        return SensorMode(size_px, flip=flip)
+    by = [Fraction(length, size) for length, size in zip(then.crop_px[2:], then.size_px, strict=True)]
+    x, y, width, height = (
+        begin + px * scale for begin, px, scale in zip((*then.crop_px[:2], 0, 0), crop, by * 2, strict=True)
+    )
+    after = SensorMode(size_px, (int(x), int(y), int(width), int(height)), then.sensor_px, flip)
+    try:
+        return after if mode_between(then, after) == mode else None
+    except BadMode:
+        return None
+
+
+def flip_name(flip: tuple[bool, bool]) -> FlipName:
+    """Return a flip's name, by `FLIPS`."""
+    return next(name for name, one in FLIPS.items() if one == flip)
+
+
+def _flip_words(flip: tuple[bool, bool]) -> str:
+    sides = [word for word, on in zip(("horizontal", "vertical"), flip, strict=True) if on]
+    return f"flip {' and '.join(sides)}"
 
 
 @dataclass(frozen=True)
@@ -96,44 +284,13 @@ def in_mode(model: CameraModel, mode: Mode) -> CameraModel:
         letter: change.scale[axis] * vector + change.shift[axis] * model.A
         for axis, (letter, vector) in enumerate((("H", model.H), ("V", model.V)))
     }
-    if mode.flip[1] and model.spline is not None:
-        control = model.distortion.reshape(model.spline.rows, model.spline.columns, 2)
-        moved["distortion"] = -control[::-1, ::-1].ravel()
-    elif mode.flip[1] and model.free_lens is not None:
+    if mode.flip[1] and "D" in model.letters:
         moved["distortion"] = model.distortion * _signs(model)
     return replace(model, size_px=change.size_px, **moved)
 
 
-def rig_in_mode(rig: Rig, camera: str, mode: Mode) -> Rig:
-    """Return a rig one of whose cameras is in another mode, with its covariance and the sensor's mode.
-
-    Of ``fit`` the covariance stays. Other figures there are of the calibrated picture and go.
-
-    Raises
-    ------
-    BadMode, CalibError
-        As `in_mode`, and if the covariance does not fit the rig.
-    """
-    before = rig.cameras[camera]
-    model = in_mode(before.model, mode)
-    fit: Mapping[str, Any] = {}
-    if (known := stored_covariance(rig)) is not None:
-        names = [f"cameras.{camera}.{name}" for name in parameter_names(model.kind)]
-        rates = _rates(before.model, mode)
-        whole = np.eye(len(known.names))
-        at = {name: i for i, name in enumerate(known.names)}
-        has = [i for i, name in enumerate(names) if name in at]
-        place = [at[names[i]] for i in has]
-        whole[np.ix_(place, place)] = rates[np.ix_(has, has)]
-        covariance = whole @ known.covariance @ whole.T
-        fit = {"parameters": list(known.names), "covariance": covariance.tolist()}
-    sensor = None if before.sensor_mode is None else sensor_mode_after(before.sensor_mode, mode)
-    after = replace(before, model=model, sensor_mode=sensor)
-    return replace(rig, cameras={**rig.cameras, camera: after}, fit=fit)
-
-
-def _rates(model: CameraModel, mode: Mode) -> FloatArray:
-    """d new step / d step (p, p) of a camera's parameters: the change is linear in them."""
+def mode_rates(model: CameraModel, mode: Mode) -> FloatArray:
+    """Return d new step / d step (p, p) of a camera's parameters: the change is linear in them."""
     change = pixel_change(model.size_px, mode)
     rates = np.eye(len(parameter_names(model.kind)))
     turn = parameter_part(model.kind, "A")

@@ -6,15 +6,10 @@ coefficients in OpenCV's order. A and O are unit vectors: they move
 in their tangent plane, along the two directions of ``tangents``. R0 is not among them: I + r0 (I - OOᵀ) is a
 linear map that H, V and A absorb, so R0 stays what it is (0 in every fit).
 
-With d = P - C, zeta = d.O, lambda = d - zeta O, a point is seen along q = O + m lambda, and (x, y) = (H.q,
-V.q) / (A.q). ``calib.geometry.lens_rays`` gives m with dm = n lambda.dlambda + k dzeta. A step o of O (at
-right angles to it) changes zeta by lambda.o and lambda by -(lambda.o) O - zeta o, hence
-
-    dq = (1 - m zeta) o + ((k - n zeta) lambda - m O) (lambda.o).
-
-OpenCV's lenses turn with A and V: with q = u x + v y + A, a turn omega of the lens frame moves (x, y) by
-omega.(q x d pixel/dq - d x d pixel/d point). A step a of A turns the frame by (-a.y, a.x, cy/fy a.x), a step
-of V about A by -dV.x / fy.
+A point is seen along q = u x + v y + z, with its slopes (u, v) and the axes x, y, z of the lens frame, and
+(X, Y) = (H.q, V.q) / (A.q). A turn omega of the lens frame moves (X, Y) by omega.(q x d pixel/dq - d x d
+pixel/d point), d = P - C. A step o of O turns the frame of CAHVOR and CAHVORE by O x o; OpenCV's lenses turn
+with A and V: a step a of A turns their frame by (-a.y, a.x, cy/fy a.x), a step of V about A by -dV.x / fy.
 """
 
 from __future__ import annotations
@@ -24,14 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.geometry.cahvor import CameraModel, letters_of
-from calib.geometry.lens import TINY, Lens, ray_angle
-from calib.geometry.lens_rays import bend
-from calib.geometry.lenses import fisheye, opencv
-from calib.geometry.lenses.fisheye import FisheyeLens
-from calib.geometry.lenses.opencv import OpencvLens
-from calib.geometry.lenses.projection import FreeLens
-from calib.geometry.rigid import FloatArray, crossed_rows, tangents
+from calib.geometry.cahvor import COEFFICIENTS, FREE, CameraModel, letters_of
+from calib.geometry.lenses import opencv
+from calib.geometry.rigid import FloatArray, crossed, crossed_rows, tangents
 
 _LETTERS = {
     "C": ("C.x", "C.y", "C.z"),
@@ -43,8 +33,8 @@ _LETTERS = {
     "E": ("E.0", "E.1", "E.2"),
 }
 _COEFFICIENTS = {
-    **{f"OPENCV{n}": tuple(f"D.{name}" for name in opencv.NAMES[:n]) for n in opencv.COUNTS},
-    "OPENCV_FISHEYE": tuple(f"D.{name}" for name in fisheye.NAMES),
+    **{kind: tuple(f"D.{name}" for name in opencv.NAMES[:count]) for kind, count in COEFFICIENTS.items()},
+    "OPENCV_FISHEYE": ("D.k1", "D.k2", "D.k3", "D.k4"),
 }
 
 
@@ -109,135 +99,91 @@ def stepped(model: CameraModel, step: FloatArray) -> CameraModel:
     return replace(model, **changed)  # type: ignore[arg-type]  # letters only
 
 
+def twist_rates(model: CameraModel) -> FloatArray:
+    """Return how a camera's step (p,) follows a small motion of it, a turn about 0 and a shift: (p, 6)."""
+    rates = np.zeros((len(parameter_names(model.kind)), 6))
+    for letter in "CAHVO":
+        if letter in model.letters:
+            vector: FloatArray = getattr(model, letter)
+            turn = crossed(np.eye(3), vector).T
+            rates[parameter_part(model.kind, letter), :3] = (
+                tangents(vector) @ turn if letter in "AO" else turn
+            )
+    rates[parameter_part(model.kind, "C"), 3:] = np.eye(3)
+    return rates
+
+
+def carried_errors(model: CameraModel, moved: CameraModel, rotation: FloatArray) -> FloatArray:
+    """Return what a camera's errors (p,) become in a motion that turns by ``rotation`` (3, 3): (p, p)."""
+    errors = np.eye(len(parameter_names(model.kind)))
+    for letter in "CAHVO":
+        if letter in model.letters:
+            part, turn = parameter_part(model.kind, letter), rotation
+            if letter in "AO":
+                turn = tangents(getattr(moved, letter)) @ rotation @ tangents(getattr(model, letter)).T
+            errors[part, part] = turn
+    return errors
+
+
 def predict(model: CameraModel, points_m: FloatArray) -> Prediction:
     """Return pixels of points (n, 3), metres in the model's frame, with derivatives.
 
     Points that have no pixel come out as not-a-number. Each number's values of all points lie side by side in
     memory, so that numpy's loops run along them.
     """
-    points = np.array(np.asarray(points_m).T, order="C")
-    points -= model.C[:, None]
+    d = np.array(np.asarray(points_m).T, order="C")
+    d -= model.C[:, None]
     with np.errstate(all="ignore"):
-        if model.free_lens is not None:
-            pixels, d_step, d_points, valid = _predict_free(model, model.free_lens, points)
-        else:
-            pixels, d_step, d_points, valid = _predict_radial(model, points)
+        pixels, d_step, d_points, valid = _predict(model, d)
     if not valid.all():
         for array in (pixels, d_step, d_points):
             array[..., ~valid] = np.nan
     return Prediction(pixels.T, d_step.transpose(2, 0, 1), d_points.transpose(2, 0, 1), valid)
 
 
-_Predicted = tuple[FloatArray, FloatArray, FloatArray, np.ndarray]
-"""Pixels (2, n), d pixel / d step (2, p, n), d pixel / d point (2, 3, n), and which are valid (n,)."""
-
-
-def _predict_radial(model: CameraModel, d: FloatArray) -> _Predicted:
-    """CAHV, CAHVOR and CAHVORE of points (3, n) from C."""
-    kind, lens, o, axis = model.kind, model.lens, model.O, model.A
-    on_a, on_o = tangents(axis), tangents(o)
-    both = np.stack([model.H, model.V])
-    zeta = o @ d
-    lam = d - o[:, None] * zeta
-    across_o = on_o @ lam
-    bent = bend(lens, np.concatenate([across_o, zeta[None]]), True)
-    if bent.derivatives is None:
-        raise AssertionError("bend was asked for derivatives")
-    m, n, k, _ = bent.derivatives
-    # dm = n lambda . d lambda + k d zeta; bend gives its rates to a point scaled to unit length.
-    unit = np.maximum(np.sqrt(_dot(lam, lam)), TINY) if lens.curved else zeta
-    n, k = n / (unit * unit), k / unit
-    q = o[:, None] + m * lam
-    depth = axis @ q
-    pixels = (both @ q) / depth
-    valid = bent.valid & (depth > 0.0) & np.isfinite(pixels).all(axis=0)
-    if not lens.curved:
-        valid &= axis @ d > 0.0
-    # d pixel / d q: (H - x A) / depth and (V - y A) / depth
-    d_q = (both[..., None] - pixels[:, None] * axis[:, None]) / depth
-    along, across = o @ d_q, _dot(d_q, lam)
-    d_points = m * (d_q - along[:, None] * o[:, None])
-    d_points += across[:, None] * (n * lam + k * o[:, None])
-    d_step = np.zeros((2, len(parameter_names(kind)), len(zeta)))
-
-    def to(letter: str) -> FloatArray:
-        return d_step[:, parameter_part(kind, letter)]
-
-    q /= depth
-    np.negative(d_points, out=to("C"))
-    np.multiply(-pixels[:, None], on_a @ q, out=to("A"))
-    to("H")[0] = to("V")[1] = q
-    if "O" in kind:  # a CAHV camera keeps O = A, but a step along O moves no pixel of it
-        turn = (k - n * zeta) * across - m * along
-        np.multiply(1.0 - m * zeta, on_o @ d_q, out=to("O"))
-        to("O")[...] += turn[:, None] * across_o
-        per_r, per_e = _lens_rates(lens, lam, zeta)
-        np.multiply(across[:, None], per_r, out=to("R"))
-        if "E" in kind:
-            np.multiply(across[:, None], per_e, out=to("E"))
-    return pixels, d_step, d_points, valid
-
-
-def _predict_free(model: CameraModel, lens: FreeLens, d: FloatArray) -> _Predicted:
-    """The same of OpenCV's families."""
-    kind, axes, matrix = model.kind, model.rotation, model.camera_matrix
-    x, _, z = axes
-    focal = matrix[:2, :2]
+def _predict(model: CameraModel, d: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, np.ndarray]:
+    """Pixels (2, n), d pixel / d step (2, p, n), d pixel / d point (2, 3, n), and which are valid (n,)."""
+    kind, lens, axes, free = model.kind, model.lens, model.lens_axes, model.kind in FREE
     local = axes @ d
     bent = lens.bend(local, True)
-    if bent.rates is None:
-        raise AssertionError("bend was asked for derivatives")
-    pixels = focal @ bent.slopes + matrix[:2, 2:]
-    valid = bent.valid & np.isfinite(pixels).all(axis=0)
-    d_points = axes.T @ np.tensordot(focal, bent.rates, 1)
-    q = axes[:2].T @ bent.slopes + z[:, None]
-    d_q = np.stack([model.H, model.V])[..., None] - pixels[:, None] * z[:, None]
-    d_turn = crossed_rows(q, d_q) - crossed_rows(d, d_points)
+    assert bent.rates is not None
+    both = np.stack([model.H, model.V])
+    q = axes[:2].T @ bent.slopes + axes[2][:, None]
+    depth = model.A @ q
+    q /= depth
+    pixels = both @ q
+    valid = bent.valid & (depth > 0.0) & np.isfinite(pixels).all(axis=0)
+    if not lens.curved:
+        valid &= model.A @ d > 0.0
+    d_q = (both[..., None] - pixels[:, None] * model.A[:, None]) / depth
+    by_slope = axes[:2] @ d_q
+    d_points = axes.T @ _chained(by_slope, bent.rates)
     d_step = np.zeros((2, len(parameter_names(kind)), d.shape[1]))
 
     def to(letter: str) -> FloatArray:
         return d_step[:, parameter_part(kind, letter)]
 
+    on_a = tangents(model.A)
     np.negative(d_points, out=to("C"))
-    on_a, (_, fy, cy) = tangents(model.A), matrix[1]
-    turns = np.stack([-on_a @ axes[1], on_a @ x, cy / fy * (on_a @ x)], axis=1) @ axes
-    np.subtract(turns @ d_turn, pixels[:, None] * (on_a @ q), out=to("A"))
-    to("H")[0] = q
-    np.multiply((z @ d_turn)[:, None], (-x / fy)[:, None], out=to("V"))
-    to("V")[1] += q
-    if isinstance(lens, (OpencvLens, FisheyeLens)):  # splines are read, not fitted
-        to("D")[...] = np.tensordot(focal, lens.coefficient_rates(local), 1)
+    np.multiply(-pixels[:, None], on_a @ q, out=to("A"))
+    to("H")[0] = to("V")[1] = q
+    if kind != "CAHV":  # whose lens may turn about anything
+        d_turn = crossed_rows(q * depth, d_q) - crossed_rows(d, d_points)
+    if free:
+        (x, y, z), (_, fy, cy) = axes, model.camera_matrix[1]
+        turns = np.stack([-on_a @ y, on_a @ x, cy / fy * (on_a @ x)], axis=1) @ axes
+        to("A")[...] += turns @ d_turn
+        to("V")[...] += (z @ d_turn)[:, None] * (-x / fy)[:, None]
+        to("D")[...] = _chained(by_slope, lens.coefficient_rates(local))
+    elif kind != "CAHV":
+        np.matmul(np.cross(model.O, tangents(model.O)), d_turn, out=to("O"))
+        rates = _chained(by_slope, lens.coefficient_rates(local))
+        to("R")[...] = rates[:, :2]
+        if kind == "CAHVORE":
+            to("E")[...] = rates[:, 2:]
     return pixels, d_step, d_points, valid
 
 
-def _dot(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Products (..., n) of vectors (..., 3, n)."""
-    return np.asarray((one * other).sum(axis=-2))
-
-
-def _lens_rates(lens: Lens, lam: FloatArray, zeta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """dm / d(r1, r2) (2, n) and dm / d(e0, e1, e2) (3, n); none of the latter for CAHVOR."""
-    length = np.sqrt(_dot(lam, lam))
-    if not lens.curved:
-        tau = (length / zeta) ** 2
-        return np.stack([tau / zeta, tau * tau / zeta]), np.zeros((0, len(zeta)))
-    length = np.maximum(length, 1e-150)
-    theta, sine, _, slope, _ = ray_angle(lens, length, zeta, True)
-    line = lens.linearity
-    if line > 0.0:
-        chi = np.tan(line * theta) / line
-        chi_rate = 1.0 + (line * chi) ** 2
-    elif line < 0.0:
-        chi = np.sin(line * theta) / line
-        chi_rate = np.cos(line * theta)
-    else:
-        chi, chi_rate = theta, np.ones_like(theta)
-    r0, r1, r2 = lens.r
-    y = chi * chi
-    rate = (1.0 + r0 + y * (3.0 * r1 + y * 5.0 * r2)) * chi_rate / length
-    per_e = (theta - sine) / slope * rate
-    turn = theta * theta
-    return (
-        np.stack([chi * y, chi * y * y]) / length,
-        np.stack([per_e, per_e * turn, per_e * turn * turn]),
-    )
+def _chained(by_slope: FloatArray, rates: FloatArray) -> FloatArray:
+    """Rates (2, k, n) of pixels from theirs to slopes (2, 2, n) and the slopes' (2, k, n)."""
+    return np.asarray(by_slope[:, 0, None] * rates[0] + by_slope[:, 1, None] * rates[1])

@@ -9,7 +9,6 @@ letters are those of calib.geometry.reach.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -100,8 +99,18 @@ def solve(
         return solve_many(  # type: ignore[return-value]  # a type checker cannot tell the shapes apart
             mast, camera_in_head, target, pixel, from_pan_rad=from_pan_rad, from_tilt_rad=from_tilt_rad
         )
-    x_px, y_px = camera_in_head.image_center_px if pixel is None else _two_numbers(pixel)
-    ray = _camera_ray(camera_in_head, x_px, y_px)
+    if pixel is None:
+        pixel = np.array(camera_in_head.image_center_px)
+    elif pixel.shape != (2,) or not np.isfinite(pixel).all():
+        raise Unreachable("bad_pixel", f"pixel {pixel.tolist()} is not two finite numbers")
+    rays = camera_in_head.ray(pixel)
+    if not rays.valid:
+        raise Unreachable(
+            "bad_pixel",
+            f"pixel ({pixel[0]:g}, {pixel[1]:g}) has no ray in this "
+            f"{camera_in_head.kind} camera{camera_in_head.why_no_ray}",
+        )
+    ray = ray_of(rays.origins_m.tolist(), rays.directions.tolist())
     return _solve(axes_of(mast), ray, target, from_pan_rad, from_tilt_rad)
 
 
@@ -150,16 +159,22 @@ def solve_many(
             "bad_target",
             f"targets of shape {targets.shape} and pixels of shape {pixels.shape} do not go together",
         ) from None
+    rays = camera_in_head.ray(np.broadcast_to(pixels, (*shape, 2)).reshape(-1, 2))
     each = zip(
         np.broadcast_to(targets, (*shape, 3)).reshape(-1, 3),
-        np.broadcast_to(pixels, (*shape, 2)).reshape(-1, 2).tolist(),
+        rays.origins_m.tolist(),
+        rays.directions.tolist(),
+        rays.valid.tolist(),
         strict=True,
     )
     found, refused = np.full((3, math.prod(shape), _MOST), np.nan), [""] * math.prod(shape)
-    for row, (target, (x_px, y_px)) in enumerate(each):
+    for row, (target, origin_m, direction, valid) in enumerate(each):
+        if not valid:
+            refused[row] = "bad_pixel"
+            continue
         try:
-            ray = _camera_ray(camera_in_head, x_px, y_px)
-            some = _solve(axes, ray, target, from_pan_rad, from_tilt_rad, told=False)
+            ray = ray_of(origin_m, direction)
+            some = _solve(axes, ray, target, from_pan_rad, from_tilt_rad, explain=False)
         except Unreachable as refusal:
             if refusal.code == "parallel_axes":  # the mast's fault, not the target's
                 raise
@@ -174,55 +189,15 @@ def solve_many(
     return Solutions(pan_rad, tilt_rad, range_m, codes)
 
 
-def solve_ray(
-    mast: Mast,
-    origin_in_head_m: ArrayLike,
-    direction_in_head: ArrayLike,
-    target_in_rover_m: ArrayLike,
-    *,
-    from_pan_rad: float = 0.0,
-    from_tilt_rad: float = 0.0,
-) -> list[Solution]:
-    """Return every pair of joint angles that puts the target on a ray fixed to the head; see ``solve``.
-
-    Parameters
-    ----------
-    mast
-        Any two revolute axes.
-    origin_in_head_m, direction_in_head
-        (3,) where the ray starts, metres, and (3,) its direction, of any length but zero, in the head frame.
-    target_in_rover_m
-        (3,) target in the rover frame, metres.
-    from_pan_rad, from_tilt_rad
-        Where the head is now, for the order.
-
-    Raises
-    ------
-    Unreachable
-        As ``solve``; ``bad_pixel`` for a ray that is not finite or has no direction.
-    """
-    check_here(from_pan_rad, from_tilt_rad)
-    origin = np.asarray(origin_in_head_m, dtype=np.float64)
-    direction = np.asarray(direction_in_head, dtype=np.float64)
-    length = float(np.linalg.norm(direction))
-    if not (np.isfinite(origin).all() and math.isfinite(length) and length > 0.0):
-        raise Unreachable(
-            "bad_pixel", f"ray from {origin.tolist()} along {direction.tolist()} has no finite direction"
-        )
-    ray = ray_of(origin.tolist(), (direction / length).tolist())
-    target = np.asarray(target_in_rover_m, dtype=np.float64)
-    return _solve(axes_of(mast), ray, target, from_pan_rad, from_tilt_rad)
-
-
 def _solve(
     axes: Axes,
     ray: Ray,
     target: FloatArray,
     from_pan_rad: float,
     from_tilt_rad: float,
-    told: bool = True,
+    explain: bool = True,
 ) -> list[Solution]:
-    """Solve for one target; a refusal tells by how much only if asked, as that takes a search."""
+    """Solve for one target; a refusal says by how much if it is to explain itself, which takes a search."""
     x, y, z = _target_in_mast(axes, target)
     if abs(axes.cos_k) < _PARALLEL:
         raise Unreachable(
@@ -244,29 +219,10 @@ def _solve(
         if not any(_same(pan, other.pan_rad) and _same(tilt, other.tilt_rad) for other in found):
             found.append(Solution(pan, _wrapped(tilt), s))
     if not found:
-        raise why_not(axes, ray, rho, z, told)
+        raise why_not(axes, ray, rho, z, explain)
     if len(found) > 1:
         found.sort(key=lambda one: order(one, from_pan_rad, from_tilt_rad))
     return found
-
-
-@lru_cache(maxsize=256)
-def _camera_ray(camera_in_head: CameraModel, x_px: float, y_px: float) -> Ray:
-    rays = camera_in_head.ray(np.array([x_px, y_px]))
-    if not rays.valid:
-        raise Unreachable(
-            "bad_pixel",
-            f"pixel ({x_px:g}, {y_px:g}) has no ray in this "
-            f"{camera_in_head.kind} camera{camera_in_head.why_no_ray}",
-        )
-    return ray_of(rays.origins_m.tolist(), rays.directions.tolist())
-
-
-def _two_numbers(pixel: FloatArray) -> tuple[float, float]:
-    if pixel.shape != (2,) or not np.isfinite(pixel).all():
-        raise Unreachable("bad_pixel", f"pixel {pixel.tolist()} is not two finite numbers")
-    x_px, y_px = pixel.tolist()
-    return x_px, y_px
 
 
 def _target_in_mast(axes: Axes, target: FloatArray) -> Triple:

@@ -1,8 +1,8 @@
-"""From points to pixels and back, for a camera whose vectors are given in its lens frame.
+"""From points to pixels and back: a lens with the plane of the image behind it.
 
-A point is turned into the lens frame (origin C, z along O), bent into slopes (`calib.geometry.lens_rays`),
-and a plane projection by H, V and A makes pixels of slopes; a ray goes the same way back. Nothing here
-changes when the camera moves: its place comes with each call as C and the lens frame's axes.
+A point is turned into the lens frame (origin C), bent into slopes by the lens (`calib.geometry.lenses`), and
+a plane projection makes pixels of slopes; a ray goes the same way back. Nothing here changes when the camera
+moves: its place comes with each call as C and the lens frame's axes.
 
 Labels print six digits, so A and O are not unit vectors to the last; they are normalised on load. The plain
 formulas of JPL's library, which takes them as they are (`project_as_published`), serve only to say by how
@@ -13,67 +13,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
-from math import inf, isfinite, nan
-from typing import Protocol
+from math import isfinite, nan
 
 import numpy as np
 
-from calib.geometry.lens import Lens
-from calib.geometry.lens_rays import bend, bend_point, unbend, unbend_point
+from calib.geometry.lenses import Lens
 from calib.geometry.rigid import FloatArray, ReadOnlyArrays
 
-CHUNK = 4096
-"""Points at a time: some thirty rows of them stay in a core's own cache."""
-
-Triple = tuple[float, float, float]
-Place = tuple[list[float], list[float], list[float], list[float]]
-"""C and the lens frame's x, y and z = O as plain floats."""
+CHUNK = 8192
+"""Points at a time: some ten rows of them stay in a core's own cache."""
 
 Rays = tuple[FloatArray, FloatArray, np.ndarray, FloatArray, FloatArray]
-
-
-class PixelMap(Protocol):
-    """The functions that a camera needs of a lens with the plane behind it, wherever the camera stands.
-
-    `Projection` is that of the CAHV family, `calib.geometry.lenses.projection.FreeProjection` that of lenses
-    which are not round about O.
-    """
-
-    @property
-    def moving(self) -> bool:
-        """Whether the entrance point moves with a ray's angle."""
-        ...
-
-    @property
-    def limit_words(self) -> str:
-        """Where the lens ends, as the end of a sentence; empty if it ends nowhere."""
-        ...
-
-    def project(
-        self, points: FloatArray, center: FloatArray, frame: FloatArray, derivatives: bool
-    ) -> tuple[FloatArray, FloatArray, np.ndarray]:
-        """Return pixels (n, 2), Jacobians (n, 2, 3) if asked for, and which are valid (n,).
-
-        ``points`` (n, 3) metres, ``center`` (3,) and ``frame`` (4, 3) are in one frame; the rows of the last
-        are A and the lens frame's axes.
-        """
-        ...
-
-    def rays(self, pixels: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool) -> Rays:
-        """Return origins (n, 3), directions (n, 3) and validity (n,) of the rays of pixels (n, 2).
-
-        Then d direction / d pixel and d origin / d pixel, (n, 3, 2) each if asked for, else with no rows.
-        """
-        ...
-
-    def project_point(self, x: float, y: float, z: float, place: Place) -> tuple[float, float]:
-        """Return the pixel of one point, not-a-number if it has none."""
-        ...
-
-    def ray_of_pixel(self, x_px: float, y_px: float, place: Place) -> tuple[Triple, Triple] | None:
-        """Return origin and direction of one pixel's ray, None if it has none."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +35,7 @@ class Projection(ReadOnlyArrays):
     lens
         Distortion, entrance point and reach.
     pixel_from_slope
-        (3, 3): H, V and A in the lens frame, as rows.
+        (3, 3): H, V and A in the lens frame, as rows; the camera matrix where the lens frame's z is A.
     slope_from_pixel
         (3, 3): its inverse.
     """
@@ -94,73 +44,51 @@ class Projection(ReadOnlyArrays):
     pixel_from_slope: FloatArray
     slope_from_pixel: FloatArray
 
-    @property
-    def moving(self) -> bool:
-        """Whether the entrance point moves with a ray's angle."""
-        return self.lens.moving
-
-    @property
-    def limit_words(self) -> str:
-        """Where the lens ends, as the end of a sentence; empty if it ends nowhere."""
-        return self.lens.limit_words
-
     def project(
-        self, points: FloatArray, center: FloatArray, frame: FloatArray, derivatives: bool
+        self, points: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
     ) -> tuple[FloatArray, FloatArray, np.ndarray]:
-        """Return pixels (n, 2), the Jacobians (n, 2, 3) if asked for, else none, and which are valid (n,).
+        """Return pixels (n, 2), the Jacobians (n, 2, 3) if wanted, else none, and which are valid (n,).
 
-        ``points`` (n, 3) metres, ``center`` (3,) and ``frame`` (4, 3) are in one frame; the rows of the last
-        are A and the lens frame's axes.
+        ``points`` (n, 3) metres, ``center`` (3,) and ``axes`` (3, 3), the lens frame's as rows, are in one
+        frame.
         """
         count = len(points)
         pixels, valid = np.empty((count, 2)), np.empty(count, dtype=bool)
         jacobian = np.empty((count if derivatives else 0, 2, 3))
         with np.errstate(all="ignore"):
-            if 0 < count <= CHUNK:
-                self._project(points, center, frame, pixels, jacobian, valid)
-            else:
-                for part in chunks(count):
-                    self._project(points[part], center, frame, pixels[part], jacobian[part], valid[part])
+            for part in _chunks(count):
+                self._project(points[part], center, axes, pixels[part], jacobian[part], valid[part])
         return pixels, jacobian, valid
 
     def _project(
         self,
         points: FloatArray,
         center: FloatArray,
-        frame: FloatArray,
+        axes: FloatArray,
         pixels: FloatArray,
         jacobian: FloatArray,
         valid: np.ndarray,
     ) -> None:
         """Fill pixels and validity of one chunk, and the Jacobian if it has rows."""
-        lens, k = self.lens, self.pixel_from_slope
-        along_a_and_local = frame @ np.subtract(points.T, center[:, None], order="C")
-        local = along_a_and_local[1:]
-        bent = bend(lens, local, len(jacobian) > 0)
-        seen = k @ bent.slopes
+        k = self.pixel_from_slope
+        local = axes @ np.subtract(points.T, center[:, None], order="C")
+        bent = self.lens.bend(local, len(jacobian) > 0)
+        seen = k[:, :2] @ bent.slopes
+        seen += k[:, 2:]
         depth = seen[2]
-        if lens.curved:
-            np.greater(depth, 0.0, out=valid)
-        else:
-            np.greater(np.minimum(depth, along_a_and_local[0]), 0.0, out=valid)
+        np.greater(depth if self.lens.curved else np.minimum(depth, k[2] @ local), 0.0, out=valid)
         valid &= bent.valid
         per_depth = np.divide(1.0, depth, out=depth)
         np.multiply(seen[:2], per_depth, out=pixels.T)
         if not isfinite(np.vdot(pixels, pixels)):
             valid &= np.isfinite(pixels).all(axis=1)
-        if bent.derivatives is not None:
-            m, n, along_w, across = bent.derivatives
-            # d pixel / d slope (2 pixel, 2 slope, n), then by the lens to (a, b, w), then turned
-            per_slope = k[:2, :2, None] - k[2, :2, None] * pixels.T[:, None]
-            per_slope *= per_depth
-            rows = np.empty((2, 3, len(points)))
-            np.multiply(per_slope, m, out=rows[:, :2])
-            per_slope *= across
-            along = per_slope[:, 0] + per_slope[:, 1]
-            np.multiply(along, along_w, out=rows[:, 2])
-            along *= n
-            rows[:, :2] += np.multiply(along[:, None], across, out=per_slope)
-            jacobian[...] = (frame[1:].T @ rows).transpose(2, 0, 1)
+        if bent.rates is not None:
+            # Of the plane's three rows by the point, turned by the axes: one product of matrices.
+            turned = np.einsum("is,jl->ijsl", k[:, :2], axes.T).reshape(9, 6)
+            rows = (turned @ bent.rates.reshape(6, -1)).reshape(3, 3, -1)
+            if k[2, :2].any():
+                rows[:2] -= pixels.T[:, None] * rows[2]
+            np.multiply(rows[:2], per_depth, out=jacobian.transpose(1, 2, 0))
         if not valid.all():
             pixels[~valid] = nan
             jacobian[~valid[: len(jacobian)]] = nan
@@ -168,7 +96,7 @@ class Projection(ReadOnlyArrays):
     def rays(self, pixels: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool) -> Rays:
         """Return origins (n, 3), directions (n, 3) and validity (n,) of the rays of pixels (n, 2).
 
-        Then d direction / d pixel and d origin / d pixel, (n, 3, 2) each if asked for, else with no rows.
+        Then d direction / d pixel and d origin / d pixel, (n, 3, 2) each if wanted, else with no rows.
         """
         count = len(pixels)
         origins, directions, valid = np.empty((count, 3)), np.empty((count, 3)), np.empty(count, dtype=bool)
@@ -176,11 +104,8 @@ class Projection(ReadOnlyArrays):
         d_directions, d_origins = np.empty((rows, 3, 2)), np.zeros((rows, 3, 2))
         filled = (origins, directions, valid, d_directions, d_origins)
         with np.errstate(all="ignore"):
-            if 0 < count <= CHUNK:
-                self._rays(pixels, center, axes, *filled)
-            else:
-                for part in chunks(count):
-                    self._rays(pixels[part], center, axes, *(array[part] for array in filled))
+            for part in _chunks(count):
+                self._rays(pixels[part], center, axes, *(array[part] for array in filled))
         return filled
 
     def _rays(
@@ -202,10 +127,8 @@ class Projection(ReadOnlyArrays):
         np.greater(per_w, 0.0, out=valid)
         np.divide(1.0, per_w, out=per_w)
         slopes *= per_w
-        ray = unbend(lens, slopes, len(d_directions) > 0)
-        local = np.empty_like(seen)
-        np.multiply(slopes, ray.p, out=local[:2])
-        local[2] = ray.q
+        ray = lens.unbend(slopes, len(d_directions) > 0)
+        local = ray.directions
         valid &= ray.valid
         if not lens.curved:
             valid &= self.pixel_from_slope[2] @ local > 0.0
@@ -213,72 +136,30 @@ class Projection(ReadOnlyArrays):
             valid &= np.isfinite(local).all(axis=0)
         np.matmul(local.T, axes, out=directions)
         origins[...] = center
-        if ray.shift is not None:
-            origins += ray.shift[:, None] * axes[2]
-        if ray.p_rate is not None and ray.q_rate is not None:
-            for column in range(2):
-                d_slopes = k[:2, column, None] - k[2, column] * slopes
-                d_slopes *= per_w
-                g = slopes * d_slopes
-                g = np.add(g[0], g[1], out=g[0])
-                np.multiply(ray.p, d_slopes, out=local[:2])
-                local[:2] += slopes * (ray.p_rate * g)
-                np.multiply(ray.q_rate, g, out=local[2])
-                d_directions[:, :, column] = (axes.T @ local).T
-                if ray.shift_rate is not None:
-                    d_origins[:, :, column] = (ray.shift_rate * g)[:, None] * axes[2]
+        if ray.shift_m is not None:
+            origins += ray.shift_m[:, None] * axes[2]
+
+        def by_pixel(rates: FloatArray) -> FloatArray:
+            """Rates (m, 2, n) to slopes as rates to pixels."""
+            per_pixel = np.tensordot(k[:2, :2], rates, axes=(0, 1)).swapaxes(0, 1)
+            per_pixel -= (rates * slopes).sum(axis=1)[:, None] * k[2, :2, None]
+            per_pixel *= per_w
+            return per_pixel
+
+        if ray.rates is not None:
+            turned = (axes.T @ ray.rates.reshape(3, -1)).reshape(3, 2, -1)
+            d_directions.transpose(1, 2, 0)[...] = by_pixel(turned)
+        if ray.shift_rates is not None:
+            d_origins[...] = axes[2][:, None] * by_pixel(ray.shift_rates[None])[0].T[:, None]
         if not valid.all():
             lost = ~valid
             origins[lost] = nan
             directions[lost] = nan
-            if len(d_directions):
-                d_directions[lost] = nan
-                d_origins[lost] = nan
-
-    @cached_property
-    def _floats(self) -> tuple[list[list[float]], list[list[float]]]:
-        """Both matrices as plain floats."""
-        return self.pixel_from_slope.tolist(), self.slope_from_pixel.tolist()
-
-    def project_point(self, x: float, y: float, z: float, place: Place) -> tuple[float, float]:
-        """Return the pixel of one point, not-a-number if it has none."""
-        (cx, cy, cz), (xx, xy, xz), (yx, yy, yz), (ox, oy, oz) = place
-        (hx, hy, hz), (vx, vy, vz), (ax, ay, az) = self._floats[0]
-        x, y, z = x - cx, y - cy, z - cz
-        a, b, w = xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, ox * x + oy * y + oz * z
-        m = bend_point(self.lens, a, b, w)
-        if not self.lens.curved and not ax * a + ay * b + az * w > 0.0:
-            return nan, nan
-        u, v = a * m, b * m
-        depth = ax * u + ay * v + az
-        if not depth > 0.0 or (per_depth := 1.0 / depth) == inf:
-            return nan, nan
-        x, y = (hx * u + hy * v + hz) * per_depth, (vx * u + vy * v + vz) * per_depth
-        return (x, y) if isfinite(x + y) else (nan, nan)
-
-    def ray_of_pixel(self, x_px: float, y_px: float, place: Place) -> tuple[Triple, Triple] | None:
-        """Return origin and direction of one pixel's ray, None if it has none."""
-        (ux, uy, uz), (vx, vy, vz), (wx, wy, wz) = self._floats[1]
-        w = wx * x_px + wy * y_px + wz
-        if not w > 0.0 or not w < inf or (per_w := 1.0 / w) == inf:
-            return None
-        u, v = (ux * x_px + uy * y_px + uz) * per_w, (vx * x_px + vy * y_px + vz) * per_w
-        ray = unbend_point(self.lens, u, v)
-        if ray is None:
-            return None
-        p, q, shift = ray
-        a, b = u * p, v * p
-        ax, ay, az = self._floats[0][2]
-        if not self.lens.curved and not ax * a + ay * b + az * q > 0.0:
-            return None
-        (cx, cy, cz), (xx, xy, xz), (yx, yy, yz), (ox, oy, oz) = place
-        return (
-            (cx + shift * ox, cy + shift * oy, cz + shift * oz),
-            (a * xx + b * yx + q * ox, a * xy + b * yy + q * oy, a * xz + b * yz + q * oz),
-        )
+            d_directions[lost[: len(d_directions)]] = nan
+            d_origins[lost[: len(d_origins)]] = nan
 
 
-def chunks(count: int) -> Iterator[slice]:
+def _chunks(count: int) -> Iterator[slice]:
     """Cut ``count`` rows into slices that fit the cache."""
     return (slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK))
 

@@ -146,7 +146,7 @@ def arm_points(axes: Axes, ray: Ray, rho: float, z: float) -> Iterator[tuple[flo
                 yield 0.5 * excess - t * (b + 0.5 * a * t), u_y0 + u_y1 * t, s
 
 
-def why_not(axes: Axes, ray: Ray, rho: float, z: float, told: bool) -> Unreachable:
+def why_not(axes: Axes, ray: Ray, rho: float, z: float, explain: bool) -> Unreachable:
     """Return the refusal for a target that no pan and tilt bring onto the ray."""
     # The tilt axis turns about its point (a, 0, 0) of the arm frame; |w| is the target's distance from there.
     farthest = math.hypot(rho + abs(axes.a), z)
@@ -157,7 +157,7 @@ def why_not(axes: Axes, ray: Ray, rho: float, z: float, told: bool) -> Unreachab
             f"target is at most {farthest:.6g} m from the tilt axis centre, {nearest - farthest:.3g} m "
             f"nearer than this pixel's ray comes ({nearest:.6g} m)",
         )
-    if not told:
+    if not explain:
         return Unreachable("blind_cone", "target is too near the pan axis")
     edge = _reach_edge_m(axes, ray, rho, z)
     side = "up" if z < 0.0 else "down"

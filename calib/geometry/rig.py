@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.geometry.cahvor import CameraModel
+from calib.geometry.mode import SensorMode
 from calib.geometry.rigid import (
     FloatArray,
     ReadOnlyArrays,
@@ -35,7 +36,6 @@ from calib.geometry.rigid import (
     rot_y,
     rot_z,
 )
-from calib.geometry.sensor_mode import SensorMode
 
 MOST_HARMONICS = 2
 STEEPEST = 0.25
@@ -362,6 +362,12 @@ class Gimbal(NamedTuple):
     translation_m: FloatArray
     twists: FloatArray
 
+    def in_head(self, twists: FloatArray) -> FloatArray:
+        """Return motions (..., k, 6) of the rover frame as the head's frame has them."""
+        turns = twists[..., :3]
+        shifts = twists[..., 3:] + crossed(turns, self.translation_m[..., None, :])
+        return np.concatenate([turns @ self.rotation, shifts @ self.rotation], axis=-1)
+
 
 def gimbal(mast: FloatArray, pan_rad: float | FloatArray, tilt_rad: float | FloatArray) -> Gimbal:
     """Return rover_from_head of the mast's eight numbers at joint angles (...), with its rates."""
@@ -390,6 +396,22 @@ def _turned(
     """Two vectors (..., 3) at right angles, turned from the first to the second."""
     c, s = np.asarray(np.cos(angle_rad))[..., None], np.asarray(np.sin(angle_rad))[..., None]
     return c * one + s * other, c * other - s * one
+
+
+def joint_twists(
+    head: Gimbal,
+    joints: JointErrors,
+    read_rad: Pair | FloatArray,
+    approach: Approach | FloatArray,
+) -> FloatArray:
+    """Return (..., 12, 6): how the head moves with the ten numbers of `JOINTS_NAMES`, the readings held, and
+    with pan's and tilt's reading."""
+    by_angles = head.twists[..., 8:, :]
+    axes: list[Any] = list(zip((joints.pan, joints.tilt), read_rad, approach, strict=True))
+    rates = np.stack([joint.rates(read, side) for joint, read, side in axes], axis=-2)
+    slopes = np.stack([np.asarray(joint.slope(read, side)) for joint, read, side in axes], axis=-1)
+    by_errors = (by_angles[..., None, :] * rates[..., None]).reshape(*rates.shape[:-2], -1, 6)
+    return np.concatenate([by_errors, by_angles * slopes[..., None]], axis=-2)
 
 
 def gimbal_rates(per_point: FloatArray, points_m: FloatArray, head: Gimbal, wanted: np.ndarray) -> FloatArray:

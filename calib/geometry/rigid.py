@@ -41,6 +41,8 @@ def finite_float(name: str, value: float) -> float:
         number = float(value)
     except (TypeError, ValueError):
         raise ValueError(f"{name} is {value!r} where a number is expected") from None
+    except OverflowError:  # an integer
+        raise ValueError(f"{name} is larger than any float") from None
     if not math.isfinite(number):
         raise ValueError(f"{name} is {number} where a finite number is expected")
     return number

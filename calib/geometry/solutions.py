@@ -89,10 +89,10 @@ def ordered(
     pan_limits_rad, tilt_limits_rad
         (lowest, highest) of each joint, both included.
     from_pan_rad, from_tilt_rad
-        Where the head is now.
+        Where the head is now, as read.
     read
-        The head's readings at a solution's true angles; limits and the present angles are then readings too.
-        By default joints read true.
+        The head's readings at a solution's true angles: of these are the limits and the motion. By default
+        joints read true.
 
     Raises
     ------
@@ -131,7 +131,7 @@ def ordered(
 
     inside = [one for one in turned if excess(one) == (0.0, 0.0)]
     if inside:
-        return sorted(inside, key=lambda one: order(one, from_pan_rad, from_tilt_rad))
+        return sorted(inside, key=lambda one: order(one, from_pan_rad, from_tilt_rad, read))
     pan_rad, tilt_rad = angles(min(turned, key=lambda one: max(excess(one))))
     raise Unreachable(
         "outside_limits",
@@ -155,9 +155,16 @@ def check_here(from_pan_rad: float, from_tilt_rad: float) -> None:
         )
 
 
-def order(one: Solution, from_pan_rad: float, from_tilt_rad: float) -> tuple[bool, float]:
+def order(
+    one: Solution,
+    from_pan_rad: float,
+    from_tilt_rad: float,
+    read: Callable[[Solution], tuple[float, float]] | None = None,
+) -> tuple[bool, float]:
+    """Return the key by which solutions are sorted; present angles are readings if ``read`` is given."""
     upright = abs(math.remainder(one.tilt_rad, math.tau)) <= 0.5 * math.pi
-    return not upright, max(abs(one.pan_rad - from_pan_rad), abs(one.tilt_rad - from_tilt_rad))
+    pan_rad, tilt_rad = (one.pan_rad, one.tilt_rad) if read is None else read(one)
+    return not upright, max(abs(pan_rad - from_pan_rad), abs(tilt_rad - from_tilt_rad))
 
 
 def _beyond(angle_rad: float, limits_rad: tuple[float, float]) -> float:

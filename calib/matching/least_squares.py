@@ -37,6 +37,8 @@ WORST_CONDITION = 1e15
 NARROW = 0.35  # of the Gaussian's sigma: slope and scale come from all of it, the place from its middle
 LEAST_COUNT = 0.01  # of a Gaussian weight that is worth computing
 _RIGID = [0, 1, 6, 7]  # the columns of place, gain and offset
+BLOT_PX = 4.0  # one sigma of the Gaussian by which neighbours say together that a place shows something else
+BLOT_SIGMAS = 2.5  # of what is usual, at which a place counts a quarter
 FLOOR_PX = 0.002  # what cubic interpolation itself leaves, measured without noise
 
 
@@ -53,7 +55,7 @@ class LeastSquaresMatch:
     deformation
         (2, 2) D: what the warp did not foresee, as a linear map of offsets from the target.
     correlation
-        Normalised correlation of template and image at the found place, pixels weighted as in the fit, -1..1.
+        Normalized correlation of template and image, -1..1, weighted by ``counts`` and ``near_px2`` alone.
     middle
         The place that the patch's middle alone shows, `NARROW` as wide, the deformation kept.
     """
@@ -72,7 +74,7 @@ def match_least_squares(
     image: Grey,
     start_px: FloatArray,
     deforming: bool = True,
-    block_px: float = 6.0,
+    block_px: float = 10.0,
     near_px2: FloatArray | None = None,
     counts: FloatArray | None = None,
 ) -> LeastSquaresMatch | None:
@@ -124,19 +126,45 @@ def match_least_squares(
         return _settled(fit, surface, q[part], t[part], rates, steps, counts[part], enough_px)
 
     first = _PatchFit(start, np.zeros((2, 2)))
-    if near_px2 is None and counts is None:
-        whole = settled(first, np.ones(t.shape), deforming, STEP_ENOUGH_PX)
-        return _refined(whole, block_px) if whole else None
     held = np.ones(t.shape) if counts is None else np.asarray(counts, dtype=np.float64)[inner]
     wide = held if near_px2 is None else held * gaussian(q, near_px2)
-    begun = settled(first, wide, False, 0.05)
-    # What bends and hides more than the deformation can follow still has a place.
-    whole = (settled(begun, wide, deforming, 10 * STEP_ENOUGH_PX) or begun) if begun else None
-    refined = _refined(whole, block_px) if whole else None
+    if near_px2 is None and counts is None:
+        whole = settled(first, wide, deforming, STEP_ENOUGH_PX)
+    else:
+        begun = settled(first, wide, False, 0.05)
+        # What bends and hides more than the deformation can follow still has a place.
+        whole = (settled(begun, wide, deforming, 10 * STEP_ENOUGH_PX) or begun) if begun else None
+    if whole is not None and near_px2 is None:
+        alike = wide * _alike(whole, surface, q, t, wide)
+        better = settled(whole, alike, deforming, 10 * STEP_ENOUGH_PX)
+        refined = _refined(better or whole, block_px)
+        # What looks different moves the place less, but it must not make a false place look right.
+        refined = replace(refined, correlation=whole.correlation) if refined else None
+    else:
+        refined = _refined(whole, block_px) if whole else None
     if whole is None or refined is None or near_px2 is None:
         return refined
     middle = settled(whole, held * gaussian(q, NARROW**2 * near_px2), False, 10 * STEP_ENOUGH_PX)
     return replace(refined, middle=_refined(middle, block_px) if middle else None)
+
+
+def _alike(fit: _PatchFit, surface: Surface, q: FloatArray, t: FloatArray, counts: FloatArray) -> FloatArray:
+    """By how much pixels (h, w) count: less where the picture shows something else all around them.
+
+    Dust on the lens, a reflection, a shadow's edge: smooth and as wide as some blocks, so that leaving out
+    single blocks does not show what they shift.
+    """
+    from scipy import ndimage  # slow to load, and a daemon that starts does not need it
+
+    seen = surface.at(fit.position + q + q @ fit.deformation.T)
+    gain, offset = _Photometry(t, counts).of(seen)
+    total, rest = (
+        ndimage.gaussian_filter(values, BLOT_PX, mode="constant")
+        for values in (counts, counts * (seen - gain * t - offset))
+    )
+    mean = rest / np.maximum(total, LEAST_COUNT)
+    usual = 1.4826 * float(np.median(np.abs(mean[counts > LEAST_COUNT])))
+    return np.asarray(1.0 / (1.0 + (mean / max(BLOT_SIGMAS * usual, 1e-6)) ** 2) ** 2)
 
 
 def _counting(counts: FloatArray) -> tuple[slice, slice] | None:
@@ -174,10 +202,9 @@ def _refined(fit: _PatchFit, block_px: float) -> LeastSquaresMatch | None:
         return None
     place = moved[:, :2] / fit.gain
     covariance = (1.0 - 1.0 / len(place)) * place.T @ place + FLOOR_PX**2 * np.eye(2)
-    correlation = _correlation(t.reshape(-1), fit.rest + fit.gain * t.reshape(-1), fit.counts.reshape(-1))
-    if not np.isfinite(covariance).all() or not np.isfinite(correlation):
+    if not np.isfinite(covariance).all() or not np.isfinite(fit.correlation):
         return None
-    return LeastSquaresMatch(fit.position, covariance, fit.deformation, correlation)
+    return LeastSquaresMatch(fit.position, covariance, fit.deformation, fit.correlation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,6 +219,12 @@ class _PatchFit:
     counts: FloatArray = field(default_factory=lambda: np.empty(0))
     weights: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     rates: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def correlation(self) -> float:
+        """Normalized correlation of template and image, pixels weighted as in the fit."""
+        t = self.template.reshape(-1)
+        return _correlation(t, self.rest + self.gain * t, self.counts.reshape(-1))
 
 
 def _settled(

@@ -21,14 +21,14 @@ from calib.geometry.stereo import triangulate, triangulate_many
 from calib.matching.patch import match_patch
 from calib.matching.relief import surface_seen
 from calib.matching.sweep import Swept, sweep
-from calib.matching.verdict import MatchSettings, PatchMatch, no_match, rivalled
-from calib.matching.warp import GRAZING, SIDES, Grey, Plane, Relief, carry
+from calib.matching.verdict import MatchSettings, PatchMatch, no_match, rivalled, worst_px2
+from calib.matching.warp import GRAZING, SIDES, Grey, Plane, PosedImage, Relief, carry
 
 LAST_SEARCH_PX = 4.0
 
 AROUND_PX = 3  # the surface is seen as far beyond the patch: another view turns and slants it
 
-MATCHED_BACK_PX = 2.0  # the way back is not refined: half a pixel of the sweep, and slope
+MATCHED_BACK_PX = 2.0  # the search back is not refined: half a pixel of the sweep, and slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,12 +85,13 @@ def find_partner(
         raise ValueError(f"nearest_m is {nearest_m} where a distance above 0 is expected")
     settings = settings or MatchSettings()
     pixel = np.asarray(pixel_px, dtype=np.float64)
-    # Most of the patch may lie on something nearer or farther than the target: then a smaller one tells.
-    sizes = [settings, *(_smaller(settings, settings.half_px // part) for part in (2, 3))]
+    # Most of the patch may lie on something nearer or farther than the target: then a smaller one is tried.
+    halves = (settings.half_px // part for part in (2, 3))
+    sizes = [settings, *(replace(settings, half_px=half, smallest_half_px=half) for half in halves)]
+    own, other = PosedImage(image, camera), PosedImage(partner_image, partner)
     refused: PatchMatch | None = None
     for size in sizes:
-        swept = sweep(image, camera, pixel, partner_image, partner, nearest_m, size)
-        surface = _surface(image, camera, pixel, partner_image, partner, swept, settings)
+        surface = _surface(own, pixel, other, sweep(own, pixel, other, nearest_m, size), settings)
         if not isinstance(surface, PatchMatch):
             break
         refused = refused or surface
@@ -108,24 +109,23 @@ def find_partner(
     except NoStereoPoint as error:
         return StereoMatch(no_match("weak", f"the two cameras see no common point: {error}", found.pixel_px))
     across, sigma = _across(camera, pixel, partner, plane, found)
+    allowed = MATCHED_BACK_PX + abs(across) + math.sqrt(worst_px2(found.covariance_px2))
     apart = math.inf
     for size in sizes:
-        back = sweep(partner_image, partner, found.pixel_px, image, camera, nearest_m, size)
+        back = sweep(other, found.pixel_px, own, nearest_m, size)
         if not isinstance(back, PatchMatch):
             apart = min(apart, float(np.linalg.norm(back.pixel_px - pixel)))
-        if apart <= MATCHED_BACK_PX + abs(across):
+        if apart <= allowed:
             return StereoMatch(replace(found, second=max(found.second, second)), plane, across, sigma, relief)
-    told = "nowhere" if math.isinf(apart) else f"{apart:.0f} px from where it came"
-    words = f"matched back from the other camera it lands {told}: probably hidden from one camera"
-    return StereoMatch(no_match("weak", words, found.predicted_px, found.correlation, second))
+    place = "nowhere" if math.isinf(apart) else f"{apart:.0f} px from where it came"
+    reason = f"matched back from the other camera it lands {place}: probably hidden from one camera"
+    return StereoMatch(no_match("weak", reason, found.predicted_px, found.correlation, second))
 
 
 def _surface(
-    image: Grey,
-    camera: CameraModel,
+    own: PosedImage,
     pixel: FloatArray,
-    partner_image: Grey,
-    partner: CameraModel,
+    partner: PosedImage,
     swept: Swept | PatchMatch,
     settings: MatchSettings,
 ) -> tuple[Plane, Relief, float] | PatchMatch:
@@ -134,22 +134,17 @@ def _surface(
         return swept
     facts = (swept.pixel_px, swept.score, swept.second)
     if rivalled(swept.score, swept.second, settings):
-        words = (
+        reason = (
             f"a second place along the epipolar line fits nearly as well: {swept.second:.2f} "
             f"beside {swept.score:.2f}"
         )
-        return no_match("ambiguous", words, *facts)
+        return no_match("ambiguous", reason, *facts)
     half = settings.half_px + AROUND_PX
-    seen = surface_seen(image, camera, pixel, partner_image, partner, swept.plane, half, settings.noise_dn)
+    seen = surface_seen(own, pixel, partner, swept.plane, half, settings.noise_dn)
     if seen is None:
-        words = "the two cameras see no common surface there: an edge, or hidden from one of them"
-        return no_match("weak", words, *facts)
+        reason = "the two cameras see no common surface there: an edge, or hidden from one of them"
+        return no_match("weak", reason, *facts)
     return *seen, swept.second
-
-
-def _smaller(settings: MatchSettings, half_px: int) -> MatchSettings:
-    """The same matching with a smaller patch."""
-    return replace(settings, half_px=half_px, smallest_half_px=half_px)
 
 
 def normal_seen(
@@ -174,26 +169,25 @@ def normal_seen(
     own
         What was found in ``camera``, if the patches come from a third picture and not from this one.
     """
+
+    def deformed(offsets: FloatArray, match: PatchMatch) -> FloatArray:
+        return offsets if match.deformation is None else offsets + offsets @ match.deformation.T
+
     # Where the old plane carries neighbours of the target, and where the deformations say they really are.
     offsets = 0.7 * found.half_px * SIDES
     mine, valid = carry(found.predicted_px + offsets, partner, plane, camera)
     if not valid.all():
         return plane.normal
     if own is not None:
-        mine = own.pixel_px + _deformed(mine - own.predicted_px, own)
-    theirs = found.pixel_px + _deformed(offsets, found)
+        mine = own.pixel_px + deformed(mine - own.predicted_px, own)
+    theirs = found.pixel_px + deformed(offsets, found)
     left, right, top, bottom = triangulate_many(camera, partner, mine, theirs).position_m
     normal = np.cross(right - left, bottom - top)
     sight, length = target_m - camera.C, float(np.linalg.norm(normal))
-    # Written so that a neighbour without a point in both eyes falls back too.
+    # Written so that a neighbour without a point in both cameras falls back too.
     if not abs(normal @ sight) > GRAZING * length * np.linalg.norm(sight):
         return plane.normal
     return np.asarray(normal / length)
-
-
-def _deformed(offsets: FloatArray, found: PatchMatch) -> FloatArray:
-    """Offsets (n, 2) from the target as a match saw them deformed."""
-    return offsets if found.deformation is None else offsets + offsets @ found.deformation.T
 
 
 def _across(

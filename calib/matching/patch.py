@@ -31,12 +31,13 @@ from calib.matching.warp import (
     blurred_to,
     carry,
     parallax_px_m,
+    summit,
     warp_patch,
 )
 
 MOST_ASPECT = 5.0  # of a weight that is round on a surface seen flat
 
-FLAT_DN2 = 0.1  # grey variance below which there is no noise either, and sums of single precision tell none
+FLAT_DN2 = 0.1  # grey variance below which there is no noise either, and sums of single precision show none
 
 COUNTS_TO = 2.2  # sigmas of that weight, beyond which pixels are left out
 
@@ -139,10 +140,8 @@ def _surface_term(
         half = np.sqrt(3.0 * np.diag(near_px2))  # a box of this half side spreads as much
     sides = template.target_px + half * SIDES
     rays = destination.ray(sides)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ranges = ((plane.point_m - rays.origins_m) @ plane.normal) / (rays.directions @ plane.normal)
-        slope = float(ray.directions @ plane.normal)
-        range_m = float((plane.point_m - ray.origins_m) @ plane.normal) / slope
+    ranges, range_m = plane.ranges_m(rays), float(plane.ranges_m(ray))
+    slope = float(ray.directions @ plane.normal)
     here = ray.origins_m + range_m * ray.directions
     reach_m = float(np.linalg.norm(rays.origins_m + ranges[:, None] * rays.directions - here, axis=1).max())
     off_m = min(roughness * reach_m / abs(slope), 0.2 * range_m)
@@ -191,7 +190,7 @@ def _template(
 def near_covariance(plane: Plane, camera: CameraModel, pixel: FloatArray, near_px: float) -> FloatArray:
     """Return the covariance (2, 2) px² of a Gaussian that is round on the plane, of the area of a circle."""
     ray = camera.ray(pixel)
-    range_m = float((plane.point_m - ray.origins_m) @ plane.normal) / float(ray.directions @ plane.normal)
+    range_m = float(plane.ranges_m(ray))
     _, rate, _ = camera.project_jacobian(ray.origins_m + range_m * ray.directions)
     seen = rate @ plane.axes
     values, vectors = np.linalg.eigh(seen @ seen.T)
@@ -212,8 +211,8 @@ def _search(
     window = template.centre_px - reach - half, template.centre_px + reach + half
     low, high = np.maximum(window[0], 0), np.minimum(window[1], np.array(image.shape[::-1]) - 1)
     if (high - low < 2 * half + 4).any():
-        words = f"the target is expected at {_at(template.target_px)}, too near the picture's border"
-        return no_match("border", words, template.target_px, half_px=int(half.min()))
+        reason = f"the target is expected at {_at(template.target_px)}, too near the picture's border"
+        return no_match("border", reason, template.target_px, half_px=int(half.min()))
     margin = int(np.ceil(4 * max(template.magnification, 1.0))) + 16
     cut_low = np.maximum(low - margin, 0)
     cut = image[cut_low[1] : high[1] + 1 + margin, cut_low[0] : high[0] + 1 + margin]
@@ -228,16 +227,19 @@ def _search(
     by_noise = expected_correlation(template.values, settings, template.counts)
     least = 0.8 * settings.least_correlation * by_noise
     if best < least:
-        words = f"no place in the window of {reach} px correlates by more than {best:.2f}"
-        return no_match("weak", words, template.target_px, *facts)
+        reason = f"no place in the window of {reach} px correlates by more than {best:.2f}"
+        return no_match("weak", reason, template.target_px, *facts)
     best_at = np.array([x, y])
     begins, ends = best_at == 0, best_at == np.array(scores.shape[::-1]) - 1
     if begins.any() or ends.any():
-        words = f"the best place is at the border of the window of {reach} px"
+        reason = f"the best place is at the border of the window of {reach} px"
         # Where the picture cut the window, the target may be outside; else the window shows something else.
         outside = (begins & (low > window[0])).any() or (ends & (high < window[1])).any()
-        return no_match("border" if outside else "weak", words, template.target_px, *facts)
-    shift = low + half + np.array([x, y]) + _summit(scores, x, y) - template.centre_px
+        return no_match("border" if outside else "weak", reason, template.target_px, *facts)
+    before, top, after = (
+        np.array([scores[y, x + d], scores[y + d, x]], dtype=np.float64) for d in (-1, 0, 1)
+    )
+    shift = low + half + np.array([x, y]) + summit(before, top, after) - template.centre_px
     start = template.target_px + shift - cut_low
     refined = match_least_squares(
         template.values,
@@ -252,8 +254,8 @@ def _search(
     if refined is None or float(np.abs(refined.pixel_px - start).max()) > 2.0 * max(
         1.0, template.magnification
     ):
-        words = f"the best place (correlation {best:.2f}) does not settle to a sub-pixel position"
-        return no_match("weak", words, template.target_px, *facts)
+        reason = f"the best place (correlation {best:.2f}) does not settle to a sub-pixel position"
+        return no_match("weak", reason, template.target_px, *facts)
     middle = refined.middle and replace(refined.middle, pixel_px=refined.middle.pixel_px + cut_low)
     return PatchFound(replace(refined, pixel_px=refined.pixel_px + cut_low, middle=middle), best, second)
 
@@ -296,20 +298,13 @@ def peaks(
     return (x, y), float(scores[y, x]), second, (u, v) if second > -1.0 else None
 
 
-def _summit(scores: NDArray[np.float32], x: int, y: int) -> FloatArray:
-    """Return how far (2,) the summit of a score surface lies from its highest pixel, by parabolas."""
-    around = np.array([scores[y, x - 1 : x + 2], scores[y - 1 : y + 2, x]], dtype=np.float64)
-    bend = 2.0 * around[:, 1] - around[:, 0] - around[:, 2]
-    return np.asarray(np.clip((around[:, 2] - around[:, 0]) / (2.0 * np.maximum(bend, 1e-9)), -0.5, 0.5))
-
-
 def block_px(magnification: float, near: bool) -> float:
     """Return over how many pixels grey differences may depend on each other: more in an enlarged picture.
 
-    Six, since errors of colour filters and JPEG reach over several; four where only what is ``near`` counts,
-    which is some fifty pixels.
+    Ten: JPEG's errors are shared within its blocks of 8, those of colour filters over some two. Four
+    where only what is ``near`` counts, which is some fifty pixels.
     """
-    return (4.0 if near else 6.0) * max(1.0, magnification)
+    return (4.0 if near else 10.0) * max(1.0, magnification)
 
 
 def _at(pixel_px: FloatArray) -> str:

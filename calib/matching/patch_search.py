@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.geometry.rigid import FloatArray
-from calib.matching.warp import Grey, Mask, square_grid
+from calib.matching.warp import Grey, Mask, square_grid, summit
 
 COLUMNS = 256
 """About as wide are the reduced pictures."""
@@ -91,15 +91,10 @@ def cut(
 ) -> NDArray[np.float32]:
     """Return the patches (n, 15, 15) as another picture of the same reduction should show them.
 
-    Parameters
-    ----------
-    places
-        (n, 2) their middles in this picture, reduced pixels.
-    shapes
-        (n, 2, 2) how offsets of this picture become offsets of the other.
-    centres, expected
-        (n, 2) the whole pixel of the other picture that the patch is cut for, and where its middle is there.
-    """  # fmt: skip
+    ``places`` (n, 2) are their middles in this picture, reduced pixels; ``shapes`` (n, 2, 2) how offsets of
+    this picture become offsets of the other; ``centres`` (n, 2) the whole pixels of the other picture that
+    the patches are cut for, and ``expected`` (n, 2) where their middles are there.
+    """
     offsets = square_grid(HALF) + (centres - expected)[:, None, None]
     maps = places[:, None, None] + np.einsum("nij,nyxj->nyxi", np.linalg.inv(shapes), offsets)
     side = 2 * HALF + 1
@@ -129,18 +124,15 @@ def found(
     if not np.isfinite(best):
         return np.full(2, np.nan), -1.0
     place = np.array([x, y], dtype=np.float64)
-    for axis, at in enumerate((x, y)):
-        line = scores[y] if axis == 0 else scores[:, x]
+    for axis, (at, line) in enumerate(((x, scores[y]), (y, scores[:, x]))):
         if 0 < at < len(line) - 1:
-            before, here, after = (float(line[at + k]) for k in (-1, 0, 1))
-            bend = 2.0 * here - before - after
-            place[axis] += float(np.clip((after - before) / (2.0 * max(bend, 1e-9)), -0.5, 0.5))
+            place[axis] += summit(*line[at - 1 : at + 2].astype(np.float64))
     return low + HALF + place, float(best)
 
 
-AGREEING = {"told": (5, 0.25), "any": (6, 0.4)}
+AGREEING = {"reported": (5, 0.25), "any": (6, 0.4)}
 """How many patches, and which share of those that a view should show, must agree on it: the reported view
-needs fewer, since a large thing may have moved in the picture, than one that is looked for everywhere."""
+needs fewer, since a large thing may have moved in the picture, than one that is searched for everywhere."""
 AGREE = 1.2
 """Patches agree whose places differ by no more, reduced pixels: relief, shape, and the search itself."""
 SEARCH_SIGMA = 0.15
@@ -173,7 +165,7 @@ class AgreedView:
     expected: int
     correlation: float
 
-    def holds(self, view: Literal["told", "any"]) -> bool:
+    def holds(self, view: Literal["reported", "any"]) -> bool:
         """Return whether enough patches agree."""
         least, share = AGREEING[view]
         return self.agreeing >= max(least, share * self.expected)
@@ -190,26 +182,14 @@ def agreed_view(
 ) -> AgreedView | None:
     """Return the view on which most patches agree, None for fewer than two.
 
-    Parameters
-    ----------
-    view
-        (2,) pan and tilt, radians, from which the patches were looked for.
-    off_px
-        (n, 2) where they were found, from where that view has them.
-    rates
-        (n, 2, 2) how they move with pan and tilt, px/rad.
-    open_px
-        (n, 2) half of the way along which they may lie, since their ranges are not known.
-    scores
-        (n,) correlations.
-    step
-        Pixels of the full picture in one of the reduced.
-    expected
-        How many patches the view should show.
+    ``view`` (2,), pan and tilt, is where the patches were searched for. ``off_px`` (n, 2) is where they were
+    found, from where that view has them; ``rates`` (n, 2, 2) how they move with pan and tilt, px/rad;
+    ``open_px`` (n, 2) half of the line along which they may lie, since their ranges are not known; ``step``
+    how many pixels of the full picture make one of the reduced.
     """
     if len(off_px) < 2:
         return None
-    votes = (np.linalg.pinv(rates) @ off_px[..., None])[..., 0]  # near the pan axis one patch tells no pan
+    votes = (np.linalg.pinv(rates) @ off_px[..., None])[..., 0]  # near the pan axis one patch shows no pan
     rest = off_px[None] - np.einsum("nij,mj->mni", rates, votes)
     length2 = np.maximum((open_px**2).sum(axis=1), 1e-12)
     along = np.clip(np.einsum("mni,ni->mn", rest, open_px) / length2, -1.0, 1.0)

@@ -1,7 +1,7 @@
 """The surface around a pixel as two cameras see it: a plane, what stands off it, and where it ends.
 
 A patch near a rock's edge shows the rock and what lies behind it, and no plane carries both to another view.
-So a small window around each of the patch's pixels is looked up in the other camera, at inverse ranges before
+So a small window around each of the patch's pixels is searched in the other camera, at inverse ranges before
 and behind a plane. Where it fits best says how far off the plane that pixel's surface is. A pixel whose
 window fits nowhere shows something else: what lies beyond a step in depth, or is hidden from the other
 camera. It does not count.
@@ -10,7 +10,6 @@ camera. It does not count.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,13 +17,24 @@ import numpy as np
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
 from calib.matching.sweep import FARTHEST_M
-from calib.matching.warp import GRAZING, Grey, Plane, Relief, parallax_px_m, sample, square_grid
+from calib.matching.warp import (
+    GRAZING,
+    Grey,
+    Plane,
+    PosedImage,
+    Relief,
+    parallax_px_m,
+    quadratic,
+    sample,
+    square_grid,
+    summit,
+)
 
 WINDOW_PX = 5
 """Side of the window around each pixel. A larger one puts the edge of what is nearer farther out, and
 flattens small stones; a smaller one finds less texture."""
 REACH_PX = 6.0
-"""So far before and behind the plane a window is looked up, pixels of the other camera..."""
+"""So far before and behind the plane a window is searched, pixels of the other camera..."""
 STEP_PX = 0.5
 """...in such steps, between which a parabola shows the summit."""
 ACROSS_PX = 3.0
@@ -78,11 +88,9 @@ class _Seen:
 
 
 def surface_seen(
-    image: Grey,
-    camera: CameraModel,
+    own: PosedImage,
     pixel_px: FloatArray,
-    partner_image: Grey,
-    partner: CameraModel,
+    partner: PosedImage,
     plane: Plane,
     half_px: int,
     noise_dn: float,
@@ -91,12 +99,10 @@ def surface_seen(
 
     Parameters
     ----------
-    image, partner_image
-        (h, w) float32 grey of one moment.
-    camera, partner
-        Their models in one common frame.
+    own, partner
+        Images of one moment.
     pixel_px
-        (2,) in ``image``, sub-pixel.
+        (2,) in the own one, sub-pixel.
     plane
         About where the surface is: good to a pixel or two in the partner's picture.
     half_px
@@ -110,11 +116,11 @@ def surface_seen(
         The plane that fits the surface near the pixel, and what stands off it.
     """
     for fits in range(PASSES + 1):
-        seen = _off_plane(image, camera, pixel_px, partner_image, partner, plane, half_px, noise_dn)
+        seen = _off_plane(own, pixel_px, partner, plane, half_px, noise_dn)
         if seen is None or seen.counts.sum() < LEAST_PIXELS:
             return None
         if fits < PASSES:
-            plane = _fitted(camera, pixel_px, plane, seen)
+            plane = _fitted(own.camera, pixel_px, plane, seen)
     if seen is None or not seen.middle:
         return None
     inverse_m = (seen.off_px / seen.px_m).astype(np.float32)
@@ -122,44 +128,41 @@ def surface_seen(
 
 
 def _off_plane(
-    image: Grey,
-    camera: CameraModel,
+    image: PosedImage,
     pixel_px: FloatArray,
-    partner_image: Grey,
-    partner: CameraModel,
+    partner: PosedImage,
     plane: Plane,
     half_px: int,
     noise_dn: float,
 ) -> _Seen | None:
-    """Look the windows of a patch's pixels up before and behind a plane."""
-    along = parallax_px_m(camera, pixel_px, plane, partner)
+    """Search for the windows of a patch's pixels before and behind a plane."""
+    along = parallax_px_m(image.camera, pixel_px, plane, partner.camera)
     px_m = float(np.linalg.norm(along))
     half = half_px + WINDOW_PX // 2
-    knots = camera.ray(pixel_px + square_grid(1).reshape(9, 2) * half)
+    knots = image.camera.ray(pixel_px + square_grid(1).reshape(9, 2) * half)
+    ranges = plane.ranges_m(knots)
     with np.errstate(invalid="ignore", divide="ignore"):
-        ranges = ((plane.point_m - knots.origins_m) @ plane.normal) / (knots.directions @ plane.normal)
         steps = np.arange(-REACH_PX, REACH_PX + STEP_PX / 2, STEP_PX) / px_m
         inverse = np.maximum(1.0 / ranges + steps[:, None], 1.0 / FARTHEST_M)
-        places, valid = partner.project(knots.origins_m + knots.directions / inverse[..., None])
+        places, valid = partner.camera.project(knots.origins_m + knots.directions / inverse[..., None])
     if not (valid.all() and (ranges > 0).all()):
         return None
-    axis = np.linspace(-1.0, 1.0, 2 * half + 1)
-    lagrange = np.stack([axis * (axis - 1) / 2, 1 - axis * axis, axis * (axis + 1) / 2], axis=1)
+    weights = quadratic(half)
     x, y = (
-        (lagrange @ places[..., c].reshape(-1, 3, 3) @ lagrange.T).astype(np.float32) for c in (0, 1)
+        (weights @ places[..., c].reshape(-1, 3, 3) @ weights.T).astype(np.float32) for c in (0, 1)
     )  # biquadratic through nine knots, each carried exactly
-    own = sample(image, pixel_px + square_grid(half)).astype(np.float32)
+    own = sample(image.image, pixel_px + square_grid(half)).astype(np.float32)
 
     def seen(k: int, across_px: float) -> Grey:
         aside_x, aside_y = across_px * np.array([-along[1], along[0]]) / px_m
         maps = x[k] + np.float32(aside_x), y[k] + np.float32(aside_y)
-        return np.asarray(cv2.remap(partner_image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+        return np.asarray(cv2.remap(partner.image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
 
-    # Eyes that disagree across the line still see the surface; how far they do is measured by the match.
+    # Cameras that disagree across the line still see the surface; how far they do is measured by the match.
     middle, tried = len(steps) // 2, np.arange(-ACROSS_PX, ACROSS_PX + STEP_PX / 2, STEP_PX)
     alike = np.array([np.corrcoef(own.ravel(), seen(middle, one).ravel())[0, 1] for one in tried])
     top = int(np.clip(alike.argmax(), 1, len(tried) - 2))
-    across_px = float(tried[top] + STEP_PX * _summit(*alike[top - 1 : top + 2]))
+    across_px = float(tried[top] + STEP_PX * summit(*alike[top - 1 : top + 2]))
     others = (seen(k, across_px) for k in range(len(steps)))
     inner = slice(WINDOW_PX // 2, -(WINDOW_PX // 2))
     variance = _spread(own, own)
@@ -173,29 +176,24 @@ def _off_plane(
     # The last of equals: from beyond the farthest range on all steps look at one place.
     best = np.clip(len(steps) - 1 - scores[::-1].argmax(axis=0), 1, len(steps) - 2)
     before, best_score, after = (np.take_along_axis(scores, best[None] + d, 0)[0] for d in (-1, 0, 1))
-    off_px = (best + _summit(before, best_score, after)) * np.float32(STEP_PX) - np.float32(REACH_PX)
+    off_px = (best + summit(before, best_score, after)) * np.float32(STEP_PX) - np.float32(REACH_PX)
     off_px = np.maximum(off_px, np.float32(px_m * (1.0 / FARTHEST_M - 1.0 / ranges[4])))  # nor beyond it
     within = (best_score >= before) & (best_score >= after)
     fits = within & (best_score >= FITS * variance / (variance + noise_dn**2))
-    held = cv2.medianBlur(fits.astype(np.uint8), SPECKS_PX)
-    weights = (fits & (held > 0)) * np.maximum(best_score, 0.0) * np.minimum(variance, MOST_VARIANCE_DN2)
+    kept = cv2.medianBlur(fits.astype(np.uint8), SPECKS_PX)
+    weights = (fits & (kept > 0)) * np.maximum(best_score, 0.0) * np.minimum(variance, MOST_VARIANCE_DN2)
     total, smooth = (cv2.GaussianBlur(v, (0, 0), SMOOTH_PX) for v in (weights, weights * off_px))
     smooth = np.where(total > 1e-3, smooth / np.maximum(total, 1e-6), 0.0)
     edge = np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)
-    counts = cv2.erode(held, edge, borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    counts = cv2.erode(kept, edge, borderType=cv2.BORDER_CONSTANT, borderValue=1)
     near = slice(half_px - NEAR_PX, half_px + NEAR_PX + 1)
     differ_px = float(cv2.medianBlur(off_px.astype(np.float32), 3)[near, near].std())
     stands_off = max(0.0, 1.0 - (SIGMA_PX / max(differ_px, 1e-6)) ** 2)  # Stein's share
     smooth[half_px, half_px] *= stands_off
     sigma_px = float(np.hypot(stands_off * SIGMA_PX, differ_px))
     return _Seen(
-        smooth.astype(np.float32), counts.astype(np.float32), px_m, sigma_px, bool(held[half_px, half_px])
+        smooth.astype(np.float32), counts.astype(np.float32), px_m, sigma_px, bool(kept[half_px, half_px])
     )
-
-
-def _summit(before: Any, top: Any, after: Any) -> Any:
-    """How far a parabola's summit lies from the middle one of three scores, in steps."""
-    return np.clip((after - before) / (2.0 * np.maximum(2.0 * top - before - after, 1e-6)), -0.5, 0.5)
 
 
 def _spread(a: Grey, b: Grey) -> Grey:
@@ -221,9 +219,9 @@ def _fitted(camera: CameraModel, pixel_px: FloatArray, plane: Plane, seen: _Seen
         robust = 1.0 / (1.0 + ((off_px - rows @ terms) / ROBUST_PX) ** 2)
     corners = np.array([[0.0, 0.0], [half / 2, 0.0], [0.0, half / 2]])
     rays = camera.ray(pixel_px + corners)
-    slopes = rays.directions @ plane.normal
-    inverse = slopes / ((plane.point_m - rays.origins_m) @ plane.normal)
-    inverse = np.maximum(inverse + (terms[0] + corners @ terms[1:]) / seen.px_m, 1.0 / FARTHEST_M)
+    inverse = np.maximum(
+        1.0 / plane.ranges_m(rays) + (terms[0] + corners @ terms[1:]) / seen.px_m, 1.0 / FARTHEST_M
+    )
     points = rays.origins_m + rays.directions / inverse[:, None]
     normal_m = np.cross(points[1] - points[0], points[2] - points[0])
     length = float(np.linalg.norm(normal_m))

@@ -6,7 +6,7 @@ range from ``nearest_m`` on. `calib.matching.shown_view` concludes the later vie
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +18,7 @@ from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.matching.patch_search import HALF, AgreedView, Reduced, agreed_view, cut, found, textured
-from calib.matching.warp import SIDES, Grey
+from calib.matching.warp import SIDES, Grey, Mask
 
 MOST_PATCHES = 20
 
@@ -93,34 +93,27 @@ class Comparison:
     ) -> None:
         self._rig, self._name = rig, name
         self._nearest_m, self._floor_rad = nearest_m, floor_rad
-        self.before, self.after = before, after
-        self.earlier, self.later = before.reduced, after.reduced
-        self.step = self.earlier.step
+        self._before_rad, self.reported_rad = np.array(before.angles_rad), np.array(after.angles_rad)
+        self._places, self._earlier, self._later = before.places, before.reduced, after.reduced
+        self._step = self._earlier.step
 
-    def camera(self, pan_rad: float, tilt_rad: float) -> CameraModel:
-        return self._rig.camera_in_rover(self._name, pan_rad, tilt_rad)
+    def _camera(self, view: FloatArray) -> CameraModel:
+        return self._rig.camera_in_rover(self._name, float(view[0]), float(view[1]))
 
     def patches(self, beside: tuple[str, Posed] | None) -> tuple[_Patches, _Patches]:
         """The textured patches of the earlier picture, and those that the reported view should show."""
-        places = self.before.places
-        camera = self.camera(*self.before.angles_rad)
-        pixels = self.earlier.to_full(places)
-        around = pixels[:, None] + HALF * self.step * SIDES
-        rays, sides = camera.ray(pixels.reshape(-1, 2)), camera.ray(around)
-        near = 1.0 / self._nearest_m
-        every = _Patches(
-            places,
-            rays.origins_m,
-            rays.directions,
-            np.full(len(places), near / 2),
-            np.full(len(places), near / 2),
-            sides.directions,
-        ).some(rays.valid & sides.valid.all(axis=1))
-        told = self.camera(*self.after.angles_rad)
+        camera = self._camera(self._before_rad)
+        pixels = self._earlier.to_full(self._places)
+        rays, sides = camera.ray(pixels), camera.ray(pixels[:, None] + HALF * self._step * SIDES)
+        half = np.full(len(pixels), 0.5 / self._nearest_m)
+        every = _Patches(self._places, rays.origins_m, rays.directions, half, half, sides.directions).some(
+            rays.valid & sides.valid.all(axis=1)
+        )
+        reported = self._camera(self.reported_rad)
         shown = np.ones(len(every.places), dtype=bool)
         for share in (-1.0, 1.0):
-            seen, valid = told.project(every.points_m(share))
-            shown &= valid & self.later.holds(self.later.from_full(seen), HALF + 2)
+            seen, valid = reported.project(every.points_m(share))
+            shown &= valid & self._later.holds(self._later.from_full(seen), HALF + 2)
         inside = every.some(spread(np.flatnonzero(shown)))
         if beside is not None and len(inside.places):
             inside = self._ranged(inside, *beside)
@@ -136,7 +129,9 @@ class Comparison:
         line = other.from_full(line)
         inverse, unsure = patches.inverse_per_m.copy(), patches.unsure_per_m.copy()
         identity = np.broadcast_to(np.eye(2), (len(inverse), 2, 2))
-        own = cut(self.earlier, patches.places, identity, np.rint(patches.places).astype(int), patches.places)
+        own = cut(
+            self._earlier, patches.places, identity, np.rint(patches.places).astype(int), patches.places
+        )
         size = np.array(other.grey.shape[::-1])
         for k, patch in enumerate(own):
             here = line[k][valid[k] & ((line[k] > -HALF) & (line[k] < size + HALF)).all(axis=1)]
@@ -151,106 +146,91 @@ class Comparison:
             apart = np.linalg.norm(line[k] - place, axis=1)
             best = int(np.nanargmin(apart))
             near, far = line[k][max(best - 1, 0)], line[k][min(best + 1, RANGES - 1)]
-            way = far - near
-            length = max(float(np.linalg.norm(way)), 1e-9)
+            line_px = far - near
+            length = max(float(np.linalg.norm(line_px)), 1e-9)
             ends = tried[max(best - 1, 0)], tried[min(best + 1, RANGES - 1)]
-            along = float(np.clip((place - near) @ way / length**2, 0.0, 1.0))
-            across = abs(float((place - near)[0] * way[1] - (place - near)[1] * way[0])) / length
+            along = float(np.clip((place - near) @ line_px / length**2, 0.0, 1.0))
+            across = abs(float((place - near)[0] * line_px[1] - (place - near)[1] * line_px[0])) / length
             if across > 2.0:
                 continue
             inverse[k] = ends[0] + along * (ends[1] - ends[0])
             unsure[k] = 0.5 * (ends[1] - ends[0]) / length
-        return _Patches(
-            patches.places, patches.origins_m, patches.directions, inverse, unsure, patches.side_directions
-        )
+        return replace(patches, inverse_per_m=inverse, unsure_per_m=unsure)
+
+    def _shapes(self, camera: CameraModel, patches: _Patches) -> tuple[FloatArray, Mask]:
+        """Maps (n, 2, 2) of offsets in the earlier picture to those in a camera's; which are no slivers."""
+        around, valid = camera.project(patches.sides_m())
+        sides = np.stack([around[:, 1] - around[:, 0], around[:, 3] - around[:, 2]], axis=-1)
+        shapes = sides / (2.0 * HALF * self._step)
+        flat = np.where(np.isfinite(shapes), shapes, 0.0)
+        return shapes, valid.all(axis=1) & (np.abs(np.linalg.det(flat)) > 0.1)
 
     def at(self, patches: _Patches, view: FloatArray, reach_rad: float) -> AgreedView | None:
-        """Look for the patches where a view puts them; None if nothing agrees."""
-        pan, tilt = float(view[0]), float(view[1])
-        camera = self.camera(pan, tilt)
-        points = patches.points_m()
-        expected, ok = camera.project(points)
-        around, sides_ok = camera.project(patches.sides_m())
-        places = self.later.from_full(expected)
-        usable = ok & sides_ok.all(axis=1) & self.later.holds(places, HALF + 1)
+        """Search for the patches where a view puts them; None if nothing agrees."""
+        camera = self._camera(view)
+        expected, valid = camera.project(patches.points_m())
+        shapes, usable = self._shapes(camera, patches)
+        usable &= valid & self._later.holds(self._later.from_full(expected), HALF + 1)
         if usable.sum() < LEAST_PATCHES - 1:
             return None
-        patches, points, expected, around, places = (
-            patches.some(usable), points[usable], expected[usable], around[usable], places[usable],
-        )  # fmt: skip
-        rates = np.stack(
-            [
-                (self.camera(pan + a, tilt + b).project(points)[0] - expected) / STEP_RAD
-                for a, b in ((STEP_RAD, 0.0), (0.0, STEP_RAD))
-            ],
-            axis=-1,
-        )
+        patches, expected, shapes = patches.some(usable), expected[usable], shapes[usable]
+        turned = (self._camera(view + STEP_RAD * axis) for axis in np.eye(2))
+        points = patches.points_m()
+        rates = np.stack([(one.project(points)[0] - expected) / STEP_RAD for one in turned], axis=-1)
         open_px = np.zeros_like(expected)
         if (patches.unsure_per_m > 0).any():
             near, far = (camera.project(patches.points_m(share))[0] for share in (1.0, -1.0))
             open_px = (near - far) / 2
-        sides = np.stack([around[:, 1] - around[:, 0], around[:, 3] - around[:, 2]], axis=-1)
-        shapes = sides / (2.0 * HALF * self.step)
         known = np.isfinite(rates).all(axis=(1, 2)) & np.isfinite(open_px).all(axis=1)
-        known &= np.abs(np.linalg.det(np.where(np.isfinite(shapes), shapes, 0.0))) > 0.1
         if known.sum() < LEAST_PATCHES - 1:
             return None
-        rates, open_px, expected = rates[known], open_px[known], expected[known]
-        patches, places, shapes = patches.some(known), places[known], shapes[known]
+        rates, open_px = rates[known], open_px[known]
+        places = self._later.from_full(expected[known])
         centres = np.rint(places).astype(int)
-        wanted = cut(self.earlier, patches.places, shapes, centres, places)
-        focal_px = float(np.abs(rates).max())
-        farthest = reach_rad * focal_px / self.step + 2.0
-        off, scores = np.empty((len(places), 2)), np.empty(len(places))
-        for k, patch in enumerate(wanted):
-            reach = np.ceil(farthest + np.abs(open_px[k]) / self.step).astype(int)
-            seen, scores[k] = found(patch, self.later, centres[k], (int(reach[0]), int(reach[1])))
-            off[k] = (seen - centres[k]) * self.step
+        wanted = cut(self._earlier, patches.places[known], shapes[known], centres, places)
+        farthest = reach_rad * float(np.abs(rates).max()) / self._step + 2.0
+        reaches = np.ceil(farthest + np.abs(open_px) / self._step).astype(int)
+        seen = [
+            found(patch, self._later, centre, (int(reach[0]), int(reach[1])))
+            for patch, centre, reach in zip(wanted, centres, reaches, strict=True)
+        ]
+        off = (np.array([place for place, _ in seen]) - centres) * self._step
+        scores = np.array([score for _, score in seen])
         good = (scores >= LEAST_CORRELATION) & np.isfinite(off).all(axis=1)
-        return agreed_view(view, off[good], rates[good], open_px[good], scores[good], self.step, len(places))
+        return agreed_view(view, off[good], rates[good], open_px[good], scores[good], self._step, len(places))
 
     def anywhere(self, patches: _Patches) -> AgreedView | None:
         """The view that the later picture shows, wherever; None if it shows nothing of the earlier one."""
-        before, told = np.array(self.before.angles_rad), np.array(self.after.angles_rad)
-        starts = [before, *self._voted(patches, before, told)]
-        fits = [self._settled(patches, start) for start in starts]
-        held = [fit for fit in fits if fit is not None and fit.holds("any")]
+        fits = []
+        for start in (self._before_rad, *self._voted(patches)):
+            fit = self.at(patches, start, CLUSTER_RAD)
+            if fit is not None and fit.agreeing >= LEAST_PATCHES - 1:
+                fits.append(self.at(patches, fit.angles_rad, self._floor_rad) or fit)
+        held = [fit for fit in fits if fit.holds("any")]
         return max(held, key=lambda fit: (fit.agreeing, fit.correlation), default=None)
 
-    def _settled(self, patches: _Patches, start: FloatArray) -> AgreedView | None:
-        """The fit at a view found from a rough one."""
-        fit = self.at(patches, start, CLUSTER_RAD)
-        if fit is None or fit.agreeing < LEAST_PATCHES - 1:
-            return None
-        return self.at(patches, fit.angles_rad, self._floor_rad) or fit
-
-    def _voted(self, patches: _Patches, before: FloatArray, told: FloatArray) -> list[FloatArray]:
-        """Views that several patches vote for, looked for in the whole picture as seen from three views."""
-        size = np.array(self.later.grey.shape[::-1])
-        middle = size // 2
+    def _voted(self, patches: _Patches) -> list[FloatArray]:
+        """Views that several patches vote for, searched in the whole picture as seen from three views."""
+        size = np.array(self._later.grey.shape[::-1])
         votes: list[FloatArray] = []
-        points = patches.points_m()
+        points, reported = patches.points_m(), self.reported_rad
         model = self._rig.cameras[self._name].model
         for share in (0.0, 0.5, 1.0):
-            camera = self.camera(*(before + share * (told - before)))
-            around, ok = camera.project(patches.sides_m())
-            sides = np.stack([around[:, 1] - around[:, 0], around[:, 3] - around[:, 2]], axis=-1)
-            shapes = sides / (2.0 * HALF * self.step)
-            with np.errstate(invalid="ignore"):
-                usable = ok.all(axis=1) & (np.abs(np.linalg.det(shapes)) > 0.1)
-            if not usable.any():
-                continue
+            view = self._before_rad + share * (reported - self._before_rad)
+            shapes, usable = self._shapes(self._camera(view), patches)
             index = np.flatnonzero(usable)
-            centres = np.rint(patches.places[index]).astype(int)
-            wanted = cut(self.earlier, patches.places[index], shapes[index], centres, patches.places[index])
+            if not len(index):
+                continue
+            places = patches.places[index]
+            wanted = cut(self._earlier, places, shapes[index], np.rint(places).astype(int), places)
             for k, patch in zip(index, wanted, strict=True):
-                seen, score = found(patch, self.later, middle, (int(size[0]), int(size[1])))
+                seen, score = found(patch, self._later, size // 2, (int(size[0]), int(size[1])))
                 if score < LEAST_CORRELATION:
                     continue
                 try:
                     solutions = solve(
-                        self._rig.mast, model, points[k], self.later.to_full(seen),
-                        from_pan_rad=float(told[0]), from_tilt_rad=float(told[1]),
+                        self._rig.mast, model, points[k], self._later.to_full(seen),
+                        from_pan_rad=float(reported[0]), from_tilt_rad=float(reported[1]),
                     )  # fmt: skip
                 except CalibError:
                     continue

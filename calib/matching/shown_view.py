@@ -35,7 +35,7 @@ class ViewLimits:
     Attributes
     ----------
     floor_rad
-        Of each joint: what an honest head leaves between readings and pictures of two poses. The full
+        Of each joint: what a sound head leaves between readings and pictures of two poses. The full
         backlash of a 12-bit servo is 4.4 mrad, half a count at either end 1.5 mrad together.
     share
         Of the way between the poses: camera models of that quality.
@@ -99,52 +99,38 @@ def shown_view(
 ) -> ShownView:
     """Return which view a later picture of a head camera shows.
 
-    Parameters
-    ----------
-    rig
-        The mast file's content.
-    camera
-        Name of the camera that took both pictures.
-    before, after
-        The earlier picture, whose reported angles are believed, and the later one, whose are checked.
-    beside
-        Name and picture of the other camera at the earlier moment, for ranges.
-    limits
-        The allowed difference of reported and shown.
-
-    Examples
-    --------
-    `shown_view(rig, "navcam_left", before, after, ("navcam_right", other)).verdict`
+    The angles reported for the picture ``before`` are believed, those for ``after`` are checked. ``beside``
+    is name and picture of the other camera at the earlier moment, for ranges.
     """
     limits = limits or ViewLimits()
     pictures = Comparison(rig, camera, before, after, limits.nearest_m, limits.floor_rad)
-    told = np.array(after.angles_rad)
-    way = np.abs(told - before.angles_rad)
+    reported = pictures.reported_rad
+    way = np.abs(reported - before.angles_rad)
     every, inside = pictures.patches(beside)
     if len(every.places) < LEAST_PATCHES:
         return ShownView("too_plain", expected=len(every.places))
     overlaps = len(inside.places) >= LEAST_PATCHES
     if overlaps:
-        fit = pictures.at(inside, told, 1.5 * limits.floor_rad)
-        if fit is not None and fit.holds("told"):
-            told_view = _told(fit, told, way, limits)
-            if told_view.verdict == "contradicted":
+        fit = pictures.at(inside, reported, 1.5 * limits.floor_rad)
+        if fit is not None and fit.holds("reported"):
+            shown = _shown(fit, reported, way, limits)
+            if shown.verdict == "contradicted":
                 fit = pictures.at(inside, fit.angles_rad, limits.floor_rad) or fit
-                return _told(fit, told, way, limits)
-            if told_view.verdict == "seen":
+                return _shown(fit, reported, way, limits)
+            if shown.verdict == "seen":
                 rival = pictures.at(inside, np.array(before.angles_rad), limits.floor_rad)
                 if rival is not None and rival.agreeing >= 0.8 * fit.agreeing:
                     stayed = np.abs(rival.angles_rad - before.angles_rad) <= limits.floor_rad
                     if stayed.all():
                         # The same match, between the two views: the head played back. Else a pattern.
                         if (np.abs(rival.angles_rad - fit.angles_rad) <= limits.floor_rad / 2).all():
-                            return replace(told_view, verdict="small_move")
+                            return replace(shown, verdict="small_move")
                         return ShownView("too_plain", expected=fit.expected, agreeing=fit.agreeing)
-            return told_view
+            return shown
     known = inside if overlaps else every.some(spread(np.arange(len(every.places))))
     fit = pictures.anywhere(known)
     if fit is not None:
-        return _told(fit, told, way, limits)
+        return _shown(fit, reported, way, limits)
     if not overlaps:
         return ShownView("no_overlap", expected=len(inside.places))
     rich = len(after.places) >= LEAST_PATCHES
@@ -163,9 +149,9 @@ def overlap(rig: Rig, camera: str, before_rad: tuple[float, float], after_rad: t
     return float((rays.valid & valid & inside).mean())
 
 
-def _told(fit: AgreedView, told: FloatArray, way: FloatArray, limits: ViewLimits) -> ShownView:
+def _shown(fit: AgreedView, reported: FloatArray, way: FloatArray, limits: ViewLimits) -> ShownView:
     """What a fit says about the reported view."""
-    off = fit.angles_rad - told
+    off = fit.angles_rad - reported
     allowed = (
         limits.floor_rad + limits.share * float(way.max()) + fit.parallax_rad + limits.sigmas * fit.sigma_rad
     )
@@ -173,15 +159,20 @@ def _told(fit: AgreedView, told: FloatArray, way: FloatArray, limits: ViewLimits
         verdict: Verdict = "contradicted"
     else:
         verdict = "small_move" if (way <= allowed).all() else "seen"
+    off_rad, sigma_rad, parallax_rad, allowed_rad = (
+        (float(pan), float(tilt)) for pan, tilt in (off, fit.sigma_rad, fit.parallax_rad, allowed)
+    )
+    off_px = float(np.sqrt(((fit.rate_px_per_rad @ off) ** 2).sum(axis=1).mean()))
+    pan_rad, tilt_rad = fit.angles_rad.tolist()
     return ShownView(
         verdict,
-        float(fit.angles_rad[0]),
-        float(fit.angles_rad[1]),
-        (float(off[0]), float(off[1])),
-        (float(fit.sigma_rad[0]), float(fit.sigma_rad[1])),
-        (float(fit.parallax_rad[0]), float(fit.parallax_rad[1])),
-        (float(allowed[0]), float(allowed[1])),
-        float(np.sqrt(((fit.rate_px_per_rad @ off) ** 2).sum(axis=1).mean())),
+        pan_rad,
+        tilt_rad,
+        off_rad,
+        sigma_rad,
+        parallax_rad,
+        allowed_rad,
+        off_px,
         fit.agreeing,
         fit.expected,
     )

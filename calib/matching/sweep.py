@@ -1,6 +1,6 @@
 """A plane swept along a pixel's ray, from near to infinity: where the other camera shows what this one sees.
 
-At each inverse range the patch is laid on planes of a few slopes and looked up in the other picture, so slope
+At each inverse range the patch is laid on planes of a few slopes and searched in the other picture, so slope
 and scale do not spoil the correlation; the line it follows is as curved as the lenses make it.
 
 The common frame has z down (rover, site): level ground is one of the planes tried.
@@ -9,7 +9,7 @@ The common frame has z down (rover, site): level ground is one of the planes tri
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calib.geometry.cahvor import CameraModel, Rays
 from calib.geometry.rigid import FloatArray
 from calib.matching.verdict import MatchSettings, PatchMatch, expected_correlation, no_match, texture_lacks
-from calib.matching.warp import GRAZING, Grey, Plane, sample, square_grid
+from calib.matching.warp import GRAZING, Plane, PosedImage, quadratic, sample, square_grid
 
 UP = np.array([0.0, 0.0, -1.0])
 
@@ -26,7 +26,7 @@ FARTHEST_M = 1e4  # as good as infinity for any stereo base on a rover
 
 COARSE = 2  # the first sweep uses every second pixel of half-size pictures
 
-DENSE = 400  # points of the ray that tell the curve's length
+DENSE = 400  # points of the ray by which the curve's length is known
 
 FINE_STEPS = np.arange(-3.0, 3.5, 0.5)  # px around each of the best coarse places
 
@@ -53,60 +53,51 @@ class _Patch:
 
 
 def sweep(
-    image: Grey,
-    camera: CameraModel,
-    pixel: FloatArray,
-    partner_image: Grey,
-    partner: CameraModel,
-    nearest_m: float,
-    settings: MatchSettings,
+    own: PosedImage, pixel: FloatArray, partner: PosedImage, nearest_m: float, settings: MatchSettings
 ) -> Swept | PatchMatch:
     """Return the best place along the line, or why there is none."""
-    half = _room(pixel, camera, settings)
+    camera = own.camera
+    edge = float(min(*(pixel - 1), *(np.array(camera.size_px) - 2 - pixel)))
+    half = min(settings.half_px, math.floor(edge))  # of the largest patch that the picture holds
     if half < settings.smallest_half_px:
         return no_match("border", "the patch is cut by the picture's border")
-    values = sample(image, pixel + square_grid(half)).astype(np.float32)
+    values = sample(own.image, pixel + square_grid(half)).astype(np.float32)
     lacking = texture_lacks(values, settings)
     if lacking:
         return no_match("flat", lacking, half_px=half)
     ray = camera.ray(pixel)
     if not bool(ray.valid):
         return no_match("border", "the pixel has no ray in this camera")
-    inverse, places = _curve(ray, partner, nearest_m, settings.smallest_half_px)
+    inverse, places = _curve(ray, partner.camera, nearest_m, settings.smallest_half_px)
     if len(inverse) == 0:
         return no_match("border", "nothing that this pixel may show lies in the other camera's picture")
     normals = _normals(ray.directions)
-    small = np.asarray(cv2.pyrDown(image), np.float32)
-    partner_small = np.asarray(cv2.pyrDown(partner_image), np.float32)
-    coarse = _patch(small, camera, pixel, half, COARSE)
-    scores = _scores(coarse, ray, inverse, normals, partner, partner_small, COARSE).max(axis=1)
+    small, partner_small = (
+        replace(one, image=np.asarray(cv2.pyrDown(one.image), np.float32)) for one in (own, partner)
+    )
+    coarse = _patch(small, pixel, half, COARSE)
+    scores = _scores(coarse, ray, inverse, normals, partner_small, COARSE).max(axis=1)
     kept = _best_apart(scores, places, settings.apart_px)
-    fine = _patch(image, camera, pixel, half, 1)
+    fine = _patch(own, pixel, half, 1)
     tries: list[tuple[float, float, int]] = []
     for index in kept:
         near = _between(inverse, places, index)
-        table = _scores(fine, ray, near, normals, partner, partner_image, 1)
+        table = _scores(fine, ray, near, normals, partner, 1)
         row, column = np.unravel_index(int(np.argmax(table)), table.shape)
         tries.append((float(table[row, column]), float(near[row]), int(column)))
     if not tries:
         return no_match("weak", "no place along the epipolar line can be compared", half_px=half)
     tries.sort(reverse=True)
     score, best, which = tries[0]
-    seen, _ = partner.project(ray.origins_m + ray.directions / np.array([[one[1]] for one in tries]))
+    seen, _ = partner.camera.project(ray.origins_m + ray.directions / np.array([[one[1]] for one in tries]))
     apart = np.linalg.norm(seen - seen[0], axis=1) > settings.apart_px
     second = max((one[0] for one, far in zip(tries, apart, strict=True) if far), default=-1.0)
     least = 0.8 * settings.least_correlation * expected_correlation(values, settings)
     if score < least:
-        words = f"no place along the epipolar line correlates by more than {score:.2f}"
-        return no_match("weak", words, None, score, second, half)
+        reason = f"no place along the epipolar line correlates by more than {score:.2f}"
+        return no_match("weak", reason, None, score, second, half)
     plane = Plane(ray.origins_m + ray.directions / best, normals[which])
     return Swept(plane, seen[0], score, second)
-
-
-def _room(pixel: FloatArray, camera: CameraModel, settings: MatchSettings) -> int:
-    """Return the half side of the largest patch around a pixel that the picture holds."""
-    edge = float(min(*(pixel - 1), *(np.array(camera.size_px) - 2 - pixel)))
-    return min(settings.half_px, math.floor(edge))
 
 
 def _curve(
@@ -145,18 +136,18 @@ def _normals(direction: FloatArray) -> FloatArray:
     return np.array(slopes)
 
 
-def _patch(image: Grey, camera: CameraModel, pixel: FloatArray, half: int, step: int) -> _Patch:
+def _patch(own: PosedImage, pixel: FloatArray, half: int, step: int) -> _Patch:
     """Cut the patch out of a picture reduced ``step`` times and prepare its knots."""
     count = half // step
     offsets = square_grid(count) * step
     maps = ((pixel + offsets) / step).astype(np.float32)
-    values = cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    values = cv2.remap(
+        own.image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     values = values.reshape(-1) - values.mean()
     length = float(np.linalg.norm(values))
-    knots = camera.ray(pixel + square_grid(1).reshape(9, 2) * (count * step))
-    axis = np.linspace(-1.0, 1.0, 2 * count + 1)
-    lagrange = np.stack([axis * (axis - 1) / 2, 1 - axis * axis, axis * (axis + 1) / 2], axis=1)
-    weights = np.einsum("yj,xi->yxji", lagrange, lagrange).reshape(len(values), 9)
+    knots = own.camera.ray(pixel + square_grid(1).reshape(9, 2) * (count * step))
+    weights = np.einsum("yj,xi->yxji", quadratic(count), quadratic(count)).reshape(len(values), 9)
     return _Patch(values / max(length, 1e-6), knots, weights.astype(np.float32))
 
 
@@ -165,8 +156,7 @@ def _scores(
     ray: Rays,
     inverse: FloatArray,
     normals: FloatArray,
-    partner: CameraModel,
-    partner_image: Grey,
+    partner: PosedImage,
     step: int,
 ) -> NDArray[np.float32]:
     """Return the correlations (m, k) at inverse ranges (m,) and slopes (k, 3).
@@ -180,12 +170,12 @@ def _scores(
         ranges = ahead / slope
         ranges = np.where((ranges > 0) & (np.abs(slope) > GRAZING), ranges, np.nan)
         hits = patch.knots.origins_m + ranges[..., None] * patch.knots.directions
-    pixels, _ = partner.project(hits)  # (m, k, 9, 2)
+    pixels, _ = partner.camera.project(hits)  # (m, k, 9, 2)
     m, k = pixels.shape[:2]
     known = np.isfinite(pixels).all(axis=(2, 3)).reshape(m * k)
     maps = np.where(np.isfinite(pixels), pixels / step, 0.0).astype(np.float32).reshape(m * k, 9, 2)
     map_x, map_y = maps[..., 0] @ patch.weights.T, maps[..., 1] @ patch.weights.T
-    seen = cv2.remap(partner_image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    seen = cv2.remap(partner.image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     seen -= seen.mean(axis=1, keepdims=True)
     length = np.sqrt(np.einsum("ij,ij->i", seen, seen))
     scores = (seen @ patch.values) / np.maximum(length, 1e-3)

@@ -1,6 +1,6 @@
 """Whether a match of patches is a measurement, and what makes it none.
 
-The verdict is part of the measurement: only a ``good`` match is one. What the other words say:
+The verdict is part of the measurement: only a ``good`` match is one. The others:
 
 - ``flat``: too little texture (or only along one direction) to hold a position;
 - ``ambiguous``: a second place fits nearly as well;
@@ -157,16 +157,16 @@ def judged(
     facts = (refined.correlation, found.second, half)
     least = settings.least_correlation * expected_correlation(template.values, settings, template.counts)
     if refined.correlation < least:
-        words = f"the best place correlates by {refined.correlation:.2f}, at least {least:.2f} is expected"
-        return no_match("weak", words, template.target_px, *facts)
+        reason = f"the best place correlates by {refined.correlation:.2f}, at least {least:.2f} is expected"
+        return no_match("weak", reason, template.target_px, *facts)
     # Both as correlated: only the best place has been deformed to fit.
     if rivalled(found.best, found.second, settings):
-        words = f"a second place fits nearly as well: {found.second:.2f} beside {found.best:.2f}"
-        return no_match("ambiguous", words, template.target_px, *facts)
+        reason = f"a second place fits nearly as well: {found.second:.2f} beside {found.best:.2f}"
+        return no_match("ambiguous", reason, template.target_px, *facts)
     worst_px = math.sqrt(worst_px2(refined.covariance_px2))
     if worst_px > settings.worst_sigma_px:
-        words = f"the place is certain to {worst_px:.2f} px only, {settings.worst_sigma_px} px is expected"
-        return no_match("weak", words, template.target_px, *facts)
+        reason = f"the place is certain to {worst_px:.2f} px only, {settings.worst_sigma_px} px is expected"
+        return no_match("weak", reason, template.target_px, *facts)
     return PatchMatch(
         "good",
         "",

@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.errors import CalibError
-from calib.geometry.cahvor import CameraModel
+from calib.geometry.cahvor import CameraModel, Rays
 from calib.geometry.rigid import FloatArray, ReadOnlyArrays, frozen_array
 
 Grey = NDArray[np.float32]
@@ -43,6 +44,12 @@ class Plane(ReadOnlyArrays):
             raise CalibError(f"plane normal {normal.tolist()} has no direction")
         object.__setattr__(self, "point_m", frozen_array(self.point_m, (3,)))
         object.__setattr__(self, "normal", frozen_array(normal / length, (3,)))
+
+    def ranges_m(self, rays: Rays) -> FloatArray:
+        """Return how far along rays (...) the plane is, metres; below 0 behind, not finite beside it."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ahead: FloatArray = (self.point_m - rays.origins_m) @ self.normal
+            return np.asarray(ahead / (rays.directions @ self.normal))
 
     @cached_property
     def axes(self) -> FloatArray:
@@ -98,13 +105,33 @@ def carry(
         are not-a-number and False.
     """
     rays = from_camera.ray(np.asarray(pixels_px, dtype=np.float64))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        slope = rays.directions @ plane.normal
-        ranges_m = ((plane.point_m - rays.origins_m) @ plane.normal) / slope
-        hit = rays.valid & (ranges_m > 0.0) & (np.abs(slope) > GRAZING)
+    ranges_m = plane.ranges_m(rays)
+    with np.errstate(invalid="ignore"):
+        hit = rays.valid & (ranges_m > 0.0) & (np.abs(rays.directions @ plane.normal) > GRAZING)
         points = rays.origins_m + np.where(hit, ranges_m, np.nan)[..., None] * rays.directions
     carried, seen = to_camera.project(points)
     return carried, np.asarray(hit & seen, dtype=np.bool_)
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """An image (h, w) float32 grey, and its camera at that moment in a frame that images share."""
+
+    image: Grey
+    camera: CameraModel
+
+
+def summit(before: Any, top: Any, after: Any) -> Any:
+    """Return how far the summit of a parabola lies from the middle of three scores, in steps, up to half."""
+    bend = np.maximum(2.0 * top - before - after, 1e-9)
+    return np.clip((after - before) / (2.0 * bend), -0.5, 0.5)
+
+
+@cache
+def quadratic(half: int) -> FloatArray:
+    """Weights (2 half + 1, 3) of values at both ends and in the middle of a line of as many pixels."""
+    axis = np.linspace(-1.0, 1.0, 2 * half + 1)
+    return np.stack([axis * (axis - 1) / 2, 1 - axis * axis, axis * (axis + 1) / 2], axis=1)
 
 
 def square_grid(half_px: int) -> FloatArray:

@@ -8,15 +8,8 @@ Each shot (all cameras at one attitude of the head) adds JᵀJ of its weighted p
 errors of its two joints eliminated. The prior is so wide that it only keeps directions closed that no picture
 has shown yet.
 
-From that follows how well the rig would point, over the whole of where it points: the figure that the choice
-of poses lowers. A target is clicked in a pair of the head at one attitude, ranged by it, and brought to the
-image centre by the closed form. Errors of the rig's parameters move the ranged place, and the direction in
-which the head then looks. With the picture of the landing as truth the residual is, at first order,
-
-    e = -(d pixel / d rig + d pixel / d point . d point / d rig),
-
-the rates of the landing's picture, and the ranged point as both clicks hold it. A single camera is given the
-range.
+From that follows how well the rig would point, over the whole of where it points
+(`calib.geometry.landing`): the figure that the choice of poses lowers.
 """
 
 from __future__ import annotations
@@ -24,14 +17,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from calib.errors import CalibError
-from calib.geometry.parameters import parameter_names, parameter_part, predict
-from calib.geometry.pointing import solve
-from calib.geometry.rig import JOINTS_NAMES, Gimbal, Rig, gimbal, gimbal_rates, numbers_of
+from calib.geometry.covariance import JOINT_NAMES, pixel_rates
+from calib.geometry.landing import LandingRates, landing_rates
+from calib.geometry.parameters import parameter_names, parameter_part
+from calib.geometry.rig import JOINTS_NAMES, Approach, Gimbal, Rig, gimbal, numbers_of
 from calib.geometry.rigid import FloatArray, Rigid, rigid_rates
 
 AXES = ("mast.axis_offset_m", "mast.axis_twist_rad")
@@ -139,63 +134,39 @@ class Knowledge:
         if not rows:
             return np.zeros((size, size))
         jacobian = np.concatenate(rows)
-        told = jacobian.T @ jacobian
+        information = jacobian.T @ jacobian
         if self.joint_sigma_rad > 0.0:
             by_joint = np.concatenate(turned)
             across = by_joint.T @ jacobian
             own = by_joint.T @ by_joint + np.eye(2) / self.joint_sigma_rad**2
-            told -= across.T @ np.linalg.solve(own, across)
-        return np.asarray(told)
+            information -= across.T @ np.linalg.solve(own, across)
+        return np.asarray(information)
 
     def rates(self, camera: str, shot: BenchShot, points_m: FloatArray) -> Rates:
         """Return where a camera sees points (n, 3) of the rover frame, and how that depends on everything."""
-        held = self.rig.cameras[camera]
-        count, size = len(points_m), len(self.names)
-        to_rig, to_joints = np.zeros((count, 2, size)), np.zeros((count, 2, 2))
-        mine = self._at[camera]
-        if held.on == "rover":
-            seen = predict(held.model, points_m)
-            to_rig[..., mine] = seen.d_step
-            return Rates(seen.pixels_px, to_rig, seen.d_points, to_joints)
-        head = self.head(shot)
-        seen = predict(held.model, (points_m - head.translation_m) @ head.rotation)
-        in_rover = seen.d_points @ head.rotation.T
-        to_rig[..., mine] = seen.d_step
-        moved = -gimbal_rates(in_rover, points_m, head, np.array([6, 7, 8, 9]))
-        to_rig[..., self._at["axes"]] = moved[..., :2]
-        to_joints = moved[..., 2:]
-        joints = self.rig.joints
-        by_pan = joints.pan.rates(shot.pan_rad, shot.pan_approach)
-        by_tilt = joints.tilt.rates(shot.tilt_rad, shot.tilt_approach)
-        terms = [moved[..., 2, None] * by_pan, moved[..., 3, None] * by_tilt]
-        to_rig[..., self._at["joints"]] = np.concatenate(terms, axis=-1)
-        return Rates(seen.pixels_px, to_rig, in_rover, to_joints)
+        names = (*self.names, *JOINT_NAMES)
+        seen = pixel_rates(self.rig, names, camera, *self._true_rad(shot), points_m, _approach(shot))
+        return Rates(seen.pixels_px, seen.to_rig[..., :-2], seen.to_points, seen.to_rig[..., -2:])
 
     def head(self, shot: BenchShot) -> Gimbal:
         """Return where the head truly is, as the estimate has it."""
-        true_rad = self.rig.joints.true_rad(
-            (shot.pan_rad, shot.tilt_rad), (shot.pan_approach, shot.tilt_approach)
-        )
-        return gimbal(numbers_of(self.rig.mast), *true_rad)
+        return gimbal(numbers_of(self.rig.mast), *self._true_rad(shot))
 
-    @cached_property
-    def _at(self) -> Mapping[str, slice]:
-        """Where each camera's, the axes' and the joints' unknowns are."""
-        out, begin = {}, 0
-        sizes = [(name, len(self._camera_names(name))) for name in self.rig.cameras]
-        for name, size in (*sizes, ("axes", len(AXES)), ("joints", len(JOINTS_NAMES))):
-            out[name] = slice(begin, begin + size)
-            begin += size
-        return out
+    def _true_rad(self, shot: BenchShot) -> tuple[float, float]:
+        return self.rig.joints.true_rad((shot.pan_rad, shot.tilt_rad), _approach(shot))
 
     def _camera_names(self, camera: str) -> Sequence[str]:
         kind = self.rig.cameras[camera].model.kind
         return [f"cameras.{camera}.{part}" for part in parameter_names(kind)]
 
 
-def without_board(told: FloatArray) -> FloatArray:
+def _approach(shot: BenchShot) -> Approach:
+    return shot.pan_approach, shot.tilt_approach
+
+
+def without_board(information: FloatArray) -> FloatArray:
     """Return what is left of (p + 6, p + 6) about the rig, (p, p), if the board's pose is unknown."""
-    rig, across, board = told[:-6, :-6], told[:-6, -6:], told[-6:, -6:]
+    rig, across, board = information[:-6, :-6], information[:-6, -6:], information[-6:, -6:]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(board), 1e-300))
     own = np.linalg.pinv(board * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
     return np.asarray(rig - across @ own @ across.T)
@@ -232,7 +203,7 @@ class Workspace:
 
 @dataclass(frozen=True, eq=False)
 class ExpectedPointing:
-    """How landings (2k) depend on the rig's unknowns (2k, p) and on the four joint readings (2k, 4).
+    """How landings (2k) depend on the rig's unknowns (2k, p) and on the four joint readings (2k, 4), px/rad.
 
     ``places`` (k) are pan and tilt of the click, radians, and the target's range, metres.
     """
@@ -264,61 +235,25 @@ def pointing(known: Knowledge, where: Workspace) -> ExpectedPointing:
     CalibError
         If nothing of the workspace can be pointed at.
     """
-    rows, joints, places = [], [], []
-    approach = 0
-    for pan in np.linspace(*where.pan_rad, STEPS[0]):
-        for tilt in np.linspace(*where.tilt_rad, STEPS[1]):
-            for range_m in where.ranges_m:
-                for click in CLICKS:
-                    # Backlash shows where click and landing were approached from different sides.
-                    approach = 0 if where.one_sided else 1 if approach != 1 else -1
-                    clicked = BenchShot("", float(pan), float(tilt), (), approach, approach)
-                    try:
-                        row = _landing(known, where.cameras, clicked, click, range_m)
-                    except CalibError:
-                        continue
-                    rows.append(row[0])
-                    joints.append(row[1])
-                    places.append((float(pan), float(tilt), float(range_m)))
-    if not rows:
-        raise CalibError(f"camera {where.cameras[0]} can be pointed at nothing of the workspace")
-    return ExpectedPointing(np.concatenate(rows), np.concatenate(joints), tuple(places))
-
-
-def _landing(
-    known: Knowledge, cameras: Sequence[str], clicked: BenchShot, click: tuple[float, float], range_m: float
-) -> tuple[FloatArray, FloatArray]:
-    """One target's two rows: to the rig, and to the readings before and after the move."""
-    rig = known.rig
-    model = rig.cameras[cameras[0]].model
-    width, height = model.size_px
-    ray = model.ray(np.array([click[0] * width, click[1] * height]))
-    head = known.head(clicked)
-    point = head.rotation @ (ray.origins_m + range_m * ray.directions) + head.translation_m
-    seen = [known.rates(camera, clicked, point[None]) for camera in cameras]
-    by_point = np.concatenate([one.to_points[0] for one in seen])
-    by_rig = np.concatenate([one.to_rig[0] for one in seen])
-    by_joints = np.concatenate([one.to_joints[0] for one in seen])
-    if len(cameras) == 1:  # its range is told: a row of its own, weighed as much as a pixel's
-        along = head.rotation @ ray.directions
-        by_point = np.vstack([by_point, along * float(np.linalg.norm(model.H)) / range_m])
-        by_rig = np.vstack([by_rig, np.zeros(by_rig.shape[1])])
-        by_joints = np.vstack([by_joints, np.zeros(2)])
-    back = np.linalg.pinv(by_point)
-    angles = solve(rig.mast, model, point, from_pan_rad=clicked.pan_rad, from_tilt_rad=clicked.tilt_rad)[0]
-    landed = BenchShot(
-        "",
-        float(rig.joints.pan.read_rad(angles.pan_rad, -clicked.pan_approach)),
-        float(rig.joints.tilt.read_rad(angles.tilt_rad, -clicked.tilt_approach)),
-        (),
-        -clicked.pan_approach,
-        -clicked.tilt_approach,
-    )
-    there = known.rates(cameras[0], landed, point[None])
-    to_point = there.to_points[0]
-    if not (np.isfinite(by_rig).all() and np.isfinite(there.to_rig).all()):
-        raise CalibError("outside the lens")
-    return (
-        to_point @ back @ by_rig - there.to_rig[0],
-        np.concatenate([-there.to_joints[0], to_point @ back @ by_joints], axis=1),
-    )
+    rig, camera = known.rig, where.cameras[0]
+    size_px = np.array(rig.cameras[camera].model.size_px)
+    landings: list[LandingRates] = []
+    places: list[tuple[float, float, float]] = []
+    side = 0
+    pans, tilts = np.linspace(*where.pan_rad, STEPS[0]), np.linspace(*where.tilt_rad, STEPS[1])
+    for pan, tilt, range_m, click in product(pans.tolist(), tilts.tolist(), where.ranges_m, CLICKS):
+        # Backlash shows where click and landing were approached from different sides.
+        side = 0 if where.one_sided else 1 if side != 1 else -1
+        sides = (side, side), (-side, -side)
+        true_rad = rig.joints.true_rad((pan, tilt), sides[0])
+        ray = rig.camera_in_rover(camera, *true_rad).ray(click * size_px)
+        target_m = ray.origins_m + range_m * ray.directions
+        try:
+            landings.append(landing_rates(rig, known.names, where.cameras, *true_rad, target_m, sides))
+        except CalibError:
+            continue
+        places.append((pan, tilt, float(range_m)))
+    if not landings:
+        raise CalibError(f"camera {camera} can be pointed at nothing of the workspace")
+    to_rig, _, to_readings = (np.concatenate(part) for part in zip(*landings, strict=True))
+    return ExpectedPointing(to_rig, to_readings, tuple(places))

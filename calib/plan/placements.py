@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -125,16 +126,16 @@ def placements(known: Knowledge, sought: Sought) -> Iterator[Placement]:
         width_m * float(np.linalg.norm(c.model.H)) / (SMALLEST_PART * c.model.size_px[0])
         for c in known.rig.cameras.values() if c.on == "head"
     )  # fmt: skip
-    pan, tilt = (
-        [math.degrees(x) for x in limits] for limits in (sought.pan_limits_rad, sought.tilt_limits_rad)
-    )
     ranges = [r for r in RANGES_M if near_m * 0.95 <= r <= max(far_m, near_m)] or [near_m]
-    for range_m in ranges:
-        for bearing in BEARINGS_DEG:
-            for height in HEIGHTS_DEG:
-                if pan[0] <= bearing <= pan[1] and tilt[0] <= height <= tilt[1]:
-                    for turned in TURNS_DEG:
-                        yield Placement(range_m, bearing, height, turned)
+    return _places(sought, ranges, HEIGHTS_DEG)
+
+
+def _places(sought: Sought, ranges_m: Sequence[float], heights_deg: Sequence[float]) -> Iterator[Placement]:
+    """Yield places at these ranges and heights in directions that are within the head's limits."""
+    pan, tilt = np.degrees(sought.pan_limits_rad), np.degrees(sought.tilt_limits_rad)
+    for range_m, bearing, height, turned in product(ranges_m, BEARINGS_DEG, heights_deg, TURNS_DEG):
+        if pan[0] <= bearing <= pan[1] and tilt[0] <= height <= tilt[1]:
+            yield Placement(range_m, bearing, height, turned)
 
 
 def advise(
@@ -156,22 +157,22 @@ def advise(
     base = known.information(shots)
     best: Advice | None = None
     for placement in every:
-        told = told_by(known, sought, placement)
-        if told is None:
+        added = information_of(known, sought, placement)
+        if added is None:
             continue
-        rms = aim.rms_px(covariance_of(base + told))
+        rms = aim.rms_px(covariance_of(base + added))
         if best is None or rms < best.expected_px:
             best = Advice(placement, rms)
     return best
 
 
-def told_by(known: Knowledge, sought: Sought, placement: Placement) -> FloatArray | None:
+def information_of(known: Knowledge, sought: Sought, placement: Placement) -> FloatArray | None:
     """Return the information of a pattern of shots of a board that stood so; None of too few."""
     head = known.rig.mast.rover_from_head(0.0, 0.0)
     supposed = replace(known, boards={"": placement.rover_from_board(head)})
     camera = next(c for c in known.rig.cameras.values() if c.on == "head")
     width, height = camera.model.size_px
-    told, middle = [], supposed.boards[""].translation_m
+    added, middle = [], supposed.boards[""].translation_m
     for k, (x, y) in enumerate(PATTERN):
         try:
             pan, tilt = readings(known.rig, sought, camera.model, middle, (x * width, y * height))
@@ -180,10 +181,10 @@ def told_by(known: Knowledge, sought: Sought, placement: Placement) -> FloatArra
         side = 0 if sought.one_sided else 1 if k % 2 else -1
         shown = seen(supposed, sought, BenchShot("", pan, tilt, (), side, side))
         if shown is not None:
-            told.append(supposed.of_shot(shown))
-    if len(told) < 3:
+            added.append(supposed.of_shot(shown))
+    if len(added) < 3:
         return None
-    return without_board(np.sum(told, axis=0))
+    return without_board(np.sum(added, axis=0))
 
 
 BODY_HEIGHTS_DEG = (-60.0, -50.0, -40.0, -30.0, -15.0)
@@ -215,10 +216,11 @@ def body_px(known: Knowledge, covariance: FloatArray, camera: str) -> float:
     x, y = np.meshgrid(*((np.arange(GRID) + 0.5) / GRID * size for size in (width, height)))
     rays = model.ray(np.stack([x.ravel(), y.ravel()], axis=-1))
     points = rays.origins_m[rays.valid] + RANGE_M * rays.directions[rays.valid]
-    rates = predict(model, points).d_step
+    seen = predict(model, points)
+    rates = seen.d_step[seen.valid]
     mine = [k for k, name in enumerate(known.names) if name.startswith(f"cameras.{camera}.")]
     squares = np.einsum("nip,pq,niq->ni", rates, covariance[np.ix_(mine, mine)], rates)
-    return float(np.sqrt(np.mean(squares[np.isfinite(squares)])))
+    return float(np.sqrt(np.mean(squares)))
 
 
 def advise_for_body(
@@ -228,32 +230,20 @@ def advise_for_body(
     the head can see. ``expected_px`` is the error of their pixels afterwards."""
     base = known.information(shots)
     best: tuple[int, float, Placement] | None = None
-    for placement in _low_placements(known, sought):
-        see = _sees(known, sought, placement) & set(cameras)
-        told = told_by(known, sought, placement) if see else None
-        if told is None:
+    head = known.rig.mast.rover_from_head(0.0, 0.0)
+    lowest_m = max(known.rig.cameras[name].model.C[2] for name in body_cameras(known)) + BELOW_M
+    for placement in _places(sought, RANGES_M, BODY_HEIGHTS_DEG):
+        if placement.rover_from_board(head).translation_m[2] > lowest_m:
             continue
-        covariance = covariance_of(base + told)
+        see = _sees(known, sought, placement) & set(cameras)
+        added = information_of(known, sought, placement) if see else None
+        if added is None:
+            continue
+        covariance = covariance_of(base + added)
         off_px = float(np.mean([body_px(known, covariance, name) for name in cameras]))
         if best is None or (-len(see), off_px) < best[:2]:
             best = -len(see), off_px, placement
     return None if best is None else Advice(best[2], best[1])
-
-
-def _low_placements(known: Knowledge, sought: Sought) -> Iterator[Placement]:
-    """Places around and below, where there should be room over the ground."""
-    head = known.rig.mast.rover_from_head(0.0, 0.0)
-    lowest_m = max(known.rig.cameras[name].model.C[2] for name in body_cameras(known)) + BELOW_M
-    pan, tilt = np.degrees(sought.pan_limits_rad), np.degrees(sought.tilt_limits_rad)
-    for range_m in RANGES_M:
-        for bearing in BEARINGS_DEG:
-            for height in BODY_HEIGHTS_DEG:
-                if not (pan[0] <= bearing <= pan[1] and tilt[0] <= height <= tilt[1]):
-                    continue
-                for turned in TURNS_DEG:
-                    placement = Placement(range_m, bearing, height, turned)
-                    if placement.rover_from_board(head).translation_m[2] <= lowest_m:
-                        yield placement
 
 
 def _sees(known: Knowledge, sought: Sought, placement: Placement) -> set[str]:

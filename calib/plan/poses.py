@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -131,19 +132,16 @@ def readings(
     return read_rad(choose(found, sought.pan_limits_rad, sought.tilt_limits_rad, read=read_rad))
 
 
-def attitudes(known: Knowledge, sought: Sought, placement: str) -> Iterator[tuple[float, float]]:
+def _attitudes(known: Knowledge, sought: Sought, placement: str) -> Iterator[tuple[float, float]]:
     """Yield joint readings, radians, that bring the board's middle to places all over each head camera."""
     middle = known.boards[placement].translation_m
-    for camera in known.rig.cameras.values():
-        if camera.on != "head":
+    models = [camera.model for camera in known.rig.cameras.values() if camera.on == "head"]
+    for model, x, y in product(models, PLACES, PLACES):
+        width, height = model.size_px
+        try:
+            yield readings(known.rig, sought, model, middle, (x * width, y * height))
+        except (Unreachable, CalibError, ValueError):
             continue
-        width, height = camera.model.size_px
-        for x in PLACES:
-            for y in PLACES:
-                try:
-                    yield readings(known.rig, sought, camera.model, middle, (x * width, y * height))
-                except (Unreachable, CalibError, ValueError):
-                    continue
 
 
 def next_shot(
@@ -181,27 +179,35 @@ def next_shot(
     choices = list(candidates(known, sought, here, placement, avoid))
     if not choices:
         return None
-    told = np.array([known.of_shot(shot) for shot in choices])
-    plan = _together(base, told, aim, ahead)
-    first = min(plan, key=dict(zip(plan, _left_px(base, told[plan], aim), strict=True)).__getitem__)
+    added = np.array([known.of_shot(shot) for shot in choices])
+    plan = _together(base, added, aim, ahead)
+    first = min(plan, key=dict(zip(plan, _left_px(base, added[plan], aim), strict=True)).__getitem__)
     others = [index for index in plan if index != first]
     if not sought.one_sided:
-        # From which side a joint comes tells its backlash alone: that is asked of the best attitudes only.
-        beside = base + told[others].sum(axis=0)
-        best = [i for i in np.argsort(_left_px(beside, told, aim)) if i not in others][:SIDES_TRIED]
-        sides = [other for i in best for other in _other_sides(choices[i])]
+        # From which side a joint comes shows its backlash alone: it is tried for the best attitudes only.
+        beside = base + added[others].sum(axis=0)
+        best = [i for i in np.argsort(_left_px(beside, added, aim)) if i not in others][:SIDES_TRIED]
+        sides = [
+            replace(
+                choices[i],
+                pan_approach=a * choices[i].pan_approach,
+                tilt_approach=b * choices[i].tilt_approach,
+            )
+            for i in best
+            for a, b in ((-1, 1), (1, -1), (-1, -1))
+        ]
         choices += sides
-        told = np.concatenate([told, [known.of_shot(shot) for shot in sides]])
+        added = np.concatenate([added, [known.of_shot(shot) for shot in sides]])
         tried = [*best, *range(len(choices) - len(sides), len(choices))]
-        first = tried[int(np.argmin(_left_px(beside, told[tried], aim)))]
-    return AttitudeChoice(choices[first], float(_left_px(base, told[[first]], aim)[0]))
+        first = tried[int(np.argmin(_left_px(beside, added[tried], aim)))]
+    return AttitudeChoice(choices[first], float(_left_px(base, added[[first]], aim)[0]))
 
 
 def _of_head(
     known: Knowledge, base: FloatArray, aim: ExpectedPointing
 ) -> tuple[Knowledge, FloatArray, ExpectedPointing]:
-    """The same without the cameras on the body, which see a board alike from every attitude: what was told of
-    them and of all else together (p + 6, p + 6) stays told of all else."""
+    """The same without the cameras on the body, which see a board alike from every attitude: what is known of
+    all else (p + 6, p + 6) stays known."""
     cameras = {name: camera for name, camera in known.rig.cameras.items() if camera.on == "head"}
     if len(cameras) == len(known.rig.cameras):
         return known, base, aim
@@ -217,33 +223,33 @@ def _of_head(
     return of_head, rest, replace(aim, to_rig=aim.to_rig[:, left])
 
 
-def _together(base: FloatArray, told: FloatArray, aim: ExpectedPointing, count: int) -> list[int]:
-    """Which of some shots (n, p + 6, p + 6) tell most together beside ``base``: one after the other, then
+def _together(base: FloatArray, added: FloatArray, aim: ExpectedPointing, count: int) -> list[int]:
+    """Which of some shots (n, p + 6, p + 6) show most together beside ``base``: one after the other, then
     each exchanged for a better one while there is any (Fedorov's exchange)."""
     plan: list[int] = []
     whole = base.copy()
-    for _ in range(min(count, len(told))):
-        left = _left_px(whole, told, aim)
+    for _ in range(min(count, len(added))):
+        left = _left_px(whole, added, aim)
         left[plan] = np.inf
         plan.append(int(np.argmin(left)))
-        whole = whole + told[plan[-1]]
+        whole = whole + added[plan[-1]]
     for _ in range(EXCHANGES if len(plan) > 1 else 0):
         before = list(plan)
         for place, index in enumerate(before):
-            rest = whole - told[index]
-            left = _left_px(rest, told, aim)
+            rest = whole - added[index]
+            left = _left_px(rest, added, aim)
             left[[other for other in plan if other != index]] = np.inf
             plan[place] = int(np.argmin(left))
-            whole = rest + told[plan[place]]
+            whole = rest + added[plan[place]]
         if plan == before:
             break
     return plan
 
 
-def _left_px(base: FloatArray, told: FloatArray, aim: ExpectedPointing) -> FloatArray:
+def _left_px(base: FloatArray, added: FloatArray, aim: ExpectedPointing) -> FloatArray:
     """Return the rms per axis (n,) of pointing that each of some shots (n, p + 6, p + 6) beside ``base``
     would leave, pixels."""
-    whole = base + told
+    whole = base + added
     whole[:, -6:, -6:] += ANYWHERE * np.eye(6)
     scale = 1.0 / np.sqrt(np.einsum("nii->ni", whole))
     whole *= scale[:, :, None] * scale[:, None, :]
@@ -251,20 +257,12 @@ def _left_px(base: FloatArray, told: FloatArray, aim: ExpectedPointing) -> Float
     return np.array([aim.rms_px(one) for one in covariance[:, :-6, :-6]])
 
 
-def _other_sides(shot: BenchShot) -> list[BenchShot]:
-    """The same attitude, come to from other sides."""
-    pan, tilt = shot.pan_approach, shot.tilt_approach
-    return [
-        replace(shot, pan_approach=i * pan, tilt_approach=j * tilt) for i, j in ((-1, 1), (1, -1), (-1, -1))
-    ]
-
-
 def with_board(known: Knowledge, shots: Sequence[BenchShot], placement: str) -> FloatArray:
     """Return the information of shots about the rig and one placement's board: (p + 6, p + 6)."""
     size = len(known.names)
-    told = np.zeros((size + 6, size + 6))
-    told[:size, :size] = known.information(shot for shot in shots if shot.placement != placement)
-    return sum((known.of_shot(shot) for shot in shots if shot.placement == placement), told)
+    information = np.zeros((size + 6, size + 6))
+    information[:size, :size] = known.information(shot for shot in shots if shot.placement != placement)
+    return sum((known.of_shot(shot) for shot in shots if shot.placement == placement), information)
 
 
 def candidates(
@@ -280,7 +278,7 @@ def candidates(
     """
     useless = [*avoid, *((shot.pan_rad, shot.tilt_rad) for shot in here)]
     last = (here[-1].pan_rad, here[-1].tilt_rad) if here else (0.0, 0.0)
-    for pan, tilt in attitudes(known, sought, placement):
+    for pan, tilt in _attitudes(known, sought, placement):
         if any(max(abs(a - pan), abs(b - tilt)) < APART_RAD for a, b in useless):
             continue
         sides = (0, 0) if sought.one_sided else (1 if pan > last[0] else -1, 1 if tilt > last[1] else -1)
@@ -305,7 +303,7 @@ def rover_from_board(
     Parameters
     ----------
     rig, camera
-        Who sees it.
+        The camera that sees it.
     pan_rad, tilt_rad
         True joint angles, radians.
     in_board_m, pixels_px
@@ -331,12 +329,6 @@ def rover_from_board(
         done = False
     if not done or not np.isfinite(place).all() or place[2, 0] <= 0.0:
         raise CalibError(f"the corners in the picture of {camera} fix no board")
-    rotation = axes @ cv2.Rodrigues(turn)[0]
-    here = Rigid(_right(rotation), axes @ place[:, 0] + model.C)
+    left, _, right = np.linalg.svd(axes @ cv2.Rodrigues(turn)[0])  # to the nearest rotation
+    here = Rigid(left @ right, axes @ place[:, 0] + model.C)
     return here if held.on == "rover" else rig.mast.rover_from_head(pan_rad, tilt_rad) @ here
-
-
-def _right(rotation: FloatArray) -> FloatArray:
-    """The nearest rotation."""
-    left, _, right = np.linalg.svd(rotation)
-    return np.asarray(left @ right)

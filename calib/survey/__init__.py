@@ -1,1 +1,1 @@
-"""A survey: the measurements of one calibration (the folder of docs/how-to/survey-calibration.md)."""
+"""A survey: the measurements of one calibration (the folder of docs/how-to/calibrate.md)."""

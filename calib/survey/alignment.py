@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -140,6 +141,31 @@ def mirrored(points_in_a_m: ArrayLike, points_in_b_m: ArrayLike, sigma_m: float)
     return fits[1] <= _limit(3 * len(a) - 6, FALSE_ALARM) < fits[0]
 
 
+def poses(
+    survey: Survey, kind: Literal["prism", "tape"], false_alarm: float = FALSE_ALARM
+) -> dict[tuple[str, str], Alignment | NotAligned]:
+    """Return by set-up and placement how its prisms lie in the rover, or its board's tapes in the station.
+
+    Measured points that are not on the design are left out. Where no pose follows, the reason is its error.
+    """
+    of_prisms = kind == "prism"
+    design = survey.prisms_in_rover_m if of_prisms else survey.board.tapes_in_board_m
+    sigma_m = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m if of_prisms else 0.0))
+    measured = survey.measured(kind)
+    keys = dict.fromkeys((p.setup, "") for p in survey.station) if of_prisms else measured
+    found: dict[tuple[str, str], Alignment | NotAligned] = {}
+    for setup, placement in keys:
+        points = {n: at for n, at in measured.get((setup, placement), {}).items() if n in design}
+        drawn, seen = [design[name] for name in points], list(points.values())
+        one, other = (seen, drawn) if of_prisms else (drawn, seen)
+        try:
+            found[setup, placement] = align(one, other, sigma_m, list(points), false_alarm=false_alarm)
+        except NotAligned as error:
+            place = f"placement {placement} in set-up {setup}" if placement else f"set-up {setup}"
+            found[setup, placement] = NotAligned(f"{kind}s of {place}: {error}")
+    return found
+
+
 def rover_from_station(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> dict[str, Alignment]:
     """Return the pose of every set-up from its prisms, by the set-up's name.
 
@@ -148,20 +174,12 @@ def rover_from_station(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> d
     NotAligned
         Naming the set-up with fewer than three prisms.
     """
-    sigma_m = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
-    measured = survey.measured("prism")
-    poses: dict[str, Alignment] = {}
-    for setup in dict.fromkeys(point.setup for point in survey.station):
-        drawn = survey.prisms_in_rover_m
-        points = {name: place for name, place in measured.get((setup, ""), {}).items() if name in drawn}
-        design = [drawn[name] for name in points]
-        try:
-            poses[setup] = align(
-                list(points.values()), design, sigma_m, list(points), false_alarm=false_alarm
-            )
-        except NotAligned as error:
-            raise NotAligned(f"prisms of set-up {setup}: {error}") from None
-    return poses
+    found: dict[str, Alignment] = {}
+    for (setup, _), pose in poses(survey, "prism", false_alarm).items():
+        if isinstance(pose, NotAligned):
+            raise pose
+        found[setup] = pose
+    return found
 
 
 def station_from_board(
@@ -174,23 +192,14 @@ def station_from_board(
     NotAligned
         Naming the placement whose tapes are on one line.
     """
-    poses: dict[tuple[str, str], Alignment] = {}
-    for (setup, placement), seen in survey.measured("tape").items():
-        points = {name: place for name, place in seen.items() if name in survey.board.tapes_in_board_m}
-        if len(points) < 3:
-            continue
-        design = [survey.board.tapes_in_board_m[name] for name in points]
-        try:
-            poses[setup, placement] = align(
-                design,
-                list(points.values()),
-                survey.sigma.station_m,
-                list(points),
-                false_alarm=false_alarm,
-            )
-        except NotAligned as error:
-            raise NotAligned(f"tapes of placement {placement} in set-up {setup}: {error}") from None
-    return poses
+    enough = {key for key, seen in survey.measured("tape").items() if len(seen) > 2}
+    found: dict[tuple[str, str], Alignment] = {}
+    for key, pose in poses(survey, "tape", false_alarm).items():
+        if isinstance(pose, Alignment):
+            found[key] = pose
+        elif key in enough:
+            raise pose
+    return found
 
 
 def _sigma(sigma_m: ArrayLike, count: int) -> FloatArray:

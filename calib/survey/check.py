@@ -6,87 +6,21 @@ each single image, tape and dot again, and finer.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from calib.files.yaml_text import nearest
-from calib.geometry.rigid import FloatArray, Rigid
-from calib.survey.doubts import dot_doubts, grid_doubts, station_doubts, unit_doubts
-from calib.survey.mixups import Placement, eyes_in_rover_m, joint_doubts, mixups, rover_from_boards
+from calib.geometry.rigid import FloatArray
+from calib.survey.disagreements import wrong_dots, wrong_grid, wrong_points, wrong_units
+from calib.survey.mixups import joint_mixups, mixups, sights
 from calib.survey.records import Survey, SurveyCamera, SurveyFinding, SurveyImage
 
-FEWEST_CORNERS = 8
-"""Of an image, for a pose that says something about the lens."""
+FEWEST_CORNERS, FEWEST_DOTS = 8, 20
+"""Of an image of a bench, and of one of a survey, for a pose that says something about the lens."""
 
 FEWEST_PLACEMENTS = 2
-
-
-def bench_findings(survey: Survey) -> Iterator[SurveyFinding]:
-    """Yield what is missing of a bench: corners of images, images of cameras, placements."""
-    for name in survey.cameras:
-        yield from _of_camera(survey, name)
-    head = [image for image in survey.images if image.pan_rad is not None and image.purpose != "check"]
-    placements = {(image.setup, image.placement, image.board) for image in head if _seen(survey, image)}
-    if head and len(placements) < FEWEST_PLACEMENTS:
-        yield SurveyFinding(
-            "warning",
-            "images.csv",
-            "the board stood in one place only; its distance and the lenses can trade for each other",
-            "Put the board elsewhere, nearer or further and at another slant, two to four placements in all",
-        )
-
-
-def _of_camera(survey: Survey, name: str) -> Iterator[SurveyFinding]:
-    mine = [image for image in survey.images if image.camera == name]
-    if not mine:
-        yield SurveyFinding(
-            "error",
-            f"camera {name}",
-            "it has no image in images.csv",
-            "Photograph a board with it, or take it out of survey.yaml",
-        )
-        return
-    without = [image for image in mine if not _seen(survey, image)]
-    lost = [image for image in without if not (survey.folder / image.file).is_file()]
-    if lost:
-        yield SurveyFinding(
-            "error",
-            f"images.csv line {lost[0].row}, camera {name}",
-            f"{len(lost)} of {len(mine)} images have neither corners in corners.csv nor a picture "
-            f"({_some_images(lost)})",
-            "Put the picture there, add its corners, or take out the row",
-        )
-    if len(without) == len(mine):
-        yield SurveyFinding(
-            "error",
-            f"camera {name}",
-            f"none of its {len(mine)} images shows corners of a board",
-            "Find the corners of its pictures, or photograph a board with it",
-        )
-    few = [image for image in mine if 0 < _count(survey, image) < FEWEST_CORNERS]
-    if few:
-        yield SurveyFinding(
-            "warning",
-            f"camera {name}",
-            f"{len(few)} images show fewer than {FEWEST_CORNERS} corners ({_some_images(few)})",
-            "Have more of the board in the picture",
-        )
-
-
-def _count(survey: Survey, image: SurveyImage) -> int:
-    return len(survey.corners[image.name]) if image.name in survey.corners else 0
-
-
-def _seen(survey: Survey, image: SurveyImage) -> bool:
-    return _count(survey, image) > 0
-
-
-def _some_images(images: list[SurveyImage]) -> str:
-    """The first few names."""
-    names = ", ".join(image.name for image in images[:4])
-    return names + (f" and {len(images) - 4} more" if len(images) > 4 else "")
-
+"""Of a bench's board."""
 
 FEWEST_BOARDS, ENOUGH_BOARDS = 3, 5
 """For a camera, and for the mast; the paper finds 5 to 8 positions adequate."""
@@ -98,7 +32,6 @@ AREA = 0.6
 """Part of a 4 x 3 division of the picture that dots should reach."""
 
 PAN_RANGE_RAD, TILT_RANGE_RAD, STILL_RAD = 0.5, 0.2, 0.02
-FEWEST_DOTS = 20
 
 PAN_LIMITS_RAD = (-np.pi, np.pi)
 TILT_LIMITS_RAD = (-np.pi / 2, np.pi / 2)
@@ -116,34 +49,29 @@ def check_survey(
     Parameters
     ----------
     survey
-        As `calib.survey.read_survey` gives it; pictures are looked for in its folder.
+        As `calib.survey.reader.read_survey` gives it; pictures are looked for in its folder.
     pan_limits_rad, tilt_limits_rad
         Beyond these, joint angles are refused.
     only_camera_images
         Whether cameras will be fitted to images of purpose camera alone, as the paper does.
     """
     purposes = ("camera",) if only_camera_images else ("camera", "mast")
-    if survey.boards:
-        return tuple(
-            sorted(
-                [*bench_findings(survey), *_angles(survey, pan_limits_rad, tilt_limits_rad)],
-                key=lambda finding: finding.severity,
-            )
-        )
-    findings = [*_missing(survey), *_set_ups(survey), *_placements(survey)]
     angles = list(_angles(survey, pan_limits_rad, tilt_limits_rad))
-    units = list(unit_doubts(survey))
-    findings += [*angles, *units, *grid_doubts(survey), *dot_doubts(survey)]
+    findings = [*_of_cameras(survey), *angles]
+    if survey.boards:
+        findings += _bench_placements(survey)
+        return tuple(sorted(findings, key=lambda finding: finding.severity))
+    units = list(wrong_units(survey))
+    findings += [*_set_ups(survey), *_placements(survey), *units, *wrong_grid(survey), *wrong_dots(survey)]
     if not units:
-        findings += station_doubts(survey)
+        findings += wrong_points(survey)
     if not units and not angles:
-        findings += list(joint_doubts(survey)) or mixups(survey)
-    boards = rover_from_boards(survey)
-    for name, camera in survey.cameras.items():
-        mine = [image for image in survey.images if image.camera == name]
-        if mine:
-            fitted = [image for image in mine if image.purpose in purposes]
-            findings += _camera_spread(survey, camera, purposes, fitted, {} if units else boards)
+        findings += list(joint_mixups(survey)) or mixups(survey)
+    for name, seen in sights(survey).items():
+        fitted = [i for i in survey.images if i.camera == name and i.purpose in purposes]
+        if any(image.camera == name for image in survey.images):
+            at = {(s.image.setup, s.image.placement): s.range_m for s in seen if s.image in fitted}
+            findings += _camera_spread(survey, name, purposes, fitted, [] if units else list(at.values()))
     if not angles:
         findings += _mast_spread(survey)
     if survey.images and not any(image.purpose == "check" for image in survey.images):
@@ -158,8 +86,10 @@ def check_survey(
     return tuple(sorted(findings, key=lambda finding: finding.severity))
 
 
-def _missing(survey: Survey) -> Iterator[SurveyFinding]:
-    """Images without dots and picture; cameras without images; images with next to no dots."""
+def _of_cameras(survey: Survey) -> Iterator[SurveyFinding]:
+    """Yield cameras without images, images without dots or corners and picture, and such with few of them."""
+    what, fewest = ("corners", FEWEST_CORNERS) if survey.boards else ("dots", FEWEST_DOTS)
+    counts = {name: len(found) for name, found in (survey.corners or survey.dots).items()}
     clicked = {click.image for click in survey.clicks}
     for name in survey.cameras:
         mine = [image for image in survey.images if image.camera == name]
@@ -170,34 +100,50 @@ def _missing(survey: Survey) -> Iterator[SurveyFinding]:
                 "it has no image in images.csv",
                 "Photograph five to eight placements with it, or take it out of survey.yaml",
             )
-        empty = [
-            image
-            for image in mine
-            if image.name not in survey.dots
-            and not (image.purpose == "check" and image.name in clicked)
-            and not (survey.folder / image.file).is_file()
+            continue
+        without = [
+            i for i in mine if not counts.get(i.name) and not (i.purpose == "check" and i.name in clicked)
         ]
-        if empty:
-            first = empty[0]
+        lost = [image for image in without if not (survey.folder / image.file).is_file()]
+        if lost:
+            first = lost[0]
             missing = (
                 f"the file {first.file.as_posix()} is missing" if first.file.name else "no file is named"
             )
             yield SurveyFinding(
                 "error",
                 f"images.csv line {first.row}, camera {name}",
-                f"{len(empty)} of {len(mine)} images have neither dots in dots.csv nor a picture "
-                f"({_some([i.name for i in empty])}): {missing}",
-                "Put the picture there, add its dots, or take out the row",
+                f"{len(lost)} of {len(mine)} images have neither {what} in {what}.csv nor a picture "
+                f"({_some(lost)}): {missing}",
+                f"Put the picture there, add its {what}, or take out the row",
             )
-        found = {i.name: len(survey.dots[i.name].rows) for i in mine if i.name in survey.dots}
-        few = [image for image, count in found.items() if count < FEWEST_DOTS]
+        if survey.boards and len(without) == len(mine):
+            yield SurveyFinding(
+                "error",
+                f"camera {name}",
+                f"none of its {len(mine)} images shows corners of a board",
+                "Find the corners of its pictures, or photograph a board with it",
+            )
+        few = [image for image in mine if 0 < counts.get(image.name, 0) < fewest]
         if few:
             yield SurveyFinding(
                 "warning",
                 f"camera {name}",
-                f"{len(few)} images have fewer than {FEWEST_DOTS} dots ({_some(few)})",
-                "Find more of their dots or photograph these placements again",
+                f"{len(few)} images have fewer than {fewest} {what} ({_some(few)})",
+                "Find more of them, or photograph these placements again with more of the board",
             )
+
+
+def _bench_placements(survey: Survey) -> Iterator[SurveyFinding]:
+    head = [image for image in survey.images if image.pan_rad is not None and image.purpose != "check"]
+    placements = {(i.setup, i.placement, i.board) for i in head if len(survey.corners.get(i.name, ()))}
+    if head and len(placements) < FEWEST_PLACEMENTS:
+        yield SurveyFinding(
+            "warning",
+            "images.csv",
+            "the board stood in one place only; its distance and the lenses can trade for each other",
+            "Put the board elsewhere, nearer or further and at another slant, two to four placements in all",
+        )
 
 
 def _set_ups(survey: Survey) -> Iterator[SurveyFinding]:
@@ -281,35 +227,33 @@ def _angles(
 
 def _camera_spread(
     survey: Survey,
-    camera: SurveyCamera,
+    name: str,
     purposes: Sequence[str],
     fitted: Sequence[SurveyImage],
-    in_rover: Mapping[Placement, Rigid],
+    ranges_m: Sequence[float],
 ) -> Iterator[SurveyFinding]:
-    """Too few boards, at one distance, or in one part of the picture."""
-    boards = list(dict.fromkeys((image.setup, image.placement) for image in fitted))
-    of_purpose = "" if len(purposes) > 1 else f" of purpose {purposes[0]}"
-    if len(boards) < ENOUGH_BOARDS:
+    """Yield too few boards, at one distance, or in one part of the picture."""
+    count = len({(image.setup, image.placement) for image in fitted})
+    if count < ENOUGH_BOARDS:
+        of_purpose = "" if len(purposes) > 1 else f" of purpose {purposes[0]}"
         yield SurveyFinding(
-            "error" if len(boards) < FEWEST_BOARDS else "warning",
-            f"camera {camera.name}",
-            f"{len(boards)} placements{of_purpose} are there to fit it; {FEWEST_BOARDS} are the least and "
+            "error" if count < FEWEST_BOARDS else "warning",
+            f"camera {name}",
+            f"{count} placements{of_purpose} are there to fit it; {FEWEST_BOARDS} are the least and "
             f"{ENOUGH_BOARDS} to 8 adequate",
             "Photograph more placements, near and far, towards all corners of the picture",
         )
-    eye_m = eyes_in_rover_m(survey)[camera.name]
-    ranges_m = [float(np.linalg.norm(in_rover[at].translation_m - eye_m)) for at in boards if at in in_rover]
     if len(ranges_m) > 1 and max(ranges_m) < DEPTH_RATIO * min(ranges_m):
         yield SurveyFinding(
             "warning",
-            f"camera {camera.name}",
+            f"camera {name}",
             f"all its boards stand between {min(ranges_m):.1f} and {max(ranges_m):.1f} m, so focal length "
             "and place of the camera can trade for each other",
             f"Photograph boards at about {min(ranges_m) / 2:.1f} m or {2 * max(ranges_m):.0f} m as well",
         )
     pixels = [survey.dots[image.name].pixels_px for image in fitted if image.name in survey.dots]
     if pixels:
-        yield from _area(camera, np.concatenate(pixels))
+        yield from _area(survey.cameras[name], np.concatenate(pixels))
 
 
 def _area(camera: SurveyCamera, pixels_px: FloatArray) -> Iterator[SurveyFinding]:
@@ -372,6 +316,7 @@ def _mast_spread(survey: Survey) -> Iterator[SurveyFinding]:
         )
 
 
-def _some(names: Sequence[str]) -> str:
+def _some(images: Sequence[SurveyImage]) -> str:
     """The first few names."""
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    names = ", ".join(image.name for image in images[:4])
+    return names + (f" and {len(images) - 4} more" if len(images) > 4 else "")

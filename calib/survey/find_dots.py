@@ -12,13 +12,13 @@ from concurrent.futures import Executor, Future, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from calib.files import open_plain
+from calib.files.pictures import decode_picture
 from calib.geometry.cahvor import WIDE, CameraModel
 from calib.geometry.rigid import FloatArray, Rigid, rot_y, rot_z
 from calib.survey.alignment import NotAligned, rover_from_station, station_from_board
-from calib.survey.folder import spoiled_png
 from calib.survey.records import Survey, SurveyCamera, SurveyImage
 from calib.targets.boards import Board, Dots
 from calib.targets.dot_grid import DetectionFailure
@@ -97,18 +97,14 @@ def find_in_file(
 ) -> DotsFound | DetectionFailure:
     """Find the dots in a picture file; a file that cannot be used is a failure with a reason."""
     try:
-        data = path.read_bytes()
+        with open_plain(path) as file:
+            data = file.read()
     except OSError as error:
         return DetectionFailure(f"{path.name} cannot be read: {error.strerror or error}")
-    spoiled = spoiled_png(data)
-    if spoiled is not None:
-        return DetectionFailure(f"{path.name} is not a picture that can be read: {spoiled}")
-    content = np.frombuffer(data, dtype=np.uint8)
-    # The pixels as the file has them: all bits, and not turned as a camera's tag may ask.
-    how = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(content, how) if len(content) else None
-    if image is None:
-        return DetectionFailure(f"{path.name} is not a picture that can be read")
+    try:
+        image = decode_picture(data)
+    except ValueError as reason:
+        return DetectionFailure(f"{path.name} is not a picture that can be read: {reason}")
     height, width = image.shape[:2]
     if (width, height) != tuple(size_px):
         return DetectionFailure(
@@ -116,7 +112,7 @@ def find_in_file(
         )
     if image.dtype not in (np.uint8, np.uint16):
         return DetectionFailure(f"{path.name} holds {image.dtype} where 8 or 16 bits a pixel are expected")
-    return find_dots(image, board, expected)  # type: ignore[arg-type]  # of OpenCV's many types one of those
+    return find_dots(image, board, expected)
 
 
 def expectations(survey: Survey) -> dict[str, PredictedBoard | Upright | None]:

@@ -1,41 +1,30 @@
-"""Read a survey folder strictly: what is wrong is refused with file, line and column.
+"""Read a survey folder strictly: what is wrong is refused with file, and line and column or key.
 
-A bench's folder has boards at unknown places, and no station.
+With a station: survey.yaml, station.csv, images.csv and, as wanted, dots.csv and clicks.csv. A bench has
+boards at unknown places, and images.csv and corners.csv; both may be missing, for it grows while it is
+measured.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import cast
+from typing import Any, Literal, cast
 
 import numpy as np
 
 from calib.errors import BadFile
-from calib.files.mast_file import read_stereo
+from calib.files import LARGEST_IMAGE_PX
+from calib.files.mast_file import CAMERA_NAME, CAMERA_NAME_WORDS, read_sensor_mode, read_stereo
 from calib.files.yaml_text import Section, kind_of, nearest
-from calib.geometry.rigid import FloatArray
-from calib.survey.folder import (
-    BOARD_KEYS,
-    FURTHEST_M,
-    SCHEMA,
-    Row,
-    SurveyFolder,
-    array_of,
-    bench_sigma_of,
-    cameras_of,
-    dot_board_of,
-    image_of,
-    joints_of,
-    once,
-    pixel_of,
-    places_of,
-    sigma_of,
-)
+from calib.geometry.cahvor import KINDS, Kind
+from calib.geometry.rigid import FloatArray, frozen_array
+from calib.survey.folder import Once, Row, SurveyFolder
 from calib.survey.records import (
     Approach,
     Click,
     Purpose,
+    Sigma,
     StationKind,
     StationPoint,
     Survey,
@@ -45,55 +34,75 @@ from calib.survey.records import (
 from calib.targets.board_file import board_of
 from calib.targets.boards import NO_BOARD, AnyBoard, Board, Corners, Dots
 
+SCHEMA = "mastctl/survey/1"
+
+STATION_COLUMNS = ("setup", "kind", "placement", "point", "x_m", "y_m", "z_m")
+IMAGE_COLUMNS = ("image", "camera", "setup", "placement", "purpose", "pan_rad", "tilt_rad", "file")
+DOT_COLUMNS = ("image", "row", "column", "x_px", "y_px")
+CLICK_COLUMNS = ("image", "point", "x_px", "y_px")
 BENCH_IMAGE_COLUMNS = ("image", "camera", "placement", "board", "purpose", "pan_rad", "tilt_rad", "file")
-
 APPROACH_COLUMNS = ("pan_approach", "tilt_approach")
-
 CORNER_COLUMNS = ("image", "board", "id", "x_px", "y_px")
-
 SIGMA_COLUMN = "sigma_px"
 
-WORST_SIGMA_PX = 100.0
+FURTHEST_M, LARGEST_ANGLE_RAD, WORST_SIGMA_PX = 1e5, 1e4, 100.0
+"""Beyond these a number is not a measurement; the check of the survey judges unlikely ones."""
 
 
-def read_bench(read: SurveyFolder, document: object) -> Survey:
-    """Return the survey of a folder whose survey.yaml names ``boards``.
+def read_survey(folder: str | Path) -> Survey:
+    """Read a survey folder.
 
-    images.csv may have no rows yet, or not be there: a bench grows while it is measured.
+    Pictures are read for their size alone; whether there are enough of them, and whether the measurements fit
+    together, is for `calib.survey.check.check_survey`.
+
+    Returns
+    -------
+    Survey
+        Its ``digest`` is the SHA-256 over names and contents of the files that were read and of the pictures
+        that images.csv names. It is the same on every machine and changes with every byte.
 
     Raises
     ------
     BadFile
-        As `calib.survey.read_survey`.
+        For a file that is missing or cannot be read, an unknown key, column or name, an invalid number, a
+        double row, an image of another size. The message has the file, the place, and what would be right.
     """
-    path = read.path / "survey.yaml"
-    top = Section(path, "", document, ("schema", "boards", "sigma", "cameras"), ("stereo",))
+    read = SurveyFolder(Path(folder))
+    document = read.document()
+    of_bench = ("schema", "boards", "sigma", "cameras")
+    of_station = ("schema", "board", "prisms_in_rover_m", "sigma", "cameras")
+    bench = "boards" in document
+    top = Section(read.path / "survey.yaml", "", document, of_bench if bench else of_station, ("stereo",))
     if top.values["schema"] != SCHEMA:
         raise top.bad("schema", f"{kind_of(top.values['schema'])} where '{SCHEMA}' is expected")
-    for name in ("station.csv", "dots.csv", "clicks.csv"):
-        if (read.path / name).exists():
-            raise BadFile(read.path / name, "", "goes with a station, and survey.yaml has boards without one")
-    boards = _boards(top)
-    cameras = cameras_of(top)
-    sigma = bench_sigma_of(top.section("sigma", ("corner_px",), ("joint_rad",)))
-    images = _bench_images(read, cameras, boards)
+    boards = _boards(read, top) if bench else {}
+    board = NO_BOARD if bench else _dot_board(top)
+    prisms = {} if bench else _places(top, "prisms_in_rover_m", "prism")
+    cameras, sigma = _cameras(top), _sigma(top, bench)
+    station = () if bench else _station(read, board, prisms)
+    images = _images(read, cameras, boards, sorted({point.setup for point in station}))
+    by_name = {image.name: image for image in images}
     return Survey(
         folder=read.path,
-        board=NO_BOARD,
-        prisms_in_rover_m={},
+        board=board,
+        prisms_in_rover_m=prisms,
         sigma=sigma,
         cameras=cameras,
         stereo=read_stereo(top, cameras),
-        station=(),
+        station=station,
         images=images,
-        dots={},
+        dots={} if bench else _dots(read, board, cameras, by_name),
+        clicks=() if bench else _clicks(read, cameras, by_name, station),
         boards=boards,
-        corners=_corners(read, boards, cameras, {image.name: image for image in images}, sigma.corner_px),
+        corners=_corners(read, boards, cameras, by_name, sigma.corner_px) if bench else {},
         digest=read.digest(),
     )
 
 
-def _boards(top: Section) -> dict[str, AnyBoard]:
+def _boards(read: SurveyFolder, top: Section) -> dict[str, AnyBoard]:
+    for name in ("station.csv", "dots.csv", "clicks.csv"):
+        if (read.path / name).exists():
+            raise BadFile(read.path / name, "", "goes with a station, and survey.yaml has boards without one")
     boards: dict[str, AnyBoard] = {}
     for name, value in top.mapping("boards").items():
         if not name.strip() or not name.isprintable():
@@ -104,29 +113,130 @@ def _boards(top: Section) -> dict[str, AnyBoard]:
     return boards
 
 
-def _bench_images(
-    read: SurveyFolder, cameras: Mapping[str, SurveyCamera], boards: Mapping[str, AnyBoard]
+def _dot_board(top: Section) -> Board:
+    section = top.section("board", ("rows", "columns", "spacing_m", "dot_diameter_m", "tapes_in_board_m"))
+    spacing_m = section.positive("spacing_m", FURTHEST_M)
+    dot_m = section.positive("dot_diameter_m", FURTHEST_M)
+    if dot_m >= spacing_m:
+        raise section.bad("dot_diameter_m", f"{dot_m:g} where less than spacing_m {spacing_m:g} is expected")
+    rows, columns = section.integer("rows", 2, 200), section.integer("columns", 2, 200)
+    return Board(rows, columns, spacing_m, dot_m, _places(section, "tapes_in_board_m", "tape"))
+
+
+def _places(section: Section, key: str, what: str) -> dict[str, FloatArray]:
+    """Read at least three named points that are not on one line."""
+    names = section.mapping(key)
+    for name in names:
+        if not name.strip() or not name.isprintable():
+            raise section.bad(key, f"{name[:40]!r} where the name of a {what} is expected")
+    if len(names) < 3:
+        raise section.bad(key, f"{len(names)} {what}s where at least three are expected")
+    inner = section.section(key, tuple(names))
+    places = {name: frozen_array(inner.vector(name, FURTHEST_M), (3,)) for name in names}
+    table = np.array(list(places.values()))
+    across = np.linalg.svd(table - table.mean(axis=0), compute_uv=False)
+    if across[1] < 1e-3 * max(across[0], 1e-3):
+        raise section.bad(key, f"the {what}s stand on one line; no pose follows from them")
+    return places
+
+
+def _sigma(top: Section, bench: bool) -> Sigma:
+    required = ("corner_px",) if bench else ("station_m", "dot_px")
+    optional = ("joint_rad",) if bench else ("joint_rad", "prism_cad_m")
+    section = top.section("sigma", required, optional)
+    return Sigma(
+        **{key: section.positive(key, FURTHEST_M) for key in required},
+        **{key: section.between(key, 0.0, 10.0, 0.0) for key in optional},
+    )
+
+
+def _cameras(top: Section) -> dict[str, SurveyCamera]:
+    cameras: dict[str, SurveyCamera] = {}
+    for name, value in top.mapping("cameras").items():
+        place = f"cameras.{name}"
+        if not CAMERA_NAME.fullmatch(name):
+            raise top.bad(place, CAMERA_NAME_WORDS)
+        required = ("on", "size_px", "model", "focal_px")
+        section = Section(top.path, place, value, required, ("rough", "sensor_mode"))
+        width, height = section.integers("size_px", 2, 1, LARGEST_IMAGE_PX)
+        rough: dict[str, Any] = {}
+        if "rough" in section:
+            inner = section.section("rough", ("C", "A"))
+            rough["rough_C_m"], axis = inner.vector("C", FURTHEST_M), inner.vector("A")
+            length = float(np.linalg.norm(axis))
+            if length < 1e-6:
+                raise inner.bad("A", "is zero where a direction is expected")
+            rough["rough_A"] = axis / length
+        cameras[name] = SurveyCamera(
+            name=name,
+            on=cast(Literal["head", "rover"], section.choice("on", ("head", "rover"))),
+            size_px=(width, height),
+            kind=cast(Kind, section.choice("model", KINDS)),
+            focal_px=section.positive("focal_px", FURTHEST_M),
+            sensor_mode=read_sensor_mode(section, (width, height)),
+            **rough,
+        )
+    if not cameras:
+        raise top.bad("cameras", "holds no camera; at least one is expected")
+    return cameras
+
+
+def _station(read: SurveyFolder, board: Board, prisms: Mapping[str, FloatArray]) -> tuple[StationPoint, ...]:
+    points: list[StationPoint] = []
+    once = Once()
+    known = {"prism": tuple(prisms), "tape": tuple(board.tapes_in_board_m)}
+    for row in read.rows("station.csv", STATION_COLUMNS, required=True):
+        setup = row.text("setup")
+        kind = row.choice("kind", ("prism", "tape", "check"), "kind of point")
+        placement = row.text("placement") if kind == "tape" else row.cells["placement"]
+        if placement and kind != "tape":
+            raise row.bad("placement", f"'{placement[:40]}' where a {kind}'s is empty")
+        point = row.text("point")
+        if kind in known:
+            row.choice("point", known[kind], f"{kind} of survey.yaml")
+        where = f"placement {placement} in " if placement else ""
+        once(row, f"{kind} {point} of {where}set-up {setup}", setup, kind, placement, point)
+        position_m = frozen_array([row.number(column, FURTHEST_M) for column in ("x_m", "y_m", "z_m")], (3,))
+        points.append(StationPoint(setup, cast(StationKind, kind), placement, point, position_m, row.line))
+    _refuse_empty(points, read, "station.csv", "the prisms and tapes that were measured")
+    return tuple(points)
+
+
+def _images(
+    read: SurveyFolder,
+    cameras: Mapping[str, SurveyCamera],
+    boards: Mapping[str, AnyBoard],
+    setups: list[str],
 ) -> tuple[SurveyImage, ...]:
     images: list[SurveyImage] = []
-    names: dict[tuple[str, ...], int] = {}
-    shown: dict[tuple[str, ...], int] = {}
-    for row in read.rows("images.csv", BENCH_IMAGE_COLUMNS, ("setup", *APPROACH_COLUMNS), optional=True):
+    once, shown = Once(), Once()
+    if boards:
+        rows = read.rows("images.csv", BENCH_IMAGE_COLUMNS, ("setup", *APPROACH_COLUMNS))
+    else:
+        rows = read.rows("images.csv", IMAGE_COLUMNS, required=True)
+    for row in rows:
         name = row.text("image")
-        once(names, (name,), row, f"image {name}")
+        once(row, f"image {name}", name)
         camera = cameras[row.choice("camera", tuple(cameras), "camera of survey.yaml")]
-        board = row.choice("board", tuple(boards), "board of survey.yaml")
+        if boards:
+            setup = row.cells.get("setup", "")
+            board = row.choice("board", tuple(boards), "board of survey.yaml")
+        else:
+            setup, board = row.choice("setup", setups, "set-up of station.csv"), ""
         purpose = cast(Purpose, row.choice("purpose", ("camera", "mast", "check"), "purpose"))
-        pan_rad, tilt_rad = joints_of(row, camera)
+        unplaced = purpose == "check" and not boards
+        placement = row.cells["placement"] if unplaced else row.text("placement")
+        pan_rad, tilt_rad = (_joint_rad(row, column, camera) for column in ("pan_rad", "tilt_rad"))
         file = row.cells["file"]
         if file:
-            once(shown, (file, board), row, f"board {board} in file {file}")
+            shown(row, f"board {board} in file {file}" if board else f"file {file}", file, board)
             read.check_picture(row, file, camera)
         images.append(
             SurveyImage(
                 name,
                 camera.name,
-                row.cells.get("setup", ""),
-                row.text("placement"),
+                setup,
+                placement,
                 purpose,
                 pan_rad,
                 tilt_rad,
@@ -136,20 +246,39 @@ def _bench_images(
                 *(_approach(row, column, camera) for column in APPROACH_COLUMNS),
             )
         )
+    if not boards:
+        _refuse_empty(images, read, "images.csv", "the images that were taken")
     return tuple(images)
 
 
-def _approach(row: Row, column: str, camera: SurveyCamera) -> Approach:
-    """From which side a joint came to rest."""
-    word = row.cells.get(column, "")
-    if not word:
-        return 0
+def _refuse_empty(rows: list[Any], read: SurveyFolder, name: str, what: str) -> None:
+    if not rows:
+        raise BadFile(read.path / name, "", f"has a header and no rows; one for each of {what} is expected")
+
+
+def _joint_rad(row: Row, column: str, camera: SurveyCamera) -> float | None:
+    """Read an angle, which a head camera has and one on the body has not."""
+    row.none_on_body(column, camera)
     if camera.on == "rover":
-        raise row.bad(column, f"'{word[:40]}' where nothing is expected: {camera.name} is on the body")
-    value = row.number(column, 1.0)
+        return None
+    if not row.cells[column]:
+        raise row.bad(column, f"is empty; {camera.name} is on the head and needs the measured angle")
+    return row.number(column, LARGEST_ANGLE_RAD)
+
+
+def _approach(row: Row, column: str, camera: SurveyCamera) -> Approach:
+    """Read from which side a joint came to rest."""
+    cell = row.cells.get(column, "")
+    row.none_on_body(column, camera)
+    value = row.number(column, 1.0) if cell else 0.0
     if value not in (-1.0, 0.0, 1.0):
-        raise row.bad(column, f"{word[:40]} where -1, 0 or 1 is expected")
+        raise row.bad(column, f"{cell[:40]} where -1, 0 or 1 is expected")
     return cast(Approach, int(value))
+
+
+def _image(row: Row, images: Mapping[str, SurveyImage]) -> SurveyImage:
+    name = row.cells["image"]
+    return images[name if name in images else row.choice("image", tuple(images), "image of images.csv")]
 
 
 def _corners(
@@ -159,169 +288,39 @@ def _corners(
     images: Mapping[str, SurveyImage],
     corner_px: float,
 ) -> dict[str, Corners]:
-    found: dict[str, list[tuple[int, float, float, float]]] = {}
-    seen: dict[tuple[str, ...], int] = {}
+    found: dict[str, list[tuple[float, ...]]] = {}
+    once = Once()
     counts = {name: len(board.ids) for name, board in boards.items()}
-    for row in read.rows("corners.csv", CORNER_COLUMNS, (SIGMA_COLUMN,), optional=True):
-        name = image_of(row, images)
+    for row in read.rows("corners.csv", CORNER_COLUMNS, (SIGMA_COLUMN,)):
+        image = _image(row, images)
         board = row.choice("board", tuple(boards), "board of survey.yaml")
-        if board != images[name].board:
-            raise row.bad("board", f"'{board}' where image {name} of images.csv shows {images[name].board}")
+        if board != image.board:
+            raise row.bad("board", f"'{board}' where image {image.name} of images.csv shows {image.board}")
         number = row.index("id", counts[board])
-        once(seen, (name, str(number)), row, f"corner {number} of image {name}")
-        x_px, y_px = pixel_of(row, cameras[images[name].camera])
-        sigma_px = corner_px
+        once(row, f"corner {number} of image {image.name}", image.name, number)
+        pixel, sigma_px = row.pixel(cameras[image.camera]), corner_px
         if row.cells.get(SIGMA_COLUMN):
             sigma_px = row.number(SIGMA_COLUMN, WORST_SIGMA_PX)
             if sigma_px <= 0:
                 raise row.bad(SIGMA_COLUMN, f"{sigma_px:g} where a number above 0 is expected")
-        found.setdefault(name, []).append((number, x_px, y_px, sigma_px))
-    corners: dict[str, Corners] = {}
-    for name, rows in found.items():
-        table = np.array(rows)
-        corners[name] = Corners(table[:, 0].astype(np.int64), table[:, 1:3], table[:, 3])
-    return corners
-
-
-STATION_COLUMNS = ("setup", "kind", "placement", "point", "x_m", "y_m", "z_m")
-
-IMAGE_COLUMNS = ("image", "camera", "setup", "placement", "purpose", "pan_rad", "tilt_rad", "file")
-
-DOT_COLUMNS = ("image", "row", "column", "x_px", "y_px")
-
-CLICK_COLUMNS = ("image", "point", "x_px", "y_px")
-
-
-def read_survey(folder: str | Path) -> Survey:
-    """Read a survey folder.
-
-    Pictures are not opened but for the size in their first bytes; whether there are enough of them, and
-    whether the measurements fit together, is for `calib.survey.check.check_survey`.
-
-    Parameters
-    ----------
-    folder
-        Holds survey.yaml, station.csv, images.csv and, as wanted, dots.csv and clicks.csv; or, where
-        survey.yaml names ``boards`` and no station was there, images.csv and corners.csv.
-
-    Returns
-    -------
-    Survey
-        Its ``digest`` is the SHA-256 over names and contents of these files and of the images that images.csv
-        names. It is the same on every machine and changes with every byte.
-
-    Raises
-    ------
-    BadFile
-        For a file that is missing or cannot be read, an unknown key, column or name, an invalid number, a
-        double row, an image of another size. The message has the file, the place, and what would be right.
-    """
-    read = SurveyFolder(Path(folder))
-    document = read.document()
-    return read_bench(read, document) if "boards" in document else _with_station(read, document)
-
-
-def _with_station(read: SurveyFolder, document: object) -> Survey:
-    """The survey of a folder with station.csv."""
-    path = read.path / "survey.yaml"
-    top = Section(
-        path,
-        "",
-        document,
-        ("schema", "board", "prisms_in_rover_m", "sigma", "cameras"),
-        ("stereo",),
-    )
-    if top.values["schema"] != SCHEMA:
-        raise top.bad("schema", f"{kind_of(top.values['schema'])} where '{SCHEMA}' is expected")
-    board = dot_board_of(top.section("board", BOARD_KEYS))
-    prisms = places_of(top, "prisms_in_rover_m", "prism")
-    cameras = cameras_of(top)
-    stereo = read_stereo(top, cameras)
-    sigma = sigma_of(top.section("sigma", ("station_m", "dot_px"), ("joint_rad", "prism_cad_m")))
-    station = _station(read, board, prisms)
-    images = _images(read, cameras, sorted({point.setup for point in station}))
-    by_name = {image.name: image for image in images}
-    return Survey(
-        folder=read.path,
-        board=board,
-        prisms_in_rover_m=prisms,
-        sigma=sigma,
-        cameras=cameras,
-        stereo=stereo,
-        station=station,
-        images=images,
-        dots=_dots(read, board, cameras, by_name),
-        clicks=_clicks(read, cameras, by_name, station),
-        digest=read.digest(),
-    )
-
-
-def _station(read: SurveyFolder, board: Board, prisms: Mapping[str, FloatArray]) -> tuple[StationPoint, ...]:
-    points: list[StationPoint] = []
-    seen: dict[tuple[str, ...], int] = {}
-    for row in read.rows("station.csv", STATION_COLUMNS):
-        setup = row.text("setup")
-        kind = row.choice("kind", ("prism", "tape", "check"), "kind of point")
-        placement = row.cells["placement"]
-        if kind == "tape":
-            placement = row.text("placement")
-        elif placement:
-            raise row.bad("placement", f"'{placement[:40]}' where a {kind}'s is empty")
-        if kind == "prism":
-            point = row.choice("point", tuple(prisms), "prism of survey.yaml")
-        elif kind == "tape":
-            point = row.choice("point", tuple(board.tapes_in_board_m), "tape of survey.yaml")
-        else:
-            point = row.text("point")
-        name = f"{kind} {point} of " + (f"placement {placement} in " if placement else "")
-        once(seen, (setup, kind, placement, point), row, f"{name}set-up {setup}")
-        position_m = array_of(row.numbers(("x_m", "y_m", "z_m"), FURTHEST_M))
-        points.append(StationPoint(setup, cast(StationKind, kind), placement, point, position_m, row.line))
-    read.some(points, "station.csv", "the prisms and tapes that were measured")
-    return tuple(points)
-
-
-def _images(
-    read: SurveyFolder, cameras: Mapping[str, SurveyCamera], setups: list[str]
-) -> tuple[SurveyImage, ...]:
-    images: list[SurveyImage] = []
-    names: dict[tuple[str, ...], int] = {}
-    files: dict[tuple[str, ...], int] = {}
-    for row in read.rows("images.csv", IMAGE_COLUMNS):
-        name = row.text("image")
-        once(names, (name,), row, f"image {name}")
-        camera = cameras[row.choice("camera", tuple(cameras), "camera of survey.yaml")]
-        setup = row.choice("setup", setups, "set-up of station.csv")
-        purpose = cast(Purpose, row.choice("purpose", ("camera", "mast", "check"), "purpose"))
-        placement = row.cells["placement"] if purpose == "check" else row.text("placement")
-        pan_rad, tilt_rad = joints_of(row, camera)
-        file = row.cells["file"]
-        if file:
-            once(files, (file,), row, f"file {file}")
-            read.check_picture(row, file, camera)
-        image = (name, camera.name, setup, placement, purpose, pan_rad, tilt_rad, Path(file), row.line)
-        images.append(SurveyImage(*image))
-    read.some(images, "images.csv", "the images that were taken")
-    return tuple(images)
+        found.setdefault(image.name, []).append((number, *pixel, sigma_px))
+    tables = {name: np.array(rows) for name, rows in found.items()}
+    return {name: Corners(t[:, 0].astype(np.int64), t[:, 1:3], t[:, 3]) for name, t in tables.items()}
 
 
 def _dots(
     read: SurveyFolder, board: Board, cameras: Mapping[str, SurveyCamera], images: Mapping[str, SurveyImage]
 ) -> dict[str, Dots]:
-    found: dict[str, list[tuple[int, int, float, float]]] = {}
-    seen: dict[tuple[str, ...], int] = {}
-    for row in read.rows("dots.csv", DOT_COLUMNS, optional=True):
-        name = image_of(row, images)
+    found: dict[str, list[tuple[float, ...]]] = {}
+    once = Once()
+    for row in read.rows("dots.csv", DOT_COLUMNS):
+        image = _image(row, images)
         place = row.index("row", board.rows), row.index("column", board.columns)
-        once(seen, (name, *map(str, place)), row, f"dot {place} of image {name}")
-        x_px, y_px = pixel_of(row, cameras[images[name].camera])
-        found.setdefault(name, []).append((*place, x_px, y_px))
-    dots: dict[str, Dots] = {}
-    for name, places in found.items():
-        table = np.array(places, dtype=np.float64)
-        indices = table[:, :2].astype(np.int64)
-        dots[name] = Dots(indices[:, 0], indices[:, 1], table[:, 2:])
-    return dots
+        once(row, f"dot {place} of image {image.name}", image.name, place)
+        found.setdefault(image.name, []).append((*place, *row.pixel(cameras[image.camera])))
+    tables = {name: np.array(rows) for name, rows in found.items()}
+    indices = {name: t[:, :2].astype(np.int64) for name, t in tables.items()}
+    return {name: Dots(at[:, 0], at[:, 1], tables[name][:, 2:]) for name, at in indices.items()}
 
 
 def _clicks(
@@ -332,14 +331,13 @@ def _clicks(
 ) -> tuple[Click, ...]:
     checks = {(point.setup, point.point) for point in station if point.kind == "check"}
     clicks: list[Click] = []
-    seen: dict[tuple[str, ...], int] = {}
-    for row in read.rows("clicks.csv", CLICK_COLUMNS, optional=True):
-        name, point = image_of(row, images), row.text("point")
-        setup = images[name].setup
-        if (setup, point) not in checks:
-            known = sorted(other for where, other in checks if where == setup)
+    once = Once()
+    for row in read.rows("clicks.csv", CLICK_COLUMNS):
+        image, point = _image(row, images), row.text("point")
+        if (image.setup, point) not in checks:
+            known = sorted(other for where, other in checks if where == image.setup)
             there = nearest(point, known) if known else "it has none"
-            raise row.bad("point", f"'{point[:40]}' is no check point of set-up {setup}; {there}")
-        once(seen, (name, point), row, f"point {point} of image {name}")
-        clicks.append(Click(name, point, array_of(pixel_of(row, cameras[images[name].camera]))))
+            raise row.bad("point", f"'{point[:40]}' is no check point of set-up {image.setup}; {there}")
+        once(row, f"point {point} of image {image.name}", image.name, point)
+        clicks.append(Click(image.name, point, frozen_array(row.pixel(cameras[image.camera]), (2,))))
     return tuple(clicks)

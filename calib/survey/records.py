@@ -1,4 +1,4 @@
-"""A survey: the measurements of one calibration (the folder of docs/how-to/survey-calibration.md)."""
+"""A survey: the measurements of one calibration (the folder of docs/how-to/calibrate.md)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 from calib.geometry.cahvor import Kind
+from calib.geometry.mode import SensorMode
 from calib.geometry.rigid import FloatArray
-from calib.geometry.sensor_mode import SensorMode
 from calib.targets.boards import AnyBoard, Board, Corners, Dots
 
 StationKind = Literal["prism", "tape", "check"]
@@ -88,12 +88,11 @@ class Click:
 class Sigma:
     """Standard deviations of the measurements, one axis each.
 
-    A bench has ``corner_px``, of corners without a sigma of their own in corners.csv, and ``joint_rad``;
-    station and dots are 0 there.
+    A bench has ``corner_px``, of corners without a sigma of their own in corners.csv, and ``joint_rad``.
     """
 
-    station_m: float
-    dot_px: float
+    station_m: float = 0.0
+    dot_px: float = 0.0
     joint_rad: float = 0.0
     prism_cad_m: float = 0.0
     corner_px: float = 0.0

@@ -116,6 +116,13 @@ def measure(path: str | Path, across_m: float, down_m: float | None = None) -> t
     return document["bar_m"]["across"], document["bar_m"]["down"]
 
 
+def bars_of(path: str | Path) -> tuple[float, float] | None:
+    """Return the lengths of a BOARD.yaml's bars as drawn, across and down, metres; None if it has none."""
+    load_board(path)
+    bars = parse_mapping(read_bytes(path, MAX_BYTES), path).get("bar_m")
+    return None if bars is None else (bars["across"], bars["down"])
+
+
 def _measured(across_m: float, down_m: float | None) -> dict[str, float]:
     return {"across_m": across_m} | ({} if down_m is None else {"down_m": down_m})
 

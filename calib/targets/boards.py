@@ -295,3 +295,6 @@ class Dots:
     columns: IntArray
     pixels_px: FloatArray
     sigma_px: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.rows)

@@ -94,6 +94,11 @@ def why_not_this_board(board: MarkerBoard, markers: Markers, stands: StandingMar
             return f"the markers in view stand as on another board: {drawn}; BOARD.yaml says otherwise"
     if mine and standing_count >= MOST_ELSEWHERE * mine:
         return ""
+    if isinstance(board, AprilGrid) and _turned_tags(board, markers) > max(0.8 * found, standing_count):
+        return (
+            "each tag is half a turn off Kalibr's, as OpenCV's dictionary draws it; "
+            "print the board of 'mastctl board make --kind aprilgrid'"
+        )
     for other, what in _relatives(board):
         others = standing(markers, other)
         if others is not None and len(others.ids) > max(0.8 * found, standing_count):
@@ -102,6 +107,15 @@ def why_not_this_board(board: MarkerBoard, markers: Markers, stands: StandingMar
         wanted = f"{board.first_id} to {last} are expected"
         return f"another board is in view: its markers are {_some(outside)}, where {wanted}"
     return f"another board is in view: its {found} markers do not stand as on one of {_drawn(board)}"
+
+
+def _turned_tags(board: AprilGrid, markers: Markers) -> int:
+    """How many tags stand as on the board, each turned by half a turn; counted from below or from the top."""
+    turned = Markers(markers.ids, np.roll(markers.corners_px, 2, axis=1))
+    row, column = np.divmod(markers.ids - board.first_id, board.columns)
+    from_top = (board.rows - 1 - row) * board.columns + column + board.first_id
+    both = (standing(one, board) for one in (turned, Markers(from_top, turned.corners_px)))
+    return max(0 if one is None else len(one.ids) for one in both)
 
 
 def why_nothing(board: AnyBoard, image: Image) -> str:

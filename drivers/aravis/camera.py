@@ -7,33 +7,28 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from calib.geometry.sensor_mode import SensorMode
 from drivers import pixels
 from drivers.aravis.capture import GenicamCapture
 from drivers.aravis.options import AravisOptions, parse_options
 from drivers.clock import Clock
 from drivers.errors import NoCamera, NoFreshFrame
-from drivers.interfaces import CameraSetting, FrameTime
+from drivers.interfaces import Camera, CameraInfo, CameraSetting, FrameTime
 from drivers.newest import Counters, TimedFrame
+from drivers.registry import Driver
 
 
 def open_camera(options: Mapping[str, Any], clock: Clock | None = None, name: str = "aravis") -> AravisCamera:
     """Open a camera by a configuration's options (docs/how-to/cameras.md).
 
-    ``clock`` is not used: the camera's clock is tied to the machine's.
-
-    Raises
-    ------
-    BadOptions
-        For options that it refuses, and without the library Aravis.
-    DriverError
-        If the camera does not answer or another program has it.
+    ``clock`` is not used: the camera's clock is tied to the machine's. Raises BadOptions for options that it
+    refuses, and without the library Aravis; DriverError if the camera does not answer or another program has
+    it.
     """
     return AravisCamera(parse_options(options, name), name)
 
 
-class AravisCamera:
-    """One camera, an instance of ``drivers.interfaces.Camera``; safe from any thread."""
+class AravisCamera(Camera):
+    """One camera; safe from any thread."""
 
     def __init__(self, options: AravisOptions, name: str) -> None:
         self.name = name
@@ -47,18 +42,18 @@ class AravisCamera:
         return self.capture.newest.counters
 
     @property
-    def size_px(self) -> tuple[int, int]:
-        """(width, height) of every picture."""
-        return self.capture.format.size_px
+    def info(self) -> CameraInfo:
+        """Size and sensor mode, its period and the name of its hardware trigger."""
+        capture = self.capture
+        return CameraInfo(
+            size_px=capture.format.size_px,
+            sensor_mode=capture.sensor_mode,
+            period_s=self._period_s(),
+            trigger=self._options.trigger,
+        )
 
-    @property
-    def sensor_mode(self) -> SensorMode:
-        """Which pixels of its sensor its pictures show, as far as it is known."""
-        return self.capture.sensor_mode
-
-    @property
-    def period_s(self) -> float:
-        """From frame to frame, seconds, by the camera's word; of a triggered one, between its last frames."""
+    def _period_s(self) -> float:
+        """From frame to frame, as the camera states it; of a triggered one, between its last frames."""
         if self.capture.period_s is not None:
             return self.capture.period_s
         times = self.recent_times()
@@ -66,11 +61,6 @@ class AravisCamera:
             return 1.0
         span_s = times[-1].exposure_began_s - times[0].exposure_began_s
         return max(1e-3, span_s / max(1, times[-1].sequence - times[0].sequence))
-
-    @property
-    def trigger(self) -> str:
-        """The name of the hardware trigger that exposes it; empty for others."""
-        return self._options.trigger
 
     def recent_times(self) -> list[FrameTime]:
         """Return the times of the last good frames of this stream, oldest first."""
@@ -81,7 +71,7 @@ class AravisCamera:
         return self.capture.settings()
 
     def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
-        """Change some of them, as `drivers.interfaces.Adjustable.adjust`."""
+        """Change some of them, as `drivers.interfaces.Camera.adjust`."""
         return self.capture.adjust(wanted)
 
     @contextmanager
@@ -95,12 +85,8 @@ class AravisCamera:
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> TimedFrame:
         """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.
 
-        Raises
-        ------
-        NoFreshFrame
-            If none came within ``timeout_s`` seconds; the message says what came instead.
-        NoCamera
-            At once, if the camera is gone.
+        Raises NoFreshFrame if none came within ``timeout_s`` seconds; the message says what came instead;
+        NoCamera (at once, if the camera is gone).
         """
         newest = self.capture.newest
         damaged = newest.damaged
@@ -133,3 +119,6 @@ class AravisCamera:
     def close(self) -> None:
         """Let go of the camera; a waiting call ends with NoFreshFrame."""
         self.capture.close()
+
+
+DRIVER = Driver(lambda options, context: open_camera(options, context.clock, context.name))

@@ -76,8 +76,6 @@ class CameraClock:
         for a camera whose clock cannot be read.
     low_s, high_s
         The bounds when they were last looked at, at ``at_s``.
-    readings
-        How often the camera's clock was read.
     """
 
     least_delay_s: float
@@ -89,10 +87,7 @@ class CameraClock:
     def read(self, before_s: float, camera_s: float, after_s: float) -> None:
         """Take in that the camera's clock stood at ``camera_s`` between two moments of ours.
 
-        Raises
-        ------
-        ClockStepped
-            If that contradicts what was observed before.
+        Raises ClockStepped if that contradicts what was observed before.
         """
         self._widen(after_s)
         low_s, high_s = before_s - camera_s, after_s - camera_s
@@ -107,10 +102,7 @@ class CameraClock:
     def arrived(self, stamp_s: float, arrived_s: float) -> None:
         """Take in that a frame stamped ``stamp_s`` by the camera began to come at ``arrived_s`` of ours.
 
-        Raises
-        ------
-        ClockStepped
-            If the frame came before it was stamped.
+        Raises ClockStepped if the frame came before it was stamped.
         """
         self._widen(arrived_s)
         above_s = arrived_s - stamp_s
@@ -127,12 +119,6 @@ class CameraClock:
 
         Parameters
         ----------
-        stamp_s
-            The camera's stamp, by its own clock.
-        stamped
-            What it stamps.
-        longest_s
-            The exposure time, or the longest that it may be.
         triggered_s
             Before which moment of ours it cannot have begun: its trigger's; -inf where none is known.
         arrived_s
@@ -140,8 +126,10 @@ class CameraClock:
         """
         begin_s = stamp_s + self.low_s - (0.0 if stamped == "start" else longest_s)
         end_s = stamp_s + self.high_s + (0.0 if stamped == "end" else longest_s)
-        if triggered_s > -math.inf:
-            begin_s = max(begin_s, triggered_s) if self.readings else triggered_s
+        if not self.readings and triggered_s > -math.inf:
+            begin_s = triggered_s
+        elif triggered_s <= stamp_s + self.high_s:  # else it was stamped before, and answers another trigger
+            begin_s = max(begin_s, triggered_s)
         return GenicamWindow(begin_s, max(begin_s, min(end_s, arrived_s)))
 
     def _widen(self, now_s: float) -> None:

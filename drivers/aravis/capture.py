@@ -171,13 +171,7 @@ class GenicamCapture:
         return self._there().settings()
 
     def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
-        """Change settings; a stream that is opened later has them too.
-
-        Raises
-        ------
-        BadSetting, DriverError
-            As `drivers.interfaces.Adjustable.adjust`.
-        """
+        """Change settings; a stream that is opened later has them too. Raises BadSetting, DriverError."""
         self._there()
         with self._opening:
             device = self._there()

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.geometry.sensor_mode import SensorMode
+from calib.geometry.mode import SensorMode
 from drivers.aravis import find
 from drivers.aravis.camera_clock import WallClock
 from drivers.aravis.library import CONTROL_LOST, GenicamError, library
@@ -29,6 +29,7 @@ log = logging.getLogger(__name__)
 
 RATE_TOLERANCE = 0.02
 _CONTINUOUS = 0  # ARV_ACQUISITION_MODE_CONTINUOUS
+# SFNC: the device's clock, and before SFNC 2.2 that of GigE Vision cameras, which is deprecated there.
 _LATCHES = (("TimestampLatch", "TimestampLatchValue"), ("GevTimestampControlLatch", "GevTimestampValue"))
 _TICKS = "GevTimestampTickFrequency"
 
@@ -49,8 +50,6 @@ class Filled(NamedTuple):
 
     Attributes
     ----------
-    handle
-        Aravis's buffer.
     wrong
         Why it is no good frame; empty if it is.
     number
@@ -78,25 +77,19 @@ beside another camera's stream it gave that camera's frame."""
 class Device:
     """A camera that streams. Closing it gives everything back.
 
+    Raises UnsupportedFormat if format, size or rate are not to be had; the message says what is; DriverError
+    if the camera cannot be opened or does not start.
+
     Attributes
     ----------
     format, period_s
         As the camera answered; a triggered camera has a period of None.
     values
         Its settings by name, as they are at the opening; None for one that its automatic sets.
-    problems
-        Sentences about controls that are missing or not as asked.
     sensor_mode
         Which pixels of the sensor frames show, as far as the camera reports it.
     lost
         Set when the camera no longer obeys: it was unplugged, or another program took it.
-
-    Raises
-    ------
-    UnsupportedFormat
-        If format, size or rate are not to be had; the message says what is.
-    DriverError
-        If the camera cannot be opened or does not start.
     """
 
     def __init__(self, options: AravisOptions, name: str, adjusted: Mapping[str, float]) -> None:
@@ -295,10 +288,7 @@ class Device:
     def read_clock(self) -> tuple[float, float, float] | None:
         """Return our time before, the camera's, ours after, seconds; None if its clock cannot be read.
 
-        Raises
-        ------
-        StreamFailed
-            If the camera does not answer.
+        Raises StreamFailed if the camera does not answer.
         """
         if self._latch is None:
             return None

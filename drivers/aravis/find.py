@@ -41,19 +41,12 @@ def list_cameras() -> list[FoundGenicam]:
 def options_for(camera: FoundGenicam, by_serial: bool, fastest_hz: float) -> dict[str, Any]:
     """Return options that open a camera as it is now: its format (else the first that is read), region, rate.
 
+    Raises DriverError if another program has it, it does not answer, or it has no format that is read.
+
     Parameters
     ----------
-    camera
-        It is opened for a moment, and nothing of it is set.
     by_serial
         Whether its serial number names it, else its id.
-    fastest_hz
-        The rate of one that is quicker now.
-
-    Raises
-    ------
-    DriverError
-        If another program has it, it does not answer, or it has no format that is read.
     """
     name = camera.words
     arv, handle = library(name), open_camera(AravisOptions(id=camera.id), name)
@@ -100,14 +93,8 @@ def _listed(arv: Library) -> list[FoundGenicam]:
 def open_camera(options: AravisOptions, name: str) -> int:
     """Open the camera that the options name and return Aravis's handle.
 
-    Raises
-    ------
-    NoCamera
-        If it does not answer.
-    CameraBusy
-        If another program controls it.
-    BadOptions
-        If several cameras bear the serial number.
+    Raises CameraBusy if another program controls it; BadOptions if several cameras bear the serial number;
+    NoCamera.
     """
     arv = library(name)
     key = options.address or options.id

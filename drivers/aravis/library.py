@@ -1,17 +1,19 @@
 """The C library Aravis by ctypes: only what this driver calls, and its errors as Python's.
 
 It is bound and not imported by GObject introspection, which would need the system's own Python
-(docs/decisions/0019-aravis-by-ctypes.md). A call lets go of Python's lock while it lasts.
+(docs/decisions/libraries.md). A call lets go of Python's lock while it lasts.
 """
 
 from __future__ import annotations
 
 import ctypes
+import resource
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any
 
-from drivers.errors import BadOptions
+from drivers.errors import BadOptions, StreamFailed
 
 SONAME = "libaravis-0.8.so.0"
 INSTALL = "sudo apt-get install aravis-tools-cli"
@@ -102,6 +104,11 @@ _FUNCTIONS = {
 """Arguments and result by `_TYPES`; ``!``: a GError is the last argument."""
 
 
+_OPENING = frozenset({"arv_update_device_list", "arv_camera_new", "arv_camera_create_stream"})
+FREE_DESCRIPTORS = 16
+"""What must be free before a call that opens some. GLib ends the whole process where it gets none."""
+
+
 class GenicamError(Exception):
     """Aravis refused a call: because of the camera's features, or of the line to it."""
 
@@ -123,8 +130,14 @@ class Library:
         self._functions = {name: _declared(arv, name, types) for name, types in _FUNCTIONS.items()}
 
     def __call__(self, name: str, *arguments: Any) -> Any:
-        """Call ``arv_NAME``; texts are str on both sides. Raises GenicamError."""
+        """Call ``arv_NAME``; texts are str on both sides.
+
+        Raises GenicamError if Aravis refuses it; StreamFailed if the process may hardly open another file,
+        for a call that would.
+        """
         name = f"arv_{name}"
+        if name in _OPENING:
+            _check_descriptors()
         given = [one.encode() if isinstance(one, str) else one for one in arguments]
         if not _FUNCTIONS[name].endswith("!"):
             result = self._functions[name](*given)
@@ -159,6 +172,19 @@ def _declared(library: ctypes.CDLL, name: str, types: str) -> Callable[..., Any]
     function.argtypes = [_TYPES[letter] for letter in given] + [ctypes.c_void_p] * types.endswith("!")
     function.restype = _TYPES[result]
     return function  # type: ignore[no-any-return]
+
+
+def _check_descriptors() -> None:
+    most, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        in_use = sum(1 for _ in Path("/proc/self/fd").iterdir())
+    except OSError:  # there is not one left for the folder itself
+        in_use = most
+    if in_use + FREE_DESCRIPTORS > most:
+        raise StreamFailed(
+            f"{in_use} of at most {most} files and connections are open in this process, and a GenICam "
+            f"camera needs {FREE_DESCRIPTORS} free ones; close some, or raise LimitNOFILE= (ulimit -n)"
+        )
 
 
 @cache

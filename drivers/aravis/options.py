@@ -85,10 +85,7 @@ class AravisOptions:
 def parse_options(options: Mapping[str, Any], name: str) -> AravisOptions:
     """Read a camera's options.
 
-    Raises
-    ------
-    BadOptions
-        Naming the camera, the option, its value and what is expected.
+    Raises BadOptions naming the camera, the option, its value and what is expected.
     """
     read = OptionReader(options, OPTIONS, device=name)
     usual = AravisOptions()

@@ -46,6 +46,8 @@ class Meaning:
     unit: float = 1.0
 
 
+# Names: GenICam's Standard Features Naming Convention (SFNC); white balance and focus as The Imaging Source's
+# cameras have them (tiscamera), which the SFNC does not name.
 EXPOSURE = Meaning("exposure_s", "exposure time", "ExposureTime", "ExposureAuto", "exposure_time", 1e-6)
 GAIN = Meaning("gain", "gain", "Gain", "GainAuto", "gain")
 MEANINGS = (
@@ -140,17 +142,14 @@ def set_up(
 ) -> tuple[dict[str, float | None], list[str]]:
     """Set what is wanted, by name, of a camera that is being opened.
 
+    Raises GenicamError if it refuses one.
+
     Returns
     -------
     values
         Of each setting that it has, None for one that its automatic sets.
     problems
         A sentence for each that it lacks, or that became another.
-
-    Raises
-    ------
-    GenicamError
-        If it refuses one.
     """
     values: dict[str, float | None] = {}
     problems: list[str] = []
@@ -183,12 +182,7 @@ def settings_of(
     """Return what of a camera may be changed, as it is now.
 
     ``period_s`` is from frame to frame and bounds an exposure; None if the camera is triggered or does not
-    say.
-
-    Raises
-    ------
-    GenicamError
-        If the camera does not answer.
+    say. Raises GenicamError if the camera does not answer.
     """
     found = []
     for one in MEANINGS:

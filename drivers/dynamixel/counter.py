@@ -26,8 +26,6 @@ class Counter:
 
     Parameters
     ----------
-    tick
-        What it showed, ms.
     sent_s, received_s
         When that was asked and when it came, seconds of our clock.
     """
@@ -38,11 +36,6 @@ class Counter:
 
     def doubts(self, tick: int, sent_s: float, received_s: float) -> str:
         """Take an answer as of its question, or say in words why it cannot be and take nothing.
-
-        Parameters
-        ----------
-        tick, sent_s, received_s
-            As of the class.
 
         Returns
         -------

@@ -21,6 +21,7 @@ from drivers.dynamixel.pair import Pair, make_ready, open_pair
 from drivers.dynamixel.servo import Reboots
 from drivers.dynamixel.settings import DynamixelSettings, dynamixel_settings
 from drivers.dynamixel.watch import Watch
+from drivers.registry import Driver
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.head import BusHead
 from drivers.servo_bus.rest import halt_axes
@@ -31,12 +32,8 @@ def open_head(
 ) -> DynamixelHead:
     """Open the head that the options of ``driver: dynamixel`` describe; see `settings.DynamixelSettings`.
 
-    Raises
-    ------
-    BadOptions
-        For options that cannot be.
-    LineLost, NoReply, WrongDevice, HardwareFault, Refused
-        If the servos cannot be reached or do not fit; the line is closed again.
+    Raises BadOptions for options that cannot be; LineLost, NoReply, WrongDevice, HardwareFault, Refused if
+    the servos cannot be reached or do not fit; the line is closed again.
     """
     return DynamixelHead(dynamixel_settings(options), clock, open_line)
 
@@ -69,3 +66,8 @@ def halt(
     """
     with closing(open_pair(dynamixel_settings(options), clock=clock, open_line=open_line)) as pair:
         return halt_axes(pair)
+
+
+DRIVER = Driver(
+    lambda options, context: open_head(options, context.clock), read_options=dynamixel_settings, halt=halt
+)

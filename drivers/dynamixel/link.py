@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 from drivers.clock import Clock
 from drivers.dynamixel.counter import TickCounters
@@ -24,11 +23,11 @@ from drivers.dynamixel.packets import (
     PING,
     READ,
     REBOOT,
+    SYNC_WRITE,
     WRITE,
     GroupAnswer,
     GroupQuestion,
     Part,
-    fast_blocks,
     group_question,
     group_write_packet,
     instruction_packet,
@@ -49,6 +48,7 @@ FORMAT = PacketFormat(
     11,
     {PING: "ping", READ: "read", WRITE: "write", REBOOT: "reboot"},
     ERROR_WORDS,
+    instruction_packet(BROADCAST_ID, SYNC_WRITE, (64).to_bytes(2, "little") + (1).to_bytes(2, "little")),
 )
 AGREEING_TRIES = 5  # of two answers in a row that are to be the same
 
@@ -78,7 +78,7 @@ class Link(BusLink):
     ) -> None:
         super().__init__(port, baud, reply_timeout_s, FORMAT, urgent, clock, open_line)
         self._counters = TickCounters(self.exchange)
-        self._group_questions: dict[tuple[bool, tuple[Part, ...]], GroupQuestion] = {}
+        self._group_questions: dict[tuple[Part, ...], GroupQuestion] = {}
 
     def ping(self, servo_id: int) -> Pinged:
         """Ask one servo who it is. Raises NoReply, BadReply, LineLost."""
@@ -87,21 +87,19 @@ class Link(BusLink):
     def ping_all(self) -> tuple[list[Pinged], int]:
         """Ask who is on the line; takes its whole window of about a second.
 
+        Raises LineLost.
+
         Returns
         -------
         list of Pinged, int
             Who answered, by id; and how many bytes came that were no reply (two servos of one id?).
-
-        Raises
-        ------
-        LineLost
-            If the line is gone.
         """
         port = self._port
-        port.send(instruction_packet(BROADCAST_ID, PING), 0)
+        question = instruction_packet(BROADCAST_ID, PING)
+        port.send(question, 0)
         port.deadline_s = self.clock.now_s() + port.reply_timeout_s + 253 * (0.003 + 14 * port.byte_s)
         found: dict[int, Pinged] = {}
-        before, understood = port.received_bytes, 0
+        before, understood = port.received_bytes, len(question) * port.echoes
         while (status := port.receive()) is not None:
             understood += PING_REPLY_BYTES
             if len(status.data) == 3:
@@ -113,14 +111,9 @@ class Link(BusLink):
     def proven(self, servo_id: int, *registers: Register) -> list[int]:
         """Return registers' values, each of an answer that is certainly of its question.
 
-        Takes a silence of some 20 ms if any of the registers is not read with the servo's counter.
-
-        Raises
-        ------
-        BadReply
-            If answers contradict one another again and again, or are of another moment.
-        NoReply, Refused, LineLost
-            With port, id, register and instruction.
+        Takes a silence of some 20 ms if any of the registers is not read with the servo's counter. Raises
+        BadReply if answers contradict one another again and again, or are of another moment; NoReply,
+        Refused, LineLost.
         """
         asked = {register.window: register for register in registers if tick_at(*register.window) is None}
         found = self._agreed(servo_id, asked)
@@ -173,10 +166,7 @@ class Link(BusLink):
     def write(self, servo_id: int, register: Register, value: int) -> None:
         """Set a register and wait for the servo's word that it did.
 
-        Raises
-        ------
-        NoReply, BadReply, Refused, LineLost
-            With port, id, register and instruction.
+        Raises NoReply, BadReply, Refused, LineLost.
         """
         data = register.address.to_bytes(2, "little") + register.encode(value)
         self.exchange.ask(servo_id, WRITE, data, 0, register.name)
@@ -199,36 +189,25 @@ class Link(BusLink):
             raise answer.missing[part.servo_id]
         return answer
 
-    def group_read(self, parts: Sequence[Part], *, fast: bool = False) -> GroupAnswer:
+    def group_read(self, parts: Sequence[Part]) -> GroupAnswer:
         """Read one block of each of several servos in one transaction.
 
         Servos whose blocks have one address and length are asked by Sync Read, others by Bulk Read. Each
         servo waits for the one before it, so one that is missing may silence those behind it. Blocks that
         hold the servo's counter are taken only if it shows this moment; a servo whose counter is not known
-        yet is asked for it first.
-
-        Parameters
-        ----------
-        parts
-            One per servo.
-        fast
-            Ask for one common reply (Fast Sync or Bulk Read); newer firmware only.
-
-        Raises
-        ------
-        LineLost, BadReply
-            If the line is gone or never quiet; everything else stands in the answer's ``missing``.
+        yet is asked for it first. Raises LineLost, BadReply if the line is gone or never quiet; everything
+        else stands in the answer's ``missing``.
         """
-        key = (fast, tuple(parts))
+        key = tuple(parts)
         question = self._group_questions.get(key)
         if question is None:
-            question = self._group_questions[key] = group_question(fast, parts)
+            question = self._group_questions[key] = group_question(parts)
         if (unmet := self._counters.unmet(question)) is not None:
             now_s = self.clock.now_s()
             return GroupAnswer({}, dict.fromkeys(question.parts, unmet), now_s, now_s)
         try:
             sent_s = self._port.send(question.packet, question.reply_bytes)
-            statuses, wrong = (self._fast_replies if fast else self._replies)(question, sent_s)
+            statuses, wrong = self._replies(question, sent_s)
         except LineLost as error:
             raise self.exchange.placed(error, list(question.parts), "group read") from error
         received_s = self.clock.now_s()
@@ -244,10 +223,7 @@ class Link(BusLink):
     def group_write(self, parts: Sequence[Part]) -> None:
         """Write to several servos with one packet; nobody answers, so read back what must be certain.
 
-        Raises
-        ------
-        LineLost, BadReply
-            If the line is gone or never quiet.
+        Raises LineLost, BadReply.
         """
         try:
             self._port.send(group_write_packet(parts), 0)
@@ -257,13 +233,8 @@ class Link(BusLink):
     def shout(self, parts: Sequence[Part], copies: int = 1) -> None:
         """Write to each of several servos by a packet of its own, at once and whatever is under way.
 
-        Nobody answers, nothing is listened to before, and one servo's packet does not hang on another's:
-        what is sent may collide with a reply, so send more than one copy where it matters.
-
-        Raises
-        ------
-        LineLost
-            If the line is gone.
+        Nobody answers, nothing is listened to before, and one servo's packet does not hang on another's: what
+        is sent may collide with a reply, so send more than one copy where it matters. Raises LineLost.
         """
         packets = b"".join(group_write_packet([part]) for part in parts)
         try:
@@ -298,30 +269,6 @@ class Link(BusLink):
                 self.exchange.stray(status)
                 if status != taken.get(servo_id):
                     return {}, wrong
-        return taken, wrong
-
-    def _fast_replies(
-        self, question: GroupQuestion, sent_s: float
-    ) -> tuple[dict[int, Status], dict[int, DriverError]]:
-        """The replies in the common reply to a fast group read."""
-        parts = list(question.parts.values())
-        taken: dict[int, Status] = {}
-        wrong: dict[int, DriverError] = {}
-        while (status := self._port.receive(partial(take_status, fast=True))) is not None:
-            blocks = fast_blocks(status, parts)
-            if blocks is None:
-                self.exchange.stray(status)
-                continue
-            if len(blocks) < len(parts):
-                self._port.suspect = True
-            for block in blocks:
-                if block.refused:
-                    wrong[block.servo_id] = self.exchange.refusal(block, "fast group read", "")
-                elif (doubts := self._counters.doubts(question, block, sent_s)) is not None:
-                    wrong[block.servo_id] = doubts
-                else:
-                    taken[block.servo_id] = block
-            break
         return taken, wrong
 
 

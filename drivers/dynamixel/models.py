@@ -23,6 +23,7 @@ POSITION_MODE = 3
 NO_SECONDARY_ID = 253  # and above
 WATCHDOG_TRIPPED = 255
 
+# By code: e-manual, control_table_baudrate_2.md (X, MX to 7, X330 to 6), p/control_table_8_baud_rate.md.
 BAUD_RATES = MappingProxyType(
     {
         0: 9600,
@@ -38,6 +39,7 @@ BAUD_RATES = MappingProxyType(
     }
 )
 
+# By bit: e-manual, Hardware Error Status (70; of a P 518) and the table of Shutdown (63).
 HARDWARE_ERRORS = MappingProxyType(
     {
         0x01: "input voltage out of its limits",
@@ -49,6 +51,7 @@ HARDWARE_ERRORS = MappingProxyType(
     }
 )
 
+# E-manual, Operating Mode (11).
 OPERATING_MODES = MappingProxyType(
     {
         0: "current",
@@ -69,16 +72,6 @@ class ServoModel:
 
     Attributes
     ----------
-    name, number
-        As ROBOTIS names it, and what a ping answers.
-    registers
-        Those that it has, by name.
-    low_count, high_count
-        What its position limits may be in position mode.
-    centre_count
-        Where its own angle is zero.
-    counts_per_turn
-        Of the output shaft.
     velocity_unit_rad_per_s, acceleration_unit_rad_per_s2
         Of one count of velocity and profile acceleration.
     current_unit_A, most_current_counts
@@ -86,8 +79,6 @@ class ServoModel:
         its load only.
     backlash_rad
         As the maker states it; None where nothing is stated.
-    watchdog_firmware
-        The first firmware with a bus watchdog.
     """
 
     name: str
@@ -177,10 +168,7 @@ TICK_ADDRESSES = tuple(sorted({model.registers["realtime_tick"].address for mode
 def model_named(name: str) -> ServoModel:
     """Return the model that a configuration names; the letter after the gear may be left out.
 
-    Raises
-    ------
-    BadOptions
-        If there is none, with the nearest known name.
+    Raises BadOptions if there is none, with the nearest known name.
     """
     wanted = str(name).upper().replace("_", "-")
     for known, model in MODELS.items():

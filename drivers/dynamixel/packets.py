@@ -24,8 +24,8 @@ ALERT = 0x80
 
 PING, READ, WRITE, REBOOT, STATUS = 0x01, 0x02, 0x03, 0x08, 0x55
 SYNC_READ, SYNC_WRITE, BULK_READ, BULK_WRITE = 0x82, 0x83, 0x92, 0x93
-FAST_SYNC_READ, FAST_BULK_READ = 0x8A, 0x9A
 
+# E-manual, protocol 2.0, the error field of a status packet.
 ERROR_WORDS = {
     1: "it could not process the instruction",
     2: "it does not know the instruction",
@@ -85,7 +85,7 @@ class StatusPacket:
         return bool(self.error & ALERT)
 
 
-def take_status(buffer: bytearray, *, at_end: bool = False, fast: bool = False) -> StatusPacket | None:
+def take_status(buffer: bytearray, *, at_end: bool = False) -> StatusPacket | None:
     """Take the first whole status packet out of a buffer; None when there is none yet.
 
     What comes before it (noise, echoes of instructions, packets whose checksum does not fit) is dropped.
@@ -96,8 +96,6 @@ def take_status(buffer: bytearray, *, at_end: bool = False, fast: bool = False) 
         Bytes as they came in; what was used or dropped is removed.
     at_end
         No more bytes will come: a header whose packet is not whole was noise, look behind it.
-    fast
-        Do not unstuff: replies to fast group reads are not stuffed.
     """
     while True:
         start = buffer.find(HEADER)
@@ -119,12 +117,10 @@ def take_status(buffer: bytearray, *, at_end: bool = False, fast: bool = False) 
                     packet = bytes(buffer[:length])
                     del buffer[:length]
                     if packet[7] == STATUS and length >= SHORTEST_STATUS:
-                        body = packet[8 : length - 2]
-                        if not fast:
-                            body = body.replace(STUFFED, START)
+                        body = packet[8 : length - 2].replace(STUFFED, START)
                         return StatusPacket(packet[4], body[0], body[1:])
                     continue  # an instruction: the adapter's echo
-            elif not at_end and (fast or buffer.find(HEADER, 1) < 0):
+            elif not at_end and buffer.find(HEADER, 1) < 0:
                 return None  # a second header inside means that this one is noise
         del buffer[:1]
 
@@ -176,14 +172,14 @@ def tick_at(address: int, length: int) -> int | None:
     return next(ticks, None)
 
 
-def group_question(fast: bool, parts: Sequence[Part]) -> GroupQuestion:
+def group_question(parts: Sequence[Part]) -> GroupQuestion:
     """Return a group read: Sync Read where all blocks are alike, else Bulk Read."""
     ids = {part.servo_id: bytes((part.servo_id,)) for part in parts}
     if _alike(parts):
-        instruction = FAST_SYNC_READ if fast else SYNC_READ
+        instruction = SYNC_READ
         body = parts[0].place + b"".join(ids.values())
     else:
-        instruction = FAST_BULK_READ if fast else BULK_READ
+        instruction = BULK_READ
         body = b"".join(ids[part.servo_id] + part.place for part in parts)
     places = {part.servo_id: tick_at(part.address, part.length) for part in parts}
     return GroupQuestion(
@@ -201,29 +197,6 @@ def group_write_packet(parts: Sequence[Part]) -> bytes:
         return instruction_packet(BROADCAST_ID, SYNC_WRITE, body)
     body = b"".join(bytes((part.servo_id,)) + part.place + part.data for part in parts)
     return instruction_packet(BROADCAST_ID, BULK_WRITE, body)
-
-
-def fast_blocks(status: Status, parts: Sequence[Part]) -> list[StatusPacket] | None:
-    """Return the replies in the common reply to a fast group read, those before the first broken block.
-
-    Blocks are error, id, data and the checksum of all bytes so far; the last checksum is the packet's, which
-    holds. None if the reply is not as long as it has to be: it is to another question.
-    """
-    body = bytes((status.error,)) + status.data
-    if len(body) != sum(4 + part.length for part in parts) - 2:  # without the last checksum
-        return None
-    total = len(body) + 3  # and the instruction and the checksum of the packet
-    crc = crc16(HEADER + bytes((status.servo_id,)) + total.to_bytes(2, "little") + bytes((STATUS,)))
-    blocks = []
-    for part in parts:
-        block, body = body[: 2 + part.length], body[2 + part.length :]
-        stated, body = body[:2], body[2:]
-        crc = crc16(block, crc)
-        if block[1] != part.servo_id or (stated and stated != crc.to_bytes(2, "little")):
-            break
-        crc = crc16(stated, crc)
-        blocks.append(StatusPacket(part.servo_id, block[0], block[2:]))
-    return blocks
 
 
 def _alike(parts: Sequence[Part]) -> bool:

@@ -1,6 +1,6 @@
 """Both servos of a head on one open line: made ready without moving them, then read and written together.
 
-What is done about what they say is decided elsewhere (`drivers.dynamixel.session`).
+What is done about what they say is decided elsewhere (`drivers.dynamixel.head`).
 """
 
 from __future__ import annotations
@@ -24,9 +24,6 @@ from drivers.servo_bus.pair import BRAKE_COPIES, ServoPair
 
 log = logging.getLogger(__name__)
 
-FAST_TRIALS = 10
-
-
 Axis = ServoAxis[Servo, DynamixelAxisSettings]
 
 
@@ -37,13 +34,6 @@ class Pair(ServoPair[Link, Axis]):
     ----------
     link
         The open line; `close` closes it.
-    head
-        What the configuration says.
-
-    Attributes
-    ----------
-    fast
-        Whether both servos are read by the fast group read.
     """
 
     def __init__(self, link: Link, head: DynamixelSettings) -> None:
@@ -51,7 +41,6 @@ class Pair(ServoPair[Link, Axis]):
         super().__init__(
             link, [ServoAxis(Servo(link, name, axis, head), link.clock, axis, head) for name, axis in axes]
         )
-        self.fast = False
         self._head = head
         self._ids = [axis.settings.servo_id for axis in self.axes]
         turns = zip(*(motion_blocks(axis.settings) for axis in self.axes), strict=True)
@@ -64,14 +53,11 @@ class Pair(ServoPair[Link, Axis]):
     def samples(self) -> list[ServoSample]:
         """Return what both servos say about their motion now, pan first, in one transaction.
 
-        Raises
-        ------
-        NoReply, Refused, LineLost
-            As `Link.group_read`, of the servo that is to blame.
-        BadReply
-            If a sample is not the answer to the question just asked.
+        Raises NoReply, Refused, LineLost as `Link.group_read`, of the servo that is to blame; BadReply if a
+        sample is not the answer to the question just asked.
         """
-        answer, blocks = self._ask_both(self.fast)
+        blocks, parts = next(self._turns)
+        answer = self.link.group_read(parts)
         if answer.missing:
             raise self._to_blame(answer)
         samples = []
@@ -106,11 +92,6 @@ class Pair(ServoPair[Link, Axis]):
             return "has its torque off"
         servo.stand()
         return "was commanded to stand where it is, and holds"
-
-    def _ask_both(self, fast: bool) -> tuple[GroupAnswer, tuple[RegisterBlock, ...]]:
-        """Ask both servos for the next of the blocks that hold their motion."""
-        blocks, parts = next(self._turns)
-        return self.link.group_read(parts, fast=fast), blocks
 
     def _to_blame(self, answer: GroupAnswer) -> DriverError:
         """Why a group read is not whole, told of the servo that does not answer alone either.
@@ -166,10 +147,7 @@ class Pair(ServoPair[Link, Axis]):
     def arm(self) -> None:
         """Arm both watchdogs with one packet, and see that they are, unless they are off by configuration.
 
-        Raises
-        ------
-        NoReply, Refused, LineLost, WrongDevice
-            As `Servo.set`.
+        Raises NoReply, Refused, LineLost, WrongDevice.
         """
         counts = self._head.watchdog_counts
         if not counts:
@@ -178,14 +156,6 @@ class Pair(ServoPair[Link, Axis]):
         for axis in self.axes:
             if axis.servo.get("bus_watchdog") != counts:
                 axis.servo.set("bus_watchdog", counts)
-
-    def prove_fast_read(self) -> bool:
-        """Return whether the servos answer the fast group read, every time of some trials."""
-        for _ in range(FAST_TRIALS):
-            if self._ask_both(fast=True)[0].missing:
-                log.info("%s: no fast group read; the plain one is used", self._head.port)
-                return False
-        return True
 
 
 def open_pair(
@@ -205,14 +175,8 @@ def make_ready(pair: Pair, head: DynamixelSettings, reboots: Reboots) -> None:
     Without a watchdog an axis may still be under way. Each is commanded to stand first, whatever the other
     does. An axis whose torque was dropped to set it up holds again if it cannot be made ready.
 
-    ``reboots`` are those done to this head.
-
-    Raises
-    ------
-    Overtaken
-        If a stop came meanwhile.
-    LineLost, NoReply, WrongDevice, HardwareFault, Refused
-        If the servos cannot be reached or do not fit.
+    ``reboots`` are those done to this head. Raises Overtaken if a stop came meanwhile; LineLost, NoReply,
+    WrongDevice, HardwareFault, Refused if the servos cannot be reached or do not fit.
     """
     if not head.watchdog_counts:
         pair.stand()
@@ -229,4 +193,3 @@ def make_ready(pair: Pair, head: DynamixelSettings, reboots: Reboots) -> None:
         for axis in pair.axes:
             axis.take_hold()
         pair.arm()
-    pair.fast = head.fast_read and pair.prove_fast_read()

@@ -98,15 +98,7 @@ class VendorTable(NamedTuple):
 
 
 def vendor_table(number: int, first_ram_address: int) -> VendorTable:
-    """Return what the SDK says of the model that answers a ping with a number.
-
-    Parameters
-    ----------
-    number
-        One that the SDK has.
-    first_ram_address
-        Where permanent registers end.
-    """
+    """Return what the SDK says of the model that answers a ping with a number."""
     found = _sections(_files()[number])
     turn = {name: round(float(value)) for name, value in found["type info"]}
     ends = (turn[f"value_of_{end}_radian_position"] for end in ("min", "max", "zero"))
@@ -178,15 +170,7 @@ def _registers(rows: Sequence[Sequence[str]], first_ram_address: int) -> Mapping
 
 
 class RegisterBlock:
-    """Neighbouring registers that are read in one go, and their decoding.
-
-    Parameters
-    ----------
-    registers
-        A register map.
-    first, last
-        The names of its ends.
-    """
+    """Neighbouring registers that are read in one go, and their decoding."""
 
     def __init__(self, registers: Mapping[str, Register], first: str, last: str) -> None:
         start, end = registers[first].address, registers[last].address

@@ -80,17 +80,8 @@ class Servo(ServoTable):
 
     Parameters
     ----------
-    link
-        The open line.
     axis
         ``pan`` or ``tilt``, for messages.
-    settings, head
-        What the configuration says.
-
-    Attributes
-    ----------
-    truth
-        What its samples are compared with.
     """
 
     def __init__(
@@ -107,12 +98,8 @@ class Servo(ServoTable):
     def check_identity(self) -> None:
         """See that the servo is the one configured, and that it answers every instruction.
 
-        Raises
-        ------
-        WrongDevice
-            For another model, or a firmware without a bus watchdog where one is configured.
-        NoReply, LineLost
-            If it does not answer.
+        Raises WrongDevice for another model, or a firmware without a bus watchdog where one is configured;
+        NoReply, LineLost.
         """
         model = self._settings.model
         number, firmware = self._model_and_firmware()
@@ -151,12 +138,8 @@ class Servo(ServoTable):
     def stand(self) -> None:
         """Make where the servo is its goal, if it is of the model configured and its torque is on.
 
-        Asked one time and not read back: whatever it is, another axis may wait for the same.
-
-        Raises
-        ------
-        NoReply, BadReply, Refused, LineLost
-            As `Link.proven` and `Link.write`.
+        Asked one time and not read back: whatever it is, another axis may wait for the same. Raises NoReply,
+        BadReply, Refused, LineLost.
         """
         registers = self._registers
         asked = (registers["model_number"], registers["torque_enable"])
@@ -169,12 +152,8 @@ class Servo(ServoTable):
     def check_health(self, reboots: Reboots) -> None:
         """See that the servo reports no hardware error; restart it if the configuration says so.
 
-        A restart drops the torque, so it is not done again and again while what is wrong goes on.
-
-        Raises
-        ------
-        HardwareFault
-            In plain words.
+        A restart drops the torque, so it is not done again and again while what is wrong goes on. Raises
+        HardwareFault.
         """
         error = self.get("hardware_error")
         now_s = self._link.clock.now_s()
@@ -202,10 +181,7 @@ class Servo(ServoTable):
     def look(self) -> ServoSample:
         """Return what the servo says about its motion now; what was lost is asked for again.
 
-        Raises
-        ------
-        NoReply, BadReply, Refused, LineLost
-            As `Link.group_read`.
+        Raises NoReply, BadReply, Refused, LineLost.
         """
         return again(self._link, self.look_once)
 
@@ -225,14 +201,9 @@ class Servo(ServoTable):
     def set_up(self) -> None:
         """Bring the servo's permanent settings to what the configuration says.
 
-        The torque may be off then: `take_hold` follows, or the pair has it hold again.
-
-        Raises
-        ------
-        WrongDevice
-            If a setting cannot be used, or must change while torque may not be dropped.
-        Refused
-            If the servo refuses a value.
+        The torque may be off then: `take_hold` follows, or the pair has it hold again. Raises WrongDevice if
+        a setting cannot be used, or must change while torque may not be dropped; Refused if the servo refuses
+        a value.
         """
         wanted = self._wanted()
         held = self.get_all(*wanted)
@@ -341,11 +312,11 @@ class Servo(ServoTable):
         self.set("goal_position", goal)
 
     def _full_strength(self) -> None:
-        """Lift the bound of the motor's drive that a trial that was killed has left; raises as `set`."""
+        """Lift a bound of the motor's drive that another program has left; raises as `set`."""
         found, limit = self.get_all("goal_pwm", "pwm_limit").values()
         if found != limit:
             log.warning(
-                "%s was bound to %.0f %% of its drive (by a servo test that was killed?); that is lifted",
+                "%s was bound to %.0f %% of its drive by another program; that is lifted",
                 self.name,
                 100 * found / max(limit, 1),
             )

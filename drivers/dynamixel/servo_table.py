@@ -15,12 +15,7 @@ from drivers.servo_bus.port import QUIET_S
 def identified(link: Link, servo_id: int, name: str) -> Pinged:
     """Return who answers a ping, twice in a row and around a silence: a servo may answer nothing else yet.
 
-    Raises
-    ------
-    BadReply
-        If it says another thing each time.
-    NoReply, LineLost
-        If it does not answer.
+    Raises BadReply if it says another thing each time; NoReply, LineLost.
     """
     before = again(link, lambda: link.ping(servo_id))
     for _ in range(ATTEMPTS):
@@ -33,17 +28,7 @@ def identified(link: Link, servo_id: int, name: str) -> Pinged:
 
 
 class ServoTable:
-    """The control table of one servo.
-
-    Parameters
-    ----------
-    link
-        The open line.
-    servo_id, registers
-        Whose, and what is in it.
-    name
-        Of the servo, for messages.
-    """
+    """The control table of one servo."""
 
     def __init__(self, link: Link, servo_id: int, registers: Mapping[str, Register], name: str) -> None:
         self.name = name
@@ -68,12 +53,8 @@ class ServoTable:
     def set(self, register: str, value: int) -> None:
         """Set a register and see that it holds the value.
 
-        Raises
-        ------
-        Refused, NoReply, BadReply, LineLost
-            As `Link.write` and `Link.proven`.
-        WrongDevice
-            If the servo says that it did but holds another value.
+        Raises WrongDevice if the servo says that it did but holds another value; Refused, NoReply, BadReply,
+        LineLost.
         """
         refused: Refused | None = None
         for _ in range(ATTEMPTS):

@@ -36,8 +36,6 @@ class DynamixelAxisSettings(ServoAxisSettings):
 
     Attributes
     ----------
-    model
-        Which servo.
     on_hardware_error
         ``report`` leaves the servo as it is; ``reboot`` restarts it, which drops its torque.
     current_limit_A
@@ -58,12 +56,9 @@ class DynamixelSettings(HeadSettings[DynamixelAxisSettings]):
     watchdog_s
         After this silence the servos stop by themselves; 0 switches that off. Left out: 0.3 s, or as much
         less as it takes to stand 0.5 s after the last poll, braking included.
-    fast_read
-        Try the servos' fast group read at start-up and use it if it proves itself.
     """
 
     watchdog_s: float = USUAL_WATCHDOG_S
-    fast_read: bool = False
     name: str = field(default="dynamixel", init=False)
 
     @property
@@ -96,10 +91,8 @@ def _watchdog_counts(watchdog_s: float) -> int:
 def dynamixel_settings(options: Mapping[str, Any]) -> DynamixelSettings:
     """Return the head that the options of ``driver: dynamixel`` describe.
 
-    Raises
-    ------
-    BadOptions
-        For an unknown or missing key or a value that cannot be: which, what it is, what would be right.
+    Raises BadOptions for an unknown or missing key or a value that cannot be: which, what it is, what would
+    be right.
     """
     known = tuple(one.name for one in fields(DynamixelSettings) if one.init)
     read = OptionReader(options, known, ("port", "pan", "tilt"))
@@ -112,7 +105,6 @@ def dynamixel_settings(options: Mapping[str, Any]) -> DynamixelSettings:
         baud=baud,
         watchdog_s=watchdog_s,
         reply_timeout_s=_reply_timeout_s(read, watchdog_s, values["poll_hz"]),
-        fast_read=read.flag("fast_read", False),
     )
 
 

@@ -25,15 +25,6 @@ WATCH_S = 0.2  # how often torque and watchdog registers are looked at while all
 class Watch(SessionWatch[Axis]):
     """The watch over two servos, from when they were made ready until the line is given up.
 
-    Parameters
-    ----------
-    pair
-        The servos, ready.
-    head
-        What the configuration says.
-    reboots
-        Counted over all lines of this head.
-
     Attributes
     ----------
     tripped
@@ -70,12 +61,8 @@ class Watch(SessionWatch[Axis]):
     def look(self) -> None:
         """Look now and then, and after every silence, whether a watchdog has tripped or torque is gone.
 
-        Raises
-        ------
-        GivenUp
-            If something set or restarted the servos that was not this driver.
-        NoReply, Refused, LineLost, BadReply
-            If a servo cannot be asked.
+        Raises GivenUp if something set or restarted the servos that was not this driver; NoReply, Refused,
+        LineLost, BadReply.
         """
         now_s = self._clock.now_s()
         errors = any(axis.hardware_error for axis in self._pair.axes)
@@ -91,6 +78,7 @@ class Watch(SessionWatch[Axis]):
                 self._note_trip()
             for axis, value in zip(self._pair.axes, values, strict=True):
                 self._judge(axis, register, value)
+        errors = any(axis.hardware_error for axis in self._pair.axes)
         for axis in self._pair.axes:
             if (words := axis.motion.other_goal_words()) and not self.tripped and not errors:
                 raise _distrust(words)
@@ -109,11 +97,14 @@ class Watch(SessionWatch[Axis]):
         return bool(value) == axis.motion.holds
 
     def _judge(self, axis: Axis, register: str, value: int | None) -> None:
-        """Give up if a register is not as it was left."""
+        """Give up if a register is not as it was left, and the servo does not report why; as `note_alert`."""
         if value is None or axis.hardware_error:
             return  # asked again soon, or known
         tripped = register == "bus_watchdog" and value == WATCHDOG_TRIPPED
         if not tripped and not self._as_left(axis, register, value):
+            if axis.servo.get("hardware_error"):  # since it was polled
+                self.note_alert(axis)
+                return
             raise _distrust(f"{axis.servo.name} has {value} in {register}")
 
     def _note_trip(self) -> None:
@@ -149,14 +140,8 @@ class Watch(SessionWatch[Axis]):
     def note_alert(self, axis: Axis) -> None:
         """A servo reports a hardware error: brake both axes, say which error it is, follow the reboot policy.
 
-        Not every hardware error switches the torque off, so the axis itself is braked too.
-
-        Raises
-        ------
-        GivenUp
-            To have the servo rebooted when it is made ready again.
-        NoReply, Refused, LineLost, WrongDevice
-            As `Servo.get` and `Servo.set`.
+        Not every hardware error switches the torque off, so the axis itself is braked too. Raises GivenUp (to
+        have the servo rebooted when it is made ready again); NoReply, Refused, LineLost, WrongDevice.
         """
         self._pair.brake()
         error = axis.servo.get("hardware_error")

@@ -17,13 +17,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drivers.approach import legs_to
-from drivers.errors import WrongDevice
+from drivers.errors import OutOfRange, WrongDevice
 from drivers.flir_ptu.options import DEVICE, AxisOptions
 
 log = logging.getLogger(__name__)
 
 ARCSEC_RAD = math.pi / 180 / 3600
 SAME_RESOLUTION = 0.005
+SAME_SPEED = 1e-6
+"""Positions a second that rounding may take from a speed which was given in radians."""
 IN_POSITION = 1
 """Positions by which an encoder-corrected axis may tremble around its target."""
 STALL_S = 1.0
@@ -56,8 +58,6 @@ class StepAxis:
     ----------
     name
         ``pan`` or ``tilt``.
-    options
-        Of the configuration.
     resolution_arcsec
         The size of one position, by the unit.
 
@@ -134,11 +134,21 @@ class StepAxis:
             )
 
     def speed_from_rad(self, speed_rad_per_s: float | None) -> int:
-        """Return a speed in positions a second, within what the unit does."""
+        """Return a speed in positions a second, rounded down, and at most the unit's fastest.
+
+        Raises OutOfRange for a speed below the unit's slowest.
+        """
         if speed_rad_per_s is None:
             return self.usual_speed
-        wanted = min(speed_rad_per_s / self.position_rad, self.fastest)
-        return max(math.ceil(self.slowest), 1, math.floor(wanted))
+        slowest = max(math.ceil(self.slowest), 1)
+        wanted = math.floor(min(speed_rad_per_s / self.position_rad + SAME_SPEED, self.fastest))
+        if wanted < slowest:
+            least = math.ceil(1e5 * slowest * self.position_rad) / 1e5
+            raise OutOfRange(
+                f"speed {speed_rad_per_s:g} rad/s is below the {least:g} rad/s at which the unit's "
+                f"{self.name} axis turns slowest; ask for a higher speed"
+            )
+        return wanted
 
     def way_to(self, angle_rad: float) -> tuple[int, int | None]:
         """Return the first target and the one after it, so that the goal is reached from the right side."""

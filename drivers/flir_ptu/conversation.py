@@ -71,8 +71,6 @@ class Conversation:
     ----------
     line
         Open; closed by `close`.
-    device
-        The head's name in errors.
     on_hit
         Called with the axis, ``pan`` or ``tilt``, whenever an unrequested limit hit comes.
     clock
@@ -111,14 +109,8 @@ class Conversation:
     def in_step(self) -> dict[str, float]:
         """Throw away what is under way, and return the resolutions, seconds of arc a position.
 
-        Raises
-        ------
-        NoReply
-            If the unit does not answer.
-        Refused
-            If it does not know its resolution, as an E46 before its first reset.
-        LineLost
-            If the line is gone.
+        Raises Refused if it does not know its resolution, as an E46 before its first reset; NoReply,
+        LineLost.
         """
         self._quiet()
         found, manners = self._resolutions()
@@ -134,16 +126,8 @@ class Conversation:
     def ask(self, query: Query) -> float:
         """Return the number that answers a query.
 
-        Raises
-        ------
-        NoReply
-            If the answer did not come in time.
-        BadReply
-            If something came that is not its answer.
-        Refused
-            If the unit will not.
-        LineLost
-            If the line is gone.
+        Raises NoReply if the answer did not come in time; BadReply if something came that is not its answer;
+        Refused if the unit will not; LineLost.
         """
         text = self._exchange(query.letters, self.reply_s)
         number = number_of(text, query.words, bool(self._manners.verbose))
@@ -184,12 +168,8 @@ class Conversation:
     def reset(self, patience_s: float) -> None:
         """Have the unit find its limits again (``R``): both axes sweep their full range.
 
-        Raises
-        ------
-        NoReply
-            If it is not done within ``patience_s`` seconds.
-        Refused, LineLost
-            If the unit will not, or is gone.
+        Raises NoReply if it is not done within ``patience_s`` seconds; Refused, LineLost if the unit will
+        not, or is gone.
         """
         self._quiet()
         self._line.write(b"R ")
@@ -201,12 +181,7 @@ class Conversation:
         """Send a command beside a call under way, from any thread.
 
         That call gets its answer, and `StopCameFirst` with its next question; then `shouted` takes this
-        one's.
-
-        Raises
-        ------
-        LineLost
-            If the line is gone.
+        one's. Raises LineLost.
         """
         ordered = self._order.acquire(timeout=ORDER_S)
         try:
@@ -220,12 +195,8 @@ class Conversation:
         """Take the answer of what was shouted; return whether it was a good one, and nothing else came.
 
         A unit answers in order, and echoes letter by letter which question it answers: so both sides are in
-        step still. If anything is otherwise, or nothing was shouted, `tell` says what is to be done.
-
-        Raises
-        ------
-        LineLost
-            If the line is gone.
+        step still. If anything is otherwise, or nothing was shouted, `tell` says what is to be done. Raises
+        LineLost.
         """
         if not (self._shouts and self._in_step and self._manners.exact):
             return False

@@ -1,7 +1,8 @@
 """Driver ``flir_ptu``: Directed Perception / FLIR D46, D47, D48E and E46 as a `drivers.interfaces.PanTilt`.
 
-It has no thread. The caller waits for the unit, never longer than a few reply times. It is not responsible
-for the service's soft limits and not for the decision what to do about a fault: it reports.
+The caller waits for the unit, never longer than a few reply times. A thread runs only while an axis is on its
+way to where an approach begins, and sends it on from there; reading moves nothing. The driver is not
+responsible for the service's soft limits and not for the decision what to do about a fault: it reports.
 
 - Both axes start together: the goals are sent in slaved mode (``S``) and begin with ``I``. Each step is
   confirmed by the unit's echo, so a goal that was garbled on the way never starts. ``A`` is not used, since
@@ -28,13 +29,15 @@ from drivers.flir_ptu.conversation import Conversation, StopCameFirst
 from drivers.flir_ptu.options import DEVICE, Options, options_from
 from drivers.flir_ptu.unit import SupplyWatch, checked_version, measure, ready_axes
 from drivers.goals import check_goal
-from drivers.interfaces import AxisMotion, Reading
+from drivers.interfaces import AxisMotion, HeadInfo, PanTilt, Reading
+from drivers.registry import Driver
 from drivers.serial_line import OpenLine, SerialLine
 
 log = logging.getLogger(__name__)
 
 SILENT_CALLS = 5  # calls without an answer, after which the line is opened anew
 STOP_OVER_S = 1.0  # how long a reading waits for the stop that it gave way to
+LEG_POLL_S = 0.05  # how often an axis that is to go on from where its approach begins is looked at
 GIVING_WAY_S = 2.0  # how long a reading begins anew where one stop comes after another
 
 
@@ -43,6 +46,9 @@ def open_head(
 ) -> FlirPtu:
     """Return the open head that the options name.
 
+    Raises BadOptions for options that cannot be used; WrongDevice if what answers does not fit them;
+    LineLost, NoReply, BadReply, Refused.
+
     Parameters
     ----------
     options
@@ -50,33 +56,18 @@ def open_head(
     clock
         Stamps the readings, and deadlines run on it if it goes on by itself; the machine's monotonic clock
         when left out.
-    open_line
-        How its line is opened.
-
-    Raises
-    ------
-    BadOptions
-        For options that cannot be used.
-    WrongDevice
-        If what answers does not fit them.
-    LineLost, NoReply, BadReply, Refused
-        If the unit cannot be reached.
     """
     return FlirPtu(options_from(options), clock or SystemClock(), open_line)
 
 
-class FlirPtu:
+class FlirPtu(PanTilt):
     """An open unit; safe to use from any thread. Opening stops it and moves nothing.
 
     Attributes
     ----------
     version
         The unit's own description.
-    stops_beside
-        A stop is confirmed sooner beside a call under way than after it.
     """
-
-    stops_beside = True
 
     def __init__(self, options: Options, clock: Clock, open_line: OpenLine) -> None:
         self._options = options
@@ -86,6 +77,8 @@ class FlirPtu:
         self._turn = ClockLock(self._time)
         self._stop_over = self._time.signal()
         self._stop_asked = False
+        self._finishing = False  # whether a thread sends last stretches
+        self._leg_due = False  # whether it waits for its turn: readings one after another leave it none
         self._count = StepCount()
         self._supply = SupplyWatch(options, self._time)
         self._absence = Absence()
@@ -100,17 +93,15 @@ class FlirPtu:
     def read(self) -> Reading:
         """Return where the axes are. A stop that comes meanwhile goes first.
 
-        Raises
-        ------
-        NoReply, BadReply
-            If the unit is silent, or says what cannot be true.
-        LineLost
-            If the line is gone; a later call opens it anew.
-        WrongDevice
-            If what answers after that does not fit the options any more.
+        Raises NoReply, BadReply if the unit is silent, or says what cannot be true; LineLost if the line is
+        gone; a later call opens it anew; WrongDevice if what answers after that does not fit the options any
+        more.
         """
         until_s = self._time.now_s() + GIVING_WAY_S
         while True:
+            with self._stop_over:
+                if self._leg_due:
+                    self._stop_over.wait(STOP_OVER_S)
             try:
                 return self._read()
             except StopCameFirst:  # several stops may come into one reading
@@ -126,8 +117,6 @@ class FlirPtu:
             time_s = measure(talk, pan, tilt, self._clock)
             if self._count.halt_owed:
                 self._halt(talk)
-            for axis in (pan, tilt):
-                self._go_on(talk, axis)
             settled = all(axis.settled(self._options.settle_s) for axis in (pan, tilt))
             if settled:  # a moving head is asked for nothing but its place
                 with suppress(NoReply, BadReply):  # the place is known; the supply is asked for again
@@ -135,12 +124,13 @@ class FlirPtu:
             return Reading(pan.angle_rad, tilt.angle_rad, not settled, time_s, self._faults())
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
-        """Start both axes together towards the nearest positions; readings carry an approach on.
+        """Start both axes together towards the nearest positions; a thread carries an approach on.
 
         Raises
         ------
         OutOfRange
-            For an angle outside the limits or a speed that is no positive number; nothing was sent.
+            For an angle outside the limits, or a speed that is no positive number or below the unit's
+            slowest (31 positions/s); nothing moves. Speeds between are rounded down.
         HardwareFault
             If the unit has lost count of its position.
         Refused
@@ -155,9 +145,10 @@ class FlirPtu:
             if self._count.lost:
                 raise HardwareFault("; ".join(self._count.lost.values()), device=DEVICE)
             ways = {name: axis.way_to(goals[name]) for name, axis in self._axes.items()}
-            for axis in self._axes.values():
+            speeds = {name: axis.speed_from_rad(speed_rad_per_s) for name, axis in self._axes.items()}
+            for name, axis in self._axes.items():
                 axis.next_target = None
-                self._set_speed(talk, axis, axis.speed_from_rad(speed_rad_per_s))
+                self._set_speed(talk, axis, speeds[name])
             talk.tell("S")
             for name, (target, _) in ways.items():
                 talk.tell(f"{name[0].upper()}P{target}")
@@ -168,9 +159,13 @@ class FlirPtu:
                 raise DriverError("a stop came before the move was started", device=DEVICE)
             for name, axis in self._axes.items():
                 axis.sent(ways[name][0], self._clock.now_s())
+            self._supply.due_s = 0.0  # what the way drew from it is judged where it ends
             talk.tell("I")
             for name, axis in self._axes.items():
                 axis.next_target = ways[name][1]
+            if self._has_legs and not self._finishing:
+                self._finishing = True
+                self._time.thread(self._finish, f"{DEVICE} approach").start()
 
     def stop(self) -> None:
         """Halt both axes; they hold where they come to rest, and no second leg of a move follows.
@@ -178,12 +173,7 @@ class FlirPtu:
         If another call is under way, anything has to be asked first, or unrequested bytes came, the halt goes
         out at once. A call under way gets the answer that it waits for, and then gives way; where anything
         else comes, the halt goes out again in order. A line that is away is tried at once: a unit has no
-        watchdog that silence would trip.
-
-        Raises
-        ------
-        NoReply, BadReply, LineLost
-            If the unit did not confirm.
+        watchdog that silence would trip. Raises NoReply, BadReply, LineLost if the unit did not confirm.
         """
         self._stop_asked = True
         free = self._turn.acquire(blocking=False)
@@ -297,9 +287,10 @@ class FlirPtu:
 
     # The unit
 
-    def axis_motion(self) -> dict[str, AxisMotion]:
-        """Return how each axis moves: the unit's acceleration when it was made ready, and its approach."""
-        return {
+    @property
+    def info(self) -> HeadInfo:
+        """How each axis moves: the unit's acceleration when it was made ready, and its approach."""
+        motion = {
             name: AxisMotion(
                 axis.acceleration * axis.position_rad,
                 axis.options.approach_rad,
@@ -308,6 +299,7 @@ class FlirPtu:
             )
             for name, axis in self._axes.items()
         }
+        return HeadInfo(stops_beside=True, motion=motion)
 
     def _set_speed(self, talk: Conversation, axis: StepAxis, speed: int) -> None:
         """Set an axis's speed unless it is set already."""
@@ -341,11 +333,43 @@ class FlirPtu:
         for axis in self._axes.values():
             axis.next_target = None
 
-    def _go_on(self, talk: Conversation, axis: StepAxis) -> None:
-        """Send an axis that is where its approach begins to its goal."""
-        if axis.next_target is not None and axis.at_target and not self._stop_asked:
-            talk.tell(f"{axis.name[0].upper()}P{axis.next_target}")
-            axis.sent(axis.next_target, self._clock.now_s())
+    @property
+    def _has_legs(self) -> bool:
+        """Whether an axis is on its way to where an approach begins."""
+        return any(axis.next_target is not None for axis in self._axes.values())
+
+    def _finish(self) -> None:
+        """Send each axis on its last stretch when it is where that begins, whether or not a client reads."""
+        while True:
+            self._time.sleep(LEG_POLL_S)
+            self._leg_due = True
+            with self._turn:
+                self._leg_due = False
+                if self._closed or self._talk is None:  # a line that comes back halts the unit first
+                    self._forget_legs()
+                elif self._has_legs:
+                    try:
+                        self._go_on()
+                    except DriverError as error:  # a stop came, or the client's next call reports it
+                        log.debug("%s: %s", DEVICE, error)
+                self._finishing = self._has_legs
+                ended = not self._finishing
+            with self._stop_over:
+                self._stop_over.notify_all()
+            if ended:
+                return
+
+    def _go_on(self) -> None:
+        """Send the axes that are where their approach begins to their goals. Raises DriverError."""
+        with self._talking() as talk:
+            pan, tilt = self._axes["pan"], self._axes["tilt"]
+            since_s = self._clock.now_s() - LEG_POLL_S
+            if any(axis.seen is None or axis.seen.time_s < since_s for axis in (pan, tilt)):
+                measure(talk, pan, tilt, self._clock)
+            for axis in (pan, tilt):
+                if axis.next_target is not None and axis.at_target and not self._stop_asked:
+                    talk.tell(f"{axis.name[0].upper()}P{axis.next_target}")
+                    axis.sent(axis.next_target, self._clock.now_s())
 
     def _faults(self) -> tuple[str, ...]:
         """What is wrong, in plain words."""
@@ -358,14 +382,9 @@ def halt(
 ) -> list[str]:
     """Halt both axes, and see that the unit took it; it holds where that ends. Sets nothing.
 
-    ``clock`` and ``open_line`` are as of `drivers.flir_ptu.head.open_head`.
-
-    Raises
-    ------
-    BadOptions
-        For options that cannot be.
-    LineLost, NoReply, BadReply, Refused
-        If it was not confirmed; the command has been sent twice all the same, unless the line is lost.
+    ``clock`` and ``open_line`` are as of `drivers.flir_ptu.head.open_head`. Raises BadOptions for options
+    that cannot be; LineLost, NoReply, BadReply, Refused if it was not confirmed; the command has been sent
+    twice all the same, unless the line is lost.
     """
     read = options_from(options)
     line = open_line(read.port, read.baud, DEVICE)
@@ -379,3 +398,8 @@ def halt(
     finally:
         talk.close()
     return ["pan and tilt halted (H), confirmed"]
+
+
+DRIVER = Driver(
+    lambda options, context: open_head(options, context.clock), read_options=options_from, halt=halt
+)

@@ -11,6 +11,7 @@ from drivers.approach import APPROACHES, ApproachedAxis
 from drivers.options import OptionReader
 
 DEVICE = "flir_ptu"
+# The manuals name 9600 (default) and 38,400 (4.7.1); that a unit takes the others was seen in no source.
 BAUDS = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 PORTS = "a serial device such as /dev/ttyUSB0, socket://HOST:4000 or rfc2217://HOST:PORT"
 
@@ -64,10 +65,8 @@ class Options:
 def options_from(values: Mapping[str, Any]) -> Options:
     """Return the options that a configuration holds.
 
-    Raises
-    ------
-    BadOptions
-        For an unknown or missing key or a value that cannot be: which, what it is, what would be right.
+    Raises BadOptions for an unknown or missing key or a value that cannot be: which, what it is, what would
+    be right.
     """
     read = OptionReader(values, Options.__dataclass_fields__, ("port", "pan", "tilt"))
     port = read.text("port", PORTS)

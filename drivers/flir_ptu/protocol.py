@@ -54,8 +54,6 @@ class PtuAnswer:
     ----------
     good
         ``*``, as opposed to ``!``.
-    text
-        The words behind it.
     echo
         Whether the command stood in front.
     exact
@@ -99,8 +97,6 @@ def answer_of(line: bytes, command: str) -> PtuAnswer | None:
     ----------
     line
         Without its end; limit hits in it are passed over.
-    command
-        The command that was sent, without its delimiter.
     """
     rest, echo, exact = without_hits(line), False, False
     if not all(32 <= byte < 127 for byte in rest):
@@ -121,8 +117,6 @@ def number_of(text: str, words: tuple[str, ...], verbose: bool) -> float | None:
 
     Parameters
     ----------
-    text
-        The answer's text.
     words
         Lower-case words that a verbose answer to this query holds: ``("current", "pan", "position")``.
     verbose

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from drivers.clock import Clock
-from drivers.errors import BadReply, Refused, WrongDevice
+from drivers.errors import BadReply, OutOfRange, Refused, WrongDevice
 from drivers.flir_ptu import protocol as ask
 from drivers.flir_ptu.axis import SeenPosition, StepAxis
 from drivers.flir_ptu.conversation import Conversation
@@ -46,12 +46,8 @@ _DEGREES_F = re.compile(r"(-?\d+(?:\.\d+)?) ?(?:deg)?F\b")
 def measure(talk: Conversation, pan: StepAxis, tilt: StepAxis, clock: Clock) -> float:
     """Ask for both positions until they can be taken, have the axes take them, and return their moment.
 
-    Raises
-    ------
-    BadReply
-        If the positions contradict each other, or as `Conversation.ask`.
-    NoReply, Refused, LineLost
-        As `Conversation.ask`.
+    Raises BadReply if the positions contradict each other, or as `Conversation.ask`; NoReply, Refused,
+    LineLost.
     """
     asked: dict[StepAxis, list[SeenPosition]] = {tilt: [], pan: []}
     at_rest: dict[StepAxis, SeenPosition] = {}
@@ -133,17 +129,13 @@ def _bend_rad(axis: StepAxis, four: Sequence[SeenPosition]) -> float:
 def checked_version(talk: Conversation, options: Options, known: str) -> str:
     """Return what the unit says about itself.
 
+    Raises WrongDevice if it is another unit, or an E46 and the options do not say its resolutions; NoReply,
+    BadReply, Refused, LineLost.
+
     Parameters
     ----------
     known
         Its earlier answers; empty if it was not asked yet.
-
-    Raises
-    ------
-    WrongDevice
-        If it is another unit, or an E46 and the options do not say its resolutions.
-    NoReply, BadReply, Refused, LineLost
-        As `Conversation.tell`.
     """
     version = talk.sure_text("V")
     if known and version != known:
@@ -167,19 +159,14 @@ def ready_axes(
 ) -> dict[str, StepAxis]:
     """Halt the unit, set its limits and speeds, and return its axes, by name, as they are seen now.
 
+    Raises WrongDevice if it does not fit the options; NoReply, BadReply, Refused, LineLost.
+
     Parameters
     ----------
     resolutions
         The size of a position, by the unit, seconds of arc.
     known
         The axes before the unit or its line was away, whose usual speeds are kept; empty the first time.
-
-    Raises
-    ------
-    WrongDevice
-        If it does not fit the options.
-    NoReply, BadReply, Refused, LineLost
-        As `Conversation.ask` and `Conversation.tell`.
     """
     talk.tell("H")
     _try(talk, "CI")  # goals are positions, not speeds
@@ -198,7 +185,10 @@ def ready_axes(
     for name, axis in axes.items():
         axis.fastest, axis.slowest = talk.sure(ask.FASTEST[name]), talk.sure(ask.SLOWEST[name])
         if options.speed_rad_per_s is not None:
-            axis.usual_speed = axis.speed_from_rad(options.speed_rad_per_s)
+            try:
+                axis.usual_speed = axis.speed_from_rad(options.speed_rad_per_s)
+            except OutOfRange as error:
+                raise WrongDevice(f"options.speed_rad_per_s: {error}", device=DEVICE) from None
         elif name in known:
             axis.usual_speed = known[name].usual_speed
         else:
@@ -273,6 +263,8 @@ class SupplyWatch:
     ----------
     words
         The faults, in plain words; empty if there are none, or the unit does not report them.
+    due_s
+        When it is judged next, on the clock.
     """
 
     def __init__(self, options: Options, clock: Clock) -> None:
@@ -280,7 +272,7 @@ class SupplyWatch:
         self._options = options
         self._clock = clock
         self._at_start: Supply | None = None  # None: this unit does not tell
-        self._due_s = 0.0
+        self.due_s = 0.0
 
     def begin(self, talk: Conversation) -> None:
         """Ask what there is, unless that is known; raises as `Conversation.tell`."""
@@ -293,7 +285,7 @@ class SupplyWatch:
 
     def look(self, talk: Conversation) -> None:
         """Ask and judge now and then; a fault counts only if it is measured twice. Raises as `begin`."""
-        if self._at_start is None or self._clock.now_s() < self._due_s:
+        if self._at_start is None or self._clock.now_s() < self.due_s:
             return
         words: tuple[str, ...] = ()
         for _ in range(2):
@@ -303,7 +295,7 @@ class SupplyWatch:
             words = supply_words(supply, self._at_start, self._options)
             if not words:
                 break
-        self.words, self._due_s = words, self._clock.now_s() + SUPPLY_EVERY_S
+        self.words, self.due_s = words, self._clock.now_s() + SUPPLY_EVERY_S
 
 
 def _supply(talk: Conversation) -> Supply | None:

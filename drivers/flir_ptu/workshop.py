@@ -44,12 +44,8 @@ class Facts:
 def facts(port: str, baud: int, clock: Clock | None = None, open_line: OpenLine = SerialLine) -> Facts:
     """Return what a unit says about itself. Moves nothing.
 
-    ``clock`` and ``open_line`` are as of `drivers.flir_ptu.head.open_head`.
-
-    Raises
-    ------
-    LineLost, NoReply, BadReply, Refused
-        If it cannot be talked to.
+    ``clock`` and ``open_line`` are as of `drivers.flir_ptu.head.open_head`. Raises LineLost, NoReply,
+    BadReply, Refused.
     """
     with _talking(open_line(port, baud, DEVICE), clock) as talk:
         return _facts(talk)
@@ -59,12 +55,8 @@ def home(port: str, baud: int, clock: Clock | None = None, open_line: OpenLine =
     """Reset a unit: both axes SWEEP THEIR FULL RANGE, whatever limits are set, and end at position 0.
 
     Takes up to half a minute. Afterwards the unit knows its positions and its resolution. ``clock`` and
-    ``open_line`` are as of `drivers.flir_ptu.head.open_head`.
-
-    Raises
-    ------
-    LineLost, NoReply, BadReply, Refused
-        If it does not come through.
+    ``open_line`` are as of `drivers.flir_ptu.head.open_head`. Raises LineLost, NoReply, BadReply, Refused if
+    it does not come through.
     """
     with _talking(open_line(port, baud, DEVICE), clock) as talk:
         talk.reset(HOMING_S)

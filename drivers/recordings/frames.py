@@ -26,10 +26,12 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from calib.errors import CalibError
-from calib.files import pds3, read_bytes
+from calib.files import read_bytes
+from calib.files.pictures import decode_picture
 from drivers.errors import BadFrame, BadOptions
 from drivers.interfaces import Image
 from drivers.recordings.mcap_file import BadRecording, McapEntry, read_at, read_items
+from drivers.recordings.pds3 import looks_like_pds3, read_product
 
 SAME_RAD = 1e-7
 """Frames whose angles differ by less were taken at one pointing; labels print no finer."""
@@ -76,10 +78,7 @@ class RecordedFrame:
     def image(self) -> Image:
         """Return the frame's picture, uint8 (h, w) or (h, w, 3) BGR, read-only.
 
-        Raises
-        ------
-        BadFrame
-            If the file cannot be read any more.
+        Raises BadFrame if the file cannot be read any more.
         """
         try:
             pixels = _pixels(self.path)
@@ -123,7 +122,7 @@ def read_products(
     first: tuple[str, tuple[int, int]] | None = None
     for path in paths:
         try:
-            product = pds3.read_product(path)
+            product = read_product(path)
         except CalibError as error:
             raise BadOptions(str(error), device="replay") from None
         pan_rad, tilt_rad = product.azimuth_measured_rad, product.elevation_measured_rad
@@ -131,7 +130,7 @@ def read_products(
             raise BadOptions(f"{path}: the label has no measured mast angles", device="replay")
         if product.image is None:
             raise BadOptions(f"{path}: {'; '.join(product.notes) or 'there is no image'}", device="replay")
-        this = (str(product.label.root.values.get("INSTRUMENT_ID", "")), product.size_px)
+        this = (str(product.label.values.get("INSTRUMENT_ID", "")), product.size_px)
         if first is None:
             first = this
         if this != first:
@@ -145,11 +144,8 @@ def read_products(
 def read_folder(path: Path, grey_range_dn: tuple[float, float] | None = None) -> list[RecordedPointing]:
     """Return the pointings of a CSV ``camera,pan_rad,tilt_rad,file`` with image files beside it.
 
-    Raises
-    ------
-    BadOptions
-        For a malformed row, an image that cannot be read, images of several sizes from one camera, or two
-        frames of one camera at the same angles.
+    Raises BadOptions for a malformed row, an image that cannot be read, images of several sizes from one
+    camera, or two frames of one camera at the same angles.
     """
     rows = _rows(path)
     samples: dict[str, list[NDArray[np.generic]]] = {}
@@ -210,8 +206,8 @@ def _pixels(path: Path) -> NDArray[np.generic]:
     """The pixels of a PDS3 product or an ordinary image file."""
     try:
         data = read_bytes(path, MAX_IMAGE_BYTES)
-        if pds3.looks_like_pds3(data):
-            image: NDArray[np.generic] | None = pds3.read_product(path).image
+        if looks_like_pds3(data):
+            image: NDArray[np.generic] | None = read_product(path).image
         else:
             image = _decoded(data)
     except CalibError as error:
@@ -225,13 +221,10 @@ def _pixels(path: Path) -> NDArray[np.generic]:
 
 def _decoded(data: bytes) -> NDArray[np.generic] | None:
     """Decode an image file; grey stays grey, colour is BGR, 16 bits stay 16. None if it is no image."""
-    if not data:
-        return None
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), HOW)
-    except cv2.error:
+        return decode_picture(data, HOW)
+    except ValueError:
         return None
-    return None if image is None else np.asarray(image)
 
 
 def _rows(path: Path) -> list[tuple[str, str, float, float, Path]]:
@@ -291,8 +284,6 @@ class McapFrame:
     ----------
     facts
         The facts beside the image (topic ``/camera/NAME/frame``).
-    path, entry
-        Where its picture is.
     """
 
     facts: Mapping[str, Any]
@@ -316,13 +307,13 @@ class McapFrame:
 def recording_files(path: Path) -> list[Path]:
     """Return the files of a recording: itself, or those in a folder, in the order in which they were made.
 
-    Raises
-    ------
-    BadRecording
-        If there is nothing.
+    Raises BadRecording if there is nothing.
     """
-    files = sorted(one for one in path.iterdir() if one.suffix == SUFFIX) if path.is_dir() else [path]
-    if not files or not files[0].is_file():
+    if path.is_dir():
+        files = sorted(one for one in path.iterdir() if one.suffix == SUFFIX and one.is_file())
+    else:
+        files = [path] if path.is_file() else []
+    if not files:
         raise BadRecording(f"{path}: there is no recording; an MCAP file or a folder of them is expected")
     return files
 
@@ -348,10 +339,8 @@ def read_frames(path: Path) -> Iterator[McapFrame]:
 def read_recording(path: Path) -> list[RecordedPointing]:
     """Return where the head rested in a recording, and the last frame of each camera there.
 
-    Raises
-    ------
-    BadOptions
-        If there is no recording, it cannot be read, or no frame in it was taken by a head at rest.
+    Raises BadOptions if there is no recording, it cannot be read, or no frame in it was taken by a head at
+    rest.
     """
     places: dict[tuple[int, int], RecordedPointing] = {}
     try:
@@ -377,7 +366,7 @@ def _facts(data: bytes) -> dict[str, Any] | None:
         told = json.loads(data)
         numbers = [float(told[name]) for name in ("pan_rad", "tilt_rad", "mid_exposure_s")]
         whole = isinstance(told["camera"], str) and isinstance(told["frame_id"], str) and "moving" in told
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None
     return told if whole and np.isfinite(numbers).all() else None
 
@@ -386,11 +375,8 @@ def _recorded_image(schema: str, data: bytes, colour: bool) -> Image:
     """A picture's pixels. Raises ValueError, DecodeError."""
     if schema == "foxglove.CompressedImage":
         flags = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
-        content = np.frombuffer(CompressedImage.FromString(data).data, np.uint8)
-        image = cv2.imdecode(content, flags | cv2.IMREAD_IGNORE_ORIENTATION) if content.size else None
-        if image is None:
-            raise ValueError("the recorded picture cannot be decoded")
-        return np.asarray(image, dtype=np.uint8)
+        content = CompressedImage.FromString(data).data
+        return np.asarray(decode_picture(content, flags | cv2.IMREAD_IGNORE_ORIENTATION), dtype=np.uint8)
     if schema != "foxglove.RawImage":
         raise ValueError(f"the recorded picture is of the schema {schema or 'none'}")
     raw = RawImage.FromString(data)

@@ -20,6 +20,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
 
+from calib.files import open_plain
 from drivers.errors import DriverError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -49,8 +50,6 @@ class McapContents:
         Chunks and records that were passed over because they are not what was written.
     whole_bytes
         Up to where records are whole; the rest was being written when the writer died.
-    left_over_bytes
-        How much follows there.
     """
 
     complete: bool = False
@@ -83,7 +82,7 @@ Item = Header | Attachment | Metadata | McapEntry
 def is_mcap(path: Path) -> bool:
     """Return whether a file begins like an MCAP file; False for one that cannot be read."""
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             return file.read(len(MAGIC)) == MAGIC
     except OSError:
         return False
@@ -91,13 +90,6 @@ def is_mcap(path: Path) -> bool:
 
 def read_items(path: Path, found: McapContents | None = None) -> Iterator[Item]:
     """Yield what a file holds, in its order: header, attachments, metadata, messages.
-
-    Parameters
-    ----------
-    path
-        The file.
-    found
-        Filled while the reading goes on.
 
     Raises
     ------
@@ -107,7 +99,7 @@ def read_items(path: Path, found: McapContents | None = None) -> Iterator[Item]:
     """
     told = found if found is not None else McapContents()
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             size = file.seek(0, io.SEEK_END)
             file.seek(0)
             begin = file.read(len(MAGIC))
@@ -134,7 +126,7 @@ def read_at(path: Path, entry: McapEntry) -> bytes:
     ``entry`` may have lost its own content since it was read. Raises BadRecording.
     """
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             file.seek(entry.at)
             opcode, length = _FRAME.unpack(file.read(_FRAME.size))
             if length > LARGEST_RECORD:

@@ -21,10 +21,11 @@ from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import BadOptions, DriverError, NoFreshFrame
-from drivers.faults import PAN_TILT
-from drivers.interfaces import Camera, Frame, FrameTime, Image, PanTilt, Reading
+from drivers.faults import PAN_TILT, nearest
+from drivers.interfaces import Camera, CameraInfo, Frame, Image, PanTilt, Reading
 from drivers.options import OptionReader
 from drivers.recordings.frames import RecordedPointing, read_folder, read_products, read_recording
+from drivers.registry import Context, Driver
 
 TOLERANCE_RAD = 0.002
 """How far from a recorded pointing a move may ask, unless the options say otherwise: two Navcam pixels."""
@@ -44,17 +45,7 @@ class NoRecording(DriverError):
 
 @dataclass(frozen=True)
 class Replay:
-    """The devices of one recording.
-
-    Attributes
-    ----------
-    pan_tilt
-        The head, at the first recorded pointing.
-    cameras
-        Cameras by name.
-    pointings
-        The recorded pointings, in the order of the recording.
-    """
+    """The devices of one recording."""
 
     pan_tilt: PanTilt
     cameras: Mapping[str, Camera]
@@ -63,6 +54,8 @@ class Replay:
 
 def open_replay(options: Mapping[str, Any], folder: Path, clock: Clock) -> Replay:
     """Open a recording.
+
+    Raises BadOptions for unknown or missing options and recordings that cannot be read.
 
     Parameters
     ----------
@@ -74,13 +67,6 @@ def open_replay(options: Mapping[str, Any], folder: Path, clock: Clock) -> Repla
         ``grey_range_dn``: [low, high], what becomes black and white in frames of more than 8 bits.
     folder
         Where relative paths start.
-    clock
-        Time of readings and frames.
-
-    Raises
-    ------
-    BadOptions
-        For unknown or missing options and recordings that cannot be read.
     """
     read = OptionReader(options, OPTIONS, device="replay")
     if sum(source in options for source in SOURCES) != 1:
@@ -115,7 +101,7 @@ def open_replay(options: Mapping[str, Any], folder: Path, clock: Clock) -> Repla
     return Replay(head, MappingProxyType(cameras), tuple(pointings))
 
 
-class ReplayedHead:
+class ReplayedHead(PanTilt):
     """A head that stands at recorded pointings only; safe from any thread."""
 
     def __init__(self, pointings: Sequence[RecordedPointing], tolerance_rad: float, clock: Clock) -> None:
@@ -134,10 +120,7 @@ class ReplayedHead:
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         """Go to the recorded pointing nearest to the angles, at once, whatever the speed.
 
-        Raises
-        ------
-        NoRecording
-            If the nearest one is farther away than the tolerance, in either joint.
+        Raises NoRecording if the nearest one is farther away than the tolerance, in either joint.
         """
         apart = [max(abs(p.pan_rad - pan_rad), abs(p.tilt_rad - tilt_rad)) for p in self._pointings]
         best = min(range(len(apart)), key=apart.__getitem__)
@@ -156,7 +139,7 @@ class ReplayedHead:
         """Nothing moves in between, so there is nothing to stop."""
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Nothing is open."""
 
     def at(self, time_s: float) -> RecordedPointing:
         """Return where the head stood at a moment, seconds of the clock."""
@@ -167,7 +150,7 @@ class ReplayedHead:
             return self._stood[0][1]
 
 
-class ReplayedCamera:
+class ReplayedCamera(Camera):
     """A camera that delivers the frame recorded where the head stands; safe from any thread.
 
     Frame n is exposed at a fixed instant, so its sequence number is a function of time; a frame that was not
@@ -186,12 +169,8 @@ class ReplayedCamera:
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
         """Return the newest frame, or wait for the first whose exposure begins after ``exposed_after_s``.
 
-        Raises
-        ------
-        NoFreshFrame
-            If it does not end its exposure within ``timeout_s``, or the camera took nothing at this pointing.
-        BadFrame
-            If the recorded file cannot be read any more.
+        Raises NoFreshFrame if it does not end its exposure within ``timeout_s``, or the camera took nothing
+        at this pointing; BadFrame if the recorded file cannot be read any more.
         """
         deadline_s = self._clock.now_s() + max(0.0, timeout_s)
         while not self._closed.is_set():
@@ -212,18 +191,9 @@ class ReplayedCamera:
         raise NoFreshFrame("it is closed", device=self._name)
 
     @property
-    def period_s(self) -> float:
-        """From frame to frame, seconds."""
-        return PERIOD_S
-
-    @property
-    def trigger(self) -> str:
-        """None: each camera's instants are its own."""
-        return ""
-
-    def recent_times(self) -> list[FrameTime]:
-        """Return none: frames that are not requested are never made."""
-        return []
+    def info(self) -> CameraInfo:
+        """Its period; each camera's instants are its own."""
+        return CameraInfo(period_s=PERIOD_S)
 
     def close(self) -> None:
         """Let go; a waiting call ends with NoFreshFrame within half a second."""
@@ -255,10 +225,27 @@ def _files(read: OptionReader, folder: Path) -> list[Path]:
     products = read.values["products"]
     if isinstance(products, str):
         pattern = folder / products
-        found = sorted(pattern.parent.glob(pattern.name))
+        found = sorted(one for one in pattern.parent.glob(pattern.name) if one.is_file())
         if not found:
             raise read.refused("products", f": no file matches the pattern {str(pattern)!r}")
         return found
     if isinstance(products, list | tuple) and all(isinstance(name, str) for name in products):
         return [folder / name for name in products]
     raise read.bad("products", "a list of files or a pattern")
+
+
+def _device(options: Mapping[str, Any], context: Context) -> PanTilt | Camera:
+    """The head or a camera of a recording; devices with the same options share one."""
+    key = f"replay {sorted(options.items())!r}"
+    if key not in context.shared:
+        context.shared[key] = open_replay(options, context.folder, context.clock)
+    replay: Replay = context.shared[key]
+    if context.name == PAN_TILT:
+        return replay.pan_tilt
+    if context.name not in replay.cameras:
+        words = f"the recording has no such camera{nearest(context.name, replay.cameras)}"
+        raise BadOptions(words, device=context.name)
+    return replay.cameras[context.name]
+
+
+DRIVER = Driver(_device, hardware="replayed", any_clock=True)

@@ -60,23 +60,10 @@ A = TypeVar("A", bound=ServoAxisSettings)
 class ServoAxis(Generic[S, A]):
     """One axis while its servo is at hand.
 
-    Parameters
-    ----------
-    servo
-        Turns it.
-    clock
-        Of the line.
-    settings, head
-        What the configuration says.
-
     Attributes
     ----------
-    servo, motion
-        Who turns it, and what it is doing.
     hardware_error
         What its servo has reported, in words; empty if nothing.
-    acceleration_rad_per_s2
-        Of its profile, as the servo rounds it.
     """
 
     def __init__(self, servo: S, clock: Clock, settings: A, head: HeadSettings[Any]) -> None:

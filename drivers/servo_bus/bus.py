@@ -66,8 +66,6 @@ class Bus:
 
     Parameters
     ----------
-    name
-        Of the thread and in errors.
     between
         Called in the thread whenever nothing is asked; returns the time of the clock, seconds, at which it
         wants to run again. It must keep what goes wrong itself; what it raises is only logged.
@@ -109,10 +107,11 @@ class Bus:
     ) -> T:
         """Run ``function`` in the owner thread and return its result.
 
+        Raises NoReply if it did not end in time, and if it had not begun then, it never will; or a stop broke
+        it off; DriverError (what ``function`` raises).
+
         Parameters
         ----------
-        what
-            For errors.
         function
             Talks on the line; must end by itself in bounded time.
         timeout_s
@@ -121,13 +120,6 @@ class Bus:
             Go before everything that waits, and have what is under way break off (see `urgent`): a stop.
         moves
             Do not begin if a call with ``first`` came after this one.
-
-        Raises
-        ------
-        NoReply
-            If it did not end in time, and if it had not begun then, it never will; or a stop broke it off.
-        DriverError
-            What ``function`` raises.
         """
         if self._closing is not None:
             raise NoReply(f"{self._name} is closed; {what} was not sent")

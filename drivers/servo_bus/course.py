@@ -53,13 +53,7 @@ class Truth:
         self._last = None
 
     def check(self, sample: ServoSample) -> None:
-        """Take a sample as true.
-
-        Raises
-        ------
-        BadReply
-            If the position has leapt.
-        """
+        """Take a sample as true. Raises BadReply if the position has leapt."""
         last = self._last
         if last is not None:
             most_ms = 1000 * (sample.received_s - last.sent_s)
@@ -73,17 +67,7 @@ class Truth:
 
 
 class AxisCourse:
-    """One axis' goals and whether it has come to rest.
-
-    Parameters
-    ----------
-    name
-        For messages.
-    settings
-        The axis.
-    settle_s
-        How long it must stand.
-    """
+    """One axis' goals and whether it has come to rest."""
 
     def __init__(self, name: str, settings: ServoAxisSettings, settle_s: float) -> None:
         self.name = name

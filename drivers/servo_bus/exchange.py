@@ -47,8 +47,6 @@ class Exchange:
     ----------
     port
         Open. `Overtaken` may come from whatever asks.
-    packets
-        What is said on it.
     """
 
     def __init__(self, port: Port, packets: PacketFormat) -> None:

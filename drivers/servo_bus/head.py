@@ -18,7 +18,7 @@ from drivers.approach import rising_below_rad
 from drivers.clock import Clock, SystemClock, deadlines_on
 from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
 from drivers.goals import check_goal
-from drivers.interfaces import AxisMotion, AxisReport, Reading, Reporting
+from drivers.interfaces import AxisMotion, AxisReport, HeadInfo, PanTilt, Reading
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.bus import Bus
 from drivers.servo_bus.pair import ServoPair, SessionWatch
@@ -32,24 +32,20 @@ T = TypeVar("T")
 CALL_TIMEOUT_S = 0.8  # the service waits 1 s
 CLOSE_TIMEOUT_S = 3.0  # the service gives no more
 AXES = ("pan", "tilt")
+SETTLES_WITHIN_COUNTS = 3
 
 
-class BusHead(Reporting):
+class BusHead(PanTilt):
     """The head; every method may be called from any thread. A family of servos says how it is made ready.
+
+    Raises LineLost, NoReply, WrongDevice, HardwareFault, Refused.
 
     Parameters
     ----------
-    settings
-        What it is made of.
     clock
         Stamps the readings. Deadlines run on it too if it runs, else on the machine's.
     open_line
         Opens the line, whose waits end by the clock of the deadlines.
-
-    Raises
-    ------
-    LineLost, NoReply, WrongDevice, HardwareFault, Refused
-        As `open_head`.
     """
 
     def __init__(
@@ -72,10 +68,8 @@ class BusHead(Reporting):
     def read(self) -> Reading:
         """Return what both servos measure now.
 
-        Raises
-        ------
-        LineLost, NoReply, BadReply, WrongDevice, HardwareFault
-            If they cannot be read, at once while the line is known to be lost.
+        Raises LineLost, NoReply, BadReply, WrongDevice, HardwareFault if they cannot be read, at once while
+        the line is known to be lost.
         """
         return self._call("read", ServoSession.read)
 
@@ -142,18 +136,19 @@ class BusHead(Reporting):
         reports = {axis: motion.report() for axis, motion in zip(AXES, self._motions, strict=True)}
         return {axis: report for axis, report in reports.items() if report is not None}
 
-    def axis_motion(self) -> dict[str, AxisMotion]:
-        """Return how each axis moves: its profile, as the servo rounds it, and its approach."""
-        told = {}
+    @property
+    def info(self) -> HeadInfo:
+        """How each axis moves: its profile, as the servo rounds it, and its approach."""
+        motion = {}
         for name, axis in zip(AXES, (self.settings.pan, self.settings.tilt), strict=True):
             counts = axis.acceleration_counts(self.settings.acceleration_rad_per_s2)
-            told[name] = AxisMotion(
+            motion[name] = AxisMotion(
                 counts * axis.model.acceleration_unit_rad_per_s2,
                 axis.approach_rad,
                 rising_below_rad(axis.approach, axis.gravity_turnover_rad),
                 axis.model.count_rad,
             )
-        return told
+        return HeadInfo(motion=motion, settles_within_counts=SETTLES_WITHIN_COUNTS)
 
     # In the thread that owns the bus
 

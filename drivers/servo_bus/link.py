@@ -16,26 +16,17 @@ REPLY_TIMEOUT_S = 0.05  # USB adapters hold bytes back for up to 16 ms, the serv
 class BusLink:
     """One open line; for one thread at a time.
 
+    Raises LineLost, BadOptions.
+
     Parameters
     ----------
     port, baud, reply_timeout_s, urgent, clock, open_line
         As of `Port`; `Overtaken` may come from every method but `shout`.
-    packets
-        Their format.
 
     Attributes
     ----------
-    name
-        Of the port.
-    clock
-        That of its deadlines.
     exchange
         Asks one servo; its answers are proven by nothing.
-
-    Raises
-    ------
-    LineLost, BadOptions
-        As `Port`.
     """
 
     def __init__(
@@ -51,6 +42,7 @@ class BusLink:
         self.name = port
         self._port = Port(port, baud, reply_timeout_s, packets.take, urgent, clock=clock, open_line=open_line)
         self.clock = self._port.clock
+        self._to_nobody = packets.to_nobody
         self.exchange = Exchange(self._port, packets)
 
     @property
@@ -61,6 +53,14 @@ class BusLink:
     def set_baud(self, baud: int) -> None:
         """Open the line anew at another speed. Raises LineLost, BadOptions."""
         self._port.set_baud(baud)
+
+    def find_echo(self) -> bool:
+        """Return whether the adapter gives back what is sent; if so, that is dropped from now on.
+
+        Raises LineLost, BadReply if the line is gone, or never quiet.
+        """
+        self._port.echoes = self._port.comes_back(self._to_nobody)
+        return self._port.echoes
 
     def close(self) -> None:
         """Let go of the line; never raises."""

@@ -29,8 +29,6 @@ class ServoPair(ABC, Generic[L, X]):
     ----------
     link
         The open line; `close` closes it.
-    axes
-        Pan and tilt.
     """
 
     def __init__(self, link: L, axes: Sequence[X]) -> None:
@@ -118,11 +116,6 @@ def _hold_again(axis: ServoAxis[Any, Any]) -> None:
 
 class SessionWatch(ABC, Generic[X]):
     """Looks for what servos do by themselves, from when they were made ready until the line is given up.
-
-    Parameters
-    ----------
-    axes
-        Pan and tilt.
 
     Attributes
     ----------

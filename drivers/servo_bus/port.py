@@ -64,16 +64,10 @@ class PacketFormat:
 
     Attributes
     ----------
-    take
-        Finds replies.
     packet
         Makes an instruction of a servo's id, the instruction and its parameters.
-    read_parameters
-        Those of a read, of an address and a length.
-    status_bytes
-        The size of a reply without data.
-    words, refusals
-        Of instructions and of refusals, for messages.
+    to_nobody
+        A write to no servo, which none obeys or answers: an adapter that gives it back echoes.
     """
 
     take: Take
@@ -82,6 +76,7 @@ class PacketFormat:
     status_bytes: int
     words: Mapping[int, str]
     refusals: Mapping[int, str]
+    to_nobody: bytes
 
 
 class Overtaken(Exception):
@@ -98,40 +93,26 @@ class Overtaken(Exception):
 class Port:
     """An open line to servos, for one thread at a time.
 
+    Raises Overtaken from every method that sends or waits, while something urgent waits; not from `send_now`;
+    LineLost, BadOptions.
+
     Parameters
     ----------
     name, baud
         As of `SerialLine`.
-    reply_timeout_s
-        How long a reply may take beyond its time on the wire.
-    take
-        Finds replies in what comes in.
     urgent
         Says that something urgent waits for the line: then nothing more is sent and no wait goes on.
     clock
         Deadlines run on it; the machine's when left out. The line's own waits have to end by it too.
-    open_line
-        Opens the line.
 
     Attributes
     ----------
-    clock
-        That of the deadlines.
     suspect
         Whether a reply may still be under way: then it is listened until the line is quiet before sending.
     deadline_s
         Until when `receive` waits, seconds of the clock.
-    received_bytes
-        In all, since the line was opened.
     echoes
         Whether the adapter gives back what is sent (half duplex): then that is dropped before a reply.
-
-    Raises
-    ------
-    Overtaken
-        From every method that sends or waits, while something urgent waits; not from `send_now`.
-    LineLost, BadOptions
-        As `SerialLine`.
     """
 
     def __init__(
@@ -191,17 +172,12 @@ class Port:
     def send(self, packet: bytes, reply_bytes: int) -> float:
         """Send a packet after what came in unasked was dropped, and start the deadline of its reply.
 
+        Raises BadReply if the line is never quiet; LineLost.
+
         Returns
         -------
         float
             A moment just before it was sent, seconds of the clock.
-
-        Raises
-        ------
-        BadReply
-            If the line is never quiet.
-        LineLost
-            If it is gone.
         """
         self._fetch(0.0)
         if self.suspect or (self._past_echo() and self._buffer):
@@ -264,12 +240,7 @@ class Port:
     def drain(self, quiet_s: float = QUIET_S, longest_s: float = LONGEST_DRAIN_S) -> None:
         """Read and drop everything until the line was quiet for ``quiet_s``.
 
-        Raises
-        ------
-        BadReply
-            If it never falls quiet.
-        LineLost
-            If the line is gone.
+        Raises BadReply if it never falls quiet; LineLost.
         """
         until_s = self.clock.now_s() + longest_s
         dropped = len(self._buffer)

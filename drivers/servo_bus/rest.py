@@ -67,10 +67,7 @@ def come_to_rest(
 def halt_axes(pair: ServoPair[Any, Any]) -> list[str]:
     """Command each axis to stand, by itself, then see that those that hold do.
 
-    Raises
-    ------
-    NoReply
-        If an axis did not confirm, or still moves; the other was commanded all the same.
+    Raises NoReply if an axis did not confirm, or still moves; the other was commanded all the same.
     """
     told: dict[str, str] = {}
     failed: dict[str, object] = {}

@@ -48,12 +48,6 @@ class ServoSession:
 
     Parameters
     ----------
-    pair
-        The servos, ready.
-    watch
-        Of them.
-    head
-        What the configuration says.
     clock
         Stamps the readings; deadlines run on that of the pair's line.
 
@@ -80,12 +74,8 @@ class ServoSession:
     def look(self) -> None:
         """Read both servos and see whether they are as they should be.
 
-        Raises
-        ------
-        GivenUp
-            If the line is gone, polls failed again and again, or the servos have to be set up anew.
-        NoReply, BadReply, Refused, WrongDevice
-            If they cannot be read this time.
+        Raises GivenUp if the line is gone, polls failed again and again, or the servos have to be set up
+        anew; NoReply, BadReply, Refused, WrongDevice if they cannot be read this time.
         """
         self._poll()
         self._watch.look()
@@ -113,12 +103,7 @@ class ServoSession:
     def poll_once(self) -> None:
         """Read both servos, take their samples, and do what follows from them.
 
-        Raises
-        ------
-        GivenUp
-            If a servo has to be rebooted.
-        DriverError
-            As `Pair.samples` and `ServoAxis.go_on`.
+        Raises GivenUp if a servo has to be rebooted; DriverError.
         """
         samples = self.pair.samples()
         now_s = self._clock.now_s()
@@ -205,10 +190,7 @@ class ServoSession:
     def stop(self) -> None:
         """Brake both axes; each then holds, or lets go as soon as it stands, as its ``at_stop`` says.
 
-        Raises
-        ------
-        GivenUp
-            If a servo did not confirm: silence lets the watchdogs stop what this could not.
+        Raises GivenUp if a servo did not confirm: silence lets the watchdogs stop what this could not.
         """
         failed = self._stop_each()
         if failed:

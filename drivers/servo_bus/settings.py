@@ -73,10 +73,6 @@ class ServoAxisSettings(ApproachedAxis):
 
     Attributes
     ----------
-    servo_id, model
-        Which servo.
-    zero_counts
-        The servo's position where the axis is at zero.
     at_stop, at_close
         Whether the servo then holds, or its torque is switched off (a tilt axis may fall).
     settle_rad
@@ -113,12 +109,8 @@ class ServoAxisSettings(ApproachedAxis):
         """Return the nearest goal within the limits to where an axis stands.
 
         A few counts beyond a limit are passed (`slack_counts`): an axis that holds at its limit droops, and
-        would be locked out for good.
-
-        Raises
-        ------
-        WrongDevice
-            If it stands outside: moving from there could go the wrong way round.
+        would be locked out for good. Raises WrongDevice if it stands outside: moving from there could go the
+        wrong way round.
         """
         low, high = self.limit_counts
         if not low - self.slack_counts <= counts <= high + self.slack_counts:
@@ -149,8 +141,6 @@ class HeadSettings(Generic[A]):
     ----------
     port, baud
         The line: a serial device or a pyserial URL, and its bits per second.
-    pan, tilt
-        The axes.
     speed_rad_per_s, acceleration_rad_per_s2
         Of the profile inside the servos; the speed is also the cap of every move.
     poll_hz
@@ -197,21 +187,14 @@ def axis_values(
 ) -> tuple[OptionReader, Mapping[str, Any]]:
     """Return the reader of an axis' options, and the values of `AXIS_KEYS` as `ServoAxisSettings` has them.
 
+    Raises BadOptions for an unknown or missing key or a value that cannot be.
+
     Parameters
     ----------
-    options
-        Of the head.
     name
         ``pan`` or ``tilt``.
     model_named
         Finds a model; raises BadOptions.
-    more
-        Keys that the family of servos has beside these.
-
-    Raises
-    ------
-    BadOptions
-        For an unknown or missing key or a value that cannot be.
     """
     expected = "a mapping with id, model, zero_counts ..."
     read = options.section(name, expected, (*AXIS_KEYS, *more), ("id", "model", "limits_rad"))
@@ -242,19 +225,12 @@ def head_values(
 ) -> dict[str, Any]:
     """Return the values of a head's options as `HeadSettings` has them, without baud and patience.
 
+    Raises BadOptions for a value that cannot be.
+
     Parameters
     ----------
-    read
-        Of the head.
-    axis
-        Reads one axis.
     most_poll_hz, steepest
         Bounds of ``poll_hz`` and ``acceleration_rad_per_s2``.
-
-    Raises
-    ------
-    BadOptions
-        For a value that cannot be.
     """
     values = {
         "port": read.text("port", "a serial device such as /dev/ttyUSB0 or a URL"),
@@ -289,12 +265,8 @@ def patience_s(
 ) -> float:
     """Return how long a servo goes on after the last packet; 0: for ever.
 
-    It is short enough for the head to stand `STANDS_WITHIN_S` after the last poll, braking included.
-
-    Raises
-    ------
-    BadOptions
-        If it is too long, or none is short enough.
+    It is short enough for the head to stand `STANDS_WITHIN_S` after the last poll, braking included. Raises
+    BadOptions if it is too long, or none is short enough.
     """
     speed, acceleration = head["speed_rad_per_s"], head["acceleration_rad_per_s2"]
     brakes_s = speed / acceleration

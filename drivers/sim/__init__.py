@@ -1,1 +1,49 @@
-"""The simulated rover: a true rig, true servos and a true scene, which the service never reads."""
+"""The simulated rover, and its driver ``sim``: the head and the cameras that a configuration names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from drivers.errors import BadOptions
+from drivers.faults import PAN_TILT, nearest
+from drivers.interfaces import Camera, PanTilt
+from drivers.registry import Context, Driver
+
+if TYPE_CHECKING:
+    from drivers.sim.rover import SimulatedRover
+
+ROVER = "simulated rover"
+"""The key of the rover among what the devices share."""
+
+
+def _device(options: Mapping[str, Any], context: Context) -> PanTilt | Camera:
+    name = context.name
+    if options:
+        raise BadOptions(
+            f"driver 'sim' has no option {next(iter(options))!r}; "
+            "the simulated rover is set up in the section 'simulation'",
+            device=name,
+        )
+    rover = _rover(context)
+    if name == PAN_TILT:
+        return rover.pan_tilt
+    if name not in rover.cameras:
+        raise BadOptions(f"the simulated rover has no such camera{nearest(name, rover.cameras)}", device=name)
+    from drivers.sim.cameras import HangingCamera
+
+    return HangingCamera(rover.cameras[name], rover.sensor_modes[name], context.clock, rover.faults)
+
+
+def _rover(context: Context) -> SimulatedRover:
+    if ROVER not in context.shared:
+        from drivers.sim.rover import SimulatedRover
+        from drivers.sim.settings import simulation_settings
+
+        settings = simulation_settings(context.simulation, context.folder)
+        context.shared[ROVER] = SimulatedRover(settings, context.clock)
+    rover: SimulatedRover = context.shared[ROVER]
+    return rover
+
+
+DRIVER = Driver(_device, hardware="simulated", any_clock=True)

@@ -57,10 +57,6 @@ def load_after_rad(
 
     Parameters
     ----------
-    before_rad, to_rad
-        The load before, and the shaft now.
-    gap_rad
-        Full width of the play.
     turnover_rad
         Load angle at which the centre of mass is straight above the axis.
     friction
@@ -119,12 +115,6 @@ class AxisSettings:
     ----------
     count_rad
         One encoder count or motor step.
-    backlash_rad
-        Full width of the gap between motor and load.
-    low_rad, high_rad
-        Goals that the device accepts.
-    speed_rad_per_s, acceleration_rad_per_s2
-        Largest speed, and the acceleration of every move.
     approach_rad
         0: the shortest way. Positive: every goal is reached moving in the positive direction, over at least
         this distance, which has to be more than the backlash.

@@ -1,4 +1,4 @@
-"""Boards that a person holds up before the simulated rover: anywhere, moved while it runs, and bent.
+"""Boards before the simulated rover: placed by its configuration, or moved while it runs, and bent.
 
 They are drawn over the picture of the scene, by where each pixel's ray meets the board, and hide what is
 behind them; nothing of the scene hides them and they throw no shadow.
@@ -6,8 +6,9 @@ behind them; nothing of the scene hides them and they throw no shadow.
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -20,7 +21,7 @@ from calib.geometry.rigid import Rigid, rot_x, rot_y, rot_z
 from calib.targets.boards import FLAT, AnyBoard, Bow
 from calib.targets.pattern import pattern_of
 from drivers.errors import BadOptions
-from drivers.sim.placed import REACH_M
+from drivers.sim.placed import REACH_M, PlacedBoard
 from drivers.sim.render import DrawsPictures, camera_key, ray_table
 
 Float32 = NDArray[np.float32]
@@ -52,14 +53,10 @@ class BenchBoard:
 
     Attributes
     ----------
-    board
-        What is printed.
     site_from_board
         The board's frame (origin in its middle, x right, y down, z into the board) in the site frame.
     bow_m
         How far its middle stands out, across and down (`calib.targets.boards`).
-    margin_m
-        White paper around the print.
     """
 
     board: AnyBoard
@@ -88,11 +85,28 @@ class BenchBoard:
         return np.asarray(np.array(self.board.size_m) / 2 + self.margin_m)
 
 
-class BenchBoards:
-    """The renderer of a scene with boards in it; boards come and go while it runs. Safe from any thread."""
+def placed_board(placed: PlacedBoard, ground_z_m: Callable[[float, float], float]) -> BenchBoard:
+    """Return a board of the configuration as it stands on the ground, whose z is ``ground_z_m(x_m, y_m)``."""
+    heading, lean = placed.heading_rad, placed.lean_rad
+    looks = np.array(
+        [math.cos(heading) * math.cos(lean), math.sin(heading) * math.cos(lean), -math.sin(lean)]
+    )
+    right = np.array([math.sin(heading), -math.cos(heading), 0.0])
+    down = np.cross(-looks, right)
+    foot = np.array([placed.x_m, placed.y_m, ground_z_m(placed.x_m, placed.y_m) - placed.raised_m])
+    stands = Rigid(np.column_stack([right, down, -looks]), foot - 0.5 * placed.size_m[1] * down)
+    return BenchBoard(placed.face.board, stands, margin_m=placed.face.paper_m)
 
-    def __init__(self, renderer: DrawsPictures) -> None:
+
+class BenchBoards:
+    """The renderer of a scene with boards in it; boards come and go while it runs. Safe from any thread.
+
+    ``placed`` are boards that stay.
+    """
+
+    def __init__(self, renderer: DrawsPictures, placed: Sequence[BenchBoard] = ()) -> None:
         self._renderer = renderer
+        self._placed = tuple(placed)
         self._lock = threading.Lock()
         self._boards: Mapping[str, BenchBoard] = MappingProxyType({})
         self._rays: dict[tuple[object, ...], tuple[Float64, Float64]] = {}
@@ -116,13 +130,13 @@ class BenchBoards:
         rows: tuple[int, int] | None = None,
     ) -> Float32:
         """Return the picture of the scene with the boards over it, as `drivers.sim.render.Renderer.image`."""
-        boards = self._boards
+        boards = (*self._placed, *self._boards.values())
         image = self._renderer.image(camera, site_from_camera_frame, samples, rows)
         if not boards:
             return image
         eye_m = site_from_camera_frame.points(camera.C)
         far_first = sorted(
-            boards.values(), key=lambda one: -float(np.linalg.norm(one.site_from_board.translation_m - eye_m))
+            boards, key=lambda one: -float(np.linalg.norm(one.site_from_board.translation_m - eye_m))
         )
         for board in far_first:
             board_from_frame = board.site_from_board.inverse @ site_from_camera_frame
@@ -138,7 +152,7 @@ class BenchBoards:
             np.asarray(origins_m, dtype=np.float64), np.asarray(directions, dtype=np.float64)
         )
         found = ranges_m.reshape(-1)
-        for board in self._boards.values():
+        for board in (*self._placed, *self._boards.values()):
             to_board = board.site_from_board.inverse
             unit = wanted.reshape(-1, 3)
             unit = unit / np.linalg.norm(unit, axis=-1, keepdims=True)
@@ -219,6 +233,8 @@ class BenchBoards:
 def facing(eye_m: ArrayLike, position_m: ArrayLike, turned_rad: ArrayLike = (0.0, 0.0, 0.0)) -> Rigid:
     """Return frame_from_board of a board at a place, upright and square to an eye, then turned about itself.
 
+    Raises BadOptions if the board would be right over or under the eye, where nothing is upright.
+
     Parameters
     ----------
     eye_m, position_m
@@ -226,11 +242,6 @@ def facing(eye_m: ArrayLike, position_m: ArrayLike, turned_rad: ArrayLike = (0.0
     turned_rad
         About the board's own x (its upper edge comes nearer), y (its right edge comes nearer) and z (it turns
         to the right, as seen from the eye), z first.
-
-    Raises
-    ------
-    BadOptions
-        If the board would be right over or under the eye, where nothing is upright.
     """
     away = np.asarray(position_m, dtype=np.float64) - np.asarray(eye_m, dtype=np.float64)
     right = np.cross([0.0, 0.0, 1.0], away)

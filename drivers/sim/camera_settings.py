@@ -83,8 +83,6 @@ class CameraSettings:
         Whether pixels lie under red, green and blue filters, and pictures are (h, w, 3) BGR.
     jpeg_quality
         Of the frames as they come, 1 to 100; 0: they come as they are.
-    lens, exposure
-        What their classes say.
     """
 
     rate_hz: float = 10.0
@@ -102,20 +100,7 @@ class CameraSettings:
 
 
 def check_cameras(settings: CameraSettings, rows: int) -> None:
-    """Pass settings that can be.
-
-    Parameters
-    ----------
-    settings
-        To be checked.
-    rows
-        Of the largest picture.
-
-    Raises
-    ------
-    BadOptions
-        Naming the key, its value, and what would be right.
-    """
+    """Pass settings that can be. Raises BadOptions naming the key, its value, and what would be right."""
     _check_numbers(settings, "")
     key, exposure, lens = "simulation.cameras", settings.exposure, settings.lens
     if exposure.auto and not exposure.reference_s:
@@ -157,8 +142,6 @@ class ClockSettings:
     ----------
     offset_s
         How much later than the others' its first frame is exposed.
-    drift_ppm
-        How much too fast its clock runs, which paces its frames.
     own_stamps
         Whether that clock stamps them too; else the host's does, as the kernel's for V4L2 cameras.
     stamped_late_s
@@ -215,14 +198,8 @@ class TemperatureSettings:
 
     Attributes
     ----------
-    amplitude_k
-        From the day's mean to its extremes, kelvin.
-    period_s
-        Length of a day.
     phase_rad
         Of the sine at the start; 0: the mean, getting warmer.
-    focal_ppm_per_k
-        How much longer the focal lengths get.
     centre_x_px_per_k, centre_y_px_per_k
         How far the images' centres move to the right and down; in right eyes, which are mounted as in a
         mirror, to the left.

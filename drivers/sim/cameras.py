@@ -11,18 +11,18 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.geometry.sensor_mode import SensorMode
+from calib.geometry.mode import SensorMode
 from drivers.clock import Clock
 from drivers.errors import BadSetting, NoFreshFrame, NoReply
 from drivers.faults import Fault, FaultPanel
-from drivers.interfaces import CameraSetting, Frame, FrameTime, HoldsExposure, Image
+from drivers.interfaces import Camera, CameraInfo, CameraSetting, Frame, FrameTime, Image
 from drivers.sim.camera_settings import CameraClock, CameraSettings, ClockSettings
 from drivers.sim.optics.exposure import AutoExposure, FixedExposure, FrameExposure
 from drivers.sim.optics.readout import Noise, Readout
@@ -30,7 +30,7 @@ from drivers.sim.optics.readout import Noise, Readout
 RING_FRAMES = 4
 """Finished frames that can still be fetched, as in a capture ring of four buffers."""
 
-ANY, NEXT_FRAME, CLOSE, RECENT_TIMES, SIZE_PX, EXPOSURE_HELD, SETTINGS = range(7)
+ANY, NEXT_FRAME, CLOSE, RECENT_TIMES, INFO, EXPOSURE_HELD, SETTINGS = range(7)
 """What the parameter ``call`` names."""
 
 SHORTEST_S, LONGEST_SHARE = 1e-5, 0.99
@@ -64,15 +64,11 @@ class _Epoch:
         return max(self.first_sequence, sequence)
 
 
-class SimulatedCamera:
-    """One camera of the simulated rover, an instance of ``drivers.interfaces.Camera``; safe from any thread.
+class SimulatedCamera(Camera):
+    """One camera of the simulated rover; safe from any thread.
 
     Parameters
     ----------
-    name
-        The camera's name, also the device name of its faults.
-    settings
-        Rate, exposure and noise.
     size_px
         (width, height).
     expose
@@ -80,14 +76,8 @@ class SimulatedCamera:
         first row begins then; one that it keeps is read-only.
     taken
         ``taken(sequence, mid_exposure_s)`` is told of every frame that is handed out, before it is.
-    clock
-        The simulation's clock.
-    faults
-        The panel that is asked for faults of this camera.
     start_s
         When the exposure of frame 0 begins: one value for all cameras of a rover.
-    own
-        What this camera's clock makes of it.
     """
 
     def __init__(
@@ -129,13 +119,8 @@ class SimulatedCamera:
 
         When that frame has left the ring already, the newest finished one comes instead; it is fresh too.
         Rendering takes its own time on top of ``timeout_s``, which bounds the wait on the simulation's clock.
-
-        Raises
-        ------
-        NoFreshFrame
-            If none came in time; the message says what came instead.
-        NoReply
-            Under the fault ``intermittent``.
+        Raises NoFreshFrame if none came in time; the message says what came instead; NoReply under the fault
+        ``intermittent``.
         """
         now_s = self._clock.now_s()
         deadline_s = now_s + max(0.0, timeout_s)
@@ -172,10 +157,7 @@ class SimulatedCamera:
     def adjust(self, wanted: Mapping[str, float]) -> list[str]:
         """Expose frames that begin from now on otherwise; nothing becomes another than wanted.
 
-        Raises
-        ------
-        BadSetting
-            For a camera that sets its exposure itself, and for a setting that it lacks.
+        Raises BadSetting for a camera that sets its exposure itself, and for a setting that it lacks.
         """
         lacks = set(wanted) - {"exposure_s", "gain"}
         if lacks or not isinstance(self._exposure, FixedExposure):
@@ -188,18 +170,9 @@ class SimulatedCamera:
         return []
 
     @property
-    def period_s(self) -> float:
-        """From frame to frame, seconds, at the rate of now."""
-        return self._epoch(self._clock.now_s()).period_s
-
-    @property
-    def trigger(self) -> str:
-        """None that could be counted by: a fault may slow one camera's count."""
-        return ""
-
-    def recent_times(self) -> list[FrameTime]:
-        """Return none: frames that nobody asks for are never made."""
-        return []
+    def info(self) -> CameraInfo:
+        """Its period at the rate of now; no trigger, since a fault may slow one camera's count."""
+        return CameraInfo(simulated=True, period_s=self._epoch(self._clock.now_s()).period_s)
 
     def close(self) -> None:
         """Let go; a waiting call ends with NoFreshFrame within half a second."""
@@ -309,7 +282,7 @@ class SimulatedCamera:
 
 
 class SelfExposedCamera(SimulatedCamera):
-    """One with an automatic exposure, also a ``drivers.interfaces.HoldsExposure``.
+    """One with an automatic exposure.
 
     Parameters
     ----------
@@ -332,7 +305,7 @@ class SelfExposedCamera(SimulatedCamera):
         return self._automatic.held()
 
 
-class HangingCamera:
+class HangingCamera(Camera):
     """A simulated camera as the service has it: every call a camera can have, and each can hang.
 
     A call that hangs returns when the fault is over, also when the camera was closed meanwhile, as a driver
@@ -344,13 +317,13 @@ class HangingCamera:
         The camera behind it; its own calls do not hang.
     sensor_mode
         Which pixels of its sensor its pictures show.
-    clock, faults
-        The simulation's.
     """
 
-    def __init__(self, camera: Any, sensor_mode: SensorMode, clock: Clock, faults: FaultPanel) -> None:
+    def __init__(
+        self, camera: SimulatedCamera, sensor_mode: SensorMode, clock: Clock, faults: FaultPanel
+    ) -> None:
         self._camera = camera
-        self.sensor_mode = sensor_mode
+        self._sensor_mode = sensor_mode
         self._clock = clock
         self._faults = faults
         self._changed = clock.signal()
@@ -359,13 +332,12 @@ class HangingCamera:
     @property
     def name(self) -> str:
         """The camera's name, also the device name of its faults."""
-        return str(self._camera.name)
+        return self._camera.name
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
         """Return the next frame, as the camera behind it."""
         self._hang(NEXT_FRAME)
-        frame: Frame = self._camera.next_frame(exposed_after_s, timeout_s)
-        return frame
+        return self._camera.next_frame(exposed_after_s, timeout_s)
 
     def close(self) -> None:
         """Let go."""
@@ -375,36 +347,24 @@ class HangingCamera:
     def settings(self) -> Sequence[CameraSetting]:
         """Return its settings, as the camera behind it."""
         self._hang(SETTINGS)
-        told: Sequence[CameraSetting] = self._camera.settings()
-        return told
+        return self._camera.settings()
 
     def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
         """Change some of them, as the camera behind it."""
         self._hang(SETTINGS)
-        notes: Sequence[str] = self._camera.adjust(wanted)
-        return notes
+        return self._camera.adjust(wanted)
 
     @property
-    def size_px(self) -> tuple[int, int]:
-        """(width, height) of its pictures."""
-        self._hang(SIZE_PX)
-        return self.sensor_mode.size_px
-
-    @property
-    def period_s(self) -> float:
-        """From frame to frame, seconds, at the rate of now."""
-        return float(self._camera.period_s)
-
-    @property
-    def trigger(self) -> str:
-        """What starts its exposures, as the camera behind it."""
-        return str(self._camera.trigger)
+    def info(self) -> CameraInfo:
+        """That of the camera behind it, and which pixels of its sensor its pictures show."""
+        self._hang(INFO)
+        mode = self._sensor_mode
+        return replace(self._camera.info, size_px=mode.size_px, sensor_mode=mode)
 
     def recent_times(self) -> Sequence[FrameTime]:
         """Return the times of recent frames, as the camera behind it."""
         self._hang(RECENT_TIMES)
-        times: Sequence[FrameTime] = self._camera.recent_times()
-        return times
+        return self._camera.recent_times()
 
     def exposure_held(self) -> AbstractContextManager[None]:
         """Return a context in which the exposure does not change."""
@@ -413,9 +373,6 @@ class HangingCamera:
     @contextmanager
     def _held(self) -> Iterator[None]:
         self._hang(EXPOSURE_HELD)
-        if not isinstance(self._camera, HoldsExposure):
-            yield
-            return
         with self._camera.exposure_held():
             yield
 

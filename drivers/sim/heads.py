@@ -164,6 +164,9 @@ PRESETS: Mapping[str, HeadSettings] = {
 def head_settings(value: Any) -> HeadSettings:
     """Return the head that a configuration names.
 
+    Raises BadOptions for an unknown preset or key, a value that is not a number of the right sign or within
+    its bounds, or values that do not go together.
+
     Parameters
     ----------
     value
@@ -171,12 +174,6 @@ def head_settings(value: Any) -> HeadSettings:
         ``approach_rad``, ``speed_rad_per_s``, ``acceleration_rad_per_s2``, ``ring_hz``, ``ring_damping``,
         ``ring_gain``, ``settle_s`` (both axes), ``sag_rad``, ``gravity_turnover_rad``, ``gravity_friction``
         (tilt), ``pan_harmonics_rad`` and ``tilt_harmonics_rad``.
-
-    Raises
-    ------
-    BadOptions
-        For an unknown preset or key, a value that is not a number of the right sign or within its bounds, or
-        values that do not go together.
     """
     changes = dict(value) if isinstance(value, Mapping) else {"preset": value}
     preset = changes.pop("preset", "ptu_d46_70")
@@ -193,10 +190,8 @@ def head_settings(value: Any) -> HeadSettings:
 def with_joints(head: HeadSettings, joints: JointErrors) -> HeadSettings:
     """Return a head whose encoders and gears err as a true rig's ``joints`` say; the same if they read true.
 
-    Raises
-    ------
-    BadOptions
-        If the head has errors of its encoders already, or comes to its goals over less than the play.
+    Raises BadOptions if the head has errors of its encoders already, or comes to its goals over less than the
+    play.
     """
     if joints.reads_true:
         return head

@@ -1,4 +1,4 @@
-"""What takes long to make and is kept: compiled code, scenes, kernels of tools/vm; numba is loaded here.
+"""What takes long to make and is kept on disk: scenes, and kernels of virtual machines.
 
 ``$XDG_CACHE_HOME/mastctl``, by default ``~/.cache/mastctl``. All of it can be made again: it may be deleted
 at any time, carried to another machine, or be there for reading only. It does not grow beyond `MOST_BYTES`.
@@ -8,16 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib
 import os
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
-from types import ModuleType
 
-from drivers.errors import BadOptions
-
-MOST_BYTES = {"compiled": 20_000_000, "scenes": 400_000_000, "vm": 150_000_000}
+MOST_BYTES = {"scenes": 400_000_000, "vm": 150_000_000}
 """What is kept of each kind, in bytes; the thing that was made last stays also if it is larger by itself."""
 
 
@@ -51,7 +47,7 @@ def keep_newest(folder: Path) -> None:
     """
     try:
         others = sorted(folder.parent.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
-    except OSError:  # somebody else is deleting
+    except OSError:  # another process is deleting
         return
     room = MOST_BYTES[folder.parent.name] - _size_bytes(folder)
     for other in others:
@@ -69,36 +65,3 @@ def _size_bytes(folder: Path) -> int:
             with contextlib.suppress(OSError):
                 size += (Path(place) / name).lstat().st_size
     return size
-
-
-def kernels() -> ModuleType:
-    """Return the module of compiled functions.
-
-    Raises
-    ------
-    BadOptions
-        If numba is not installed.
-    """
-    try:
-        return importlib.import_module("drivers.sim.kernels")
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.split(".")[0] not in ("numba", "llvmlite"):
-            raise
-        raise BadOptions("the simulated rover needs numba: pip install 'mastctl[sim]'") from error
-
-
-def is_compiled() -> bool:
-    """Return whether the renderer starts at once: compiled in this process, or on disk and up to date.
-
-    When it does not, the first scene takes some ten to twenty seconds of compiling.
-
-    Raises
-    ------
-    BadOptions
-        If numba is not installed.
-    """
-    for function in kernels().ENTRIES:
-        folder = Path(function.stats.cache_path)
-        if not function.signatures and not any(folder.glob(f"*.{function.__name__}-*.nbi")):
-            return False
-    return True

@@ -30,10 +30,6 @@ class Leg:
     ----------
     start_s, start_rad, start_rad_per_s
         When, where and how fast (signed) the leg begins.
-    goal_rad
-        Where it ends at rest.
-    speed_rad_per_s, acceleration_rad_per_s2
-        Bounds, both positive.
     """
 
     start_s: float

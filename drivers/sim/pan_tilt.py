@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 from drivers.clock import Clock
 from drivers.errors import BadOptions, BadReply, DriverError, NoReply
 from drivers.faults import PAN_TILT, Fault, FaultPanel
-from drivers.interfaces import AxisMotion, PanTilt, Reading
+from drivers.interfaces import AxisMotion, HeadInfo, PanTilt, Reading
 from drivers.serial_line import OpenLine
 from drivers.sim.axis import AxisSettings
 from drivers.sim.heads import PRESETS, HeadSettings
@@ -84,17 +84,13 @@ def check_head(wire: str, head: HeadSettings) -> None:
         )
 
 
-class SimulatedPanTilt:
-    """A head in memory that fulfils ``drivers.interfaces.PanTilt``; safe from any thread.
+class SimulatedPanTilt(PanTilt):
+    """A head in memory; safe from any thread.
 
     A new goal while under way replaces the old one without a jump in position or velocity.
 
     Parameters
     ----------
-    head
-        What it is made of.
-    clock
-        The simulation's clock.
     faults
         The panel that is asked for faults of ``pan_tilt``; none when left out.
     """
@@ -114,27 +110,17 @@ class SimulatedPanTilt:
     def read(self) -> Reading:
         """Return the motor-side angles in whole counts.
 
-        Raises
-        ------
-        NoReply
-            Under faults that keep the answer away, and after ``close``.
-        BadReply
-            Under faults that damage it.
+        Raises NoReply under faults that keep the answer away, and after ``close``; BadReply under faults that
+        damage it.
         """
         return self._call(self._reading)
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         """Start towards the angles, rounded to counts, and return at once.
 
-        ``speed_rad_per_s`` bounds each axis; left out, or above the axis's own, the axis's own holds.
-
-        Raises
-        ------
-        DriverError
-            For a goal outside the device's own range, or an angle or speed that is not a usable number;
-            nothing moves then.
-        NoReply, BadReply
-            As ``read``.
+        ``speed_rad_per_s`` bounds each axis; left out, or above the axis's own, the axis's own holds. Raises
+        DriverError for a goal outside the device's own range, or an angle or speed that is not a usable
+        number; nothing moves then; NoReply, BadReply.
         """
         axes = (("pan", self.head.pan, pan_rad), ("tilt", self.head.tilt, tilt_rad))
         for word, axis, goal in axes:
@@ -167,10 +153,11 @@ class SimulatedPanTilt:
                 self._halt(self._clock.now_s())
             self._closed = True
 
-    def axis_motion(self) -> Mapping[str, AxisMotion]:
-        """Return how each axis moves, by its settings; with an approach it rises to every goal."""
+    @property
+    def info(self) -> HeadInfo:
+        """How each axis moves, by its settings; with an approach it rises to every goal."""
         axes = {"pan": self.head.pan, "tilt": self.head.tilt}
-        return {
+        motion = {
             name: AxisMotion(
                 axis.acceleration_rad_per_s2,
                 axis.approach_rad,
@@ -179,6 +166,7 @@ class SimulatedPanTilt:
             )
             for name, axis in axes.items()
         }
+        return HeadInfo(simulated=True, motion=motion)
 
     def true_joints(self, time_s: float) -> tuple[float, float]:
         """Return the mechanical pan and tilt at a moment of the last minute, radians. Never fails."""
@@ -261,6 +249,8 @@ class SimulatedPanTilt:
 class WiredHead:
     """Axes, the simulator that turns them, the line to it, and the real driver at its other end.
 
+    Raises BadOptions for a head or clock that this cannot be done with; DriverError.
+
     Parameters
     ----------
     wire
@@ -271,20 +261,6 @@ class WiredHead:
         What simulator, line and driver live on: the machine's own or the simulation's, none turned by hand.
     faults
         Those of ``pan_tilt`` act on the axes and on the line.
-
-    Attributes
-    ----------
-    pan_tilt
-        The real driver.
-    line
-        What it talks over.
-
-    Raises
-    ------
-    BadOptions
-        For a head or clock that this cannot be done with.
-    DriverError
-        As the driver when it is opened.
     """
 
     def __init__(self, wire: str, head: HeadSettings, clock: Clock, faults: FaultPanel) -> None:

@@ -5,11 +5,9 @@ Places are in the site frame (x north, y east), which is the rover frame as long
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -17,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.geometry.rig import Rig
+from calib.targets.boards import Charuco, DotBoard
 from drivers.errors import BadOptions
 from drivers.faults import nearest
 from drivers.options import check_bounds, filled
@@ -31,7 +30,6 @@ BOARD_M = 0.02  # thick
 ROVER_M = 0.5  # from its origin nothing is placed nearer than this, or than its cameras reach
 CLEAR_M = 0.05  # beyond the cameras' reach
 DICTIONARIES = {name: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
-MOST_TEXELS = 2048
 
 
 @dataclass(frozen=True)
@@ -67,10 +65,14 @@ class PlacedDots:
     margin_m: float = 0.08
 
     @property
-    def size_m(self) -> tuple[float, float]:
-        """Width and height of the board."""
-        reach_m = 2 * self.margin_m
-        return (self.columns - 1) * self.spacing_m + reach_m, (self.rows - 1) * self.spacing_m + reach_m
+    def board(self) -> DotBoard:
+        """What is printed."""
+        return DotBoard(self.columns, self.rows, self.spacing_m, self.dot_diameter_m)
+
+    @property
+    def paper_m(self) -> float:
+        """White paper around the print."""
+        return self.margin_m - self.dot_diameter_m / 2
 
 
 @dataclass(frozen=True)
@@ -85,33 +87,22 @@ class PlacedCharuco:
     margin_m: float = 0.02
 
     @property
-    def size_m(self) -> tuple[float, float]:
-        """Width and height of the board."""
-        reach_m = 2 * self.margin_m
-        return self.columns * self.square_m + reach_m, self.rows * self.square_m + reach_m
-
-
-@dataclass(frozen=True)
-class PlacedPicture:
-    """A picture from a file, so wide; pixels are square."""
-
-    picture: str = ""
-    width_m: float = 0.8
-    digest: str = ""
-    size_px: tuple[int, int] = (1, 1)
+    def board(self) -> Charuco:
+        """What is printed."""
+        return Charuco(self.columns, self.rows, self.square_m, self.marker_m, self.dictionary)
 
     @property
-    def size_m(self) -> tuple[float, float]:
-        """Width and height of the board."""
-        return self.width_m, self.width_m * self.size_px[1] / self.size_px[0]
+    def paper_m(self) -> float:
+        """White paper around the print."""
+        return self.margin_m
 
 
-FACES: Mapping[str, Any] = {"dots": PlacedDots(), "charuco": PlacedCharuco(), "picture": PlacedPicture()}
+FACES: Mapping[str, Any] = {"dots": PlacedDots(), "charuco": PlacedCharuco()}
 
 
 @dataclass(frozen=True)
 class PlacedBoard:
-    """A board of 2 cm: the middle of its lower edge over (x, y), ``raised_m`` over the ground.
+    """A board: the middle of its lower edge over (x, y), ``raised_m`` over the ground.
 
     Its face looks along the heading (by default towards the site's origin), ``lean_rad`` upwards.
     """
@@ -121,7 +112,12 @@ class PlacedBoard:
     heading_rad: float = math.nan
     lean_rad: float = 0.0
     raised_m: float = 0.0
-    face: PlacedDots | PlacedCharuco | PlacedPicture = PlacedDots()
+    face: PlacedDots | PlacedCharuco = PlacedDots()
+
+    @property
+    def size_m(self) -> Float64:
+        """Width and height with the white paper, (2,)."""
+        return np.array(self.face.board.size_m) + 2 * self.face.paper_m
 
 
 Placed = PlacedRock | PlacedBrick | PlacedBoard
@@ -140,62 +136,57 @@ BOUNDS: Mapping[type, Mapping[str, tuple[float, float]]] = {
         "rows": (2, 50), "columns": (2, 50), "square_m": (0.005, 1.0), "marker_m": (0.002, 1.0),
         "margin_m": (0.0, 1.0),
     },
-    PlacedPicture: {"width_m": (0.05, 4.0)},
 }  # fmt: skip
 
 
-def read_list(kind: str, values: Sequence[Any], folder: Path) -> tuple[Any, ...]:
+def read_list(kind: str, values: Sequence[Any]) -> tuple[Any, ...]:
     """Return the placed rocks, bricks or boards of ``simulation.scene``.
 
-    Raises
-    ------
-    BadOptions
-        With the place in the configuration, the value, and what would be right.
+    Raises BadOptions with the place in the configuration, the value, and what would be right.
     """
     key = f"simulation.scene.{kind}"
     if len(values) > MOST[kind]:
         raise BadOptions(f"{key} are {len(values)}, expected {MOST[kind]} at most")
-    return tuple(_one(kind, value, f"{key}[{k}]", folder) for k, value in enumerate(values))
+    return tuple(_one(kind, value, f"{key}[{k}]") for k, value in enumerate(values))
 
 
-def _one(kind: str, value: Any, key: str, folder: Path) -> Placed:
+def _one(kind: str, value: Any, key: str) -> Placed:
     if not isinstance(value, Mapping):
         raise BadOptions(f"{key} is {value!r}, expected keys and values, as {{x_m: 5, y_m: 0}}")
     for needed in ("x_m", "y_m"):
         if needed not in value:
             raise BadOptions(f"{key} has no {needed}; metres in the site frame are expected")
     if kind == "boards":
-        return _board(dict(value), key, folder)
+        return _board(dict(value), key)
     thing: Placed = filled(PlacedRock() if kind == "rocks" else PlacedBrick(), value, key)
     check_bounds(thing, BOUNDS[type(thing)], key)
     return thing
 
 
-def _board(value: dict[str, Any], key: str, folder: Path) -> PlacedBoard:
+def _board(value: dict[str, Any], key: str) -> PlacedBoard:
     """A board's place, and its face by the kind."""
     kind = value.pop("kind", "dots")
     if kind not in FACES:
         raise BadOptions(f"{key}.kind is {kind!r}{nearest(str(kind), FACES)}")
     own = {f.name for f in fields(PlacedBoard)} - {"face"}
-    known = {f.name for f in fields(FACES[kind])} - {"digest", "size_px"}
+    known = {f.name for f in fields(FACES[kind])}
     for name in value:
         if name not in own | known:
             raise BadOptions(f"{key} has no key {name!r} for kind {kind!r}{nearest(str(name), own | known)}")
     face = filled(FACES[kind], {k: v for k, v in value.items() if k in known}, key)
     check_bounds(face, BOUNDS[type(face)], key)
     _check_face(face, key)
-    if isinstance(face, PlacedPicture):
-        face = _with_digest(face, key, folder)
-    board: PlacedBoard = filled(PlacedBoard(), {k: v for k, v in value.items() if k in own}, key)
+    plain: PlacedBoard = filled(PlacedBoard(), {k: v for k, v in value.items() if k in own}, key)
+    board = replace(plain, face=face)
     if math.isnan(board.heading_rad) and "heading_rad" not in value:
         board = replace(board, heading_rad=math.atan2(-board.y_m, -board.x_m))
     check_bounds(board, BOUNDS[PlacedBoard], key)
-    if not 0.05 <= max(face.size_m) <= 4.0:
-        raise BadOptions(f"{key} is {face.size_m[0]:g} x {face.size_m[1]:g} m, expected 0.05 to 4 m")
-    return replace(board, face=face)
+    if not 0.05 <= board.size_m.max() <= 4.0:
+        raise BadOptions(f"{key} is {board.size_m[0]:g} x {board.size_m[1]:g} m, expected 0.05 to 4 m")
+    return board
 
 
-def _check_face(face: PlacedDots | PlacedCharuco | PlacedPicture, key: str) -> None:
+def _check_face(face: PlacedDots | PlacedCharuco, key: str) -> None:
     """What two values of a face must be to each other."""
     if isinstance(face, PlacedDots) and not face.dot_diameter_m < face.spacing_m:
         raise BadOptions(
@@ -223,32 +214,6 @@ def _check_face(face: PlacedDots | PlacedCharuco | PlacedPicture, key: str) -> N
             )
 
 
-def _with_digest(face: PlacedPicture, key: str, folder: Path) -> PlacedPicture:
-    """The picture's whole path, size, and a digest of its bytes, so that a changed file is another scene."""
-    if not face.picture:
-        raise BadOptions(f"{key} has no picture; the name of a PNG or JPEG file is expected")
-    image, digest, path = read_picture(face.picture, f"{key}.picture", folder)
-    if max(image.shape) > MOST_TEXELS:
-        raise BadOptions(
-            f"{key}.picture: {path} has {image.shape[1]} x {image.shape[0]} pixels, "
-            f"expected {MOST_TEXELS} at most"
-        )
-    return replace(face, picture=str(path), digest=digest, size_px=(image.shape[1], image.shape[0]))
-
-
-def read_picture(name: str, key: str, folder: Path) -> tuple[NDArray[np.uint8], str, Path]:
-    """Return grey levels (h, w) of a picture file, the digest of its bytes, and where it lies."""
-    path = (folder / name).resolve()
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise BadOptions(f"{key}: {path}: {error.strerror}; a PNG or JPEG file is expected") from None
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
-    if image is None:
-        raise BadOptions(f"{key}: {path} is no picture that can be read; a PNG or JPEG file is expected")
-    return np.asarray(image, dtype=np.uint8), hashlib.sha256(data).hexdigest()[:16], path
-
-
 def footprint_m(thing: Placed) -> Float64:
     """Return the outline (n, 2) of a thing from above, site frame."""
     middle = np.array([thing.x_m, thing.y_m])
@@ -260,9 +225,9 @@ def footprint_m(thing: Placed) -> Float64:
     if isinstance(thing, PlacedBrick):
         front, back, aside = thing.length_m / 2, -thing.length_m / 2, thing.width_m / 2
     else:
-        back_m = -thing.face.size_m[1] * math.sin(thing.lean_rad)  # of the upper edge
+        back_m = -thing.size_m[1] * math.sin(thing.lean_rad)  # of the upper edge
         front, back = max(0.0, back_m), min(0.0, back_m) - BOARD_M
-        aside = thing.face.size_m[0] / 2
+        aside = thing.size_m[0] / 2
     ways = ((front, aside), (front, -aside), (back, -aside), (back, aside))
     return np.array([middle + along * ahead + across * right for along, across in ways])
 
@@ -283,7 +248,7 @@ def heights_m(thing: Placed) -> tuple[float, float]:
         return 0.0, 0.8 * thing.diameter_m
     if isinstance(thing, PlacedBrick):
         return 0.0, thing.height_m
-    return thing.raised_m, thing.raised_m + thing.face.size_m[1] * math.cos(thing.lean_rad)
+    return thing.raised_m, thing.raised_m + thing.size_m[1] * math.cos(thing.lean_rad)
 
 
 def named(rocks: Any, bricks: Any, boards: Any) -> dict[str, Placed]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions
-from drivers.sim.kept import kernels
+from drivers.sim.compiled import kernels
 from drivers.sim.optics.readout import Noise
 from drivers.sim.scene import Scene, tiny_scene
 
@@ -167,6 +167,8 @@ class Renderer:
     ) -> Float32:
         """Return the picture that ``camera`` takes of the scene.
 
+        Raises BadOptions if ``samples`` is out of bounds, or the camera stands where it sees nothing.
+
         Parameters
         ----------
         camera
@@ -184,11 +186,6 @@ class Renderer:
         image : (h, w) float32
             Brightness, 0 to 255, noise-free. Pixels for which the model has no ray are 0, and so are those
             whose ray starts under the ground (in CAHVORE rays start the farther from C the more they bend).
-
-        Raises
-        ------
-        BadOptions
-            If ``samples`` is out of bounds, or the camera stands where it sees nothing.
         """
         if not 1 <= samples <= MAX_SAMPLES:
             raise BadOptions(f"{samples} samples across a pixel where 1 to {MAX_SAMPLES} are possible")
@@ -302,36 +299,10 @@ def camera_key(camera: CameraModel) -> tuple[object, ...]:
     return tuple(n.tobytes() if isinstance(n, np.ndarray) else n for n in numbers)
 
 
-def compile_drawing() -> None:
-    """Compile what draws a picture, or load it: by far the largest part of what `compile_renderer` does."""
-    beams = np.full((1, 1, 6), -1.0)
-    kernels().render_tiles(
-        tiny_scene(lit=False).world,
-        np.empty((BLOCK_PX, BLOCK_PX, 1, 3), dtype=np.float32),
-        np.empty((0, 0, 0, 3), dtype=np.float32),
-        beams,
-        beams,
-        TILE_PX,
-        BLOCK_PX,
-        0,
-        0,
-        np.eye(3),
-        np.zeros(3),
-        np.empty((5, BLOCK_PX * BLOCK_PX)),
-        np.empty((BLOCK_PX, BLOCK_PX), dtype=np.float32),
-    )
-
-
 def compile_renderer() -> None:
     """Compile what building a scene and drawing it need, or load it from the disk cache.
 
-    Say before calling this what is being waited for, if `drivers.sim.kept.is_compiled` is false: some twenty
-    seconds.
-
-    Raises
-    ------
-    BadOptions
-        If numba is not installed.
+    Compiling takes some twenty seconds. Raises BadOptions if numba is not installed.
     """
     scene = tiny_scene()
     camera = CameraModel(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.kept import kernels
+from drivers.sim.compiled import kernels
 
 Float64 = NDArray[np.float64]
 
@@ -138,9 +138,8 @@ def stones_at(
         normals[k] = corner_normals(corners[k])
     tones = np.exp(rng.normal(0.0, 0.16, len(where))).astype(np.float32)
     return kernels().Rocks(
-        spheres(corners), *(boxes(corners, 4**level) for level in (3, 2, 1)), corners, normals, tones,
-        np.full(len(where), kernels().NOTHING),
-    )  # fmt: skip
+        spheres(corners), *(boxes(corners, 4**level) for level in (3, 2, 1)), corners, normals, tones
+    )
 
 
 def together(*some: Any) -> Any:
@@ -229,9 +228,8 @@ def meshes(bricks: Sequence[Brick]) -> Any:
     normals = np.repeat(across[:, :, None], 3, axis=2).astype(np.float32)
     tones = np.full(len(bricks), BRICK_TONE, dtype=np.float32)
     return kernels().Rocks(
-        spheres(corners), *(boxes(corners, 4**level) for level in (3, 2, 1)), corners, normals, tones,
-        np.full(len(bricks), kernels().NOTHING),
-    )  # fmt: skip
+        spheres(corners), *(boxes(corners, 4**level) for level in (3, 2, 1)), corners, normals, tones
+    )
 
 
 def _triangles(brick: Brick) -> Float64:

@@ -16,43 +16,46 @@ from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.errors import BadFile
 from calib.files.mast_file import load_rig
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.mode import rig_in_mode
+from calib.geometry.covariance import rig_in_mode
+from calib.geometry.mode import BadMode, Mode, SensorMode, sensor_mode_after
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
-from calib.geometry.sensor_mode import BadMode, Mode, SensorMode, sensor_mode_after
 from calib.targets.boards import FLAT, AnyBoard
 from drivers.clock import Clock
 from drivers.errors import BadOptions, NoFreshFrame
 from drivers.faults import FaultPanel, nearest
 from drivers.interfaces import PanTilt
-from drivers.sim.bench_boards import BenchBoard, BenchBoards, checked, facing
+from drivers.sim.bench_boards import BenchBoard, BenchBoards, checked, facing, placed_board
 from drivers.sim.camera_settings import ClockSettings, check_cameras
 from drivers.sim.cameras import SelfExposedCamera, SimulatedCamera
 from drivers.sim.heads import with_joints
+from drivers.sim.kept_scenes import kept_scene
 from drivers.sim.optics.lens import SimulatedLens
 from drivers.sim.optics.shutter import Shutter
-from drivers.sim.outside_scene import OutsideRenderer, outside_scene
 from drivers.sim.pan_tilt import SimulatedPanTilt, WiredHead
 from drivers.sim.placed import REACH_M, check_clear_of
-from drivers.sim.quick_start import drawing_compiled_beside, kept_scene
 from drivers.sim.render import Renderer, Stills, compile_renderer
-from drivers.sim.scene import Scene, SceneSettings
+from drivers.sim.scene import Scene
 from drivers.sim.settings import SimulationSettings
 
 TRUTH_FRAMES = 512
 """How many frames of each camera ``frame_truth`` remembers."""
 
-BLUR_STEP_PX = 1.5
-"""An exposure during which the picture moves is averaged over renderings no further apart than this..."""
+STIRS_PX = 0.05
+"""An exposure during which the picture moves by less shows the pose at its middle..."""
+
+MOVING_PX = 4
+"""...any other is drawn with pixels of so many along each side, so that a turning head is seen to turn..."""
 
 BLUR_STEPS = 5
-"""...but over no more than so many, of one ray a pixel, which take about as long as one still picture."""
+"""...and is the mean of one view for each of these that it moves by, of so many at most."""
 
 GIVES_WAY_S = 0.05  # between two pictures that nobody has asked for yet
 RESTS_RAD = 1e-7
@@ -62,30 +65,9 @@ METER_PX = 32
 """A pixel of what an automatic exposure sees is so many of the camera's along each side."""
 
 
-def _made(settings: SceneSettings) -> tuple[Scene, Renderer]:
-    """The scene, and what draws it."""
-    if settings.plugin:
-        outside = outside_scene(settings)
-        return outside, OutsideRenderer(outside)
-    scene = kept_scene(settings)
-    return scene, Renderer(scene)
-
-
 @dataclass(frozen=True, eq=False)
 class FrameTruth:
-    """Where a camera really was when a frame was taken.
-
-    Attributes
-    ----------
-    mid_exposure_s
-        Middle of the exposure.
-    pan_rad, tilt_rad
-        Mechanical joint angles then, with backlash and sag.
-    camera_in_rover
-        The true camera model in the rover frame then.
-    site_from_rover
-        Where the rover stood then.
-    """
+    """Where a camera really was when a frame was taken."""
 
     mid_exposure_s: float
     pan_rad: float
@@ -97,17 +79,7 @@ class FrameTruth:
 class SimulatedRover:
     """A rover in memory: one head, all cameras of its true rig, one scene, one panel of faults.
 
-    Parameters
-    ----------
-    settings
-        What it is made of.
-    clock
-        Time for head, cameras and faults.
-
-    Raises
-    ------
-    BadOptions
-        If the true rig's file cannot be used, or a fault of the settings is unknown.
+    Raises BadOptions if the true rig's file cannot be used, or a fault of the settings is unknown.
     """
 
     def __init__(self, settings: SimulationSettings, clock: Clock) -> None:
@@ -133,13 +105,11 @@ class SimulatedRover:
         self.faults = FaultPanel(clock.now_s, self.rig.cameras)
         self.faults.set_all(settings.faults)
         check_clear_of(settings.scene.placed, self.rig)
-        with drawing_compiled_beside():
-            self.scene, renderer = _made(settings.scene)
-        self._renderer = BenchBoards(renderer)
+        self.scene: Scene = kept_scene(settings.scene)
+        placed = [placed_board(board, self.scene.ground_z_m) for board in settings.scene.boards]
+        self._renderer = BenchBoards(Renderer(self.scene), placed)
         # Before any camera is asked: a frame's deadline is no time for a compiler.
         compile_renderer()
-        if settings.scene.terrain is not None:
-            self._check_over_ground()
         self._stills = Stills(self._renderer)
         self._render_lock = threading.Lock()
         self._closing = threading.Event()
@@ -183,17 +153,6 @@ class SimulatedRover:
         size_px = self.rig.cameras[name].model.size_px
         self.sensor_modes[name] = replace(after or SensorMode(size_px), flip=flip)
 
-    def _check_over_ground(self) -> None:
-        """Refuse a map whose ground rises over a camera."""
-        for name in self.rig.cameras:
-            x_m, y_m, z_m = self.rig.camera_in_rover(name, 0.0, 0.0).C
-            ground_m = self.scene.ground_z_m(float(x_m), float(y_m))
-            if z_m >= ground_m:
-                raise BadOptions(
-                    f"simulation.scene.terrain: the ground at ({x_m:.2f}, {y_m:.2f}) m rises to z "
-                    f"{ground_m:.2f} m, over {name} at {z_m:.2f} m, expected ground below all cameras"
-                )
-
     def true_joints(self, time_s: float) -> tuple[float, float]:
         """Return the mechanical pan and tilt at a moment of the last minute, radians."""
         return self._head.true_joints(time_s)
@@ -203,17 +162,15 @@ class SimulatedRover:
     ) -> Rigid:
         """Put the rover somewhere on the ground, at once, and return site_from_rover.
 
+        Raises BadOptions (farther than ``REACH_M`` from the middle of the ground, or for an angle that is no
+        number).
+
         Parameters
         ----------
         x_m, y_m
             In the site frame; the rover's origin comes to lie on the ground there.
         heading_rad, pitch_rad, roll_rad
             As `Scene.standing` takes them.
-
-        Raises
-        ------
-        BadOptions
-            Farther than ``REACH_M`` from the middle of the ground, or for an angle that is no number.
         """
         for name, angle in (("heading", heading_rad), ("pitch", pitch_rad), ("roll", roll_rad)):
             if not math.isfinite(angle):
@@ -242,6 +199,9 @@ class SimulatedRover:
     ) -> BenchBoard:
         """Have a board stand somewhere from the next picture on, and return it.
 
+        Raises BadOptions for a board that is not there and was not given, a place off the ground, or too much
+        of a bow.
+
         Parameters
         ----------
         board
@@ -254,11 +214,6 @@ class SimulatedRover:
             (3, 3) rover_from_board instead of that.
         bow_m
             How far its middle stands out (across, down); None: as before, flat at first.
-
-        Raises
-        ------
-        BadOptions
-            For a board that is not there and was not given, a place off the ground, or too much of a bow.
         """
         before = self.boards.get(name)
         if board is None and before is None:
@@ -295,10 +250,8 @@ class SimulatedRover:
     def frame_truth(self, camera: str, sequence: int) -> FrameTruth:
         """Return where a camera was when a frame was taken.
 
-        Raises
-        ------
-        LookupError
-            For an unknown camera, a frame that was never fetched, or one longer ago than ``TRUTH_FRAMES``.
+        Raises LookupError for an unknown camera, a frame that was never fetched, or one longer ago than
+        ``TRUTH_FRAMES``.
         """
         with self._truth_lock:
             try:
@@ -332,6 +285,12 @@ class SimulatedRover:
         model = self.frame_truth(camera, sequence).camera_in_rover
         pixels, _ = model.project(np.asarray(point_in_rover_m, dtype=np.float64).reshape(3))
         return pixels
+
+    def stones_m(self) -> FloatArray:
+        """Return middles and radii (n, 4) of balls around the scene's stones, rover frame, metres."""
+        spheres_m = self.scene.world.rocks.spheres_m  # those of stones, then of bricks
+        stones_m = spheres_m[: len(spheres_m) - len(self.scene.bricks)]
+        return np.hstack([self.site_from_rover.inverse.points(stones_m[:, :3]), stones_m[:, 3:]])
 
     def draw_ahead(self, time_s: float) -> None:
         """Draw what each camera sees at a moment, so that its first picture is there when it is asked for.
@@ -374,7 +333,7 @@ class SimulatedRover:
     def _exposed(self, name: str, begin_s: float, exposure_s: float) -> NDArray[np.float32]:
         """The light of one exposure on the sensor.
 
-        One picture at its middle if nothing moves, or a smear, or the mean along the head's way through it.
+        One picture at its middle if nothing moves, or a smear, or coarse views along the head's path.
         """
         settings = self.settings.camera
         rolling_s = (self.rig.cameras[name].model.size_px[1] - 1) * settings.row_time_s
@@ -393,20 +352,19 @@ class SimulatedRover:
     def _copies(
         self, name: str, begin_s: float, exposure_s: float, way_rad: float
     ) -> NDArray[np.float32] | None:
-        """The mean of a few renderings along the head's way; None if one is enough."""
+        """The mean of a few coarse views along the head's path; None if the picture hardly moves."""
         model = self._model(name, begin_s + 0.5 * exposure_s)
-        focal_px = model.focal_px[0]
-        steps = min(BLUR_STEPS, max(1, math.ceil(way_rad * focal_px / BLUR_STEP_PX)))
-        if steps == 1:
+        way_px = way_rad * model.focal_px[0]
+        if way_px < STIRS_PX:
             return None
-        total: NDArray[np.float32] | None = None
-        for step in range(steps):
-            pose = self._pose(name, begin_s + (step + 0.5) / steps * exposure_s)
+        few, count = coarse(model, MOVING_PX), min(BLUR_STEPS, math.ceil(way_px / MOVING_PX))
+        views = []
+        for step in range(count):
+            pose = self._pose(name, begin_s + (step + 0.5) / count * exposure_s)
             with self._drawing(name):
-                image = self._renderer.image(model, pose, 1)
-            total = image if total is None else total + image
-        assert total is not None
-        return total / np.float32(steps)
+                views.append(self._renderer.image(few, pose, 1))
+        light = np.asarray(np.mean(views, axis=0), dtype=np.float32)
+        return np.asarray(cv2.resize(light, model.size_px, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
 
     def _shutter(self, name: str, time_s: float) -> Shutter:
         """The shutter of a camera as it is at a moment."""
@@ -435,7 +393,7 @@ class SimulatedRover:
         """A coarse picture of a moment, as an automatic exposure sees it; kept while nothing moves."""
         pose, kept = self._pose(name, time_s), self._metered_at.get(name)
         if kept is None or kept[0] != pose:
-            camera = coarse(self.rig.cameras[name].model)
+            camera = coarse(self.rig.cameras[name].model, METER_PX)
             with self._drawing(name):
                 light = self._renderer.image(camera, pose, 1)
             if not self._lenses[name].changes_nothing:
@@ -508,9 +466,9 @@ class SimulatedRover:
                 frames.popitem(last=False)
 
 
-def coarse(camera: CameraModel) -> CameraModel:
-    """Return a camera of ``METER_PX`` times fewer pixels along each side with the same view."""
-    width, height = (max(4, side // METER_PX) for side in camera.size_px)
+def coarse(camera: CameraModel, times: int) -> CameraModel:
+    """Return a camera of so many times fewer pixels along each side with the same view."""
+    width, height = (max(4, side // times) for side in camera.size_px)
     shrunk = [side / few for side, few in zip(camera.size_px, (width, height), strict=True)]
     # The centre of the top-left pixel is (0, 0), so x = (x' + 0.5) / shrunk - 0.5.
     h, v = (

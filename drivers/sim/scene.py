@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -18,10 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.geometry.rigid import Rigid, rot_x, rot_y, rot_z
 from drivers.errors import BadOptions
-from drivers.sim import boards, ground, rocks
-from drivers.sim.boards import SceneBoard
-from drivers.sim.ground import OwnTerrain
-from drivers.sim.kept import kernels
+from drivers.sim import ground, rocks
+from drivers.sim.compiled import kernels
 from drivers.sim.placed import (
     Placed,
     PlacedBoard,
@@ -60,8 +58,6 @@ class SceneSettings:
 
     Attributes
     ----------
-    seed
-        Same seed, same scene.
     relief_m
         How far the ground rises and falls about z = 0, metres, 0 to 1; 0 gives flat textured ground.
     rocks
@@ -71,10 +67,6 @@ class SceneSettings:
         these.
     boards
         Boards that stand there. Where one does, or a brick or rock was placed, no scattered one is.
-    terrain
-        Ground of one's own instead of the relief; the hills beyond stay, where ``relief_m`` is not 0.
-    plugin, options
-        A scene from outside instead, ``package.module:factory``, and what it is made with.
     sun_azimuth_rad, sun_elevation_rad
         Where the sun stands: from north over east, and above the horizon (0.2 to 1.5 rad).
     """
@@ -84,11 +76,8 @@ class SceneSettings:
     rocks: int | tuple[PlacedRock, ...] = 50
     bricks: int | tuple[PlacedBrick, ...] = 0
     boards: tuple[PlacedBoard, ...] = ()
-    terrain: OwnTerrain | None = None
     sun_azimuth_rad: float = -1.95
     sun_elevation_rad: float = 0.70
-    plugin: str = ""
-    options: dict[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         for name, (low, high) in SCENE_BOUNDS.items():
@@ -112,9 +101,6 @@ class Scene:
         self.settings = settings
         self.world = world
         self.bricks = bricks
-        self.boards: tuple[SceneBoard, ...] = tuple(
-            boards.standing(board, self.ground_z_m) for board in settings.boards
-        )
 
     def cast(self, origins_m: ArrayLike, directions: ArrayLike) -> Float64:
         """Return how far rays go before they meet the ground or a rock.
@@ -169,10 +155,7 @@ class Scene:
 def build_scene(settings: SceneSettings | None = None) -> Scene:
     """Return the scene of ``settings``; takes some two seconds once the kernels are compiled.
 
-    Raises
-    ------
-    BadOptions
-        If numba is not installed.
+    Raises BadOptions if numba is not installed.
     """
     settings = settings or SceneSettings()
     # one stream of numbers for each part: a flat scene keeps the stones and gravel of the rough one
@@ -183,20 +166,13 @@ def build_scene(settings: SceneSettings | None = None) -> Scene:
     inner = make_grid(inner_relief_m(settings, relief_rng), INNER_CELL_M)
     outer = make_grid(outer_relief_m(settings, hill_rng), OUTER_CELL_M)
     stones, laid = laid_out(settings, rock_rng, brick_rng, placed_rng, partial(ground_z_m, inner))
-    stood = [boards.standing(board, partial(ground_z_m, inner)) for board in settings.boards]
     if laid:
         stones = rocks.together(stones, rocks.meshes(laid))
-    if stood:
-        stones = rocks.together(stones, boards.meshes(stood))
-    tones = ground_tones(inner, sun, tone_rng, settings.terrain) * shadows(inner, stones, sun)
-    if settings.terrain is None or settings.terrain.gravel:
-        gravel = ground.gravel(gravel_rng, sun, ground.DETAIL_TEXELS)
-    else:
-        gravel = np.ones((ground.DETAIL_TEXELS,) * 2, dtype=np.float32)
-    detail = ground.pyramid(gravel, ground.DETAIL_TEXEL_M)
+    tones = ground_tones(inner, sun, tone_rng) * shadows(inner, stones, sun)
+    detail = ground.pyramid(ground.gravel(gravel_rng, sun, ground.DETAIL_TEXELS), ground.DETAIL_TEXEL_M)
     stone = ground.pyramid(ground.stone(stone_rng, ground.STONE_TEXELS), ground.STONE_TEXEL_M)
     broad = ground.pyramid(tones, INNER_CELL_M)
-    world = kernels().World(inner, outer, stones, detail, broad, stone, boards.faces(stood), sun)
+    world = kernels().World(inner, outer, stones, detail, broad, stone, sun)
     return Scene(settings, world, laid)
 
 
@@ -231,21 +207,17 @@ def laid_out(
     return stones, rocks.scattered(settings.bricks, brick_rng, taken_m, ground_m)
 
 
-def tiny_scene(lit: bool = True) -> Scene:
-    """Return a level scene with one rock and next to no texture, made in no time: for compiling only.
-
-    Without light nothing has to be compiled to make it.
-    """
+def tiny_scene() -> Scene:
+    """Return a level scene with one rock and next to no texture, made in no time: for compiling only."""
     settings = SceneSettings(relief_m=0.0, rocks=1)
     rng = np.random.default_rng(settings.seed)
     sun = sun_direction(settings)
     inner = make_grid(np.zeros((9, 9), dtype=np.float32), INNER_CELLS * INNER_CELL_M / 8)
     stones = rocks.make_rocks(1, rng, partial(ground_z_m, inner))
-    even = np.ones((8, 8), dtype=np.float32)
-    broad = ground.pyramid(shadows(inner, stones, sun) if lit else even, inner.cell_m)
-    detail = ground.pyramid(ground.gravel(rng, sun, 128) if lit else even, ground.DETAIL_TEXEL_M)
+    broad = ground.pyramid(shadows(inner, stones, sun), inner.cell_m)
+    detail = ground.pyramid(ground.gravel(rng, sun, 128), ground.DETAIL_TEXEL_M)
     stone = ground.pyramid(ground.stone(rng, 128), ground.STONE_TEXEL_M)
-    world = kernels().World(inner, inner, stones, detail, broad, stone, boards.faces([]), sun)
+    world = kernels().World(inner, inner, stones, detail, broad, stone, sun)
     return Scene(settings, world)
 
 
@@ -262,9 +234,6 @@ def inner_relief_m(settings: SceneSettings, rng: np.random.Generator) -> NDArray
     axis = np.asarray((np.arange(n + 1) - n / 2) * INNER_CELL_M, dtype=np.float64)
     rim = np.maximum(np.abs(axis)[:, None], np.abs(axis)[None, :])
     level_at_rim = 1.0 - smooth_step(rim, 28.0, 31.8)
-    if settings.terrain is not None:
-        own: Any = ground.elevation_m(settings.terrain, axis[None, :], axis[:, None])
-        return np.asarray(own * level_at_rim, dtype=np.float32)
     swells = ground.fractal(n, rng, 1.9, 0.8 / INNER_CELL_M, 12.0 / INNER_CELL_M)
     bumps = ground.fractal(n, rng, 1.7, 2.0, 0.8 / INNER_CELL_M)
     # a peak of three standard deviations comes to relief_m
@@ -335,9 +304,7 @@ def ground_z_m(grid: Any, x_m: float, y_m: float) -> float:
     return float(-(h00 + rise))
 
 
-def ground_tones(
-    grid: Any, sun: Float64, rng: np.random.Generator, own: OwnTerrain | None = None
-) -> NDArray[np.float32]:
+def ground_tones(grid: Any, sun: Float64, rng: np.random.Generator) -> NDArray[np.float32]:
     """Relative brightness (n, n) [y, x] of the inner grid's cells: light and dark soil, lit by the sun."""
     module = kernels()
     e = grid.elevation_m.astype(np.float64)
@@ -348,9 +315,6 @@ def ground_tones(
     level = module.AMBIENT - (1.0 - module.AMBIENT) * sun[2]
     soil = ground.fractal(grid.cells, rng, 0.75, 2.0, 10.0 / grid.cell_m)
     soil = np.exp(0.13 * soil)
-    if own is not None:
-        middles = grid.x0_m + (np.arange(grid.cells) + 0.5) * grid.cell_m
-        soil = ground.soil(own, middles[None, :], middles[:, None], grid.cell_m, soil)
     return np.asarray(soil * light / level, dtype=np.float32)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from calib.geometry.sensor_mode import FLIPS, Mode
+from calib.geometry.mode import FLIPS, Mode
 from drivers.errors import BadOptions
 from drivers.faults import nearest, read_script
 from drivers.options import OptionReader, filled
@@ -19,7 +19,6 @@ from drivers.sim.camera_settings import (
     clock_settings,
     temperature_settings,
 )
-from drivers.sim.ground import read_terrain
 from drivers.sim.heads import HeadSettings, head_settings
 from drivers.sim.pan_tilt import DEFAULT_HEADS, check_head
 from drivers.sim.placed import read_list
@@ -33,23 +32,15 @@ class SimulationSettings:
 
     Attributes
     ----------
-    rover
-        The true rig, a mast file.
-    head
-        What the head is made of.
     camera
         Rate, exposure and noise of every camera; the seed is the simulation's.
     samples
         Rays per pixel along each side: 2 is 2x2.
-    scene
-        What is rendered.
     faults
         Faults set from the start, as ``FaultPanel.set_all`` reads them.
     wire
         None: the head is in memory. ``dynamixel`` or ``flir_ptu``: the real driver turns it through a
         simulated line.
-    temperature
-        What a day does to lenses and mount.
     clocks
         By camera's name: when it exposes and what its stamps are worth; those of no entry are one and true.
     sensor_modes
@@ -80,6 +71,9 @@ KEYS = (
 def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationSettings:
     """Return the settings that a configuration's ``simulation`` section asks for.
 
+    Raises BadOptions for an unknown key or a value of the wrong kind, naming the key and the nearest valid
+    one.
+
     Parameters
     ----------
     section
@@ -92,11 +86,6 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
         needed.
     folder
         Where relative paths start.
-
-    Raises
-    ------
-    BadOptions
-        For an unknown key or a value of the wrong kind, naming the key and the nearest valid one.
     """
     read = OptionReader(section, KEYS, ("rover",), "simulation.")
     rover = read.text("rover", "the file of the true rig")
@@ -122,7 +111,7 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
         head=head,
         camera=replace(camera, seed=seed),
         samples=read.whole("samples", 2, 1, 6),
-        scene=scene_settings(scene, folder),
+        scene=scene_settings(scene),
         faults=tuple(faults),
         wire=wire,
         speed=simulation_speed(section.get("speed", 1.0)),
@@ -150,24 +139,16 @@ def _sensor_modes(simulation: OptionReader) -> dict[str, Mode]:
     return modes
 
 
-def scene_settings(section: Any, folder: Path) -> SceneSettings:
-    """Return the settings of ``simulation.scene``; files in it start at ``folder``. Raises BadOptions."""
+def scene_settings(section: Any) -> SceneSettings:
+    """Return the settings of ``simulation.scene``. Raises BadOptions."""
     plain: Any = section
     placed: dict[str, Any] = {}
     if isinstance(section, Mapping):
         placed = {
-            kind: read_list(kind, section[kind], folder)
+            kind: read_list(kind, section[kind])
             for kind in ("rocks", "bricks", "boards")
             if isinstance(section.get(kind), list | tuple)
         }
-        if "terrain" in section:
-            placed["terrain"] = read_terrain(section["terrain"], folder)
         plain = {key: value for key, value in section.items() if key not in placed}
-        beside = set(section) - {"plugin", "options", "seed"} if "plugin" in section else set()
-        if beside:
-            words = "stands beside plugin, expected nothing: the scene from outside makes all"
-            raise BadOptions(f"simulation.scene.{min(beside, key=str)} {words}")
     settings: SceneSettings = filled(SceneSettings(), plain, "simulation.scene")
-    if settings.options and not settings.plugin:
-        raise BadOptions("simulation.scene.options stand without a plugin, expected that too")
     return replace(settings, **placed)

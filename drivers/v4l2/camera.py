@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from calib.geometry.sensor_mode import SensorMode
 from drivers import pixels
 from drivers.clock import Clock, SystemClock
 from drivers.errors import NoCamera, NoFreshFrame, StreamFailed
-from drivers.interfaces import CameraSetting, FrameTime
+from drivers.interfaces import Camera, CameraInfo, CameraSetting, FrameTime
 from drivers.newest import Counters, TimedFrame
+from drivers.registry import Driver
 from drivers.v4l2 import find
 from drivers.v4l2.capture import Bytes, Capture
 from drivers.v4l2.controls import get_value, list_controls
@@ -29,18 +29,14 @@ HOLD_MOST_S = 1.0
 def open_camera(options: Mapping[str, Any], clock: Clock | None = None, name: str = "v4l2") -> V4l2Camera:
     """Open a camera by a configuration's options (docs/how-to/cameras.md).
 
-    Raises
-    ------
-    BadOptions
-        For options that it refuses; UnsupportedFormat and NotACamera are of this kind.
-    DriverError
-        If the camera is not connected, busy, or not to be opened by this user.
+    Raises BadOptions for options that it refuses; UnsupportedFormat and NotACamera are of this kind;
+    DriverError if the camera is not connected, busy, or not to be opened by this user.
     """
     return V4l2Camera(parse_options(options, name), name, clock or SystemClock())
 
 
-class V4l2Camera:
-    """One camera, an instance of ``drivers.interfaces.Camera``; safe from any thread."""
+class V4l2Camera(Camera):
+    """One camera; safe from any thread."""
 
     def __init__(self, options: CameraOptions, name: str, clock: Clock) -> None:
         self.name = name
@@ -75,26 +71,22 @@ class V4l2Camera:
         return self.capture.newest.counters
 
     @property
-    def size_px(self) -> tuple[int, int]:
-        """(width, height) of every picture."""
-        return self.capture.format.size_px
-
-    @property
-    def sensor_mode(self) -> SensorMode:
-        """Which pixels of its sensor its pictures show, as far as its driver reports it."""
-        return self.capture.sensor_mode
+    def info(self) -> CameraInfo:
+        """Size, sensor mode and period as its driver reports them, and the configured trigger."""
+        capture = self.capture
+        return CameraInfo(
+            size_px=capture.format.size_px,
+            sensor_mode=capture.sensor_mode,
+            period_s=capture.period_s,
+            trigger=self._options.trigger,
+        )
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> TimedFrame:
         """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.
 
-        Its stamp is at most a period and 5 ms old, or it came during the call.
-
-        Raises
-        ------
-        NoFreshFrame
-            If none came within ``timeout_s`` seconds; the message says what came instead.
-        NoCamera
-            At once, if the camera is gone.
+        Its stamp is at most a period and 5 ms old, or it came during the call. Raises NoFreshFrame if none
+        came within ``timeout_s`` seconds; the message says what came instead; NoCamera (at once, if the
+        camera is gone).
         """
         damaged = self.capture.newest.damaged
         taken = self.capture.take(exposed_after_s, timeout_s)
@@ -124,16 +116,6 @@ class V4l2Camera:
         )
         return self._last
 
-    @property
-    def period_s(self) -> float:
-        """From frame to frame, seconds, by the driver's word."""
-        return self.capture.period_s
-
-    @property
-    def trigger(self) -> str:
-        """The name of the hardware trigger that exposes it; empty for a free-running camera."""
-        return self._options.trigger
-
     def recent_times(self) -> list[FrameTime]:
         """Return the times of the last good frames of this stream, oldest first."""
         return [FrameTime(frame.sequence, frame.window.begin_s) for frame in self.capture.newest.recent()]
@@ -161,7 +143,7 @@ class V4l2Camera:
         return self.capture.settings()
 
     def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
-        """Change some of them, as `drivers.interfaces.Adjustable.adjust`."""
+        """Change some of them, as `drivers.interfaces.Camera.adjust`."""
         return self.capture.adjust(wanted)
 
     @contextmanager
@@ -170,12 +152,8 @@ class V4l2Camera:
 
         A change that this camera's group decided on before is first made, and waited for until it shows, for
         eight periods (1 s) at most. What was not made by then is made after the block. A change of settings
-        that was made before is waited for likewise.
-
-        Raises
-        ------
-        StreamFailed
-            If the camera is still at such a change after that time: nobody could say when it takes effect.
+        that was made before is waited for likewise. Raises StreamFailed if the camera is still at such a
+        change after that time: nobody could say when it takes effect.
         """
         control = self._exposure
         if control is None:
@@ -262,3 +240,6 @@ class V4l2Camera:
         finally:
             with self._exposed:
                 self._changing, self._asked_s = False, stream.asked_exposure_s
+
+
+DRIVER = Driver(lambda options, context: open_camera(options, context.clock, context.name))

@@ -131,13 +131,7 @@ class Capture:
         return self._convert(frame.format, data), pixels.jpeg_of(frame.format, data)
 
     def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
-        """Change settings; a stream that is opened later has them too.
-
-        Raises
-        ------
-        BadSetting, DriverError
-            As `drivers.interfaces.Adjustable.adjust`.
-        """
+        """Change settings; a stream that is opened later has them too. Raises BadSetting, DriverError."""
         with self._opening, find.open_node(self._options.address, self._name) as node:
             became, notes, refused = change(node, wanted, self._in_force, self._clock, self._name)
             self._options = with_settings(self._options, became)

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from drivers.v4l2 import abi
-from drivers.v4l2.node import Node
+from drivers.v4l2.node import Node, reason
 
 Value = int | str | bool
 
@@ -36,6 +36,14 @@ _TYPE_WORDS = {
     abi.CTRL_TYPE_INTEGER_MENU: "menu",
 }
 
+_REASONS = {
+    errno.EACCES: "it cannot be changed now; its automatic may be on",
+    errno.EBUSY: "it cannot be changed now; another program has it",
+    errno.ERANGE: "the camera says that the value is out of its range",
+    errno.EREMOTEIO: "the camera has not enough power",
+}
+"""What error numbers mean of a control, by the V4L2 API's pages and by uvcvideo (uvc_query_ctrl)."""
+
 
 @dataclass(frozen=True)
 class CameraControl:
@@ -50,8 +58,6 @@ class CameraControl:
         ``type 263`` for one that this program does not know; the last two can be listed but not set.
     minimum, maximum, step, default
         Its range, in the device's own units.
-    menu
-        The entries of a menu by number.
     settable
         Whether it takes a value (perhaps not now: an inactive one waits for its automatic to be off).
     """
@@ -84,7 +90,7 @@ def list_controls(node: Node) -> list[CameraControl]:
     found: list[CameraControl] = []
     last_id = 0
     for _ in range(_MOST_CONTROLS):
-        query = abi.QueryExtCtrl(id=last_id | abi.CTRL_FLAG_NEXT_CTRL)
+        query = abi.QueryExtCtrl(id=last_id | abi.CTRL_FLAG_NEXT_CTRL | abi.CTRL_FLAG_NEXT_COMPOUND)
         try:
             fcntl.ioctl(node.fileno(), abi.VIDIOC_QUERY_EXT_CTRL, query)
         except OSError as error:
@@ -211,5 +217,5 @@ def _exchange(node: Node, request: int, entry: abi.ExtControl) -> str:
     except OSError as error:
         if error.errno in (errno.ENODEV, errno.ENXIO):
             raise node.failure(error, "take controls") from None
-        return error.strerror or str(error)
+        return _REASONS.get(error.errno or 0) or reason(error)
     return ""

@@ -53,8 +53,6 @@ class ExposureControl:
 
     Parameters
     ----------
-    settings
-        The target.
     exposure_s
         The exposure time to begin with, seconds.
     """
@@ -154,11 +152,8 @@ class _Groups:
     def join(self, camera: str, settings: AutoExposureSettings, exposure_s: float) -> ExposureControl:
         """Return the control of a group, made by its first camera; a camera without group has its own.
 
-        Raises
-        ------
-        BadOptions
-            If the camera has other settings, or begins with another exposure time, than the group's first:
-            cameras of one group have one exposure.
+        Raises BadOptions if the camera has other settings, or begins with another exposure time, than the
+        group's first: cameras of one group have one exposure.
         """
         if not settings.group:
             return ExposureControl(settings, exposure_s)

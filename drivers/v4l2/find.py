@@ -75,14 +75,7 @@ def check_address(address: Address, name: str) -> None:
 def open_node(address: Address, name: str) -> Node:
     """Open the camera of an address.
 
-    Raises
-    ------
-    NoCamera
-        If nothing of that name is connected.
-    BadOptions
-        If several cameras bear it.
-    DriverError
-        If it cannot be opened.
+    Raises NoCamera if nothing of that name is connected; BadOptions if several cameras bear it; DriverError.
     """
     if address.link is not None:
         return Node(address.link, name)
@@ -178,13 +171,8 @@ def options_for(
 
     A node's number is good for now, so here, where a person just read it, it is taken and turned into card
     and bus. What is not given stays as the camera has it: size and rate, and the format if it can be read.
-
-    Raises
-    ------
-    NoCamera
-        If nothing of that name is connected.
-    DriverError
-        If it cannot be opened or has no format that can be read.
+    Raises NoCamera if nothing of that name is connected; DriverError if it cannot be opened or has no format
+    that can be read.
     """
     path = _node_path(word)
     with Node(path, word) as node:

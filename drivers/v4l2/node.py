@@ -27,13 +27,24 @@ from drivers.errors import (
 from drivers.pixels import PictureFormat
 from drivers.v4l2 import abi
 
-_quick_ioctl = ctypes.PyDLL(None, use_errno=True).ioctl
-"""Keeps Python's lock, for the two requests of every frame: they never wait, and a thread that lets go of the
-lock may get it back only after 5 ms."""
+_quick_ioctl = ctypes.CDLL(None, use_errno=True).ioctl
+"""For the two requests of every frame: half the time of `fcntl.ioctl`. It releases Python's lock, because
+many drivers make them wait for the end of a control write."""
 _quick_ioctl.argtypes = (ctypes.c_int, ctypes.c_ulong, ctypes.c_void_p)
 
 _CAPTURES = abi.CAP_VIDEO_CAPTURE | abi.CAP_VIDEO_CAPTURE_MPLANE
 _MOST_ENTRIES = 1024  # of any enumeration: a driver that never ends one must not hang us
+
+
+_USB_TRANSFERS = "its USB transfers fail; try another cable, port or powered hub"
+_USB_REASONS = {
+    errno.EPROTO: _USB_TRANSFERS,
+    errno.EILSEQ: _USB_TRANSFERS,
+    errno.ETIME: _USB_TRANSFERS,
+    errno.ETIMEDOUT: "it does not answer over USB; unplug it and plug it in again",
+    errno.EPIPE: "it refuses the USB request; unplug it and plug it in again, or use another format",
+}
+"""What the kernel's error numbers mean of a USB device (Documentation/driver-api/usb/error-codes.rst)."""
 
 
 class NotACamera(BadOptions):
@@ -69,19 +80,8 @@ class Dequeued(NamedTuple):
 class Node:
     """An open video node, of either capture interface of the kernel: single-planar or multi-planar.
 
-    A context manager; closing it stops the stream and gives everything back.
-
-    Parameters
-    ----------
-    path
-        The node or a link to it. That it captures is checked here.
-    name
-        The camera's name in messages.
-
-    Raises
-    ------
-    NoCamera, NoPermission, CameraBusy, NotACamera
-        If it cannot be opened or gives no pictures.
+    A context manager; closing it stops the stream and gives everything back. Raises NoCamera, NoPermission,
+    CameraBusy, NotACamera if it cannot be opened or gives no pictures.
     """
 
     def __init__(self, path: str | Path, name: str = "") -> None:
@@ -232,8 +232,17 @@ class Node:
             except OSError as error:
                 raise self.failure(error, f"map buffer {index}") from None
             self.queue(index)
-        on = ctypes.c_int32(self._type)
-        self.call(abi.VIDIOC_STREAMON, on, "start the stream")
+        try:
+            fcntl.ioctl(self._fd, abi.VIDIOC_STREAMON, ctypes.c_int32(self._type))
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise self.failure(error, "start the stream") from None
+            raise StreamFailed(
+                f"{self.path} does not start the stream: its USB bus has no bandwidth left for "
+                f"{self._picture()}; use the format MJPG, a smaller size or a lower rate, or a port of "
+                "another USB controller",
+                device=self.name,
+            ) from None
         self._streaming = True
 
     def queue(self, index: int) -> None:
@@ -318,13 +327,28 @@ class Node:
             return NoCamera(f"{self.path} is gone", device=self.name)
         if error.errno == errno.EBUSY:
             return CameraBusy(f"{self.path} is in use by another program", device=self.name)
-        return StreamFailed(f"{self.path} does not {what}: {os.strerror(error.errno or 0)}", device=self.name)
+        return StreamFailed(f"{self.path} does not {what}: {reason(error)}", device=self.name)
+
+    def _picture(self) -> str:
+        """The format, size and rate that are set, for a message."""
+        try:
+            set_now = self.current_format()
+        except DriverError:
+            return "its pictures"
+        rate_hz = self.current_rate()
+        at = "" if rate_hz is None else f" at {rate_hz:g} Hz"
+        return f"{set_now.code} {set_now.size_px[0]}x{set_now.size_px[1]}{at}"
 
     def _unmap(self) -> None:
         for mapping in chain.from_iterable(self._maps):
             with contextlib.suppress(BufferError):  # somebody still looks at a frame: it goes with that
                 mapping.close()
         self._maps = []
+
+
+def reason(error: OSError) -> str:
+    """Return why the kernel refused a request, in words."""
+    return _USB_REASONS.get(error.errno or 0) or os.strerror(error.errno or 0)
 
 
 def capture_nodes(folder: Path = Path("/sys/class/video4linux")) -> Iterator[Path]:

@@ -27,8 +27,6 @@ class CameraOptions:
 
     Attributes
     ----------
-    address
-        Which camera.
     format, size_px, rate_hz
         What is asked of it; a rate of None (null) stays as it is. The answer is checked against them.
     colour
@@ -67,10 +65,7 @@ class CameraOptions:
 def parse_options(options: Mapping[str, Any], name: str) -> CameraOptions:
     """Read a camera's options.
 
-    Raises
-    ------
-    BadOptions
-        Naming the camera, the option, its value and what is expected.
+    Raises BadOptions naming the camera, the option, its value and what is expected.
     """
     read = OptionReader(options, OPTIONS, device=name)
     device, card, bus = (read.text(key, "a text", "") for key in ("device", "card", "bus"))

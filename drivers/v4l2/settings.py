@@ -32,8 +32,6 @@ class Meaning:
         As in `drivers.interfaces.SETTINGS`, and in words.
     automatic, off
         The control of its automatic, and that control's value for off.
-    control, unit
-        The control of its value, and what one of that is worth.
     """
 
     name: str
@@ -86,10 +84,6 @@ def settings_of(node: Node, options: CameraOptions, period_s: float | None) -> l
 
     Parameters
     ----------
-    node
-        The opened node.
-    options
-        Those it was opened with.
     period_s
         From frame to frame, which bounds an exposure; None if the camera does not say.
     """

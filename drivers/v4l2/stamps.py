@@ -124,8 +124,6 @@ def exposure_window(
 
     Parameters
     ----------
-    flags
-        The buffer's flags.
     stamp_s, received_s
         The buffer's stamp, and when it was dequeued, seconds of CLOCK_MONOTONIC.
     """
@@ -159,8 +157,6 @@ class Spacing:
     ----------
     promised_s
         From frame to frame by the camera's own word, seconds; None where it gives none.
-    margin_s
-        How late a stamp may be.
     """
 
     def __init__(self, promised_s: float | None, margin_s: float) -> None:

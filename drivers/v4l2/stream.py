@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
-from calib.geometry.sensor_mode import SensorMode
+from calib.geometry.mode import SensorMode
 from drivers.clock import Clock
 from drivers.errors import DriverError, NoCamera, UnsupportedFormat
 from drivers.pixels import FORMATS, PictureFormat
@@ -34,34 +34,24 @@ UNKNOWN_RATE_HZ = 5.0  # a period longer than any that a camera without a rate i
 class Stream:
     """A camera with its format, rate and controls set, streaming. Closing it gives everything back.
 
+    Raises UnsupportedFormat if format, size or rate are not to be had, the message says what is; and for an
+    exposure longer than a frame, for which a camera stretches its frames; DriverError if the camera cannot be
+    opened or does not start.
+
     Attributes
     ----------
-    node, format
-        The open node, and the format that frames have.
     rate_hz, period_s
         The rate that the camera answered, or the asked one where it does not tell; from frame to frame.
     rate_told
         Whether the camera itself told that rate.
-    rule
-        How the time stamps are to be read.
     in_force
         With which exposure time, gain, ... a frame may have been taken, of those that it has.
     exposure_s
         The exposure time by the camera's own word, None if unknown: also where its automatic stayed on.
     asked_exposure_s
         The exposure time that was set last, before the camera rounded it.
-    problems
-        Controls that are missing or not as asked.
     sensor_mode
         Which pixels of the sensor frames show, as far as the driver reports it.
-
-    Raises
-    ------
-    UnsupportedFormat
-        If format, size or rate are not to be had, the message says what is; and for an exposure longer than a
-        frame, for which a camera stretches its frames.
-    DriverError
-        If the camera cannot be opened or does not start.
     """
 
     def __init__(
@@ -166,10 +156,7 @@ class Stream:
 def set_format(node: Node, code: str, size_px: tuple[int, int], name: str) -> PictureFormat:
     """Set format and size and check the answer.
 
-    Raises
-    ------
-    UnsupportedFormat
-        If the camera answers with another one; the message says what it offers.
+    Raises UnsupportedFormat if the camera answers with another one; the message says what it offers.
     """
     answer = node.set_format(code, size_px)
     if answer.code != code:

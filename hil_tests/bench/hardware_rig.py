@@ -10,14 +10,17 @@ from typing import Any
 
 from drivers.dynamixel import workshop as dynamixel
 from drivers.dynamixel.link import Link
-from drivers.feetech import workshop as feetech
-from drivers.feetech.link import FeetechLink, open_link
-from drivers.hardware import DeviceSettings, head_options
+from drivers.dynamixel.settings import dynamixel_settings
+from drivers.feetech import servos as feetech
+from drivers.feetech.head import feetech_settings
+from drivers.feetech.servos import open_link
+from drivers.hardware import DeviceSettings
 from mastctl.config import load_config
 from mastctl.conform.devices import head_under_test
 from mastctl.conform.head_trial import HeadTrial
 from mastctl.service.masts import bounds_of
 
+READERS: dict[str, Any] = {"dynamixel": dynamixel_settings, "feetech": feetech_settings}
 CHOSEN: str | None = None
 """The configuration that --hardware names."""
 
@@ -34,15 +37,14 @@ def hardware_trial(file: Path) -> Iterator[HeadTrial]:
 
 def error_registers(settings: DeviceSettings) -> dict[str, Any]:
     """What the device itself has noted as wrong, by name; the head has to be closed."""
-    if settings.driver not in ("dynamixel", "feetech"):
-        return {}  # a PTU's !P and !T are in the last reading's faults; a VISCA or Pelco head notes nothing
-    options = head_options(settings)
-    link: Link | FeetechLink
+    if settings.driver not in READERS:
+        return {}  # a PTU's !P and !T are in the last reading's faults
+    options: Any = READERS[settings.driver](settings.options)
+    ids = {"pan": options.pan.servo_id, "tilt": options.tilt.servo_id}
     if settings.driver == "dynamixel":
-        link, register, facts = Link(options.port, options.baud), "hardware_error", dynamixel.facts
+        with closing(Link(options.port, options.baud)) as link:
+            found = {name: dynamixel.facts(link, n).values["hardware_error"] for name, n in ids.items()}
     else:
-        link, register, facts = open_link(options.port, options.baud), "status", feetech.facts
-    with closing(link):
-        axes = {"pan": options.pan, "tilt": options.tilt}
-        found = {name: facts(link, axis.servo_id).values[register] for name, axis in axes.items()}
+        with closing(open_link(options.port, options.baud)) as line:
+            found = {name: feetech.facts(line, n).values["status"] for name, n in ids.items()}
     return {name: value for name, value in found.items() if value}

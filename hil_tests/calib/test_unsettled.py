@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,17 +12,21 @@ from scipy.spatial.transform import Rotation
 
 from calib.adjust import robust
 from calib.adjust import solver as least_squares
+from calib.adjust.terms import ImageTerm
 from calib.calibrate import body as fit_body_pose
 from calib.calibrate import paper as fit_paper
 from calib.calibrate import survey as fit_joint
-from calib.calibrate.starts import camera as fit_camera
-from calib.calibrate.starts import mast as fit_mast
+from calib.calibrate.starts import agreeing
+from calib.calibrate.starts.agreeing import Agreed
+from calib.calibrate.starts.camera import CameraNotFitted
+from calib.calibrate.starts.mast import MastNotFitted, References, fit_mast
 from calib.errors import CalibError
+from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
-from calib.geometry.rigid import FloatArray
+from calib.geometry.rigid import FloatArray, Rigid
 from calib.matching import look as one_point
 from hil_tests.calib.adjust.small_surveys import survey_of
-from hil_tests.calib.calibrate.test_fit_camera import boards
+from hil_tests.calib.calibrate.test_fit_camera import boards, fit_camera
 from hil_tests.calib.matching.handed_over import HAZCAMS, hand_offs, moved_hazcams, plain_rig, targets
 from tools.flight import poses as fit_poses
 
@@ -82,51 +87,55 @@ def stopped(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 def test_a_camera(true_rig: Rig, stopped: Callable[..., None]) -> None:
-    stopped(fit_camera)
+    stopped(agreeing)
     model = true_rig.cameras["navcam_left"].model
     points, pixels, images = boards(model, (3.0, 6.0), 1)
     pixels = pixels + np.random.default_rng(4).normal(0.0, 0.1, pixels.shape)
     focal_px = float(np.linalg.norm(np.cross(model.A, model.H)))
-    with pytest.raises(fit_camera.CameraNotFitted, match="settled"):
-        fit_camera.fit_camera(
-            points, pixels, images, kind=model.kind, size_px=model.size_px, focal_px=focal_px
-        )
+    with pytest.raises(CameraNotFitted, match="settled"):
+        fit_camera(points, pixels, images, kind=model.kind, size_px=model.size_px, focal_px=focal_px)
 
 
 @pytest.mark.parametrize("parameters", [4, 6])
 def test_a_mast(navcams: Rig, stopped: Callable[..., None], parameters: int) -> None:
-    views = mast_views(navcams)
-    fit_mast.fit_mast(views, parameters, keep_all=parameters == 4)
-    stopped(fit_mast)
-    with pytest.raises(fit_mast.MastNotFitted, match="settled"):
-        fit_mast.fit_mast(views, parameters, keep_all=parameters == 4)
+    fitted_mast(navcams, parameters, keep_all=parameters == 4)
+    stopped(agreeing)
+    with pytest.raises(MastNotFitted, match="settled"):
+        fitted_mast(navcams, parameters, keep_all=parameters == 4)
 
 
 def test_a_mast_is_judged_by_where_its_last_fit_ended(navcams: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    views, far = mast_views(navcams), np.array([0.5, 0.2, -1.7, 0.1, -0.1, 0.1, 0.0, 0.0])
-    fit = fit_mast.fit_mast(views, 6, expected_px=0.3, rough=far)
+    far = np.array([0.5, 0.2, -1.7, 0.1, -0.1, 0.1, 0.0, 0.0])
+    fit = fitted_mast(navcams, 6, expected_px=0.3, rough=far)
 
     def minimise(*arguments: object, steps: int = 200, **options: object) -> object:
         return least_squares.minimise(*arguments, steps=steps if steps >= 100 else 0, **options)  # type: ignore
 
-    monkeypatch.setattr(fit_mast, "minimise", minimise)  # what leads there does not
-    late = fit_mast.fit_mast(views, 6, expected_px=0.3, rough=far)
+    monkeypatch.setattr(agreeing, "minimise", minimise)  # what leads there does not
+    late = fitted_mast(navcams, 6, expected_px=0.3, rough=far)
     assert not late.left_out
-    assert np.abs(late.mast - fit.mast).max() < 1e-6
+    assert np.abs(late.fit.state.mast - fit.fit.state.mast).max() < 1e-6
 
 
-def mast_views(rig: Rig) -> list[fit_mast.MastView]:
-    """Images of random points at many joint angles."""
-    rng, views = np.random.default_rng(3), []
+def fitted_mast(rig: Rig, parameters: int, **options: Any) -> Agreed:
+    """The mast fitted to images of random points at many joint angles."""
+    rng, terms = np.random.default_rng(3), []
     for index in range(8):
         joints = (float(rng.uniform(-0.6, 0.6)), float(rng.uniform(-0.5, 0.0)))
         camera = rig.camera_in_rover("navcam_left", *joints)
         rays = camera.ray(rng.uniform(100, 700, (12, 2)))
         points = rays.origins_m + rng.uniform(2.0, 5.0, 12)[:, None] * rays.directions
         pixels = camera.project(points)[0] + rng.normal(0.0, 0.2, (12, 2))
-        reference = rig.camera_in_rover("navcam_left", 0.0, -0.2)
-        views.append(fit_mast.MastView(f"i{index}", reference, (0.0, -0.2), joints, points, pixels))
-    return views
+        rows, name = np.arange(12), f"i{index}"
+        terms.append(
+            ImageTerm(
+                name, "navcam_left", ("points", name), index, *joints, rows, rows, points, pixels,
+                np.ones(12), np.ones(12, dtype=bool),
+            )
+        )  # fmt: skip
+    at = (0.0, -0.2)
+    references = References({"navcam_left": rig.camera_in_rover("navcam_left", *at)}, {"navcam_left": at})
+    return fit_mast(terms, {t.board: Rigid.identity() for t in terms}, references, parameters, **options)
 
 
 def test_a_survey_in_one_piece(navcams: Rig, stopped: Callable[..., None]) -> None:
@@ -136,7 +145,7 @@ def test_a_survey_in_one_piece(navcams: Rig, stopped: Callable[..., None]) -> No
 
 
 def test_a_survey_as_the_paper_does_it(navcams: Rig, stopped: Callable[..., None]) -> None:
-    stopped(fit_mast)
+    stopped(agreeing)
     with pytest.raises(robust.SurveyNotFitted, match="settled"):
         fit_paper.fit_paper(survey_of(navcams, 2))
 
@@ -144,7 +153,7 @@ def test_a_survey_as_the_paper_does_it(navcams: Rig, stopped: Callable[..., None
 def test_a_mast_from_camera_models(navcams: Rig, stopped: Callable[..., None]) -> None:
     rng = np.random.default_rng(1)
     pan, tilt = rng.uniform(-1.0, 1.0, 8), rng.uniform(-0.6, 0.3, 8)
-    models = []
+    models: list[CameraModel] = []
     for p, t in zip(pan, tilt, strict=True):
         model = navcams.camera_in_rover("navcam_left", float(p), float(t))
         models.append(shaken(model, rng))
@@ -156,8 +165,6 @@ def test_a_mast_from_camera_models(navcams: Rig, stopped: Callable[..., None]) -
 
 def shaken(model: object, rng: np.random.Generator) -> object:
     """The model turned by some 5 mrad and moved by some 5 mm."""
-    from calib.geometry.rigid import Rigid
-
     turn = Rotation.from_rotvec(rng.normal(0.0, 5e-3, 3)).as_matrix()
     return model.moved(Rigid(turn, rng.normal(0.0, 5e-3, 3)))  # type: ignore[attr-defined]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,7 +13,7 @@ import pytest
 from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.rig import Rig, RigCamera
 from drivers.sim import rover
-from drivers.sim.quick_start import kept_scene
+from drivers.sim.kept_scenes import kept_scene
 from drivers.sim.scene import Scene, SceneSettings
 
 SHRINK = 4
@@ -51,9 +50,10 @@ def small_rig(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 @pytest.fixture(scope="session")
 def sources(repository: Path) -> dict[str, str]:
-    """File name to text, from the code blocks of the page that follow a file's name."""
-    page = (repository / "docs" / "drivers.md").read_text()
-    return dict(re.findall(r"`([\w/]+\.(?:py|toml))`[^\n]*:\n\n```\w+\n(.*?)```", page, re.DOTALL))
+    """File name to text of the package that the page shows."""
+    package = repository / "docs" / "examples" / "bench_rig"
+    names = ("pyproject.toml", "bench_rig/head.py", "bench_rig/camera.py")
+    return {name: (package / name).read_text() for name in names}
 
 
 @pytest.fixture(scope="session")

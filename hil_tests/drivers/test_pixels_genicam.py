@@ -41,17 +41,6 @@ def test_packed_grey_keeps_its_upper_eight_bits(bits: int, ending: str, lay: obj
     assert np.array_equal(pixels.grey(format, raw), values >> bits - 8)
 
 
-def test_colours_stand_in_the_order_of_the_name() -> None:
-    raw = np.tile(np.array([200, 100, 50], np.uint8), WIDTH * HEIGHT)
-    red_first = pixels.colour(PictureFormat("RGB8", (WIDTH, HEIGHT), 0, len(raw)), raw)
-    blue_first = pixels.colour(PictureFormat("BGR8", (WIDTH, HEIGHT), 0, len(raw)), raw)
-    assert red_first[0, 0].tolist() == [50, 100, 200]
-    assert blue_first[0, 0].tolist() == [200, 100, 50]
-    assert not np.shares_memory(blue_first, raw)
-    grey = pixels.grey(PictureFormat("RGB8", (WIDTH, HEIGHT), 0, len(raw)), raw)
-    assert abs(int(grey[0, 0]) - round(0.299 * 200 + 0.587 * 100 + 0.114 * 50)) <= 1
-
-
 @pytest.mark.parametrize(("name", "code"), [("BayerRG8", "RGGB"), ("BayerGB8", "GBRG"), ("Mono16", "Y16")])
 def test_the_same_samples_make_the_same_picture_as_through_v4l2(name: str, code: str) -> None:
     size = WIDTH * HEIGHT * (2 if name == "Mono16" else 1)

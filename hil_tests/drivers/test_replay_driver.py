@@ -11,7 +11,6 @@ import pytest
 
 from drivers.clock import ManualClock
 from drivers.errors import BadFrame, BadOptions, NoFreshFrame
-from drivers.interfaces import Camera, PanTilt
 from drivers.recordings.replay import NoRecording, Replay, open_replay
 
 ANGLES = [(0.1, -0.2), (0.5, -0.2), (1.0, 0.1)]
@@ -34,14 +33,7 @@ def opened(folder: Path, clock: ManualClock | None = None, **options: Any) -> Re
     return open_replay({"frames": "frames.csv", **options}, folder, clock or ManualClock(100.0))
 
 
-def test_the_devices_are_those_of_the_protocols(folder: Path) -> None:
-    recording = opened(folder)
-    assert isinstance(recording.pan_tilt, PanTilt)
-    assert sorted(recording.cameras) == ["navcam_left", "navcam_right"]
-    assert all(isinstance(camera, Camera) for camera in recording.cameras.values())
-
-
-def test_the_head_goes_to_the_nearest_pointing_and_reads_what_was_measured_there(folder: Path) -> None:
+def test_the_head_goes_to_the_nearest_recorded_pointing(folder: Path) -> None:
     recording = opened(folder)
     assert (recording.pan_tilt.read().pan_rad, recording.pan_tilt.read().tilt_rad) == ANGLES[0]
     recording.pan_tilt.move(0.5015, -0.1985, 0.3)
@@ -65,11 +57,6 @@ def test_the_tolerance_is_tested_on_both_sides(folder: Path, pan: float, refused
     assert head.read().pan_rad == 0.1
 
 
-def test_angles_that_are_no_numbers_are_refused(folder: Path) -> None:
-    with pytest.raises(NoRecording):
-        opened(folder).pan_tilt.move(float("nan"), 0.0)
-
-
 def test_frames_are_exposed_after_the_asked_moment_and_counted(folder: Path) -> None:
     clock = ManualClock(100.0)
     recording = opened(folder, clock)
@@ -89,15 +76,6 @@ def test_frames_are_exposed_after_the_asked_moment_and_counted(folder: Path) -> 
     late = camera.next_frame(moved_s, 1.0)
     assert late.mid_exposure_s > clock.now_s() - 0.2
     assert late.sequence - second.sequence == pytest.approx(100, abs=2)
-
-
-def test_a_frame_begun_before_the_move_shows_the_old_pointing(folder: Path) -> None:
-    clock = ManualClock(100.0)
-    recording = opened(folder, clock)
-    clock.advance(0.15)
-    recording.pan_tilt.move(0.5, -0.2)
-    clock.advance(0.01)
-    assert (recording.cameras["navcam_left"].next_frame(0.0, 1.0).image == 0).all()
 
 
 def test_no_frame_in_time_says_when_the_next_one_comes(folder: Path) -> None:
@@ -121,8 +99,8 @@ def test_sixteen_bits_become_eight_by_one_scale_for_all_frames(
     folder: Path, low_dn: int, high_dn: int
 ) -> None:
     for index in range(3):
-        image = np.linspace(1000 * index, 1000 * index + 1000, 48).reshape(6, 8).astype(np.uint16)
-        cv2.imwrite(str(folder / f"left{index}.png"), image)
+        deep = np.linspace(1000 * index, 1000 * index + 1000, 48).reshape(6, 8).astype(np.uint16)
+        cv2.imwrite(str(folder / f"left{index}.png"), deep)
     clock = ManualClock(100.0)
     recording = opened(folder, clock, grey_range_dn=[low_dn, high_dn])
     recording.pan_tilt.move(0.5, -0.2)
@@ -133,8 +111,9 @@ def test_sixteen_bits_become_eight_by_one_scale_for_all_frames(
         round((1000 - low_dn) / dn_a_level),
         round((2000 - low_dn) / dn_a_level),
     )
-    scales = {pointing.frames["navcam_left"].scale for pointing in opened(folder).pointings}
-    assert len(scales) == 1
+    recording.pan_tilt.move(1.0, 0.1)
+    other = recording.cameras["navcam_left"].next_frame(clock.now_s(), 1.0).image
+    assert other[0, 0] == round((2000 - low_dn) / dn_a_level), "one scale for all frames"
 
 
 def test_a_file_that_is_gone_is_a_bad_frame(folder: Path) -> None:
@@ -147,48 +126,12 @@ def test_a_file_that_is_gone_is_a_bad_frame(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({}, "one of options.recording, options.products and options.frames"),
-        (
-            {"frames": "frames.csv", "products": "*.IMG"},
-            "one of options.recording, options.products and options.frames",
-        ),
-        ({"frame": "frames.csv"}, "did you mean 'frames'"),
-        ({"frames": 3}, "path of a CSV"),
-        ({"frames": "missing.csv"}, "missing.csv"),
-        ({"frames": "frames.csv", "camera": "navcam_left"}, "name their own"),
-        ({"frames": "frames.csv", "tolerance_rad": 0}, "options.tolerance_rad is 0"),
-        ({"frames": "frames.csv", "tolerance_rad": "wide"}, "options.tolerance_rad is 'wide'"),
-        ({"frames": "frames.csv", "grey_range_dn": [5, 5]}, "options.grey_range_dn is [5, 5]"),
-        ({"products": "*.IMG"}, "options.camera is missing"),
-        ({"products": "*.IMG", "camera": "navcam_left"}, "no file matches"),
-        ({"products": 7, "camera": "navcam_left"}, "list of files or a pattern"),
-        ({"products": [], "camera": "navcam_left"}, "empty"),
-        ({"products": ["left0.png"], "camera": "navcam_left"}, "left0.png"),
-    ],
-)
-def test_options_that_make_no_recording_are_refused_in_one_line(
-    folder: Path, options: dict[str, Any], words: str
-) -> None:
-    with pytest.raises(BadOptions) as caught:
-        open_replay(options, folder, ManualClock())
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
     ("line", "words"),
     [
         ("navcam_left,0.3,0.0", "row 6: 3 cells where 4"),
         ("navcam_left,far,0.0,left0.png", "row 6, pan_rad: 'far' where an angle"),
-        ("navcam_left,0.0,far,left0.png", "row 6, tilt_rad: 'far' where an angle"),
         ("navcam_left,nan,0.0,left0.png", "'nan' where an angle"),
-        ("navcam_left,7.1,0.0,left0.png", "'7.1' where an angle"),
-        (",0.3,0.0,left0.png", "a camera and a file"),
-        ("navcam_left,0.3,0.0,frames.csv", "no image that can be read"),
         ("navcam_left,0.3,0.0,none.png", "none.png"),
-        ("navcam_left,0.1,-0.2,left1.png", "same angles"),
         ("navcam_left,0.3,0.0,big.png", "8 x 6 is expected"),
     ],
 )
@@ -200,12 +143,3 @@ def test_a_malformed_row_is_refused_with_its_place(folder: Path, line: str, word
         opened(folder)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "content", [b"", b"\xff\xfe\x00", b"a,b\n1,2\n", b'camera,pan_rad,tilt_rad,file\n"x']
-)
-def test_a_table_that_is_none_is_refused(folder: Path, content: bytes) -> None:
-    (folder / "frames.csv").write_bytes(content)
-    with pytest.raises(BadOptions):
-        opened(folder)

@@ -13,6 +13,7 @@ from typing import TypeVar
 
 from drivers.clock import Clock
 from drivers.interfaces import PanTilt, Reading
+from drivers.serial_line import ByteLine, OpenLine
 from drivers.simulation_clock import SimulationClock
 from hil_tests import waiting
 
@@ -96,7 +97,7 @@ def turned() -> Iterator[Turned]:
 
 
 class Gate:
-    """Closed until somebody opens it; who waits at it waits on the clock."""
+    """Closed until it is set; waiting at it is waiting on the clock."""
 
     def __init__(self, clock: Clock) -> None:
         self.is_open = False
@@ -112,3 +113,44 @@ class Gate:
         with self._signal:
             while not self.is_open:
                 assert self._signal.wait(waiting.NET_S), "the gate stayed closed"
+
+
+class HangingHost:
+    """Opens a driver's line so that the driver can be kept from writing, as in a process that hangs."""
+
+    def __init__(self, open_line: OpenLine, clock: Clock) -> None:
+        self._open_line = open_line
+        self._free = Gate(clock)
+        self._free.set()
+        self._clock = clock
+
+    def __call__(self, port: str, baud: int, device: str = "") -> ByteLine:
+        line = self._open_line(port, baud, device)
+        return _HangingLine(line, lambda: self._free)
+
+    @contextmanager
+    def hanging(self) -> Iterator[None]:
+        """Every write waits until this ends."""
+        self._free = Gate(self._clock)
+        try:
+            yield
+        finally:
+            self._free.set()
+
+
+class _HangingLine:
+    """A line on which writing waits at a gate."""
+
+    def __init__(self, line: ByteLine, free: Callable[[], Gate]) -> None:
+        self._line, self._free = line, free
+        self.baud, self.byte_s = line.baud, line.byte_s
+
+    def write(self, data: bytes) -> None:
+        self._free().wait()
+        self._line.write(data)
+
+    def read(self, wait_s: float) -> bytes:
+        return self._line.read(wait_s)
+
+    def close(self) -> None:
+        self._line.close()

@@ -24,12 +24,12 @@ def mer() -> ModuleType:
 
 
 @pytest.fixture(scope="session")
-def msl_folder(shared_data: Path) -> Path:
+def msl_folder(reference_data: Path) -> Path:
     """Labels of Curiosity's Navcams."""
-    return shared_data / "msl_navcam"
+    return reference_data / "msl_navcam"
 
 
 @pytest.fixture(scope="session")
-def mer_folder(shared_data: Path) -> Path:
+def mer_folder(reference_data: Path) -> Path:
     """Frames of Opportunity's Navcam."""
-    return shared_data / "mer_navcam"
+    return reference_data / "mer_navcam"

@@ -97,17 +97,6 @@ def test_the_axes_are_those_of_the_flight_software(msl: ModuleType, msl_folder: 
     assert found.twist_mrad[0] == pytest.approx(found.twist_mrad[1], abs=0.005)
 
 
-def test_a_perfect_mast_with_printed_labels_is_no_better(
-    msl: ModuleType, labels: tuple[list[Any], list[Any]], fitted: Any
-) -> None:
-    training, others = labels[0], labels[1][::FEWER]
-    printed = msl.printed_labels(fitted, training, 3), msl.printed_labels(fitted, others, 1003)
-    found = msl.errors(msl.fit(printed[0]), printed[1])
-    assert 0.003 < found.orientation_rms_mrad < 0.007
-    real = msl.errors(fitted, others).orientation_rms_mrad
-    assert real < 1.25 * found.orientation_rms_mrad
-
-
 @pytest.mark.parametrize(("change", "at_least_mrad"), [("six parameters", 0.02), ("final angles", 1.0)])
 def test_the_wrong_mast_and_the_wrong_angles_are_seen(
     msl: ModuleType, msl_folder: Path, change: str, at_least_mrad: float

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import pytest
 
+from hil_tests.support.virtual_machine import apt
 from hil_tests.waiting import until
-from tools.virtual_machine import apt
 
 PROGRAMS = {"debootstrap": "debootstrap", "systemd-nspawn": "systemd-container"}
 SUITE = "bookworm"
@@ -78,9 +78,14 @@ def running(
 
 @contextmanager
 def booted(root: Path, console: Path) -> Iterator[int]:
-    """Boot systemd in a container; yield the number of its first process, for `inside`."""
+    """Boot systemd in a container; yield the number of its first process, for `inside`.
+
+    It may load programs into the kernel: by these systemd allows a unit its devices and addresses alone.
+    """
+    may = ["--capability=all", "--system-call-filter=bpf", "--boot", "--console=read-only"]
     with console.open("wb") as out, subprocess.Popen(
-        [*_options(root), "--boot", "--console=read-only"], stdin=subprocess.DEVNULL, stdout=out, stderr=out
+        [*_options(root), *may], stdin=subprocess.DEVNULL, stdout=out, stderr=out,
+        env={**os.environ, "SYSTEMD_NSPAWN_UNIFIED_HIERARCHY": "1"},
     ) as process, ended(process):  # fmt: skip
         first = first_process(process)
         until(

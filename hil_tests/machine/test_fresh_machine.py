@@ -26,6 +26,7 @@ pytestmark = pytest.mark.long(4, "a whole Debian is made, mastctl installed and 
 
 CONTAINERFILE = Path("configs/container/Containerfile")
 RIG = "configs/rigs/two_servos_two_webcams"
+HEAD = "192.0.2.10"  # of the range for documentation: no machine has it
 SERVOS = """
 [Service]
 User=mastctl
@@ -120,7 +121,7 @@ def test_the_published_port_takes_a_stop_from_anyone_and_a_command_with_a_token(
 @pytest.fixture(scope="module")
 def service_root(root: Path, repository: Path) -> Path:
     """The same Debian with systemd, the unit as it is shipped, and simulated servos on a serial line."""
-    wanted = "systemd systemd-sysv dbus"
+    wanted = "systemd systemd-sysv dbus iproute2"
     debian.run(
         root, "sh", "-c", f"apt-get update -qq && apt-get install -y -qq --no-install-recommends {wanted}",
         network=True, DEBIAN_FRONTEND="noninteractive",
@@ -157,7 +158,8 @@ class Booted:
         return done.stdout + done.stderr
 
     def mastctl(self, *words: str, fails: bool = False) -> str:
-        return self.run("/opt/mastctl/bin/mastctl", *words, fails=fails)
+        named = "MASTCTL_URL=http://127.0.0.1:8420"  # another user's daemon is commanded by its address alone
+        return self.run("/usr/bin/env", named, "/opt/mastctl/bin/mastctl", *words, fails=fails)
 
     def status(self, *words: str) -> dict[str, Any]:
         return dict(json.loads(self.mastctl("status", "--json", *words)))
@@ -229,6 +231,49 @@ def test_systemctl_stop_stops_the_head_first_and_nothing_starts_again(machine: B
     )
     assert machine.property("ActiveState") == "inactive"  # and not "activating", as before a restart
     assert machine.property("Result") == "success"
+
+
+PTU = f"""
+[Service]
+User=mastctl
+ExecStart=/opt/mastctl/bin/mastctl sim ptu --tcp {HEAD}:4000
+"""
+
+
+def test_a_head_on_the_network_is_reached_once_the_unit_allows_its_address(
+    machine: Booted, service_root: Path, repository: Path
+) -> None:
+    machine.run("systemctl", "stop", "mastctl")  # with the servos of the tests before
+    machine.run("ip", "address", "add", f"{HEAD}/32", "dev", "lo")
+    units, file = service_root / "etc/systemd/system", service_root / "etc/mastctl/mastctl.yaml"
+    (units / "ptu.service").write_text(PTU)
+    limits = "pan: {limits_rad: [-2.5, 2.5], sign: -1}, tilt: {limits_rad: [-0.7, 0.4]}"
+    text, count = re.subn(
+        r"^pan_tilt:\n(  .*\n|#.*\n)+",
+        f"pan_tilt: {{driver: flir_ptu, options: {{port: 'socket://{HEAD}:4000', {limits}}}}}\n",
+        file.read_text(), flags=re.MULTILINE,
+    )  # fmt: skip
+    assert count == 1
+    file.write_text(text)
+    machine.run("systemctl", "daemon-reload")
+    machine.run("systemctl", "start", "ptu")
+    before = len(machine.journal())
+    machine.run("systemctl", "start", "mastctl", fails=True)
+    in_order(
+        machine.journal()[before:],
+        r"socket://192\.0\.2\.10:4000 cannot be opened: timed out; .*IPAddressAllow",
+    )
+    machine.run("systemctl", "stop", "mastctl")
+    page = (repository / "docs/how-to/operations.md").read_text()
+    drop_in = re.search(r"```ini\n(\[Service\]\nIPAddressAllow=)[\d.]+\n```", page)
+    assert drop_in is not None, "the page shows the drop-in"
+    (units / "mastctl.service.d").mkdir()
+    (units / "mastctl.service.d/override.conf").write_text(f"{drop_in[1]}{HEAD}\n")
+    machine.run("systemctl", "daemon-reload")
+    machine.run("systemctl", "start", "mastctl")
+    assert machine.status("--wait", "30")["state"] in WELL
+    in_order(machine.back_after("KILL"), r"pan and tilt halted \(H\), confirmed", r"Started mastctl.service")
+    machine.run("systemctl", "stop", "mastctl", "ptu")
 
 
 def in_order(text: str, *patterns: str) -> None:

@@ -13,7 +13,10 @@ import pytest
 from hil_tests.waiting import NET_S
 
 if TYPE_CHECKING:
+    import httpx
+
     from hil_tests.mastctl.service_fakes import FakeHardware
+    from mastctl.client import Client
     from mastctl.daemon import RunningDaemon
 
 
@@ -68,4 +71,36 @@ def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Running
         pytest.MonkeyPatch.context() as patch,
         fake_daemon(patch, tmp_path_factory.mktemp("standing")) as made,
     ):
+        yield made
+
+
+@pytest.fixture
+def daemon(pair: tuple[RunningDaemon, FakeHardware]) -> RunningDaemon:
+    """The daemon of the test's pair."""
+    return pair[0]
+
+
+@pytest.fixture
+def hardware(pair: tuple[RunningDaemon, FakeHardware]) -> FakeHardware:
+    """Its devices."""
+    return pair[1]
+
+
+@pytest.fixture
+def web(daemon: RunningDaemon) -> Iterator[httpx.Client]:
+    """A plain HTTP client of its interface."""
+    import httpx
+
+    from hil_tests.mastctl.service_fakes import PLAIN
+
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", **PLAIN) as made:
+        yield made
+
+
+@pytest.fixture
+def client(daemon: RunningDaemon) -> Iterator[Client]:
+    """A client of it that tells its name."""
+    from mastctl.client import Client
+
+    with Client(daemon.url, name="bench") as made:
         yield made

@@ -24,7 +24,6 @@ from drivers.clock import Clock, SystemClock
 from drivers.interfaces import Camera, Frame, PanTilt, Reading
 from hil_tests.waiting import NET_S
 from mastctl.client import Client
-from mastctl.client.connection import finished
 from mastctl.config import load_config
 
 if TYPE_CHECKING:
@@ -69,7 +68,7 @@ def little_mast_file() -> bytes:
 
 
 @dataclass
-class FakeHead:
+class FakeHead(PanTilt):
     """A head that is where it was sent at once; ``hook(name)`` runs first in every call and may raise."""
 
     pan_rad: float = 0.0
@@ -104,7 +103,7 @@ class FakeHead:
         self.calls.append(("close",))
 
 
-class FakeCamera:
+class FakeCamera(Camera):
     """A camera that takes a picture whenever it is asked; ``change(frame)`` may make something else of it."""
 
     def __init__(self, name: str, seed: int = 0, clock: Clock | None = None) -> None:
@@ -247,6 +246,7 @@ def fake_daemon(
     listen: str = "{port: 0}",
     config: str | None = None,
     loop: type[ScriptedLoop] = ScriptedLoop,
+    hardware: FakeHardware | None = None,
 ) -> Iterator[tuple[RunningDaemon, FakeHardware]]:
     """A daemon on fakes: a real server on loopback, fake devices, a scripted loop.
 
@@ -261,7 +261,7 @@ def fake_daemon(
     for name in ("READ_TIMEOUT_S", "MOVE_TIMEOUT_S", "STOP_TIMEOUT_S"):
         monkeypatch.setattr(devices_module, name, NET_S)
     monkeypatch.setattr(commands_module, "STOP_ANSWER_S", 2.0 * NET_S)
-    hardware = FakeHardware()
+    hardware = hardware or FakeHardware()
     (folder / "little.yaml").write_bytes(little_mast_file())
     (folder / "daemon.yaml").write_text((config or CONFIG).format(listen=listen))
     monkeypatch.setattr("mastctl.devices.opening.open_hardware", lambda settings, clock: hardware)
@@ -283,4 +283,4 @@ limits: {{pan_rad: [-2.0, 2.0], tilt_rad: [-1.0, 1.0], speed_rad_per_s: 0.5}}
 
 def asked_plainly(client: Client, method: str, path: str, **options: Any) -> dict[str, Any]:
     """What a client is answered where it has no method that asks so."""
-    return finished(client._calls._daemon.json(dict[str, Any], method, path, **options))
+    return client.daemon.json(dict[str, Any], method, path, **options)

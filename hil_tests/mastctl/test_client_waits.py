@@ -6,7 +6,6 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -19,15 +18,8 @@ from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
 from mastctl.client import connection as connection_module
 from mastctl.daemon import RunningDaemon
-from mastctl.http import waiting as streams_module
 
 BOTH = tuple[RunningDaemon, FakeHardware]
-
-
-@pytest.fixture
-def client(pair: BOTH) -> Iterator[Client]:
-    with Client(pair[0].url) as made:
-        yield made
 
 
 @pytest.fixture
@@ -93,50 +85,17 @@ def test_an_end_between_the_question_and_the_subscription_is_not_missed(
     assert client.wait(operation, timeout_s=NET_S)["state"] == "done"
 
 
-def test_two_wait_at_once(client: Client, go: threading.Event, pair: BOTH) -> None:
-    operation = client.point(pan_rad=0.0, tilt_rad=0.0)
-    with Client(pair[0].url) as other, ThreadPoolExecutor(2) as pool:
-        waiting = [pool.submit(one.wait, operation, NET_S) for one in (client, other)]
-        go.set()
-        assert [one.result(NET_S)["state"] for one in waiting] == ["done", "done"]
-
-
-def test_a_daemon_that_ends_during_a_wait_is_one_plain_sentence(
-    client: Client, go: threading.Event, pair: BOTH
-) -> None:
-    operation = client.point(pan_rad=0.0, tilt_rad=0.0)
-    publisher = pair[0].service.machine.publisher
-    before = publisher.listeners
-    with ThreadPoolExecutor(1) as pool:
-        waiting = pool.submit(client.wait, operation, NET_S)
-        until(lambda: publisher.listeners > before, "it listens")
-        pair[0].close()
-        try:
-            assert waiting.result(NET_S)["state"] == "stopped"  # its last word came in time
-        except ClientError as error:
-            assert error.code == "no_daemon" and "Traceback" not in str(error)
-    with pytest.raises(ClientError, match="no daemon answers at") as refused:
-        client.wait(operation, timeout_s=NET_S)
-    assert refused.value.code == "no_daemon"
-
-
-@pytest.mark.parametrize("way", ["operation", "state", "track"])
-def test_a_daemon_that_is_killed_while_a_client_listens_is_one_plain_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
+def test_a_daemon_killed_while_a_client_listens_is_one_plain_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     heard, listens = connection_module.DaemonHttp.heard, threading.Event()
 
-    async def noted(self: Any, *args: Any) -> Any:
-        async for event in heard(self, *args):
+    def noted(self: Any, *args: Any) -> Any:
+        for event in heard(self, *args):
             listens.set()
             yield event
 
     monkeypatch.setattr(connection_module.DaemonHttp, "heard", noted)
-    waits: dict[str, Callable[[Client, str], Any]] = {
-        "operation": lambda client, name: client.wait(name, 2.0 * NET_S),
-        "state": lambda client, name: client.wait_state("stopped", timeout_s=2.0 * NET_S),
-        "track": lambda client, name: client.wait_track(name, 2.0 * NET_S),
-    }
     with (
         daemon_process(tmp_path, write_config(tmp_path)) as daemon,
         Client(line(daemon)) as client,
@@ -145,7 +104,7 @@ def test_a_daemon_that_is_killed_while_a_client_listens_is_one_plain_sentence(
     ):
         under_way(client)
         operation = client.status()["operation"]
-        waiting = pool.submit(waits[way], waiter, operation)
+        waiting = pool.submit(waiter.wait, operation, 2.0 * NET_S)
         assert listens.wait(NET_S)
         daemon.kill()
         with pytest.raises(ClientError) as told:
@@ -161,8 +120,8 @@ def test_a_stream_that_breaks_is_begun_again(
     operation = client.point(pan_rad=0.0, tilt_rad=0.0)
     heard, broken = connection_module.DaemonHttp.heard, []
 
-    async def breaking(self: Any, *args: Any) -> Any:
-        async for event in heard(self, *args):
+    def breaking(self: Any, *args: Any) -> Any:
+        for event in heard(self, *args):
             yield event
             if len(broken) < 2:
                 broken.append(event)
@@ -172,25 +131,6 @@ def test_a_stream_that_breaks_is_begun_again(
     monkeypatch.setattr(connection_module.DaemonHttp, "heard", breaking)
     assert client.wait(operation, timeout_s=NET_S)["state"] == "done"
     assert len(broken) == 2
-
-
-def test_without_a_stream_left_the_daemon_is_asked(
-    client: Client, go: threading.Event, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(streams_module.Streams, "listening", full)
-    operation = client.point(pan_rad=0.0, tilt_rad=0.0)
-    threading.Timer(0.3, go.set).start()
-    assert client.wait(operation, timeout_s=NET_S)["state"] == "done"
-
-
-def full(self: Any, topics: Any, keys: Any) -> Any:
-    raise streams_module.Unable("too_many", "no more may listen", 1.0)
-
-
-def test_an_unknown_operation_is_said_at_once(client: Client) -> None:
-    with pytest.raises(ClientError) as refused:
-        client.wait("000001-none", timeout_s=NET_S)
-    assert refused.value.code == "operation_unknown"
 
 
 def test_a_state_is_waited_for(client: Client, go: threading.Event) -> None:
@@ -204,13 +144,7 @@ def test_a_state_is_waited_for(client: Client, go: threading.Event) -> None:
         client.wait_state("stopped", timeout_s=0.2)
 
 
-@pytest.mark.parametrize("way", ["operation", "state", "track"])
-def test_a_wait_on_a_daemon_that_hangs_ends_with_its_time(way: str) -> None:
-    waits: dict[str, Callable[[Client], Any]] = {
-        "operation": lambda client: client.wait("000001", 0.2),
-        "state": lambda client: client.wait_state("ready", timeout_s=0.2),
-        "track": lambda client: client.wait_track("000001", 0.2),
-    }
+def test_a_wait_on_a_daemon_that_hangs_ends_with_its_time() -> None:
     ended = threading.Event()
 
     def hang(listener: socket.socket) -> None:
@@ -223,7 +157,7 @@ def test_a_wait_on_a_daemon_that_hangs_ends_with_its_time(way: str) -> None:
         hangs = pool.submit(hang, listener)
         url = f"http://127.0.0.1:{listener.getsockname()[1]}"
         with Client(url) as client, pytest.raises(ClientError, match="took the request but did not") as told:
-            waits[way](client)
+            client.wait("000001", 0.2)
         hung = not hangs.done()
         ended.set()
     assert told.value.code == "timeout" and hung

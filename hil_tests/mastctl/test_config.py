@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from calib.errors import BadFile
 from hil_tests.mastctl.service_fakes import rig
 from mastctl.config import Config, Listen, check_cameras, load_config, parse_address, parse_config
-from mastctl.motion.settings import PairBounds
 from mastctl.packaged import config_folder, default_config
 
 GOOD: dict[str, Any] = {
@@ -54,27 +53,6 @@ def test_a_good_configuration_is_read_whole() -> None:
     assert config.hardware.folder == Path("rover").resolve()
 
 
-def test_a_cameras_offset_is_read_for_any_driver() -> None:
-    config = parsed(changed("cameras/navcam_left/offset_s", -0.0125))
-    assert config.hardware.cameras["navcam_left"].offset_s == -0.0125
-    assert parsed(yaml.safe_dump(GOOD).encode()).hardware.cameras["navcam_left"].offset_s == 0.0
-
-
-@pytest.mark.parametrize("offset", [2, -1.5, "12 ms", None, float("nan"), True])
-def test_an_offset_that_cannot_be_is_refused(offset: object) -> None:
-    with pytest.raises(BadFile, match=r"daemon.yaml: cameras.navcam_left.offset_s: .* expected"):
-        parsed(changed("cameras/navcam_left/offset_s", offset))
-
-
-def test_the_head_has_no_offset() -> None:
-    with pytest.raises(BadFile, match=r"pan_tilt\.offset_s: unknown key"):
-        parsed(changed("pan_tilt/offset_s", 0.1))
-
-
-def test_an_absolute_mast_file_stays_where_it_is() -> None:
-    assert parsed(changed("mast_file", "/somewhere/mast.yaml")).mast_file == Path("/somewhere/mast.yaml")
-
-
 @pytest.mark.parametrize(
     ("listen", "needs"),
     [
@@ -96,15 +74,6 @@ def test_a_token_is_asked_for_where_others_than_this_machine_may_come_in(
     assert parsed(changed("listen", listen)).listen.needs_token is needs
 
 
-def test_names_and_tls_are_read_and_every_address_is_asked_for_on_this_machine() -> None:
-    tls = {"certificate": "a.pem", "key": "/b.key"}
-    listen = parsed(changed("listen", {"host": "0.0.0.0", "hosts": ["Rover.Local"], "tls": tls})).listen
-    assert listen.hosts == ("rover.local",)
-    assert listen.tls is not None and listen.tls.certificate.is_absolute() and str(listen.tls.key) == "/b.key"
-    assert listen.url == "https://127.0.0.1:8420"
-    assert parsed(changed("listen", {"host": "::"})).listen.url == "http://[::1]:8420"
-
-
 @pytest.mark.parametrize(
     ("text", "url"),
     [
@@ -118,14 +87,6 @@ def test_an_address_is_read_as_a_command_takes_it(text: str, url: str) -> None:
     assert parse_address(text).url == url
 
 
-@pytest.mark.parametrize(
-    "text", ["", "8420", "host", "host:", ":8420", "::1:8420", "h:70000", "h:-1", "h:8x", "/" * 101]
-)
-def test_what_is_no_address_is_refused_with_what_is_expected(text: str) -> None:
-    with pytest.raises(ValueError, match=r"expected|longer"):
-        parse_address(text)
-
-
 def test_listen_may_be_left_out_or_be_a_socket() -> None:
     assert parsed(changed("listen", ...)).listen.url == "http://127.0.0.1:8420"
     assert (
@@ -136,61 +97,35 @@ def test_listen_may_be_left_out_or_be_a_socket() -> None:
 
 BAD: list[tuple[str, Any, str, str]] = [
     ("schema", "mastctl/config/2", "schema", "mastctl/config/1"),
-    ("schema", ..., "schema", "mastctl/config/1"),
     ("mast_fiel", "x", "mast_fiel", "unknown key; the nearest known is 'mast_file'"),
     ("mast_file", ..., "mast_file", "missing"),
-    ("mast_file", 7, "mast_file", "7 where text is expected"),
-    ("pan_tilt", ..., "pan_tilt", "missing"),
-    ("pan_tilt/drivr", "sim", "pan_tilt.drivr", "the nearest known is 'driver'"),
     ("pan_tilt/driver", ..., "pan_tilt.driver", "missing"),
-    ("pan_tilt/options", [1], "pan_tilt.options", "a mapping is expected"),
     ("pan_tilt/options", {"x": float("nan")}, "pan_tilt.options.x", "finite"),
-    ("cameras", ["navcam_left"], "cameras", "a mapping is expected"),
     ("cameras/navcam_left", "v4l2", "cameras.navcam_left", "a mapping with driver"),
-    ("cameras/navcam_left/option", {}, "cameras.navcam_left.option", "the nearest known is 'options'"),
-    ("limits/pan_rad", [1.0], "limits.pan_rad", "[lowest, highest]"),
     ("limits/pan_rad", [1.0, 1.0], "limits.pan_rad", "below the highest"),
     ("limits/pan_rad", [2.0, 1.0], "limits.pan_rad", "[2, 1]"),
     ("limits/pan_rad", [-150, 150], "limits.pan_rad.lowest", "6.2832"),
     ("limits/tilt_rad", [float("nan"), 1.0], "limits.tilt_rad.lowest", "finite"),
-    ("limits/tilt_rad", [-1.0, float("inf")], "limits.tilt_rad.highest", "finite"),
     ("limits/tilt_rad", [False, True], "limits.tilt_rad.lowest", "number"),
-    ("limits/tilt_rad", ["-1", "1"], "limits.tilt_rad.lowest", "number"),
     ("limits/speed_rad_per_s", 0, "limits.speed_rad_per_s", "above 0"),
-    ("limits/speed_rad_per_s", -1.0, "limits.speed_rad_per_s", "above 0"),
     ("limits/speed_rad_per_s", float("inf"), "limits.speed_rad_per_s", "finite"),
     ("limits/speed_rad_per_s", ..., "limits.speed_rad_per_s", "missing"),
-    ("limits/tild_rad", [0, 1], "limits.tild_rad", "the nearest known is 'tilt_rad'"),
     ("listen/port", 65536, "listen.port", "65535"),
-    ("listen/port", "8420", "listen.port", "integer"),
     ("listen/port", 8420.0, "listen.port", "integer"),
     ("listen/port", True, "listen.port", "integer"),
     ("listen/hosts", "rover.local", "listen.hosts", "list of names"),
-    ("listen/hosts", [7], "listen.hosts", "list of names"),
     ("listen/hosts", ["http://rover"], "listen.hosts", "without scheme"),
-    ("listen/hosts", ["rover:8420"], "listen.hosts", "without scheme"),
-    ("listen/hosts", ["*"], "listen.hosts", "without scheme"),
-    ("listen/tls", {"certificate": "a.pem"}, "listen.tls.key", "missing"),
-    (
-        "listen",
-        {"socket": "/run/x", "tls": {"certificate": "a", "key": "b"}},
-        "listen.tls",
-        "beside 'socket'",
-    ),
+    ("listen/tls", {"certificate": "a.pem"}, "listen.tls", "unknown key"),
     ("listen/socket", "/run/x.sock", "listen.host", "beside 'socket'"),
     ("listen", {"socket": "/" + "x" * 120}, "listen.socket", "longer than"),
-    ("simulation", "yes", "simulation", "a mapping is expected"),
     (
         "tracking",
         "yes",
         "tracking",
         "a mapping with handoff, most_step, start_error, handoff_log is expected",
     ),
-    ("tracking", {"most_stap": 0.3}, "tracking.most_stap", "the nearest known is 'most_step'"),
     ("tracking", {"most_step": 0.0}, "tracking.most_step", "from 0.01 to 1"),
-    ("tracking", {"start_error": "a"}, "tracking.start_error", "number"),
     ("tracking", {"handoff": {"margin_px": -1}}, "tracking.handoff.margin_px", "from 0 to 1000"),
-    ("tracking", {"handoff": {"pairs": [1]}}, "tracking.handoff.pairs", "a mapping is expected"),
     (
         "tracking",
         {"handoff": {"pairs": {"navcam": {"nearest": 1}}}},
@@ -225,30 +160,6 @@ def test_a_camera_that_the_mast_file_lacks_is_named_with_the_nearest() -> None:
     check_cameras(parsed(yaml.safe_dump(GOOD).encode()), rig())
 
 
-def test_what_is_left_out_of_tracking_stays_as_it_is() -> None:
-    usual = parsed(yaml.safe_dump(GOOD).encode()).tracking
-    assert usual.handoff.pairs["pancam"].nearest_m == 6.0
-    pairs = {"navcam": {"nearest_m": 2.5, "steepest_rad": 0.7}}
-    tracking = parsed(changed("tracking", {"handoff": {"pairs": pairs, "range_error": 0.1}})).tracking
-    assert tracking.handoff.pairs["navcam"] == PairBounds(2.5, 0.7)
-    assert tracking.handoff.pairs["pancam"] == usual.handoff.pairs["pancam"]
-    assert (tracking.handoff.range_error, tracking.most_step) == (0.1, usual.most_step)
-
-
-def test_the_record_of_hand_offs_lies_beside_the_configuration_and_is_none_by_default(tmp_path: Path) -> None:
-    data = changed("tracking", {"handoff_log": "handed/over.jsonl"})
-    assert parse_config(data, tmp_path / "d.yaml").tracking.handoff_log == tmp_path / "handed/over.jsonl"
-    assert parsed(yaml.safe_dump(GOOD).encode()).tracking.handoff_log is None
-    with pytest.raises(BadFile, match=r"tracking\.handoff_log"):
-        parsed(changed("tracking", {"handoff_log": 3}))
-
-
-def test_a_pair_that_the_mast_file_lacks_is_named() -> None:
-    config = parsed(changed("tracking", {"handoff": {"pairs": {"navcan": {"nearest_m": 2.0}}}}))
-    with pytest.raises(BadFile, match=r"tracking\.handoff\.pairs\.navcan: .*the nearest known is 'navcam'"):
-        check_cameras(config, rig())
-
-
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(BadFile, match=r"nowhere\.yaml: cannot be read"):
         load_config(tmp_path / "nowhere.yaml")
@@ -256,7 +167,7 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
         load_config(tmp_path)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.binary(max_size=400))
 def test_random_bytes_are_refused_in_one_line(data: bytes) -> None:
     with pytest.raises(BadFile) as refused:
@@ -272,7 +183,7 @@ VALUES = st.recursive(
 PLACES = sorted({entry[0] for entry in BAD} | {"cameras/navcam_left/options", "cameras/navcam_left/driver"})
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.sampled_from(PLACES), VALUES)
 def test_any_value_anywhere_is_read_or_refused(place: str, value: Any) -> None:
     try:
@@ -314,15 +225,11 @@ def test_keep_outs_and_a_sun_are_read_and_the_margin_is_left_at_both_ends() -> N
     ("more", "place", "words"),
     [
         ({"margin_rad": 0.6}, "limits.margin_rad", "number from 0 to 0.5"),
-        ({"margin_rad": -0.1}, "limits.margin_rad", "number from 0 to 0.5"),
         ({"tilt_rad": [0.0, 0.2], "margin_rad": 0.1}, "limits.tilt_rad", "leaves nothing between margins"),
         ({"acceleration_rad_per_s2": 0}, "limits.acceleration_rad_per_s2", "above 0"),
         ({"keep_out": {"deck": BOX}}, "limits.margin_rad", "needed beside keep_out"),
         ({"margin_rad": 0.1, "keep_out": {"deck": {}}}, "limits.keep_out.deck.pan_rad", "missing"),
         ({"margin_rad": 0.1, "keep_out": {"sun": BOX}}, "limits.keep_out.sun", "not 'sun'"),
-        ({"margin_rad": 0.1, "keep_out": {"a b": BOX}}, "limits.keep_out.a b", "letters"),
-        ({"margin_rad": 0.1, "keep_out": {7: BOX}}, "limits.keep_out.7", "letters"),
-        ({"margin_rad": 0.1, "keep_out": [BOX]}, "limits.keep_out", "mapping"),
         ({"keep_out": {"deck": {**BOX, "pan": 1}}}, "limits.keep_out.deck.pan", "unknown key"),
         (
             {"keep_out": {"deck": {**BOX, "pan_rad": [1, -1]}}},
@@ -330,11 +237,6 @@ def test_keep_outs_and_a_sun_are_read_and_the_margin_is_left_at_both_ends() -> N
             "must be below",
         ),
         ({"sun": {"azimuth_rad": 0, "elevation_rad": 0.5}}, "limits.sun.half_angle_rad", "missing"),
-        (
-            {"sun": {"azimuth_rad": 0, "elevation_rad": 2, "half_angle_rad": 0.2}},
-            "limits.sun.elevation_rad",
-            "1.57",
-        ),
         (
             {"sun": {"azimuth_rad": 0, "elevation_rad": 1, "half_angle_rad": 0.2, "frame": "mast"}},
             "limits.sun.frame",

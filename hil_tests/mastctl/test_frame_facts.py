@@ -28,8 +28,8 @@ FACTS = FrameFacts(
 
 def test_every_fact_comes_back_to_the_last_bit() -> None:
     headers = headers_of(FACTS)
-    assert headers["X-Mastctl-Mid-Exposure-S"] == repr(FACTS.mid_exposure_s)
-    assert (headers["X-Mastctl-Moving"], headers["X-Mastctl-Sequence"]) == ("true", "7")
+    assert headers["Mastctl-Mid-Exposure-S"] == repr(FACTS.mid_exposure_s)
+    assert (headers["Mastctl-Moving"], headers["Mastctl-Sequence"]) == ("true", "7")
     assert facts_in(headers) == asdict(FACTS)
 
 
@@ -45,8 +45,8 @@ def test_every_fact_comes_back_to_the_last_bit() -> None:
 )
 def test_a_fact_that_is_missing_or_of_another_kind_is_refused(header: str, value: str | None) -> None:
     headers = headers_of(FACTS)
-    del headers[f"X-Mastctl-{header}"]
+    del headers[f"Mastctl-{header}"]
     if value is not None:
-        headers[f"X-Mastctl-{header}"] = value
+        headers[f"Mastctl-{header}"] = value
     with pytest.raises((KeyError, ValueError)):
         facts_in(headers)

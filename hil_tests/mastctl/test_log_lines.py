@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.mastctl.outside_daemon import Pipe
-from mastctl.logs import JsonLines, QueuedHandler, QueuedWriter, formatter, to_journal
+from mastctl.logs import JsonLines, formatter, to_journal
 
 
 def record(level: int, words: str, *args: object) -> logging.LogRecord:
@@ -54,15 +53,3 @@ def test_what_goes_to_journald_is_known_by_its_stream(
     with (tmp_path / "terminal").open("w") as stream:
         assert not to_journal(stream.fileno())
         assert not isinstance(formatter(None, stream.fileno()), JsonLines)
-
-
-def test_what_was_dropped_is_told_in_the_same_form() -> None:
-    pipe = Pipe()
-    pipe.fill()
-    handler = QueuedHandler(QueuedWriter(pipe.write, kept=3))
-    handler.setFormatter(JsonLines())
-    for number in range(10):
-        handler.handle(record(logging.INFO, "word %d", number))
-    told = pipe.drain(b"dropped").decode()
-    last = next(line for line in told.splitlines() if "dropped" in line)
-    assert "messages were dropped" in json.loads(last.lstrip("x"))["message"]

@@ -60,21 +60,6 @@ def test_a_reload_carries_the_time_that_the_manager_compares() -> None:
     assert lines[1].startswith("MONOTONIC_USEC=") and lines[1].partition("=")[2].isdecimal()
 
 
-@pytest.mark.parametrize("address", ["", "relative", "/nobody/listens/here"])
-def test_without_a_manager_nothing_happens(address: str) -> None:
-    service = ServiceManager({"NOTIFY_SOCKET": address})
-    service.ready()
-    service.close()
-    service.alive()
-
-
-def test_a_manager_that_reads_nothing_holds_nobody(manager: socket.socket) -> None:
-    service = ServiceManager(environment(manager))
-    for _ in range(5000):  # far more than the socket keeps
-        service.alive()
-    assert 0 < len(told(manager)) < 5000
-
-
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
@@ -136,18 +121,6 @@ def test_a_loop_that_stands_still_is_asked_once_and_not_told_of(manager: socket.
     assert told(manager) == []
 
 
-def test_a_loop_that_has_ended_does_not_hurt_the_head(manager: socket.socket) -> None:
-    loop = Loop()
-    loop.ended = True
-    Heartbeat(ServiceManager(environment(manager, WATCHDOG_USEC="1000000")), loop.soon).turn()
-
-
-def test_who_does_not_watch_is_not_told(manager: socket.socket) -> None:
-    loop = Loop()
-    Heartbeat(ServiceManager(environment(manager)), loop.soon).turn()
-    assert loop.waiting == []
-
-
 # The same from a daemon in a process of its own
 
 HEAD_THAT_ENDS_BADLY = OUTSIDE.replace(
@@ -189,17 +162,6 @@ def test_a_daemon_says_that_it_is_ready_that_it_lives_and_that_it_ends(
         daemon.send_signal(signal.SIGTERM)
         heard(manager, "STOPPING=1")
         assert daemon.wait(NET_S) == 0
-
-
-def test_each_state_is_told_in_words_and_a_fault_with_its_reason(
-    manager: socket.socket, tmp_path: Path
-) -> None:
-    with watched_daemon(tmp_path, manager):
-        heard(manager, "STATUS=ready")
-        (tmp_path / "fail").touch()
-        assert "the cable is out" in heard(manager, "STATUS=fault: ")
-        (tmp_path / "fail").unlink()
-        heard(manager, "STATUS=holding: ")
 
 
 def test_a_head_that_fails_is_alive_and_one_that_hangs_is_not(manager: socket.socket, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
 from calib.targets.boards import Board
-from tools.sim_survey.board import BoardLook, draw_board, photograph
+from hil_tests.support.sim_survey.board import BoardLook, draw_board, photograph
 
 BOARD = Board(4, 5, 0.08, 0.04, {})
 LOOK = BoardLook(paper_dn=200.0, dot_dn=40.0, margin_m=0.08)
@@ -40,25 +40,6 @@ def weighted(picture: np.ndarray, around_px: np.ndarray, half: int) -> tuple[np.
     return np.array([(dark * columns).sum(), (dark * rows).sum()]) / dark.sum(), float(dark.sum())
 
 
-def test_dots_of_a_board_in_front_are_where_and_as_large_as_they_must_be() -> None:
-    picture = draw(Rigid(np.eye(3), [0.013, -0.021, 2.0]))
-    for row in range(4):
-        for column in range(5):
-            place = np.array([(column - 2) * 0.08 + 0.013, (row - 1.5) * 0.08 - 0.021])
-            expected = CENTRE_PX + FOCAL_PX * place / 2.0
-            middle, area = weighted(picture, expected, 12)
-            assert middle == pytest.approx(expected, abs=SAMPLING_PX), (row, column)
-            assert area == pytest.approx(np.pi * (FOCAL_PX * 0.02 / 2.0) ** 2, rel=0.01)
-
-
-def test_paper_ends_at_its_margin_and_the_ground_stays() -> None:
-    picture = draw(Rigid(np.eye(3), [0.0, 0.0, 2.0]))
-    share = (picture - 100.0) / (LOOK.paper_dn - 100.0)
-    # the line between the dots' rows crosses only ground and paper
-    assert share[120].sum() == pytest.approx(FOCAL_PX * (0.32 + 2 * 0.08) / 2.0, abs=0.1)
-    assert (picture[:20] == 100.0).all() and (picture[:, :20] == 100.0).all()
-
-
 def test_tilted_dots_are_at_the_centroid_that_depth_weighs() -> None:
     turn = Rotation.from_euler("xyz", [35, -40, 20], degrees=True).as_matrix()
     at = np.array([0.02, 0.01, 1.2])
@@ -77,40 +58,6 @@ def test_tilted_dots_are_at_the_centroid_that_depth_weighs() -> None:
         assert middle == pytest.approx(expected, abs=2 * SAMPLING_PX), (row, column)
 
 
-def test_the_back_of_a_board_is_plain_paper() -> None:
-    back = Rigid(Rotation.from_rotvec([0, np.pi, 0]).as_matrix(), np.array([0.0, 0.0, 2.0]))
-    assert set(np.unique(draw(back)[110:130, 140:180])) == {LOOK.paper_dn}
-
-
-@pytest.mark.parametrize("place", [[0.0, 0.0, -2.0], [5.0, 0.0, 2.0]])
-def test_a_board_outside_the_view_changes_nothing(place: list[float]) -> None:
-    assert (draw(Rigid(np.eye(3), place)) == ground()).all()
-
-
-def test_a_board_cut_by_the_image_is_drawn_as_far_as_it_goes() -> None:
-    picture = draw(Rigid(np.eye(3), [0.4, 0.0, 2.0]))
-    assert (picture[120, -5:] == LOOK.paper_dn).all() and picture[120, 5] == 100.0
-
-
-def test_few_rays_where_nothing_happens_lose_nothing() -> None:
-    # pixels with all their rays, by the pinhole's formulas
-    placed = Rigid(Rotation.from_euler("xyz", [30, 20, 10], degrees=True).as_matrix(), [0.0, 0.0, 1.5])
-    whole = draw(placed)
-    offsets = (np.arange(8) + 0.5) / 8 - 0.5
-    turn, at = placed.rotation, placed.translation_m
-    rng = np.random.default_rng(2)
-    for x, y in rng.integers([100, 60], [220, 180], (200, 2)):
-        dx, dy = np.meshgrid(offsets, offsets)
-        rays = np.stack([(x + dx - CENTRE_PX[0]), (y + dy - CENTRE_PX[1]), np.full_like(dx, FOCAL_PX)], -1)
-        hits = rays * ((turn[:, 2] @ at) / (rays @ turn[:, 2]))[..., None] - at
-        u, v = hits @ turn[:, 0] / 0.08, hits @ turn[:, 1] / 0.08
-        i, j = np.clip(np.rint(u), -2, 2), np.clip(np.rint(v - 0.5), -2, 1) + 0.5
-        dot = np.hypot(u - i, v - j) <= 0.25
-        paper = (abs(u) <= 3) & (abs(v) <= 2.5)
-        expected = np.where(paper, np.where(dot, LOOK.dot_dn, LOOK.paper_dn), 100.0).mean()
-        assert whole[y, x] == pytest.approx(expected, abs=0.01), (x, y)
-
-
 def test_a_photograph_has_the_blur_and_noise_asked_for() -> None:
     flat = photograph(np.full((200, 200), 120.0), 0.7, 3.0, np.random.default_rng(1))
     assert flat.dtype == np.uint8
@@ -121,8 +68,3 @@ def test_a_photograph_has_the_blur_and_noise_asked_for() -> None:
     slope = np.diff(row) / 200.0
     x = np.arange(100) + 0.5
     assert np.sqrt(slope @ (x - slope @ x) ** 2) == pytest.approx(2.0, rel=0.02)
-
-
-def test_a_picture_of_another_size_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"\(240, 320\) is expected"):
-        draw_board(np.zeros((10, 10)), pinhole(), Rigid(np.eye(3), [0, 0, 2.0]), BOARD)

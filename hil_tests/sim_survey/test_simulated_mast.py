@@ -67,21 +67,3 @@ def test_the_shipped_mast_file_is_as_good_as_a_survey_and_no_better(
     assert {name.split(".")[1] for name in covariance.names if name.startswith("cameras.")} == set(
         shipped.cameras
     )
-
-
-def test_a_true_rig_that_is_not_there_is_one_line(
-    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = [
-        "python",
-        "-m",
-        "tools.simulated.mast",
-        "--rig",
-        "nowhere.yaml",
-        "--out",
-        str(tmp_path / "x.yaml"),
-    ]
-    assert run_tool(repository, words, monkeypatch) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1 and "nowhere.yaml" in told
-    assert not (tmp_path / "x.yaml").exists()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.virtual_machine import kernel
+from hil_tests.support.virtual_machine import kernel
 
 collect_ignore = [] if os.environ.get("VM_OUT") else ["inside"]
 

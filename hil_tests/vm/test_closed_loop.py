@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.closed_loop.__main__ import through_devices
+from hil_tests.support.closed_loop.run import through_devices
 
 TIMEOUT_S = 900.0
 TOLD = "target_not_found"

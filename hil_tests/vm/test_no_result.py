@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.virtual_machine import boot, suite
+from hil_tests.support.virtual_machine import boot, suite
 
 
 def test_a_machine_that_ends_under_the_command_is_a_failure(vm_kernel: Path, tmp_path: Path) -> None:

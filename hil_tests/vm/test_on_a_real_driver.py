@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from tools.virtual_machine import boot, suite
+from hil_tests.support.virtual_machine import boot, suite
 
 TIMEOUT_S = 900.0
 

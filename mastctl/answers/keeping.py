@@ -91,25 +91,6 @@ class CalibrationHealthTold(CalibrationTold):
     sentinel: SentinelTold | None
 
 
-class HistoryEvent(TypedDict):
-    """Something that happened, and whether it is well."""
-
-    age_s: Seconds
-    kind: Literal["state", "fault", "command"]
-    words: str
-    well: bool
-
-
-class HistoryTold(TypedDict):
-    """``GET /history``: oldest first; one number a sample, of the axes that report their temperature, °C."""
-
-    age_s: list[Seconds]
-    pan_rad: list[float]
-    tilt_rad: list[float]
-    temperatures_c: dict[str, list[float | None]]
-    events: list[HistoryEvent]
-
-
 class RecordingListed(TypedDict):
     """A recording on the disk: a run, what a fault kept, or the ring; size in 10⁶ bytes, its files' names."""
 
@@ -195,17 +176,10 @@ class ReloadTold(TypedDict):
 class SessionTold(TypedDict):
     """``GET /session``: the client, its rights, and the way it came.
 
-    ``ends_in_s`` of a page's session; ``needs_token``: whether the daemon asks for one at all.
+    ``needs_token``: whether the daemon requires one at all.
     """
 
     name: str
     role: Role
     via: str
-    ends_in_s: Seconds | None
     needs_token: bool
-
-
-class LoggedOut(TypedDict):
-    """``POST /logout``."""
-
-    logged_out: Literal[True]

@@ -157,11 +157,10 @@ class EstopTold(EstopHeld):
 
 
 class ResetTold(TypedDict):
-    """``POST /reset``: the emergency stop that was released, and those that are ``left``."""
+    """``POST /reset``: the first cause of the latch that was released, and whether one came since."""
 
     latched: bool
     released: EstopHeld
-    left: list[EstopHeld]
 
 
 class EyeTold(TypedDict):

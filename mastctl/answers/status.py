@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NotRequired
 
 from annotated_types import Len
 from typing_extensions import TypedDict
@@ -11,9 +11,13 @@ from mastctl.answers.words import Angles, Count, Json, Pixel, Point, Quaternion,
 
 
 class LiveTold(TypedDict):
-    """``GET /health/live``."""
+    """``GET /health/live``.
+
+    ``token_folder``: where the daemon reads its tokens, for a caller on its own machine, if it requires any.
+    """
 
     live: Literal[True]
+    token_folder: NotRequired[str]
 
 
 class ReadyTold(TypedDict):

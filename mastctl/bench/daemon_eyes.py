@@ -13,8 +13,8 @@ import numpy as np
 
 from calib.calibrate.bench.problem import FEWEST_CORNERS
 from calib.files.mast_file import parse_rig
+from calib.geometry.mode import FLIPS, SensorMode
 from calib.geometry.rig import Rig
-from calib.geometry.sensor_mode import FLIPS, SensorMode
 from calib.targets.boards import AnyBoard
 from calib.targets.corners import CornersNotFound, find_corners
 from mastctl.bench.eyes import BenchHead, BenchInterrupted, BenchLook, NoLight, NotThere, SeenBoard
@@ -27,9 +27,6 @@ PATIENCE_S = 30.0
 AGAIN_S = 1.0
 ADJUSTING_S = 1.0
 """How long pictures without light are taken again: an automatic exposure needs some frames."""
-
-UNLIT = ("the picture is dark", "the picture is saturated")
-"""What a daemon says of pictures without light, or with too much of it."""
 
 COME_FROM_RAD = 0.06
 """How far beside an attitude the head goes first to come to it from the other side: more than any play."""
@@ -111,13 +108,13 @@ class DaemonEyes:
             try:
                 return self._look(pan_rad, tilt_rad, approach, cameras)
             except ClientError as error:
-                if error.code in ("outside_limits", "keep_out", "sun", "unreachable", "no_way"):
+                if error.code in ("outside_limits", "keep_out", "sun", "unreachable"):
                     raise NotThere(str(error)) from None
                 waited_s = time.monotonic() - begun
                 if _unlit(error) and waited_s > min(ADJUSTING_S, PATIENCE_S):
-                    raise NoLight(_sentence(error)) from None
+                    raise NoLight(self._reason(error)) from None
                 if error.code in LASTING or waited_s > PATIENCE_S:
-                    raise BenchInterrupted(f"{_sentence(error)}") from None
+                    raise BenchInterrupted(self._reason(error)) from None
                 time.sleep(AGAIN_S)
 
     def seconds_each(self) -> dict[str, float]:
@@ -175,7 +172,7 @@ class DaemonEyes:
             joints: Mapping[str, Any] = self._client.status()["joints"] or {}
             here = float(joints.get("pan_rad", pan_rad)), float(joints.get("tilt_rad", tilt_rad))
             beside = [
-                _beside(wanted, now, side, limits)
+                beside_goal(wanted, now, side, limits)
                 for wanted, now, side, limits in zip(
                     (pan_rad, tilt_rad), here, approach,
                     (self._head.pan_limits_rad, self._head.tilt_limits_rad), strict=True,
@@ -187,31 +184,35 @@ class DaemonEyes:
 
     def _go(self, pan_rad: float, tilt_rad: float) -> None:
         """Have the daemon turn to readings, as its commanded angles are."""
-        try:
-            operation = self._client.wait(
-                self._client.point(pan_rad=pan_rad, tilt_rad=tilt_rad), timeout_s=TURN_TIMEOUT_S
-            )
-        except KeyboardInterrupt:  # who leaves leaves no head behind that turns
-            with suppress(ClientError), Client(self._client.url, name="calibrate bench") as client:
-                client.stop()
-            raise
+        operation = self._client.turn(pan_rad, tilt_rad, TURN_TIMEOUT_S)
         told: Mapping[str, Any] = operation.get("error") or {}
         why = str(told.get("message", "the move failed"))
         if operation["state"] == "stopped":
-            raise BenchInterrupted(self._stopped(why))
+            raise BenchInterrupted(
+                f"the head was stopped in the middle of a move: {why}{self._how_to_go_on()}"
+            )
         if operation["state"] != "done":
             raise ClientError(str(told.get("code", "failed")), why)
 
-    def _stopped(self, why: str) -> str:
-        """What stopped a move: an emergency stop, who took over, a daemon that ends, or the stop button."""
-        held = None
+    def _how_to_go_on(self) -> str:
+        """What releases the head, as the end of a sentence; empty if no emergency stop is latched."""
         with suppress(ClientError):
-            held = self._client.status()["estop"]
-        if held is not None:
-            return f"the head was stopped in the middle of a move by {why}; 'mastctl reset' releases it"
-        if why == "a stop was asked for":
-            return "a stop was requested in the middle of a move, and the head stands still"
-        return f"the head was stopped in the middle of a move: {why}"
+            if self._client.status()["estop"] is not None:
+                return "; 'mastctl reset' releases it"
+        return ""
+
+    def _reason(self, error: ClientError) -> str:
+        """What a daemon refused, as what a person has to do about it."""
+        detail = error.detail or {}
+        if error.code == "leased":
+            return f"another client steers the head: {error}"
+        if error.code == "estopped":
+            return f"the emergency stop is latched ('mastctl reset' releases it): {error}"
+        if error.code == "lease_over" and "how" in detail:
+            return f"{detail['how']}{self._how_to_go_on()}"
+        if detail.get("light") == "dark":
+            return f"{error}; turn on a light, or let the camera expose longer"
+        return str(error)
 
     def _seen(self, shot: Snapshot) -> SeenBoard:
         pan_rad, tilt_rad = shot.pan_rad, shot.tilt_rad
@@ -253,7 +254,7 @@ def served_rig(rig: Rig, cameras: Sequence[str]) -> Rig:
     )
 
 
-def _beside(wanted: float, now: float, side: int, limits: tuple[float, float]) -> float:
+def beside_goal(wanted: float, now: float, side: int, limits: tuple[float, float]) -> float:
     """Where to go first to come from a side; where it is wanted if it comes from there anyway.
 
     0 is the side that is on the way. Where a limit leaves no room on one side, it comes from the other.
@@ -273,7 +274,7 @@ def _side(shot: Snapshot, name: str) -> int:
 
 def _unlit(error: ClientError) -> bool:
     """Whether a daemon refused a picture for its light."""
-    return any(words in str(error) for words in UNLIT)
+    return (error.detail or {}).get("light") is not None
 
 
 def _without_picture(camera: str, error: ClientError) -> str:
@@ -289,17 +290,3 @@ def _why(image: Any, reason: str) -> str:
     if mean > BRIGHT_DN:
         return f"too bright, mean grey level {mean:.0f} of 255"
     return reason
-
-
-def _sentence(error: ClientError) -> str:
-    """What a daemon said, as what somebody has to do about it."""
-    if error.code == "leased":
-        return f"another client steers the head: {error}"
-    if error.code == "estopped":
-        return f"the emergency stop is latched ('mastctl reset' releases it): {error}"
-    if error.code == "lease_over" and "the head was stopped" in str(error):
-        how = str(error).removeprefix("the lease has ended: ").removesuffix("; acquire another")
-        return f"{how}; 'mastctl reset' releases it" if "emergency" in how else how
-    if UNLIT[0] in str(error):
-        return f"{error}; turn on a light, or let the camera expose longer"
-    return str(error)

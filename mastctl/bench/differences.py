@@ -42,8 +42,13 @@ class Difference:
 
     @property
     def rms_px(self) -> float:
-        """Rms length of what the lens differs by."""
+        """Rms length of what the lens differs by, where both see."""
         return float(np.sqrt(np.nanmean(np.sum(self.lens_px**2, axis=1))))
+
+    @property
+    def unseen(self) -> float:
+        """Part of what the former saw that the new one does not."""
+        return float(np.isnan(self.lens_px).any(axis=1).mean())
 
     @property
     def sentence(self) -> str:
@@ -53,6 +58,7 @@ class Difference:
             f"{self.camera}: turned by {turn[0]:+.2f}, {turn[1]:+.2f}, {turn[2]:+.2f} mrad about x, y, z "
             f"and shifted by {shift[0]:+.1f}, {shift[1]:+.1f}, {shift[2]:+.1f} mm; "
             f"its lens differs by {self.rms_px:.2f} px rms"
+            + (f"; {100 * self.unseen:.0f} % of what it saw has no pixel any more" if self.unseen else "")
         )
 
 

@@ -26,20 +26,28 @@ SIDES = ((1, plots.BLUE, "came from smaller angles"), (-1, plots.RUST, "came fro
          (0, plots.GREY, "came from either side"))  # fmt: skip
 
 
+def cells_seen(calibration: BenchCalibration, camera: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return how many fitted corners each of an image's `CELLS` has, (columns, rows), and the edges, px."""
+    width, height = calibration.rig.cameras[camera].model.size_px
+    places, _ = dots_of(_mine(calibration, camera), told)
+    return np.histogram2d(
+        places[:, 0], places[:, 1], bins=CELLS, range=((-0.5, width - 0.5), (-0.5, height - 0.5))
+    )
+
+
 def coverage(calibration: BenchCalibration, cameras: Sequence[str]) -> Any:
     """Draw where in each camera's picture corners were seen, and how many."""
     figure = plots.new(5.6 * len(cameras), 4.2)
     axes = np.atleast_1d(figure.subplots(1, len(cameras)))
     for axis, name in zip(axes, cameras, strict=True):
         width, height = calibration.rig.cameras[name].model.size_px
-        places, _ = dots_of(_mine(calibration, name), told)
-        counts, xs, ys = np.histogram2d(
-            places[:, 0], places[:, 1], bins=CELLS, range=((-0.5, width - 0.5), (-0.5, height - 0.5))
-        )
+        counts, xs, ys = cells_seen(calibration, name)
         shown = axis.pcolormesh(xs, ys, np.ma.masked_equal(counts.T, 0), cmap="viridis", vmin=0)
         axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="x, px")
         seen = float((counts > 0).mean())
-        axis.set_title(f"{name}: {len(places)} corners over {100 * seen:.0f} % of the picture", fontsize=10)
+        axis.set_title(
+            f"{name}: {counts.sum():.0f} corners over {100 * seen:.0f} % of the picture", fontsize=10
+        )
         axis.set_facecolor("#dddddd")
         figure.colorbar(shown, ax=axis, label="corners a cell", shrink=0.8)
     axes[0].set_ylabel("y, px")

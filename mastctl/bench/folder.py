@@ -13,7 +13,6 @@ from typing import Any, cast
 from calib.errors import BadFile
 from calib.files.atomic import replace_bytes
 from calib.files.mast_file import load_rig
-from calib.geometry.cahvor import SPLINED
 from calib.geometry.rig import Rig
 from calib.plan.placements import Placement
 from calib.survey.records import Approach, Sigma, Survey, SurveyCamera, SurveyImage
@@ -192,7 +191,7 @@ def survey_cameras(rig: Rig, names: Mapping[str, tuple[int, int]]) -> dict[str, 
         held = rig.cameras[name]
         model = held.model
         focal_px = model.focal_px[0]
-        kind = {"CAHV": "CAHVOR", SPLINED: "OPENCV8"}.get(model.kind, model.kind)
+        kind = "CAHVOR" if model.kind == "CAHV" else model.kind
         cameras[name] = SurveyCamera(
             name, held.on, size_px, cast(Any, kind), round(focal_px, 1), sensor_mode=held.sensor_mode
         )
@@ -247,7 +246,7 @@ def _read_notes(path: Path) -> list[dict[str, Any]]:
     for line in lines:
         try:
             note = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             continue
         if isinstance(note, dict):
             notes.append(note)

@@ -15,6 +15,7 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.plan.knowledge import ExpectedPointing
 from calib.survey.records import Survey
+from mastctl.as_json import readable
 from mastctl.bench import drawn
 from mastctl.bench.differences import rig_differences
 from mastctl.bench.run import Checked
@@ -52,7 +53,7 @@ def write_bench_report(told: BenchPage, folder: Path) -> Path:
     OSError, BadFile
         If it cannot be written; then the file is as it was.
     """
-    page = _page(told).encode()
+    page = readable(_page(told)).encode()
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / PAGE
     save_bytes(path, page)

@@ -17,6 +17,7 @@ from calib.geometry.covariance import RigCovariance
 from calib.geometry.rig import Rig
 from calib.plan.knowledge import Knowledge, Workspace, pointing
 from calib.survey.records import Survey
+from mastctl.bench.drawn import cells_seen
 from mastctl.bench.events import px
 from mastctl.bench.frame import RoverFrame, fit_in_frame
 from mastctl.bench.known import first_cameras
@@ -29,6 +30,8 @@ from mastctl.calibration.run import checked_survey, save_new
 from mastctl.calibration.tested import components_told, finite
 from mastctl.calibration.verdict import CalibrationVerdict
 from mastctl.errors import MastctlError
+
+HALF = 0.5
 
 
 class NotReported(MastctlError):
@@ -74,6 +77,12 @@ class BenchDone:
     pictures: int = 0
     page: Path | None = None
 
+    @property
+    def coverage(self) -> dict[str, float]:
+        """Part of each camera's picture in which corners were fitted, 0 to 1."""
+        cameras = sorted({image.camera for image in self.calibration.images})
+        return {name: float((cells_seen(self.calibration, name)[0] > 0).mean()) for name in cameras}
+
     def told(self) -> dict[str, Any]:
         """Return it as JSON."""
         fit = self.calibration
@@ -93,6 +102,7 @@ class BenchDone:
                 {"parameters": list(d.parameters), "sentence": d.sentence} for d in fit.degenerate
             ],
             "verdict": self.verdict.told(),
+            "coverage": self.coverage,
             "gauges": list(fit.gauges),
             "notes": list(fit.notes),
             "outliers": [outlier.sentence for outlier in fit.outliers],
@@ -144,8 +154,18 @@ class BenchDone:
             )
 
     def lines(self) -> list[str]:
-        """Return it for a person."""
+        """Return all but the verdict for a person."""
         return list(self._lines())
+
+    def verdict_line(self) -> str:
+        """Return the verdict, with the cameras of whose picture less than `HALF` was seen."""
+        few = [f"{name} {100 * part:.0f} %" for name, part in self.coverage.items() if part < HALF]
+        if not few:
+            return f"verdict: {self.verdict.words}"
+        return (
+            f"verdict: {self.verdict.words}, but corners were seen over less than half of the picture of "
+            f"{', '.join(few)}; where none were, the lens is extrapolated"
+        )
 
     def _lines(self) -> Iterator[str]:
         fit = self.calibration
@@ -160,8 +180,6 @@ class BenchDone:
         for term in fit.terms:
             yield term.sentence
         yield from (f"{what}: {value}" for what, value in self.worth())
-        yield f"verdict: {self.verdict.words}"
-        yield from (f"{reason.grade}: {reason.sentence}" for reason in self.verdict.reasons)
         yield from (f"held: {sentence}" for sentence in fit.gauges)
         yield from (f"note: {sentence}" for sentence in fit.notes)
         yield from (f"left out: {outlier.sentence}" for outlier in fit.outliers[:10])
@@ -169,6 +187,7 @@ class BenchDone:
         yield f"survey: {self.survey.folder}"
         if self.page is not None:
             yield f"report: {self.page}"
+        yield from (f"{reason.grade}: {reason.sentence}" for reason in self.verdict.reasons)
 
 
 def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> BenchDone:

@@ -171,7 +171,9 @@ def _point(
             (there_m,) = known.boards[name].points(board.in_board_m(np.array([corner])))
             point = ray.origins_m + ray.directions * float(np.linalg.norm(there_m - ray.origins_m))
         found = solve(rig.mast, model, point, from_pan_rad=here[0][0], from_tilt_rad=here[0][1])
-        angles = choose(found, head.pan_limits_rad, head.tilt_limits_rad, *here[0], read=read_rad)
+        angles = choose(
+            found, head.pan_limits_rad, head.tilt_limits_rad, look.pan_rad, look.tilt_rad, read=read_rad
+        )
     except (Unreachable, CalibError):
         return None
     sides = (0, 0)

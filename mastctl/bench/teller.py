@@ -13,6 +13,7 @@ from dataclasses import asdict
 from typing import Any, Protocol, TextIO
 
 from calib.plan.placements import Placement
+from mastctl import signals
 from mastctl.as_json import as_json
 from mastctl.bench.events import (
     LINES,
@@ -149,6 +150,8 @@ class Terminal:
         NobodyThere
             If nobody can answer.
         """
+        if not signals.may_read_stdin():
+            raise NobodyThere("no one can place the board: the command runs in its terminal's background")
         self.say(
             f"\nPlacement {name}: put the board {placement.words()}.\n{sketch(placement, self._board_m)}"
         )

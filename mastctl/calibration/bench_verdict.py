@@ -19,6 +19,7 @@ from mastctl.calibration.verdict import (
     CalibrationVerdict,
     Grade,
     Reason,
+    chi_square_grade,
     sigma_reasons,
 )
 
@@ -74,21 +75,23 @@ def _noise(survey: Survey, calibration: BenchCalibration) -> Iterator[Reason]:
         f"chi-square is {calibration.chi2:.0f} for {freedom:.0f} degrees of freedom: the residuals are "
         f"{factor:.2f} times what the stated sigmas make them"
     )
-    wrong = [c for c in calibration.components if c.wrong]
-    unexplained: Grade = "bad" if factor > 2.0 and not wrong else "care"
-    yield Reason(unexplained if calibration.chi2_probability < RARELY else "good", words)
+    yield Reason(chi_square_grade(calibration, factor), words)
     yield from sigma_reasons(survey, calibration)
 
 
 def _inexact(survey: Survey, calibration: BenchCalibration) -> Iterator[Reason]:
     """Whether corners are where the board's measures and the lenses have them, but for noise."""
     if calibration.inexact_m > 0.0:
-        off_px = float(np.median(np.concatenate([image.sigma_px for image in calibration.images])))
+        off_px = calibration.inexact_m * float(
+            np.median(
+                [calibration.rig.cameras[i.camera].model.focal_px[0] / i.range_m for i in calibration.images]
+            )
+        )
         yield Reason(
             "care" if off_px > LITTLE * survey.sigma.corner_px else "good",
-            f"corners are off by some {1e3 * calibration.inexact_m:.2g} mm on the board, more than their own "
-            "sigmas say: an inexact print, or a lens that is only nearly of its model. They count with that, "
-            "but it is the same in every picture, and uncertainties are rather too small",
+            f"corners are off by some {1e3 * calibration.inexact_m:.2g} mm on the board, each alike in all "
+            "pictures: an inexact print. They count with that, but since it is the same in every picture, "
+            "uncertainties are rather too small",
         )
 
 
@@ -127,7 +130,16 @@ def _drifts(calibration: BenchCalibration) -> Iterator[Reason]:
 
 def _checks(calibration: BenchCalibration) -> Iterator[Reason]:
     """Whether pictures that were not fitted are predicted as well as they should be."""
-    if not calibration.check_rms_px:
+    lost = {
+        image.name: int((~np.isfinite(image.residuals_px).all(axis=1)).sum())
+        for image in calibration.images
+        if image.purpose == "check"
+    }
+    for name, count in lost.items():
+        if count:
+            words = f"check picture {name} shows {count} corners where its camera, as fitted, has no pixel"
+            yield Reason("bad", words)
+    if not (calibration.check_rms_px or any(lost.values())):
         yield Reason("care", "there is no check picture: nothing shows how well the result predicts")
     for camera, xy in calibration.check_rms_px.items():
         expected, most, _ = calibration.checks[camera]

@@ -87,7 +87,7 @@ def _expected_px2(
     in_rover = rigid_rates(rates, points, setup.b_from_a.translation_m)
     common = np.einsum("nip,pq,niq->ni", in_rover, setup.covariance, in_rover)
     _, by_fit = pixel_covariance(calibration, image.camera, pan, tilt, points)
-    dots = calibration.widened(DOTS_OF + image.camera)
+    dots = calibration.widened(DOTS_OF + image.camera) * image.scatter
     by_joints = _by_joints_px2(calibration, image, points, survey.sigma.joint_rad)
     relative = np.maximum(np.einsum("nii->ni", by_fit) - common, 0.0)
     return float(np.nanmean(by_board + relative + by_joints + (dots * image.sigma_px[:, None]) ** 2))

@@ -8,17 +8,16 @@ rig. What happens then is by the true one. The paper's sections IV and V, withou
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.adjust.result import Calibration
-from calib.adjust.uncertainty import pixel_covariance, rig_moved_along
+from calib.adjust.uncertainty import pixel_covariance, pointing_covariance
 from calib.errors import CalibError
-from calib.geometry.cahvor import CameraModel
 from calib.geometry.pointing import solve
-from calib.geometry.rig import Mast, Rig
+from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import triangulate
 
@@ -137,8 +136,6 @@ def handoff_errors_px(
 PAN_RAD = (-2.6, 2.6)
 TILT_RAD = (-1.2, 0.7)
 STEPS = (27, 15)
-STEP = 0.1
-"""Of a sigma, for numerical derivatives."""
 
 CORNER = (0.2, 0.25)
 """Where a click is taken to be, as part of the image's width and height: off the middle."""
@@ -166,8 +163,10 @@ def uncertainty_map(calibration: Calibration, pair: str, range_m: float) -> Poin
     """Return the sigma (rms per axis, px) that the calibration alone gives to pointing, over the joints."""
     names = calibration.rig.stereo[pair]
     middle = np.array(calibration.rig.cameras[names[0]].model.image_center_px)
-    clicks = _Clicks(calibration, names, range_m)
-    by_click = clicks.sigma_px
+    corner = _corner(calibration.rig, names[0])
+
+    def by_click(tilt: float) -> float:
+        return _rms(pointing_covariance(calibration, names, 0.0, tilt, corner, range_m))
 
     def by_position(pan: float, tilt: float) -> float:
         rays = calibration.rig.camera_in_rover(names[0], pan, tilt).ray(middle)
@@ -197,62 +196,6 @@ def change_map(new: Rig, old: Rig, pair: str, range_m: float) -> PointingMap | N
         return float(np.linalg.norm(position_error_px(old, new, names[0], pan, tilt, target, target)))
 
     return _map(pair, names[0], range_m, by_click, by_position)
-
-
-class _Clicks:
-    """A click near a corner, pointed at by rigs that are off by one sigma in one direction each.
-
-    `calib.adjust.uncertainty.pointing_covariance` for many joint angles: a target that keeps its place in the
-    head frame is triangulated once a rig, not once for each pan and tilt. The directions are the columns of a
-    square root of the covariance, so that their squares add up to the variance.
-    """
-
-    def __init__(self, calibration: Calibration, names: tuple[str, str], range_m: float) -> None:
-        rig = calibration.rig
-        self.rig = replace(rig, cameras={name: rig.cameras[name] for name in names}, stereo={})
-        self.camera = names[0]
-        models = [rig.cameras[name].model for name in names]
-        ray = models[0].ray(_corner(rig, names[0]))
-        self.target_in_head_m = ray.origins_m + range_m * ray.directions
-        clicks: list[FloatArray] = []
-        for model, name in zip(models, names, strict=True):
-            pixel, valid = model.project(self.target_in_head_m)
-            if not valid:
-                raise CalibError(f"camera {name} does not see a target at {range_m:g} m")
-            clicks.append(pixel)
-        columns = np.concatenate(
-            [calibration.part("mast."), *(calibration.part(f"cameras.{n}.") for n in names)]
-        )
-        values, vectors = np.linalg.eigh(calibration.covariance[np.ix_(columns, columns)])
-        steps = (vectors * np.sqrt(np.maximum(values, 0.0))).T
-        narrow = replace(calibration, rig=self.rig)
-        self.believed: list[tuple[Mast, CameraModel, FloatArray]] = []
-        for step in (np.zeros(len(columns)), *(STEP * step for step in steps)):
-            moved = rig_moved_along(narrow, columns, step)
-            left, right = (moved.cameras[name].model for name in names)
-            found = triangulate(left, right, clicks[0], clicks[1]).position_m
-            self.believed.append((moved.mast, left, found))
-
-    def sigma_px(self, tilt: float, pan: float = 0.0) -> float:
-        """Rms per axis of where the target lands; CalibError where it cannot be pointed at."""
-        target = self.rig.mast.rover_from_head(pan, tilt).points(self.target_in_head_m)
-        landed = [self._landed(*rig, pan, tilt, target) for rig in self.believed]
-        off = (np.array(landed[1:]) - landed[0]) / STEP
-        return float(np.sqrt(np.sum(off**2) / 2))
-
-    def _landed(
-        self,
-        mast: Mast,
-        left: CameraModel,
-        in_head_m: FloatArray,
-        pan: float,
-        tilt: float,
-        target: FloatArray,
-    ) -> FloatArray:
-        position = mast.rover_from_head(pan, tilt).points(in_head_m)
-        angles = solve(mast, left, position, left.image_center_px, from_pan_rad=pan, from_tilt_rad=tilt)[0]
-        in_head = self.rig.mast.rover_from_head(angles.pan_rad, angles.tilt_rad).inverse.points(target)
-        return np.asarray(self.rig.cameras[self.camera].model.project(in_head)[0])
 
 
 def _map(

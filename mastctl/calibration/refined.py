@@ -9,8 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from calib.calibrate.body import corrected_covariance, corrected_rig, fit_body_pose
-from calib.calibrate.body_sights import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose, body_groups
+from calib.calibrate.body import (
+    PRIOR_SHIFT_M,
+    PRIOR_TURN_RAD,
+    BodyPose,
+    corrected_covariance,
+    corrected_rig,
+    fit_body_pose,
+)
+from calib.calibrate.body_sights import body_groups
 from calib.errors import NoCorrection
 from calib.files.mast_file import StoredRig
 from calib.geometry.covariance import stored_covariance
@@ -162,10 +169,10 @@ def pose_told(pose: BodyPose) -> dict[str, Any]:
         "directions_seen": pose.seen,
         "unseen": list(pose.unseen),
     }
-    if pose.eyes_apart is not None:
+    if pose.cameras_apart is not None:
         told["eyes_apart"] = {
-            "right_less_left_px": pose.eyes_apart.offset_px.tolist(),
-            "covariance_px2": pose.eyes_apart.covariance_px2.tolist(),
-            "sigmas": pose.eyes_apart.sigmas,
+            "right_less_left_px": pose.cameras_apart.offset_px.tolist(),
+            "covariance_px2": pose.cameras_apart.covariance_px2.tolist(),
+            "sigmas": pose.cameras_apart.sigmas,
         }
     return told

@@ -11,6 +11,7 @@ import numpy as np
 from calib.adjust.result import HELD_FIXED, Calibration
 from calib.files.atomic import save_bytes
 from calib.files.mast_file import StoredRig
+from mastctl.as_json import readable
 from mastctl.calibration import drawn
 from mastctl.calibration.landing import change_map, uncertainty_map
 from mastctl.calibration.run import Calibrated
@@ -34,7 +35,7 @@ def write_calibration_report(told: Calibrated, in_use: StoredRig | None, folder:
     OSError, BadFile
         If it cannot be written; then the file is as it was.
     """
-    page = _page(told, in_use).encode()
+    page = readable(_page(told, in_use)).encode()
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "calibration.html"
     save_bytes(path, page)

@@ -46,6 +46,12 @@ ODD_IMAGE = 6.0
 
 FEW_IMAGES = 4
 
+UNEXPLAINED = 2.0
+"""Residuals so many times their stated sigmas that no kind of measurement explains are a model's."""
+
+MANY_UNEVEN = 0.25
+"""Share of images noisier than stated above which somebody should look for the cause."""
+
 HOPELESS = 5.0
 """Measurements that scatter so many times their stated sigma, or by so much less, are not what they are taken
 for."""
@@ -140,8 +146,7 @@ def _noise(survey: Survey, calibration: Calibration) -> list[Reason]:
         f"the residuals are {factor:.2f} times what the stated sigmas make them"
     )
     wrong = [c for c in calibration.components if c.wrong]
-    unexplained: Grade = "bad" if factor > 2.0 and not wrong else "care"
-    reasons = [Reason(unexplained if calibration.chi2_probability < RARELY else "good", words)]
+    reasons = [Reason(chi_square_grade(calibration, factor), words)]
     reasons += sigma_reasons(survey, calibration)
     told = [c for c in calibration.components if np.isfinite(c.factor)]
     if told and not wrong:
@@ -150,6 +155,16 @@ def _noise(survey: Survey, calibration: Calibration) -> list[Reason]:
         words += f"{most.factor:.2f} ± {most.factor_sigma:.2f} times their sigma"
         reasons.append(Reason("good", words))
     return reasons
+
+
+def chi_square_grade(calibration: Calibration | BenchCalibration, factor: float) -> Grade:
+    """Return how bad residuals are that are ``factor`` times what stated sigmas make them: no reason by
+    themselves where single kinds of measurements, or images, explain it; these have reasons of their own."""
+    if calibration.chi2_probability >= RARELY:
+        return "good"
+    if any(c.wrong for c in calibration.components) or any(i.scatter > 1.0 for i in calibration.images):
+        return "good"
+    return "bad" if factor > UNEXPLAINED else "care"
 
 
 def sigma_reasons(survey: Survey, calibration: Calibration | BenchCalibration) -> list[Reason]:
@@ -162,13 +177,31 @@ def sigma_reasons(survey: Survey, calibration: Calibration | BenchCalibration) -
     wrong = [c for c in components if c.wrong]
     reasons = []
     for c in (*wrong, *(c for c in components if c.generous)):
-        grade: Grade = "good" if c.generous else "care"
-        if c.factor > HOPELESS * allowed(survey, images, c.kind):
+        most = allowed(survey, images, c.kind)
+        grade: Grade = "good" if c.generous or 1.0 < c.factor <= most else "care"
+        if c.factor > HOPELESS * most:
             grade = "bad"
         elif c.factor < 1.0 / HOPELESS and not survey.boards:  # a bench's are counts, which nobody chose
             grade = "care"
         reasons.append(Reason(grade, wrong_sentence(survey, images, c, wrong)))
-    return [*reasons, *_one_station(survey, components)]
+    return [*reasons, *_uneven(survey, images), *_one_station(survey, components)]
+
+
+def _uneven(survey: Survey, images: Sequence[ImageResiduals]) -> list[Reason]:
+    """Images that are noisier than others of their camera: each counts with what it scatters."""
+    order_px = survey.sigma.corner_px if survey.boards else survey.sigma.dot_px
+    noisy = [image for image in images if image.scatter > 1.0]
+    if not noisy:
+        return []
+    worst = max(noisy, key=lambda image: image.scatter)
+    beyond = [i for i in noisy if i.scatter * float(np.median(i.sigma_px)) > order_px]
+    words = (
+        f"{len(noisy)} of {len(images)} images scatter more than others of their camera, {worst.name} most, "
+        f"by {worst.scatter:.1f} times; each counts with its own sigma"
+    )
+    if len(beyond) <= MANY_UNEVEN * len(images):
+        return [Reason("good", words)]
+    return [Reason("care", f"{words}. That is many: look for motion, focus or light")]
 
 
 def _one_station(survey: Survey, components: Sequence[Component]) -> list[Reason]:
@@ -228,9 +261,11 @@ def _by_the_others(calibration: Calibration) -> list[Reason]:
         reasons.append(Reason("care", words))
     fitted, predicted = cross_validation_px(calibration)
     if not odd and np.isfinite(predicted):
-        words = (
-            f"each of {len(boards)} boards is where the others say: {predicted:.3f} px rms by the others, "
-        )
+        tested = sum(bool(np.isfinite(one.predicted_px)) for one in boards)
+        which = f"each of {tested} boards"
+        if tested < len(boards):
+            which += f" (the others do not determine {len(boards) - tested} more)"
+        words = f"{which} is where the others say: {predicted:.3f} px rms by the others, "
         reasons.append(Reason("good", f"{words}{fitted:.3f} px with it"))
     return reasons
 
@@ -268,13 +303,21 @@ def _odd_images(calibration: Calibration) -> list[Reason]:
 
 def _checks(survey: Survey, calibration: Calibration) -> list[Reason]:
     """Whether images that were not fitted are predicted as well as they should be."""
-    if not calibration.check_rms_px:
-        return [Reason("care", "there is no check image: nothing shows how well the result predicts")]
     reasons = [
         Reason("bad", f"check image {image.name} cannot show placement {image.placement}, which it names")
         for image in calibration.images
         if image.purpose == "check" and not np.isfinite(image.residuals_px).all()
     ]
+    reasons += [
+        Reason(
+            "bad",
+            f"image {click.image} cannot show check point {click.point}, which was clicked in it: correct "
+            "its row in clicks.csv or the point's in station.csv",
+        )
+        for click in calibration.unseen_clicks
+    ]
+    if not (calibration.check_rms_px or reasons):
+        return [Reason("care", "there is no check image: nothing shows how well the result predicts")]
     for camera, size in check_sizes(survey, calibration).items():
         words = (
             f"check images of {camera} are off by {size.seen_px:.2f} px rms an axis where the survey's noise "

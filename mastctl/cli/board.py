@@ -87,7 +87,7 @@ def _make(args: argparse.Namespace) -> int:
     paper_mm = _paper_mm(args)
     board = _board(args, paper_mm)
     sheet = sheet_of(board, paper_mm, out.stem)
-    measured = _bars_m(args.measured_bar_mm)
+    measured = _bars_m(args.measured_bar_mm, sheet.bar_m, ("--measured-bar-mm", "--measured-bar-mm"))
     yaml = out.with_suffix(".yaml")
     _check_free(yaml, measured is not None)
     save_bytes(out, pdf_of(sheet) if out.suffix == ".pdf" else svg_of(sheet))
@@ -97,13 +97,11 @@ def _make(args: argparse.Namespace) -> int:
 
 
 def _measured(args: argparse.Namespace) -> int:
-    from calib.targets.board_file import measure
+    from calib.targets.board_file import bars_of, measure
 
-    across_m, down_m = _bars_m([one for one in (args.across_mm, args.down_mm) if one is not None]) or (
-        0.0,
-        None,
-    )
     board = Path(args.board)
+    bars_mm = [one for one in (args.across_mm, args.down_mm) if one is not None]
+    across_m, down_m = _bars_m(bars_mm, bars_of(board), ("--across-mm", "--down-mm")) or (0.0, None)
     named = board.is_file() and board.read_bytes().startswith(NAMES_SCHEMA.encode())
     bar_m = measure(board, across_m, down_m)
     if named:
@@ -113,21 +111,23 @@ def _measured(args: argparse.Namespace) -> int:
 
 
 def _find(args: argparse.Namespace) -> int:
-    import cv2
     import numpy as np
 
     from calib.files.atomic import save_bytes
+    from calib.files.pictures import decode_picture
     from calib.targets.board_file import load_board
     from calib.targets.corners import CornersNotFound, find_corners
+    from mastctl.as_json import readable
 
     board = load_board(args.board)
     rows, found = ["picture,id,x_px,y_px,sigma_px\n"], []
     for name in args.pictures:
-        data = Path(name).read_bytes() if Path(name).is_file() else b""
-        flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-        if image is None or image.dtype not in (np.uint8, np.uint16):
-            raise WrongUse(f"{name} is no picture that can be read; a PNG or JPEG file is expected")
+        try:
+            image = decode_picture(Path(name).read_bytes() if Path(name).is_file() else b"")
+        except ValueError as reason:
+            raise WrongUse(f"{name} is no picture that can be read: {reason}") from None
+        if image.dtype not in (np.uint8, np.uint16):
+            raise WrongUse(f"{name} holds {image.dtype} where 8 or 16 bits a pixel are expected")
         corners = find_corners(
             board, image.astype(np.uint8) if image.dtype == np.uint8 else image.astype(np.uint16)
         )
@@ -139,7 +139,7 @@ def _find(args: argparse.Namespace) -> int:
         for number, (x, y), sigma in zip(
             corners.ids.tolist(), corners.pixels_px.tolist(), corners.sigma_px.tolist(), strict=True
         ):
-            rows.append(f"{name},{number},{x!r},{y!r},{sigma!r}\n")
+            rows.append(f"{readable(name)},{number},{x!r},{y!r},{sigma!r}\n")
     if args.out is not None:
         save_bytes(args.out, "".join(rows).encode())
     if args.json:
@@ -233,13 +233,30 @@ def _refuse_others(args: argparse.Namespace) -> None:
             )
 
 
-def _bars_m(bars_mm: list[float] | None) -> tuple[float, float | None] | None:
+def _bars_m(
+    bars_mm: list[float] | None, drawn_m: tuple[float, float] | None, options: tuple[str, str]
+) -> tuple[float, float | None] | None:
+    """The measured bars, if they can be those that were drawn. Raises WrongUse, in millimetres."""
+    from calib.targets.board_file import WORST_ASPECT, WORST_SCALE
+
     if not bars_mm:
         return None
     if len(bars_mm) > 2:
         raise WrongUse(
             f"--measured-bar-mm: {len(bars_mm)} numbers where one or two are expected: across, down"
         )
+    scale = 1.0
+    for option, bar_mm, bar_m, part in zip(
+        options, bars_mm, drawn_m or (), (WORST_SCALE, WORST_ASPECT), strict=False
+    ):
+        wanted_mm = 1000 * bar_m * scale
+        if not wanted_mm * (1 - part) <= bar_mm <= wanted_mm * (1 + part):
+            metres = f"; {bar_mm:g} m is {1000 * bar_mm:g} mm" if abs(bar_mm) < 10 else ""
+            raise WrongUse(
+                f"{option} is {bar_mm:g} where {wanted_mm * (1 - part):.4g} to {wanted_mm * (1 + part):.4g} "
+                f"millimetres are expected, {1000 * bar_m:.4g} as drawn{metres}"
+            )
+        scale *= bar_mm / wanted_mm
     return bars_mm[0] / 1000, bars_mm[1] / 1000 if len(bars_mm) > 1 else None
 
 

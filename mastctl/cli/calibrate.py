@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.output import check_file, check_folder, positive_number, unusable
+from mastctl.cli.output import check_file, check_folder, unusable
 
 if TYPE_CHECKING:
     from calib.files.mast_file import StoredRig
@@ -25,7 +25,7 @@ def add_commands(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "calibrate",
         help="fit cameras and mast to a survey, and write the mast file",
-        description="Reads a survey folder (docs/how-to/survey-calibration.md), checks it, finds dots where "
+        description="Reads a survey folder (docs/how-to/calibrate.md), checks it, finds dots where "
         "there are none, fits cameras and mast, and writes the mast file with its uncertainty. Every former "
         "version is kept: the last as NAME.previous.yaml, those before as NAME.previous-1.yaml and so on. "
         "With --refine it corrects the body cameras of a mast file by hand-offs instead, as a new mast file. "
@@ -35,7 +35,7 @@ def add_commands(subparsers: Any) -> None:
         "survey",
         type=Path,
         metavar="SURVEY",
-        help="the survey folder; with --refine and --refine-scene the mast file",
+        help="the survey folder; with --refine the mast file",
     )
     parser.add_argument(
         "--refine",
@@ -43,20 +43,6 @@ def add_commands(subparsers: Any) -> None:
         action="append",
         metavar="HANDOFFS.jsonl",
         help="record of hand-offs to correct the body cameras by; may be given several times",
-    )
-    parser.add_argument(
-        "--refine-scene",
-        type=Path,
-        metavar="RECORD",
-        help="pictures of a scene at many angles, the rover standing still: a recording, a CSV of pictures "
-        "(camera,pan_rad,tilt_rad,file) or a folder of PDS3 products; corrects cameras, axes and joints",
-    )
-    parser.add_argument("--camera", metavar="NAME", help="with --refine-scene: this camera's pictures only")
-    parser.add_argument(
-        "--joint-sigma-rad",
-        type=positive_number,
-        metavar="RAD",
-        help="with --refine-scene: what a rest of the head is off by chance (default 0.0002)",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="MAST.yaml", help="the mast file to write")
     parser.add_argument("--report", type=Path, metavar="DIR", help="folder for calibration.html")
@@ -83,20 +69,12 @@ def add_commands(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, check, find dots, fit, save, report; nothing is written before the fit is good."""
-    if args.model is not None and (args.refine or args.refine_scene is not None):
+    if args.model is not None and args.refine:
         raise output.WrongUse("--model is for a survey; a correction keeps the cameras' models")
-    if args.refine and args.refine_scene is not None:
-        raise output.WrongUse("--refine and --refine-scene: one of them is expected")
     if args.refine:
         from mastctl.cli import calibrate_refine
 
         return calibrate_refine.run(args)
-    if args.refine_scene is not None:
-        from mastctl.cli import calibrate_refine
-
-        return calibrate_refine.run_scene(args)
-    if args.camera is not None or args.joint_sigma_rad is not None:
-        raise output.WrongUse("--camera and --joint-sigma-rad belong to --refine-scene")
     args.method, args.mast = args.method or "joint", args.mast or 6
     return _from_survey(args)
 

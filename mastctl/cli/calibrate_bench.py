@@ -12,11 +12,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mastctl import signals
 from mastctl.cli import output
 from mastctl.cli.output import CommandError, WrongUse, check_file, check_folder
 
 if TYPE_CHECKING:
     from mastctl.bench.frame import RoverFrame
+    from mastctl.bench.result import BenchDone
     from mastctl.bench.run import BenchRun
     from mastctl.bench.teller import Teller
     from mastctl.client import Client
@@ -39,7 +41,7 @@ def add_commands(subparsers: Any) -> None:
         help="fit cameras, axes and joints to pictures of a board that stands anywhere; drives the head",
         description="Turns the head to look for a board, chooses each next pose by its expected information, "
         "and asks for two to four placements of the board. It ends by itself when the wanted pointing error "
-        "is met (docs/how-to/bench-calibration.md). Everything seen is kept in a folder: a run that ended "
+        "is met (docs/how-to/calibrate.md). Everything seen is kept in a folder: a run that ended "
         "goes on with the same command. With FOLDER such a folder is fitted again, and nothing moves.",
     )
     parser.add_argument(
@@ -158,7 +160,7 @@ def _again(args: argparse.Namespace) -> int:
             found = families.compared(survey)
         told |= {"models": families.families_told(survey, found)}
         lines += families.families_lines(survey, found)
-    _tell(args, told, lines)
+    _tell(args, told, done, lines)
     return 0
 
 
@@ -226,13 +228,13 @@ def _drive(args: argparse.Namespace) -> int:
             number = getattr(interrupt, "number", signal.SIGINT)
             words = f"interrupted; {kept}" if folder.exists() else "interrupted"
             raise CommandError("interrupted", words, 128 + number) from None
-    _tell(args, done.told(), done.lines())
+    _tell(args, done.told(), done, done.lines())
     return 0
 
 
 def _go_on(args: argparse.Namespace, reason: Exception, folder: Path) -> bool:
     """Ask the person at the terminal, if there is one, whether to go on now."""
-    if args.json or args.lines or not sys.stdin.isatty():
+    if args.json or args.lines or not signals.can_ask():
         return False
     output.tell(f"{reason}. Everything seen is kept in {folder}")
     sys.stderr.write("Enter to go on, Ctrl-C to leave it for later. ")
@@ -342,10 +344,13 @@ def _daemon(args: argparse.Namespace) -> Iterator[Client]:
         yield client
 
 
-def _tell(args: argparse.Namespace, document: dict[str, Any], lines: list[str]) -> None:
+def _tell(args: argparse.Namespace, document: dict[str, Any], done: BenchDone, lines: list[str]) -> None:
     if args.lines:
         args.lines.done(document)
     elif args.json:
         output.print_json(document)
     else:
-        sys.stdout.write("\n".join(lines) + "\n")
+        output.print_lines(lines, done.verdict_line(), COLOURS[done.verdict.grade])
+
+
+COLOURS = {"good": "bold green", "care": "bold yellow", "bad": "bold red"}

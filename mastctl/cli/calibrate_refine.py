@@ -1,4 +1,4 @@
-"""``mastctl calibrate --refine`` and ``--refine-scene``: a mast file corrected by hand-offs or scenes."""
+"""``mastctl calibrate --refine``: a mast file corrected by hand-offs."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, Any
 from mastctl.cli import output
 
 if TYPE_CHECKING:
-    from calib.calibrate.body_sights import BodyPose
-    from calib.calibrate.scene.fit import SceneFit
+    from calib.calibrate.body import BodyPose
     from calib.files.mast_file import StoredRig
     from mastctl.calibration.refined import Proposal
-    from mastctl.calibration.scene import SceneProposal
 
 
 OUTLIERS_SHOWN = 20
@@ -108,12 +106,12 @@ def _show(proposal: Proposal) -> None:
 
 
 def _show_pose(group: str, pose: BodyPose) -> None:
-    from calib.calibrate.body_sights import WORDS
+    from calib.calibrate.body import STEP_NAMES
     from mastctl.calibration.refined import SHIFT_FIRST
 
     sigma = pose.covariance.diagonal() ** 0.5
     rows = [
-        [WORDS[i], f"{1e3 * pose.step[i]:+.2f}", f"{1e3 * sigma[i]:.2f}", "mrad" if i < 3 else "mm"]
+        [STEP_NAMES[i], f"{1e3 * pose.step[i]:+.2f}", f"{1e3 * sigma[i]:.2f}", "mrad" if i < 3 else "mm"]
         for i in SHIFT_FIRST
     ]
     notes = [
@@ -126,10 +124,10 @@ def _show_pose(group: str, pose: BodyPose) -> None:
         notes.append(f"and {len(pose.outliers) - OUTLIERS_SHOWN} more were not used, all named by --json")
     if pose.scale > 1.0:
         notes.append(f"the sigmas are widened by {pose.scale**0.5:.2f}, as the residuals ask")
-    if pose.eyes_apart is not None and pose.eyes_apart.sigmas > 3.0:
-        x, y = pose.eyes_apart.offset_px
+    if pose.cameras_apart is not None and pose.cameras_apart.sigmas > 3.0:
+        x, y = pose.cameras_apart.offset_px
         notes.append(
-            f"right and left camera differ by {x:+.2f}, {y:+.2f} px ({pose.eyes_apart.sigmas:.1f} sigma): "
+            f"right and left camera differ by {x:+.2f}, {y:+.2f} px ({pose.cameras_apart.sigmas:.1f} sigma): "
             "no motion of the pair explains it. One camera or its model is off; survey the pair again"
         )
     words = f"{pose.sigmas:.1f} sigma ({'' if pose.significant else 'not '}significant)"
@@ -148,96 +146,10 @@ def _show_saved(proposal: Proposal, saved: StoredRig, previous: Path | None) -> 
         "its covariance is that after the correction"
         if covariance
         else "it has no covariance, as the former file has none",
-        "a daemon uses it after 'mastctl mast use' (docs/how-to/survey-calibration.md, Use the mast file)",
+        "a daemon uses it after 'mastctl mast use' (docs/how-to/calibrate.md, Use the mast file)",
     ]
     notes += [f"kept from before: {previous}"] if previous is not None else []
     output.print_table(
         "Corrected", ["pair", "cameras"],
         [[group, ", ".join(pose.cameras)] for group, pose in proposal.significant.items()], notes,
     )  # fmt: skip
-
-
-OUTLIERS_OF_SCENES = 10
-
-
-def run_scene(args: argparse.Namespace) -> int:
-    """Propose a correction as a new mast file; 1, and no file, if the pictures tell none that holds."""
-    from calib.calibrate.scene.fit import JOINT_SIGMA_RAD
-    from calib.files.mast_file import load_rig
-    from mastctl.calibration.scene import propose_scene, save_scene
-    from mastctl.cli.output import check_file
-
-    unused = {"--report": args.report, "--in-use": args.in_use, "--method": args.method, "--mast": args.mast}
-    if given := [option for option, value in unused.items() if value is not None]:
-        raise output.WrongUse(f"{given[0]} belongs to a survey; --refine-scene corrects by pictures alone")
-    for path in (args.survey, args.refine_scene):
-        if args.out.resolve() == path.resolve():
-            raise output.WrongUse(f"--out {args.out} is what is read; name another file, for the proposal")
-    check_file(args.out, "--out")
-    mast = load_rig(args.survey)
-    for note in mast.notes:
-        output.tell(note)
-    sigma_rad = JOINT_SIGMA_RAD if args.joint_sigma_rad is None else args.joint_sigma_rad
-    with output.waiting(args.json, f"looking for features in {args.refine_scene}"):
-        proposal = propose_scene(mast, args.refine_scene, sigma_rad, args.camera)
-    saved, previous = save_scene(proposal, args.out)
-    if args.json:
-        output.print_json(_scene_document(proposal, saved, None if previous is None else str(previous)))
-    else:
-        _show_scene(proposal, saved, sigma_rad)
-    return 0
-
-
-def _scene_document(proposal: SceneProposal, saved: StoredRig, previous: str | None) -> dict[str, Any]:
-    from mastctl.calibration.scene import scene_told
-
-    return {
-        "mast_file": {"path": str(saved.path), "digest": saved.digest, "previous": previous},
-        "former": {"path": str(proposal.mast.path), "digest": proposal.mast.digest},
-        "pictures": len(proposal.views),
-        "other_mast": proposal.other_mast,
-        **scene_told(proposal.fit),
-    }
-
-
-def _show_scene(proposal: SceneProposal, saved: StoredRig, told_rad: float) -> None:
-    """Corrections with their sigmas, what each term gained, and how the rest is predicted."""
-    fit = proposal.fit
-    sigma = fit.covariance.diagonal() ** 0.5
-    rows = [
-        [name, f"{1e3 * value:+.3f}", f"{1e3 * one:.3f}", _unit(name), "not seen" * (name in fit.unseen)]
-        for name, value, one in zip(fit.names, fit.values, sigma, strict=True)
-    ]
-    notes = [f"{words}: {gain:.1f} sigma" for words, gain in fit.gains.items()]
-    notes += [
-        f"{len(fit.features)} features of {len(proposal.views)} pictures: {fit.rms_px[0]:.3f} px rms before, "
-        f"{fit.rms_px[1]:.3f} after; {fit.median_px[0]:.3f} and {fit.median_px[1]:.3f} in the median",
-        f"each rest's own angles would explain it down to {fit.rms_px[2]:.3f} px rms: the joints repeat to "
-        f"{1e3 * fit.joint_sigma_rad:.2f} mrad{_scatter(fit, told_rad)}",
-        f"pictures that had no part in the correction: {fit.predicted_px[0]:.3f} px rms before, "
-        f"{fit.predicted_px[1]:.3f} after",
-        *fit.outliers[:OUTLIERS_OF_SCENES],
-    ]
-    if len(fit.outliers) > OUTLIERS_OF_SCENES:
-        notes.append(f"and {len(fit.outliers) - OUTLIERS_SHOWN} more were not used, all named by --json")
-    if proposal.other_mast:
-        notes.append(
-            f"{proposal.other_mast} pictures were taken with another mast file; their joint readings count"
-        )
-    if fit.scale > 1.0:
-        notes.append(f"the sigmas are widened by {fit.scale**0.5:.2f}, as the residuals ask")
-    notes += [
-        f"proposed mast file: {saved.path} ({saved.digest[:12]}); {proposal.mast.path} is as it was",
-        "where the rover is and the joints' zero stay as in the former file: pictures cannot show them",
-    ]
-    output.print_table("Corrected by the scene", ["number", "added", "sigma", "", ""], rows, notes)
-
-
-def _unit(name: str) -> str:
-    """What a number is told in."""
-    return {"scale": "1/1000 of the focal length", "r1": "1/1000"}.get(name.rpartition(".")[2], "mrad")
-
-
-def _scatter(fit: SceneFit, told_rad: float) -> str:
-    """What is to be said of how rests scatter."""
-    return "" if fit.joint_sigma_rad <= told_rad else f", not to {1e3 * told_rad:.2f} as was stated"

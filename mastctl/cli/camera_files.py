@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from calib.geometry.cahvor import CameraModel
 
 
-_SOURCES = "mast or camera file, .cahvor, PDS3 label, OpenCV's, ROS's, Kalibr's, mrcal's or COLMAP's"
+_SOURCES = "mast or camera file, .cahvor, OpenCV's, ROS's, Kalibr's or mrcal's"
 
 MOST_EMPTY_TOLD = 20
 """So many rows without a pixel or a ray get a sentence each; the others are counted."""
@@ -61,18 +61,17 @@ def add_commands(subparsers: Any) -> None:
         "target",
         type=Path,
         metavar="OUT",
-        help="x.yaml (a camera file), x.cahvor, x.cameramodel, x.txt (COLMAP), "
-        "x.opencv.yaml, x.ros.yaml, x.kalibr.yaml",
+        help="x.yaml (a camera file), x.cahvor, x.cameramodel, x.opencv.yaml, x.ros.yaml, x.kalibr.yaml",
     )
     convert.add_argument(
         "--camera",
         metavar="NAME",
         action="append",
-        help="which camera, where IN holds several; again for each camera of a Kalibr or COLMAP file",
+        help="which camera, where IN holds several; again for each camera of a Kalibr file",
     )
     convert.add_argument(
         "--to",
-        choices=("mastctl", "cahvor", "opencv", "ros", "kalibr", "mrcal", "colmap"),
+        choices=("mastctl", "cahvor", "opencv", "ros", "kalibr", "mrcal"),
         default="",
         help="the format, where the name of OUT does not say it",
     )

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from calib.geometry.sensor_mode import FLIPS, Mode
 from mastctl.cli import output
 from mastctl.cli.mast_files import camera_name, read_mast_file
 from mastctl.cli.output import at_least
@@ -29,7 +28,12 @@ def add_action(actions: Any) -> None:
         "--bin", nargs="+", type=at_least(1), metavar="N", default=[1],
         help="so many pixels make one: one number, or one across and one down; after the crop",
     )  # fmt: skip
-    mode.add_argument("--flip", choices=FLIPS, default="none", help="after crop and binning")
+    mode.add_argument(
+        "--flip",
+        choices=("none", "horizontal", "vertical", "both"),
+        default="none",
+        help="after crop and binning",
+    )
     mode.add_argument(
         "--size", nargs=2, type=at_least(1), metavar=("WIDTH", "HEIGHT"),
         help="of the camera's pictures, to be compared with what comes out",
@@ -41,7 +45,8 @@ def add_action(actions: Any) -> None:
 def camera_mode(args: argparse.Namespace) -> int:
     """Write the mast file of another mode."""
     from calib.files.mast_file import save_rig
-    from calib.geometry.mode import rig_in_mode
+    from calib.geometry.covariance import rig_in_mode
+    from calib.geometry.mode import FLIPS, Mode
 
     if len(args.bin) > 2:
         raise output.WrongUse(f"--bin has {len(args.bin)} numbers where one or two are expected")

@@ -266,7 +266,7 @@ def camera_check(args: argparse.Namespace) -> int:
             "driver": camera.capture.identity.driver,
             "format": camera.capture.format.code,
             "size_px": list(camera.capture.format.size_px),
-            **sensor_mode_keys(camera.sensor_mode),
+            **sensor_mode_keys(camera.capture.sensor_mode),
             "asked_rate_hz": 1 / camera.capture.period_s,
             **measured,
             "quality": quality.told(),

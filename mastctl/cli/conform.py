@@ -9,12 +9,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mastctl import signals
 from mastctl.cli import output
 from mastctl.cli.output import WrongUse, at_least, finite_number, positive_number
 
 if TYPE_CHECKING:
     from drivers.hardware import HardwareSettings
-    from mastctl.conform.checks import Check, ConformReport, Outcome
+    from mastctl.conform.checks import Check, CheckOutcome, ConformReport
     from mastctl.conform.head_trial import Angles
     from mastctl.devices.opening import Bounds
 
@@ -203,7 +204,7 @@ def _motion(args: argparse.Namespace, checks: Sequence[Check[Any]], whose: str, 
 
 def _may_move(question: str) -> bool:
     """Ask whoever sits at the terminal. Raises WrongUse where nobody does."""
-    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+    if not signals.can_ask():
         raise WrongUse(f"{question}: --motion allows it, --no-motion leaves those checks out")
     sys.stderr.write(f"{question[0].upper()}{question[1:]}. Move it? [y/N] ")
     sys.stderr.flush()
@@ -238,10 +239,10 @@ def _check_junit(path: Path | None) -> None:
         raise WrongUse(f"--junit {path}: a file in a folder that is there is expected")
 
 
-def tell_of(args: argparse.Namespace) -> Callable[[Outcome], None]:
+def tell_of(args: argparse.Namespace) -> Callable[[CheckOutcome], None]:
     """Return what tells a person of each check as it ends, one line each."""
 
-    def tell(outcome: Outcome) -> None:
+    def tell(outcome: CheckOutcome) -> None:
         if args.json:
             return
         words = outcome.promise if outcome.state == "passed" else ""

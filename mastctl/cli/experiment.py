@@ -1,12 +1,19 @@
-"""``mastctl experiment pointing`` on any daemon, ``mastctl demo`` on the simulated rover."""
+"""``mastctl experiment`` on any daemon, ``mastctl demo`` on the simulated rover.
+
+``experiment pointing`` is here; the paper's other experiments are programs of a checkout, `STUDIES`.
+"""
 
 from __future__ import annotations
 
 import argparse
+import os
+import sys
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
+import mastctl
 from mastctl.cli import output
 from mastctl.cli.output import check_folder
 from mastctl.cli.tasks import (
@@ -21,6 +28,7 @@ from mastctl.cli.tasks import (
 )
 
 if TYPE_CHECKING:
+    from calib.geometry.rigid import FloatArray
     from mastctl.client import Client
     from mastctl.experiment.pointing import ClickTruth, PointingExperiment, TargetRecord
 
@@ -28,11 +36,17 @@ DEFAULT_TARGETS = 10
 DEMO_TARGETS = 3  # a first contact: a minute with installation and compiling
 DEFAULT_DISTANCES_M = (10.0, 6.0, 2.0)
 HEADS = ("ptu_d46_70", "dynamixel_x", "ph42")
+STUDIES = {
+    "handoff": "hand targets over from Pancam to Navcam to Hazcam and measure the errors",
+    "approach": "follow a rock from 10 m to 1 m on the simulated rover, beside the paper's Table I",
+    "calibration": "simulated surveys of several sizes, beside the paper's Tables IV and V",
+}
+"""Experiments that are ``tools.studies.NAME`` in a checkout; their own ``--help`` has their options."""
 
 
 def add_commands(subparsers: Any) -> None:
     """Add ``experiment`` and ``demo``."""
-    experiment = subparsers.add_parser("experiment", help="the paper's pointing experiment")
+    experiment = subparsers.add_parser("experiment", help="the paper's experiments")
     kinds = experiment.add_subparsers(dest="experiment", metavar="EXPERIMENT", required=True)
     pointing = kinds.add_parser("pointing", help="point at random textured targets and measure the residuals")
     from mastctl.cli.service import add_daemon_options
@@ -54,6 +68,10 @@ def add_commands(subparsers: Any) -> None:
     )
     add_task_options(pointing)
     pointing.set_defaults(run=run_pointing)
+
+    for name, summary in STUDIES.items():
+        study = kinds.add_parser(name, help=f"{summary} (in a checkout)", add_help=False)
+        study.set_defaults(run=lambda args: become_study(args.experiment, ()))
 
     demo = subparsers.add_parser("demo", help="the pointing experiment on the packaged simulated rover")
     _add_common(demo, "folder for the report (default mastctl_demo)", DEMO_TARGETS)
@@ -94,6 +112,33 @@ def _add_common(parser: argparse.ArgumentParser, out_help: str, targets: int = D
         help=f"targets at each distance (default {targets})",
     )
     add_run_options(parser, "chooses views and pixels", out_help)
+
+
+def study_of(words: Sequence[str]) -> tuple[str, list[str]] | None:
+    """Return the study that a command line names, and its own options; None if it names none."""
+    plain = [at for at, word in enumerate(words) if not word.startswith("-")][:2]
+    if len(plain) < 2 or words[plain[0]] != "experiment" or words[plain[1]] not in STUDIES:
+        return None
+    return words[plain[1]], [word for at, word in enumerate(words) if at not in plain]
+
+
+def become_study(name: str, options: Sequence[str]) -> NoReturn:
+    """Replace this process by a study of the checkout.
+
+    Raises
+    ------
+    WrongUse
+        If mastctl was installed without one.
+    """
+    root = Path(mastctl.__file__).parents[1]
+    if not (root / "tools" / "studies" / f"{name}.py").is_file():
+        raise output.WrongUse(
+            f"'experiment {name}' is a program of the checkout, and mastctl was installed without one in "
+            f"{root}; run it in a checkout after tools/setup"
+        )
+    path = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
+    command = [sys.executable, "-P", "-m", f"tools.studies.{name}", *options]
+    os.execve(command[0], command, os.environ | {"PYTHONPATH": path})
 
 
 def run_pointing(args: argparse.Namespace) -> int:
@@ -138,7 +183,6 @@ def _run_simulated(args: argparse.Namespace) -> int:
 
 def run_demo(args: argparse.Namespace) -> int:
     """Start a simulated rover behind a daemon on a free port, and run the experiment on it."""
-    from drivers.sim.quick_start import drawing_compiled_beside
     from mastctl.config import load_config
     from mastctl.experiment.pointing import head_pair
     from mastctl.experiment.simulated import SimulationTruth, demo_config, head_note, own_config
@@ -150,8 +194,7 @@ def run_demo(args: argparse.Namespace) -> int:
         )
     else:
         config = own_config(load_config(args.config), head=args.head, wire=args.wire, speed=args.speed)
-    # compiling begins before the daemon is imported
-    with drawing_compiled_beside(), simulated_daemon(args, config) as (daemon, client):
+    with simulated_daemon(args, config) as (daemon, client):
         rover = daemon.hardware.simulation
         assert rover is not None  # both configurations are of simulated rovers
         rig = daemon.service.stored.rig
@@ -159,7 +202,8 @@ def run_demo(args: argparse.Namespace) -> int:
         notes = (head_note(rover, rig, camera),)
         behind = f" behind {args.wire} bytes" if args.wire else ""
         output.tell(f"simulated rover at {daemon.url}, head {rover.settings.head.name}{behind}")
-        experiment = _run(args, client, DEFAULT_DISTANCES_M, SimulationTruth(rover), notes)
+        truth = SimulationTruth(rover)
+        experiment = _run(args, client, DEFAULT_DISTANCES_M, truth, notes, rover.stones_m())
     return _report(args, experiment)
 
 
@@ -169,6 +213,7 @@ def _run(
     distances_m: tuple[float, ...],
     truth: ClickTruth | None,
     notes: tuple[str, ...],
+    rocks_m: FloatArray | None = None,
 ) -> PointingExperiment:
     """Run with a progress bar on stderr, one step a target."""
 
@@ -194,6 +239,7 @@ def _run(
             notes=notes,
             on_target=show,
             pictures=PICTURES_PER_DISTANCE if args.out is not None else 0,
+            rocks_m=rocks_m,
         )
 
 

@@ -13,6 +13,7 @@ import argparse
 import atexit
 import contextlib
 import importlib
+import io
 import logging
 import os
 import re
@@ -35,7 +36,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.stop": ("stop", "estop", "reset", "halt"),
     "mastctl.cli.steering": ("lease", "track", "jog"),
     "mastctl.cli.operations": ("reload", "operations", "events", "mast", "fault"),
-    "mastctl.cli.setup": ("token", "completion", "man", "doctor", "schema"),
+    "mastctl.cli.setup": ("token", "completion", "doctor", "schema"),
     "mastctl.cli.camera_files": ("camera",),
     "mastctl.cli.geometry": ("solve", "triangulate", "budget", "handoff"),
     "mastctl.cli.board": ("board",),
@@ -47,7 +48,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.sim": ("sim",),
     "mastctl.cli.rig": ("rig",),
     "mastctl.cli.sentinel": ("sentinel",),
-    "mastctl.cli.servos": ("servo", "ptu", "ptz"),
+    "mastctl.cli.servos": ("servo", "ptu"),
     "mastctl.cli.ros2": ("ros2",),
 }
 
@@ -145,8 +146,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         The words after ``mastctl``; those of the process by default.
     """
     for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed by whoever started us (>&-): then nobody reads
+        stream = getattr(sys, name)
+        if stream is None:  # closed by whoever started us (>&-): then nobody reads
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123  for as long as the process
+        elif isinstance(stream, io.TextIOWrapper):
+            # What the terminal's encoding, or none, can hold (a tick mark, a file's name) is escaped.
+            stream.reconfigure(errors="backslashreplace")
     words = list(sys.argv[1:] if argv is None else argv)
     as_json = "--json" in words
     if not logging.getLogger().handlers:
@@ -201,6 +206,11 @@ def _run(words: Sequence[str]) -> int:
     try:
         words = _as_one_word(_url_last(words))
         _check_command(words)
+        if "experiment" in words:
+            from mastctl.cli.experiment import become_study, study_of
+
+            if (study := study_of(words)) is not None:
+                become_study(*study)
         parser = build_parser(words)
         args = parser.parse_args(words)
     except SystemExit as done:
@@ -300,9 +310,11 @@ board find board.yaml picture.png
 calibrate survey --out mast.yaml --report report
 calibrate bench --config rig.yaml --board board.yaml --out mast.yaml --report report
 experiment pointing --targets 20 --out pointing
+experiment handoff
+experiment approach
+experiment calibration
 demo --out demo
 completion bash --install
-man
 schema config
 conform http://127.0.0.1:8420
 doctor --config rover.yaml
@@ -324,16 +336,14 @@ sim feetech --pty
 servo scan /dev/ttyUSB0
 servo info /dev/ttyUSB0 1
 servo set-id /dev/ttyUSB0 1 2
-servo test /dev/ttyUSB0 1 --degrees 5
 ptu info /dev/ttyUSB0
 ptu home /dev/ttyUSB0
-ptz info /dev/ttyUSB0
 ros2 --url http://127.0.0.1:8420
 """
 _GROUPS = frozenset(
     (
         *("lease", "token", "track", "operations", "mast", "fault", "camera", "experiment", "record"),
-        *("sim", "servo", "ptu", "ptz", "board", "sentinel", "rig"),
+        *("sim", "servo", "ptu", "board", "sentinel", "rig"),
     )
 )
 

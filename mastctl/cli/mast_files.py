@@ -86,14 +86,14 @@ def camera_of(source: StoredRig | CameraFile | CameraFiles, name: str | None) ->
         _refuse_name(name)
         return "camera", source
     if isinstance(source, CameraFiles):
-        cameras = source.cameras
+        cameras = source.names
         if name is None:
             raise output.WrongUse(
                 f"{source.path} holds several cameras; --camera with one of {', '.join(cameras)}"
             )
         if name not in cameras:
             raise output.WrongUse(f"no camera '{name}' in {source.path}; {nearest_of(name, cameras)}")
-        return name, cameras[name]
+        return name, source.camera(name)
     name = camera_name(source, name)
     camera = source.rig.cameras[name]
     provenance = {"mast_file_sha256": source.digest, **source.rig.provenance}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import pwd
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -72,6 +73,16 @@ def print_table(
     console.print(table)
     for note in notes:
         console.print(Text(note))
+
+
+def print_lines(lines: Iterable[str], last: str, style: str) -> None:
+    """Write lines for people to stdout, the last in a style of rich; a terminal breaks them at words."""
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(file=sys.stdout)
+    for line, its in [*((line, "") for line in lines), (last, style)]:
+        console.print(Text(one_line(line), style=its), soft_wrap=not console.is_terminal)
 
 
 def tell(message: str) -> None:
@@ -165,6 +176,17 @@ def finite_number(text: str) -> float:
     return value
 
 
+def angle_rad(text: str) -> float:
+    """Read an option's value as an angle of at most a full turn, radians (argparse ``type``)."""
+    value = finite_number(text)
+    if abs(value) > math.tau:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' where radians are expected, at most {math.tau:.2f} (a full turn); "
+            f"{value:g} degrees are {math.radians(value):.6g}"
+        )
+    return value
+
+
 def positive_number(text: str) -> float:
     """Read an option's value as a finite number above zero (argparse ``type``)."""
     value = finite_number(text)
@@ -212,10 +234,10 @@ def add_model(parser: Any) -> None:
 
 def _model_kind(text: str) -> str:
     """Return a camera model's name as files have it; argparse tells the refusal."""
-    from calib.geometry.cahvor import FITTED
+    from calib.geometry.cahvor import KINDS
 
-    if text.upper() not in FITTED:
-        known = ", ".join(kind.lower() for kind in FITTED)
+    if text.upper() not in KINDS:
+        known = ", ".join(kind.lower() for kind in KINDS)
         raise argparse.ArgumentTypeError(f"'{text}' is not a camera model; known are {known}")
     return text.upper()
 
@@ -257,6 +279,14 @@ def _try_to_write(folder: Path, what: str) -> None:
             pass
     except OSError as error:
         raise unusable(what, f"nothing can be written to {folder}: {error.strerror or error}") from None
+
+
+def user_name(uid: int) -> str:
+    """Return the name of a user of this machine, or the number of one without a name."""
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
 
 
 def unusable(what: str, why: str) -> CommandError:

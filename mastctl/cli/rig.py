@@ -13,10 +13,9 @@ from mastctl.cli.sim_new import folder_name
 if TYPE_CHECKING:
     from mastctl.rig.drawing import RigAnswers
     from mastctl.rig.plugged import Plugged, PluggedHead
-    from mastctl.rig.questions import Questions
+    from mastctl.rig.questions import Prompts
 
 
-AXES = ("pan", "tilt")
 NOTHING = "no head and no camera is plugged in; write a simulated twin, which runs"
 TWIN_DEG = {"pan": 175.0, "tilt": 90.0}
 """The reach of the simulated head to each side."""
@@ -41,21 +40,6 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     number = at_least(0)
     new.add_argument("--pan-id", type=number, metavar="ID", help="the servo that turns pan")
     new.add_argument("--tilt-id", type=number, metavar="ID", help="the servo that turns tilt")
-    new.add_argument(
-        "--baud", nargs="+", type=number, default=[], metavar="B",
-        help="ask VISCA and Pelco heads at these rates (default 9600 and 38400; 2400, 4800 and 9600)",
-    )  # fmt: skip
-    new.add_argument(
-        "--address", nargs="+", type=number, default=[], metavar="N",
-        help="ask VISCA and Pelco heads at these addresses (default 1 to 7; 1 and 2)",
-    )  # fmt: skip
-    new.add_argument(
-        "--count-deg", type=positive_number, metavar="DEG", help="one count of a VISCA head (its data sheet)"
-    )
-    new.add_argument(
-        "--fastest-deg", nargs=2, type=positive_number, metavar=("PAN", "TILT"),
-        help="speeds of a VISCA or Pelco head, degrees per second (its data sheet)",
-    )  # fmt: skip
     for axis, usual in (("pan", "-85 85"), ("tilt", "-40 30")):
         new.add_argument(
             f"--{axis}-deg", nargs=2, type=finite_number, metavar=("LOW", "HIGH"),
@@ -84,14 +68,14 @@ def _new(args: argparse.Namespace) -> int:
     """Look, ask, write, and say what is next."""
     from mastctl.rig.folder import check_free, write_rig, write_simulated
     from mastctl.rig.plugged import look
-    from mastctl.rig.questions import Questions
+    from mastctl.rig.questions import Prompts
     from mastctl.setup.machine import ExaminedMachine
 
     check_folder(args.folder, "FOLDER")
     check_free(args.folder)
     machine = ExaminedMachine()
-    questions = Questions(terminal=False if args.json else None)
-    found = look(args.port, machine, output.tell, (args.baud, args.address))
+    questions = Prompts(terminal=False if args.json else None)
+    found = look(args.port, machine, output.tell)
     for words in found.words:
         output.tell(f"found {words}")
     for words in found.unused:
@@ -137,7 +121,7 @@ def _new(args: argparse.Namespace) -> int:
     return 0
 
 
-def _head(found: Plugged, questions: Questions) -> PluggedHead | None:
+def _head(found: Plugged, questions: Prompts) -> PluggedHead | None:
     """The head of the rig, of those that can be one."""
     heads = found.heads
     if len(heads) < 2:
@@ -148,7 +132,7 @@ def _head(found: Plugged, questions: Questions) -> PluggedHead | None:
 
 
 def _answers(
-    args: argparse.Namespace, found: Plugged, head: PluggedHead | None, questions: Questions
+    args: argparse.Namespace, found: Plugged, head: PluggedHead | None, questions: Prompts
 ) -> RigAnswers:
     """What the options say, else the person at the terminal, else what is usual."""
     from mastctl.rig.drawing import RigAnswers
@@ -187,25 +171,10 @@ def _answers(
         tilt_deg=ends["tilt"],
         pan_id=pan_id,
         tilt_id=tilt_id,
-        **_data_sheet(args, head, questions),
     )
 
 
-def _data_sheet(args: argparse.Namespace, head: PluggedHead | None, questions: Questions) -> dict[str, Any]:
-    """What only the data sheet of a VISCA or Pelco head tells: 0, or no option, leaves it open."""
-    if head is None or not head.ptz:
-        return {}
-    count_deg, fastest_deg = args.count_deg, args.fastest_deg
-    sheet = "by its data sheet (0: not known)"
-    if count_deg is None and head.ptz[0].dialect.driver == "visca":
-        count_deg = questions.number(f"one count of the head, degrees, {sheet}", 0.0, 0.0, 1.0) or None
-    if fastest_deg is None:
-        speeds = [questions.number(f"speed of {axis}, degrees/s, {sheet}", 0.0, 0.0, 1000.0) for axis in AXES]
-        fastest_deg = speeds if all(speeds) else None
-    return {"count_deg": count_deg, "fastest_deg": None if fastest_deg is None else tuple(fastest_deg)}
-
-
-def _axes(args: argparse.Namespace, ids: list[int], questions: Questions) -> tuple[int, int]:
+def _axes(args: argparse.Namespace, ids: list[int], questions: Prompts) -> tuple[int, int]:
     """Which servo turns pan, and which tilt."""
     usual = ids if len(ids) > 1 else [*ids, *(number for number in (1, 2) if number not in ids)]
     pan, tilt = args.pan_id, args.tilt_id

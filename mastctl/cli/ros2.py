@@ -49,12 +49,12 @@ def _run(args: argparse.Namespace) -> int:
             raise WrongUse(f"{option} is '{text}' where a word of letters, digits and _ is expected")
     check_ros()
     with client_of(args) as client:
-        url = client.url
+        url, reads_only = client.url, client.reads_only
     name = f"ros2@{os.uname().nodename}:{os.getpid()}"
     queue_output()
     with suppress(KeyboardInterrupt), signals.raised():
         run(
-            lambda: Client(url, timeout_s=10.0, name=name),
+            lambda: Client(url, timeout_s=10.0, name=name, reads_only=reads_only),
             args.prefix,
             args.base,
             args.ros_args,

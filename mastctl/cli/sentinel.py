@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.output import positive_number
+from mastctl.cli.output import angle_rad, positive_number
 from mastctl.cli.service import add_daemon_options, client_of, tell_result
 
 if TYPE_CHECKING:
@@ -61,13 +61,10 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 
 def _pose(text: str) -> tuple[float, float]:
-    try:
-        pan, tilt = (float(word) for word in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' where PAN,TILT in radians is expected") from None
-    if not max(abs(pan), abs(tilt)) < 10.0:
+    words = text.split(",")
+    if len(words) != 2:
         raise argparse.ArgumentTypeError(f"'{text}' where PAN,TILT in radians is expected")
-    return pan, tilt
+    return angle_rad(words[0]), angle_rad(words[1])
 
 
 @contextmanager

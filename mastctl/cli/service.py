@@ -17,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mastctl import signals
 from mastctl.cli import output
 from mastctl.cli.output import CommandError, WrongUse, finite_number, positive_number
 from mastctl.cli.target import add_target_options, check_done, check_target, option_number, target_of
@@ -62,7 +63,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     point = subparsers.add_parser("point", help="point a camera at something and measure the residual")
     what = add_target_options(point, "a point, metres")
     what.add_argument(
-        "--angles", nargs=2, type=finite_number, metavar=("PAN", "TILT"), help="joint angles, radians"
+        "--angles", nargs=2, type=output.angle_rad, metavar=("PAN", "TILT"), help="joint angles, radians"
     )
     point.add_argument("--aim", nargs=3, metavar=("CAMERA", "X", "Y"), help="where the target shall come")
     far = point.add_mutually_exclusive_group()
@@ -107,8 +108,6 @@ def _address(text: str) -> Listen:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from mastctl import signals
-
     queue_output()
     # Told to end before it is up, it ends: nothing has moved yet. Before the imports, which take a second.
     with suppress(KeyboardInterrupt), signals.raised(signal.SIGINT):
@@ -128,7 +127,7 @@ def queue_output() -> None:
         writer = writer_to(descriptor)
         setattr(sys, name, QueuedText(writer))
         atexit.register(writer.flush)
-    signal.signal(signal.SIGTTOU, signal.SIG_IGN)  # a background job may write to its terminal
+    signals.write_from_background()
 
 
 def _set_log(args: argparse.Namespace) -> None:
@@ -182,7 +181,10 @@ def _status(args: argparse.Namespace) -> int:
 
 
 def _ready(client: Client, wait_s: float) -> Status:
-    """The status as soon as the daemon carries out commands; of a stop or a fault at the end of the wait."""
+    """Return the status as soon as the daemon carries out commands.
+
+    A fault is waited for, since it may clear. A latched emergency stop is not: only a reset releases it.
+    """
     from mastctl.answers.words import WELL
     from mastctl.client import ClientError
     from mastctl.client.following import PASSING
@@ -195,6 +197,8 @@ def _ready(client: Client, wait_s: float) -> Status:
                 return status
             reason = status.get("reason")
             words = f"the daemon is {status['state']}{f': {reason}' if reason else ''}"
+            if status["state"] == "stopped":
+                raise CommandError("not_ready", words)
         except ClientError as error:
             if error.code not in PASSING:
                 raise
@@ -283,27 +287,61 @@ def refuse_daemon_options(args: argparse.Namespace) -> None:
 def client_of(args: argparse.Namespace, *, whatever_configured: bool = False) -> Iterator[Client]:
     """A client of the daemon that the options, or MASTCTL_URL, name.
 
-    ``whatever_configured``: where the configuration cannot be read, the usual address is asked.
+    Where nothing names one, it is that of the packaged configuration, and a daemon of another user is only
+    read there. ``whatever_configured``: where the configuration cannot be read, the usual address is asked.
     """
     from calib.errors import BadFile
     from mastctl.client import Client
     from mastctl.config import Listen, load_config
 
-    url = args.url or os.environ.get("MASTCTL_URL")
+    url, reads_only = args.url or os.environ.get("MASTCTL_URL"), ""
     if url is None:
+        named = args.config is not None
         try:
             listen = load_config(args.config).listen
         except BadFile as error:
             if not whatever_configured:
                 raise
-            listen = Listen()
+            listen, named = Listen(), False
             output.tell(f"{error}; asking the usual address {listen.url}")
         if listen.socket is None and listen.port == 0:
             raise WrongUse("the configuration listens at any free port (0); give --url")
         url = listen.url
-    with Client(url, name=_person()) as client:
+        if not named:
+            reads_only = _not_ours(listen)
+    with Client(url, name=_person(), reads_only=reads_only) as client:
         client.use_lease(getattr(args, "lease", None))
         yield client
+
+
+def _not_ours(listen: Listen) -> str:
+    """Why a daemon that nothing names is not commanded; empty if this user started it, or it is not there."""
+    owner = listener_of(listen.host, listen.port)
+    if owner is None or owner == os.getuid():
+        return ""
+    return (
+        f"the daemon at {listen.url} was started by {output.user_name(owner)}, not by this user; "
+        f"if it is the one that is meant, name it: --url {listen.url}"
+    )
+
+
+LISTENING = "0A"  # the state TCP_LISTEN of Linux, include/net/tcp_states.h
+
+
+def listener_of(host: str, port: int) -> int | None:
+    """Return the user id of who listens at an IPv4 address of this machine; None if nobody does (proc(5))."""
+    found = None
+    for table in (Path("/proc/net/tcp"), Path("/proc/net/tcp6")):
+        lines = table.read_text(encoding="ascii").splitlines()[1:] if table.exists() else []
+        for _, local, _, state, _, _, _, owner, *_ in map(str.split, lines):
+            address, _, number = local.partition(":")
+            if state != LISTENING or int(number, 16) != port:
+                continue
+            if address == socket.inet_aton(host)[::-1].hex().upper():
+                return int(owner)
+            if set(address) == {"0"}:  # every address of the machine
+                found = int(owner)
+    return found
 
 
 def _person() -> str:

@@ -1,51 +1,45 @@
-"""Real heads on their lines: ``mastctl servo`` (two families), ``mastctl ptu`` and ``mastctl ptz``."""
+"""Real heads on their lines: ``mastctl servo`` (two families) and ``mastctl ptu``."""
 
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.output import CommandError, WrongUse, positive_number
+from mastctl.cli.output import CommandError, WrongUse
 
 REPLY_TIMEOUT_S = 0.05
 
 if TYPE_CHECKING:
     from drivers.dynamixel.link import Link
-    from drivers.feetech.link import FeetechLink
+    from drivers.feetech.servos import FeetechLink
     from drivers.flir_ptu.workshop import Facts
 
 
 FAMILIES = {
-    "dynamixel": (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000),
-    "feetech": (1_000_000, 115_200, 500_000, 57_600),
-}
-"""The baud rates that a scan tries, first that of the factory."""
+    "dynamixel": (
+        57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000, 6_000_000, 10_500_000, 9600,
+    ),
+    "feetech": (1_000_000, 115_200, 500_000, 250_000, 128_000, 76_800, 57_600, 38_400),
+}  # fmt: skip
+"""The baud rates that a scan tries: every rate that ``set-id`` can give, first that of the factory."""
 
-NO_SERVOS = {
-    "flir_ptu": "mastctl ptu info PORT",
-    "visca": "mastctl ptz info PORT",
-    "pelco": "mastctl ptz info PORT",
-}
+NO_SERVOS = {"flir_ptu": "mastctl ptu info PORT"}
 """Heads without servos, and the command that asks one."""
-
-FARTHEST_DEG = 20.0
 
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add servo, ptu and ptz."""
-    for add in (_add_servo, _add_ptu, _add_ptz):
+    """Add servo and ptu."""
+    for add in (_add_servo, _add_ptu):
         add(subparsers)
 
 
 def _add_servo(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add servo with its four commands."""
+    """Add servo with its three commands."""
     servo = subparsers.add_parser(
-        "servo", help="find, read, number and try Dynamixel or Feetech servos on the bench"
+        "servo", help="find, read and number Dynamixel or Feetech servos on the bench"
     )
     commands = servo.add_subparsers(dest="servo_command", metavar="WHAT", required=True)
 
@@ -72,21 +66,6 @@ def _add_servo(subparsers: argparse._SubParsersAction[Any]) -> None:
         "--torque-off", action="store_true", help="switch its torque off for that (what hangs on it may fall)"
     )
     set_id.set_defaults(run=_set_id)
-
-    test = commands.add_parser(
-        "test", help="turn a servo a few degrees to each side and back, slowly and weakly"
-    )
-    _add_port(test)
-    test.add_argument("id", type=_whole, metavar="ID", help="as 'mastctl servo scan' finds it")
-    _add_baud(test)
-    test.add_argument(
-        "--degrees", type=positive_number, default=5.0, metavar="DEG", help="how far (default 5, at most 20)"
-    )
-    test.add_argument(
-        "--torque-percent", type=positive_number, default=30.0, metavar="P",
-        help="bound of the motor's drive, percent of full (default 30)",
-    )  # fmt: skip
-    test.set_defaults(run=_test)
 
 
 def _add_port(parser: argparse.ArgumentParser) -> None:
@@ -118,7 +97,7 @@ def _add_baud(parser: argparse.ArgumentParser) -> None:
 def _workshop(args: argparse.Namespace) -> Any:
     """The workshop of a family of servos."""
     from drivers.dynamixel import workshop as dynamixel
-    from drivers.feetech import workshop as feetech
+    from drivers.feetech import servos as feetech
 
     return feetech if args.family == "feetech" else dynamixel
 
@@ -136,7 +115,7 @@ def _line(args: argparse.Namespace) -> Iterator[Any]:
     baud = FAMILIES[args.family][0] if args.baud is None else args.baud
     link: Link | FeetechLink
     if args.family == "feetech":
-        from drivers.feetech.link import open_link
+        from drivers.feetech.servos import open_link
 
         link = open_link(args.port, baud)
     else:
@@ -160,13 +139,8 @@ def _scan(args: argparse.Namespace) -> int:
     if not result.found:
         raise CommandError(
             "no_servo",
-            f"no servo answered on {args.port} at {bauds} baud"
-            + (
-                f"; {'; '.join(garbled)}; "
-                if garbled
-                else f"; is its power on, is it a {args.family} servo? "
-            )
-            + f"'mastctl ptz info {quote(args.port)}' asks for VISCA and Pelco heads",
+            f"no servo answered on {args.port} at {bauds} baud; "
+            + ("; ".join(garbled) or f"is its power on, is it a {args.family} servo?"),
         )
     if args.json:
         rows = [
@@ -228,63 +202,6 @@ def _set_id(args: argparse.Namespace) -> int:
         output.print_json({"id": args.new_id, "old_id": args.id, "baud": baud})
     else:
         output.tell(f"the servo now answers to id {args.new_id} at {baud} baud")
-    return 0
-
-
-def _test(args: argparse.Namespace) -> int:
-    """Turn a servo a little."""
-    from mastctl.devices.opening import line_held
-
-    if args.degrees > FARTHEST_DEG:
-        raise WrongUse(f"--degrees is {args.degrees:g}, expected at most {FARTHEST_DEG:g} for a careful test")
-    if args.torque_percent > 100:
-        raise WrongUse(f"--torque-percent is {args.torque_percent:g}, expected at most 100")
-    output.tell(
-        f"servo {args.id} is to turn {args.degrees:g} degrees to each side and back, at most "
-        f"{args.torque_percent:g} % of its strength"
-    )
-    with line_held(args.port), _line(args) as link:
-        trial = _workshop(args).try_out(link, args.id, math.radians(args.degrees), args.torque_percent)
-    count_deg = math.degrees(trial.count_rad)
-    worst = max(abs(step.left_counts) for step in trial.steps)
-    if args.json:
-        rows = [
-            {
-                "goal_counts": step.goal_counts,
-                "measured_counts": step.measured_counts,
-                "left_counts": step.left_counts,
-                "seconds": step.seconds,
-                "most_current_A": step.most_current_A,
-                "voltage_V": step.voltage_V,
-                "temperature_C": step.temperature_C,
-            }
-            for step in trial.steps
-        ]
-        told = {"id": trial.servo_id, "model": trial.model, "count_deg": count_deg, "steps": rows}
-        if trial.speed_unit_counts is not None:
-            told["speed_unit_counts"] = trial.speed_unit_counts
-        output.print_json(told)
-        return 0
-    notes = [f"It missed its goals by {worst} counts ({worst * count_deg:.3f} deg) at most."]
-    if trial.speed_unit_counts is not None:
-        notes.append(f"Its unit of speed is {trial.speed_unit_counts} counts/s: speed_unit_counts.")
-    output.print_table(
-        f"Servo {trial.servo_id}: {trial.model}, one count is {count_deg:.4f} degrees",
-        ("goal", "measured", "left", "seconds", "most A", "V", "C"),
-        [
-            (
-                str(s.goal_counts),
-                str(s.measured_counts),
-                str(s.left_counts),
-                f"{s.seconds:.2f}",
-                "-" if s.most_current_A is None else f"{s.most_current_A:.3f}",
-                f"{s.voltage_V:.1f}",
-                str(s.temperature_C),
-            )
-            for s in trial.steps
-        ],
-        notes,
-    )
     return 0
 
 
@@ -374,70 +291,3 @@ def _show(args: argparse.Namespace, found: Facts) -> None:
     ]
     notes = [f"supply: {found.supply}"] if found.supply else []
     output.print_table(found.version, ("", "pan", "tilt"), rows, notes)
-
-
-def _add_ptz(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add ptz with its command."""
-    ptz = subparsers.add_parser("ptz", help="ask for a VISCA or Pelco head on the bench")
-    commands = ptz.add_subparsers(dest="ptz_command", metavar="WHAT", required=True)
-    info = commands.add_parser(
-        "info", help="show which VISCA or Pelco head answers, and where it stands; moves nothing"
-    )
-    info.add_argument(
-        "port", metavar="PORT", help="serial device, udp://HOST, socket://HOST:PORT or rfc2217://HOST:PORT"
-    )
-    for name, letter, usual in (
-        ("baud", "B", "VISCA 9600 and 38400, Pelco 2400, 4800 and 9600"),
-        ("address", "N", "VISCA 1 to 7, Pelco 1 and 2"),
-    ):
-        info.add_argument(
-            f"--{name}", nargs="+", type=_whole, default=[], metavar=letter,
-            help=f"to ask at (default: {usual})",
-        )  # fmt: skip
-    info.set_defaults(run=_ptz_info)
-
-
-def _ptz_info(args: argparse.Namespace) -> int:
-    """Show the heads of a line."""
-    from drivers.errors import BadOptions
-    from drivers.ptz.inquiry import find_heads
-    from mastctl.rig.plugged import PTZ_DIALECTS
-
-    asked = [one for one in PTZ_DIALECTS if one.takes(args.port)] or PTZ_DIALECTS
-    bauds = sorted({baud for dialect in asked for baud in dialect.possible_bauds})
-    highest = max(dialect.highest_address for dialect in asked)
-    for baud in args.baud:
-        if baud not in bauds:
-            raise BadOptions(f"--baud is {baud}, expected one of {', '.join(map(str, bauds))}")
-    for address in args.address:
-        if not 1 <= address <= highest:
-            raise BadOptions(f"--address is {address}, expected 1 to {highest}")
-    found = find_heads(args.port, PTZ_DIALECTS, args.baud, args.address)
-    if not found:
-        raise CommandError(
-            "no_head",
-            f"no VISCA or Pelco head answered on {args.port}; is its power on, does it answer position "
-            "queries? --baud and --address name others than the usual ones",
-        )
-    rows = [
-        {
-            "driver": one.dialect.driver,
-            **one.dialect.options,
-            "baud": one.baud,
-            "address": one.address,
-            "pan_counts": one.places[0],
-            "tilt_counts": one.places[1],
-        }
-        for one in found
-    ]
-    if args.json:
-        output.print_json({"port": args.port, "heads": rows})
-        return 0
-    names = ("protocol", "baud", "address", "pan, counts", "tilt, counts")
-    output.print_table(
-        f"Heads on {args.port}",
-        names,
-        [(one.dialect.name, *map(str, (one.baud, one.address, *one.places))) for one in found],
-        ["A count of Pelco is 0.01 degree; that of VISCA is in the head's data sheet, like its speed."],
-    )
-    return 0

@@ -1,4 +1,4 @@
-"""Setting up: ``doctor``, ``schema``, ``token``, ``completion``, ``man``."""
+"""Setting up: ``doctor``, ``schema``, ``token``, ``completion``."""
 
 from __future__ import annotations
 
@@ -122,8 +122,9 @@ def _add_token(subparsers: argparse._SubParsersAction[Any]) -> None:
     revoke.add_argument("name", metavar="NAME", help="as 'mastctl token list' shows it")
     revoke.set_defaults(run=_revoke)
     for one in (new, shown, revoke):
+        one.add_argument("--url", help="the running daemon's address (default: that of the configuration)")
         one.add_argument("--config", metavar="FILE", help="the configuration that the daemon runs with")
-        one.add_argument("--state", metavar="FOLDER", help="the daemon's state folder, wherever it is")
+        one.add_argument("--state", metavar="FOLDER", help="state folder of a daemon that does not run now")
 
 
 def _new(args: argparse.Namespace) -> int:
@@ -158,25 +159,53 @@ def _revoke(args: argparse.Namespace) -> int:
 
 
 def _tokens(args: argparse.Namespace) -> TokenList:
-    """The list that the options name."""
+    """The list that the daemon reads."""
     from mastctl.http.tokens import TokenList
 
-    return TokenList(_folder(args))
+    folder = _folder_of_running(args) if args.state is None else _folder_kept(args.state)
+    owner = folder.stat().st_uid
+    if owner != os.geteuid():  # what root writes there the daemon could not read
+        user = output.user_name(owner)
+        words = f"{folder} belongs to {user}, whose daemon reads it: sudo -u {user} mastctl token ..."
+        raise CommandError("another_user", words)
+    return TokenList(folder)
 
 
-def _folder(args: argparse.Namespace) -> Path:
-    """The state folder of the daemon that the options name."""
-    from mastctl.config import load_config
-    from mastctl.safety.state_folder import usual_folder
+def _folder_of_running(args: argparse.Namespace) -> Path:
+    """Where the running daemon says that it reads tokens."""
+    from mastctl.cli.service import client_of
+    from mastctl.client import ClientError
 
-    if args.state is not None:
-        return Path(args.state)
-    config = load_config(args.config)
-    return config.state_folder or usual_folder(config.path, config.listen.url)
+    with client_of(args) as client:
+        try:
+            folder = client.live().get("token_folder")
+        except ClientError as error:
+            if error.code != "no_daemon":
+                raise
+            words = (
+                f"no daemon answers at {client.url}, and only a running one knows where it reads its tokens: "
+                "start it, or name the folder of one that has run by --state FOLDER"
+            )
+            raise CommandError(error.code, words) from None
+    if folder is None:
+        words = f"the daemon at {client.url} requires no token, or is on another machine: make it there"
+        raise CommandError("no_tokens", words)
+    return Path(folder)
+
+
+def _folder_kept(named: str) -> Path:
+    """The folder of --state, if a daemon that requires tokens has kept its state there."""
+    from mastctl.http.tokens import LIST_NAME
+
+    folder = Path(named)
+    if not (folder / LIST_NAME).exists():
+        words = "no daemon has kept its state here that requires tokens; its first run makes them"
+        raise output.unusable(str(folder), words)
+    return folder
 
 
 def _add_completion(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add completion and man."""
+    """Add completion."""
     completion = subparsers.add_parser(
         "completion", help="print what makes a shell complete commands and options, or install it"
     )
@@ -187,12 +216,6 @@ def _add_completion(subparsers: argparse._SubParsersAction[Any]) -> None:
         help="write it where the shell finds it, for this user (bash and zsh)",
     )
     completion.set_defaults(run=_completion)
-    man = subparsers.add_parser("man", help="write the man pages, one for each command, where man finds them")
-    man.add_argument(
-        "--to", type=Path, metavar="FOLDER",
-        help="a folder man1 (default: share/man/man1 beside the program's own bin)",
-    )  # fmt: skip
-    man.set_defaults(run=_man)
 
 
 def _completion(args: argparse.Namespace) -> int:
@@ -228,20 +251,3 @@ def _write(file: Path, text: str) -> None:
         file.write_text(text, encoding="utf-8")
     except OSError as error:
         raise output.unusable(str(file), str(error.strerror)) from None
-
-
-def _man(args: argparse.Namespace) -> int:
-    from mastctl.cli.main import build_parser
-    from mastctl.cli.man import man_pages
-
-    folder = args.to if args.to is not None else Path(sys.prefix) / "share" / "man" / "man1"
-    output.check_folder(folder, "--to")
-    pages = man_pages(build_parser([]))
-    for name, text in pages.items():
-        _write(folder / name, text)
-    if args.json:
-        output.print_json({"written": [str(folder / name) for name in pages]})
-    else:
-        named = "mastctl-point" if args.to is None else str(folder / "mastctl-point.1")
-        sys.stdout.write(output.one_line(f"{len(pages)} pages in {folder}; try: man {named}") + "\n")
-    return 0

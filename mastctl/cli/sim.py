@@ -1,7 +1,8 @@
 """Simulated servos behind real bytes, for any driver: `mastctl sim dynamixel|feetech|ptu`.
 
 Each runs until SIGTERM, SIGINT (Ctrl-C) or, with --until-eof, the end of its standard input. JSON
-lines on standard input switch faults on and off while it runs.
+lines on standard input switch faults on and off while it runs. A terminal is never read: a job in the
+background would be stopped by the next keystroke (SIGTTIN).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from mastctl import signals
 from mastctl.cli import output, sim_new
 from mastctl.cli.output import WrongUse
 
@@ -27,11 +29,12 @@ if TYPE_CHECKING:
     from drivers.sim.wire.line import PtyLine, TcpLine, WireDevice
 
 _LIVE = """\
-JSON lines on standard input, one order each, answered on standard error:
+JSON lines from a file or a pipe on standard input, one order each, answered on standard error:
   {"word": "mute", "replies": 5}                       a fault of the head, with parameters
   {"word": "overload", "angle_rad": 0.3, "at_s": 2}    from two seconds on
   {"clear": true}                                      all faults off
-The words are those of docs/drivers.md. SIGTERM or Ctrl-C ends it."""
+The faults are those of docs/drivers.md. A terminal is not read; `cat | mastctl sim ...` reads one.
+SIGTERM or Ctrl-C ends it."""
 
 
 _PAN_TILT: tuple[Literal[0], Literal[1]] = (0, 1)
@@ -204,6 +207,7 @@ def _serve(
     tcp = getattr(args, "tcp", None)
     if tcp is not None and args.link is not None:
         raise WrongUse("--link goes with --pty")
+    signals.write_from_background()
     observer = _observer(clock.now_s()) if args.verbose else None
     with _signals() as wake:
         if args.faults is not None:
@@ -254,10 +258,10 @@ def _signals() -> Iterator[int]:
 
 
 def _follow_orders(panel: FaultPanel, wake: int, until_eof: bool) -> None:
-    """Carry out the lines of standard input until a signal comes."""
+    """Carry out the lines of standard input, unless that is a terminal, until a signal comes."""
     source: list[int] = []
     with contextlib.suppress(OSError, ValueError, AttributeError):  # closed, or none at all
-        source = [sys.stdin.fileno()]
+        source = [] if sys.stdin.isatty() else [sys.stdin.fileno()]
     rest = b""
     while True:
         try:

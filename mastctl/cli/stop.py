@@ -40,9 +40,6 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     reset = subparsers.add_parser("reset", help="release an emergency stop; nothing moves by that")
     reset.add_argument("--reason", required=True, metavar="WORDS", help="why it is safe to move again")
     reset.add_argument("--name", required=True, metavar="WHO", help="who says so")
-    reset.add_argument(
-        "--latched-by", metavar="NAME", help="release the stop that this person latched, where several are"
-    )
     reset.set_defaults(run=_reset)
 
     halt = subparsers.add_parser(
@@ -59,7 +56,8 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
 def _stop(args: argparse.Namespace) -> int:
     answer = _by_any_way(args, "stop", lambda client: client.stop())
     operation = answer.get("operation")
-    tell_result(args, answer, f"stopped{f', operation {operation} too' if operation else ''}")
+    line = f"stopped at {answer['reached']}{f', operation {operation} too' if operation else ''}"
+    tell_result(args, answer, line)
     return 0
 
 
@@ -67,7 +65,7 @@ def _estop(args: argparse.Namespace) -> int:
     reason, name = (" ".join((words or "").split()) for words in (args.reason, args.name))
     line = f"estop {name.replace(':', ' ')}: {reason}"
     answer = _by_any_way(args, line, lambda client: client.estop(reason=reason or None, name=name or None))
-    words = f"stopped and latched ({answer.get('name')}: {answer.get('reason')})"
+    words = f"stopped at {answer['reached']} and latched ({answer.get('name')}: {answer.get('reason')})"
     if answer.get("message"):
         words += f"; {answer['message']}"
     tell_result(args, answer, f"{words}; 'mastctl reset --reason ... --name ...' releases it")
@@ -76,18 +74,16 @@ def _estop(args: argparse.Namespace) -> int:
 
 def _reset(args: argparse.Namespace) -> int:
     with client_of(args, whatever_configured=True) as client:
-        answer = client.reset(reason=args.reason, name=args.name, latched_by=args.latched_by)
+        answer = client.reset(reason=args.reason, name=args.name)
     was = answer["released"]
-    left = "".join(f"; still latched: {one['name']}: {one['reason']}" for one in answer["left"])
-    words = f"released (it was latched by {was['name']}, {was['at']}: {was['reason']})"
-    tell_result(args, answer, f"{words}{left}")
+    tell_result(args, answer, f"released (it was latched by {was['name']}, {was['at']}: {was['reason']})")
     return 0
 
 
 def _by_any_way(
     args: argparse.Namespace, line: str, ask: Callable[[Client], Mapping[str, Any]]
 ) -> Mapping[str, Any]:
-    """Ask by the stop socket where there is one, else over HTTP."""
+    """Ask by the stop socket where there is one, else over HTTP; ``reached``: the socket or address."""
     from mastctl.safety.stop_line import NoAnswer
     from mastctl.safety.stop_line import ask as ask_socket
 
@@ -96,7 +92,7 @@ def _by_any_way(
     for paths in _sockets(args):
         for path in paths:
             try:
-                answer = ask_socket(path, line)
+                answer = {**ask_socket(path, line), "reached": str(path)}
             except NoAnswer:
                 continue
             except ValueError as error:
@@ -111,7 +107,7 @@ def _by_any_way(
 
     try:
         with client_of(args, whatever_configured=True) as client:
-            return ask(client)
+            return {**ask(client), "reached": client.url}
     except ClientError as error:
         if error.code != "no_daemon":
             raise

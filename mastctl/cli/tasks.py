@@ -26,7 +26,7 @@ Result = TypeVar("Result")
 def add_task_options(parser: argparse.ArgumentParser) -> None:
     """Add --executor, --workers, --results, --list-tasks and --task."""
     group = parser.add_argument_group(
-        "tasks", "where they run, and how a run goes on (docs/how-to/campaigns.md)"
+        "tasks", "where they run, and how a run goes on (docs/how-to/simulation.md)"
     )
     group.add_argument(
         "--executor", default="local", metavar="WHERE",

@@ -1,75 +1,47 @@
-"""The two clients of a running daemon: one whose caller waits, and one for asyncio."""
+"""The client of a running daemon; each method waits for the daemon's answer."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator
-from contextlib import AbstractAsyncContextManager, AbstractContextManager
-from functools import update_wrapper
-from types import MethodType, TracebackType
-from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
+import contextlib
+import math
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Any, Literal, cast
+from urllib.parse import quote
 
-from mastctl.client.calls import Calls
-from mastctl.client.connection import AsyncDaemonHttp, DaemonHttp, finished, iterated
-from mastctl.client.jog import Jog
+from mastctl.answers import (
+    EstopTold,
+    Event,
+    OperationListed,
+    Operations,
+    OperationTold,
+    PoseTaken,
+    PreviewTold,
+    ResetTold,
+    Started,
+    StateTold,
+    Status,
+    StepTold,
+    StopTold,
+    TrackTold,
+)
+from mastctl.client.connection import ClientError, DaemonHttp
+from mastctl.client.following import PASSING, followed
+from mastctl.client.jog import ANSWER_S, Jog
+from mastctl.client.keeping_calls import KeepingCalls
+from mastctl.client.lease import LeaseCalls
+from mastctl.client.simulation_calls import SimulationCalls
+from mastctl.client.snapshot import Snapshot, read_snapshot
 
 if TYPE_CHECKING:
     from mastctl.client.pictures import LivePictures
 
-P = ParamSpec("P")
-R = TypeVar("R")
-T = TypeVar("T")
+ENDED = ("done", "failed", "stopped")
+STOP_ANSWER_S = 5.0  # the daemon answers a stop within 3 s
 DEFAULT_URL = "http://127.0.0.1:8420"
 
 
-class waits(Generic[P, R]):
-    """A question of `Calls` as a method of `Client`: the calling thread waits where asyncio would go on.
-
-    A coroutine becomes a function, what yields asynchronously an iterator, and so with a context manager.
-    """
-
-    def __init__(self, call: Callable[Concatenate[Calls, P], R]) -> None:
-        def asked(client: Client, *args: P.args, **options: P.kwargs) -> Any:
-            work = call(client._calls, *args, **options)
-            if isinstance(work, AsyncGenerator):
-                return iterated(work)
-            if isinstance(work, AbstractAsyncContextManager):
-                return _Held(work)
-            return finished(cast(Coroutine[Any, Any, Any], work))
-
-        self._asked = update_wrapper(asked, call)
-
-    @overload
-    def __get__(
-        self: waits[P, Coroutine[Any, Any, T]], client: Client | None, owner: object = None
-    ) -> Callable[P, T]: ...
-    @overload
-    def __get__(
-        self: waits[P, AsyncGenerator[T]], client: Client | None, owner: object = None
-    ) -> Callable[P, Iterator[T]]: ...
-    @overload
-    def __get__(
-        self: waits[P, AbstractAsyncContextManager[T]], client: Client | None, owner: object = None
-    ) -> Callable[P, AbstractContextManager[T]]: ...
-    def __get__(self, client: Client | None, owner: object = None) -> Any:
-        return self._asked if client is None else MethodType(self._asked, client)
-
-
-class _Held(AbstractContextManager[T]):
-    """A context manager that waits where an asynchronous one would."""
-
-    def __init__(self, held: AbstractAsyncContextManager[T]) -> None:
-        self._held = held
-
-    def __enter__(self) -> T:
-        return finished(self._held.__aenter__())
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> bool | None:
-        return finished(self._held.__aexit__(kind, error, trace))
-
-
-class Client:
+class Client(LeaseCalls, KeepingCalls, SimulationCalls):
     """A connection to one daemon. A context manager; usable from one thread at a time.
 
     Parameters
@@ -84,6 +56,13 @@ class Client:
     token
         The token that a daemon expects from other machines; by default that of ``$MASTCTL_TOKEN``. Others
         can read it on the way without TLS. The file ``$MASTCTL_CA_FILE`` may name further certificates.
+    reads_only
+        Why this client sends no command (``reads_only``, one sentence); empty if it does.
+
+    Attributes
+    ----------
+    daemon
+        The connection, for a request that no method sends.
 
     Where the connection breaks, the client sends a command again; its key lets the daemon execute it once.
 
@@ -99,83 +78,322 @@ class Client:
         timeout_s: float = 30.0,
         name: str | None = None,
         token: str | None = None,
+        reads_only: str = "",
     ) -> None:
         self.url = url
-        self._calls = Calls(DaemonHttp(url, timeout_s, name, token))
+        self.reads_only = reads_only
+        self.daemon = DaemonHttp(url, timeout_s, name, token, reads_only)
 
-    lease = waits(Calls.lease)
-    control = waits(Calls.control)
-    acquire_lease = waits(Calls.acquire_lease)
-    renew_lease = waits(Calls.renew_lease)
-    release_lease = waits(Calls.release_lease)
-    status = waits(Calls.status)
-    point = waits(Calls.point)
-    preview = waits(Calls.preview)
-    operation = waits(Calls.operation)
-    operations = waits(Calls.operations)
-    wait = waits(Calls.wait)
-    wait_state = waits(Calls.wait_state)
-    events = waits(Calls.events)
-    stop = waits(Calls.stop)
-    estop = waits(Calls.estop)
-    reset = waits(Calls.reset)
-    pose = waits(Calls.pose)
-    track = waits(Calls.track)
-    start_track = waits(Calls.start_track)
-    look = waits(Calls.look)
-    wait_track = waits(Calls.wait_track)
-    watch_track = waits(Calls.watch_track)
-    stop_track = waits(Calls.stop_track)
-    snapshot = waits(Calls.snapshot)
+    def _longest_s(self, timeout_s: float | None) -> float:
+        """Longest time of a request: the connection's, or what is left of a wait if that is less."""
+        return min(self.daemon.timeout_s, math.inf if timeout_s is None else timeout_s)
 
-    reload = waits(Calls.reload)
-    calibration_health = waits(Calls.calibration_health)
-    sentinel = waits(Calls.sentinel)
-    rig = waits(Calls.rig)
-    camera_settings = waits(Calls.camera_settings)
-    set_camera = waits(Calls.set_camera)
-    bench = waits(Calls.bench)
-    begin_bench = waits(Calls.begin_bench)
-    board_stands = waits(Calls.board_stands)
-    leave_bench = waits(Calls.leave_bench)
-    forget_bench = waits(Calls.forget_bench)
-    reports = waits(Calls.reports)
-    report = waits(Calls.report)
-    history = waits(Calls.history)
-    recordings = waits(Calls.recordings)
-    start_recording = waits(Calls.start_recording)
-    stop_recording = waits(Calls.stop_recording)
-    recording = waits(Calls.recording)
-    delete_recording = waits(Calls.delete_recording)
-    mast_file = waits(Calls.mast_file)
-    use_mast = waits(Calls.use_mast)
-    use_former_mast = waits(Calls.use_former_mast)
-    places = waits(Calls.places)
-    keep_place = waits(Calls.keep_place)
-    forget_place = waits(Calls.forget_place)
-    sun = waits(Calls.sun)
-    keep_off_sun = waits(Calls.keep_off_sun)
-    forget_sun = waits(Calls.forget_sun)
-    session = waits(Calls.session)
-    login = waits(Calls.login)
-    logout = waits(Calls.logout)
+    def status(self, timeout_s: float | None = None) -> Status:
+        """Return what the daemon knows at this moment.
 
-    true_pose = waits(Calls.true_pose)
-    stand = waits(Calls.stand)
-    boards = waits(Calls.boards)
-    put_board = waits(Calls.put_board)
-    take_board = waits(Calls.take_board)
-    simulation_time = waits(Calls.simulation_time)
-    advance = waits(Calls.advance)
-    truth = waits(Calls.truth)
-    fault_words = waits(Calls.fault_words)
-    faults = waits(Calls.faults)
-    set_fault = waits(Calls.set_fault)
-    clear_faults = waits(Calls.clear_faults)
+        ``timeout_s`` shortens the longest time of this request, seconds. Another program's answer is
+        ``bad_answer``.
+        """
+        status = self.daemon.json(Status, "GET", "/status", timeout=self._longest_s(timeout_s))
+        if not isinstance(status.get("state"), str) or "mast" not in status:
+            raise self.daemon.bad_answer("its status has no state, or no mast")
+        return status
 
-    def use_lease(self, lease_id: str | None) -> None:
-        """Have each command carry a lease from now on, or none."""
-        self._calls.use_lease(lease_id)
+    def point(
+        self,
+        *,
+        pixel: tuple[str, str, float, float] | None = None,
+        position_m: Sequence[float] | None = None,
+        frame: Literal["rover", "site"] | None = None,
+        pan_rad: float | None = None,
+        tilt_rad: float | None = None,
+        aim: tuple[str, float, float] | None = None,
+        pointings: int | None = None,
+        range_m: float | None = None,
+        plane: Mapping[str, Sequence[float]] | None = None,
+        deadline_s: float | None = None,
+        idempotency_key: str | None = None,
+    ) -> str:
+        """Start a pointing operation and return its id.
+
+        Parameters
+        ----------
+        pixel
+            (camera, frame id, x, y), pixels; or
+        position_m, frame
+            a point, metres, in the ``rover`` (default) or ``site`` frame; or
+        pan_rad, tilt_rad
+            joint angles.
+        aim
+            (camera, x, y): where the target shall come; the daemon's default when left out.
+        pointings
+            1 (default) or 2.
+        range_m, plane
+            How far what the pixel shows is from its camera, metres, or a plane of the rover frame in which it
+            lies: ``{"point_m": (x, y, z), "normal": (x, y, z)}``, level without ``normal``. The pair's other
+            camera is not asked then.
+        deadline_s
+            How long it is given, seconds of the daemon's clock; then the head is stopped and the operation
+            fails with ``deadline_passed``. By default from the longest way and the speed.
+        idempotency_key
+            The same for each try of one command; a new one by default.
+        """
+        body = _target(pixel, position_m, frame)
+        if aim is not None:
+            body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
+        others = {"pan_rad": pan_rad, "tilt_rad": tilt_rad, "pointings": pointings}
+        body |= _how_far(range_m, plane)
+        body |= {key: value for key, value in others.items() if value is not None}
+        started = self.daemon.command(
+            Started, "POST", "/point", body, key=idempotency_key, deadline_s=deadline_s
+        )
+        return started["id"]
+
+    def turn(self, pan_rad: float, tilt_rad: float, timeout_s: float = 90.0) -> OperationTold:
+        """Turn to joint angles as the head reads them; return the operation's record when it has ended.
+
+        A turn of which this program loses sight, or whose time is over, is stopped: it leaves no head behind
+        that turns.
+
+        Parameters
+        ----------
+        timeout_s
+            What the daemon gives it, seconds of the daemon's clock, and how long it is waited for.
+        """
+        operation = None
+        try:
+            operation = self.point(pan_rad=pan_rad, tilt_rad=tilt_rad, deadline_s=timeout_s)
+            return self.wait(operation, timeout_s + STOP_ANSWER_S)
+        except BaseException as error:
+            refused = operation is None and isinstance(error, ClientError) and error.code not in PASSING
+            if not refused:
+                self._stop_beside(operation)
+            raise
+
+    def _stop_beside(self, operation: str | None) -> None:
+        """Stop an operation over a connection of its own, or the mast where its name is not known."""
+        daemon = self.daemon.beside(STOP_ANSWER_S)
+        path = "/stop" if operation is None else f"/operations/{quote(operation, safe='')}/stop"
+        with contextlib.suppress(ClientError):  # what ended the turn is reported, not what the stop met
+            daemon.json(dict[str, Any], "POST", path)
+        daemon.close()
+
+    def preview(
+        self,
+        pixel: tuple[str, str, float, float],
+        *,
+        aim: tuple[str, float, float] | None = None,
+        range_m: float | None = None,
+        plane: Mapping[str, Sequence[float]] | None = None,
+    ) -> PreviewTold:
+        """Return what a pixel (camera, frame id, x, y) shows and where `point` would send the head.
+
+        Nothing moves. ``position_m`` with ``sigma_m``, ``range_m``, the match in the other camera,
+        ``goal_rad``, and ``refused`` where the head would not be sent. ``range_m`` and ``plane`` as for
+        `point`.
+        """
+        body = _target(pixel, None, None) | _how_far(range_m, plane)
+        if aim is not None:
+            body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
+        return self.daemon.json(PreviewTold, "POST", "/point/preview", json=body)
+
+    def operation(self, operation_id: str, timeout_s: float | None = None) -> OperationTold:
+        """Return an operation's record; ``timeout_s`` as of `status`."""
+        longest_s, word = self._longest_s(timeout_s), quote(operation_id, safe="")
+        return self.daemon.json(OperationTold, "GET", f"/operations/{word}", timeout=longest_s)
+
+    def operations(self) -> list[OperationListed]:
+        """Return the newest operations, newest first, without their steps."""
+        return (self.daemon.json(Operations, "GET", "/operations"))["operations"]
+
+    def stop_operation(self, operation_id: str) -> OperationTold:
+        """Stop the mast and one operation, if it still runs; what another client began goes on.
+
+        Returns its record, which may not have ended yet.
+        """
+        word = quote(operation_id, safe="")
+        return self.daemon.json(OperationTold, "POST", f"/operations/{word}/stop")
+
+    def wait(
+        self,
+        operation_id: str,
+        timeout_s: float = 60.0,
+        on_step: Callable[[StepTold], None] | None = None,
+    ) -> OperationTold:
+        """Wait until an operation has ended (done, failed or stopped) and return its record.
+
+        Parameters
+        ----------
+        on_step
+            Called with each step as it comes.
+
+        Raises
+        ------
+        ClientError
+            ``timeout``, if it has not ended in time; it goes on.
+        """
+        told = 0
+        query = {"topics": "operation", "key": operation_id}
+
+        def ask(within_s: float) -> OperationTold:
+            return self.operation(operation_id, within_s)
+
+        changes = followed(self.daemon, query, ask, timeout_s)
+        for record in changes:
+            for step in record["steps"][told:]:
+                told += 1
+                if on_step is not None:
+                    on_step(step)
+            if record["state"] in ENDED:
+                return record
+        raise ClientError("timeout", f"operation {operation_id} has not ended after {timeout_s:g} s")
+
+    def wait_state(
+        self,
+        *states: str,
+        timeout_s: float = 60.0,
+        on_change: Callable[[Status | StateTold], None] | None = None,
+    ) -> Status | StateTold:
+        """Wait until the daemon's state is one of some words; return ``state``, ``reason`` and what goes with
+        them in the status.
+
+        Parameters
+        ----------
+        on_change
+            Called with the same at the beginning and at each change.
+
+        Raises
+        ------
+        ClientError
+            ``timeout``, if it was none of them in time.
+        """
+        word = ""
+        for told in followed(self.daemon, {"topics": "state"}, self.status, timeout_s):
+            word = told["state"]
+            if on_change is not None:
+                on_change(told)
+            if word in states:
+                return told
+        wanted = " or ".join(states)
+        raise ClientError("timeout", f"the state is {word} and not {wanted} after {timeout_s:g} s")
+
+    def events(self, *topics: str, keys: Sequence[str] = ()) -> Generator[Event, None, None]:
+        """Yield each change of some topics (all without any) and keys, beginning with what is known, until
+        the daemon ends: ``topic``, ``key``, ``sequence``, ``lost``, ``value``.
+        """
+        query: dict[str, Any] = {"key": list(keys)} if keys else {}
+        if topics:
+            query["topics"] = ",".join(topics)
+        for event in self.daemon.heard("/events", query):
+            if event is not None:
+                yield cast(Event, event)
+
+    def stop(self) -> StopTold:
+        """Stop the mast and the running operation."""
+        return self.daemon.json(StopTold, "POST", "/stop")
+
+    def estop(self, *, reason: str | None = None, name: str | None = None) -> EstopTold:
+        """Stop the mast and let nothing move it until `reset`; ``kept`` says whether a restart would know."""
+        body = {"reason": reason, "name": name}
+        told = {key: value for key, value in body.items() if value is not None}
+        return self.daemon.json(EstopTold, "POST", "/estop", json=told)
+
+    def reset(self, *, reason: str, name: str) -> ResetTold:
+        """Release the emergency stop; a later command moves again."""
+        return self.daemon.json(ResetTold, "POST", "/reset", json={"reason": reason, "name": name})
+
+    def pose(
+        self,
+        position_m: Sequence[float],
+        quaternion: Sequence[float],
+        *,
+        covariance: Sequence[Sequence[float]] | None = None,
+        sigma: tuple[float, float] | None = None,
+        time_s: float | None = None,
+        look: bool = True,
+    ) -> PoseTaken:
+        """Say where the rover stands; return the track as it is then, and the ``operation`` of a look.
+
+        Parameters
+        ----------
+        position_m, quaternion
+            site_from_rover: (x, y, z), metres, and (w, x, y, z).
+        covariance
+            6 rows of 6 of the motion since the pose before, along the rover's axes of this pose: x, y, z in
+            metres, then the turns about them in radians; or
+        sigma
+            (metres, radians): one sigma of each axis of its translation and of its rotation.
+        time_s
+            By the sender's clock.
+        look
+            Whether a track's target shall be looked for.
+        """
+        body: dict[str, Any] = {
+            "position_m": [float(value) for value in position_m],
+            "quaternion": [float(value) for value in quaternion],
+            "look": look,
+        }
+        if covariance is not None:
+            body["covariance"] = [[float(value) for value in row] for row in covariance]
+        if sigma is not None:
+            body["sigma"] = {"position_m": sigma[0], "rotation_rad": sigma[1]}
+        if time_s is not None:
+            body["time_s"] = time_s
+        return self.daemon.json(PoseTaken, "POST", "/pose", json=body)
+
+    def track(self, timeout_s: float | None = None) -> TrackTold:
+        """Return the track as it is; ``timeout_s`` as of `status`."""
+        return self.daemon.json(TrackTold, "GET", "/track", timeout=self._longest_s(timeout_s))
+
+    def start_track(
+        self,
+        *,
+        pixel: tuple[str, str, float, float] | None = None,
+        position_m: Sequence[float] | None = None,
+        frame: Literal["rover", "site"] | None = None,
+        deadline_s: float | None = None,
+        idempotency_key: str | None = None,
+    ) -> str:
+        """Start to follow a target and return the operation's id; arguments as for `point`."""
+        body = _target(pixel, position_m, frame)
+        started = self.daemon.command(
+            Started, "POST", "/track", body, key=idempotency_key, deadline_s=deadline_s
+        )
+        return started["id"]
+
+    def look(self, *, deadline_s: float | None = None, idempotency_key: str | None = None) -> str:
+        """Look for the track's target once more; return the operation's id."""
+        started = self.daemon.command(
+            Started, "POST", "/track/look", key=idempotency_key, deadline_s=deadline_s
+        )
+        return started["id"]
+
+    def wait_track(
+        self,
+        operation_id: str | None,
+        timeout_s: float = 60.0,
+        on_step: Callable[[StepTold], None] | None = None,
+    ) -> TrackTold:
+        """Wait until a start or a look of the track has ended; return the track after it.
+
+        ``None`` for the operation returns the track as it is. Raises ClientError as `wait`.
+        """
+        if operation_id is not None:
+            self.wait(operation_id, timeout_s, on_step)
+        for track in followed(self.daemon, {"topics": "track"}, self.track, timeout_s):
+            if operation_id is None or track["operation"] != operation_id:
+                return track
+        raise ClientError("timeout", f"the track did not take up operation {operation_id}")
+
+    def watch_track(self) -> Generator[TrackTold, None, None]:
+        """Yield the track as it is, and again at each change, until the daemon ends."""
+        for track in self.daemon.heard("/track/stream"):
+            if track is not None:
+                yield cast(TrackTold, track)
+
+    def stop_track(self) -> TrackTold:
+        """End the track; return it as it is then."""
+        return self.daemon.json(TrackTold, "POST", "/track/stop")
 
     def jog(self) -> Jog:
         """Return a context in which the head turns at rates; it sends the heartbeats itself.
@@ -188,7 +406,7 @@ class Client:
                 jog.rates(0.2, 0.0)      # rad/s
                 time.sleep(1.5)
         """
-        return self._calls.jog()
+        return Jog(lambda: self.daemon.beside(ANSWER_S))
 
     def live_pictures(self, *cameras: str) -> AbstractContextManager[LivePictures]:
         """Return a context in which pictures of some cameras come, as JPEG at the cameras' own rate.
@@ -201,9 +419,48 @@ class Client:
                 pictures.wanted("navcam_left")
                 picture = pictures.next(timeout_s=1.0)     # facts, jpeg; None if there was none
         """
-        return self._calls.live_pictures(*cameras)
+        try:
+            from mastctl.client.pictures import live_pictures  # WebSockets, only where pictures are watched
+        except ImportError:
+            words = "live pictures need the package websockets; 'pip install websockets' brings it"
+            raise ClientError("no_websockets", words) from None
+        return live_pictures(self.daemon, cameras)
 
-    close = waits(Calls.close)
+    def snapshot(
+        self,
+        camera: str,
+        *,
+        fresh: bool = True,
+        frame_id: str | None = None,
+        format: Literal["png", "jpeg"] = "png",
+    ) -> Snapshot:
+        """Return a picture with its facts.
+
+        Parameters
+        ----------
+        camera
+            The camera's name.
+        fresh
+            Whether it must be exposed after the daemon got the request; else it is at most a second old.
+        frame_id
+            A frame that the daemon still keeps, instead of a new one.
+        format
+            ``png`` is lossless.
+        """
+        query: dict[str, str] = {"format": format}
+        if frame_id is None:
+            query["fresh"] = "true" if fresh else "false"
+        else:
+            query["frame_id"] = frame_id
+        answer = self.daemon.ask("GET", f"/snapshot/{quote(camera, safe='')}", params=query)
+        try:
+            return read_snapshot(answer.content, answer.headers)
+        except ValueError as reason:
+            raise self.daemon.bad_answer(str(reason)) from None
+
+    def close(self) -> None:
+        """Let go of the connection."""
+        self.daemon.close()
 
     def __enter__(self) -> Client:
         return self
@@ -212,21 +469,25 @@ class Client:
         self.close()
 
 
-class AsyncClient(Calls):
-    """A connection to one daemon for asyncio; parameters, methods and errors as `Client` has them."""
+def _how_far(range_m: float | None, plane: Mapping[str, Sequence[float]] | None) -> dict[str, Any]:
+    """What says how far a pixel's thing is, as a body has it."""
+    told: dict[str, Any] = {} if range_m is None else {"range_m": range_m}
+    if plane is not None:
+        told["plane"] = {key: list(values) for key, values in plane.items()}
+    return told
 
-    def __init__(
-        self,
-        url: str = DEFAULT_URL,
-        timeout_s: float = 30.0,
-        name: str | None = None,
-        token: str | None = None,
-    ) -> None:
-        self.url = url
-        super().__init__(AsyncDaemonHttp(url, timeout_s, name, token))
 
-    async def __aenter__(self) -> AsyncClient:
-        return self
-
-    async def __aexit__(self, *ignored: object) -> None:
-        await self.close()
+def _target(
+    pixel: tuple[str, str, float, float] | None,
+    position_m: Sequence[float] | None,
+    frame: Literal["rover", "site"] | None,
+) -> dict[str, Any]:
+    """What a request says of its target: a pixel of a frame, or a point; what was not given is left out."""
+    body: dict[str, Any] = {}
+    if pixel is not None:
+        body["pixel"] = dict(zip(("camera", "frame_id", "x_px", "y_px"), pixel, strict=True))
+    if position_m is not None:
+        body["position_m"] = [float(value) for value in position_m]
+    if frame is not None:
+        body["frame"] = frame
+    return body

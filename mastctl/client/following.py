@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
-from contextlib import aclosing
+from collections.abc import Callable, Generator, Mapping
+from contextlib import closing
 from typing import Any, TypeVar, cast
 
-from mastctl.client.connection import Broken, ClientError, DaemonConnection
+from mastctl.client.connection import Broken, ClientError, DaemonHttp
 
 T = TypeVar("T")
 
@@ -19,12 +19,12 @@ LEAST_S = 1.0  # for a request, on a machine that is busy
 ASK_S = 0.25  # between questions to a daemon that has no stream left
 
 
-async def followed(
-    daemon: DaemonConnection,
+def followed(
+    daemon: DaemonHttp,
     query: Mapping[str, Any],
-    ask: Callable[[float], Awaitable[T]],
+    ask: Callable[[float], T],
     timeout_s: float,
-) -> AsyncGenerator[T]:
+) -> Generator[T, None, None]:
     """Yield a value as it is, then at each change, for some seconds.
 
     The value is asked for before each stream, and each stream begins with what is known, so that no end of
@@ -47,10 +47,10 @@ async def followed(
     pauses: list[float] = []  # a daemon that does not answer at the beginning is told at once
     while True:
         try:
-            yield await ask(max(until_s - time.monotonic(), LEAST_S))
+            yield ask(max(until_s - time.monotonic(), LEAST_S))
             pauses = pauses or list(AGAIN_S)  # it answers
-            async with aclosing(_stream(daemon, query, until_s)) as values:
-                async for value in values:
+            with closing(_stream(daemon, query, until_s)) as values:
+                for value in values:
                     pauses = list(AGAIN_S)
                     yield cast(T, value)
         except ClientError as error:
@@ -60,21 +60,21 @@ async def followed(
                 raise
             if not pauses:
                 raise
-            await daemon.pause(max(0.0, min(pauses.pop(0), until_s - time.monotonic())))
+            daemon.pause(max(0.0, min(pauses.pop(0), until_s - time.monotonic())))
         if time.monotonic() >= until_s:
             return
 
 
-async def _stream(
-    daemon: DaemonConnection, query: Mapping[str, Any], until_s: float
-) -> AsyncGenerator[dict[str, Any]]:
+def _stream(
+    daemon: DaemonHttp, query: Mapping[str, Any], until_s: float
+) -> Generator[dict[str, Any], None, None]:
     """Yield a stream's values until it ends, or a time, or some seconds before it."""
     left_s = until_s - time.monotonic()
     if left_s <= 0:
         return
     last = left_s <= LAST_S
-    async with aclosing(daemon.heard("/events", query, min(left_s, SILENT_S))) as events:
-        async for event in events:
+    with closing(daemon.heard("/events", query, min(left_s, SILENT_S))) as events:
+        for event in events:
             if event is not None:
                 yield event["value"]
             left_s = until_s - time.monotonic()

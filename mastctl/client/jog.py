@@ -1,8 +1,7 @@
-"""Turning the head at a rate: the heartbeats that keep it going, from a thread also under asyncio."""
+"""Turning the head at a rate: the heartbeats that keep it going, from a thread."""
 
 from __future__ import annotations
 
-import asyncio
 import threading
 import time
 from collections.abc import Callable
@@ -10,7 +9,7 @@ from typing import Any
 from urllib.parse import quote
 
 from mastctl.answers import JogTold, OperationTold
-from mastctl.client.connection import ClientError, DaemonHttp, finished
+from mastctl.client.connection import ClientError, DaemonHttp
 
 BEAT_S = 0.12  # the daemon waits 0.5 s: three may get lost
 ANSWER_S = 1.0
@@ -75,15 +74,9 @@ class Jog:
             self._rates, self._ending = (0.0, 0.0), True
             self._changed.notify_all()
         self._thread.join(3 * ANSWER_S)
-        finished(self._daemon.close())
+        self._daemon.close()
         if kind is None:
             self.check()
-
-    async def __aenter__(self) -> Jog:
-        return self.__enter__()
-
-    async def __aexit__(self, kind: type[BaseException] | None, *ignored: object) -> None:
-        await asyncio.to_thread(self.__exit__, kind)
 
     def _work(self) -> None:
         while True:
@@ -100,7 +93,8 @@ class Jog:
                 if ending:
                     return
                 if rates == self._rates and not self._ending:
-                    self._changed.wait(BEAT_S if rates != (0.0, 0.0) else None)
+                    at_rest = rates == (0.0, 0.0) and self._id is None
+                    self._changed.wait(None if at_rest else BEAT_S)
 
     def _send(self, rates: tuple[float, float]) -> None:
         if rates == (0.0, 0.0) and self._id is None:
@@ -110,7 +104,7 @@ class Jog:
         body["sequence"] = self._sequence
         if self._id is not None:
             body["id"] = self._id
-        answer = finished(self._daemon.json(JogTold, "POST", "/jog", json=body))
+        answer = self._daemon.json(JogTold, "POST", "/jog", json=body)
         self._id, self._held = answer["id"], answer["held"]
         if rates == (0.0, 0.0) and self._id is not None:
             self._wait_ended(self._id)
@@ -121,6 +115,6 @@ class Jog:
         until_s = time.monotonic() + ANSWER_S
         while time.monotonic() < until_s:
             path = f"/operations/{quote(jog, safe='')}"
-            if finished(self._daemon.json(OperationTold, "GET", path))["state"] not in ("queued", "running"):
+            if self._daemon.json(OperationTold, "GET", path)["state"] not in ("queued", "running"):
                 return
             time.sleep(LOOK_S)

@@ -11,8 +11,7 @@ from mastctl.answers import (
     BenchTold,
     CalibrationHealthTold,
     CameraSettingsTold,
-    HistoryTold,
-    LoggedOut,
+    LiveTold,
     MastsTold,
     PlacesTold,
     PlaceTold,
@@ -27,41 +26,43 @@ from mastctl.answers import (
     SessionTold,
     SunTold,
 )
-from mastctl.client.connection import DaemonConnection
+from mastctl.client.connection import DaemonHttp
 
 
 class KeepingCalls:
     """Questions to a daemon that move no head."""
 
-    _daemon: DaemonConnection
+    daemon: DaemonHttp
 
-    async def reload(self) -> ReloadTold:
+    def reload(self) -> ReloadTold:
         """Have the daemon read its configuration again; return ``changed``, ``mast`` and ``notes``.
 
         All of what it says comes into use while the head rests, or nothing (``restart_needed``,
         ``bad_config``, ``bad_mast_file``, ``busy``, ``moving``).
         """
-        return await self._daemon.command(ReloadTold, "POST", "/reload")
+        return self.daemon.command(ReloadTold, "POST", "/reload")
 
-    async def calibration_health(self) -> CalibrationHealthTold:
+    def live(self) -> LiveTold:
+        """Return that the daemon answers; needs no token."""
+        return self.daemon.json(LiveTold, "GET", "/health/live")
+
+    def calibration_health(self) -> CalibrationHealthTold:
         """Return whether residuals of the last days are as the mast file predicts, with the figures."""
-        return await self._daemon.json(CalibrationHealthTold, "GET", "/calibration/health")
+        return self.daemon.json(CalibrationHealthTold, "GET", "/calibration/health")
 
-    async def sentinel(self) -> SentinelTold:
+    def sentinel(self) -> SentinelTold:
         """Return what the drift sentinel in the daemon's state folder has found, and how long ago."""
-        return await self._daemon.json(SentinelTold, "GET", "/sentinel")
+        return self.daemon.json(SentinelTold, "GET", "/sentinel")
 
-    async def rig(self) -> RigTold:
+    def rig(self) -> RigTold:
         """Return the configured cameras by the mast file in use: where each looks and how much it sees."""
-        return await self._daemon.json(RigTold, "GET", "/rig")
+        return self.daemon.json(RigTold, "GET", "/rig")
 
-    async def camera_settings(self, camera: str) -> CameraSettingsTold:
+    def camera_settings(self, camera: str) -> CameraSettingsTold:
         """Return what of a camera can be changed: ``settings`` with bounds, and whether they are ``held``."""
-        return await self._daemon.json(
-            CameraSettingsTold, "GET", f"/cameras/{quote(camera, safe='')}/settings"
-        )
+        return self.daemon.json(CameraSettingsTold, "GET", f"/cameras/{quote(camera, safe='')}/settings")
 
-    async def set_camera(
+    def set_camera(
         self,
         camera: str,
         *,
@@ -78,15 +79,15 @@ class KeepingCalls:
         """
         given = {"exposure_s": exposure_s, "gain": gain, "white_balance_k": white_balance_k, "focus": focus}
         body = {name: value for name, value in given.items() if value is not None}
-        return await self._daemon.command(
+        return self.daemon.command(
             CameraSettingsTold, "PATCH", f"/cameras/{quote(camera, safe='')}/settings", body
         )
 
-    async def bench(self) -> BenchTold:
+    def bench(self) -> BenchTold:
         """Return the bench calibration at work or the last one (``run``), and those that are kept."""
-        return await self._daemon.json(BenchTold, "GET", "/bench")
+        return self.daemon.json(BenchTold, "GET", "/bench")
 
-    async def begin_bench(
+    def begin_bench(
         self,
         board: str | None = None,
         *,
@@ -116,88 +117,82 @@ class KeepingCalls:
         told: dict[str, Any] = {"board": board, "board_file": board_file, "resume": resume}
         told |= {"wanted_px": wanted_px, "pictures": pictures, "by_hand": by_hand}
         body = {key: value for key, value in told.items() if value is not None}
-        return (await self._daemon.command(BenchBegun, "POST", "/bench", body))["run"]
+        return (self.daemon.command(BenchBegun, "POST", "/bench", body))["run"]
 
-    async def board_stands(self) -> BenchRunTold:
+    def board_stands(self) -> BenchRunTold:
         """Say that the board stands where it was asked for."""
-        return (await self._daemon.command(BenchBegun, "POST", "/bench/stands"))["run"]
+        return (self.daemon.command(BenchBegun, "POST", "/bench/stands"))["run"]
 
-    async def leave_bench(self) -> BenchRunTold:
+    def leave_bench(self) -> BenchRunTold:
         """End the bench calibration; it can go on later (`begin_bench`, ``resume``)."""
-        return (await self._daemon.command(BenchBegun, "POST", "/bench/leave"))["run"]
+        return (self.daemon.command(BenchBegun, "POST", "/bench/leave"))["run"]
 
-    async def forget_bench(self, name: str) -> BenchTold:
+    def forget_bench(self, name: str) -> BenchTold:
         """Remove a bench calibration that is over, with its pictures and report; its mast file stays.
 
         Returns what is left, as `bench`. Refused with ``bench_runs``, ``bench_unknown``, ``unwritable``.
         """
-        return await self._daemon.command(BenchTold, "DELETE", f"/bench/runs/{quote(name, safe='')}")
+        return self.daemon.command(BenchTold, "DELETE", f"/bench/runs/{quote(name, safe='')}")
 
-    async def reports(self) -> ReportsTold:
+    def reports(self) -> ReportsTold:
         """Return the reports that can be read, the newest first."""
-        return await self._daemon.json(ReportsTold, "GET", "/reports")
+        return self.daemon.json(ReportsTold, "GET", "/reports")
 
-    async def report(self, name: str) -> bytes:
+    def report(self, name: str) -> bytes:
         """Return a report, HTML."""
-        return bytes((await self._daemon.ask("GET", f"/reports/{quote(name, safe='')}")).content)
+        return bytes((self.daemon.ask("GET", f"/reports/{quote(name, safe='')}")).content)
 
-    async def history(self) -> HistoryTold:
-        """Return joints, temperatures and events of the last hours, oldest first."""
-        return await self._daemon.json(HistoryTold, "GET", "/history")
-
-    async def recordings(self) -> Recordings:
+    def recordings(self) -> Recordings:
         """Return the daemon's recordings, and what it records now."""
-        return await self._daemon.json(Recordings, "GET", "/recordings")
+        return self.daemon.json(Recordings, "GET", "/recordings")
 
-    async def start_recording(self, name: str = "") -> RecorderTold:
+    def start_recording(self, name: str = "") -> RecorderTold:
         """Have the daemon record until `stop_recording`; return what it records then."""
-        return await self._daemon.command(RecorderTold, "POST", "/recordings/start", {"name": name})
+        return self.daemon.command(RecorderTold, "POST", "/recordings/start", {"name": name})
 
-    async def stop_recording(self) -> RecordingEnded:
+    def stop_recording(self) -> RecordingEnded:
         """End the recording; return its file on the daemon's machine, its size and what was dropped."""
-        return await self._daemon.command(RecordingEnded, "POST", "/recordings/stop")
+        return self.daemon.command(RecordingEnded, "POST", "/recordings/stop")
 
-    async def recording(self, name: str, file: str) -> bytes:
+    def recording(self, name: str, file: str) -> bytes:
         """Return a file of a recording whole, by the names that `recordings` returns."""
         name, file = quote(name, safe=""), quote(file, safe="")
-        return bytes((await self._daemon.ask("GET", f"/recordings/{name}/{file}")).content)
+        return bytes((self.daemon.ask("GET", f"/recordings/{name}/{file}")).content)
 
-    async def delete_recording(self, name: str) -> RecordingDeleted:
+    def delete_recording(self, name: str) -> RecordingDeleted:
         """Delete a run, or what was kept at a fault; return what is left."""
-        return await self._daemon.command(RecordingDeleted, "DELETE", f"/recordings/{quote(name, safe='')}")
+        return self.daemon.command(RecordingDeleted, "DELETE", f"/recordings/{quote(name, safe='')}")
 
-    async def mast_file(self) -> bytes:
+    def mast_file(self) -> bytes:
         """Return the mast file that the daemon uses, byte for byte."""
-        return bytes((await self._daemon.ask("GET", "/mast")).content)
+        return bytes((self.daemon.ask("GET", "/mast")).content)
 
-    async def use_mast(self, file: str) -> MastsTold:
+    def use_mast(self, file: str) -> MastsTold:
         """Use another mast file of the same folder; return which is in use now, and the former one."""
-        return await self._daemon.command(MastsTold, "POST", "/mast", {"file": file})
+        return self.daemon.command(MastsTold, "POST", "/mast", {"file": file})
 
-    async def use_former_mast(self) -> MastsTold:
+    def use_former_mast(self) -> MastsTold:
         """Go back to the mast file that was in use before; return which is in use now, and the former one."""
-        return await self._daemon.command(MastsTold, "POST", "/mast/back")
+        return self.daemon.command(MastsTold, "POST", "/mast/back")
 
-    async def places(self) -> dict[str, PlaceTold]:
+    def places(self) -> dict[str, PlaceTold]:
         """Return the places of the head that are kept, by name; ``home`` is always among them."""
-        return (await self._daemon.json(PlacesTold, "GET", "/places"))["places"]
+        return (self.daemon.json(PlacesTold, "GET", "/places"))["places"]
 
-    async def keep_place(self, name: str, pan_rad: float, tilt_rad: float) -> dict[str, PlaceTold]:
+    def keep_place(self, name: str, pan_rad: float, tilt_rad: float) -> dict[str, PlaceTold]:
         """Keep a place of the head by a name, for everybody; return all."""
         body = {"pan_rad": pan_rad, "tilt_rad": tilt_rad}
-        return (await self._daemon.command(PlacesTold, "POST", f"/places/{quote(name, safe='')}", body))[
-            "places"
-        ]
+        return (self.daemon.command(PlacesTold, "POST", f"/places/{quote(name, safe='')}", body))["places"]
 
-    async def forget_place(self, name: str) -> dict[str, PlaceTold]:
+    def forget_place(self, name: str) -> dict[str, PlaceTold]:
         """Forget a place; return those that are left. Raises ClientError ``place_unknown``."""
-        return (await self._daemon.command(PlacesTold, "DELETE", f"/places/{quote(name, safe='')}"))["places"]
+        return (self.daemon.command(PlacesTold, "DELETE", f"/places/{quote(name, safe='')}"))["places"]
 
-    async def sun(self) -> SunTold:
+    def sun(self) -> SunTold:
         """Return the direction that no head camera looks into: ``sun``, null where none was stated."""
-        return await self._daemon.json(SunTold, "GET", "/limits/sun")
+        return self.daemon.json(SunTold, "GET", "/limits/sun")
 
-    async def keep_off_sun(
+    def keep_off_sun(
         self,
         azimuth_rad: float,
         elevation_rad: float,
@@ -219,20 +214,12 @@ class KeepingCalls:
         body |= {"half_angle_rad": half_angle_rad, "frame": frame}
         if valid_s is not None:
             body["valid_s"] = valid_s
-        return await self._daemon.command(SunTold, "POST", "/limits/sun", body)
+        return self.daemon.command(SunTold, "POST", "/limits/sun", body)
 
-    async def forget_sun(self) -> SunTold:
+    def forget_sun(self) -> SunTold:
         """Keep the head off no sun any more."""
-        return await self._daemon.command(SunTold, "DELETE", "/limits/sun")
+        return self.daemon.command(SunTold, "DELETE", "/limits/sun")
 
-    async def session(self) -> SessionTold:
+    def session(self) -> SessionTold:
         """Return who asks: ``name``, ``role``, ``via``, and whether the daemon asks for a token at all."""
-        return await self._daemon.json(SessionTold, "GET", "/session")
-
-    async def login(self, token: str) -> SessionTold:
-        """Begin a session as a page does: this client then needs its token no longer, for some hours."""
-        return await self._daemon.json(SessionTold, "POST", "/login", json={"token": token})
-
-    async def logout(self) -> None:
-        """End the session that `login` began."""
-        await self._daemon.json(LoggedOut, "POST", "/logout")
+        return self.daemon.json(SessionTold, "GET", "/session")

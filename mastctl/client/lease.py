@@ -1,16 +1,16 @@
-"""The lease that a client steers under: asked for, and held by a thread, under asyncio too."""
+"""The lease that a client steers under: acquired, and renewed by a thread."""
 
 from __future__ import annotations
 
 import contextlib
 import threading
 import time
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from mastctl.answers import ControlTold, LeaseGranted, LeaseTold
-from mastctl.client.connection import Broken, ClientError, DaemonConnection, finished, plain_name
+from mastctl.client.connection import Broken, ClientError, DaemonHttp, plain_name
 
 RENEWALS = 3  # within a lease's time, so that one may be lost
 LEAST_TIMEOUT_S = 0.5
@@ -27,7 +27,7 @@ class HeldLease:
         Why the lease is no longer held, None while it is; the next command is refused with the same reason.
     """
 
-    def __init__(self, daemon: DaemonConnection, granted: LeaseGranted, for_s: float) -> None:
+    def __init__(self, daemon: DaemonHttp, granted: LeaseGranted, for_s: float) -> None:
         self.id = str(granted["lease_id"])
         self.holder = str(granted["holder"])
         self.lost: ClientError | None = None
@@ -47,8 +47,8 @@ class HeldLease:
         self._thread.join()
         if self.lost is None:
             with contextlib.suppress(ClientError):
-                finished(self._daemon.json(LeaseTold, "DELETE", "/lease"))
-        finished(self._daemon.close())
+                self._daemon.json(LeaseTold, "DELETE", "/lease")
+        self._daemon.close()
 
     def _renew(self) -> None:
         """Renew until the end; a daemon that does not answer is asked again until the lease is over."""
@@ -56,7 +56,7 @@ class HeldLease:
             asked_s = time.monotonic()
             try:
                 renewal = {"for_s": self._for_s}
-                finished(self._daemon.json(LeaseGranted, "POST", "/lease/renew", json=renewal))
+                self._daemon.json(LeaseGranted, "POST", "/lease/renew", json=renewal)
                 self._until_s = asked_s + self._for_s
             except ClientError as error:
                 passing = isinstance(error, Broken) or error.code in ("no_daemon", "timeout")
@@ -69,10 +69,10 @@ class HeldLease:
 class LeaseCalls:
     """Acquiring, renewing and releasing a lease."""
 
-    _daemon: DaemonConnection
+    daemon: DaemonHttp
 
-    @asynccontextmanager
-    async def lease(
+    @contextmanager
+    def lease(
         self,
         name: str | None = None,
         for_s: float = 30.0,
@@ -80,7 +80,7 @@ class LeaseCalls:
         preemptible: bool = False,
         ends_with_stop: bool = False,
         stops_when_silent: bool = False,
-    ) -> AsyncIterator[HeldLease]:
+    ) -> Iterator[HeldLease]:
         """Steer alone inside the block: a thread renews the lease, and this client's commands carry it.
 
         Parameters
@@ -112,20 +112,20 @@ class LeaseCalls:
             ``leased`` if another client steers.
         """
         ends = preemptible, ends_with_stop, stops_when_silent
-        granted = await self.acquire_lease(name, for_s, take_over, *ends)
-        before, held = self._daemon.lease_id, HeldLease(self._daemon, granted, for_s)
-        self._daemon.lease_id = held.id
+        granted = self.acquire_lease(name, for_s, take_over, *ends)
+        before, held = self.daemon.lease_id, HeldLease(self.daemon, granted, for_s)
+        self.daemon.lease_id = held.id
         try:
             yield held
         finally:
-            self._daemon.lease_id = before
-            await self._daemon.away(held.end)
+            self.daemon.lease_id = before
+            held.end()
 
-    async def control(self) -> ControlTold | None:
+    def control(self) -> ControlTold | None:
         """Return who steers, or None: ``holder``, ``kind`` (lease, operation), ``for_s``, ``until``."""
-        return (await self._daemon.json(LeaseTold, "GET", "/lease"))["control"]
+        return (self.daemon.json(LeaseTold, "GET", "/lease"))["control"]
 
-    async def acquire_lease(
+    def acquire_lease(
         self,
         name: str | None = None,
         for_s: float = 30.0,
@@ -138,31 +138,29 @@ class LeaseCalls:
 
         Returns ``lease_id``, ``holder``, ``for_s`` and ``until``; `use_lease` has commands carry it.
         """
-        body: dict[str, Any] = {"for_s": float(for_s)}
+        ends = {
+            "preemptible": preemptible,
+            "ends_with_stop": ends_with_stop,
+            "stops_when_silent": stops_when_silent,
+        }
+        body: dict[str, Any] = {"for_s": float(for_s)} | {key: True for key, wanted in ends.items() if wanted}
         if name is not None:
             body["name"] = name
-        if take_over is not None:
-            return await self._daemon.command(
-                LeaseGranted, "POST", "/lease/take", body | {"reason": take_over}
-            )
-        if preemptible:
-            body["preemptible"] = True
-        if ends_with_stop:
-            body["ends_with_stop"] = True
-        if stops_when_silent:
-            body["stops_when_silent"] = True
-        return await self._daemon.command(LeaseGranted, "POST", "/lease", body)
+        if take_over is None:
+            return self.daemon.command(LeaseGranted, "POST", "/lease", body)
+        body["reason"] = take_over
+        return self.daemon.command(LeaseGranted, "POST", "/lease/take", body)
 
     def use_lease(self, lease_id: str | None) -> None:
         """Have each command carry a lease from now on, or none."""
-        self._daemon.lease_id = None if lease_id is None else plain_name(lease_id)
+        self.daemon.lease_id = None if lease_id is None else plain_name(lease_id)
 
-    async def renew_lease(self, for_s: float | None = None) -> LeaseGranted:
+    def renew_lease(self, for_s: float | None = None) -> LeaseGranted:
         """Have the lease in use run for ``for_s`` seconds from now on, by default as long as at first."""
-        return await self._daemon.command(
+        return self.daemon.command(
             LeaseGranted, "POST", "/lease/renew", {} if for_s is None else {"for_s": float(for_s)}
         )
 
-    async def release_lease(self) -> None:
+    def release_lease(self) -> None:
         """Release the lease in use."""
-        await self._daemon.command(LeaseTold, "DELETE", "/lease")
+        self.daemon.command(LeaseTold, "DELETE", "/lease")

@@ -12,7 +12,7 @@ from urllib.parse import urlencode
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
 from websockets.sync.client import ClientConnection, connect, unix_connect
 
-from mastctl.client.connection import PREFIX, Broken, ClientError, DaemonConnection, trusted
+from mastctl.client.connection import PREFIX, Broken, ClientError, DaemonHttp, trusted
 
 OPENS_S = 10.0
 
@@ -66,7 +66,7 @@ class LivePictures:
 
 
 @contextmanager
-def live_pictures(daemon: DaemonConnection, cameras: Sequence[str]) -> Iterator[LivePictures]:
+def live_pictures(daemon: DaemonHttp, cameras: Sequence[str]) -> Iterator[LivePictures]:
     """Open a line of pictures of some cameras, at their own rate.
 
     Raises

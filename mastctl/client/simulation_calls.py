@@ -17,33 +17,33 @@ from mastctl.answers import (
     WordsTold,
     WordTold,
 )
-from mastctl.client.connection import DaemonConnection
+from mastctl.client.connection import DaemonHttp
 
 
 class SimulationCalls:
     """Where the rover truly stands, boards before it, its time, its faults; only of a simulated one."""
 
-    _daemon: DaemonConnection
+    daemon: DaemonHttp
 
-    async def true_pose(self) -> StandTold:
+    def true_pose(self) -> StandTold:
         """Return where a simulated rover truly stands: ``position_m`` and ``quaternion``, site_from_rover."""
-        return await self._daemon.json(StandTold, "GET", "/simulation/pose")
+        return self.daemon.json(StandTold, "GET", "/simulation/pose")
 
-    async def stand(
+    def stand(
         self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
     ) -> StandTold:
         """Put a simulated rover somewhere on its ground, truly; return its true pose."""
         body = {"x_m": x_m, "y_m": y_m, "heading_rad": heading_rad}
         body |= {"pitch_rad": pitch_rad, "roll_rad": roll_rad}
-        return await self._daemon.command(StandTold, "POST", "/simulation/pose", body)
+        return self.daemon.command(StandTold, "POST", "/simulation/pose", body)
 
-    async def boards(self) -> dict[str, BoardStands]:
+    def boards(self) -> dict[str, BoardStands]:
         """Return the boards held up before a simulated rover, by name: ``board``, ``position_m``,
         ``quaternion`` (rover_from_board), ``bow_m``.
         """
-        return (await self._daemon.json(BoardsTold, "GET", "/simulation/boards"))["boards"]
+        return (self.daemon.json(BoardsTold, "GET", "/simulation/boards"))["boards"]
 
-    async def put_board(
+    def put_board(
         self,
         name: str,
         position_m: Sequence[float],
@@ -73,25 +73,23 @@ class SimulationCalls:
         ClientError
             ``not_simulated``, ``bad_options``, ``bad_board``.
         """
-        body: dict[str, Any] = {"position_m": [float(value) for value in position_m]}
+        body: dict[str, Any] = {"position_m": _as_sent(position_m)}
         if board is not None:
             body["board"] = dict(board)
         for key, values in (("turned_rad", turned_rad), ("quaternion", quaternion), ("bow_m", bow_m)):
             if values is not None:
-                body[key] = [float(value) for value in values]
-        return await self._daemon.command(
-            BoardStands, "POST", f"/simulation/boards/{quote(name, safe='')}", body
-        )
+                body[key] = _as_sent(values)
+        return self.daemon.command(BoardStands, "POST", f"/simulation/boards/{quote(name, safe='')}", body)
 
-    async def take_board(self, name: str) -> None:
+    def take_board(self, name: str) -> None:
         """Take a board away from a simulated rover."""
-        await self._daemon.command(BoardsTold, "DELETE", f"/simulation/boards/{quote(name, safe='')}")
+        self.daemon.command(BoardsTold, "DELETE", f"/simulation/boards/{quote(name, safe='')}")
 
-    async def simulation_time(self) -> TimeTold:
+    def simulation_time(self) -> TimeTold:
         """Return a simulated rover's time: ``now_s``, and ``speed``, a number or ``max``."""
-        return await self._daemon.json(TimeTold, "GET", "/simulation/time")
+        return self.daemon.json(TimeTold, "GET", "/simulation/time")
 
-    async def advance(self, duration_s: float) -> TimeTold:
+    def advance(self, duration_s: float) -> TimeTold:
         """Let time pass for a simulated rover whose ``simulation.speed`` is ``max``; return it as
         `simulation_time` does.
 
@@ -100,9 +98,9 @@ class SimulationCalls:
         ClientError
             ``time_passes`` where time passes by itself, ``not_simulated``.
         """
-        return await self._daemon.command(TimeTold, "POST", "/simulation/time", {"advance_s": duration_s})
+        return self.daemon.command(TimeTold, "POST", "/simulation/time", {"advance_s": duration_s})
 
-    async def truth(
+    def truth(
         self,
         frame_id: str,
         *,
@@ -127,22 +125,27 @@ class SimulationCalls:
             asked |= dict(zip(("x_px", "y_px"), pixel, strict=True))
         if position_in_site_m is not None:
             asked |= dict(zip(("x_m", "y_m", "z_m"), position_in_site_m, strict=True))
-        return await self._daemon.json(TruthTold, "GET", "/simulation/truth", params=asked)
+        return self.daemon.json(TruthTold, "GET", "/simulation/truth", params=asked)
 
-    async def fault_words(self) -> dict[str, dict[str, WordTold]]:
+    def fault_words(self) -> dict[str, dict[str, WordTold]]:
         """Return the fault words of each simulated device: each one's ``effect``, and its ``parameters``."""
-        return (await self._daemon.json(WordsTold, "GET", "/simulation/words"))["devices"]
+        return (self.daemon.json(WordsTold, "GET", "/simulation/words"))["devices"]
 
-    async def faults(self) -> list[FaultSet]:
+    def faults(self) -> list[FaultSet]:
         """Return the faults that are switched on in a simulated rover."""
-        return (await self._daemon.json(FaultsSet, "GET", "/simulation/faults"))["faults"]
+        return (self.daemon.json(FaultsSet, "GET", "/simulation/faults"))["faults"]
 
-    async def set_fault(self, /, device: str, word: str, **parameters: float) -> list[FaultSet]:
+    def set_fault(self, /, device: str, word: str, **parameters: float) -> list[FaultSet]:
         """Switch a fault of a simulated device on; return all that are on."""
         body = {"device": device, "word": word, "parameters": parameters}
-        return (await self._daemon.command(FaultsSet, "POST", "/simulation/faults", body))["faults"]
+        return (self.daemon.command(FaultsSet, "POST", "/simulation/faults", body))["faults"]
 
-    async def clear_faults(self, device: str | None = None) -> None:
+    def clear_faults(self, device: str | None = None) -> None:
         """Switch the faults of one simulated device off, or all."""
         params = {} if device is None else {"device": device}
-        await self._daemon.command(FaultsSet, "DELETE", "/simulation/faults", params=params)
+        self.daemon.command(FaultsSet, "DELETE", "/simulation/faults", params=params)
+
+
+def _as_sent(values: Sequence[float]) -> list[float]:
+    """Return numbers as JSON has them; a whole number stays one, since it may exceed a float's range."""
+    return [value if isinstance(value, int) else float(value) for value in values]

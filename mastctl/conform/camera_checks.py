@@ -10,7 +10,7 @@ from typing import Any
 
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
-from drivers.interfaces import Adjustable, Camera
+from drivers.interfaces import Camera
 from mastctl.conform.checks import NotTried, PromiseBroken, Suite, expect
 from mastctl.conform.settings_trial import settings_tried
 from mastctl.conform.worker import beside, ended
@@ -115,8 +115,6 @@ def _threads(trial: CameraTrial) -> None:
 )
 def _settings(trial: CameraTrial) -> str:
     camera = trial.camera
-    if not isinstance(camera, Adjustable):
-        raise NotTried("nothing of it can be changed while it runs")
     return settings_tried(
         lambda: ended("settings()", beside(camera.settings)),
         lambda name, value: ended("adjust()", beside(lambda: camera.adjust({name: value}))),

@@ -52,7 +52,7 @@ class Check(Generic[Subject]):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CheckOutcome:
     """What became of a check; ``message`` says what was measured, what is wrong, or why it was skipped."""
 
     name: str
@@ -91,8 +91,8 @@ def run_checks(
     subject: Subject,
     *,
     motion: bool,
-    tell: Callable[[Outcome], object] = lambda outcome: None,
-) -> list[Outcome]:
+    tell: Callable[[CheckOutcome], object] = lambda outcome: None,
+) -> list[CheckOutcome]:
     """Run checks one after the other; return what became of each.
 
     Parameters
@@ -104,7 +104,7 @@ def run_checks(
     tell
         Called with each outcome as it comes.
     """
-    outcomes: list[Outcome] = []
+    outcomes: list[CheckOutcome] = []
     lost = ""
     for check in checks:
         began_s = time.monotonic()
@@ -118,7 +118,7 @@ def run_checks(
                 state, message = _asked(check, subject)
             except SubjectLost as reason:
                 state, message, lost = "failed", str(reason), check.name
-        outcomes.append(Outcome(check.name, check.promise, state, message, time.monotonic() - began_s))
+        outcomes.append(CheckOutcome(check.name, check.promise, state, message, time.monotonic() - began_s))
         tell(outcomes[-1])
     return outcomes
 
@@ -160,7 +160,7 @@ class ConformReport:
     kind: str
     subject: str
     began_s: float
-    outcomes: Sequence[Outcome]
+    outcomes: Sequence[CheckOutcome]
     may_move: str = ""
 
     @property

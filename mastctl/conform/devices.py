@@ -12,15 +12,14 @@ from typing import Any
 
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
-from drivers.hardware import CAMERAS as CAMERA_DRIVERS
-from drivers.hardware import HEADS as HEAD_DRIVERS
-from drivers.hardware import DeviceSettings, HardwareSettings, head_options
+from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.interfaces import Camera
+from drivers.registry import kinds_of
 from mastctl.conform.camera_checks import CAMERAS, CameraTrial
 from mastctl.conform.checks import (
     Check,
+    CheckOutcome,
     ConformReport,
-    Outcome,
     PromiseBroken,
     SubjectLost,
     run_checks,
@@ -33,17 +32,15 @@ from mastctl.devices.opening import Bounds, head_beside, open_one_camera
 
 log = logging.getLogger(__name__)
 
-COUNTS = {"dynamixel": 3, "feetech": 3, "flir_ptu": 1, "pelco": 1, "visca": 1}
-"""How many counts from its goal a head of this repository may stand when it calls itself settled."""
-
 STOPS_WITHIN_S = 3.0
 ANYWHERE: tuple[Angles, Angles] = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2))
 """Where a head may be moved of which nothing is known."""
 
 
 def kind_of(driver: str) -> str:
-    """Return ``head`` or ``camera`` for a driver of this repository that is one of them, else nothing."""
-    return "head" if driver in HEAD_DRIVERS else "camera" if driver in CAMERA_DRIVERS else ""
+    """Return ``head`` or ``camera`` for a driver that an installed package offers for one of them alone."""
+    kinds = kinds_of(driver)
+    return kinds.pop() if len(kinds) == 1 else ""
 
 
 def device_settings(driver: str, options: Mapping[str, Any], kind: str, name: str) -> HardwareSettings:
@@ -97,8 +94,9 @@ def head_under_test(
         ends = bounds.limits.pan_rad, bounds.limits.tilt_rad
     known = own_limits_rad is not None or bounds.stored is not None
     with head_beside(settings, bounds, SystemClock(), moves=moves) as opened:
-        count_rad = count_of(settings.pan_tilt)
         head = opened()
+        counts_rad = head.door.counts_rad.values()
+        count_rad = max(counts_rad) if len(counts_rad) == 2 else None
         trial = HeadTrial(
             head, ((0.0, 0.0), (0.0, 0.0)), min(speed_rad_per_s, bounds.limits.speed_rad_per_s),
             limits_rad=ends if own_limits_rad is not None or (known and math.isinf(reach_rad)) else None,
@@ -106,8 +104,7 @@ def head_under_test(
             count_rad=count_rad, open_again=None if settings.pan_tilt.driver == "sim" else opened,
         )  # fmt: skip
         if count_rad is not None:
-            trial.settle_rad = COUNTS[settings.pan_tilt.driver] * count_rad
-            trial.step_rad = step_of(settings.pan_tilt)
+            trial.settle_rad = head.info.settles_within_counts * count_rad
         try:
             try:
                 first = trial.read()
@@ -152,7 +149,7 @@ def camera_under_test(
 
 def check_head(
     trial: HeadTrial, driver: str, checks: Sequence[Check[HeadTrial]], motion: bool,
-    tell: Callable[[Outcome], object] = lambda outcome: None,
+    tell: Callable[[CheckOutcome], object] = lambda outcome: None,
 ) -> ConformReport:  # fmt: skip
     """Run checks on a head, and stop it however they end, by Ctrl-C too."""
     began_s = time.time()
@@ -183,40 +180,11 @@ def _stopped(trial: HeadTrial) -> str:
 
 def check_camera(
     trial: CameraTrial, driver: str, checks: Sequence[Check[CameraTrial]],
-    tell: Callable[[Outcome], object] = lambda outcome: None,
+    tell: Callable[[CheckOutcome], object] = lambda outcome: None,
 ) -> ConformReport:  # fmt: skip
     """Run checks on a camera."""
     began_s = time.time()
     return ConformReport("camera", driver, began_s, run_checks(checks, trial, motion=False, tell=tell))
-
-
-def count_of(device: DeviceSettings) -> float | None:
-    """Return one count of a head of this repository, radians, the coarser axis; None for another.
-
-    Raises
-    ------
-    BadOptions
-        For options that its driver refuses.
-    LineLost, NoReply, BadReply, Refused
-        If a PTU, which alone has to be asked, cannot be.
-    """
-    if device.driver not in HEAD_DRIVERS:
-        return None
-    read = head_options(device)
-    axes = read.pan, read.tilt
-    if device.driver == "flir_ptu":
-        from drivers.flir_ptu.workshop import facts
-
-        found = facts(read.port, read.baud)
-        return math.radians(max(found.pan.resolution_arcsec, found.tilt.resolution_arcsec) / 3600)
-    if device.driver == "pelco":
-        return float(max(axis.resolution_rad for axis in axes))
-    return float(max(axis.count_rad if device.driver == "visca" else axis.model.count_rad for axis in axes))
-
-
-def step_of(device: DeviceSettings) -> float:
-    """Return the way that a head makes at its own speed, whatever was asked, radians."""
-    return float(head_options(device).step_rad) if device.driver == "pelco" else 0.0
 
 
 ALL: Mapping[str, Sequence[Check[Any]]] = {"head": HEADS.checks, "camera": CAMERAS.checks}

@@ -46,7 +46,8 @@ def _reading(trial: HeadTrial) -> str:
 @HEADS.check("head.move", "a move returns at once and ends at its goal, at the nearest count", moves=True)
 def _move(trial: HeadTrial) -> str:
     worst_rad = 0.0
-    for parts in ((0.3, -0.2), (0.25033, -0.25047), (-0.0007, 0.0004), (-0.6, 0.5)):
+    shares: list[tuple[float, str]] = []  # of each way's time, that move() took; a busy machine delays some
+    for parts in ((0.3, -0.2), (0.25033, -0.25047), (-0.0007, 0.0004), (-0.6, 0.5), (0.6, -0.5)):
         goal = trial.goal(*parts)
         way_rad = away(trial.settled(), goal)
         began_s = trial.clock.now_s()
@@ -54,13 +55,15 @@ def _move(trial: HeadTrial) -> str:
         took_s = trial.clock.now_s() - began_s
         needs_s = way_rad / trial.speed_rad_per_s
         expect(took_s < MOVE_TIMEOUT_S, f"move() took {took_s:.2f} s, {MOVE_TIMEOUT_S:g} s are allowed")
-        expect(
-            needs_s < 0.2 or took_s < 0.7 * needs_s,
-            f"move() came back after {took_s:.2f} s, when the way of {way_rad:.3f} rad was gone: not at once",
-        )
+        if needs_s >= 0.2:
+            words = f"move() came back after {took_s:.2f} s, when the way of {way_rad:.3f} rad was gone"
+            shares.append((took_s / needs_s, f"{words}: not at once"))
         reading = trial.settled()
         bound_rad = trial.settle_rad + (0.5 * trial.count_rad if trial.count_rad else OUTSIDE_COUNT_RAD)
         worst_rad = max(worst_rad, trial.check_arrived(reading, goal, bound_rad))
+    if shares:
+        share, words = min(shares)
+        expect(share < 0.7, words)
     return f"within {worst_rad:.1e} rad"
 
 
@@ -258,7 +261,7 @@ def fastest_seen(trial: HeadTrial, asked_rad_per_s: float) -> tuple[float, float
             angles = np.interp(moments_s, stamps_s, [angles[axis] for _, angles in readings])
         fastest = max(fastest, float(np.abs(np.diff(angles)).max()) / step_s)
     count_rad = OUTSIDE_COUNT_RAD if trial.count_rad is None else trial.count_rad
-    return fastest, (2 * count_rad + trial.step_rad) / step_s
+    return fastest, 2 * count_rad / step_s
 
 
 @HEADS.check(

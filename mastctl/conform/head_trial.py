@@ -10,6 +10,7 @@ import numpy as np
 
 from drivers.clock import Clock, SystemClock
 from drivers.interfaces import PanTilt, Reading
+from drivers.options import is_number
 from mastctl.conform.checks import NotTried, SubjectLost, expect
 from mastctl.conform.worker import Worker
 from mastctl.devices.frames import CLOCK_TOLERANCE_S
@@ -43,8 +44,6 @@ class HeadTrial:
         One count; None: not known.
     settle_rad
         How far from its goal a settled head may stand, beyond the rounding to counts.
-    step_rad
-        The way that an axis may make at its own speed: a head that keeps a speed only as a mean.
     true_rad
         Where the axes truly are at a moment of the last minute; None where nobody knows.
     open_again
@@ -64,7 +63,6 @@ class HeadTrial:
     own_limits: bool = False
     count_rad: float | None = None
     settle_rad: float = 0.006
-    step_rad: float = 0.0
     true_rad: Callable[[float], Angles] | None = None
     open_again: Callable[[], PanTilt] | None = None
     closed: bool = False
@@ -110,12 +108,12 @@ class HeadTrial:
         for name in ("pan_rad", "tilt_rad"):
             angle = getattr(reading, name, None)
             expect(
-                isinstance(angle, (int, float)) and math.isfinite(angle) and abs(angle) <= math.tau,
+                isinstance(angle, (int, float)) and abs(angle) <= math.tau,
                 f"read(): {name} is {angle!r} where a finite angle within a turn is expected",
             )
         moving, stamp_s = getattr(reading, "moving", None), getattr(reading, "time_s", None)
         expect(isinstance(moving, (bool, np.bool_)), f"read(): moving is {moving!r}, neither true nor false")
-        expect(isinstance(stamp_s, (int, float)) and math.isfinite(stamp_s), f"read(): time_s is {stamp_s!r}")
+        expect(is_number(stamp_s), f"read(): time_s is {stamp_s!r}")
         expect(
             began_s - CLOCK_TOLERANCE_S <= reading.time_s <= ended_s + CLOCK_TOLERANCE_S,
             f"read(): stamped {reading.time_s - began_s:+.3f} s from the call's begin, "

@@ -15,9 +15,9 @@ import yaml
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.conform.checks import (
     Check,
+    CheckOutcome,
     ConformReport,
     NotTried,
-    Outcome,
     PromiseBroken,
     expect,
     run_checks,
@@ -187,7 +187,7 @@ def check_rig(
     trial: RigTrial,
     checks: Sequence[Check[RigTrial]],
     motion: bool,
-    tell: Callable[[Outcome], object] = lambda outcome: None,
+    tell: Callable[[CheckOutcome], object] = lambda outcome: None,
 ) -> ConformReport:
     """Run checks on a rig. However they end, by Ctrl-C too, a head that was moved is stopped.
 

@@ -26,7 +26,7 @@ def settings_tried(
     Parameters
     ----------
     read, adjust
-        Return the settings, and change one; as `drivers.interfaces.Adjustable`.
+        Return the settings, and change one; as `drivers.interfaces.Camera.adjust`.
     of_a_frame
         Returns the settings of a frame that is exposed from now on.
 

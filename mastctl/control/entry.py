@@ -80,6 +80,7 @@ SUN = Command("limits.sun")  # a fact too
 SUN_FORGET = Command("limits.sun.forget")
 STOP = Command("stop", "view")
 ESTOP = Command("estop", "view")
+OPERATION_STOP = Command("operation.stop")  # of that one only: whoever steers by now is not disturbed
 RESET = Command("reset", need="latch")
 RECORD_START = Command("record.start")
 RECORD_STOP = Command("record.stop")

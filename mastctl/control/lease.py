@@ -9,7 +9,9 @@ Reading from here (`LeaseTable.control`) takes no lock.
 
 from __future__ import annotations
 
+import contextlib
 import hmac
+import logging
 import math
 import secrets
 import threading
@@ -24,9 +26,12 @@ from mastctl.answers import ControlTold, LeaseRuns
 from mastctl.control.caller import Caller
 from mastctl.errors import BadRequest, NotNow
 
+log = logging.getLogger(__name__)
+
 SHORTEST_S, USUAL_S, LONGEST_S = 1.0, 30.0, 3600.0
-OUT_OF_TIME = "s were over"
+NOT_RENEWED = "the lease was not renewed for"
 SILENT_S = 0.2  # how soon after its time what runs under a lease that stops it is stopped, at most
+AGAIN_S = 1.0  # between such stops while the head does not confirm one
 REMEMBERED = 64  # ended leases whose end is still told to who comes with them
 
 
@@ -36,6 +41,14 @@ class Leased(NotNow):
     def __init__(self, control: WhoSteers, now_s: float) -> None:
         self.detail = control.told(now_s)
         super().__init__("leased", f"{control.sentence(now_s)}; wait, or take over with a reason")
+
+
+class LeaseOver(NotNow):
+    """A lease has ended; ``detail`` has ``how``."""
+
+    def __init__(self, how: str) -> None:
+        self.detail = {"how": how}
+        super().__init__("lease_over", f"the lease has ended: {how}; acquire another")
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +77,7 @@ class Lease:
     last_stop: StopCame | None = None
     credential: str = field(default="", repr=False)
     stops_when_silent: bool = False
+    caller: str = ""
 
 
 @dataclass(frozen=True)
@@ -136,6 +150,7 @@ class LeaseTable:
         self._over: dict[str, str] = {}  # id of an ended lease: how it ended
         self._under_way: dict[object, str] = {}  # commands that are being carried out: their party
         self._party: str | None = None  # who started what runs
+        self._closed = False
 
     def control(self) -> WhoSteers | None:
         """Return who steers now, None for nobody."""
@@ -202,32 +217,69 @@ class LeaseTable:
         BadRequest
             If ``for_s`` is out of bounds.
         DriverError
-            If what runs under a lease that gives way could not be stopped; the new lease stands.
+            If what runs under a lease that gives way could not be stopped; there is no new lease then.
         """
         _check_time(for_s)
         with self._changing():
             why = self._check_free(caller)
             last_stop = self._last_stop if preemptible or ends_with_stop else None
             lease = self._grant(caller, name, for_s, preemptible, last_stop, stops_when_silent)
-        if stops_when_silent:
-            threading.Thread(target=self._watch, args=(lease,), name="silent holder", daemon=True).start()
-        if why:
-            self._give_way(why)
+        return self._begun(lease, why)
+
+    def _begun(self, lease: Lease, why: str) -> Lease:
+        """Return a new lease when what gives way to it was stopped.
+
+        If that fails the lease ends: its id is told to no client.
+        """
+        try:
+            if lease.stops_when_silent:
+                threading.Thread(target=self._watch, args=(lease,), name="silent holder", daemon=True).start()
+            if why:
+                self._give_way(why)
+        except BaseException:
+            with self._changing():
+                if self._lease is not None and self._lease.id == lease.id:
+                    self._end("it could not be granted")
+            raise
         return lease
 
     def _watch(self, lease: Lease) -> None:
-        while not self.stopped_silent(lease):
-            self._clock.sleep(SILENT_S)
+        """Stop what a lease's holder has left running, again and again until the head confirms it, unless
+        another client steers by then."""
+        try:
+            while not self.stopped_silent(lease):
+                self._clock.sleep(SILENT_S)
+            return
+        except Exception as error:
+            log.error("what %s has left running: %s; the stop is sent again", lease.holder, error)
+        why = self._silence(lease)
+        names = lease.holder, lease.caller
+        while not self._closed and ((now := self.control()) is None or now.holder in names):
+            self._clock.sleep(AGAIN_S)
+            with contextlib.suppress(Exception):
+                self._give_way(why)
+                log.warning("the head has confirmed the stop: %s", why)
+                return
 
     def stopped_silent(self, lease: Lease) -> bool:
-        """Return whether a lease has ended; what runs is stopped if that was because its time ran out."""
+        """Return whether a lease has ended; what its holder began is stopped if its time ran out."""
         with self._changing():
             if self._lease is not None and self._lease.id == lease.id:
                 return False
-            how = self._over.get(lease.id, "")
-        if how.endswith(OUT_OF_TIME) and self._running():
-            self._give_way(f"{lease.holder} began it and has fallen silent: {how}")
+            its_own = self._lease is None and self._party in (lease.holder, lease.caller)
+            why = self._silence(lease)
+        if why and its_own and self._running():
+            self._give_way(why)
         return True
+
+    def _silence(self, lease: Lease) -> str:
+        """Why what runs under a lease is stopped; empty unless its time ran out."""
+        how = self._over.get(lease.id, "")
+        return f"{lease.holder} began it and has fallen silent: {how}" if how.startswith(NOT_RENEWED) else ""
+
+    def close(self) -> None:
+        """Send no stop for a silent holder any more: the service has stopped the head, and ends."""
+        self._closed = True
 
     def holds(self, lease_id: str) -> bool:
         """Return whether a lease runs now; takes no lock."""
@@ -270,21 +322,24 @@ class LeaseTable:
         name: str | None = None,
         for_s: float = USUAL_S,
         last_stop: StopCame | None = None,
+        preemptible: bool = False,
+        ends_with_stop: bool = False,
+        stops_when_silent: bool = False,
     ) -> Lease:
         """Return a new lease, whoever steers; the former holder is told by whom it was taken, and why.
 
         What runs goes on, but for what runs under a lease that gives way. With ``last_stop`` it ends with the
-        first stop after that one. Raises as `acquire`.
+        first stop after that one. Other parameters and exceptions as of `acquire`.
         """
         _check_time(for_s)
         with self._changing():
             gave_way = self._lease is not None and self._lease.preemptible and self._running()
             how = f"{name or caller.name} took over: {reason}"
             self._end(how)
-            lease = self._grant(caller, name, for_s, last_stop=last_stop)
-        if gave_way:
-            self._give_way(how)
-        return lease
+            if last_stop is None and (preemptible or ends_with_stop):
+                last_stop = self._last_stop
+            lease = self._grant(caller, name, for_s, preemptible, last_stop, stops_when_silent)
+        return self._begun(lease, how if gave_way else "")
 
     @contextmanager
     def steering(self, caller: Caller, lease_id: str | None) -> Iterator[None]:
@@ -309,13 +364,16 @@ class LeaseTable:
                 why = self._check_free(caller)
                 party = caller.name
             self._under_way[ticket] = party
+            anothers = self._running()
         try:
             if why:
                 self._give_way(why)
             yield
+            anothers = False  # it was carried out: what runs from now on is its
         finally:
             with self._changing():
-                self._party = party
+                if not anothers:
+                    self._party = party
                 del self._under_way[ticket]
 
     # With the lock held
@@ -341,7 +399,7 @@ class LeaseTable:
     def _over_by(self, lease: Lease) -> str:
         """What has ended a lease that nobody released or took, '' if nothing has; takes no lock."""
         if self._clock.now_s() >= lease.until_s:
-            return f"its {lease.for_s:g} {OUT_OF_TIME}"
+            return f"{NOT_RENEWED} {lease.for_s:g} s"
         if self.was_stopped(lease):
             return self._last_stop.how
         if lease.credential and not self.stands(lease.credential):
@@ -371,7 +429,7 @@ class LeaseTable:
         how = self._over.get(lease_id)
         if how is None:
             raise NotNow("lease_unknown", "the lease is not known, or ended long ago; acquire one")
-        raise NotNow("lease_over", f"the lease has ended: {how}; acquire another")
+        raise LeaseOver(how)
 
     def _grant(
         self,
@@ -392,6 +450,7 @@ class LeaseTable:
             last_stop,
             caller.credential,
             stops_when_silent,
+            caller.name,
         )
         self._lease = lease
         return lease

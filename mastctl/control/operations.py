@@ -231,6 +231,21 @@ class OperationRunner:
         """
         self._end_by(name, Stopped(reason))
 
+    def stop_one(self, name: str) -> None:
+        """Stop the mast and one operation, if it runs; nothing where it has ended, or another one runs.
+
+        Raises
+        ------
+        NotKnown
+            As `get`.
+        DriverError
+            If the head did not confirm the stop; the operation is stopped all the same.
+        """
+        self.get(name)
+        error = self._end_by(name, Stopped(STOP_ASKED))
+        if error is not None:
+            raise error
+
     def get(self, name: str) -> Operation:
         """Return one record.
 
@@ -271,30 +286,36 @@ class OperationRunner:
             log.error("operation %s did not end within %.0f s; it is given up", current[0], END_TIMEOUT_S)
             self._end(current[0], "stopped", None, error_body(Stopped(CLOSING)))
 
-    def _end_by(self, name: str, error: MastctlError) -> None:
-        """End an operation with an error and stop the mast, unless it is being stopped already."""
+    def _end_by(self, name: str, error: MastctlError) -> BaseException | None:
+        """End an operation with an error and stop the mast, unless it is being stopped already.
+
+        Returns why the head did not confirm the stop, None if it did.
+        """
         with self._lock:
             current = self._current
             if current is None or current[0] != name or current[1].is_set():
-                return
+                return None
             with self._ended:
                 self._stops_of_its_own += 1
             self._cancelled_because = error
             current[1].set()
             self._mover.block_moves(name, str(error))
         self._machine.stop_asked()
-        self._stop_unasked(f"when operation {name} was to end")
+        unconfirmed = self._stop_unasked(f"when operation {name} was to end")
         self._machine.stop_ended()
         with self._ended:
             self._stops_of_its_own -= 1
             self._ended.notify_all()
+        return unconfirmed
 
-    def _stop_unasked(self, when: str) -> None:
-        """Stop the mast where nobody waits for the answer; whatever its driver raises must not go further."""
+    def _stop_unasked(self, when: str) -> BaseException | None:
+        """Stop the mast where no client waits for the answer; return whatever its driver raises."""
         try:
             self._mover.stop()
         except BaseException as error:
             log.error("the head did not confirm the stop %s: %s", when, error_body(error)["message"])
+            return error
+        return None
 
     def _keep(self, operation: Operation) -> None:
         """Keep a record, and forget the oldest; the lock is held."""

@@ -76,12 +76,9 @@ class Latched:
 
 
 def latched_sentence(entries: Sequence[Latched]) -> str:
-    """Return what is told of all emergency stops that hold."""
-    if len(entries) == 1:
-        return entries[0].sentence
-    told = "; ".join(f"{one.name}: {one.reason}" for one in entries)
-    words = f"{len(entries)} emergency stops are latched ({told})"
-    return f"{words}; 'mastctl reset' with a reason, a name and whose it is ('--latched-by') releases each"
+    """Return the sentence of a latch with all its causes."""
+    causes = "; ".join(f"{one.name}: {one.reason}" for one in entries)
+    return f"an emergency stop is latched ({causes}); 'mastctl reset' with a reason and a name releases it"
 
 
 @dataclass(frozen=True)

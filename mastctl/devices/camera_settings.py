@@ -13,7 +13,7 @@ from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import BadReply, BadSetting, DriverError
-from drivers.interfaces import SETTINGS, Adjustable, Camera, CameraSetting, HoldsExposure
+from drivers.interfaces import SETTINGS, Camera, CameraSetting
 from mastctl.control.standing import StandingFault
 from mastctl.devices.thread import DeviceThread
 from mastctl.errors import NotNow
@@ -22,7 +22,7 @@ HOLD_TIMEOUT_S = 3.0  # a driver waits up to 2 s for changes under way to show
 SET_TIMEOUT_S = 2.0
 
 
-class CameraSettings:
+class CameraControls:
     """The settings of all cameras; safe from any thread.
 
     Parameters
@@ -72,10 +72,8 @@ class CameraSettings:
                 raise NotNow("busy", f"{name}: {words}")
             before, _ = self._told(name)
             changes = check_wanted(before, wanted, name)
-            camera = self._cameras[name]
-            assert isinstance(camera, Adjustable)
             try:
-                notes = [str(note) for note in camera.adjust(changes)]
+                notes = [str(note) for note in self._cameras[name].adjust(changes)]
             except BaseException:
                 with suppress(Exception):  # the first error counts
                     self._note_focus(name, wanted, before)
@@ -113,10 +111,7 @@ class CameraSettings:
 
     def _told(self, name: str) -> tuple[list[CameraSetting], bool]:
         """In the camera's thread: what it says, if that can be."""
-        camera = self._cameras[name]
-        if not isinstance(camera, Adjustable):
-            return [], self._holds[name] > 0
-        return [_believed(one, name) for one in camera.settings()], self._holds[name] > 0
+        return [_believed(one, name) for one in self._cameras[name].settings()], self._holds[name] > 0
 
     def _note_focus(self, name: str, wanted: Mapping[str, float], before: Sequence[CameraSetting]) -> None:
         """Compare a focus that was to be changed with that of before its first change."""
@@ -163,7 +158,12 @@ def _believed(one: object, camera: str) -> CameraSetting:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer
+        return False
 
 
 _RIGHT: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
@@ -244,11 +244,9 @@ class ExposureHold:
     def _enter(self) -> None:
         self._holds = 1
         self._count(1)
-        camera = self._camera()
-        if isinstance(camera, HoldsExposure):
-            context = camera.exposure_held()
-            context.__enter__()
-            self._context = context
+        context = self._camera().exposure_held()
+        context.__enter__()
+        self._context = context
 
     def _leave(self) -> None:
         self._count(-self._holds)

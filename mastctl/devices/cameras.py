@@ -12,21 +12,21 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from calib.geometry.mode import SensorMode
 from calib.geometry.rig import Rig, RigCamera
-from calib.geometry.sensor_mode import SensorMode
 from drivers.absent import AbsentCamera
 from drivers.clock import Clock, SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame
-from drivers.frame_times import Offset, Pairing, learned
-from drivers.interfaces import Camera, Frame, FrameTime, KnowsSensorMode, KnowsSize, Paced, Reading
+from drivers.frame_times import Offset, Pace, Pairing, learned
+from drivers.interfaces import Camera, Frame, FrameTime, Reading
 from mastctl.control.standing import StandingFault
 from mastctl.devices import frames as frame_checks
-from mastctl.devices.camera_settings import CameraSettings
+from mastctl.devices.camera_settings import CameraControls
 from mastctl.devices.fault_watch import FaultWords
 from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import JointHistory
@@ -95,7 +95,7 @@ class Cameras:
     ) -> None:
         self._cameras = dict(cameras)
         self._threads: dict[str, DeviceThread] = {}
-        self.settings = CameraSettings(self._cameras, self._threads, clock)
+        self.settings = CameraControls(self._cameras, self._threads, clock)
         self._store = store
         self._history = history
         self._read = read
@@ -275,9 +275,9 @@ class Cameras:
     def _offsets(self, names: Sequence[str], deadline_s: float) -> dict[str, Offset]:
         """What is known of each camera's times beside the first one's."""
         first = names[0]
-        asked: dict[str, ThreadCall[_Times | None]] = {}
+        asked: dict[str, ThreadCall[Pace | None]] = {}
         for name in names:
-            tell = partial(self._times_of, name)
+            tell = partial(self._pace_of, name)
             left_s = max(0.0, deadline_s - self._time.now_s())
             asked[name] = self._threads[name].submit("recent_times", tell, left_s + self._grace_s)
         times = {
@@ -383,6 +383,15 @@ class Cameras:
             for kind, count in thread.errors().items()
         }
 
+    def counts(self) -> dict[str, tuple[int, int]]:
+        """Return how many frames each camera sent, and how many of its frames were lost or damaged."""
+        found = {}
+        for name, camera in self._cameras.items():
+            counters = camera.counters
+            if counters is not None:
+                found[name] = counters.good, counters.damaged + counters.dropped
+        return found
+
     def close(self, until_s: float) -> None:
         """End the threads; waits until a moment of the deadlines' clock, and for each 0.1 s at least."""
         for thread in self._threads.values():
@@ -424,9 +433,7 @@ class Cameras:
         """Pass cameras that are as calibrated, or do not tell it now. Raises BadFrame."""
         until_s = self._time.now_s() + SIZE_TIMEOUT_S
         asked = {
-            name: thread.submit(
-                "size_px", partial(self._check_as_calibrated, name), SIZE_TIMEOUT_S, told=False
-            )
+            name: thread.submit("info", partial(self._check_as_calibrated, name), SIZE_TIMEOUT_S, told=False)
             for name, thread in self._threads.items()
         }
         for name, told in asked.items():
@@ -452,34 +459,22 @@ class Cameras:
             That of a driver that fails to answer.
         """
         calibrated = self._calibrated.get(name)
-        try:
-            self._check_mode(name, calibrated)  # first: it says more of what mends it than the size
-        except BadFrame:
-            raise
-        except Exception:
-            self._check_size(name, calibrated)
-            raise
-        self._check_size(name, calibrated)
+        info = self._cameras[name].info
+        # The mode first: its refusal says better than that of the size what would mend it.
+        self._check_mode(name, info.sensor_mode, calibrated)
+        if info.size_px is not None and calibrated is not None:
+            try:
+                width, height = (int(side) for side in info.size_px)
+            except (TypeError, ValueError, OverflowError):
+                words = f"info.size_px is {type(info.size_px).__name__} where (width, height) is expected"
+                raise BadReply(words, device=name) from None
+            frame_checks.check_size(name, (width, height), calibrated.model.size_px)
 
-    def _check_size(self, name: str, calibrated: RigCamera | None) -> None:
-        camera = self._cameras[name]
-        if not isinstance(camera, KnowsSize) or calibrated is None:
+    def _check_mode(self, name: str, mode: SensorMode | None, calibrated: RigCamera | None) -> None:
+        if mode is None:
             return
-        told = camera.size_px
-        try:
-            width, height = (int(side) for side in told)
-        except (TypeError, ValueError, OverflowError):
-            words = f"size_px is {type(told).__name__} where (width, height) is expected"
-            raise BadReply(words, device=name) from None
-        frame_checks.check_size(name, (width, height), calibrated.model.size_px)
-
-    def _check_mode(self, name: str, calibrated: RigCamera | None) -> None:
-        camera = self._cameras[name]
-        if not isinstance(camera, KnowsSensorMode):
-            return
-        mode = camera.sensor_mode
         if not isinstance(mode, SensorMode):
-            words = f"sensor_mode is {type(mode).__name__} where a SensorMode is expected"
+            words = f"info.sensor_mode is {type(mode).__name__} where a SensorMode is expected"
             raise BadReply(words, device=name)
         self.sensor_modes[name] = mode
         if calibrated is not None and (then := calibrated.sensor_mode) is not None:
@@ -491,13 +486,14 @@ class Cameras:
                     name,
                 )
 
-    def _times_of(self, name: str) -> _Times | None:
-        """What a camera tells of its frames' times; None if it is not `Paced`."""
+    def _pace_of(self, name: str) -> Pace | None:
+        """What a camera states of its frames' times; None for one without a steady rate."""
         camera = self._cameras[name]
-        if not isinstance(camera, Paced):
+        info = camera.info
+        if info.period_s is None:
             return None
         recent = [FrameTime(one.sequence, one.exposure_began_s) for one in camera.recent_times()]
-        return _Times(float(camera.period_s), str(camera.trigger), recent)
+        return Pace(float(info.period_s), str(info.trigger), recent)
 
     def _taker(
         self, camera: str, exposed_after_s: float, deadline_s: float
@@ -573,18 +569,6 @@ class Cameras:
                 f"the picture is frozen: equal to the last bit although the head moved {moved_rad:.6f} rad",
                 device=frame.camera,
             )
-
-
-@dataclass(frozen=True)
-class _Times:
-    """A camera's times as it told them: what `drivers.frame_times.learned` asks for."""
-
-    period_s: float
-    trigger: str
-    recent: Sequence[FrameTime]
-
-    def recent_times(self) -> Sequence[FrameTime]:
-        return self.recent
 
 
 def _check_order(frame: Frame, newest: StampedFrame) -> None:

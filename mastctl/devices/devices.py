@@ -15,8 +15,8 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Protocol
 
-from calib.geometry.rig import AxisJoint, JointErrors, Rig
-from calib.geometry.sensor_mode import SensorMode
+from calib.geometry.mode import SensorMode
+from calib.geometry.rig import JointErrors, Rig
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import BadReply, DriverError, LineLost, NoReply
 from drivers.interfaces import (
@@ -25,9 +25,8 @@ from drivers.interfaces import (
     Camera,
     CameraSetting,
     PanTilt,
-    Reporting,
-    StopsBeside,
 )
+from drivers.options import is_number
 from mastctl.control.machine import StateMachine
 from mastctl.control.standing import StandingFault
 from mastctl.devices import joint_history
@@ -40,7 +39,6 @@ from mastctl.devices.keep_out import Pair
 from mastctl.devices.limits import Limits, SunDirection
 from mastctl.devices.stops import AT_ONCE_S, PATIENCE_S, StopRequests
 from mastctl.devices.thread import DeviceThread
-from mastctl.devices.ways import Way
 from mastctl.errors import MastctlError, Stopped
 
 log = logging.getLogger(__name__)
@@ -152,7 +150,7 @@ class Devices:
         self._head = DeviceThread(
             HEAD, between=self._poll, between_timeout_s=READ_TIMEOUT_S, words=WORDS, clock=self._time
         )
-        patience_s = AT_ONCE_S if _stops_beside(self._pan_tilt) else PATIENCE_S
+        patience_s = AT_ONCE_S if self._pan_tilt.info.stops_beside is True else PATIENCE_S
         self._stops = StopRequests(self._head, HEAD, lambda: self._pan_tilt.stop(), self._time, patience_s)
         self.fault_watch.begin()
 
@@ -205,7 +203,7 @@ class Devices:
         """One count of ``pan`` and of ``tilt``, as far as the head says it."""
         return self.door.counts_rad
 
-    def goal(self, true_rad: Pair, here: HeadReading, corners: Sequence[Pair] = ()) -> Pair:
+    def goal(self, true_rad: Pair, here: HeadReading) -> Pair:
         """Return the readings to send the head to, so that it comes to true angles.
 
         By the mast file's joints. The side from which each axis will come follows from where it stands, and
@@ -218,20 +216,16 @@ class Devices:
             (pan, tilt) wanted.
         here
             Where the head rests.
-        corners
-            Readings that it goes by on its way.
         """
         pan, tilt = (
-            joint.goal_rad(wanted, *_after(joint, read, came, [corner[axis] for corner in corners]), turn)
-            for axis, (joint, wanted, read, came, turn) in enumerate(
-                zip(
-                    (self._joints.pan, self._joints.tilt),
-                    true_rad,
-                    (here.pan_rad, here.tilt_rad),
-                    here.approach,
-                    self.door.turns_to(self._joints.read_rad(true_rad)),
-                    strict=True,
-                )
+            joint.goal_rad(wanted, read, came, turn)
+            for joint, wanted, read, came, turn in zip(
+                (self._joints.pan, self._joints.tilt),
+                true_rad,
+                (here.pan_rad, here.tilt_rad),
+                here.approach,
+                self.door.turns_to(self._joints.read_rad(true_rad)),
+                strict=True,
             )
         )
         return pan, tilt
@@ -273,9 +267,9 @@ class Devices:
 
         self._head.call("move", send, MOVE_TIMEOUT_S)
 
-    def way(self, here: Pair, goal: Pair) -> Way:
-        """Return the moves that lead to a goal (`mastctl.devices.judge.Door.way`)."""
-        return self.door.way(here, goal)
+    def check_from(self, here: Pair, goal: Pair) -> None:
+        """Pass a goal that may be commanded from a place (`KeepOutJudge.check_from`)."""
+        self.door.check_from(here, goal)
 
     def stop(self) -> None:
         """Halt the head at once, whatever hangs (`mastctl.devices.stops`); moves still waiting are never
@@ -351,7 +345,7 @@ class Devices:
         return self._cameras.exposure_held()
 
     def camera_settings(self, camera: str) -> tuple[list[CameraSetting], bool]:
-        """Return what a camera is set to, as `mastctl.devices.camera_settings.CameraSettings.told`."""
+        """Return what a camera is set to, as `mastctl.devices.camera_settings.CameraControls.told`."""
         check_known(camera, self._cameras.newest_frames())
         return self._cameras.settings.told(camera)
 
@@ -361,7 +355,7 @@ class Devices:
         return self._cameras.sensor_modes
 
     def set_camera(self, camera: str, wanted: Mapping[str, float]) -> list[str]:
-        """Change it, as `mastctl.devices.camera_settings.CameraSettings.change`."""
+        """Change it, as `mastctl.devices.camera_settings.CameraControls.change`."""
         check_known(camera, self._cameras.newest_frames())
         return self._cameras.settings.change(camera, wanted)
 
@@ -392,6 +386,10 @@ class Devices:
         """Return how often calls have failed since the start: by device, call, and the error's code."""
         head = {(HEAD, *kind): count for kind, count in self._head.errors().items()}
         return head | self._cameras.errors()
+
+    def frame_counts(self) -> dict[str, tuple[int, int]]:
+        """Return how many frames were received and missed, of each camera whose driver counts them."""
+        return self._cameras.counts()
 
     def close(self) -> None:
         """Stop the head and end the threads; takes some 4 s at most and never raises."""
@@ -452,31 +450,14 @@ class Devices:
         except Exception:  # of a driver from outside; the reading is good all the same
             told = {}
         warm = {name: axis.temperature_C for name, axis in told.items()}
-        self.temperatures_c = {
-            name: value
-            for name, value in warm.items()
-            if isinstance(value, int | float) and math.isfinite(value)
-        }
+        self.temperatures_c = {name: value for name, value in warm.items() if is_number(value)}
         return MOVING_PERIOD_S if moving else RESTING_PERIOD_S
 
     def _reported(self) -> Mapping[str, AxisReport]:
         head = self._pan_tilt
-        told = dict(head.report()) if isinstance(head, Reporting) else {}
-        for axis in told.values():
+        reports = dict(head.report())
+        for axis in reports.values():
             if not isinstance(axis, AxisReport):
                 words = f"report returned {type(axis).__name__} where an AxisReport is expected"
                 raise BadReply(words, device=HEAD)
-        return told
-
-
-def _after(joint: AxisJoint, read_rad: float, approach: float, corners_rad: Sequence[float]) -> Pair:
-    """Where an axis stands, and from which side it came, when it has gone by some readings."""
-    half_rad = 0.5 * joint.backlash_rad
-    load = read_rad - approach * half_rad
-    for read_rad in corners_rad:
-        load = min(max(load, read_rad - half_rad), read_rad + half_rad)
-    return read_rad, (read_rad - load) / half_rad if half_rad else 0.0
-
-
-def _stops_beside(head: object) -> bool:
-    return isinstance(head, StopsBeside) and head.stops_beside is True
+        return reports

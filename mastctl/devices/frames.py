@@ -10,13 +10,13 @@ from __future__ import annotations
 import re
 import secrets
 import threading
-from collections import deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from calib.geometry.sensor_mode import BadMode, SensorMode, flip_name, mode_between
+from calib.geometry.mode import BadMode, SensorMode, flip_name, mode_between
 from drivers.errors import BadFrame, NoFreshFrame
 from drivers.interfaces import SETTINGS, Frame, Image
 from mastctl.errors import NoLonger, NotKnown, NotNow
@@ -25,6 +25,8 @@ from mastctl.frame_facts import FrameFacts
 _FRAME_ID = re.compile(r"(.{1,100})-([0-9]{6,20})-([0-9a-f]{8})-([0-9a-f]{4})", re.ASCII)
 KEPT_FRAMES = 16  # per camera; six cameras of 1024x768 grey are 75 MB
 ASKED = "asked"  # who was given a frame by name: a snapshot, a click
+OPERATIONS = "operations"  # who holds the pictures that pointings end with
+WATCHED_BYTES = 256_000_000  # of the frames of all others, who only watch, each frame counted once
 MOST_TOLD = 1024  # more than are kept of all cameras
 CLOCK_TOLERANCE_S = 0.005  # what a stamp may lie in the future: rounding, and a driver that estimates
 DARK_GREY = 8  # a picture whose brightest hundredth is below this shows nothing to correlate with
@@ -145,10 +147,10 @@ def checked(
     darkest, brightest = np.percentile(image[::8, ::8], (1, 99))
     if brightest < DARK_GREY:
         words = f"the picture is dark: its brightest hundredth is at {brightest:.0f} of 255"
-        raise BadFrame(words, device=camera)
+        raise BadFrame(words, device=camera, detail={"light": "dark"})
     if darkest >= SATURATED_GREY:
         words = f"the picture is saturated: its darkest hundredth is at {darkest:.0f} of 255"
-        raise BadFrame(f"{words}; expose it for less time", device=camera)
+        raise BadFrame(f"{words}; expose it for less time", device=camera, detail={"light": "saturated"})
     if image.flags.writeable or not image.flags.c_contiguous:
         # The driver may use its buffer again; one that hands over a read-only array is spared the copy.
         image = image.copy()
@@ -161,6 +163,60 @@ def checked(
 def random_run() -> str:
     """Return four hexadecimal digits that tell a run of the service from those before it."""
     return secrets.token_hex(2)
+
+
+Place = tuple[str, str]
+
+
+class _Held:
+    """The frames that are kept for those who look at them, by place: for whom, and of which camera.
+
+    Of those who only watch the oldest give way beyond ``WATCHED_BYTES`` in all, each frame counted once.
+    """
+
+    def __init__(self) -> None:
+        self._places: dict[Place, OrderedDict[str, StampedFrame]] = {}
+        self._order: OrderedDict[tuple[Place, str], None] = OrderedDict()  # of those who watch
+        self._watched: Counter[str] = Counter()  # how many of them keep a frame
+        self._bytes = 0
+
+    def add(self, place: Place, frame: StampedFrame, most: int) -> None:
+        """Keep a frame as the newest of a place, which has so many."""
+        self._remove(place, frame.frame_id)
+        frames = self._places.setdefault(place, OrderedDict())
+        frames[frame.frame_id] = frame
+        if place[0] not in (ASKED, OPERATIONS):
+            self._order[place, frame.frame_id] = None
+            self._bytes += 0 if self._watched[frame.frame_id] else frame.image.nbytes
+            self._watched[frame.frame_id] += 1
+        while len(frames) > most:
+            self._remove(place, next(iter(frames)))
+        while self._bytes > WATCHED_BYTES and len(self._order) > 1:
+            self._remove(*next(iter(self._order)))
+
+    def get(self, frame_id: str) -> StampedFrame | None:
+        """Return a kept frame by its id."""
+        return next((frames[frame_id] for frames in self._places.values() if frame_id in frames), None)
+
+    def drop(self, ends: Callable[[Place], bool]) -> None:
+        """Keep nothing more for some places."""
+        for place in [one for one in self._places if ends(one)]:
+            for frame_id in list(self._places[place]):
+                self._remove(place, frame_id)
+
+    def _remove(self, place: Place, frame_id: str) -> None:
+        frames = self._places.get(place)
+        if frames is None or frame_id not in frames:
+            return
+        frame = frames.pop(frame_id)
+        if not frames:
+            del self._places[place]
+        if (place, frame_id) in self._order:
+            del self._order[place, frame_id]
+            self._watched[frame_id] -= 1
+            if not self._watched[frame_id]:
+                del self._watched[frame_id]
+                self._bytes -= frame.image.nbytes
 
 
 class FrameStore:
@@ -183,7 +239,7 @@ class FrameStore:
         self._runs: dict[str, str] = {}
         self._kept = kept
         self._frames: dict[str, deque[StampedFrame]] = {}
-        self._held: dict[tuple[str, str], deque[StampedFrame]] = {}
+        self._held = _Held()
         self._newest: Mapping[str, StampedFrame] = {}  # replaced, never edited
         self._told: deque[str] = deque(maxlen=MOST_TOLD)
         self._lock = threading.Lock()
@@ -205,7 +261,7 @@ class FrameStore:
         with self._lock:
             self._digest = mast_digest
             self._frames.clear()
-            self._held.clear()
+            self._held = _Held()
             self._newest = {}
             self._runs.clear()
 
@@ -213,7 +269,7 @@ class FrameStore:
         """Forget a camera's frames, because its count went back: one number must not name two pictures."""
         with self._lock:
             self._frames.pop(camera, None)
-            self._held = {place: held for place, held in self._held.items() if place[1] != camera}
+            self._held.drop(lambda place: place[1] == camera)
             self._newest = {name: frame for name, frame in self._newest.items() if name != camera}
             self._runs[camera] = self._new_run()
 
@@ -273,15 +329,12 @@ class FrameStore:
         with self._lock:
             if frame.mast_digest != self._digest:
                 return
-            held = self._held.setdefault((by, frame.camera), deque(maxlen=kept))
-            if frame in held:
-                held.remove(frame)
-            held.append(frame)
+            self._held.add((by, frame.camera), frame, kept)
 
     def let_go(self, by: str) -> None:
         """Hold nothing more for somebody."""
         with self._lock:
-            self._held = {place: held for place, held in self._held.items() if place[0] != by}
+            self._held.drop(lambda place: place[0] == by)
 
     def by_id(self, frame_id: str) -> StampedFrame:
         """Return a frame by its id.
@@ -293,10 +346,12 @@ class FrameStore:
             was taken with another mast file, ``frame_unknown`` otherwise.
         """
         with self._lock:
-            for frames in (*self._frames.values(), *self._held.values()):
+            for frames in self._frames.values():
                 for frame in frames:
                     if frame.frame_id == frame_id:
                         return frame
+            if (kept := self._held.get(frame_id)) is not None:
+                return kept
             newest = {camera: frames[-1].sequence for camera, frames in self._frames.items() if frames}
             runs = dict(self._runs)
             in_use = self._digest[:8]
@@ -347,7 +402,10 @@ def _number(value: object) -> float:
     """Return a finite float, refusing what only looks like one."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise TypeError(f"{type(value).__name__} where a number is expected")
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # an integer
+        raise ValueError("a number beyond any float where a finite one is expected") from None
     if not np.isfinite(number):
         raise ValueError(f"{number} where a finite number is expected")
     return number

@@ -18,12 +18,11 @@ from calib.geometry.rig import AxisJoint, Rig
 from calib.geometry.rigid import FloatArray
 from drivers.clock import Clock
 from drivers.errors import BadOptions
-from drivers.interfaces import AxisMotion, PanTilt, Reading, StatesMotion
+from drivers.interfaces import AxisMotion, PanTilt, Reading
 from mastctl.answers import SunTold
 from mastctl.control.standing import StandingFault
 from mastctl.devices.keep_out import Box, KeepOuts, KeptOut, Pair, Span
 from mastctl.devices.limits import SUN, Limits, SunDirection, sun_boxes
-from mastctl.devices.ways import Way, duration_s, plan
 
 log = logging.getLogger(__name__)
 
@@ -80,7 +79,7 @@ class KeepOutJudge:
         self.limits = limits
         self._clock = clock
         self._device = device
-        self._stated: Mapping[str, AxisMotion] = head.axis_motion() if isinstance(head, StatesMotion) else {}
+        self._stated: Mapping[str, AxisMotion] = head.info.motion
         still = AxisMotion(ASSUMED_RAD_PER_S2)
         pan, tilt = (self._stated.get(axis, still).beyond_goal_rad for axis in ("pan", "tilt"))
         self._beyond = pan, tilt
@@ -163,21 +162,20 @@ class KeepOutJudge:
         if keep_outs is not None:
             keep_outs.check_goal((pan_rad, tilt_rad))
 
-    def way(self, here: Pair, goal: Pair) -> Way:
-        """Return the moves that lead a head at rest to a goal.
+    def check_from(self, here: Pair, goal: Pair) -> None:
+        """Pass a goal to which a head that rests ``here`` may be sent.
 
         Raises
         ------
-        OutsideLimits, KeptOut
+        OutsideLimits
             If the goal may not be commanded.
-        NoWay
-            If nothing leads there.
+        KeptOut
+            If a keep-out holds the goal, or lies where the move may pass; it names the nearest free goal.
         """
         self.limits.check(*goal)
-        keep_outs, speed = self._now(), self.limits.speed_rad_per_s
-        if keep_outs is None:
-            return Way((goal,), duration_s(here, (goal,), speed))
-        return plan(keep_outs, here, goal, speed)
+        keep_outs = self._now()
+        if keep_outs is not None:
+            keep_outs.refuse_unless_free(Span.around(here), goal, True)
 
     def room(self, here: Pair) -> Span | None:
         """Return a wide free rectangle within the limits about a place; None for one that is kept out.
@@ -208,7 +206,7 @@ class KeepOutJudge:
         if keep_outs is None:
             return None
         start, rests = self._start(read())
-        keep_outs.check_move(start, goal, rests)
+        keep_outs.refuse_unless_free(start, goal, rests)
         return start
 
     def sent(self, start: Span | None, goal: Pair, speed_rad_per_s: float) -> None:

@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-from mastctl.errors import BadRequest, NotNow
+from mastctl.errors import BadRequest
 
 Pair = tuple[float, float]
 
@@ -22,29 +22,26 @@ ASIDE_RAD = 5e-3  # a move along one axis leaves the other where it was read: th
 
 
 class KeptOut(BadRequest):
-    """A goal, or every way to it that was asked for, lies in a keep-out.
+    """A goal, or the move to it, lies in a keep-out.
 
     Attributes
     ----------
     name
         Of the keep-out.
+    nearest
+        Of the goals that the head may be sent to, the one nearest to the refused goal: (pan, tilt), radians.
+        None if it was not searched for, or there is none.
     """
 
-    def __init__(self, name: str, message: str) -> None:
+    def __init__(self, name: str, message: str, nearest: Pair | None = None) -> None:
         self.name = name
+        self.nearest = nearest
         super().__init__("keep_out", message)
 
     @property
-    def detail(self) -> dict[str, str]:
+    def detail(self) -> dict[str, str | Pair | None]:
         """The same for programs."""
-        return {"keep_out": self.name}
-
-
-class NoWay(NotNow):
-    """From where the head stands the goal cannot be reached without passing a keep-out."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__("no_way", message)
+        return {"keep_out": self.name, "nearest_rad": self.nearest}
 
 
 @dataclass(frozen=True)
@@ -138,7 +135,7 @@ class KeepOuts:
     beyond_rad
         How far the head may pass a goal on purpose, in pan and in tilt.
     pan_rad, tilt_rad
-        The joint limits: ways out of a box end within them.
+        The joint limits: a path out of a box, and a nearest free goal, lie within them.
     """
 
     boxes: tuple[Box, ...]
@@ -227,6 +224,54 @@ class KeepOuts:
                     f"between {_told(_middle(start))} and {_told(goal)} the head may pass the {box.told()}"
                     f"{self._slack_told()}: each axis goes at its own pace",
                 )
+
+    def refuse_unless_free(self, start: Span, goal: Pair, rests: bool) -> None:
+        """Check a move as `check_move` does, and search for the nearest free goal where it is refused.
+
+        Raises
+        ------
+        KeptOut
+            With the nearest free goal in its message.
+        """
+        try:
+            self.check_move(start, goal, rests)
+        except KeptOut as refused:
+            nearest = self.nearest_free(start, goal, rests)
+            advice = "from there no goal is free"
+            if nearest is not None:
+                advice = f"the nearest goal that is free from there is {_told(nearest)}"
+            raise KeptOut(refused.name, f"{refused}; {advice}", nearest) from None
+
+    def nearest_free(self, start: Span, goal: Pair, rests: bool) -> Pair | None:
+        """Return the goal nearest to a refused one to which the head may go from a start; None if none.
+
+        What may be reached is bounded by edges of boxes, grown by the room that goals and moves keep. So each
+        coordinate of the nearest one lies on such an edge, or is the start's, the goal's or a limit's.
+        """
+        here = _middle(start)
+        out = self.way_out(here) if self.holding(start) else None
+        lines = []
+        for axis, limits in enumerate((self.pan_rad, self.tilt_rad)):
+            past = self.beyond_rad[axis]
+            edges = {here[axis], min(max(goal[axis], limits[0]), limits[1]), *limits}
+            edges |= {edge for full in self.full for edge in (full.pan_rad, full.tilt_rad)[axis]}
+            for near in self.near(start):
+                low, high = (near.pan_rad, near.tilt_rad)[axis]
+                edges |= {low - past, high + past}
+            if out is not None:
+                edges.add(out[axis])
+            lines.append([edge for edge in edges if limits[0] <= edge <= limits[1]])
+        places = ((pan, tilt) for pan in lines[0] for tilt in lines[1])
+        by_distance = sorted(places, key=lambda one: (math.dist(one, goal), one))
+        return next((one for one in by_distance if self._allows(start, one, rests)), None)
+
+    def _allows(self, start: Span, goal: Pair, rests: bool) -> bool:
+        """Whether `check_move` passes a move."""
+        try:
+            self.check_move(start, goal, rests)
+        except KeptOut:
+            return False
+        return True
 
     def way_out(self, here: Pair) -> Pair | None:
         """Return where the shortest way along one axis leaves the boxes that hold the head; None if none.

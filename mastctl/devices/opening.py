@@ -18,7 +18,7 @@ from types import SimpleNamespace
 from calib.files.mast_file import StoredRig
 from drivers.clock import Clock
 from drivers.hardware import Hardware, HardwareSettings, head_name, says_simulated
-from drivers.interfaces import Camera, PanTilt, Reading
+from drivers.interfaces import Camera, HeadInfo, PanTilt, Reading
 from drivers.open_hardware import open_hardware
 from drivers.open_hardware import open_one_camera as open_one_camera
 from drivers.serial_line import stable_name
@@ -149,7 +149,7 @@ def line_held(port: str) -> Iterator[None]:
         yield
 
 
-class GuardedHead:
+class GuardedHead(PanTilt):
     """A head whose every move is judged by the door before it goes out; safe as far as the driver is.
 
     Attributes
@@ -163,6 +163,11 @@ class GuardedHead:
         self.door = door
         self._moves = moves
         self._moving = threading.Lock()  # what was judged goes out before the next is judged
+
+    @property
+    def info(self) -> HeadInfo:
+        """As the driver."""
+        return self._head.info
 
     def read(self) -> Reading:
         """As the driver."""

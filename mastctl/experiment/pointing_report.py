@@ -22,6 +22,7 @@ from mastctl.report.pictures import Figure
 from mastctl.report.tables import Table, number, x_y
 
 PICTURES_PER_DISTANCE = 4
+LEAST_REACH_PX = 0.1  # of the scatter's axes
 CROP_PX, CROP_SCALE = 60, 4  # half the side of the piece of image shown around the aim, and how much larger
 
 CSV_COLUMNS = (
@@ -45,24 +46,30 @@ def write_pointing_report(experiment: PointingExperiment, folder: Path) -> Path:
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "targets.csv", CSV_COLUMNS, [_csv_row(record) for record in experiment.records])
-    targets = [
-        {"distance_m": r.distance_m, "target": r.index, "error": r.error, "operation": dict(r.operation)}
-        for r in experiment.records
-    ]
-    record = experiment.as_json() | {"status": dict(experiment.status), "targets": targets}
+    targets, on_rocks = (
+        [
+            {"distance_m": r.distance_m, "target": r.index, "error": r.error, "operation": dict(r.operation)}
+            for r in records
+        ]
+        for records in (experiment.records, experiment.on_rocks)
+    )
+    record = experiment.as_json() | {
+        "status": dict(experiment.status), "targets": targets, "on_rocks": on_rocks,
+    }  # fmt: skip
     write_json(folder / "record.json", record)
     page = folder / "report.html"
-    page.write_text(_page(experiment), encoding="utf-8")
+    page.write_text(_page(experiment), encoding="utf-8", errors="backslashreplace")
     return page
 
 
 def pointing_table(summaries: Sequence[DistanceSummary]) -> Table:
     """Return the table beside the paper's Table VI; true residuals where they are known."""
     with_truth = any(row.true_first_rms_px is not None for row in summaries)
-    headings = ["distance", "targets", "failed", "first x, y", "second x, y"]
+    measured = "simulated " if with_truth else ""
+    headings = ["distance", "targets", "failed", f"{measured}first x, y", f"{measured}second x, y"]
     if with_truth:
-        headings += ["true first x, y", "true second x, y"]
-    headings += ["paper first x, y", "paper second x, y", "s per target"]
+        headings += ["simulated truth first x, y", "simulated truth second x, y"]
+    headings += ["paper's rover first x, y", "paper's rover second x, y", "s per target"]
     rows = []
     for row in summaries:
         values = [row.first_rms_px, row.second_rms_px]
@@ -112,6 +119,7 @@ def _page(experiment: PointingExperiment) -> str:
         failures=Table(("distance", "target", "reason"), failures),
         landed=landed,
         scatter=_scatter(experiment) if landed and plots.installed() else None,
+        on_rocks=[(r.error, _pictures(experiment, r)) for r in experiment.on_rocks],
         views=_views(experiment),
         targets=_targets(experiment.records),
     )
@@ -120,8 +128,9 @@ def _page(experiment: PointingExperiment) -> str:
 def _targets(records: Sequence[TargetRecord]) -> Table:
     """Every target for people."""
     headings = (
-        "distance", "target", "range m", "clicked x, y", "first x, y ± sigma", "second x, y ± sigma", "s", "",
+        "distance", "target", "range m", "clicked x, y", "first x, y ± sigma", "second x, y ± sigma", "s",
     )  # fmt: skip
+    failed = any(record.error for record in records)
     rows = []
     for record in records:
         landings = [
@@ -130,14 +139,15 @@ def _targets(records: Sequence[TargetRecord]) -> Table:
         ]
         start = [f"{record.distance_m:g} m", str(record.index), number(record.range_m)]
         clicked = "" if math.isnan(record.clicked_px[0]) else x_y(record.clicked_px, 0)
-        rows.append([*start, clicked, *[*landings, "", ""][:2], f"{record.seconds:.1f}", record.error])
-    return Table(headings, rows)
+        cells = [*start, clicked, *[*landings, "", ""][:2], f"{record.seconds:.1f}"]
+        rows.append([*cells, record.error] if failed else cells)
+    return Table((*headings, "reason") if failed else headings, rows)
 
 
 def _scatter(experiment: PointingExperiment) -> Figure:
     """Residuals over x and y, one plot a distance, on one scale."""
     landings = [landing for record in experiment.records for landing in record.landings]
-    reach = max(1.0, 1.1 * max(max(abs(v) for v in landing.residual_px) for landing in landings))
+    reach = max(LEAST_REACH_PX, 1.1 * max(max(abs(v) for v in landing.residual_px) for landing in landings))
     count = len(experiment.summaries)
     figure = plots.new(4.2 * count, 4.4)
     for axis, summary in zip(figure.subplots(1, count, squeeze=False)[0], experiment.summaries, strict=True):
@@ -180,7 +190,9 @@ def _pictures(experiment: PointingExperiment, record: TargetRecord) -> list[Figu
     cv2.circle(view, clicked, 22, pictures.ORANGE_BGR, 3, cv2.LINE_AA)
     cv2.circle(view, clicked, 3, pictures.ORANGE_BGR, -1, cv2.LINE_AA)
     small = cv2.resize(view, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    caption = f"target {record.index}: clicked in {record.frame_id}"
+    caption = f"{record.range_m:.1f} m away, clicked in {record.camera}"
+    if record not in experiment.on_rocks:
+        caption = f"target {record.index}: {caption}"
     chosen = pictures.enlarged(record.clicked_image, record.clicked_px, CROP_PX, CROP_SCALE)
     shown = [
         pictures.photo(small, "the target chosen", caption),

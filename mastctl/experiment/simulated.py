@@ -97,7 +97,7 @@ def head_note(rover: SimulatedRover, rig: Rig, camera: str) -> str:
 
 
 class SimulationTruth:
-    """Where a clicked point really is in a later frame (`experiment.pointing.Truth`)."""
+    """Where a clicked point really is in a later frame (`mastctl.experiment.pointing.ClickTruth`)."""
 
     def __init__(self, rover: SimulatedRover) -> None:
         self._rover = rover

@@ -16,7 +16,7 @@ from calib.errors import NoStereoPoint, Unreachable
 from calib.geometry import pointing
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
-from calib.geometry.rigid import FloatArray
+from calib.geometry.rigid import FloatArray, rot_z
 from calib.geometry.solutions import Solution, choose
 from calib.geometry.stereo import triangulate
 from calib.matching.partner import find_partner
@@ -78,21 +78,32 @@ def choose_target(
     rows, columns = np.nonzero(likely if likely.any() else candidates)
     if len(rows) == 0:
         return None
-    images = grey(left.image), grey(right.image)
     for pick in rng.integers(len(rows), size=TRIES_PER_VIEW):
         pixel = np.array([columns[pick], rows[pick]], dtype=np.float64)
-        found = find_partner(images[0], left_in_rover, pixel, images[1], right_in_rover)
-        if found.match.verdict != "good":
-            continue
-        try:
-            point = triangulate(left_in_rover, right_in_rover, pixel, found.match.pixel_px).position_m
-        except NoStereoPoint:
-            continue
-        range_m = float(np.linalg.norm(point - left_in_rover.C))
-        if abs(range_m - distance_m) <= RANGE_SLACK * distance_m:
-            partner = (float(found.match.pixel_px[0]), float(found.match.pixel_px[1]))
-            return Target(left, float(pixel[0]), float(pixel[1]), range_m, right, partner)
+        target = target_at(left, right, left_in_rover, right_in_rover, pixel)
+        if target is not None and abs(target.range_m - distance_m) <= RANGE_SLACK * distance_m:
+            return target
     return None
+
+
+def target_at(
+    left: Snapshot,
+    right: Snapshot,
+    left_in_rover: CameraModel,
+    right_in_rover: CameraModel,
+    pixel: FloatArray,
+) -> Target | None:
+    """Return the target at a pixel (2,) of the left picture; None where the right one has no good match."""
+    found = find_partner(grey(left.image), left_in_rover, pixel, grey(right.image), right_in_rover)
+    if found.match.verdict != "good":
+        return None
+    try:
+        point_m = triangulate(left_in_rover, right_in_rover, pixel, found.match.pixel_px).position_m
+    except NoStereoPoint:
+        return None
+    partner = (float(found.match.pixel_px[0]), float(found.match.pixel_px[1]))
+    range_m = float(np.linalg.norm(point_m - left_in_rover.C))
+    return Target(left, float(pixel[0]), float(pixel[1]), range_m, right, partner)
 
 
 def on_level_ground(camera_in_rover: CameraModel, distance_m: float) -> NDArray[np.bool_]:
@@ -127,6 +138,8 @@ def texture_mask(image: Image) -> NDArray[np.bool_]:
     return np.asarray(mask, dtype=np.bool_)
 
 
+BESIDE_RAD = 0.2  # a rock that is shown lies so far to one side before the head turns to it
+ROCK_SLACK = 0.3  # a rock is shown for "10 m" within this share of the distance
 # A view that offers no usable target is left for another; after this many in a row the distance is given up.
 VIEWS_PER_TARGET = 12
 OPERATION_TIMEOUT_S = 60.0
@@ -166,6 +179,52 @@ class TargetViews:
             return None
         models = tuple(self._rig.camera_in_rover(shot.camera, *shot.true_rad) for shot in pair)
         return choose_target(*pair, models[0], models[1], distance_m, self._rng)
+
+    def rocks_near(self, distance_m: float, rocks_m: FloatArray) -> FloatArray:
+        """Return those of some balls (n, 4), as for `find_target_on`, that are ahead and near the distance.
+
+        What looks largest from the head comes first.
+        """
+        away_m = rocks_m[:, :3] - self._rig.mast.rover_from_head(0.0, 0.0).translation_m
+        ranges_m = np.linalg.norm(away_m, axis=-1)
+        near = np.abs(ranges_m - distance_m) <= ROCK_SLACK * distance_m
+        near &= np.abs(np.arctan2(away_m[:, 1], away_m[:, 0])) <= self._pan_range_rad
+        order = np.argsort(-rocks_m[:, 3] / ranges_m, kind="stable")
+        return np.asarray(rocks_m[order[near[order]]])
+
+    def find_target_on(self, rock_m: FloatArray) -> Target | None:
+        """Turn so that a rock is to one side of the image and choose a textured pixel on it.
+
+        Parameters
+        ----------
+        rock_m
+            Middle and radius (4,) of a ball around the rock, rover frame, metres.
+
+        Raises
+        ------
+        ClientError
+            If the daemon does not turn the head or gives no pictures.
+        """
+        middle_m, radius_m = rock_m[:3], rock_m[3]
+        pair = self.look_at(rot_z(BESIDE_RAD) @ middle_m)
+        if pair is None:
+            return None
+        left, right = (self._rig.camera_in_rover(shot.camera, *shot.true_rad) for shot in pair)
+        (middle_px, top_px), seen = left.project([middle_m, middle_m - [0.0, 0.0, radius_m]])
+        if not np.all(seen):
+            return None
+        rows, columns = np.nonzero(texture_mask(pair[0].image))
+        pixels = np.stack([columns, rows], axis=-1)
+        off_px = np.linalg.norm(pixels - middle_px, axis=-1)
+        on_it = np.argsort(off_px)[: np.count_nonzero(off_px <= np.linalg.norm(top_px - middle_px) / 2)]
+        for pixel in pixels[on_it[:: max(1, len(on_it) // TRIES_PER_VIEW)]].astype(np.float64):
+            target = target_at(*pair, left, right, pixel)
+            if target is None:
+                continue
+            point_m = triangulate(left, right, pixel, target.right_px).position_m
+            if np.linalg.norm(point_m - middle_m) <= radius_m:
+                return target
+        return None
 
     def look_at(self, point_m: FloatArray) -> tuple[Snapshot, Snapshot] | None:
         """Turn to a point (3,) of the rover frame and take both pictures; None outside the head's limits.
@@ -215,12 +274,12 @@ def pointed(client: Client, **request: Any) -> OperationTold:
         If it refuses; ``timeout``, if it has not ended in time. It is stopped then, so that the next one can
         begin.
     """
+    operation = client.point(**request)
     try:
-        return client.wait(client.point(**request), timeout_s=OPERATION_TIMEOUT_S)
+        return client.wait(operation, timeout_s=OPERATION_TIMEOUT_S)
     except ClientError as error:
         if error.code == "timeout":
-            with suppress(ClientError):  # what took too long is told, not what the stop met
-                stopped = client.stop()["operation"]
-                if stopped is not None:
-                    client.wait(stopped, timeout_s=STOP_TIMEOUT_S)
+            with suppress(ClientError):  # what took too long is reported, not what the stop met
+                client.stop_operation(operation)
+                client.wait(operation, timeout_s=STOP_TIMEOUT_S)
         raise

@@ -77,13 +77,10 @@ class WayIn:
     lend
         Makes a token for a program, that holds until the second of what it returns is called; None where
         nobody needs one.
-    certificate
-        The daemon's own, where it speaks TLS.
     """
 
     url: str
     lend: Callable[[str], tuple[str, Callable[[], None]]] | None = None
-    certificate: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -314,8 +311,6 @@ class Guide:
         environment = {"MASTCTL_LEASE": lease.id}
         if text is not None:
             environment["MASTCTL_TOKEN"] = text
-        if door.certificate is not None:
-            environment["MASTCTL_CERTIFICATE"] = str(door.certificate)
         try:
             work.child = GuidedProgram(
                 self._command(folder, asked, door, masts / asked["mast_file"]),

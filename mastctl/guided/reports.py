@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from calib.errors import BadFile
-from calib.files import read_bytes
+from calib.files import is_plain_file, read_bytes
 from mastctl.answers import ReportListed
 from mastctl.errors import NotKnown
 from mastctl.guided.runs import Runs
@@ -89,7 +89,7 @@ def _entries(folder: Path) -> list[Path]:
 
 def _is_own(path: Path) -> bool:
     """Whether it is a file where it seems to be, and no link to elsewhere."""
-    return path.is_file() and not path.is_symlink()
+    return is_plain_file(path) and not path.is_symlink()
 
 
 def _report(name: str, path: Path) -> Report | None:

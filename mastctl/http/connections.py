@@ -119,7 +119,6 @@ class Connection(H11Protocol):
         self.logger = log  # what strangers send is no warning
         self.waits_since_s = 0.0
         self._stalled_since_s: float | None = None
-        self._early = b""
         self._unread = b""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -127,18 +126,9 @@ class Connection(H11Protocol):
         self.waits_since_s = self.loop.time()
         if not room_for(self, self.connections, self.most):
             self.app = cast(Any, _Crowded(cast(ASGIApp, self.app)))
-        if self._early:
-            early, self._early = self._early, b""
-            self.data_received(early)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        if self._made:
-            super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        if not self._made:  # a TLS client that asks in the same breath as it ends its handshake
-            self._early += data
-        elif self._unread:
+        if self._unread:
             self._unread += data
             if len(self._unread) > MOST_UNREAD_BYTES:
                 self.transport.pause_reading()
@@ -189,10 +179,6 @@ class Connection(H11Protocol):
         crowded = isinstance(self.app, _Crowded)
         listens = self.scope["path"] in SOCKETS and self.scope["method"] == "GET"
         return listens and not crowded and super()._should_upgrade()
-
-    @property
-    def _made(self) -> bool:
-        return cast(Any, self.transport) is not None
 
     def on_response_complete(self) -> None:
         self.waits_since_s = self.loop.time()
@@ -247,7 +233,7 @@ def _doubt(data: bytes) -> str:
 
 
 async def sweep(connections: Iterable[Any], stands: Callable[[str], bool] = lambda credential: True) -> None:
-    """Leave overdue connections, and readers whose token or session has ended, until cancelled."""
+    """Leave overdue connections, and readers whose token has ended, until cancelled."""
     while True:
         await asyncio.sleep(SWEEP_S)
         now_s = asyncio.get_running_loop().time()

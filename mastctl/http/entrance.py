@@ -1,4 +1,4 @@
-"""Who comes in, and whose page asks: a caller by token, by a page's session, or by the way it came.
+"""Who comes in, and whose page asks: a caller by its token, in a header or a cookie, or by its connection.
 
 Every web page that a browser has open can send requests to whatever the browser's machine reaches. A foreign
 name in Host means that a name of somebody else's resolves to this daemon (DNS rebinding). A foreign Origin or
@@ -15,14 +15,14 @@ from urllib.parse import urlsplit
 
 from mastctl.config import is_loopback
 from mastctl.control.caller import NETWORK, Caller, told_name
-from mastctl.errors import NotLetIn, TooMany
-from mastctl.http.access import Access, neighbourhood
+from mastctl.errors import NotLetIn
+from mastctl.http.access import Access
 from mastctl.http.refusals import GuardError
-from mastctl.http.tokens import Token, digest_of
+from mastctl.http.tokens import Token
 
 
 @dataclass(frozen=True)
-class Names:
+class HostNames:
     """The names that a daemon answers to.
 
     Attributes
@@ -31,13 +31,10 @@ class Names:
         Beside the loopback ones, in lower case.
     any_address
         Whether any IP address will do as one: what no name server can point elsewhere.
-    secure
-        Whether it speaks TLS itself.
     """
 
     hosts: frozenset[str] = frozenset()
     any_address: bool = False
-    secure: bool = False
 
     def check_host(self, headers: Mapping[str, str]) -> None:
         """Pass a request for one of these names. Raises GuardError ``foreign_host``."""
@@ -61,9 +58,8 @@ class Names:
             parts = urlsplit(origin)
         except ValueError:
             parts = urlsplit("")
-        schemes = ("https",) if self.secure else ("http", "https")  # https: by a proxy of this machine
         host = headers.get("host", "").lower()
-        if not host or parts.netloc.lower() != host or parts.scheme not in schemes:
+        if not host or parts.netloc.lower() != host or parts.scheme not in SCHEMES:
             words = f"Origin is '{_shown(origin)}', which is not this service"
             raise GuardError(403, "foreign_origin", words)
 
@@ -103,19 +99,20 @@ def _shown(text: str) -> str:
 
 
 SCHEME = "bearer "
-MOST_REQUESTS_PER_S = 1000
+SCHEMES = ("http", "https")
+"""Of a page of the daemon's own; https by a reverse proxy."""
 
 
 @dataclass(frozen=True)
-class Credentials:
-    """What a request shows: a token, a session's secret, or nothing."""
+class Shown:
+    """The token that a request shows, and whether it came as the page's cookie."""
 
     token: str | None
-    session: str | None
+    cookie: bool = False
 
 
 @dataclass
-class Entrance:
+class EntryRules:
     """What a daemon asks of who comes in.
 
     Attributes
@@ -129,93 +126,69 @@ class Entrance:
         That way: ``loopback`` or ``unix``.
     """
 
-    names: Names = field(default_factory=Names)
+    names: HostNames = field(default_factory=HostNames)
     access: Access | None = None
     via: str = "loopback"
 
     def caller(self, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
-        """Return who asks.
+        """Return the caller of a request.
 
         Raises
         ------
-        NotLetIn, TooMany
-            ``no_token``, ``wrong_token``, ``too_many_guesses``.
+        NotLetIn
+            ``no_token``, ``wrong_token``.
         GuardError
-            ``foreign_origin`` for a page's session without an Origin where something is changed.
+            ``foreign_origin`` for a page's cookie without an Origin where something is changed.
         """
         if self.access is None:
+            if by := forwarded(headers):
+                words = (
+                    f"{by.title()} says that the request came through a proxy, and this daemon has no tokens"
+                )
+                raise NotLetIn("no_token", f"{words}: set listen.hosts, so that clients need one")
             name = told_name(headers.get("mastctl-client"))
             return Caller(name, "admin", self.via, address_of(scope))
-        shown = credentials(scope, headers)
-        token = self._token(shown, address_of(scope))
-        if shown.token is None and changes(scope) and "origin" not in headers:
-            raise GuardError(403, "foreign_origin", "a page's session says its Origin")
-        return _named(token, shown, scope, headers)
+        shown = shown_token(scope, headers)
+        if shown.token is None:
+            raise NotLetIn("no_token", "a token is expected: Authorization: Bearer TOKEN, or a cookie")
+        token = self.access.token_of(shown.token)
+        if shown.cookie and changes(scope) and "origin" not in headers:
+            raise GuardError(403, "foreign_origin", "a request with the page's cookie carries its Origin")
+        return _named(token, scope, headers)
 
     def stopper(self, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
-        """Return who asks for a stop: anybody may. Nothing is counted and nothing is logged on this way."""
+        """Return who asks for a stop or for health: anybody may. Nothing is counted and nothing is logged."""
         if self.access is None:
-            return self.caller(scope, headers)
-        shown = credentials(scope, headers)
-        held = None if shown.session is None else self.access.session_of(shown.session)
-        token = self.access.known(shown.token) if shown.token is not None else held[0] if held else None
-        return self.stranger(scope, headers) if token is None else _named(token, shown, scope, headers)
+            return self.stranger(scope, headers) if forwarded(headers) else self.caller(scope, headers)
+        shown = shown_token(scope, headers)
+        token = None if shown.token is None else self.access.known(shown.token)
+        return self.stranger(scope, headers) if token is None else _named(token, scope, headers)
 
     def stranger(self, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
         """Return who asks without a token what needs none, or is refused before it is known."""
         return Caller(told_name(headers.get("mastctl-client")), "view", NETWORK, address_of(scope))
 
-    def _token(self, shown: Credentials, address: str) -> Token:
-        assert self.access is not None
-        if shown.token is not None:
-            return self.access.token_of(shown.token, address)
-        if shown.session is not None:
-            held = self.access.session_of(shown.session)
-            if held is not None:
-                return held[0]
-            raise NotLetIn("no_token", "the session has ended; log in again")
-        raise NotLetIn("no_token", "a token is expected: Authorization: Bearer TOKEN, or POST /api/v1/login")
 
-
-def _named(token: Token, shown: Credentials, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
+def _named(token: Token, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
     """Who shows a token: its name, which is proven, and what the program calls itself, which is not."""
     told = headers.get("mastctl-client")
     name = f"{token.name}/{told_name(told)}" if told else token.name
-    credential = token.sha256 if shown.token is not None else digest_of(shown.session or "")
-    return Caller(name, token.role, "token", address_of(scope), credential)
+    return Caller(name, token.role, "token", address_of(scope), token.sha256)
 
 
-class Rate:
-    """How many requests each address sends in a second; used on one thread."""
-
-    def __init__(self) -> None:
-        self._second = -1
-        self._counts: dict[str, int] = {}
-
-    def count(self, scope: Mapping[str, Any], now_s: float) -> None:
-        """Count a request. Raises TooMany ``too_many_requests``."""
-        if int(now_s) != self._second:
-            self._second = int(now_s)
-            self._counts.clear()
-        address = neighbourhood(address_of(scope))
-        counted = self._counts[address] = self._counts.get(address, 0) + 1
-        if counted > MOST_REQUESTS_PER_S:
-            words = f"more than {MOST_REQUESTS_PER_S} requests a second; ask more slowly"
-            raise TooMany("too_many_requests", words, 1.0)
-
-
-def credentials(scope: Mapping[str, Any], headers: Mapping[str, str]) -> Credentials:
-    """Return what a request shows; a token goes before a session."""
-    told = headers.get("authorization", "")
-    token = told[len(SCHEME) :].strip() if told[: len(SCHEME)].lower() == SCHEME else None
+def shown_token(scope: Mapping[str, Any], headers: Mapping[str, str]) -> Shown:
+    """Return the token that a request shows; one in a header goes before the page's cookie."""
+    header = headers.get("authorization", "")
+    if header[: len(SCHEME)].lower() == SCHEME:
+        return Shown(header[len(SCHEME) :].strip())
     name = cookie_name(scope)
     parts = [part.strip().partition("=") for part in headers.get("cookie", "").split(";")]
-    secrets = [value for key, _, value in parts if key == name]
-    return Credentials(token, secrets[0] if len(secrets) == 1 else None)
+    tokens = [value for key, _, value in parts if key == name]
+    return Shown(tokens[0], cookie=True) if tokens else Shown(None)
 
 
 def cookie_name(scope: Mapping[str, Any]) -> str:
-    """Return the cookie of a page's session: one for each port, as browsers do not tell ports apart."""
+    """Return the page's cookie: one for each port, as browsers share cookies between ports."""
     server = scope.get("server")
     port = server[1] if server else None
     return f"mastctl-{port}" if port else "mastctl"
@@ -225,6 +198,26 @@ def address_of(scope: Mapping[str, Any]) -> str:
     """Return the address that a request came from; what headers say of it is not asked."""
     client = scope.get("client")
     return str(client[0]) if client else "a socket of this machine"
+
+
+def from_this_machine(scope: Mapping[str, Any], headers: Mapping[str, str]) -> bool:
+    """Return whether a request came from this machine and by no proxy that says otherwise."""
+    client, server = scope.get("client"), scope.get("server")
+    if forwarded(headers):
+        return False
+    return not client or is_loopback(str(client[0])) or bool(server and client[0] == server[0])
+
+
+def forwarded(headers: Mapping[str, str]) -> str:
+    """Return by which header a proxy says that a request came from elsewhere; empty if by none.
+
+    What it says is not asked: its client may have written it.
+    """
+    return next((name for name in headers if name in FORWARDED or name.startswith("x-forwarded-")), "")
+
+
+FORWARDED = ("forwarded", "via", "x-real-ip", "x-client-ip", "true-client-ip", "cf-connecting-ip")
+"""Headers by which a proxy says that a request came from elsewhere, beside all of ``X-Forwarded-...``."""
 
 
 def changes(scope: Mapping[str, Any]) -> bool:

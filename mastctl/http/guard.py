@@ -1,4 +1,4 @@
-"""What stands before the API: whose page asks, who comes in, how much it sends, and whether that is JSON.
+"""Checks before the API: the page's origin, the caller, how much is sent, and whether that is JSON.
 
 A stop passes nearly all of it: only another site's page is refused one. It is not refused for a slash too
 many in its address, nor for naming its host in front as a client of a proxy does. Everything else has one
@@ -22,8 +22,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from mastctl.control.caller import Caller
 from mastctl.errors import MastctlError, one_line
 from mastctl.http import PREFIX
-from mastctl.http.access import neighbourhood
-from mastctl.http.entrance import Entrance, Rate, changes, check_site
+from mastctl.http.entrance import EntryRules, changes, check_site
 from mastctl.http.refusals import GuardError, error_response, marked, told
 
 log = logging.getLogger(__name__)
@@ -39,7 +38,10 @@ STOP_LINE = re.compile(f"POST {_WRITTEN}[ ?]".encode())
 
 UNREAD = frozenset({f"{PREFIX}/stop", TRACK_STOP})
 """Where no body is read; an emergency stop reads what it can of its own."""
-LOGIN, LOGOUT = f"{PREFIX}/login", f"{PREFIX}/logout"
+SESSION = f"{PREFIX}/session"
+"""Where a page keeps its token in a cookie; open to each role."""
+HEALTH = frozenset({f"{PREFIX}/health/live", f"{PREFIX}/health/ready"})
+"""What a monitor asks that has no token."""
 PAGES = frozenset({"/", "/docs"})
 SITE = "/docs/"
 FILES = ("/page/", SITE)
@@ -47,7 +49,7 @@ FILES = ("/page/", SITE)
 LARGEST_HEADERS_BYTES = 16384
 MOST_HEADERS = 100
 
-ATTACKS = frozenset({"wrong_token", "too_many_guesses", "foreign_host", "foreign_origin"})
+ATTACKS = frozenset({"wrong_token", "foreign_host", "foreign_origin"})
 """Refusals that are recorded of reading too; of what changes something each one is."""
 RECORDED = 100  # refusals of one party in COUNTED_S; then each RARELY-th
 RARELY = 1000
@@ -86,11 +88,10 @@ class Guard:
     """
 
     def __init__(
-        self, app: ASGIApp, entrance: Entrance | None = None, records: Records | None = None
+        self, app: ASGIApp, entrance: EntryRules | None = None, records: Records | None = None
     ) -> None:
         self._app = app
-        self._entrance = entrance or Entrance()
-        self._rate = Rate()
+        self._entrance = entrance or EntryRules()
         self._records = records
         self._minute = -1
         self._refused: dict[tuple[str, str], int] = {}  # of this minute, by token and address
@@ -166,8 +167,6 @@ class Guard:
     def _let_in(self, scope: Scope, headers: Mapping[str, str], twice: set[str]) -> None:
         """Pass a request, or say why not."""
         entrance, path = self._entrance, scope["path"]
-        if entrance.access is not None:
-            self._rate.count(scope, asyncio.get_running_loop().time())
         _check_size(scope)
         _check_shape(headers, twice)
         entrance.names.check_host(headers)
@@ -175,13 +174,15 @@ class Guard:
             entrance.names.check_origin(headers)
         check_site(headers, page=(path in PAGES or path.startswith(SITE)) and not changes(scope))
         _check_no_secret(scope)
-        if path == LOGIN or path in PAGES or path.startswith(FILES):
+        if path in PAGES or path.startswith(FILES):
             _hand_on(scope, entrance.stranger(scope, headers))
+        elif path in HEALTH and not changes(scope):
+            _hand_on(scope, entrance.stopper(scope, headers))
         else:
             caller = entrance.caller(scope, headers)
             _hand_on(scope, caller)
             # The entry asks each command's role. A body, and a jog's heartbeat, are heard before the entry.
-            if changes(scope) and path != LOGOUT and not caller.may("operate"):
+            if changes(scope) and path != SESSION and not caller.may("operate"):
                 words = f"{caller.name} may {caller.role}; {scope['method']} {path[:80]} needs operate"
                 raise GuardError(403, "role", words)
 
@@ -199,7 +200,7 @@ class Guard:
         if minute != self._minute or len(self._refused) > MOST_PARTIES:
             self._minute, self._refused = minute, {}
         token = caller.name.partition("/")[0] if caller.credential else ""  # one, in all of its sessions
-        party = token, neighbourhood(caller.address)
+        party = token, caller.address
         times = self._refused[party] = self._refused.get(party, 0) + 1
         if times <= RECORDED or times % RARELY == 0:
             what = one_line(f"{scope.get('method', 'GET')} {scope['path']}", 100)
@@ -261,7 +262,7 @@ def _check_no_secret(scope: Scope) -> None:
 
 def _check_origin_said(headers: Mapping[str, str]) -> None:
     if "origin" not in headers:
-        raise GuardError(403, "foreign_origin", "a page's session says its Origin with a WebSocket")
+        raise GuardError(403, "foreign_origin", "a WebSocket with the page's cookie carries its Origin")
 
 
 async def _refuse_websocket(refused: Exception, scope: Scope, receive: Receive, send: Send) -> None:

@@ -18,6 +18,7 @@ from starlette.exceptions import HTTPException
 from calib.errors import CalibError
 from calib.files.yaml_text import nearest
 from drivers.errors import BadOptions, DriverError, NoFreshFrame, NoReply
+from mastctl.as_json import as_json
 from mastctl.errors import (
     BadRequest,
     MastctlError,
@@ -26,7 +27,6 @@ from mastctl.errors import (
     NotKnown,
     NotLetIn,
     NotNow,
-    TooMany,
     Unable,
     error_body,
 )
@@ -65,13 +65,24 @@ class GuardError(Exception):
         super().__init__(message)
 
 
+class JsonAnswer(JSONResponse):
+    """JSON; what it has no place for (no finite number, a name that is no UTF-8) as `as_json` has it."""
+
+    def render(self, content: Any) -> bytes:
+        """Return the bytes of an answer."""
+        try:
+            return super().render(content)
+        except ValueError:
+            return super().render(as_json(content))
+
+
 def error_response(
     status: int, code: str, message: str, detail: Any = None, headers: Mapping[str, str] | None = None
 ) -> JSONResponse:
     """Return an error in the one form of docs/reference/http.md."""
     body = {"error": {"code": code, "message": message, "detail": detail}}
     told = {**HEADERS, "content-security-policy": NO_PAGE, **(headers or {})}
-    return JSONResponse(body, status_code=status, headers=told)
+    return JsonAnswer(body, status_code=status, headers=told)
 
 
 @asynccontextmanager
@@ -184,7 +195,6 @@ STATUS_OF_KIND: Mapping[type[Exception], int] = {
     BadRequest: 422,
     NotLetIn: 401,
     NotAllowed: 403,
-    TooMany: 429,
     NotKnown: 404,
     NoLonger: 410,
     NotNow: 409,

@@ -57,7 +57,7 @@ class Socket(WebSocketsSansIOProtocol):
     def end_reading(self, stands: Callable[[str], bool]) -> None:
         """Close it if its credential lets in no more."""
         if self.handshake_complete and not let_in(self.scope, stands):
-            self._end(BROKEN_RULES, "the token or the session that opened this has ended")
+            self._end(BROKEN_RULES, "the token that opened this has ended")
 
     def shutdown(self) -> None:
         """As uvicorn asks of all when the daemon ends: who tells here ends too, and says goodbye first."""

@@ -181,11 +181,14 @@ async def _in_thread(function: Callable[[], T]) -> T:
             answer.set_result(result)  # type: ignore[arg-type]
 
     def run() -> None:
-        result, error = None, None
+        result: T | None = None
+        error: Exception | None = None
         try:
             result = function()
-        except Exception as raised:  # it belongs to who waits
-            error = raised
+        except BaseException as raised:  # it belongs to the request that waits, which nothing else would end
+            error = RuntimeError(f"{type(raised).__name__}: {raised}")
+            if isinstance(raised, Exception) and not isinstance(raised, StopIteration):
+                error = raised
         with contextlib.suppress(RuntimeError):  # the loop has ended already
             loop.call_soon_threadsafe(tell, result, error)
 

@@ -8,12 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import Protocol, TypeVar
 
-from calib.geometry.solutions import Solution, order, ordered
+from calib.geometry.solutions import Solution, ordered
 from drivers.clock import Clock
 from mastctl.devices.joint_history import HeadReading, RestWatch
-from mastctl.devices.keep_out import KeptOut, NoWay, Pair
+from mastctl.devices.keep_out import KeptOut, Pair
 from mastctl.devices.limits import Limits
-from mastctl.devices.ways import Way
 from mastctl.motion.results import PointingError
 from mastctl.motion.settings import PointingSettings
 
@@ -31,10 +30,10 @@ class SteeredHeadLike(Protocol):
     def reading_sigma_rad(self) -> Pair: ...
     @property
     def counts_rad(self) -> Mapping[str, float]: ...
-    def goal(self, true_rad: Pair, here: HeadReading, corners: Sequence[Pair] = ()) -> Pair: ...
+    def goal(self, true_rad: Pair, here: HeadReading) -> Pair: ...
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None: ...
     def stop(self) -> None: ...
-    def way(self, here: Pair, goal: Pair) -> Way: ...
+    def check_from(self, here: Pair, goal: Pair) -> None: ...
 
 
 class SteeredHead:
@@ -96,18 +95,18 @@ class SteeredHead:
             + settings.margin_s
         )
 
-    def way(self, pan_rad: float, tilt_rad: float) -> tuple[Pair, ...]:
-        """Return where to send the head, one after the other, so that it comes to these angles.
+    def check_goal(self, pan_rad: float, tilt_rad: float) -> None:
+        """Pass angles to which the head may be sent from where it rests.
 
         Raises
         ------
-        OutsideLimits, KeptOut, NoWay
-            If they may not be commanded, or keep-outs lie around.
+        OutsideLimits, KeptOut
+            If they may not be commanded, or the move may pass a keep-out.
         PointingError, DriverError
             As for a reading.
         """
         here = self.read()
-        return self._head.way((here.pan_rad, here.tilt_rad), (pan_rad, tilt_rad)).goals
+        self._head.check_from((here.pan_rad, here.tilt_rad), (pan_rad, tilt_rad))
 
     def chosen(self, solutions: Sequence[Solution], here: HeadReading) -> Solution:
         """Return the one of several true joint angles that is taken from ``here``; raises as `reached`."""
@@ -115,11 +114,11 @@ class SteeredHead:
         def read(one: Solution) -> Pair:
             return self.goal((one.pan_rad, one.tilt_rad), here)
 
-        return reached(solutions, self._limits, self._head.way, (here.pan_rad, here.tilt_rad), read)
+        return reached(solutions, self._limits, self._head.check_from, (here.pan_rad, here.tilt_rad), read)
 
-    def goal(self, true_rad: Pair, here: HeadReading, corners: Sequence[Pair] = ()) -> Pair:
+    def goal(self, true_rad: Pair, here: HeadReading) -> Pair:
         """Return the readings to send the head to, so that it comes to true angles."""
-        return self._head.goal(true_rad, here, corners)
+        return self._head.goal(true_rad, here)
 
     def send(self, pan_rad: float, tilt_rad: float) -> None:
         """Start the move at the speed cap. Raises OutsideLimits, Stopped, DriverError."""
@@ -227,11 +226,11 @@ def _outside(value: float, one: float, other: float) -> float:
 def reached(
     solutions: Sequence[Solution],
     limits: Limits,
-    way: Callable[[Pair, Pair], Way],
+    check_from: Callable[[Pair, Pair], None],
     here: Pair,
     read: Callable[[Solution], Pair],
 ) -> Solution:
-    """Return the solution to take: upright ones first, then the one that is reached soonest.
+    """Return the solution to take, of those that no keep-out bars: upright ones first, then the nearest.
 
     Parameters
     ----------
@@ -239,8 +238,8 @@ def reached(
         Of the closed form; at least one.
     limits
         Of the joints: an angle is taken whole turns away too, where a cable lets the pan turn so far.
-    way
-        Plans the moves from one pose to another, in readings.
+    check_from
+        Raises KeptOut where a move from one pose to another, in readings, may not be sent.
     here
         Where the head rests, as read.
     read
@@ -250,22 +249,19 @@ def reached(
     ------
     Unreachable
         If none lies within the limits.
-    KeptOut, NoWay
-        If keep-outs stand against all that do; of the one that would have been taken.
+    KeptOut
+        If keep-outs bar all that do; of the one that would have been taken.
     """
-    found: list[tuple[bool, float, Solution]] = []
-    refused: KeptOut | NoWay | None = None
+    refused: KeptOut | None = None
     for one in ordered(solutions, limits.pan_rad, limits.tilt_rad, *here, read):
         try:
-            time_s = way(here, read(one)).time_s
-        except (KeptOut, NoWay) as error:
+            check_from(here, read(one))
+        except KeptOut as error:
             refused = refused or error
         else:
-            found.append((order(one, *here)[0], time_s, one))
-    if not found:
-        assert refused is not None
-        raise refused
-    return min(found, key=lambda candidate: candidate[:2])[2]
+            return one
+    assert refused is not None
+    raise refused
 
 
 LOOKED_S = 0.02  # how late a stop may be noticed

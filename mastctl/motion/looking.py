@@ -24,6 +24,9 @@ from mastctl.devices.joint_history import HeadReading
 from mastctl.motion.results import PointingError, rounded
 from mastctl.motion.settings import PointingSettings
 
+BESIDE = "; try a pixel beside it"
+"""To a person who clicked: at a rim or on bare ground a neighbour may match."""
+
 
 class FramesLike(Protocol):
     """What of `mastctl.devices.devices.Devices` brings pictures."""
@@ -108,15 +111,13 @@ class RigCameras:
         timeout_s = self._settings.frame_timeout_s if timeout_s is None else timeout_s
         for name, frame in self._cameras.frames(names, after_s, timeout_s).items():
             if frame.exposure_began_s < after_s:
-                words = (
-                    f"frame {frame.frame_id} was exposed {after_s - frame.exposure_began_s:.3f} s too early"
+                early_s = after_s - frame.exposure_began_s
+                raise PointingError(
+                    "no_fresh_frame", f"an image of {name} was exposed {early_s:.3f} s too early"
                 )
-                raise PointingError("no_fresh_frame", words)
             apart = max(abs(frame.pan_rad - resting.pan_rad), abs(frame.tilt_rad - resting.tilt_rad))
             if frame.moving or not apart <= self._settings.rest_tolerance_rad:
-                words = (
-                    f"the head moved while frame {frame.frame_id} was exposed ({apart:.4f} rad off its rest)"
-                )
+                words = f"the head moved while an image of {name} was exposed ({apart:.4f} rad off its rest)"
                 raise PointingError("head_moving", words)
             views[name] = self.view(frame)
         return views
@@ -141,8 +142,8 @@ class RigCameras:
         if not np.isfinite(places).all() or (places[1] < 0).any() or (places[1] > size - 1).any():
             raise PointingError(
                 "not_in_view",
-                f"the head has turned by {here:.3f} rad since frame {view.frame.frame_id}: "
-                "the clicked pixel is out of view, click in a new picture",
+                f"the head has turned by {here:.3f} rad since the clicked image of {view.frame.camera}: "
+                "the pixel is out of view, click in a new image",
             )
         spread = float(np.ptp(places, axis=0).max())
         search = min(settings.wide_search_px, settings.search_px / 2 + spread)
@@ -169,12 +170,14 @@ class RigCameras:
         found = find_partner(
             view.image, view.camera, pixel_px, other.image, other.camera, settings.nearest_m, settings.match
         )
+        if found.match.verdict in ("weak", "ambiguous", "flat"):
+            raise _refusal(found.match, other, BESIDE)
         _good(found.match, other)
         if abs(found.across_px) > settings.eyes_px + 5.0 * found.across_sigma_px:
             raise PointingError(
                 "eyes_disagree",
                 f"{other.frame.camera} sees the target {found.across_px:+.2f} px off the line on which "
-                f"{view.frame.camera} puts it, at most {settings.eyes_px:g} px is expected",
+                f"{view.frame.camera} puts it, at most {settings.eyes_px:g} px is expected{BESIDE}",
             )
         return found
 
@@ -297,8 +300,13 @@ def _good(found: PatchMatch, view: CameraView) -> PatchMatch:
     """Pass a good match. Raises PointingError with the verdict in its code."""
     if found.verdict == "good":
         return found
+    raise _refusal(found, view)
+
+
+def _refusal(found: PatchMatch, view: CameraView, advice: str = "") -> PointingError:
     code = "target_not_found" if found.verdict == "weak" else f"target_{found.verdict}"
-    raise PointingError(code, f"the target is not found in {view.frame.frame_id}: {found.reason}")
+    message = f"the target is not found in the image of {view.frame.camera}: {found.reason}{advice}"
+    return PointingError(code, message)
 
 
 def _plane_at(camera: CameraModel, pixel_px: FloatArray, range_m: float) -> Plane:

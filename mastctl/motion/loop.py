@@ -261,7 +261,7 @@ class _Run:
             best = self._chosen(aim, np.array([aim.x_px, aim.y_px]), here, {})
             goal = self._steps.head.goal((best.pan_rad, best.tilt_rad), here)
             self._limits.check(*goal)
-            self._steps.head.way(*goal)
+            self._steps.head.check_goal(*goal)
         except (MastctlError, CalibError) as error:
             words = " ".join(str(error).split())
             return goal, {"code": getattr(error, "code", "failed"), "message": words}

@@ -1,8 +1,9 @@
 """Pointing with one camera: how far the clicked thing is was told, follows from a plane, or is not known.
 
-What is not known is counted with (`calib.geometry.one_eye`): between `PointingSettings.unknown_nearest_m` and
-infinity at first, and less after each view from elsewhere that shows the thing. There is no second eye that
-could confirm a match; instead the thing must be found near the line on which its range can put it.
+What is not known is counted with (`calib.geometry.line_of_sight`): between
+`PointingSettings.unknown_nearest_m` and infinity at first, and less after each view from elsewhere that shows
+the thing. There is no second camera that could confirm a match; instead the thing must be found near the line
+on which its range can put it.
 """
 
 from __future__ import annotations
@@ -13,7 +14,15 @@ from typing import Any, Literal
 import numpy as np
 
 from calib.geometry.covariance import stored_covariance
-from calib.geometry.one_eye import NORMAL_95, SeenFrom, Sight, range_to_plane, seen_from, shown, unknown_range
+from calib.geometry.line_of_sight import (
+    NORMAL_95,
+    SeenFrom,
+    Sight,
+    range_to_plane,
+    seen_from,
+    shown,
+    unknown_range,
+)
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.matching.verdict import PatchMatch
@@ -135,7 +144,7 @@ class OneCamera:
         if beside_px > most_px:
             raise PointingError(
                 "off_the_line",
-                f"the target's likeness in {now.frame.frame_id} is {beside_px:.1f} px from where its "
+                f"{now.frame.camera} finds the target's likeness {beside_px:.1f} px from where its "
                 f"range can put it, at most {most_px:.1f} px is expected",
             )
         return {"beside_px": round(beside_px, 3)}

@@ -21,7 +21,7 @@ from calib.geometry.stereo import stereo_range_error_m
 from calib.matching.handed_over import MatchedHandoff, matched_handoff
 from calib.matching.handoff import Eye, RefineSettings, refine_handoff
 from calib.matching.verdict import PatchMatch
-from mastctl.devices.keep_out import KeptOut, NoWay
+from mastctl.devices.keep_out import KeptOut
 from mastctl.devices.limits import Limits
 from mastctl.motion.looking import CameraView
 from mastctl.motion.settings import HandoffRules, PairBounds
@@ -102,7 +102,7 @@ def choose_pairs(
     for name in rig.stereo:
         try:
             focal_px, choice = _looked_at(rig, name, position_m, rules, choose_one, from_rad)
-        except (CalibError, KeptOut, NoWay) as error:
+        except (CalibError, KeptOut) as error:
             reasons.append(f"{name}: {error}")
             continue
         (broken if choice.outside else kept).append((focal_px, choice))

@@ -174,7 +174,7 @@ def clicked_frame(target: PixelTarget, rig: Rig, find: Callable[[str], StampedFr
     if frame.camera != camera:
         raise wrong_camera(frame, camera)
     if frame.moving:
-        words = f"the head moved while frame {frame.frame_id} was exposed; take another"
+        words = f"the head moved while this image of {camera} was exposed; take another"
         raise NotNow("frame_moving", words)
     _check_inside(rig, camera, target.x_px, target.y_px, "pixel")
     return frame

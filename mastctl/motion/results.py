@@ -250,7 +250,7 @@ def counts_told(head: object, tilt_rad: float, model: CameraModel | None) -> dic
     Parameters
     ----------
     head
-        Anything; what has no ``report`` (see `drivers.interfaces.Reporting`) knows no counts: empty.
+        Anything; what has no ``report`` (see `drivers.interfaces.PanTilt`) knows no counts: empty.
     tilt_rad
         Where the head looks: a pan turns the picture of a head that looks up less.
     model

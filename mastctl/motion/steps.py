@@ -158,34 +158,22 @@ class Steps:
         """Go to true angles, as `go` does; return the readings that were commanded, and the arrival."""
         here = self.head.read()
         goal = self.head.goal((pan_rad, tilt_rad), here)
-        *corners, _ = self.head.way(*goal)
-        if corners:  # from there an axis may come from the other side
-            goal = self.head.goal((pan_rad, tilt_rad), here, corners)
         return goal, self.go(*goal, camera)
 
     def go(self, pan_rad: float, tilt_rad: float, camera: str | None = None) -> HeadReading:
         """Check the limits, move until the head reads the angles, wait until settled; return the reading.
 
-        Round a keep-out the head goes by corners, and rests at each; the record names them.
         Where the head knows its counts, the record says what these leave, in pixels of ``camera``.
 
         Raises
         ------
-        OutsideLimits, KeptOut, NoWay, PointingError, Stopped, DriverError
+        OutsideLimits, KeptOut, PointingError, Stopped, DriverError
             If the angles may not be commanded or are not reached.
         """
         with self.step("limits") as detail:
             detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad)
             self._limits.check(pan_rad, tilt_rad)
-            *corners, _ = self.head.way(pan_rad, tilt_rad)
-            if corners:
-                detail.update(corners_rad=[rounded(corner) for corner in corners])
-        for corner in corners:
-            with self.step("corner") as detail:
-                detail.update(pan_rad=corner[0], tilt_rad=corner[1])
-                until_s = self._clock.now_s() + self.head.time_allowed_s(*corner)
-                self.head.send(*corner)
-                self.head.arrived(*corner, until_s)
+            self.head.check_goal(pan_rad, tilt_rad)
         with self.step("move") as detail:
             allowed_s = self.head.time_allowed_s(pan_rad, tilt_rad)
             detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad, allowed_s=round(allowed_s, 3))

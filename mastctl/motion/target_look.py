@@ -81,7 +81,7 @@ class TrackSighting:
     pixels
         By camera.
     chi2, renewed
-        As `calib.matching.look.Look`.
+        As `calib.matching.look.TrackLook`.
     pose_doubt
         What the pictures say against the pose, one sentence; empty if they do not.
     matched

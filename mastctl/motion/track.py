@@ -258,7 +258,7 @@ class TrackStatus:
         }
 
 
-Outcome = tuple[Track, TrackSighting]
+LookOutcome = tuple[Track, TrackSighting]
 Said = tuple[Any, ...]
 """Something for the log: level, words, what they are about."""
 
@@ -272,7 +272,7 @@ class TrackTurn:
     said: tuple[Said, ...] = ()
 
 
-def started(status: TrackStatus, operation: Operation, outcome: Outcome | None, left: bool) -> TrackTurn:
+def started(status: TrackStatus, operation: Operation, outcome: LookOutcome | None, left: bool) -> TrackTurn:
     """Return a track that began, or why it did not.
 
     Parameters
@@ -303,7 +303,9 @@ def started(status: TrackStatus, operation: Operation, outcome: Outcome | None, 
     return TrackTurn(status, Carried(track, status.stands_at), (said,))
 
 
-def looked(status: TrackStatus, carried: Carried, operation: Operation, outcome: Outcome | None) -> TrackTurn:
+def looked(
+    status: TrackStatus, carried: Carried, operation: Operation, outcome: LookOutcome | None
+) -> TrackTurn:
     """Return what a look told, which stood where the track was carried to; parameters as for `started`."""
     status = replace(status, looks=status.looks + 1)
     if outcome is None and operation.state == "stopped":

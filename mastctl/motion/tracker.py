@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from typing import Any, Protocol
@@ -32,7 +32,7 @@ from mastctl.motion.target_look import Looker, TrackSighting
 from mastctl.motion.track import (
     ACTIVE,
     Carried,
-    Outcome,
+    LookOutcome,
     RoverPose,
     TrackStatus,
     TrackTurn,
@@ -75,7 +75,7 @@ class Tracker:
     settings
         Which pair looks, how far a pose may lie from the one before.
     on_matched
-        Gets each hand-off's record; must return at once.
+        Gets each hand-off's record, in the operation's thread; it may take its time.
     machine
         Is told when a track begins and ends; its publisher gets each change of the track. One of its own by
         default.
@@ -136,7 +136,7 @@ class Tracker:
             if self._status.state in ACTIVE:
                 raise NotNow("busy", f"track {self._status.id} runs; stop it before another is started")
 
-            def begin(looker: Looker) -> Outcome:
+            def begin(looker: Looker) -> LookOutcome:
                 if isinstance(target, PixelTarget):
                     return looker.begin_at_pixel(target)
                 return looker.begin_at_position(np.array(target.position_m))
@@ -289,9 +289,9 @@ class Tracker:
         words = f"the rover moved by {way_m:.2f} m, and its pose was refused: it had no covariance"
         self._publish(replace(self._status, state="lost", predicted=True, reason=words))
 
-    def _run(self, told: Told, work: Callable[[Looker], Outcome]) -> Operation:
+    def _run(self, told: Told, work: Callable[[Looker], LookOutcome]) -> Operation:
         """Start an operation that looks; its outcome comes to `_ended`."""
-        rig, outcomes = self._rig, list[Outcome]()
+        rig, outcomes = self._rig, list[LookOutcome]()
         self._left = False
 
         def run(record: Callable[[Any], None], cancelled: threading.Event) -> TrackSighting:
@@ -349,7 +349,7 @@ class Tracker:
 
     # In the operation's thread
 
-    def _ended(self, operation: Operation, outcome: Outcome | None) -> None:
+    def _ended(self, operation: Operation, outcome: LookOutcome | None) -> None:
         """Take what a start or a look told, then the poses that waited for it; a defect ends the track."""
         try:
             self._taken(operation, outcome)
@@ -358,14 +358,21 @@ class Tracker:
             self.stop(words)
             raise
 
-    def _taken(self, operation: Operation, outcome: Outcome | None) -> None:
+    def _taken(self, operation: Operation, outcome: LookOutcome | None) -> None:
+        matched = None if outcome is None else outcome[1].matched
+        with self._lock:
+            came = len(self._waiting)
+            left = self._left_by(self._waiting)
+            counts = self._status.operation == operation.id and self._status.state != "starting"
+            counts = counts and not left and not self._left
+        if matched is not None and counts:  # without the lock, for which a stop waits: it may take its time
+            self._on_matched(matched)
         with self._held():
             if self._status.operation != operation.id:
                 return  # stopped meanwhile
             waiting, self._waiting = self._waiting, []
             status = replace(self._status, operation=None)
-            stood = status.stands_at
-            left = any(stood is not None and not stands(motion_between(stood, one)) for one in waiting)
+            left = self._left_by(waiting[:came])
             if status.state == "starting":
                 status = self._take(started(status, operation, outcome, left or self._left))
             elif self._left:
@@ -376,11 +383,14 @@ class Tracker:
             else:
                 assert self._carried is not None
                 status = self._take(looked(status, self._carried, operation, outcome))
-                if outcome is not None and outcome[1].matched is not None:
-                    self._on_matched(outcome[1].matched)
             if self._carried is not None:
                 for one in waiting:
                     status = self._carry(status, one)
                 if self._look_again:
                     status = self._looked_for(status)
             self._publish(status)
+
+    def _left_by(self, poses: Sequence[RoverPose]) -> bool:
+        """Whether the rover left where it stood, by poses that came since; the lock is held."""
+        stood = self._status.stands_at
+        return stood is not None and any(not stands(motion_between(stood, one)) for one in poses)

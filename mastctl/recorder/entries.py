@@ -1,4 +1,4 @@
-"""Which messages become of what the daemon publishes, and what a file or a live view begins with."""
+"""Which messages become of what the daemon publishes, and what a file begins with."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ToldLike(Protocol):
 
 
 class Sink(Protocol):
-    """Where messages go: a recording, or a live view."""
+    """Where messages go: a recording."""
 
     clocks: Clocks
 

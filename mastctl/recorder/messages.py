@@ -16,6 +16,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
+from calib.files.opencv_ros import lens_pose
 from calib.files.twin import TwinError, even_axes, nearest_opencv, twin_error
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
@@ -92,8 +93,16 @@ def transforms(rig: Rig, pan_rad: float, tilt_rad: float, time_ns: int) -> Messa
         ("mast", "head", mast.mast_from_head(pan_rad, tilt_rad)),
     ]
     for name, camera in rig.cameras.items():
-        known.append((camera.on, name, Rigid(even_axes(camera.model), camera.model.C)))
+        known.append((camera.on, name, _carrier_from_optical(camera.model)))
     return FrameTransforms(transforms=[_transform(*one, time_ns) for one in known])
+
+
+def _carrier_from_optical(model: CameraModel) -> Rigid:
+    """The frame that the ``plumb_bob`` camera of `calibration` is in; its own axes if there is none."""
+    try:
+        return lens_pose(_nearest(model)[0])
+    except ValueError:
+        return Rigid(even_axes(model), model.C)
 
 
 def _transform(parent: str, child: str, parent_from_child: Rigid, time_ns: int) -> FrameTransform:

@@ -153,7 +153,7 @@ class _Reader:
     def _told(self, item: McapEntry) -> None:
         try:
             told = json.loads(item.message.data)
-        except ValueError:
+        except (ValueError, RecursionError):
             return
         if not isinstance(told, dict):
             return

@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 from calib.geometry.rig import Rig
 from drivers.clock import Clock
 from mastctl.answers import RecorderTold, RecordingDeleted, RecordingEnded, RecordingListed
+from mastctl.as_json import readable
 from mastctl.control.standing import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError, NotKnown, NotNow, Unable
@@ -223,11 +224,11 @@ class Recorder:
         Unable
             ``unreadable``.
         """
-        found = next((path for path in self._found(name).files if path.name == file), None)
+        found = next((path for path in self._found(name).files if readable(path.name) == file), None)
         if found is None:
             raise NotKnown("recording_unknown", f"the recording {name[:80]} has no file {file[:80]}")
         now = self._now.file
-        if now is not None and now.path.name == file:
+        if now is not None and now.path == found:
             raise NotNow("recording", f"{file} is being written; it can be read when that has ended")
         return found
 

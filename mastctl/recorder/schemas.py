@@ -120,7 +120,7 @@ class Described:
 
 @cache
 def described(schema: str) -> Described:
-    """Return how a channel is announced; ``schema`` is ``foxglove.MESSAGE`` or ``mastctl.TOPIC``."""
+    """Return how a channel is announced; ``schema`` is ``foxglove.MESSAGE`` or ``mastctl.`` and a topic."""
     if schema.startswith("foxglove."):
         return Described(MessageEncoding.Protobuf, SchemaEncoding.Protobuf, descriptor_set(schema))
     data = json.dumps(json_schema(schema.removeprefix("mastctl."))).encode()

@@ -13,14 +13,15 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import shutil
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from calib.files import is_plain_file
 from mastctl.answers import RecordingKind, RecordingListed
+from mastctl.as_json import readable
 
 SUFFIX = ".mcap"
 MB = 1e6
@@ -36,6 +37,7 @@ class Recorded:
     kind: RecordingKind
     files: tuple[Path, ...]
     size_bytes: int
+    folder: Path  # of its files; its own for what was kept
 
     def told(self) -> RecordingListed:
         """Return it as JSON."""
@@ -44,7 +46,7 @@ class Recorded:
             "kind": self.kind,
             "size_mb": self.size_bytes / MB,
             "files": len(self.files),
-            "names": [path.name for path in self.files],
+            "names": [readable(path.name) for path in self.files],
         }
 
 
@@ -127,34 +129,41 @@ class Shelf:
             path.rename(place / path.name)
         kept = [one for one in self.all() if one.kind == "kept"]
         while len(kept) > 1 and sum(one.size_bytes for one in kept) > kept_mb * MB:
-            shutil.rmtree(self._kept / kept.pop(0).name, ignore_errors=True)
+            with contextlib.suppress(OSError):
+                self.delete(kept.pop(0))
         return place.name
 
     def delete(self, one: Recorded) -> None:
-        """Delete a run, or what was kept at a fault."""
+        """Delete a run, or what was kept at a fault; other files in its folder stay."""
+        for path in one.files:
+            path.unlink(missing_ok=True)
         if one.kind == "kept":
-            shutil.rmtree(self._kept / one.name)
-        else:
-            for path in one.files:
-                path.unlink()
+            with contextlib.suppress(OSError):  # something else is in it
+                one.folder.rmdir()
 
     def all(self) -> list[Recorded]:
         """Return every recording, the oldest of each kind first."""
-        found = [_recorded(path.stem, "run", [path]) for path in _files(self._runs)]
+        found = [_recorded(path.stem, "run", [path], self._runs) for path in _files(self._runs)]
         with contextlib.suppress(FileNotFoundError):
-            folders = sorted((path for path in self._kept.iterdir() if path.is_dir()), key=_order)
-            found += [_recorded(path.name, "kept", _files(path)) for path in folders]
+            folders = sorted((path for path in self._kept.iterdir() if _is_folder(path)), key=_order)
+            kept = [_recorded(path.name, "kept", _files(path), path) for path in folders]
+            found += [one for one in kept if one.files]
         if segments := _files(self._ring):
-            found.append(_recorded("ring", "ring", segments))
+            found.append(_recorded("ring", "ring", segments, self._ring))
         return found
 
 
 def _files(folder: Path) -> list[Path]:
-    """The recordings in a folder, by their numbers if they have such, else by name."""
+    """The recordings in a folder, by their numbers if they have such, else by name; plain files only."""
     try:
-        return sorted((path for path in folder.iterdir() if path.suffix == SUFFIX), key=_order)
+        found = (path for path in folder.iterdir() if path.suffix == SUFFIX and is_plain_file(path))
+        return sorted(found, key=_order)
     except FileNotFoundError:
         return []
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
 
 
 def _order(path: Path) -> tuple[int, str]:
@@ -167,12 +176,12 @@ def _next_number(paths: Iterable[Path]) -> int:
     return max((_order(path)[0] for path in paths), default=0) + 1
 
 
-def _recorded(name: str, kind: RecordingKind, files: Iterable[Path]) -> Recorded:
+def _recorded(name: str, kind: RecordingKind, files: Iterable[Path], folder: Path) -> Recorded:
     sizes = {}
     for path in files:
         with contextlib.suppress(FileNotFoundError):  # it went round meanwhile
             sizes[path] = path.stat().st_size
-    return Recorded(name, kind, tuple(sizes), sum(sizes.values()))
+    return Recorded(readable(name), kind, tuple(sizes), sum(sizes.values()), folder)
 
 
 def _stamp() -> str:

@@ -149,7 +149,7 @@ def write_what_if(what_if: WhatIf, folder: Path) -> Path:
         others=other_lines(what_if),
     )
     page = folder / "what_if.html"
-    page.write_text(html, encoding="utf-8")
+    page.write_text(html, encoding="utf-8", errors="backslashreplace")
     return page
 
 

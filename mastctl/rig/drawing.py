@@ -10,10 +10,8 @@ from typing import Any
 
 from calib.files.mast_file import MAST_SCHEMA
 from drivers.flir_ptu.workshop import AxisFacts
-from drivers.ptz.inquiry import FoundHead
 from mastctl.config import CONFIG_SCHEMA
 from mastctl.rig.plugged import FAMILIES, PluggedCamera, PluggedHead
-from mastctl.setup.rig_folder import CONFIG
 
 ARCSEC_RAD = math.radians(1 / 3600)
 FORWARD_M, DOWN_M = 0.04, 0.02
@@ -42,10 +40,6 @@ class RigAnswers:
         Ends of what the head may reach.
     pan_id, tilt_id
         Which servo turns which axis.
-    count_deg
-        One count of a VISCA head; None: not known.
-    fastest_deg
-        Its speed, or a Pelco head's, of pan and tilt, degrees per second; None: not known.
     date
         Of the drawing.
     """
@@ -57,8 +51,6 @@ class RigAnswers:
     tilt_deg: tuple[float, float] = (-40.0, 30.0)
     pan_id: int = 1
     tilt_id: int = 2
-    count_deg: float | None = None
-    fastest_deg: tuple[float, float] | None = None
     date: datetime = field(default_factory=lambda: datetime.now(UTC))
 
 
@@ -78,8 +70,6 @@ def configuration(
     if head is not None and head.unit is not None:
         ends = {axis: _within(ends[axis], getattr(head.unit, axis), PTU_SIGNS[axis]) for axis in ends}
         driver, options, speed = "flir_ptu", _ptu(head.unit_baud, ends), 0.5
-    elif head is not None and head.ptz:
-        driver, options, speed = head.ptz[0].dialect.driver, _ptz(head.ptz[0], answers, ends), 0.5
     else:
         driver = FAMILIES[0].driver if head is None or head.family is None else head.family.driver
         options, speed = _servos(head, answers, ends), 0.8
@@ -126,36 +116,6 @@ def _within(ends: tuple[float, float], axis: AxisFacts, sign: int) -> tuple[floa
 def _ptu(baud: int, ends: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
     axes = {axis: {"sign": PTU_SIGNS[axis], "limits_rad": list(ends[axis])} for axis in ends}
     return {"baud": baud, **axes}
-
-
-def _ptz(head: FoundHead, answers: RigAnswers, ends: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
-    """The options of a VISCA or Pelco head, without what nobody has told."""
-    pelco = head.dialect.driver == "pelco"
-    axes: dict[str, dict[str, Any]] = {axis: {"limits_rad": list(ends[axis])} for axis in ends}
-    if pelco:
-        axes["tilt"]["sign"] = -1
-    elif answers.count_deg is not None:
-        for one in axes.values():
-            one["count_rad"] = round(math.radians(answers.count_deg), 8)
-    if answers.fastest_deg is not None:
-        for one, fastest_deg in zip(axes.values(), answers.fastest_deg, strict=True):
-            one["fastest_rad_per_s"] = round(math.radians(fastest_deg), 5)
-    return {"baud": head.baud, "address": head.address, **head.dialect.options, **axes}
-
-
-def untold(head: PluggedHead | None, answers: RigAnswers) -> str:
-    """Return what the configuration of a VISCA or Pelco head lacks, in one sentence; empty if nothing."""
-    if head is None or not head.ptz:
-        return ""
-    visca = head.ptz[0].dialect.driver == "visca"
-    lacks = ["count_rad (one count)"] if visca and answers.count_deg is None else []
-    lacks += ["fastest_rad_per_s (its speed)"] if answers.fastest_deg is None else []
-    if not lacks:
-        return ""
-    return (
-        f"{CONFIG} lacks {' and '.join(lacks)} of pan and tilt, and no daemon starts without. No inquiry "
-        "gives it: write it from the head's data sheet"
-    )
 
 
 def _servos(

@@ -18,7 +18,8 @@ import numpy as np
 from calib.files.atomic import save_bytes
 from calib.files.mast_file import load_rig
 from calib.files.yaml_text import dump_mapping
-from drivers.hardware import HEADS, head_options
+from drivers.faults import PAN_TILT
+from drivers.registry import driver_of
 from mastctl.config import check_cameras, load_config
 from mastctl.packaged import SCHEMAS, config_folder, name_schema
 from mastctl.rig.drawing import (
@@ -28,7 +29,6 @@ from mastctl.rig.drawing import (
     configuration,
     drawing,
     soft_limits,
-    untold,
 )
 from mastctl.rig.plugged import Plugged, PluggedCamera, PluggedHead, set_id, usb_of
 from mastctl.setup.machine import ExaminedMachine
@@ -98,11 +98,8 @@ def write_rig(
     cameras = list(plugged.cameras)
     port = LINE if head is None or _NUMBERED.fullmatch(head.port) else head.port
     name = re.sub(r"\W+", "_", folder.resolve().name) or "rig"
-    lacks = untold(head, answers)
     servos = head is None or head.family is not None
-    words = (
-        f"{_CONFIG_WORDS}{_SERVO_WORDS if servos else _HEAD_WORDS}{f'# {lacks}.{chr(10)}' if lacks else ''}"
-    )
+    words = f"{_CONFIG_WORDS}{_SERVO_WORDS if servos else _HEAD_WORDS}"
     files = {
         CONFIG: words.encode() + dump_mapping(configuration(head, cameras, answers, port)),
         MAST: _MAST_WORDS.encode() + dump_mapping(drawing(name, cameras, answers)),
@@ -113,14 +110,14 @@ def write_rig(
     files[RULES] = rules(head, plugged, machine, alike).encode()
     notes = [f"{' and '.join(alike)} {SAME_SERIAL}"] if alike else []
     notes += [NO_HEAD] if head is None else []
-    notes += [lacks] if lacks else []
     steps = _steps(folder, head, len(cameras))
-    files[README] = _readme(plugged, steps, notes).encode()
+    files[README] = _readme(plugged, steps, notes).encode("utf-8", "surrogateescape")
     with nothing_left(folder):
         made = _written(folder, files, steps, simulated=False)
         device = load_config(folder / CONFIG).hardware.pan_tilt
-        if device.driver in HEADS and not lacks:
-            head_options(device)
+        read_options = driver_of("head", device.driver, PAN_TILT).read_options
+        if read_options is not None:
+            read_options(device.options)
     return replace(made, notes=tuple(notes))
 
 
@@ -143,7 +140,12 @@ def write_simulated(folder: Path, plugged: Plugged, answers: RigAnswers) -> NewR
     )
     with nothing_left(folder):
         write_built(rig, folder, simulation, TWIN_SEED, soft_limits(answers))
-        made = _written(folder, {README: _readme(plugged, steps).encode()}, steps, simulated=True)
+        made = _written(
+            folder,
+            {README: _readme(plugged, steps).encode("utf-8", "surrogateescape")},
+            steps,
+            simulated=True,
+        )
     return NewRigFolder(folder, (CONFIG, MAST, TRUE_RIG, *made.files), True, steps)
 
 
@@ -189,7 +191,7 @@ _CONFIG_WORDS = """\
 """
 _SERVO_WORDS = """\
 # Check before the first move: which servo turns which axis, its sign (sign: -1), and the limits.
-# `mastctl servo test PORT ID` turns one servo by 5 degrees, slowly.
+# `mastctl servo info PORT ID` shows its position: turn it by hand, with its torque off, and ask again.
 """
 _HEAD_WORDS = """\
 # Check before the first move: the sign of each axis (pan positive to the right, tilt up), zero_rad, and the
@@ -274,7 +276,7 @@ def _readme(plugged: Plugged, steps: Sequence[str], notes: Sequence[str] = ()) -
             "`mastctl doctor` names what is missing, and the command that mends it. `mastctl run` ends with",
             "Ctrl-C. In another terminal, `mastctl point --angles 0.2 0.0` turns the head and `mastctl stop`",
             "stops it.",
-            "`mastctl calibrate bench` then replaces the drawing (docs/how-to/bench-calibration.md).",
+            "`mastctl calibrate bench` then replaces the drawing (docs/how-to/calibrate.md).",
             *_slow(plugged),
             "After an upgrade, `mastctl schema config > schemas/config.json` renews what editors check by.",
             "",

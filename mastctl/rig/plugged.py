@@ -1,8 +1,7 @@
 """What is plugged in: servos and pan/tilt heads that answer on serial lines, and cameras. Moves nothing.
 
 Each line is asked in the words of each head that this program drives, until one answers. Nothing is written
-to a servo. A VISCA or Pelco head is only asked where it stands. A PTU that answers in short form is set to
-its usual one, which it forgets at power-off.
+to a servo. A PTU that answers in short form is set to its usual one, which it forgets at power-off.
 """
 
 from __future__ import annotations
@@ -21,21 +20,15 @@ from drivers.dynamixel import workshop as dynamixel
 from drivers.dynamixel.models import MODELS
 from drivers.dynamixel.settings import POLL_BYTES
 from drivers.errors import BadOptions, DriverError
-from drivers.feetech import models as feetech_models
-from drivers.feetech import settings as feetech_settings
-from drivers.feetech import workshop as feetech
+from drivers.feetech import servos as feetech
 from drivers.flir_ptu import workshop as flir_ptu
 from drivers.flir_ptu.workshop import Facts
-from drivers.pelco import options as pelco
-from drivers.ptz.inquiry import FoundHead, find_heads
 from drivers.servo_bus.bench import FoundServo, Scan
 from drivers.servo_bus.link import REPLY_TIMEOUT_S
 from drivers.servo_bus.settings import CountedModel
 from drivers.v4l2 import find
 from drivers.v4l2.node import Node, capture_nodes
-from drivers.visca import options as visca
 from mastctl.setup.machine import ExaminedMachine, examine_port
-from mastctl.setup.rig_folder import CONFIG
 
 
 @dataclass(frozen=True)
@@ -87,20 +80,19 @@ FAMILIES = (
         "feetech",
         feetech.scan,
         (1_000_000, 115_200, 500_000),
-        feetech_models.MODELS,
-        feetech_settings.POLL_BYTES,
+        feetech.MODELS,
+        feetech.POLL_BYTES,
     ),
 )
 PTU_BAUDS = (9600, 38_400)
 """As units come from the factory, and as docs/how-to/hardware.md has them set up."""
-PTZ_DIALECTS = (*visca.DIALECTS, *pelco.DIALECTS)
 LEAST_PX, USUAL_HZ = (640, 480), 30.0
 MOST_CAMERAS, BY_ID = 2, "by-id"
 NO_GENICAM = (
     "no camera was found; GigE Vision and USB3 Vision cameras are found only with the library Aravis: "
     f"{genicam_library.INSTALL}"
 )
-NO_POWER = "; is its power on? --baud and --address name others for VISCA and Pelco"
+NO_POWER = "; is its power on?"
 BY_HAND = "write it into configuration and mast file by hand (configs/rigs/rover.yaml has six)"
 
 
@@ -113,15 +105,13 @@ class PluggedHead:
     port
         As it is named on this machine.
     family
-        Whose servos they are; None for a PTU, and for a VISCA or Pelco head.
+        Whose servos they are; None for a PTU.
     servos
         Those that the driver turns, by id.
     others
         Models that answered and that it does not drive.
     unit, unit_baud
         A PTU's facts, and the rate at which it told them.
-    ptz
-        The VISCA or Pelco heads of the line; the first is the rig's.
     """
 
     port: str
@@ -130,13 +120,10 @@ class PluggedHead:
     others: tuple[str, ...] = ()
     unit: Facts | None = None
     unit_baud: int = PTU_BAUDS[0]
-    ptz: tuple[FoundHead, ...] = ()
 
     @property
     def words(self) -> str:
         """What it is, in one sentence."""
-        if self.ptz:
-            return f"{self.port}: {self.ptz[0].words}"
         if self.unit is not None:
             return f"{self.port}: a FLIR PTU, {self.unit.version}"
         servos = [f"{one.model} (id {one.servo_id}, {one.baud} baud)" for one in self.servos]
@@ -145,10 +132,7 @@ class PluggedHead:
 
     @property
     def lacks(self) -> str:
-        """The advice about a servo that is missing, or heads too many, in one sentence; empty if none is."""
-        if len(self.ptz) > 1:
-            others = ", ".join(str(one.address) for one in self.ptz[1:])
-            return f"{self.port}: heads answer at the addresses {others} too; address in {CONFIG} names one"
+        """The advice about a servo that is missing, in one sentence; empty if none is."""
         if self.family is None or len(self.servos) != 1:
             return ""
         (servo,) = self.servos
@@ -203,7 +187,6 @@ def look(
     ports: Sequence[str],
     machine: ExaminedMachine,
     say: Callable[[str], None],
-    ptz: tuple[Sequence[int], Sequence[int]] = ((), ()),
 ) -> Plugged:
     """Ask every serial line and camera what it is.
 
@@ -215,18 +198,16 @@ def look(
         Where devices lie.
     say
         Told what is being asked; a line takes some seconds.
-    ptz
-        Rates and addresses at which VISCA and Pelco heads are asked; empty: the usual ones.
     """
     heads: list[PluggedHead] = []
     unused: list[str] = []
     named = [port if "://" in port else str(Path(port).absolute()) for port in ports]
     for port in named or serial_lines(machine):
         say(f"asking {port}")
-        found, why = ask_line(port, machine, ptz)
+        found, why = ask_line(port, machine)
         if found is None:
             unused.append(why)
-        elif found.unit is None and not found.servos and not found.ptz:
+        elif found.unit is None and not found.servos:
             unused.append(found.words)
         else:
             heads.append(found)
@@ -246,24 +227,18 @@ def serial_lines(machine: ExaminedMachine) -> list[str]:
     return [f"/{path.relative_to(machine.root)}" for path in found]
 
 
-def ask_line(
-    port: str, machine: ExaminedMachine, ptz: tuple[Sequence[int], Sequence[int]] = ((), ())
-) -> tuple[PluggedHead | None, str]:
-    """Return what answers on a line, or None and why nothing does; a line in use is left alone.
-
-    ``ptz`` is as of `look`.
-    """
+def ask_line(port: str, machine: ExaminedMachine) -> tuple[PluggedHead | None, str]:
+    """Return what answers on a line, or None and why nothing does; a line in use is left alone."""
     path = port if "://" in port else str(machine.at(port))
     pseudo = os.path.realpath(path).startswith("/dev/pts/")  # both its ends are open in the program behind it
     for finding in examine_port(port, machine):
         if finding.level == "bad" or (finding.what == "port in use" and not pseudo):
             return None, f"{finding.sentence}; {finding.advice}"
-    udp = path.startswith("udp://")  # of these only VISCA
-    for baud in () if udp else PTU_BAUDS:
+    for baud in PTU_BAUDS:
         with suppress(DriverError):  # no PTU
             return PluggedHead(port, unit=flir_ptu.facts(path, baud), unit_baud=baud), ""
     noise = ""
-    for family in () if udp else FAMILIES:
+    for family in FAMILIES:
         try:
             found, garbled = _servos(path, family)
         except DriverError as error:
@@ -274,13 +249,7 @@ def ask_line(
             return PluggedHead(port, family, driven, others), ""
         if garbled:
             noise = f"; at {garbled[0]} baud something answers: {one_id(port, family, garbled[0])}"
-    try:
-        heads = find_heads(path, PTZ_DIALECTS, *ptz)
-    except DriverError as error:
-        return None, str(error)
-    if heads:
-        return PluggedHead(port, ptz=tuple(heads)), ""
-    return None, f"{port}: no servo, no PTU and no VISCA or Pelco head answers{noise or NO_POWER}"
+    return None, f"{port}: no servo and no PTU answers{noise or NO_POWER}"
 
 
 def _servos(path: str, family: ServoFamily) -> tuple[list[FoundServo], list[int]]:

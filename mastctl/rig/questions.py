@@ -6,16 +6,17 @@ import sys
 from collections.abc import Sequence
 from typing import TextIO
 
+from mastctl import signals
 
-class Questions:
+
+class Prompts:
     """Asks on stderr and reads stdin, if both are a terminal."""
 
     def __init__(
         self, source: TextIO | None = None, out: TextIO | None = None, terminal: bool | None = None
     ) -> None:
         self._source, self._out = source or sys.stdin, out or sys.stderr
-        asks = self._source.isatty() and self._out.isatty()
-        self.terminal = asks if terminal is None else terminal
+        self.terminal = (source is None and signals.can_ask()) if terminal is None else terminal
 
     def number(self, question: str, usual: float, low: float, high: float) -> float:
         """Return a number from low to high; an empty answer is the usual one."""

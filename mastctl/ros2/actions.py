@@ -18,7 +18,7 @@ from trajectory_msgs.msg import JointTrajectoryPoint
 from mastctl.client import Client
 from mastctl.ros2 import messages
 from mastctl.ros2.asked import Asked
-from mastctl.ros2.steering import Outcome
+from mastctl.ros2.steering import GoalOutcome
 
 log = logging.getLogger(__name__)
 
@@ -107,11 +107,11 @@ class Actions:
         goal: Any,
         request: Callable[[Client], Mapping[str, Any]],
         progress: Callable[[], Any],
-    ) -> Outcome:
+    ) -> GoalOutcome:
         """Have a goal's wish done, with feedback; it is withdrawn when canceled, or nobody waits for it."""
-        over, ends = threading.Event(), list[Outcome]()
+        over, ends = threading.Event(), list[GoalOutcome]()
 
-        def end(outcome: Outcome) -> None:
+        def end(outcome: GoalOutcome) -> None:
             ends.append(outcome)
             over.set()
 
@@ -135,7 +135,7 @@ class Actions:
         service = self._node.resolve_service_name(f"{what}/_action/get_result")
         return bool(self._node.count_clients(service))
 
-    def _give_up(self, goal: Any, outcome: Outcome) -> None:
+    def _give_up(self, goal: Any, outcome: GoalOutcome) -> None:
         if goal.is_cancel_requested and outcome.state in ("stopped", "replaced"):
             goal.canceled()
         else:

@@ -68,12 +68,12 @@ def run(
     from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
 
-    from mastctl.ros2.names import Names
+    from mastctl.ros2.names import RosNames
     from mastctl.ros2.node import MastNode
 
     try:
         rclpy.init(args=["mastctl", "--ros-args", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
-        node = MastNode(connect, Names(prefix, base))
+        node = MastNode(connect, RosNames(prefix, base))
     except Exception as error:  # of many kinds: arguments, a middleware that is not there
         raise NoRos(f"ROS cannot begin: {error}") from None
     executor = MultiThreadedExecutor(THREADS)

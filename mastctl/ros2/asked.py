@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from calib.files.twin import even_axes
 from calib.geometry.cahvor import CameraModel
+from calib.geometry.rigid import Rigid
 from mastctl.client import Client
-from mastctl.ros2.known import FRAMES, Known
+from mastctl.ros2.known import FRAMES, KnownState
 from mastctl.ros2.messages import stamp_ns
-from mastctl.ros2.names import Names
-from mastctl.ros2.steering import Outcome, Steering, Wish
+from mastctl.ros2.names import RosNames
+from mastctl.ros2.steering import GoalOutcome, RosSteering, Wish
 from mastctl.ros2.tf_tree import NoTransform
 from mastctl.ros2.times import NS
 
@@ -41,7 +41,11 @@ class Asked:
     """
 
     def __init__(
-        self, names: Names, known: Known, steering: Steering, refused: Callable[[str, Outcome], None]
+        self,
+        names: RosNames,
+        known: KnownState,
+        steering: RosSteering,
+        refused: Callable[[str, GoalOutcome], None],
     ) -> None:
         self.names, self.known, self.steering = names, known, steering
         self._refused = refused
@@ -65,11 +69,11 @@ class Asked:
         self,
         what: str,
         request: Callable[[Client], Mapping[str, Any]],
-        on_end: Callable[[Outcome], None] = lambda outcome: None,
+        on_end: Callable[[GoalOutcome], None] = lambda outcome: None,
     ) -> Wish:
         """Have something done, and return the wish; ``on_end`` is told how it ended."""
 
-        def end(outcome: Outcome) -> None:
+        def end(outcome: GoalOutcome) -> None:
             if outcome.operation is None:
                 self._refused(what, outcome)
             on_end(outcome)
@@ -178,17 +182,18 @@ class Asked:
                 self.names.optical(name) for name, one in rig.cameras.items() if one.on == "head"
             ]  # fmt: skip
             raise ValueError(f"pointing_frame is '{frame}' where one of {known} is expected")
-        return {"aim": (camera, *_pixel_along(rig.cameras[camera].model, axis))}
+        optical = self.known.carrier_from_optical(rig, camera)
+        return {"aim": (camera, *_pixel_along(rig.cameras[camera].model, optical, axis))}
 
 
-def _pixel_along(model: CameraModel, axis: tuple[float, float, float]) -> tuple[float, float]:
+def _pixel_along(model: CameraModel, optical: Rigid, axis: tuple[float, float, float]) -> tuple[float, float]:
     """The pixel on which a point far along an axis of the optical frame falls."""
     if not any(axis):
         width, height = model.size_px
         return (width - 1) / 2, (height - 1) / 2
     if not all(map(math.isfinite, axis)):
         raise ValueError(f"pointing_axis is {list(axis)} where finite numbers are expected")
-    along = even_axes(model) @ (np.array(axis) / np.linalg.norm(axis))
+    along = optical.rotation @ (np.array(axis) / np.linalg.norm(axis))
     pixel, valid = model.project(model.C + FAR_M * along)
     if not valid:
         raise ValueError(f"the camera does not see along pointing_axis {list(axis)}")

@@ -10,7 +10,7 @@ from typing import Any
 
 from mastctl.client import Client, ClientError
 from mastctl.client.pictures import LivePicture
-from mastctl.ros2.times import Exchange, real_from_monotonic_ns
+from mastctl.ros2.times import ClockExchange, real_from_monotonic_ns
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +34,9 @@ class Following:
         self._over = threading.Event()
         self._threads: list[threading.Thread] = []
 
-    def status(self, tell: Callable[[dict[str, Any], Exchange], None], lost: Callable[[str], None]) -> None:
+    def status(
+        self, tell: Callable[[dict[str, Any], ClockExchange], None], lost: Callable[[str], None]
+    ) -> None:
         """Have the status told once a second, with the exchange of times; ``lost`` gets why there is none."""
 
         def work(client: Client) -> None:
@@ -42,7 +44,7 @@ class Following:
                 sent_s = time.monotonic()
                 told = client.status()
                 got_s = time.monotonic()
-                tell(dict(told), Exchange(sent_s, told["now_s"], got_s, real_from_monotonic_ns()))
+                tell(dict(told), ClockExchange(sent_s, told["now_s"], got_s, real_from_monotonic_ns()))
                 self._over.wait(STATUS_S)
 
         self._begin("status", work, lost)

@@ -13,11 +13,11 @@ from geometry_msgs.msg import TransformStamped, Vector3Stamped
 from sensor_msgs.msg import CameraInfo, CompressedImage, JointState
 from std_msgs.msg import Header
 
-from calib.files.twin import even_axes
+from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid, quaternion_of, rot_x, rot_y, rot_z, rotation_of
-from mastctl.ros2.lens import RosLens
-from mastctl.ros2.names import Names
+from mastctl.ros2.known import KnownState
+from mastctl.ros2.names import RosNames
 from mastctl.ros2.times import NS, RosTime
 
 OK, WARN, ERROR = 0, 1, 2
@@ -34,7 +34,7 @@ def stamp_ns(time: Time) -> int:
     return int(time.sec) * NS + int(time.nanosec)
 
 
-def joint_state(names: Names, at_ns: int, pan_rad: float, tilt_rad: float) -> JointState:
+def joint_state(names: RosNames, at_ns: int, pan_rad: float, tilt_rad: float) -> JointState:
     """Return the joints as the head reads them, radians."""
     return JointState(
         header=Header(stamp=stamp(at_ns)), name=[names.pan, names.tilt], position=[pan_rad, tilt_rad]
@@ -42,7 +42,7 @@ def joint_state(names: Names, at_ns: int, pan_rad: float, tilt_rad: float) -> Jo
 
 
 def moving_transforms(
-    names: Names, rig: Rig, at_ns: int, true_pan_rad: float, true_tilt_rad: float
+    names: RosNames, rig: Rig, at_ns: int, true_pan_rad: float, true_tilt_rad: float
 ) -> list[TransformStamped]:
     """Return mast <- pan_link <- head at true joint angles."""
     mast = rig.mast
@@ -53,7 +53,7 @@ def moving_transforms(
     ]
 
 
-def fixed_transforms(names: Names, rig: Rig, at_ns: int) -> list[TransformStamped]:
+def fixed_transforms(names: RosNames, known: KnownState, rig: Rig, at_ns: int) -> list[TransformStamped]:
     """Return base <- rover <- mast, and each camera's optical frame in what carries it.
 
     The base has ROS's axes (x ahead, y left, z up), the rover those of mastctl (y right, z down).
@@ -64,7 +64,7 @@ def fixed_transforms(names: Names, rig: Rig, at_ns: int) -> list[TransformStampe
         transform(names.rover, names.mast, at_ns, rig.mast.rover_from_mast),
     ]
     for name, camera in rig.cameras.items():
-        place = Rigid(even_axes(camera.model), camera.model.C)
+        place = known.carrier_from_optical(rig, name)
         told.append(transform(carriers[camera.on], names.optical(name), at_ns, place))
     return told
 
@@ -88,17 +88,19 @@ def rigid(told: TransformStamped) -> Rigid:
     return Rigid(rotation_of(quaternion / np.linalg.norm(quaternion)), np.array([place.x, place.y, place.z]))
 
 
-def camera_info(lens: RosLens) -> CameraInfo:
-    """Return a camera as ROS has it; its header is set with each image."""
-    width, height = lens.size_px
+def camera_info(lens: str, camera: CameraModel) -> CameraInfo:
+    """Return a camera of one of ROS's lenses; its header is set with each image."""
+    width, height = camera.size_px
+    shortest = 5 if lens == "plumb_bob" else len(camera.distortion)
+    distortion = [*camera.distortion.tolist(), *[0.0] * (shortest - len(camera.distortion))]
     return CameraInfo(
         width=width,
         height=height,
-        distortion_model=lens.name,
-        d=lens.distortion.tolist(),
-        k=lens.matrix_px.ravel().tolist(),
+        distortion_model=lens,
+        d=distortion,
+        k=camera.camera_matrix.ravel().tolist(),
         r=np.eye(3).ravel().tolist(),
-        p=np.hstack([lens.matrix_px, np.zeros((3, 1))]).ravel().tolist(),
+        p=np.hstack([camera.camera_matrix, np.zeros((3, 1))]).ravel().tolist(),
     )
 
 

@@ -7,7 +7,7 @@ import re
 from calib.geometry.rig import Rig
 
 
-class Names:
+class RosNames:
     """The names of joints and frames, each with the prefix that the user gave.
 
     Parameters

@@ -19,6 +19,7 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from calib.errors import BadFile
+from calib.files import digest_of
 from calib.files.mast_file import parse_rig
 from mastctl.client import Client, ClientError
 from mastctl.client.pictures import LivePicture
@@ -26,11 +27,10 @@ from mastctl.ros2 import messages
 from mastctl.ros2.actions import Actions
 from mastctl.ros2.asked import Asked
 from mastctl.ros2.follow import Following
-from mastctl.ros2.known import Known
-from mastctl.ros2.lens import nearest_lens
-from mastctl.ros2.names import Names
-from mastctl.ros2.steering import Outcome, Steering
-from mastctl.ros2.times import NS, Exchange
+from mastctl.ros2.known import KnownState
+from mastctl.ros2.names import RosNames
+from mastctl.ros2.steering import GoalOutcome, RosSteering
+from mastctl.ros2.times import NS, ClockExchange
 
 log = logging.getLogger(__name__)
 
@@ -55,20 +55,19 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         Of joints and frames.
     """
 
-    def __init__(self, connect: Callable[[], Client], names: Names) -> None:
+    def __init__(self, connect: Callable[[], Client], names: RosNames) -> None:
         super().__init__("mastctl")
         self.names = names
-        self.known = Known()
+        self.known = KnownState()
         self._connect = connect
         self._cameras: tuple[str, ...] = ()
-        self._ended: set[str] = set()
         self._own: set[str] = set()
         self._infos: dict[str, CameraInfo] = {}
-        self._mast_file = b""
+        self._mast_digest = ""  # of the file that was read last, also of one that cannot be used
         self._images: dict[str, tuple[Any, Any]] = {}
         self._latched: dict[str, Any] = {}
         self._make_publishers()
-        self.steering = Steering(connect)
+        self.steering = RosSteering(connect)
         self.following = Following(connect)
         self.asked = Asked(names, self.known, self.steering, self._tell_refusal)
         self._take()
@@ -79,7 +78,7 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         with self._connect() as client:
             status = client.status()
             self._cameras = tuple(status["cameras"])
-            self._ended = {one["id"] for one in client.operations() if one["state"] in ENDED}
+            self.known.expect_ends(one["id"] for one in client.operations() if one["state"] in ENDED)
         self.known.expect_images(self._cameras)
         for name in self._cameras:
             topic = self.names.topic(name)
@@ -153,7 +152,7 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         except ValueError as error:
             log.warning("a transform of tf is left out: %s", error)
 
-    def _tell_status(self, told: dict[str, Any], exchange: Exchange) -> None:
+    def _tell_status(self, told: dict[str, Any], exchange: ClockExchange) -> None:
         if self.known.clock.heard(exchange):
             used = self.known.clock.exchange
             assert used is not None
@@ -166,12 +165,11 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         self._diagnostics.publish(messages.diagnostics(self.now_ns(), [line]))
 
     def _tell_event(self, topic: str, key: str, value: Any) -> None:
-        if topic == "mast" or self.known.rig is None:
+        if topic == "mast" and value["digest"] != self._mast_digest:
             self._read_rig()
         if topic == "joints":
             self._tell_joints(value)
-        elif topic == "operation" and value["state"] in ENDED and key not in self._ended:
-            self._ended.add(key)
+        elif topic == "operation" and value["state"] in ENDED and self.known.is_new_end(key):
             self._tell_operation(value)
 
     def _tell_joints(self, told: dict[str, Any]) -> None:
@@ -198,7 +196,7 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         self._sigma.publish(messages.residual(header, told["residual_sigma_px"] or (None, None)))
         self._residual.publish(messages.residual(header, told["residual_px"]))
 
-    def _tell_refusal(self, what: str, outcome: Outcome) -> None:
+    def _tell_refusal(self, what: str, outcome: GoalOutcome) -> None:
         """Publish a wish of ROS that never became an operation."""
         told = messages.pointing(self.now_ns(), what, outcome.state, outcome.message, None)
         self._pointings.publish(told)
@@ -226,29 +224,28 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         """Take the mast file in use: fixed transforms, and each camera's lens with its worst error."""
         with self._connect() as client:
             data = client.mast_file()
-        if data == self._mast_file:
+        digest = digest_of(data)
+        if digest == self._mast_digest:
             return
-        self._mast_file = data
+        self._mast_digest = digest
         try:
             rig = parse_rig(data, "the daemon's mast file").rig
         except BadFile as error:
             log.warning("no transforms and no camera_info: %s", error)
             return
+        self.known.use_rig(rig)
         self._infos = {}
         for name in self._cameras:
-            try:
-                lens = nearest_lens(rig.cameras[name].model)
-            except (KeyError, ValueError) as error:
-                log.warning("no camera_info of %s: %s", name, error)
+            if name not in self.known.lenses:
                 continue
-            log.info("%s: %s, at most %.4f px off", name, lens.name, lens.worst_px)
+            lens, twin, off = self.known.lenses[name]
+            log.info("%s: %s, at most %.4f px off", name, lens, off.worst_px)
             if name not in self._latched:
                 topic = f"{self.names.topic(name)}/camera_info_error_px"
                 self._latched[name] = self.create_publisher(Float64, topic, LATCHED)
-            self._latched[name].publish(Float64(data=lens.worst_px))
-            self._infos[name] = messages.camera_info(lens)
-        self._publish_transforms(messages.fixed_transforms(self.names, rig, self.now_ns()), True)
-        self.known.rig = rig
+            self._latched[name].publish(Float64(data=off.worst_px))
+            self._infos[name] = messages.camera_info(lens, twin)
+        self._publish_transforms(messages.fixed_transforms(self.names, self.known, rig, self.now_ns()), True)
 
     # What ROS asks
 
@@ -289,10 +286,9 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
             return answer
 
         def reset(client: Client) -> str:
-            told = client.reset(reason=reason, name=NAME)
+            client.reset(reason=reason, name=NAME)
             self.set_parameters([rclpy.parameter.Parameter(REASON, value="")])
-            left = ", ".join(one["name"] for one in told["left"])
-            return f"released; still latched by {left}" if left else "released"
+            return "released"
 
         return self._answered(answer, reset)
 

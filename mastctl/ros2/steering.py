@@ -25,7 +25,7 @@ CODES_OF_LOSS = ("no_daemon", "timeout", "lease_over", "lease_unknown", "closing
 
 
 @dataclass(frozen=True)
-class Outcome:
+class GoalOutcome:
     """How a wish ended: ``state`` is ``done``, ``failed``, ``stopped``, ``refused`` or ``replaced``.
 
     ``operation`` is the daemon's record, where there is one.
@@ -53,11 +53,11 @@ class Wish:
 
     what: str
     request: Callable[[Client], Mapping[str, Any]]
-    on_end: Callable[[Outcome], None] = lambda outcome: None
+    on_end: Callable[[GoalOutcome], None] = lambda outcome: None
     over: threading.Event = field(default_factory=threading.Event)
 
 
-class Steering:
+class RosSteering:
     """Carries out wishes in a thread of its own; `close` stops what runs.
 
     Parameters
@@ -71,7 +71,7 @@ class Steering:
         self._changed = threading.Condition()
         self._next: Wish | None = None
         self._now: Wish | None = None
-        self._started = False  # the daemon has what runs now
+        self._operation = ""  # of the daemon, for what runs now
         self._closed = False
         self._thread = threading.Thread(target=self._work, name="steering", daemon=True)
         self._thread.start()
@@ -79,10 +79,15 @@ class Steering:
     def ask(self, wish: Wish) -> None:
         """Take a wish; what runs is stopped for it, and what waited is told that it was replaced."""
         with self._changed:
-            waiting, self._next = self._next, wish
-            self._changed.notify_all()
+            closed = self._closed
+            if not closed:
+                waiting, self._next = self._next, wish
+                self._changed.notify_all()
+        if closed:
+            self._end(wish, GoalOutcome("stopped", message="the adapter ends"))
+            return
         if waiting is not None:
-            self._end(waiting, Outcome("replaced", message="a newer wish came"))
+            self._end(waiting, GoalOutcome("replaced", message="a newer wish came"))
         self._stop_running()
 
     def withdraw(self, wish: Wish) -> None:
@@ -93,7 +98,7 @@ class Steering:
                 self._next = None
             running = self._now is wish
         if waiting:
-            self._end(wish, Outcome("stopped", message="it was canceled"))
+            self._end(wish, GoalOutcome("stopped", message="it was canceled"))
         elif running:
             wish.over.set()
             self._stop_running()
@@ -112,16 +117,17 @@ class Steering:
             waiting, self._next = self._next, None
             self._changed.notify_all()
         if waiting is not None:
-            self._end(waiting, Outcome("stopped", message="the adapter ends"))
+            self._end(waiting, GoalOutcome("stopped", message="the adapter ends"))
         self._stop_running()
         self._thread.join()
 
     def _stop_running(self) -> None:
+        """Stop what ROS has begun, and nothing else: the head may be another client's by now."""
         with self._changed:
-            started = self._started
-        if started:
+            operation = self._operation
+        if operation:
             with contextlib.suppress(ClientError), self._connect() as client:
-                client.stop()
+                client.stop_operation(operation)
 
     def _superseded(self, wish: Wish) -> bool:
         return self._closed or self._next is not None or wish.over.is_set()
@@ -138,10 +144,10 @@ class Steering:
                 self._now = wish
             outcome = self._done(wish)
             with self._changed:
-                self._now, self._started = None, False
+                self._now, self._operation = None, ""
             self._end(wish, outcome)
 
-    def _done(self, wish: Wish) -> Outcome:
+    def _done(self, wish: Wish) -> GoalOutcome:
         """Carry a wish out."""
         try:
             with self._connect() as client:
@@ -149,32 +155,32 @@ class Steering:
                 with client.lease(for_s=LEASE_S, ends_with_stop=True, stops_when_silent=True):
                     return self._carried_out(client, wish, asked)
         except ValueError as error:
-            return Outcome("refused", "bad_request", str(error))
+            return GoalOutcome("refused", "bad_request", str(error))
         except ClientError as error:
-            return Outcome("refused", error.code, str(error))
+            return GoalOutcome("refused", error.code, str(error))
         except Exception:  # the thread goes on: the next wish, and the stop at the end, need it
             log.exception("'%s' met a defect of the program", wish.what)
-            return Outcome("failed", "defect", "a defect of the program; the log has it")
+            return GoalOutcome("failed", "defect", "a defect of the program; the log has it")
 
-    def _carried_out(self, client: Client, wish: Wish, asked: Mapping[str, Any]) -> Outcome:
+    def _carried_out(self, client: Client, wish: Wish, asked: Mapping[str, Any]) -> GoalOutcome:
         if self._superseded(wish):
-            return Outcome("replaced", message="a newer wish came")
+            return GoalOutcome("replaced", message="a newer wish came")
         operation = client.point(**asked)
         with self._changed:
-            self._started = True
+            self._operation = operation
         if self._superseded(wish):  # it came before this one could be stopped
-            client.stop()
+            client.stop_operation(operation)
         try:
             record = client.wait(operation, WAIT_S)
         except ClientError as error:
             log.warning("lost sight of '%s' (%s); the head is stopped", wish.what, error)
             with contextlib.suppress(ClientError):
-                client.stop()
-            return Outcome("failed", error.code, str(error))
+                client.stop_operation(operation)
+            return GoalOutcome("failed", error.code, str(error))
         why = record["error"] or {"code": "", "message": ""}
-        return Outcome(record["state"], why["code"], why["message"], record)
+        return GoalOutcome(record["state"], why["code"], why["message"], record)
 
-    def _end(self, wish: Wish, outcome: Outcome) -> None:
+    def _end(self, wish: Wish, outcome: GoalOutcome) -> None:
         if outcome.state != "done":
             log.warning("%s: %s %s", wish.what, outcome.state, outcome.message)
         try:

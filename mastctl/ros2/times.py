@@ -24,7 +24,7 @@ CALM = 60
 
 
 @dataclass(frozen=True)
-class Exchange:
+class ClockExchange:
     """One question for the daemon's time.
 
     Attributes
@@ -84,12 +84,12 @@ class RosTime:
     """
 
     def __init__(self) -> None:
-        self.exchange: Exchange | None = None
+        self.exchange: ClockExchange | None = None
         self.steps = 0
         self._since_step = CALM
-        self._kept: deque[Exchange] = deque(maxlen=EXCHANGES)
+        self._kept: deque[ClockExchange] = deque(maxlen=EXCHANGES)
 
-    def heard(self, new: Exchange) -> bool:
+    def heard(self, new: ClockExchange) -> bool:
         """Take one more exchange; return whether the offset is another one than before."""
         old = self.exchange
         self._since_step += 1

@@ -1,7 +1,7 @@
-"""The latched emergency stops: held in memory from the first moment, and on the disk across restarts.
+"""The latch of a head: in memory from the first moment, and on the disk across restarts.
 
-They lie in the head's place (`mastctl.safety.heads`), or in the state folder for a head in this program's
-memory. Each person's stop is an entry, and each is released by itself.
+It lies in the head's place (`mastctl.safety.heads`), or in the state folder for a head in this program's
+memory. It keeps a log of its causes, one a person, and a reset releases all of them.
 
 What cannot be read counts as latched: so a stop is written over the file that says that none is, which is
 there from the start, and quick. The disk never holds the stop up: a thread of its own writes, after the head
@@ -164,21 +164,18 @@ class Latch:
             return self._folder.why_temporary or "this daemon keeps its state in a temporary folder"
         return self._problem or "the disk has not confirmed it yet"
 
-    def release(self, reason: str, name: str, latched_by: str | None = None) -> Latched:
-        """Release one entry on the disk, then in memory; return it.
+    def release(self, reason: str, name: str) -> tuple[Latched, ...]:
+        """Release the latch on the disk, then in memory; return its causes.
 
         Parameters
         ----------
         reason, name
             Why, and who says so.
-        of
-            Whose stop it is; may be left out where only one is latched.
 
         Raises
         ------
         NotNow
-            ``not_estopped`` if none is latched, ``several_estops`` if it is not clear which is meant,
-            ``stopping`` if another stop came meanwhile.
+            ``not_estopped`` if none is latched, ``stopping`` if another stop came meanwhile.
         Unable
             ``not_saved`` if the disk goes on to say that one is: a restart would be latched again.
         """
@@ -187,25 +184,25 @@ class Latch:
             words = "the disk has not taken the emergency stop yet; a reset follows it"
             raise Unable("not_saved", words, PATIENCE_S)
         try:
-            entries, asked = self.entries, self._asked
-            held = _meant(entries, latched_by)
-            left = tuple(one for one in entries if one is not held)
+            causes, asked = self.entries, self._asked
+            if not causes:
+                raise NotNow("not_estopped", "no emergency stop is latched")
             with self._changed:  # before the disk changes: from here on nobody is told that it holds a stop
                 self._kept = None
             if self._on_disk:
                 released = {"by": name, "reason": reason, "at": _now()}
-                told = {**asdict(held), "released": released}
-                self._write_released(_document(left) if left else {"latched": False, **told}, bool(left))
+                self._write_released({"latched": False, **asdict(causes[0]), "released": released})
             with self._changed:
                 self._changed.notify_all()
                 if asked != self._asked:
                     raise NotNow("stopping", "another emergency stop came during the reset; it is latched")
-                self.entries = self._kept = left
+                self.entries = self._kept = ()
                 self._problem = ""
         finally:
             self._disk.release()
-        log.warning("the emergency stop (%s: %s) is released by %s: %s", held.name, held.reason, name, reason)
-        return held
+        listed = "; ".join(f"{one.name}: {one.reason}" for one in causes)
+        log.warning("the emergency stop (%s) is released by %s: %s", listed, name, reason)
+        return causes
 
     def close(self) -> None:
         """End the thread, after what is to be kept was tried once more."""
@@ -214,8 +211,8 @@ class Latch:
             self._due_s = 0.0
             self._changed.notify_all()
 
-    def _write_released(self, document: dict[str, Any], is_left: bool) -> None:
-        """Say on the disk that nothing, or only what is left, is latched. Raises Unable."""
+    def _write_released(self, document: dict[str, Any]) -> None:
+        """Write to the disk that nothing is latched. Raises Unable."""
 
         def remove() -> None:
             for file in (*self._marks, self._file):  # without its mark nobody misses the file
@@ -224,7 +221,7 @@ class Latch:
         ways: tuple[Callable[[], None], ...] = (
             lambda: self._file.write(document),
             lambda: self._file.overwrite(document),  # a full disk still takes this, and the room stays
-            *(() if is_left else (remove,)),  # and this one that cannot be written to
+            remove,  # and this one that cannot be written to
         )
         refused = ""
         for file in self._others:
@@ -239,7 +236,7 @@ class Latch:
             except BadFile as error:
                 refused = refused or str(error)
             else:
-                self._on_disk = is_left
+                self._on_disk = False
                 return
         with self._changed:  # what the disk says is not known: the thread writes it again
             self._changed.notify_all()
@@ -381,24 +378,6 @@ def _merged(entries: tuple[Latched, ...], more: tuple[Latched, ...]) -> tuple[La
         if one.name not in [other.name for other in entries]:
             entries = (*entries, one)
     return entries
-
-
-def _meant(entries: tuple[Latched, ...], latched_by: str | None) -> Latched:
-    """The entry that is to be released. Raises NotNow."""
-    if not entries:
-        raise NotNow("not_estopped", "no emergency stop is latched")
-    names = ", ".join(one.name for one in entries)
-    if latched_by is not None:
-        for one in entries:
-            if one.name == _told(latched_by, ""):
-                return one
-        raise NotNow(
-            "not_estopped", f"no emergency stop of {_told(latched_by, 'nobody')} is latched, but of {names}"
-        )
-    if len(entries) > 1:
-        words = f"{len(entries)} emergency stops are latched, of {names}; each is released by itself"
-        raise NotNow("several_estops", f"{words}: say whose ('latched_by'; mastctl reset --latched-by NAME)")
-    return entries[0]
 
 
 def _now() -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.errors import BadFile
+from calib.files import open_plain
 from calib.files.atomic import overwrite_bytes, remove, replace_bytes
 
 MAX_BYTES = 1 << 20
@@ -48,7 +49,7 @@ class StateFile:
             If there is one that cannot be read, or is something else.
         """
         try:
-            with self.path.open("rb") as file:
+            with open_plain(self.path) as file:
                 data = file.read(MAX_BYTES + 1)
         except FileNotFoundError:
             return None

@@ -154,7 +154,7 @@ def state_home() -> Path:
 
 def usual_folder(config: Path, address: str) -> Path:
     """Return the usual place of a daemon: the configuration's name, and digits of its path and address."""
-    digest = hashlib.sha256(f"{config.resolve()}\n{address}".encode()).hexdigest()[:8]
+    digest = hashlib.sha256(os.fsencode(f"{config.resolve()}\n{address}")).hexdigest()[:8]
     return state_home() / f"{config.stem}-{digest}"
 
 

@@ -68,7 +68,7 @@ def ask(path: Path, line: str) -> dict[str, Any]:
         raise ValueError(rest)
     try:
         told = json.loads(rest)
-    except ValueError:
+    except (ValueError, RecursionError):
         told = None
     if not isinstance(told, dict) or verb != line.split()[0]:
         raise NoAnswer(f"the program that listens at {path} does not answer as a daemon does")

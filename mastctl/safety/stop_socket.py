@@ -42,7 +42,7 @@ WAITING_IN_KERNEL = 4096
 THREADS = 2
 
 
-class StopRequests(Protocol):
+class StopHandlers(Protocol):
     """What the socket carries out."""
 
     def stop_told(self) -> StopTold:
@@ -71,7 +71,7 @@ class StopSocket:
         If it cannot listen there.
     """
 
-    def __init__(self, path: Path, stops: StopRequests) -> None:
+    def __init__(self, path: Path, stops: StopHandlers) -> None:
         self.path = path
         self._stops = stops
         self._listener = _listener(path)

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calib.errors import BadFile, CalibError
-from calib.files import read_bytes
+from calib.files import is_plain_file, read_bytes
 from calib.files.mast_file import StoredRig, parse_rig
 from calib.files.yaml_text import MAX_BYTES
 from calib.geometry.covariance import stored_covariance
+from calib.geometry.mode import SensorMode
 from calib.geometry.rig import Rig
-from calib.geometry.sensor_mode import SensorMode
 from drivers.errors import BadFrame
 from mastctl.answers import MastTold
 from mastctl.config import Config, check_cameras
@@ -89,7 +89,7 @@ def read_next(name: str, config: Config, now: MastInUse, sensor_modes: Mapping[s
             f"file is '{name[:80]}' where the plain name of a file beside the configured one is expected"
         )
     path = folder / name
-    if not path.is_file():
+    if not is_plain_file(path):
         raise BadMastFile(
             f"there is no file {name[:80]} beside the configured mast file {config.mast_file.name}"
         )

@@ -28,17 +28,15 @@ from mastctl.control.operations import OperationRunner
 from mastctl.control.records import Operation, last_frame
 from mastctl.control.standing import StandingFault
 from mastctl.devices.devices import Devices
-from mastctl.devices.frames import StampedFrame, check_known
+from mastctl.devices.frames import OPERATIONS, StampedFrame, check_known
 from mastctl.devices.opening import open_rig
 from mastctl.errors import MastctlError
 from mastctl.guided.guide import Guide
 from mastctl.guided.reports import Reports
-from mastctl.live.settings import LiveSettings
-from mastctl.live.view import LiveView, check_installed
 from mastctl.motion.jog import Jogs
 from mastctl.motion.pairs import in_picture
 from mastctl.motion.requests import wrong_camera
-from mastctl.motion.track import ACTIVE, TrackStatus
+from mastctl.motion.track import ACTIVE, RoverPose, TrackStatus
 from mastctl.motion.tracker import Tracker
 from mastctl.safety import heads, stop_socket
 from mastctl.safety.latch import Latch
@@ -54,7 +52,6 @@ from mastctl.service.steering import Steering
 from mastctl.service.stopping import SocketStops, Stopping, state_faults
 from mastctl.service_manager import ServiceManager
 from mastctl.watch.handoffs import HandoffCheck
-from mastctl.watch.history import History
 from mastctl.watch.metrics import Metrics
 from mastctl.watch.reference import SENTINEL_FOLDER
 from mastctl.watch.residuals import CalibrationHealth
@@ -69,7 +66,6 @@ RENDERING_S = 20.0  # six simulated cameras share one renderer, on a machine tha
 HARDWARE_CLOSE_S = 3.0
 AUDIT_FILE = "audit.jsonl"
 STRANGERS_FILE = "strangers.jsonl"
-OPERATIONS = "operations"  # who holds the pictures that pointings end with
 KEPT_PICTURES = 8  # of a camera
 
 
@@ -111,12 +107,8 @@ class Service:
         Where each command passes, who steers, and what is recorded of it; of strangers' elsewhere.
     metrics
         What is counted, for Prometheus.
-    history
-        Joints, temperatures and events of the last hours.
     recording
         The recorder, and what it hears.
-    live
-        What Foxglove shows, if the configuration asks for it.
     stop_threads
         Where the web side stops: threads that nothing else can keep busy.
     folder, head_folder
@@ -171,7 +163,6 @@ class Service:
             self.devices.frame_by_id,
             clock,
         )
-        self.live = None if config.live is None else self._live_view(config.live)
         people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
         self.leases = LeaseTable(people_s, self.machine.something_runs, self._steered, self.stopping.stop)
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
@@ -192,8 +183,13 @@ class Service:
         )
         self.reports = Reports(self.folder.path, self.guide.runs)
         self.sentinel = SentinelFindings(self.folder.path / SENTINEL_FOLDER, lambda: self.stored.digest)
-        self.metrics = Metrics(lambda: self.state().told(), self.devices.errors, publisher)
-        self.history = History(publisher, lambda: self.devices.temperatures_c, self.clock)
+        self.metrics = Metrics(
+            lambda: self.state().told(),
+            self.devices.errors,
+            self.devices.frame_counts,
+            publisher,
+            lambda: self.devices.temperatures_c,
+        )
         self.devices.fault_watch.also(self._own_faults)
         self.stop_socket: StopSocket | None = None
         self._socket_folder: StateFolder | None = None
@@ -261,15 +257,11 @@ class Service:
             If a driver refuses its options or cannot reach its device.
         StateInUse
             If another program drives the head.
-        Unable
-            ``no_foxglove`` if a live view is asked for, and what shows it is not installed.
         """
         clock = clock or clock_for(config.hardware)
         mast = read_mast(config.mast_file, config)
         for note in mast.stored.notes:
             log.warning("%s", note)
-        if config.live is not None:
-            check_installed()
         with contextlib.ExitStack() as undo:
             hardware, head = open_rig(config.hardware, clock)
             if head is not None:
@@ -280,6 +272,9 @@ class Service:
                 undo.callback(kept.close)
             with clock.at_work():
                 service = cls(config, mast, hardware, clock, kept, head)
+                if hardware.simulation is not None:  # as an odometer would
+                    pose = RoverPose(hardware.simulation.site_from_rover, received_s=clock.now_s())
+                    service.steering.take_pose(pose, look=False)
             undo.pop_all()
         return service
 
@@ -382,18 +377,17 @@ class Service:
         folders = self.folder, self.head_folder, self._socket_folder
         maybe = (self.stop_socket, self.audit, self.strangers, self.latch, *folders)
         first_to_last: tuple[Callable[[], object], ...] = (
+            self.leases.close,
             self.operations.close,
             self.guide.close,
             self.devices.close,
             self.machine.publisher.close,
             self.metrics.close,
-            self.history.close,
             self.stop_threads.close,
             self.handoffs.close,
             self.health.close,
             self.sentinel.close,
             self.recording.close,
-            *(() if self.live is None else (self.live.close,)),
             lambda: bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S),
             *(one.close for one in maybe if one is not None),
         )
@@ -408,7 +402,6 @@ class Service:
         return (
             *self.handoffs.faults(),
             *self.recording.faults(),
-            *(() if self.live is None else self.live.faults()),
             *self.audit.faults(),
             *self.strangers.faults(),
             *state_faults(self.folder, self.latch, self.started_s),
@@ -442,14 +435,6 @@ class Service:
         self.handoffs.use_mast(stored.digest)
         self.health.use_mast(stored)
         self.recording.use_mast(mast)
-        if self.live is not None:
-            self.live.use_mast(stored.rig, stored.digest)
-
-    def _live_view(self, settings: LiveSettings) -> LiveView:
-        stored, names = self.stored, tuple(self.hardware.cameras)
-        return LiveView(
-            settings, stored.rig, stored.digest, names, self.machine.publisher, self.devices, self.clock
-        )
 
     def _steered(self, control: WhoSteers | None) -> None:
         """Publish who holds the lease."""

@@ -220,7 +220,7 @@ class Steering:
         self._devices.hold(frame)  # until it has been found again, however many pictures somebody watches
         moved_s = self._tracker.moved_s
         if moved_s is not None and frame.exposure_began_s < moved_s:
-            words = f"the rover moved since frame {target.frame_id} was exposed; take another"
+            words = f"the rover moved since this image of {target.camera} was exposed; take another"
             raise NotNow("rover_moved", words)
 
     def _in_rover(self, target: PositionTarget) -> PositionTarget:

@@ -20,7 +20,7 @@ from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.motion.tracker import Tracker
 from mastctl.safety.latch import Estopped, Latch
 from mastctl.safety.state_folder import StateFolder
-from mastctl.safety.stop_socket import StopRequests
+from mastctl.safety.stop_socket import StopHandlers
 
 KEPT_S = 1.0  # what the disk is given before an emergency stop is answered without it
 STATE = "state"
@@ -134,26 +134,23 @@ class Stopping:
             self._machine.stop_ended()
         return held
 
-    def reset(self, reason: str, name: str, latched_by: str | None = None) -> ResetTold:
-        """Release one emergency stop; nothing moves before the last is released, and a command comes.
+    def reset(self, reason: str, name: str) -> ResetTold:
+        """Release the emergency stop; nothing moves before a command comes.
 
         Parameters
         ----------
         reason, name
             Why, and who says so.
-        of
-            Whose stop it is; may be left out where only one is latched.
 
         Returns
         -------
         dict
-            As ``POST /reset`` tells it: what is ``released``, what is ``left``, and whether that is any.
+            As ``POST /reset`` answers: the first cause that is ``released``, and whether another came since.
 
         Raises
         ------
         NotNow
-            ``not_estopped`` if none is latched, ``several_estops`` if it is not clear which is meant,
-            ``stopping`` while a stop is under way.
+            ``not_estopped`` if none is latched, ``stopping`` while a stop is under way.
         Unable
             ``not_saved`` if the state folder goes on to say that it is latched; ``closing``.
         """
@@ -163,11 +160,11 @@ class Stopping:
         if self._devices.stop_pending:
             raise NotNow("stopping", "the mast is being stopped; an emergency stop is released after that")
         with self._resetting:
-            held = self._latch.release(reason, name, latched_by)
-            self._devices.allow_moves(held)  # and not what another one blocks that came meanwhile
+            causes = self._latch.release(reason, name)
+            for one in causes:  # and not what another one blocks that came meanwhile
+                self._devices.allow_moves(one)
             self._machine.reset(name, reason, lambda: self._latch.entries)
-            left = [one.told() for one in self._latch.entries]
-        return {"latched": bool(left), "released": held.told(), "left": left}
+            return {"latched": bool(self._latch.entries), "released": causes[0].told()}
 
 
 def state_faults(folder: StateFolder, latch: Latch, started_s: float) -> Iterator[StandingFault]:
@@ -206,7 +203,7 @@ class SocketStops:
         Records them.
     """
 
-    def __init__(self, stops: StopRequests, entry: CommandEntry) -> None:
+    def __init__(self, stops: StopHandlers, entry: CommandEntry) -> None:
         self._stops = stops
         self._entry = entry
 

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 
 from calib.files.mast_file import sensor_mode_keys
-from calib.geometry.sensor_mode import SensorMode
+from calib.geometry.mode import SensorMode
 from drivers.clock import Clock
 from drivers.errors import DriverError, NoFreshFrame
-from drivers.interfaces import Camera, Frame, HoldsExposure, Image, KnowsSensorMode, KnowsSize, Paced
+from drivers.interfaces import Camera, Frame, Image
 from mastctl.devices import frames as frame_checks
 from mastctl.devices.thread import DeviceThread
 
@@ -134,18 +134,16 @@ class CameraCheck:
 
     def _check_abilities(self) -> None:
         """What it says of itself must be what came."""
-        camera = self._camera
-        if isinstance(camera, KnowsSize) and self._frames:
+        info = self._camera.info
+        if info.size_px is not None and self._frames:
             height, width = self._frames[-1].image.shape[:2]
-            if tuple(camera.size_px) != (width, height):
-                self._problem(
-                    "told", f"size_px is {tuple(camera.size_px)}, its pictures have ({width}, {height})"
-                )
-        rate_hz = self._rate_hz()
-        if isinstance(camera, Paced) and rate_hz and abs(camera.period_s * rate_hz - 1) > PACE_TOLERANCE:
-            self._problem(
-                "told", f"period_s is {camera.period_s:.4g} s, frames come every {1 / rate_hz:.4g} s"
-            )
+            if tuple(info.size_px) != (width, height):
+                words = f"info.size_px is {tuple(info.size_px)}, its pictures have ({width}, {height})"
+                self._problem("told", words)
+        rate_hz, period_s = self._rate_hz(), info.period_s
+        if period_s is not None and rate_hz and abs(period_s * rate_hz - 1) > PACE_TOLERANCE:
+            words = f"info.period_s is {period_s:.4g} s, frames come every {1 / rate_hz:.4g} s"
+            self._problem("told", words)
 
     def _rate_hz(self) -> float | None:
         if len(self._frames) < 2:
@@ -155,13 +153,7 @@ class CameraCheck:
         return counted / span_s if counted > 0 and span_s > 0 else None
 
     def _told(self, seconds: float) -> dict[str, Any]:
-        frames, camera = self._frames, self._camera
-        abilities = (
-            ("size_px", KnowsSize),
-            ("sensor_mode", KnowsSensorMode),
-            ("exposure_held", HoldsExposure),
-            ("period_s", Paced),
-        )
+        frames, info = self._frames, self._camera.info
         told: dict[str, Any] = {
             "camera": self._name,
             "seconds": seconds,
@@ -169,11 +161,11 @@ class CameraCheck:
             "refused": self._refused,
             "rate_hz": self._rate_hz(),
             "mid_exposure_uncertainty_s": self._uncertainty_s,
-            "abilities": [word for word, protocol in abilities if isinstance(camera, protocol)],
+            "abilities": [word for word in STATED if getattr(info, word) is not None],
             "problems": self.problems(),
         }
-        if isinstance(camera, KnowsSensorMode) and isinstance(camera.sensor_mode, SensorMode):
-            told |= sensor_mode_keys(camera.sensor_mode)
+        if isinstance(info.sensor_mode, SensorMode):
+            told |= sensor_mode_keys(info.sensor_mode)
         if frames:
             image = frames[-1].image
             told |= {
@@ -187,6 +179,7 @@ class CameraCheck:
         return told
 
 
+STATED = ("size_px", "sensor_mode", "period_s")
 BINS = 16
 DARK, SATURATED = 5, 250
 

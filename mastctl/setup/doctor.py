@@ -14,15 +14,9 @@ from drivers.aravis import find as genicam
 from drivers.aravis import library as genicam_library
 from drivers.aravis import options as genicam_options
 from drivers.errors import BadOptions, CameraBusy, DriverError, NoCamera, NoPermission
-from drivers.hardware import (
-    CAMERAS,
-    HEADS,
-    OURS,
-    DeviceSettings,
-    clock_for,
-    head_options,
-    installed_drivers,
-)
+from drivers.faults import PAN_TILT
+from drivers.hardware import DeviceSettings, clock_for
+from drivers.registry import driver_of, installed_drivers
 from drivers.v4l2 import find
 from drivers.v4l2.options import parse_options
 from mastctl.config import Config, check_cameras, load_config
@@ -40,8 +34,6 @@ from mastctl.setup.machine import (
 )
 from mastctl.watch.reference import SENTINEL_FOLDER
 from mastctl.watch.sentinel import read_folder, standing
-
-PTZ = ("visca", "pelco")
 
 Asked = Callable[[str], Mapping[str, Any] | None]
 """Returns the status of the daemon at an address, None if nobody answers there."""
@@ -80,7 +72,7 @@ def examine(
     for name, camera in config.hardware.cameras.items():
         if camera.driver == "aravis":
             yield examine_genicam(name, camera.options, in_use=status is not None)
-        elif camera.driver in CAMERAS:
+        elif camera.driver == "v4l2":
             yield examine_camera(name, camera.options, in_use=status is not None)
     yield from _simulation(config)
     yield from examine_folder(
@@ -148,29 +140,34 @@ def _head_line(config: Config, machine: ExaminedMachine) -> Iterator[DoctorFindi
     """The head's line, if it has one."""
     head = config.hardware.pan_tilt
     port = head.options.get("port")
-    if head.driver in HEADS and isinstance(port, str):
+    try:
+        driver = driver_of("head", head.driver, PAN_TILT)
+    except BadOptions as error:
+        advice = "correct the configuration; docs/drivers.md lists the drivers"
+        yield DoctorFinding("head", "bad", str(error), advice)
+        return
+    if driver.hardware != "real":
+        return
+    if driver.read_options is None:
+        yield DoctorFinding("head", "unsure", f"{head.driver} is from outside; it is not looked at", "")
+    elif isinstance(port, str):
         yield from examine_port(port, machine)
-        yield _head_options(head)
+        yield _head_options(head, driver.read_options)
         yield from _servos(head.driver, head.options, port)
-    elif head.driver in HEADS:
+    else:
         words = f"driver {head.driver} has no 'port' in its options"
         yield DoctorFinding("port", "bad", words, "name the serial device; docs/reference/configuration.md")
-    elif head.driver not in OURS:
-        yield DoctorFinding("head", "unsure", f"{head.driver} is from outside; it is not looked at", "")
 
 
-def _head_options(head: DeviceSettings) -> DoctorFinding:
+def _head_options(head: DeviceSettings, read_options: Callable[[Mapping[str, Any]], Any]) -> DoctorFinding:
     """Whether the driver takes the head's options, and what asks such a head; it is not asked here."""
     try:
-        read = head_options(head)
+        read = read_options(head.options)
     except BadOptions as error:
         advice = "correct the configuration; docs/how-to/hardware.md has every option"
         return DoctorFinding("head", "bad", str(error), advice)
     words = f"driver {head.driver}, {read.baud} baud"
-    if head.driver in PTZ:
-        asks = f"mastctl ptz info {quote(read.port)} --baud {read.baud} --address {read.address}"
-        words += f", address {read.address}; '{asks}' shows where it reports to stand"
-    elif head.driver == "flir_ptu":
+    if head.driver == "flir_ptu":
         words += f"; 'mastctl ptu info {quote(read.port)} --baud {read.baud}' asks it"
     return DoctorFinding("head", "good", words)
 

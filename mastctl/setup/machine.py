@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
-from drivers.hardware import BUILT_IN, InstalledDriver
+from drivers.registry import OURS, InstalledDriver
 from drivers.sim.kept import MOST_BYTES, kept_bytes, kept_home
 
 Level = Literal["good", "unsure", "bad"]
@@ -124,13 +124,15 @@ def examine_folder(what: str, folder: Path) -> Iterator[DoctorFinding]:
 
 
 def examine_drivers(installed: Sequence[InstalledDriver]) -> Iterator[DoctorFinding]:
-    """List the drivers that installed packages offer, and those that cannot be meant by their name."""
-    names = [(one.kind, one.name) for one in installed]
-    for one in installed:
-        what, told = f"driver {one.name}", f"for a {one.kind}: {one.factory} of {one.package}"
-        if one.name in BUILT_IN:
+    """List the drivers that other packages offer, and those that cannot be meant by their name."""
+    own = {(one.kind, one.name) for one in installed if one.distribution == OURS}
+    others = [one for one in installed if one.distribution != OURS]
+    names = [(one.kind, one.name) for one in others]
+    for one in others:
+        what, told = f"driver {one.name}", f"for a {one.kind}: {one.path} of {one.package}"
+        if (one.kind, one.name) in own:
             words = f"{told}; mastctl's own driver of this name is used instead"
-            yield DoctorFinding(what, "unsure", words, f"name it {one.factory} in the configuration")
+            yield DoctorFinding(what, "unsure", words, f"name it {one.path} in the configuration")
         elif names.count((one.kind, one.name)) > 1:
             words = f"{told}; another package offers one of this name"
             yield DoctorFinding(what, "unsure", words, "uninstall one of them, or name the factory itself")

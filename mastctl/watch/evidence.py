@@ -250,7 +250,7 @@ def expected(rig: Rig, parameters: Sequence[str], cameras: Sequence[str], one: M
     there = _rates_of_position(rig, pair, one.from_rad, point)
     by_click = rig.camera_in_rover(one.camera, *one.to_rad).project_jacobian(point)[1] @ there
     before = by_click @ click_rates(rig, names, pair, *one.from_rad, point)
-    after = pixel_rates(rig, names, one.camera, *one.to_rad, point[None])[1][0]
+    after = pixel_rates(rig, names, one.camera, *one.to_rad, point[None]).to_rig[0]
     joints = np.concatenate([before[:, -2:], after[:, -2:]], axis=1)
     sigma_rad = np.array(2 * one.count_rad) / math.sqrt(12.0)
     noise = (

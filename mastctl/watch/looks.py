@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.calibrate.scene.drift import JOINT_SIGMA_RAD, SceneDrift, ViewShift, find_drift
-from calib.calibrate.scene.features import seen_again
+from calib.calibrate.drift import JOINT_SIGMA_RAD, SceneDrift, ViewShift, find_drift, seen_again
 from calib.errors import BadFile
 from calib.files.mast_file import parse_rig
 from calib.geometry.rig import Rig
@@ -120,7 +119,7 @@ def take_pictures(
 
 
 def _turn(client: Client, pan_rad: float, tilt_rad: float) -> None:
-    operation = client.wait(client.point(pan_rad=pan_rad, tilt_rad=tilt_rad), timeout_s=TURN_TIMEOUT_S)
+    operation = client.turn(pan_rad, tilt_rad, TURN_TIMEOUT_S)
     told: Mapping[str, Any] = operation.get("error") or {}
     if operation["state"] == "stopped":
         raise LookEnded(f"{told.get('message', 'somebody stopped the head')}; nothing was kept")
@@ -256,7 +255,7 @@ def look_idle(client: Client, reference: Reference) -> SceneDrift:
             return look_again(client, reference)
         except ClientError as error:
             if error.code in ("lease_over", "leased"):
-                how = str(error).removeprefix("the lease has ended: ").removesuffix("; acquire another")
+                how = (error.detail or {}).get("how", error)
                 raise LookEnded(f"{how}; nothing was kept") from None
             raise
 

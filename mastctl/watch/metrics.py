@@ -37,6 +37,7 @@ ENDED = frozenset({"done", "failed", "stopped"})
 
 Status = Callable[[], Mapping[str, Any]]
 Errors = Callable[[], Mapping[tuple[str, str, str], int]]
+FrameCounts = Callable[[], Mapping[str, tuple[int, int]]]
 
 
 class Metrics:
@@ -48,20 +49,28 @@ class Metrics:
         Returns what ``GET /status`` tells.
     errors
         Returns how often calls to devices have failed: by device, call, and the error's code.
+    frame_counts
+        Returns how many frames were received and missed, by camera.
     publisher
         Whose news are counted.
+    temperatures_c
+        Returns the temperatures that the head's axes report now, degrees Celsius.
     """
 
-    def __init__(self, status: Status, errors: Errors, publisher: Publisher) -> None:
+    def __init__(
+        self,
+        status: Status,
+        errors: Errors,
+        frame_counts: FrameCounts,
+        publisher: Publisher,
+        temperatures_c: Callable[[], Mapping[str, float]] = dict,
+    ) -> None:
         self._registry = CollectorRegistry()
-        self._registry.register(_NowMetrics(status, errors))
+        self._registry.register(_NowMetrics(status, errors, frame_counts, temperatures_c))
         ProcessCollector(registry=self._registry)
         self._operations = self._counter("operations", "Operations that have ended.", "state", "code")
         self._commands = self._counter("commands", "Commands, by what came of them.", "command", "result")
-        self._frames = self._counter("frames", "Frames taken.", "camera")
-        self._missed = self._counter(
-            "frames_missed", "Frames that a camera counted but did not deliver.", "camera"
-        )
+        self._frames = self._counter("frames", "Frames taken on request.", "camera")
         self._residual = self._histogram("residual_pixels", "Residuals, each axis by itself.", RESIDUAL_PX)
         self._sigmas = self._histogram("residual_sigmas", "Residuals over their sigma.", SIGMAS)
         self._step = self._histogram("step_seconds", "Steps of pointings and looks.", STEP_S, "step")
@@ -69,7 +78,6 @@ class Metrics:
             "reading_interval_seconds", "From one reading of the head to the next.", READING_S
         )
         self._last_reading_s: float | None = None
-        self._sequences: dict[str, int] = {}
         self._news = publisher.subscribe("operation", "command", "frame", "joints", known=False, every=True)
         self._thread = threading.Thread(target=self._count, name="metrics", daemon=True)
         self._thread.start()
@@ -94,9 +102,8 @@ class Metrics:
         lost = 0
         while not self._news.closed:
             news = self._news.wait()
-            if self._news.lost > lost:  # what is next follows nothing: no camera missed what was lost here
+            if self._news.lost > lost:  # the next reading follows none
                 lost = self._news.lost
-                self._sequences.clear()
                 self._last_reading_s = None
             for one in news:
                 try:
@@ -110,7 +117,7 @@ class Metrics:
         elif one.topic == "command":
             self._command(one.value)
         elif one.topic == "frame":
-            self._frame(one.key, one.value)
+            self._frames.labels(one.key).inc()
         elif one.topic == "joints":
             before, self._last_reading_s = self._last_reading_s, one.value.time_s
             if before is not None:
@@ -136,20 +143,21 @@ class Metrics:
         if "result" in record:  # not the record of its operation's end
             self._commands.labels(record["command"], record["result"]).inc()
 
-    def _frame(self, camera: str, facts: Any) -> None:
-        before = self._sequences.get(camera)
-        self._sequences[camera] = facts.sequence
-        self._frames.labels(camera).inc()
-        if before is not None and facts.sequence > before + 1:
-            self._missed.labels(camera).inc(facts.sequence - before - 1)
-
 
 class _NowMetrics:
     """What is true at the moment, read when somebody asks."""
 
-    def __init__(self, status: Status, errors: Errors) -> None:
+    def __init__(
+        self,
+        status: Status,
+        errors: Errors,
+        frame_counts: FrameCounts,
+        temperatures_c: Callable[[], Mapping[str, float]],
+    ) -> None:
         self._status = status
         self._errors = errors
+        self._frame_counts = frame_counts
+        self._temperatures_c = temperatures_c
 
     def describe(self) -> Iterable[Metric]:
         """Return nothing: without it the library would ask for a status to find out the names."""
@@ -178,6 +186,10 @@ class _NowMetrics:
             angle.add_metric(["tilt"], joints["tilt_rad"])
             yield angle
             yield GaugeMetricFamily("mastctl_joints_age_seconds", "Since the head was read.", joints["age_s"])
+        warm = GaugeMetricFamily("mastctl_axis_temperature_celsius", "As the axis reports.", labels=["axis"])
+        for name, value in self._temperatures_c().items():
+            warm.add_metric([name], value)
+        yield warm
         age = GaugeMetricFamily("mastctl_frame_age_seconds", "Of the newest frame.", labels=["camera"])
         for name, camera in status["cameras"].items():
             if camera["age_s"] is not None:
@@ -193,17 +205,28 @@ class _NowMetrics:
         for kind, count in self._errors().items():
             failed.add_metric(kind, count)
         yield failed
+        received = CounterMetricFamily(
+            "mastctl_frames_received", "Frames that a camera sent, requested or not.", labels=["camera"]
+        )
+        missed = CounterMetricFamily(
+            "mastctl_frames_missed", "Frames of a camera that were lost or damaged.", labels=["camera"]
+        )
+        for camera, (good, lost) in self._frame_counts().items():
+            received.add_metric([camera], good)
+            missed.add_metric([camera], lost)
+        yield received
+        yield missed
         yield from _steering(status.get("control"))
         yield from _calibration(status.get("calibration"))
         yield from _drift(status.get("sentinel"))
 
 
 def _steering(control: Mapping[str, Any] | None) -> Iterable[Metric]:
-    """Who steers, and for how long."""
-    held = GaugeMetricFamily("mastctl_lease", "1 for the one who steers.", labels=["holder", "kind"])
+    """What steers, and for how long; the holder is no label, since clients choose their names."""
+    held = GaugeMetricFamily("mastctl_lease", "1 for what steers: lease, operation.", labels=["kind"])
     left = GaugeMetricFamily("mastctl_lease_left_seconds", "Until the lease is over.")
     if control is not None:
-        held.add_metric([str(control.get("holder", "")), str(control.get("kind", ""))], 1.0)
+        held.add_metric([str(control["kind"])], 1.0)
         if control.get("for_s") is not None:
             left.add_metric([], float(control["for_s"]))
     yield held

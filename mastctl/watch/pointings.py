@@ -19,6 +19,7 @@ from calib.errors import BadFile
 from calib.files.atomic import replace_bytes
 from calib.files.mast_file import StoredRig
 from drivers.interfaces import COARSE_COUNT_RAD
+from drivers.options import is_number
 from mastctl.control.records import Operation
 from mastctl.json_lines import append_line, read_lines
 
@@ -144,7 +145,7 @@ def _numbers(values: object, key: str, size: int) -> tuple[float, ...]:
     """Pass so many finite numbers. Raises ValueError."""
     if not isinstance(values, list | tuple) or len(values) != size:
         raise ValueError(f"{key} is not {size} numbers")
-    if not all(type(value) in (int, float) and math.isfinite(value) for value in values):
+    if not all(is_number(value) for value in values):
         raise ValueError(f"{key} is not {size} finite numbers")
     return tuple(float(value) for value in values)
 

@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calib.calibrate.scene.drift import SceneDrift
+from calib.calibrate.drift import SceneDrift
 from calib.errors import BadFile
 from calib.files import read_bytes
 from calib.files.atomic import replace_bytes
@@ -141,7 +141,7 @@ def read_reference(folder: Path) -> Reference:
         raise BadFile(folder, "", "holds no reference; take one: mastctl sentinel reference")
     try:
         document = json.loads(read_bytes(path, MOST_BYTES))
-    except ValueError:
+    except (ValueError, RecursionError):
         raise BadFile(path, "", "is no JSON; take the reference again") from None
     top = Section(path, "", document, ("schema", "time", "mast_digest", "rests", "pictures"))
     top.choice("schema", (SCHEMA,))

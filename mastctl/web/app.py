@@ -7,7 +7,6 @@ Every refusal is ``{"error": {"code", "message", "detail"}}``.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Coroutine
 from functools import cache
 from importlib.metadata import version
@@ -19,11 +18,12 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from typing_extensions import get_type_hints, is_typeddict
 
 from mastctl.answers import ErrorBody
-from mastctl.http.entrance import Entrance
+from mastctl.http.entrance import EntryRules
 from mastctl.http.guard import Guard
-from mastctl.http.refusals import add_errors
+from mastctl.http.refusals import JsonAnswer, add_errors
 from mastctl.http.waiting import Streams, Waiting
 from mastctl.service.service import Service
+from mastctl.web import described
 from mastctl.web.events import add_events
 from mastctl.web.images import add_cameras, add_images
 from mastctl.web.keeping import add_bench, add_masts, add_places, add_recordings
@@ -39,7 +39,7 @@ from mastctl.web.watching import add_watching
 def create_app(
     service: Service,
     waiting: Waiting | None = None,
-    entrance: Entrance | None = None,
+    entrance: EntryRules | None = None,
     streams: Streams | None = None,
     watched: WatchedCameras | None = None,
 ) -> ASGIApp:
@@ -57,7 +57,7 @@ def create_app(
         Takes pictures for who watches cameras.
     """
     waiting = waiting or Waiting(service.clock)
-    entrance = entrance or Entrance()
+    entrance = entrance or EntryRules()
     streams = streams or Streams(service.machine.publisher)
     watched = watched or WatchedCameras(service.devices, service.clock)
     parts = Parts(service, waiting, streams, entrance, watched)
@@ -105,6 +105,7 @@ def api() -> FastAPI:
         version=version("mastctl"),
         description="A rover mast: state, pointing with a measured residual, pictures with their facts.",
         responses={status: {"model": ErrorBody, "description": "Refused"} for status in ("4XX", "5XX", 422)},
+        default_response_class=JsonAnswer,
         openapi_url=None,  # served by a route of our own, which does not make it on the event loop
         docs_url=None,
         redoc_url=None,
@@ -120,9 +121,7 @@ def api() -> FastAPI:
 
     @app.get("/openapi.json", include_in_schema=False)
     async def told(request: Request, here: Here) -> Response:
-        described = sys.modules.get("mastctl.web.described")
-        made = described is not None and described.is_made()
-        text = _description() if made else await here.waiting.run(_description)
+        text = _description() if described.is_made() else await here.waiting.run(_description)
         return text_answer(request.headers, text, "application/json")
 
     return app
@@ -130,6 +129,4 @@ def api() -> FastAPI:
 
 def _description() -> bytes:
     """What /openapi.json tells; not for the event loop, which would let no stop through for 0.2 s."""
-    from mastctl.web.described import description  # its models are slow to load, and few ask for them
-
-    return description(api())
+    return described.description(api())

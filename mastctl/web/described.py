@@ -16,12 +16,10 @@ from pydantic import Field, TypeAdapter
 from pydantic.json_schema import JsonSchemaMode
 from typing_extensions import get_type_hints, is_typeddict
 
-from mastctl.answers import Event, HistoryTold, TrackTold
+from mastctl.answers import Event, TrackTold
 from mastctl.frame_facts import described_headers
 from mastctl.http import PREFIX
 
-TEXTS: Mapping[str, type] = {"GET /history": HistoryTold}
-"""Answers that a route makes a text of itself."""
 EVENTS: Mapping[str, str] = {"GET /events": "Event", "GET /track/stream": TrackTold.__name__}
 """Server-sent events without an end: one line each, ``data:`` and the JSON of this kind."""
 FILES: Mapping[str, tuple[str, ...]] = {
@@ -56,7 +54,7 @@ def _made(app: FastAPI) -> bytes:
 
 def answers_of(app: FastAPI) -> dict[str, type]:
     """Return the type of each route's answer, where that is a JSON object."""
-    told = dict(TEXTS)
+    told: dict[str, type] = {}
     for route in app.routes:
         if isinstance(route, APIRoute) and route.include_in_schema:
             kind = get_type_hints(route.endpoint).get("return")

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Query, Response, WebSocket
 from starlette.websockets import WebSocketDisconnect
 
-from calib.geometry.sensor_mode import SensorMode, flip_name
+from calib.geometry.mode import SensorMode, flip_name
 from drivers.interfaces import SETTINGS
 from mastctl.answers import CameraSettingsTold, SensorModeTold
 from mastctl.as_json import as_json
@@ -43,7 +43,7 @@ def add_images(app: FastAPI) -> None:
 
     @app.get(
         f"{PREFIX}/snapshot/{{camera}}",
-        summary="A picture; its facts are in X-Mastctl headers",
+        summary="A picture; its facts are in Mastctl headers",
         response_class=Response,
         responses={200: {"content": {"image/png": {}, "image/jpeg": {}}}},
     )

@@ -20,6 +20,7 @@ from mastctl.answers import (
     ReloadTold,
     ReportsTold,
 )
+from mastctl.as_json import readable
 from mastctl.control.entry import (
     BENCH,
     BENCH_FORGET,
@@ -76,7 +77,7 @@ def add_masts(app: FastAPI) -> None:
         return Response(
             in_use.data,
             media_type="application/yaml",
-            headers={"X-Mastctl-Mast-Digest": in_use.stored.digest},
+            headers={"Mastctl-Mast-Digest": in_use.stored.digest},
         )
 
     @command(app, "POST /mast", MAST, "Use another mast file, or the former one, from now on")
@@ -141,7 +142,7 @@ def add_recordings(app: FastAPI) -> None:
         path = await here.waiting.run(lambda: here.service.recording.recorder.file(name, file))
         headers = request.scope["headers"]
         request.scope["headers"] = [one for one in headers if one[0] != b"range"]  # it is given whole
-        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+        return FileResponse(path, media_type="application/octet-stream", filename=readable(path.name))
 
     @command(app, "DELETE /recordings/{name}", RECORD_DELETE, "Delete a run, or what was kept at a fault")
     def delete(name: str, here: Here) -> RecordingDeleted:

@@ -19,6 +19,7 @@ from mastctl.guided.guide import RunRequest
 from mastctl.motion.jog import Beat
 from mastctl.motion.requests import (
     LARGEST_M,
+    LARGEST_PX,
     Aim,
     Angle,
     AnglesTarget,
@@ -62,11 +63,10 @@ class EstopBody(BaseModel):
 
 
 class ResetBody(_Strict):
-    """``POST /reset``: why and by whom the stop is released; of several, ``latched_by`` names one."""
+    """``POST /reset``: why and by whom the stop is released."""
 
     reason: Words
     name: Words
-    latched_by: Words | None = None
 
 
 class LeaseBody(_Strict):
@@ -89,11 +89,9 @@ class RenewBody(_Strict):
     for_s: LeaseS | None = None
 
 
-class TakeBody(_Strict):
+class TakeBody(LeaseBody):
     """``POST /lease/take``: why, beside what goes with a lease."""
 
-    name: Name | None = None
-    for_s: LeaseS = USUAL_S
     reason: Annotated[
         str, Field(min_length=1, max_length=400, pattern=r"\S", description="a reason in words")
     ]
@@ -421,12 +419,6 @@ class BenchBody(_Strict):
         return RunRequest(**self.model_dump())
 
 
-class LoginBody(_Strict):
-    """``POST /login``: a token."""
-
-    token: Annotated[str, Field(min_length=1, max_length=200)]
-
-
 class FaultBody(_Strict):
     """``POST /simulation/faults``: a fault word for a simulated device, with its parameters."""
 
@@ -491,17 +483,21 @@ class ImagesQuery(BaseModel):
     every: bool = False
 
 
+QueryPixel = Annotated[float, Field(ge=-LARGEST_PX, le=LARGEST_PX)]  # not strict: a query is text
+QueryMetres = Annotated[float, Field(ge=-LARGEST_M, le=LARGEST_M)]
+
+
 class TruthQuery(BaseModel):
     """``GET /simulation/truth``: a frame, and a pixel of it or a point of the site, metres."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     frame_id: Name
-    x_px: float | None = None
-    y_px: float | None = None
-    x_m: float | None = None
-    y_m: float | None = None
-    z_m: float | None = None
+    x_px: QueryPixel | None = None
+    y_px: QueryPixel | None = None
+    x_m: QueryMetres | None = None
+    y_m: QueryMetres | None = None
+    z_m: QueryMetres | None = None
 
     @model_validator(mode="after")
     def _one(self) -> Self:

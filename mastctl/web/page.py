@@ -23,8 +23,10 @@ from starlette.responses import RedirectResponse
 from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
 
+from calib.files import is_plain_file
 from calib.geometry.rig import RigCamera
 from mastctl.answers import CameraMountTold, RigTold
+from mastctl.as_json import readable
 from mastctl.errors import NotKnown
 from mastctl.http import PREFIX
 from mastctl.packaged import site_folder
@@ -35,7 +37,6 @@ ASK_AGAIN = "no-cache"
 """A browser keeps it, and asks each time whether it is still so."""
 FOR_GOOD = "public, max-age=31536000, immutable"
 """What stands at this address will never be another text."""
-QUICKLY = 1
 PACKED = {"Content-Encoding": "gzip"}
 
 
@@ -59,13 +60,6 @@ def text_answer(asked: Mapping[str, str], data: bytes, kind: str, keep: str = AS
     if _takes_packed(asked):
         return Response(_packed(data), media_type=kind, headers=headers | PACKED)
     return Response(data, media_type=kind, headers=headers)
-
-
-def passing_answer(asked: Mapping[str, str], data: bytes, kind: str) -> Response:
-    """Return a text of the moment, which nobody keeps; for a worker thread, as it computes for long."""
-    if _takes_packed(asked):
-        return Response(gzip.compress(data, QUICKLY), media_type=kind, headers=PACKED)
-    return Response(data, media_type=kind)
 
 
 @cache
@@ -137,7 +131,9 @@ def rig_told(service: Service) -> RigTold:
     names = service.config.hardware.cameras
     folder = service.masts.in_use.path.parent
     made = stored.rig.provenance.get("date")
-    found = sorted(one.name for one in folder.glob("*.yaml"))[:MOST_MAST_FILES]
+    found = sorted(
+        one.name for one in folder.glob("*.yaml") if is_plain_file(one) and one.name == readable(one.name)
+    )
     return {
         "digest": stored.digest,
         "mast_date": None if made is None else str(made)[:40],
@@ -147,7 +143,7 @@ def rig_told(service: Service) -> RigTold:
             for name, camera in stored.rig.cameras.items()
             if name in names
         },
-        "mast_files": found,
+        "mast_files": found[:MOST_MAST_FILES],
     }
 
 

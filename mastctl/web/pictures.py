@@ -118,6 +118,7 @@ class WatchedCameras:
         watcher = Watcher(self, f"watcher {next(self._numbers)}", cameras, wake, ready, every)
         with self._changed:
             self._watchers.add(watcher)
+            self._changed.notify_all()  # a camera's thread may be waiting for a viewer that is ready
         try:
             for camera in watcher.cameras:
                 self._begin(camera)
@@ -174,19 +175,27 @@ class WatchedCameras:
                 else:
                     made = Picture(frame, frame.jpeg or encoded(frame.image, "jpeg", JPEG_QUALITY))
                     pause_s = 0.0
+                for watcher in self._ready(camera):
+                    self._hand_to(watcher, made)
             except (DriverError, MastctlError) as error:  # its fault tells more
                 log.debug("no picture of %s for its viewers: %s", camera, error)
                 made, pause_s = None, FAILING_S
             except Exception:  # a defect must not end the thread
                 log.exception("pictures of %s met a defect of the program", camera)
                 made, pause_s = None, FAILING_S
-            else:
-                for watcher in self._ready(camera):
-                    self._cameras.hold(frame, watcher.name, watcher.held_of(frame))
-                    if self._is_there(watcher):
-                        watcher.put(made.within(watcher.most_bytes(camera)))
-                    else:  # it left before the frame was held, and would hold it for ever
-                        self._cameras.let_go(watcher.name)
+
+    def _hand_to(self, watcher: Watcher, made: Picture) -> None:
+        """Hand a picture to a watcher; one that fails is left out from then on, and no other waits for it."""
+        camera = made.frame.camera
+        try:
+            self._cameras.hold(made.frame, watcher.name, watcher.held_of(made.frame))
+            if self._is_there(watcher):
+                watcher.put(made.within(watcher.most_bytes(camera)))
+            else:  # it left before the frame was stored for it, which would be kept for ever
+                self._cameras.let_go(watcher.name)
+        except Exception:
+            log.exception("%s of %s met a defect of the program", watcher.name, camera)
+            self.leave(watcher)
 
     def _wanted(self, camera: str, pause_s: float) -> bool:
         """Wait until somebody is ready for a picture; False if nobody watches any more."""

@@ -35,6 +35,7 @@ from mastctl.control.entry import (
     LEASE_RELEASE,
     LEASE_RENEW,
     LEASE_TAKE,
+    OPERATION_STOP,
     POINT,
     POSE,
     RESET,
@@ -118,6 +119,18 @@ def add_pointing(app: FastAPI) -> None:
     async def operation(operation_id: str, here: Here) -> OperationTold:
         return here.service.operations.get(operation_id).told()
 
+    @app.post(
+        f"{PREFIX}/operations/{{operation_id}}/stop",
+        summary="Stop the mast and one operation, if it still runs; what another client began goes on",
+    )
+    async def stop_one(operation_id: str, request: Request, here: Here, asked: Asks) -> OperationTold:
+        def act() -> dict[str, Any]:  # no id: it begins nothing
+            here.service.operations.stop_one(operation_id)
+            return {}
+
+        await carried_out(here, request, OPERATION_STOP, asked, {}, act, beside=True)
+        return here.service.operations.get(operation_id).told()
+
     @app.post(f"{PREFIX}/stop", summary="Stop the mast and the running operation, at once")
     async def stop(request: Request, here: Here) -> StopTold:
         return await stop_first(here, STOP, request, here.service.stopping.stop_told)
@@ -143,7 +156,7 @@ def add_estop(app: FastAPI) -> None:
 
     @command(app, "POST /reset", RESET, "Release an emergency stop; nothing moves before the next command")
     def reset(body: ResetBody, here: Here) -> ResetTold:
-        return here.service.stopping.reset(body.reason, body.name, body.latched_by)
+        return here.service.stopping.reset(body.reason, body.name)
 
 
 async def _words(request: Request) -> dict[str, str]:
@@ -263,10 +276,8 @@ def add_lease(app: FastAPI) -> None:
 
     @command(app, "POST /lease", LEASE, "Acquire the lease, if no other client steers")
     def acquire(body: LeaseBody, here: Here, asked: Asks) -> LeaseGranted:
-        leases, name = here.service.leases, None if body.name is None else told_name(body.name)
-        ends = body.preemptible, body.ends_with_stop, body.stops_when_silent
-        granted = leases.acquire(asked.caller, name, body.for_s, *ends)
-        return _granted(leases, granted)
+        leases = here.service.leases
+        return _granted(leases, leases.acquire(asked.caller, **_terms(body)))
 
     @command(
         app,
@@ -291,8 +302,14 @@ def add_lease(app: FastAPI) -> None:
         app, "POST /lease/take", LEASE_TAKE, "Take the lease from its holder; a running operation goes on"
     )
     def take(body: TakeBody, here: Here, asked: Asks) -> LeaseGranted:
-        leases, name = here.service.leases, None if body.name is None else told_name(body.name)
-        return _granted(leases, leases.take(asked.caller, body.reason, name, body.for_s))
+        leases = here.service.leases
+        return _granted(leases, leases.take(asked.caller, body.reason, **_terms(body)))
+
+
+def _terms(body: LeaseBody) -> dict[str, Any]:
+    """What a lease is granted with, by the names of `LeaseTable.acquire`."""
+    terms = body.model_dump(exclude={"reason"})
+    return terms | {"name": None if body.name is None else told_name(body.name)}
 
 
 def _granted(leases: LeaseTable, lease: Lease) -> LeaseGranted:

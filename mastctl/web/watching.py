@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import cast
 
 from fastapi import FastAPI, Request, Response
@@ -11,10 +10,11 @@ from mastctl.answers import CalibrationHealthTold, LiveTold, ReadyTold, Sentinel
 from mastctl.answers.words import WELL
 from mastctl.errors import Unable
 from mastctl.http import PREFIX
+from mastctl.http.entrance import from_this_machine
 from mastctl.watch.metrics import CONTENT_TYPE
 from mastctl.watch.reference import SENTINEL_FOLDER
 from mastctl.watch.sentinel import findings
-from mastctl.web.page import passing_answer
+from mastctl.web.commands import caller_of
 from mastctl.web.parts import Here
 
 
@@ -23,32 +23,26 @@ def add_watching(app: FastAPI) -> None:
 
     @app.get("/metrics", summary="Figures in the text format of Prometheus", response_class=Response)
     async def metrics(here: Here) -> Response:
-        return Response(here.service.metrics.text(), media_type=CONTENT_TYPE)
+        text = await here.waiting.run(here.service.metrics.text)  # it reads /proc
+        return Response(text, media_type=CONTENT_TYPE)
 
     @app.get(f"{PREFIX}/health/live", summary="Whether requests are answered: they are")
-    async def live() -> LiveTold:
-        return {"live": True}
+    async def live(request: Request, here: Here) -> LiveTold:
+        access = here.entrance.access
+        if access is None or not from_this_machine(request.scope, request.headers):
+            return {"live": True}
+        return {"live": True, "token_folder": access.folder}
 
     @app.get(
         f"{PREFIX}/health/ready",
         summary="Whether commands are carried out: 200 if they are, else 503 and why not",
     )
-    async def ready(here: Here) -> ReadyTold:
+    async def ready(request: Request, here: Here) -> ReadyTold:
         now = here.service.machine.standing
+        reason = "" if caller_of(request).stranger else now.reason  # it may name a person
         if now.word not in WELL:
-            raise Unable("not_ready", f"{now.word}: {now.reason}" if now.reason else now.word)
-        return {"ready": True, "state": now.word, "reason": now.reason}
-
-    @app.get(
-        f"{PREFIX}/history",
-        summary="Joints, temperatures and events of the last hours",
-        response_class=Response,
-    )
-    async def history(request: Request, here: Here) -> Response:
-        def told() -> bytes:
-            return json.dumps(here.service.history.told(), allow_nan=False).encode()
-
-        return await here.waiting.run(lambda: passing_answer(request.headers, told(), "application/json"))
+            raise Unable("not_ready", f"{now.word}: {reason}" if reason else now.word)
+        return {"ready": True, "state": now.word, "reason": reason}
 
     @app.get(
         f"{PREFIX}/calibration/health",

@@ -1,6 +1,6 @@
 """Fit OpenCV's families of lenses with this project, OpenCV and mrcal to the same corners, in one run.
 
-    .venv/bin/python -m tools.against_others.families [--data ../shared/data/opencv_stereo]
+    .venv/bin/python -m tools.against_others.families [--data hil_tests/data/opencv_stereo]
     .venv/bin/python -m tools.against_others.families --board BOARD.yaml PICTURES
 
 Without ``--board`` the corners are those of OpenCV's stereo sample; with it, of a folder with pictures of one
@@ -12,9 +12,10 @@ pole or a fold inside the picture; mrcal and this project hold the numbers near 
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
+import subprocess
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -32,29 +33,18 @@ from calib.calibrate.starts.views import view_poses
 from calib.errors import CalibError
 from calib.files import blind_part
 from calib.geometry.cahvor import COEFFICIENTS, CameraModel, Kind
+from calib.geometry.rigid import Rigid
 from calib.targets.board_file import load_board
 from calib.targets.boards import Corners
 from calib.targets.corners import find_corners
-from tools.against_others.calibration import (
-    ROUGH_FOCAL,
-    boards_problem,
-    boards_residuals,
-    find_mrcal,
-    mrcal_row,
-    rms,
-)
-from tools.against_others.points import (
-    COLUMNS,
-    NOISE_PX,
-    REPOSITORY,
-    ROWS,
-    SETTLED,
-    SQUARE_M,
-    BoardViews,
-    read_views,
-)
-from tools.command import end
+from tools.command import end, options, show
 
+REPOSITORY = Path(__file__).resolve().parents[2]
+COLUMNS, ROWS, SQUARE_M = 9, 6, 0.025
+NOISE_PX = 0.1
+SETTLED = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 200, 1e-12)
+ROUGH_FOCAL = 1.2
+"""Times OpenCV's focal length: where mrcal's fits start."""
 RATIONAL = cv2.CALIB_RATIONAL_MODEL
 FLAGS: dict[Kind, int] = {
     "OPENCV4": cv2.CALIB_FIX_K3,
@@ -69,6 +59,14 @@ WANTED = 1.01
 """Our rms over the others', at most."""
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp"}
 FEWEST, FEWEST_PICTURES = 8, 3
+
+
+TABLE = {
+    "pictures": "{pictures}", "family": "{kind}", "ours px": "{ours_px:.4f}", "OpenCV": "{opencv_px:.4f}",
+    "ours over": "{opencv_ratio:.3f}", "image": "{opencv_image:.0%}", "mrcal": "{mrcal_px:.4f}",
+    "ours over mrcal": "{mrcal_ratio:.3f}", "s": "{ours_s:.2f}",
+    "verdict": "{verdict}", "note": "{note} {about_others}",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -97,6 +95,84 @@ class FamilyRow:
             return ""
         ours_px = math.inf if self.ours_px is None or self.note else self.ours_px
         return "met" if all(ours_px <= WANTED * one for one in told) else "NOT MET"
+
+
+@dataclass(frozen=True, eq=False)
+class BoardViews:
+    """Corners of a chessboard: (54, 3) on the board, metres, and (n, 54, 2) in n pictures, pixels."""
+
+    name: str
+    size_px: tuple[int, int]
+    in_board_m: np.ndarray
+    pixels_px: np.ndarray
+
+
+def read_views(folder: Path, side: str) -> BoardViews:
+    """Find the corners in every picture of one side.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there are no pictures.
+    """
+    files = sorted(folder.glob(f"{side}*.jpg"))
+    if not files:
+        raise FileNotFoundError(
+            f"{folder} has no {side}*.jpg; it should hold OpenCV's stereo sample pictures"
+        )
+    found, size = [], (0, 0)
+    for file in files:
+        grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        seen, corners = cv2.findChessboardCorners(grey, (COLUMNS, ROWS))
+        if not seen:
+            continue
+        fine = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+        found.append(cv2.cornerSubPix(grey, corners, (11, 11), (-1, -1), fine)[:, 0].astype(np.float64))
+        size = (grey.shape[1], grey.shape[0])
+    x, y = np.meshgrid(np.arange(COLUMNS) * SQUARE_M, np.arange(ROWS) * SQUARE_M)
+    board = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
+    return BoardViews(side, size, board, np.array(found))
+
+
+def rms(residuals_px: np.ndarray) -> float:
+    """Root of the mean square length of residuals (..., 2)."""
+    return float(np.sqrt(np.mean(np.sum(residuals_px**2, axis=-1))))
+
+
+def centred(size_px: tuple[int, int], focal_px: float) -> CameraModel:
+    """Return a pinhole camera at the origin that looks along z, as CAHVOR."""
+    x, y, z = np.eye(3)
+    cx, cy = (np.array(size_px) - 1) / 2
+    return CameraModel("CAHVOR", size_px, np.zeros(3), z, focal_px * x + cx * z, focal_px * y + cy * z, z)
+
+
+def boards_problem(views: BoardViews, focal_px: float) -> tuple[Adjustment, Estimate]:
+    """Return the project's adjustment of one camera and free boards, and its start."""
+    camera = centred(views.size_px, focal_px)
+    middle = (np.array(views.size_px) - 1) / 2
+    terms, poses = [], {}
+    for number, pixels in enumerate(views.pixels_px):
+        board = (views.name, str(number))
+        slopes = (pixels - middle) / focal_px
+        _, turn, shift = cv2.solvePnP(
+            views.in_board_m, slopes[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+        )
+        poses[board] = Rigid(cv2.Rodrigues(turn)[0], shift.ravel())
+        count = np.arange(len(pixels))
+        terms.append(
+            ImageTerm(
+                str(number), "camera", board, None, 0.0, 0.0, count // COLUMNS, count % COLUMNS,
+                views.in_board_m, pixels, np.full(len(pixels), NOISE_PX), np.ones(len(pixels), dtype=bool),
+            )
+        )  # fmt: skip
+    start = Estimate({"camera": camera}, np.zeros(8), {}, poses, {}, np.zeros((0, 2)))
+    return Adjustment(terms, (), start, mast_parameters=0, prisms_cad_m={}), start
+
+
+def boards_residuals(problem: Adjustment, state: Estimate) -> np.ndarray:
+    """Return residuals of all corners, (n, 2), pixels."""
+    found = [problem.image_residual(state, term).reshape(-1, 2) for term in problem.images]
+    return np.concatenate(found) * NOISE_PX
 
 
 def fit_ours(kind: Kind, size_px: tuple[int, int], terms: Sequence[ImageTerm]) -> tuple[float, str]:
@@ -148,10 +224,29 @@ def fit_mrcal(
         "lens": f"LENSMODEL_{kind}", "size_px": views.size_px, "boards": poses,
         "pixels": views.pixels_px.tolist(),
         "intrinsics": [focal_px, focal_px, *middle, *[0] * COEFFICIENTS[kind]],
-        "columns": COLUMNS, "rows": ROWS, "spacing_m": SQUARE_M, "rounds": 1,
+        "columns": COLUMNS, "rows": ROWS, "spacing_m": SQUARE_M,
     }  # fmt: skip
-    row = mrcal_row("", kind, 0, interpreter, request, views.pixels_px.reshape(-1, 2))
-    return row.rms_px, row.note
+    if interpreter is None:
+        return None, "no mrcal"
+    done = subprocess.run(
+        [interpreter, str(Path(__file__).with_name("mrcal_fit.py"))],
+        input=json.dumps(request), capture_output=True, text=True, cwd="/",
+    )  # fmt: skip
+    if done.returncode:
+        return None, f"mrcal ended: {done.stderr.strip()[-80:]}"
+    answer = json.loads(done.stdout.splitlines()[-1])
+    if "refused" in answer:
+        return None, f"refused: {answer['refused']}"
+    return rms(np.array(answer["pixels"]) - views.pixels_px.reshape(-1, 2)), ""
+
+
+def find_mrcal() -> str | None:
+    """Return the first interpreter that has mrcal."""
+    for interpreter in (sys.executable, "/usr/bin/python3"):
+        probe = [interpreter, "-c", "import mrcal"]
+        if Path(interpreter).exists() and not subprocess.run(probe, capture_output=True, cwd="/").returncode:
+            return interpreter
+    return None
 
 
 def sample_terms(views: BoardViews) -> list[ImageTerm]:
@@ -216,16 +311,24 @@ def compare(
     return rows
 
 
+def _as_row(row: FamilyRow) -> dict[str, object]:
+    over = {
+        f"{name}_ratio": row.ours_px / px
+        for name, px in (("opencv", row.opencv_px), ("mrcal", row.mrcal_px))
+        if px and row.ours_px
+    }
+    return asdict(row) | over | {"verdict": row.verdict}
+
+
 def main() -> int:
     """Compare and print; exit code 1 if our rms is more than 1 % above another's, or there is none."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    sample = REPOSITORY.parent / "shared" / "data" / "opencv_stereo"
+    parser = options(__doc__, seed=None, as_json=True, tasks=False)
+    sample = REPOSITORY / "hil_tests" / "data" / "opencv_stereo"
     parser.add_argument(
         "--data", type=Path, default=sample, help="OpenCV's stereo sample, left*.jpg and right*.jpg"
     )
     parser.add_argument("--board", type=Path, help="BOARD.yaml of the pictures in FOLDER")
     parser.add_argument("folder", type=Path, nargs="?", help="pictures of one camera and one board")
-    parser.add_argument("--json", action="store_true", help="print one JSON document instead of a table")
     arguments = parser.parse_args()
     if (arguments.board is None) != (arguments.folder is None):
         parser.error("--board and FOLDER go together")
@@ -246,23 +349,7 @@ def main() -> int:
             except FileNotFoundError as error:
                 parser.error(str(error))
             rows += compare(side, views.size_px, sample_terms(views), views)
-    if arguments.json:
-        print(json.dumps([asdict(row) | {"verdict": row.verdict} for row in rows], indent=1))
-    else:
-        print(
-            f"{'pictures':10} {'family':15} {'ours px':>8} {'OpenCV':>8} {'ratio':>6} {'image':>6} "
-            f"{'mrcal':>8} {'ratio':>6} {'s':>6}"
-        )
-        for row in rows:
-            ours = row.ours_px or np.nan
-            opencv, mrcal = (
-                f"{px:8.4f} {ours / px:6.3f}" if px else "       -      -"
-                for px in (row.opencv_px, row.mrcal_px)
-            )
-            print(
-                f"{row.pictures:10} {row.kind:15} {ours:8.4f} {opencv} {row.opencv_image:6.0%} {mrcal} "
-                f"{row.ours_s:6.2f}  {row.verdict} {row.note} {row.about_others}".rstrip()
-            )
+    show(arguments, [_as_row(row) for row in rows], TABLE)
     return 0 if all(row.verdict != "NOT MET" for row in rows) else 1
 
 

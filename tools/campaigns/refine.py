@@ -17,8 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.calibrate.body import corrected_rig, fit_body_pose
-from calib.calibrate.body_sights import PRIOR_SHIFT_M, PRIOR_TURN_RAD
+from calib.calibrate.body import PRIOR_SHIFT_M, PRIOR_TURN_RAD, corrected_rig, fit_body_pose
 from calib.files.mast_file import load_rig
 from calib.geometry.handoff import Joints, hand_off
 from calib.geometry.rig import Rig
@@ -27,7 +26,7 @@ from calib.matching.handed_over import MatchedHandoff, matched_handoff
 from calib.matching.handoff import RefinedPixel
 from mastctl.calibration.landing import handoff_errors_px
 from mastctl.cli.output import at_least, not_negative, positive_number
-from tools.command import end, options, rms, run_cases
+from tools.command import end, options, rms, run_cases, show
 
 HEAD_HEIGHT_M, ASIDE_RAD = 1.45, 0.35
 HELD_OUT, HELD_OUT_M = 60, (1.5, 4.0)
@@ -57,7 +56,7 @@ class RefineBlock:
 
 @dataclass(frozen=True)
 class RefinedCase:
-    """One fit: significant or not, directions told, chi-square of six, held-out errors (n, 2) px."""
+    """One fit: significant or not, directions determined, chi-square of six, held-out errors (n, 2) px."""
 
     significant: bool
     seen: int
@@ -169,9 +168,17 @@ def blocks_of(true: Rig, options: argparse.Namespace) -> list[RefineBlock]:
     ]  # fmt: skip
 
 
+COLUMNS = {
+    "targets": "{targets}", "moved": "{moved}", "significant": "{significant} of {of}",
+    "directions": "{directions:.1f}", "chi2 of 6": "{chi2:.2f}",
+    "before rms, worst px": "{before_px[0]:.2f}, {before_px[1]:.2f}",
+    "after rms, worst px": "{after_px[0]:.2f}, {after_px[1]:.2f}",
+}  # fmt: skip
+
+
 def main() -> int:
     """Print the table."""
-    parser = options(__doc__, 100)
+    parser = options(__doc__, 100, as_json=True)
     parser.add_argument("--rig", required=True, type=Path, help="the true rig")
     parser.add_argument("--handoffs", type=at_least(1), default=20, help="of each case")
     parser.add_argument("--click-px", type=positive_number, default=0.2)
@@ -182,28 +189,35 @@ def main() -> int:
         parser.error(f"--rig {args.rig} has no stereo pair '{lacking[0]}'")
     blocks = blocks_of(true, args)
     found = run_cases(args, "tens of cases", run_block, blocks, label)
-    print("targets     moved  significant  told  chi2 of 6   before rms, worst px   after rms, worst px")
-    for words, ranges_m, size in ROWS:
+    rows = []
+    for name, ranges_m, size in ROWS:
         row = [
             case
             for block, cases in zip(blocks, found, strict=True)
             if (block.ranges_m, block.size) == (ranges_m, size)
             for case in cases
         ]
-        told = [
-            f"{rms(e):6.2f} {np.linalg.norm(e, axis=-1).max():6.2f}"
-            for e in (np.concatenate([c.before_px for c in row]), np.concatenate([c.after_px for c in row]))
-        ]
-        significant, seen = sum(case.significant for case in row), np.mean([case.seen for case in row])
-        print(
-            f"{words:11s} {'yes' if size else 'no':5s}  {significant:4d} of {args.cases:<4d}  "
-            f"{seen:4.1f}  {np.mean([c.chi2 for c in row]):9.2f}   {told[0]:>20s}  {told[1]:>20s}"
+        before, after = (
+            np.concatenate([getattr(one, key) for one in row]) for key in ("before_px", "after_px")
         )
+        rows.append(
+            {
+                "targets": name,
+                "moved": "yes" if size else "no",
+                "significant": sum(case.significant for case in row),
+                "of": args.cases,
+                "directions": float(np.mean([case.seen for case in row])),
+                "chi2": float(np.mean([case.chi2 for case in row])),
+                "before_px": [rms(before), float(np.linalg.norm(before, axis=-1).max())],
+                "after_px": [rms(after), float(np.linalg.norm(after, axis=-1).max())],
+            }
+        )
+    show(args, rows, COLUMNS)
     return 0
 
 
 def label(block: RefineBlock) -> str:
-    """A task in words."""
+    """The description of a task."""
     targets = next(words for words, ranges_m, _ in ROWS if ranges_m == block.ranges_m)
     return f"{targets}, {'moved' if block.size else 'not moved'}, cases from {block.first}"
 

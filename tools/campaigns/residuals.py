@@ -1,7 +1,6 @@
 """How true the residuals are that the daemon tells, of clicks at random pixels of rocks and of ground.
 
     .venv/bin/python -m tools.campaigns.residuals [--cases 200] [--seed 1] [--day kind worst] [--json]
-    .venv/bin/python -m tools.campaigns.residuals --day worst --without colour
 
 The packaged rover in scenes drawn anew, through a daemon. A case turns the head to a random view, clicks a
 random pixel of the left Navcam that shows a rock (or ground) 2 to 10 m away, and points once. No texture is
@@ -10,9 +9,6 @@ and the point is projected into the new picture. Told are the cases, those refus
 of these the other eye cannot see; z, which is the measured minus the true residual over the told sigma, of
 both axes together (rms, of x and y, the worst); what is beyond three sigmas, percent of targets; the error in
 px; medians of sigma.
-
-A day without some of what it does to head and pictures (``--without``) has the same scenes and, but for
-rounding, the same clicks: what is left out is the cause where z falls.
 """
 
 from __future__ import annotations
@@ -20,8 +16,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from copy import deepcopy
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -43,21 +38,6 @@ from mastctl.packaged import config_folder
 from tools.command import end, options, rms, run_cases, show
 
 DAYS = {"kind": "default.yaml", "worst": "worst_day.yaml"}
-PARTS: Mapping[str, tuple[str, ...]] = {
-    "ringing": ("head.ring_hz", "head.ring_damping", "head.settle_s"),
-    "harmonics": ("head.pan_harmonics_rad", "head.tilt_harmonics_rad"),
-    "play": ("head.gravity_turnover_rad", "head.gravity_friction"),
-    "clocks": ("clocks",),
-    "temperature": ("temperature",),
-    "shutter": ("cameras.smear", "cameras.row_time_s"),
-    "exposure": ("cameras.exposure",),
-    "falloff": ("cameras.lens.falloff",),
-    "defocus": ("cameras.lens.f_number", "cameras.lens.focus_m", "cameras.lens.pitch_um"),
-    "dust": ("cameras.lens.dust", "cameras.lens.dust_um", "cameras.lens.dust_gap_um"),
-    "colour": ("cameras.colour",),
-    "jpeg": ("cameras.jpeg_quality",),
-}
-"""What a day may be without, as keys of a configuration's simulation."""
 GROUPS = ("rocks", "ground")
 LEFT, RIGHT = "navcam_left", "navcam_right"
 NEAR_M, FAR_M = 2.0, 10.0
@@ -79,10 +59,9 @@ VIEWS = 40
 
 @dataclass(frozen=True)
 class ClicksTask:
-    """So many clicks of one group, in one scene of its own, on a day without some of its `PARTS`."""
+    """So many clicks of one group on a day, in one scene of its own."""
 
     day: str
-    without: tuple[str, ...]
     group: str
     seed: int
     number: int
@@ -112,16 +91,10 @@ class TrueClick:
     sigma_px: tuple[float, float] | None = None
 
 
-def config_of(day: str, scene_seed: int, without: Sequence[str] = ()) -> Config:
+def config_of(day: str, scene_seed: int) -> Config:
     """The packaged rover with its Navcams on such a day, in a scene of its own."""
     config = own_config(load_config(config_folder() / DAYS[day]), head=None, wire=None, speed=MAX)
-    simulation = {**deepcopy(config.hardware.simulation), "seed": scene_seed}
-    for key in (key for part in without for key in PARTS[part]):
-        *sections, name = key.split(".")
-        section = simulation
-        for each in sections:
-            section = section.get(each, {})
-        section.pop(name, None)
+    simulation = {**config.hardware.simulation, "seed": scene_seed}
     cameras = {name: config.hardware.cameras[name] for name in (LEFT, RIGHT)}
     return replace(config, hardware=replace(config.hardware, simulation=simulation, cameras=cameras))
 
@@ -131,7 +104,7 @@ def click_all(task: ClicksTask) -> list[TrueClick]:
     scene_seed = int(np.random.default_rng([task.seed, task.number, 1]).integers(1, 2**31))
     rng = np.random.default_rng([task.seed, task.number, GROUPS.index(task.group), 2])
     with (
-        RunningDaemon(config_of(task.day, scene_seed, task.without)) as daemon,
+        RunningDaemon(config_of(task.day, scene_seed)) as daemon,
         Client(daemon.url, timeout_s=120.0) as client,
     ):
         rover = daemon.hardware.simulation
@@ -288,21 +261,19 @@ def main() -> int:
         help="(default kind worst)",
     )
     parser.add_argument(
-        "--without", choices=PARTS, nargs="+", default=[], metavar="PART", help=f"of {', '.join(PARTS)}"
+        "--on", choices=GROUPS, nargs="+", default=list(GROUPS), help="what is clicked (default both)"
     )
     args = parser.parse_args()
     tasks = [
-        ClicksTask(
-            day, tuple(args.without), group, args.seed, number, min(A_TASK, args.cases - number * A_TASK)
-        )
+        ClicksTask(day, group, args.seed, number, min(A_TASK, args.cases - number * A_TASK))
         for number in range(math.ceil(args.cases / A_TASK))
         for day in args.day
-        for group in GROUPS
+        for group in args.on
     ]
     label = "{0.day} day, {0.group}, scene {0.number}".format
     found = run_cases(args, "scenes", click_all, tasks, label)
     rows, clicks = [], []
-    for day, group in product(args.day, GROUPS):
+    for day, group in product(args.day, args.on):
         mine = [
             one
             for task, row in zip(tasks, found, strict=True)

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calib.files.pds3 import PdsProduct, read_product
+from calib.errors import NoStereoPoint
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig, RigCamera
@@ -35,7 +35,9 @@ from calib.matching.patch import match_patch
 from calib.matching.verdict import MatchSettings, rivalled
 from calib.matching.warp import Grey, Plane, grey
 from drivers.clock import ManualClock
+from drivers.recordings.pds3 import PdsProduct, read_product
 from drivers.recordings.replay import Replay, open_replay
+from tools.command import rms
 from tools.flight.poses import PoseFit, fit_poses
 
 PRODUCTS = "1N4910*.IMG"
@@ -74,36 +76,12 @@ class CarriedFeatures:
     position_m: FloatArray
 
 
-@dataclass(frozen=True)
-class PairResult:
-    """What a pair of views tells: residuals across the epipolar line, pixels.
-
-    ``turned_*``: after a turn of the second camera (3 parameters), which its pointing error may be.
-    ``on_line_*``: the service's own search, bound to the line, for comparison.
-    """
-
-    seen: int
-    matched: int
-    median_px: float
-    rms_px: float
-    mean_px: float
-    worst_px: float
-    turn_mrad: float
-    turned_median_px: float
-    turned_rms_px: float
-    on_line_matched: int
-    on_line_median_px: float
-    nearest_m: float
-    farthest_m: float
-
-
 @dataclass(frozen=True, eq=False)
 class Rehearsal:
     """A pointing at a feature of one view, aimed at the pixel of another view where it should be seen.
 
     The range comes from neighbouring features, never from the feature's own match. ``solution`` are the
-    angles that put it on ``aim_px``, ``off_rad`` how far they are from the recorded ones, ``centre`` the
-    angles that would put it in the middle of the picture.
+    angles that put it on ``aim_px``, ``off_rad`` how far they are from the recorded ones.
     """
 
     carried: CarriedFeatures
@@ -111,7 +89,6 @@ class Rehearsal:
     aim_px: FloatArray
     solution: Solution
     off_rad: float
-    centre: Solution
 
     @property
     def residual_px(self) -> FloatArray:
@@ -215,7 +192,10 @@ def carry(first: FlightView, pixel_px: FloatArray, second: FlightView) -> Carrie
     ]
     if elsewhere and rivalled(best.correlation, max(elsewhere), settings):
         return None
-    position = triangulate(first.camera, second.camera, pixel_px, best.pixel_px).position_m
+    try:
+        position = triangulate(first.camera, second.camera, pixel_px, best.pixel_px).position_m
+    except NoStereoPoint:  # a match so near the vanishing point that the rays diverge: a false one
+        return None
     across = across_px(first.camera, pixel_px, second.camera, best.pixel_px)
     return CarriedFeatures(pixel_px, best.pixel_px, across, best.correlation, position)
 
@@ -238,31 +218,34 @@ def carried_features(first: FlightView, second: FlightView) -> tuple[int, list[C
 
 def pair_result(
     first: FlightView, second: FlightView, seen: int, carried: Sequence[CarriedFeatures]
-) -> PairResult:
-    """Sum up a pair of views."""
+) -> dict[str, float]:
+    """Return a pair's row: residuals across the epipolar line, pixels, and ranges, metres.
+
+    ``turned_*``: after a turn of the second camera (3 parameters), which its pointing error may be.
+    ``on_line_*``: the service's own search, bound to the line, for comparison.
+    """
     across = np.array([one.across_px for one in carried])
-    turn_rad, left = turned(first, second, carried)
+    _, left = turned(first, second, carried)
     on_line = [
         find_partner(first.image, first.camera, corner, second.image, second.camera, NEAREST_M)
         for corner in features(first, second)
     ]
     on_line_px = [one.across_px for one in on_line if one.match.verdict == "good"]
     ranges = [float(np.linalg.norm(one.position_m - first.camera.C)) for one in carried]
-    return PairResult(
-        seen,
-        len(carried),
-        float(np.median(np.abs(across))),
-        rms(across),
-        float(across.mean()),
-        float(np.abs(across).max()),
-        float(np.linalg.norm(turn_rad) * 1e3),
-        float(np.median(np.abs(left))),
-        rms(left),
-        len(on_line_px),
-        float(np.median(np.abs(on_line_px))),
-        min(ranges),
-        max(ranges),
-    )
+    return {
+        "seen": seen,
+        "matched": len(carried),
+        "nearest_m": min(ranges),
+        "farthest_m": max(ranges),
+        "median_px": np.median(np.abs(across)),
+        "rms_px": rms(across),
+        "worst_px": np.abs(across).max(),
+        "mean_px": across.mean(),
+        "turned_median_px": np.median(np.abs(left)),
+        "turned_rms_px": rms(left),
+        "on_line_matched": len(on_line_px),
+        "on_line_median_px": np.median(np.abs(on_line_px)),
+    }
 
 
 def turned_about_itself(camera: CameraModel, turn_rad: FloatArray) -> CameraModel:
@@ -280,7 +263,7 @@ def turned(
         turned = turned_about_itself(second.camera, turn_rad)
         return np.array([across_px(first.camera, one.pixel_px, turned, one.found_px) for one in carried])
 
-    best = least_squares(across, np.zeros(3), x_scale=1e-3, diff_step=1e-2)
+    best = least_squares(across, np.zeros(3), x_scale=1e-3, diff_step=np.full(3, 1e-2))
     return best.x, best.fun
 
 
@@ -304,13 +287,5 @@ def rehearse(
     best = solve(
         rover.mast, head_camera, target, aim, from_pan_rad=first.pan_rad, from_tilt_rad=first.tilt_rad
     )[0]
-    centre = solve(rover.mast, head_camera, target, from_pan_rad=first.pan_rad, from_tilt_rad=first.tilt_rad)[
-        0
-    ]
     off = max(abs(best.pan_rad - second.pan_rad), abs(best.tilt_rad - second.tilt_rad))
-    return Rehearsal(this, target, aim, best, off, centre)
-
-
-def rms(values: FloatArray) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
+    return Rehearsal(this, target, aim, best, off)

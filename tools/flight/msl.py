@@ -8,12 +8,14 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.maps import model_difference, with_one_lens
 from calib.geometry.rig import Mast
+from tools.command import rms
+from tools.flight.difference import model_difference, with_one_lens
 from tools.flight.poses import PoseFit, fit_poses
 
 CAMERAS = {"A": ("216", "4"), "B": ("215", "6")}
@@ -70,23 +72,16 @@ def _label(row: dict[str, str], angles: str) -> Label:
     def vector(letter: str, names: str = "xyz") -> np.ndarray:
         return np.array([float(row[f"{letter}_{name}"]) for name in names])
 
-    model, _ = CameraModel.normalised(
-        kind="CAHVOR",
-        size_px=(int(row["line_samples"]), int(row["lines"])),
-        C=vector("C"),
-        A=vector("A"),
-        H=vector("H"),
-        V=vector("V"),
-        O=vector("O"),
-        R=vector("R", "012"),
-    )
+    size_px = (int(row["line_samples"]), int(row["lines"]))
+    vectors: dict[str, Any] = {letter: vector(letter) for letter in "CAHVO"}
+    model, _ = CameraModel.normalised(kind="CAHVOR", size_px=size_px, R=vector("R", "012"), **vectors)
     return Label(row["product_id"], model, float(row[f"az_{angles}_rad"]), float(row[f"el_{angles}_rad"]))
 
 
 def new_pointings(training: Sequence[Label], others: Sequence[Label]) -> list[Label]:
     """Return one label for each pair of angles that training does not have; many labels repeat angles."""
     known = {(label.pan_rad, label.tilt_rad) for label in training}
-    first = {}
+    first: dict[tuple[float, float], Label] = {}
     for label in others:
         first.setdefault((label.pan_rad, label.tilt_rad), label)
     return [label for angles, label in first.items() if angles not in known]
@@ -118,20 +113,8 @@ def errors(fitted: PoseFit, labels: Sequence[Label]) -> LabelErrors:
         position.append(np.linalg.norm(found.position_m) * 1e3)
         orientation.append(np.linalg.norm(found.rotation_rad) * 1e3)
         shift.append(np.linalg.norm(found.shift_px, axis=-1))
-    return LabelErrors(
-        len(labels),
-        rms(position),
-        float(np.max(position)),
-        rms(orientation),
-        float(np.max(orientation)),
-        rms(shift),
-        float(np.max(shift)),
-    )
-
-
-def rms(values: Sequence[float] | Sequence[np.ndarray]) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
+    sizes = (f(values) for values in (position, orientation, shift) for f in (rms, np.max))
+    return LabelErrors(len(labels), *map(float, sizes))
 
 
 def printed_labels(fitted: PoseFit, labels: Sequence[Label], seed: int) -> list[Label]:
@@ -149,7 +132,9 @@ def printed_labels(fitted: PoseFit, labels: Sequence[Label], seed: int) -> list[
         true = fitted.camera_in_rover(pan, tilt)
         if label.model.size_px != true.size_px:
             true = _resized(true, label.model.size_px)
-        six = {letter: np.array([float(f"{x:.6g}") for x in getattr(true, letter)]) for letter in "CAHVO"}
+        six: dict[str, Any] = {
+            letter: np.array([float(f"{x:.6g}") for x in getattr(true, letter)]) for letter in "CAHVO"
+        }
         model, _ = CameraModel.normalised(kind=true.kind, size_px=true.size_px, R=true.R, **six)
         made.append(replace(label, model=model))
     return made

@@ -34,9 +34,9 @@ from calib.adjust.solver import Minimum, Normal, covariance_of, minimise
 from calib.adjust.uncertainty import SEEN_RAD, in_words, open_parameters
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.maps import RANGES_M, ModelDifference, model_difference, pixel_grid
 from calib.geometry.rig import MAST_FREE, MAST_NAMES, Mast, gimbal, gimbal_rates, mast_of, numbers_of
 from calib.geometry.rigid import FloatArray, Rigid, moved_rigid, rigid_rates, rot_x, rot_y, rot_z
+from tools.flight.difference import RANGES_M, ModelDifference, model_difference, pixel_grid
 
 TWISTS_RAD = np.linspace(-1.4, 1.4, 15)
 """Twists tried for a start, since the closed form of the start needs one."""
@@ -95,19 +95,12 @@ def fit_poses(
 
     Unknown are the mast and the six of the camera's place in the head; the camera's lens (focal
     lengths, centre, distortion) is the first model's. Every pixel residual weighs the same. Where the
-    lens itself changes from model to model, ``calib.geometry.maps.with_one_lens``
+    lens itself changes from model to model, ``tools.flight.difference.with_one_lens``
     takes that out first.
 
-    Parameters
-    ----------
-    models
-        At least three models of one camera in the rover frame. Sizes may differ by binning.
-    pan_rad, tilt_rad
-        (n,) measured joint angles of the models, radians; positive tilt looks up.
-    parameters
-        6 for axes that meet at a right angle (the paper's mast), 8 for any two axes that are not parallel.
-    ranges_m
-        Near and far range of the compared points, metres.
+    Models are in the rover frame, of one camera, and may differ in size by binning; joint angles (n,) are in
+    radians, positive tilt looks up. Six parameters are for axes that meet at a right angle (the paper's
+    mast), eight for any two that are not parallel. Compared are points at the near and the far range.
 
     Raises
     ------
@@ -161,7 +154,7 @@ class _State(NamedTuple):
 
 
 class _Poses:
-    """The problem (``calib.adjust.solver.Problem``) of the mast and the camera's place in the head.
+    """The mast and the camera's place in the head, as a `calib.adjust.solver.LeastSquaresProblem`.
 
     Points (n, m, 3) of n models in the rover frame, the pixels (m, 2) to see them at, and which exist (n, m).
     """

@@ -1,6 +1,6 @@
 """Carry targets from one picture of Opportunity's Navcam to the next, as the tracker would: what is left.
 
-    .venv/bin/python -m tools.flight.real_handoff ../shared/data/mer_navcam [--picture FILE] [--json]
+    .venv/bin/python -m tools.flight.real_handoff hil_tests/data/mer_navcam [--json]
 
 Five left-Navcam frames of one rover pose and five pointings; six ordered pairs overlap. Each frame is taken
 as a camera of its own, with the CAHVOR model of its label (computed at the MEASURED joint angles). Targets
@@ -22,20 +22,14 @@ between the raw patches, started up to half a pixel off the prediction. It share
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
-import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
@@ -46,11 +40,10 @@ from calib.matching.look import TrackLook, seen_by
 from calib.matching.track import KeyPicture, Track, TrackSettings
 from calib.matching.warp import Plane, carry
 from drivers.clock import ManualClock
-from tools.campaigns.render_bias import BLUR_PX, GRID_PX, HALF_PX, MARGIN_PX, best_affine
-from tools.campaigns.render_bias import match as ecc
-from tools.command import end, new_file
+from hil_tests.support.rendered_patches import BLUR_PX, GRID_PX, HALF_PX, MARGIN_PX, best_affine
+from hil_tests.support.rendered_patches import match as ecc
+from tools.command import end, options, show
 from tools.flight import mer
-from tools.flight.mer import FlightView
 
 PAIRS = ((0, 1), (1, 0), (2, 3), (3, 2), (3, 4), (4, 3))
 EVERY_PX = 32
@@ -75,8 +68,6 @@ class CarriedTarget:
     ----------
     pixel_px, predicted_px
         (2,) in the first frame, and where the labels' models and the assumed range put it in the second.
-    spread_px2
-        (2, 2) covariance of that prediction.
     verdict
         Of the match; ``misfit`` for a good match that does not fit the prediction, so that the tracker
         refuses it.
@@ -90,7 +81,6 @@ class CarriedTarget:
 
     pixel_px: FloatArray
     predicted_px: FloatArray
-    spread_px2: FloatArray
     verdict: str
     reason: str
     found_px: FloatArray
@@ -114,7 +104,11 @@ def views(folder: Path) -> list[mer.FlightView]:
         )
     clock = ManualClock(50.0)
     seen = mer.views(mer.replay(folder, clock), clock, mer.rig(mer.fit(products), products))
-    by_pan = {round(product.azimuth_measured_rad or 0.0, 5): product.camera_model for product in products}
+    by_pan = {
+        round(product.azimuth_measured_rad or 0.0, 5): product.camera_model
+        for product in products
+        if product.camera_model is not None
+    }
     return [replace(view, camera=by_pan[round(view.pan_rad, 5)]) for view in seen]
 
 
@@ -156,13 +150,12 @@ def carried(
         "tracked", point, covariance, KeyPicture(Eye(first.image, first.camera), pixel_px, plane.normal)
     )
     look = seen_by(track, {"second": Eye(second.image, second.camera)}, SETTINGS)
-    predicted, rate, _ = second.camera.project_jacobian(point)
-    spread = rate @ covariance @ rate.T + SETTINGS.model_px**2 * np.eye(2)
+    predicted, _ = second.camera.project(point)
     match = look.found["second"]
     good = match.verdict == "good"
     across = mer.across_px(first.camera, pixel_px, second.camera, match.pixel_px) if good else np.nan
     return CarriedTarget(
-        pixel_px, np.asarray(predicted), spread, _verdict(look), look.reason, match.pixel_px, across,
+        pixel_px, np.asarray(predicted), _verdict(look), look.reason, match.pixel_px, across,
         _by_ecc(first, second, pixel_px, plane, seed) if good else np.full(2, np.nan),
     )  # fmt: skip
 
@@ -228,7 +221,7 @@ def _plane_near(
     return Plane(middle, normal) if 1.0 < range_m < 100.0 else None
 
 
-def told(some: Sequence[CarriedTarget]) -> dict[str, Any]:
+def summary(some: Sequence[CarriedTarget]) -> dict[str, Any]:
     """Sum up: shares of verdicts, residuals of the found, and how far ECC ends from our match."""
     found = [one for one in some if one.verdict in ("good", "misfit")]
     off = np.array([one.found_px - one.predicted_px for one in found]).reshape(-1, 2)
@@ -255,132 +248,40 @@ def told(some: Sequence[CarriedTarget]) -> dict[str, Any]:
     }
 
 
+COLUMNS = {
+    "frames": "{frames}", "range": "{range}", "targets": "{targets}", "found": "{found}",
+    "rms x, y px": "{rms_px[0]:.2f}, {rms_px[1]:.2f}", "worst px": "{worst_px:.2f}",
+    "across the line: rms, mean, worst px":
+        "{across_rms_px:.2f}, {across_mean_px:+.2f}, {across_worst_px:.2f}",
+    "ECC agrees": "{ecc_agrees}", "apart: median, rms x, y px":
+        "{ecc_apart_median_px:.3f}, {ecc_apart_rms_px[0]:.3f}, {ecc_apart_rms_px[1]:.3f}",
+    "its residual x, y px": "{ecc_residual_rms_px[0]:.2f}, {ecc_residual_rms_px[1]:.2f}",
+}  # fmt: skip
+
+
 def main() -> int:
-    """Print a row a pair and assumption, and draw the picture."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    """Print a row for each pair and assumption."""
+    parser = options(__doc__, seed=None, as_json=True, tasks=False)
     parser.add_argument("data", type=Path, help="folder of the frames 1N4910*.IMG")
-    parser.add_argument("--picture", type=new_file, help="file for the picture")
-    parser.add_argument("--json", action="store_true", help="print one JSON document instead of the table")
     arguments = parser.parse_args()
     try:
         frames = views(arguments.data)
     except FileNotFoundError as error:
         parser.error(str(error))
-    found = {(a, b): pair(frames[a], frames[b]) for a, b in PAIRS}
+    found = {f"{a + 1} to {b + 1}": pair(frames[a], frames[b]) for a, b in PAIRS}
+    found["all"] = {
+        assumed: [one for by_range in found.values() for one in by_range[assumed]] for assumed in RANGE_SIGMA
+    }
     rows = [
-        {"from": a + 1, "to": b + 1, "range": way, **told(some)}
-        for (a, b), ways in found.items()
-        for way, some in ways.items()
+        {"frames": name, "range": assumed, **summary(some)}
+        for name, by_range in found.items()
+        for assumed, some in by_range.items()
     ]
-    for way in RANGE_SIGMA:
-        rows.append(
-            {"from": "all", "to": "", "range": way, **told([o for w in found.values() for o in w[way]])}
-        )
-    if arguments.picture is not None:
-        draw(frames[2], frames[3], found[2, 3], arguments.picture)
-    if arguments.json:
-        print(json.dumps(rows, indent=1))
-    else:
-        print_table(rows)
+    for row in rows:
+        verdicts = sorted(row["verdicts"].items())
+        row["notes"] = [", ".join(f"{verdict} {count}" for verdict, count in verdicts)]
+    show(arguments, rows, COLUMNS, "notes")
     return 0
-
-
-def print_table(rows: Sequence[dict[str, Any]]) -> None:
-    """Print the rows."""
-    for one in rows:
-        verdicts = ", ".join(f"{name} {count}" for name, count in sorted(one["verdicts"].items()))
-        frames = f"{one['from']} to {one['to']}" if one["to"] else one["from"]
-        print(f"{frames}, {one['range']}: {one['targets']} targets: {verdicts}")
-        if one["found"]:
-            x, y = one["rms_px"]
-            print(
-                f"    residual rms x {x:.2f}, y {y:.2f}, worst {one['worst_px']:.2f} px; across the line rms "
-                f"{one['across_rms_px']:.2f}, mean {one['across_mean_px']:+.2f}, worst "
-                f"{one['across_worst_px']:.2f} px"
-            )
-        if one["ecc_agrees"]:
-            (x, y), (u, v) = one["ecc_apart_rms_px"], one["ecc_residual_rms_px"]
-            print(
-                f"    ECC agrees in {one['ecc_agrees']} of {one['found']}: apart median "
-                f"{one['ecc_apart_median_px']:.3f}, rms x {x:.3f}, y {y:.3f} px; "
-                f"its own residual x {u:.2f}, y {v:.2f} px"
-            )
-
-
-matplotlib.use("Agg")
-
-CREDIT = "Images: NASA/JPL-Caltech (Opportunity Navcam, 2015-07-24)"
-COLOURS = {"good": "#3ddc84", "misfit": "#ffd23f"}
-OTHER, PREDICTED = "#bbbbbb", "#ff4f4f"
-ARROW_PX = 60.0
-"""Pixels of the picture that an arrow takes for one pixel of residual."""
-ZOOM_PX = 26
-EXAMPLES = 3
-
-
-def draw(
-    first: FlightView, second: FlightView, ways: Mapping[str, Sequence[CarriedTarget]], path: Path
-) -> None:
-    """Draw a pair: all targets with their residuals, and some of them large."""
-    figure = Figure(figsize=(11.0, 8.6), layout="constrained")
-    grid = figure.add_gridspec(2, 2 * EXAMPLES, height_ratios=(2.6, 1))
-    left, right = figure.add_subplot(grid[0, :EXAMPLES]), figure.add_subplot(grid[0, EXAMPLES:])
-    some = ways["neighbours"]
-    _frame(left, first, "targets: accepted, refused by the misfit, not found")
-    _frame(right, second, f"found; arrows: found less predicted, {ARROW_PX:.0f} times")
-    for one in some:
-        colour = COLOURS.get(one.verdict, OTHER)
-        left.plot(*one.pixel_px, ".", color=colour, ms=4)
-        if one.verdict in COLOURS:
-            right.plot(*one.found_px, ".", color=colour, ms=4)
-            end = one.found_px + ARROW_PX * (one.found_px - one.predicted_px)
-            right.annotate("", end, one.found_px, arrowprops={"arrowstyle": "->", "color": colour, "lw": 1.0})
-    level = [one for one in ways["level"] if one.verdict == "good"]
-    # Of the accepted by range: the nearest, the middle and the farthest, as seen in the first frame.
-    order = sorted(level, key=lambda one: -one.pixel_px[1])
-    for column, index in enumerate(np.linspace(0, len(order) - 1, EXAMPLES).astype(int)):
-        one = order[index]
-        _zoom(figure.add_subplot(grid[1, 2 * column]), first, one.pixel_px, "target", one.pixel_px)
-        axes = figure.add_subplot(grid[1, 2 * column + 1])
-        _zoom(axes, second, one.predicted_px, "predicted (level), found", one.found_px)
-        axes.plot(*one.predicted_px, "x", color=PREDICTED, ms=8, mew=1.5)
-        _ellipse(axes, one)
-    figure.supxlabel(CREDIT, fontsize=8, color="#555555", x=0.99, ha="right")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(
-        path, dpi=100, pil_kwargs={"quality": 74, "optimize": True} if path.suffix == ".jpg" else None
-    )
-
-
-def _stretched(image: np.ndarray) -> np.ndarray:
-    """Return a frame with its shadows lifted, for the eye only."""
-    clear = cv2.createCLAHE(clipLimit=2.0, tileGridSize=(6, 6))
-    return np.asarray(clear.apply(np.clip(image * 1.6, 0, 255).astype(np.uint8)))
-
-
-def _frame(axes: Axes, view: FlightView, title: str) -> None:
-    axes.imshow(_stretched(view.image), cmap="gray", vmin=0, vmax=255, interpolation="antialiased")
-    angles = f"pan {np.degrees(view.pan_rad):.2f}°, tilt {np.degrees(view.tilt_rad):.2f}°"
-    axes.set_title(f"{title}\n{angles}", fontsize=9)
-    height, width = view.image.shape
-    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=(), yticks=())
-
-
-def _zoom(axes: Axes, view: FlightView, middle_px: FloatArray, title: str, cross_px: FloatArray) -> None:
-    axes.imshow(_stretched(view.image), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
-    x, y = middle_px
-    axes.set(xlim=(x - ZOOM_PX, x + ZOOM_PX), ylim=(y + ZOOM_PX, y - ZOOM_PX), xticks=(), yticks=())
-    axes.plot(*cross_px, "+", color=COLOURS["good"], ms=12, mew=1.5)
-    axes.set_title(f"{title}\n({2 * ZOOM_PX} px wide)", fontsize=8)
-
-
-def _ellipse(axes: Axes, one: CarriedTarget) -> None:
-    """The window's ellipse: as many sigmas of the prediction as the tracker searches."""
-    values, vectors = np.linalg.eigh(one.spread_px2)
-    width, height = 2 * TrackSettings().sigmas * np.sqrt(values[::-1])
-    angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
-    shape = {"fill": False, "color": PREDICTED, "lw": 1.2}
-    axes.add_patch(Ellipse((one.predicted_px[0], one.predicted_px[1]), width, height, angle=angle, **shape))
 
 
 if __name__ == "__main__":

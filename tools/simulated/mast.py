@@ -35,11 +35,11 @@ from calib.survey.writer import write_survey
 from drivers.clock import ManualClock
 from drivers.sim.heads import PRESETS, HeadSettings
 from drivers.sim.pan_tilt import SimulatedPanTilt
+from hil_tests.support.sim_survey.plan import Ring, SurveyPlan
+from hil_tests.support.sim_survey.survey import simulate_survey
 from mastctl.calibration.run import Calibrated, calibrate, checked_survey
 from mastctl.cli.output import at_least
 from tools.command import end
-from tools.sim_survey.plan import Ring, SurveyPlan
-from tools.sim_survey.survey import simulate_survey
 
 SIGMA = Sigma(station_m=0.001, dot_px=0.1, joint_rad=3e-5)
 """The joints' is half a step of the packaged rover's head."""
@@ -109,12 +109,6 @@ def tell_projection(true: Rig, believed: Rig) -> None:
                 for name, off in errors.items()
             )
             print(f"  {distance_m:2.0f} m: {words}")
-    if "hazcam" in true.stereo:
-        off_mm = 1000 * hazcam_range_error_m(true, believed, 1.0)
-        print(
-            f"range by the Hazcams at 1 m: rms {np.sqrt(np.mean(off_mm**2)):.2f} mm, worst "
-            f"{np.abs(off_mm).max():.2f} mm"
-        )
 
 
 def tell_pointing(true: Rig, believed: Rig, options: argparse.Namespace) -> None:
@@ -215,19 +209,6 @@ def projection_error_px(truth: Rig, belief: Rig, camera: str, distance_m: float)
     return np.concatenate(errors)
 
 
-def hazcam_range_error_m(truth: Rig, belief: Rig, distance_m: float) -> np.ndarray:
-    """Return (n,) metres: believed less true distance from the left Hazcam, of points that both see."""
-    left, right = truth.stereo["hazcam"]
-    points = _seen_at(truth, left, (0.0, 0.0), distance_m)
-    pixels, valid = truth.cameras[right].model.project(points)
-    size = np.array(truth.cameras[right].model.size_px)
-    both = valid & ((pixels >= 0) & (pixels <= size - 1)).all(axis=1)
-    eyes = belief.cameras[left].model, belief.cameras[right].model
-    clicks = zip(_grid(eyes[0])[both], pixels[both], strict=True)
-    found = np.array([triangulate(*eyes, *pair).position_m for pair in clicks])
-    return np.asarray(np.linalg.norm(found - eyes[0].C, axis=1) - distance_m)
-
-
 def pointing_error_px(
     truth: Rig,
     belief: Rig,
@@ -274,8 +255,8 @@ def pointing_error_px(
         if not (seen[0][0] and seen[1][0]):
             continue
         left_px, right_px = (click[0] + rng.normal(0, click_px, 2) for click in clicks)
-        models = (belief.camera_in_rover(n, *measured) for n in (left, right))
-        found = triangulate(*models, left_px, right_px)
+        one, other = (belief.camera_in_rover(n, *measured) for n in (left, right))
+        found = triangulate(one, other, left_px, right_px)
         aim = choose(solve(belief.mast, believed, found.position_m), PAN_LIMITS_RAD, TILT_LIMITS_RAD)
         _, true = go(aim.pan_rad, aim.tilt_rad)
         landed, _ = truth.camera_in_rover(left, *true).project(target[None])

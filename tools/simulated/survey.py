@@ -22,11 +22,11 @@ from calib.survey.records import Sigma, Survey
 from calib.survey.writer import write_survey
 from drivers.sim.render import Renderer
 from drivers.sim.scene import build_scene
+from hil_tests.support.sim_survey.board import draw_board, photograph
+from hil_tests.support.sim_survey.plan import SurveyPlan, SurveyTruth
+from hil_tests.support.sim_survey.survey import simulate_survey
 from mastctl.cli.output import at_least, not_negative
 from tools.command import end
-from tools.sim_survey.board import draw_board, photograph
-from tools.sim_survey.plan import SurveyPlan, SurveyTruth
-from tools.sim_survey.survey import simulate_survey
 
 BLUR_PX, NOISE_DN = 0.7, 2.0
 

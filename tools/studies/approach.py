@@ -3,279 +3,397 @@
     .venv/bin/python -m tools.studies.approach --cases 5 --out approaches
 
 Each run follows a rock from Pancam to Navcam to Hazcam, a minute a run. It prints the errors of the tracked
-stops beside the paper's Table I; ``--out`` gets the record of all stops and their pictures.
+stops beside the paper's Table I; ``--out`` gets stops.csv, a row for each stop.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import astuple, dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from calib.errors import CalibError
 from calib.files.mast_file import load_rig
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.pointing import solve
+from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import target_approach_budget
-from drivers.interfaces import Image
+from calib.matching.look import seen_by
+from calib.matching.track import Track, moved_track, start_track
+from drivers.sim.scene import SceneSettings, build_scene
 from mastctl.cli import output
-from mastctl.cli.output import check_folder
+from mastctl.experiment.targets import texture_mask
+from mastctl.motion.pairs import choose_pairs
 from mastctl.packaged import config_folder
-from mastctl.report import pictures, plots
-from mastctl.report.pages import write_csv, write_json
-from mastctl.report.tables import Table
-from tools.command import end, options, run_cases
-from tools.studies.approach_run import ApproachRun, ApproachTask, Stop, one_approach
+from mastctl.report.pages import write_csv
+from tools.command import end, options, run_cases, show
+from tools.studies.approach_world import ApproachWorld, WorldErrors
+
+START_M, END_M = 10.0, 1.0
+STEP = 0.1
+"""Of the range, driven in one step."""
+
+ROCK_M = 0.05
+"""A target so far above the ground is on a rock."""
+
+ROCKS = 150
+"""In the scene, so that several stand at the start range."""
+
+PICKS = 12
+"""Pixels that are tried in one view: most of a rock's strongest texture is its edge, which is refused."""
+
+INSIDE_PX, APART_M = 15.0, 0.15
+"""On a rock, what is seen this far beside a target (4 cm across at 10 m) is not farther away from it."""
+
+NEAR_ROCK_PX = 40
+"""How far from the rock's chosen point its texture is looked for."""
+
+SUN_MOVES_RAD = math.radians(8.0)
+LOST_LOOKS = 3
+"""How often a lost target is looked for at one stop, before the rover drives on."""
+
+GIVE_UP = 4
+"""Stops without the target after which the run ends as lost."""
+
+
+AXES = ("along", "right", "below")
+"""Of an error: along the pair's line of sight, to its right, below it."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """One stop of an approach, a row of ``--out``; errors are believed less true, along `AXES`.
+
+    ``range_m`` is the true distance from the middle of the pair's cameras; ``state`` tracked or lost, and
+    ``reason`` why; ``pixel_error_px`` of the left camera's match, not-a-number without one; ``untracked_m``
+    the error had the start's position been carried by reported motions alone; ``pose_doubt`` the pictures'
+    objection to the reported motion, which is honest.
+    """
+
+    range_m: float
+    pair: str
+    state: str
+    reason: str
+    error_m: tuple[float, ...]
+    sigma_m: tuple[float, ...]
+    pixel_error_px: float
+    renewed: bool
+    untracked_m: tuple[float, ...]
+    pose_doubt: str = ""
+
+    @property
+    def silently_wrong(self) -> bool:
+        """Whether it says tracked and is off by over 3 cm, 1 % of the range and five of its sigmas."""
+        far = float(np.linalg.norm(self.error_m)) > max(0.03, 0.01 * self.range_m)
+        return (
+            self.state == "tracked"
+            and far
+            and bool((np.abs(self.error_m) > 5 * np.array(self.sigma_m)).any())
+        )
+
+
+@dataclass(frozen=True)
+class ApproachRun:
+    """One approach: its stops, or why it did not begin; ``start_m`` is the first stereo's error."""
+
+    seed: int
+    stops: tuple[Stop, ...]
+    error: str = ""
+    start_m: tuple[float, ...] = (math.nan,) * 3
+
+    @property
+    def kept(self) -> bool:
+        """Whether the target was tracked at the last stop, near its end."""
+        return bool(self.stops) and self.stops[-1].state == "tracked" and self.stops[-1].range_m < 1.3
+
+    @property
+    def handoffs(self) -> int:
+        """How often another pair took over and found the target."""
+        seen = [stop.pair for stop in self.stops if stop.state == "tracked"]
+        return sum(a != b for a, b in pairwise(seen))
+
+    @property
+    def losses(self) -> tuple[int, int]:
+        """How often the target was lost, and how often found again."""
+        pairs = list(pairwise(["tracked", *(stop.state for stop in self.stops)]))
+        return pairs.count(("tracked", "lost")), pairs.count(("lost", "tracked"))
+
+
+@dataclass(frozen=True, eq=False)
+class ApproachTask:
+    """One approach: the true and the believed rig, and the seed."""
+
+    true: Rig
+    believed: Rig
+    seed: int
+
+
+def one_approach(task: ApproachTask) -> ApproachRun:
+    """Drive the approach of a task, which comes to the same wherever it runs."""
+    return run_approach(task.true, task.believed, task.seed)
+
+
+def run_approach(true: Rig, believed: Rig, seed: int) -> ApproachRun:
+    """Drive one approach to a random rock; ``true`` takes the pictures, ``believed`` is the mast file's."""
+    rng = np.random.default_rng([seed, 6])
+    light = SceneSettings(seed=seed, rocks=ROCKS)
+    world = ApproachWorld(build_scene(light), true, believed, WorldErrors(), rng)
+    try:
+        begun = _begin(world, rng)
+        if isinstance(begun, str):
+            return ApproachRun(seed, (), begun)
+        track, target = begun
+        there = world.site_from_rover.inverse.points(target)
+        start_m = _axes(there - track.key.eye.camera.C) @ (track.position_m - there)
+        world.read_windows()
+        stops = _drive(world, track, target, light, rng)
+        return ApproachRun(seed, tuple(stops), "", _tuple(start_m))
+    finally:
+        world.close()
+
+
+def _begin(world: ApproachWorld, rng: np.random.Generator) -> tuple[Track, FloatArray] | str:
+    """Pick a textured pixel of the left Pancam at the start range; the track, and the truth in the site."""
+    pair = world.believed.stereo["pancam"]
+    reason = "no view offered a target"
+    for _ in range(12):
+        rock = world.turn_to_rock(START_M, ROCK_M)
+        if rock is None:
+            return "no rock stands at the start range"
+        aim = world.site_from_rover.inverse.points(rock)
+        angles = solve(world.believed.mast, world.believed.cameras[pair[0]].model, aim)[0]
+        eyes = world.look(pair, angles.pan_rad, angles.tilt_rad)
+        left, right = (eyes[name] for name in pair)
+        fit = texture_mask(left.image.astype(np.uint8)) & _pixels_near(left.camera, aim)
+        rows, columns = np.nonzero(fit)
+        for pick in rng.integers(len(rows), size=PICKS) if len(rows) else ():
+            pixel = np.array([float(columns[pick]), float(rows[pick])])
+            at = (pair[0], angles.pan_rad, angles.tilt_rad, pixel)
+            target = world.point_at(*at)
+            if target is None or not lies_on_rock(world, *at, target):
+                continue
+            range_m = float(np.linalg.norm(world.site_from_rover.inverse.points(target) - left.camera.C))
+            if abs(range_m - START_M) > 0.15 * START_M:
+                continue
+            try:
+                return start_track(left, right, pixel), target
+            except CalibError as error:
+                reason = str(error)
+    return reason
+
+
+def _pixels_near(camera: CameraModel, aim_m: FloatArray) -> NDArray[np.bool_]:
+    """Which pixels (h, w) lie near the image of a point."""
+    (x, y), (width, height) = camera.project(aim_m)[0], camera.size_px
+    columns, rows = np.arange(width), np.arange(height)[:, None]
+    return np.asarray(np.maximum(np.abs(columns - x), np.abs(rows - y)) <= NEAR_ROCK_PX)
+
+
+def lies_on_rock(
+    world: ApproachWorld, camera: str, pan_rad: float, tilt_rad: float, pixel: FloatArray, target: FloatArray
+) -> bool:
+    """Whether a target lies on a rock and not at its boundary, where nobody would put one."""
+    if world.height_m(target) < ROCK_M:
+        return False
+    for off in INSIDE_PX * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]):
+        beside = world.point_at(camera, pan_rad, tilt_rad, pixel + off)
+        if beside is None or float(np.linalg.norm(beside - target)) > APART_M:
+            return False
+    return True
+
+
+def _drive(
+    world: ApproachWorld, track: Track, target: FloatArray, light: SceneSettings, rng: np.random.Generator
+) -> list[Stop]:
+    """Step by step up to the target."""
+    stops: list[Stop] = []
+    missed, relit, carried = 0, False, track.position_m
+    for _ in range(60):
+        here = world.site_from_rover
+        away = target[:2] - here.translation_m[:2]
+        distance = float(np.linalg.norm(away))
+        # Where the front cameras stand, ahead of the rover's origin, is where 1 m counts from.
+        ahead = _front_m(world)
+        left_m = distance - ahead
+        if left_m <= END_M * 1.02 or missed >= GIVE_UP:
+            break
+        step = min(STEP * left_m, left_m - END_M)
+        bearing = math.atan2(away[1], away[0]) + rng.normal(0.0, 0.15)
+        x, y = here.translation_m[:2] + step * np.array([math.cos(bearing), math.sin(bearing)])
+        facing = math.atan2(target[1] - y, target[0] - x) + rng.normal(0.0, 0.08)
+        motion, covariance = world.drive(float(x), float(y), facing)
+        track, carried = moved_track(track, motion, covariance), motion.points(carried)
+        if not relit and left_m < 4.0:
+            sun = light.sun_azimuth_rad + SUN_MOVES_RAD
+            world.relight(build_scene(replace(light, sun_azimuth_rad=sun)))
+            relit = True
+        track, stop = _look(world, track, target, carried)
+        stops.append(stop)
+        missed = 0 if stop.state == "tracked" else missed + 1
+    return stops
+
+
+def _front_m(world: ApproachWorld) -> float:
+    """How far ahead of the rover's origin the last pair stands."""
+    left, right = (world.believed.cameras[n].model.C[0] for n in world.believed.stereo["hazcam"])
+    return float(left + right) / 2
+
+
+def _look(
+    world: ApproachWorld, track: Track, target: FloatArray, carried_m: FloatArray
+) -> tuple[Track, Stop]:
+    """Look for the target with the pair of its range, again if it is lost; the track and the record."""
+    rig = world.believed
+    chosen = choose_pairs(rig, track.position_m)[0]
+    name, pan, tilt = chosen.pair, chosen.pan_rad or 0.0, chosen.tilt_rad or 0.0
+    pair = rig.stereo[name]
+    doubt = ""
+    for _ in range(LOST_LOOKS):
+        eyes = world.look(pair, pan, tilt)
+        look = seen_by(track, eyes)
+        doubt = doubt or (look.doubt.sentence if look.doubt else "")
+        if look.track.state == "tracked":
+            break
+    track = look.track
+    true = world.site_from_rover.inverse.points(target)
+    middle = (eyes[pair[0]].camera.C + eyes[pair[1]].camera.C) / 2
+    axes = _axes(true - middle)
+    found = look.found.get(pair[0])
+    pixel_error = math.nan
+    if found is not None and found.verdict == "good":
+        exact = world.true_pixel(pair[0], pan, tilt, target)
+        pixel_error = float(np.linalg.norm(found.pixel_px - exact))
+    return track, Stop(
+        float(np.linalg.norm(true - middle)),
+        name,
+        track.state,
+        look.reason,
+        _tuple(axes @ (track.position_m - true)),
+        _tuple(np.sqrt(np.diag(axes @ track.target_covariance_m2 @ axes.T))),
+        pixel_error,
+        look.renewed,
+        _tuple(axes @ (carried_m - true)),
+        doubt,
+    )
+
+
+def _axes(sight: FloatArray) -> FloatArray:
+    """Rows: along a line of sight, to its right, below it."""
+    along = sight / np.linalg.norm(sight)
+    right = np.cross([0.0, 0.0, 1.0], along)
+    right /= np.linalg.norm(right)
+    return np.stack([along, right, np.cross(along, right)])
+
+
+def _tuple(values: FloatArray) -> tuple[float, ...]:
+    return tuple(values.tolist())
+
+
+# What the runs come to
 
 PAPER_CM = {"stereo": 9.7, "untracked": 22.2, "tracked": 1.5}
 """Table I as printed, Pancam: stereo at 10 m, the approach without and with ideal tracking; 3 sigma."""
 
 BINS_M = ((6.0, math.inf), (2.0, 6.0), (0.0, 2.0))
-STOPS_CSV = (
-    "seed", "stop", "range_m", "pair", "state", "along_m", "right_m", "below_m",
-    "sigma_along_m", "sigma_right_m", "sigma_below_m", "pixel_error_px", "renewed",
-    "untracked_along_m", "untracked_right_m", "untracked_below_m", "reason",
-)  # fmt: skip
-SCALE = 2
-AXES = ("along", "right", "below")
+COLUMNS = {
+    "3 rms, cm": "{name}", "stops": "{stops}", "eqs. (1)-(4)": "{theory_cm:.2f}", "paper": "{paper_cm:g}",
+    "range": "{along_cm:.2f}", "right": "{right_cm:.2f}", "below": "{below_cm:.2f}",
+    "3-D": "{position_cm:.2f}",
+}  # fmt: skip
 
 
-def silently_wrong(stop: Stop) -> bool:
-    """Tell whether a stop says tracked and is off by over 3 cm, 1 % of the range and five of its sigmas."""
-    far = float(np.linalg.norm(stop.error_m)) > max(0.03, 0.01 * stop.range_m)
-    return stop.state == "tracked" and far and bool((np.abs(stop.error_m) > 5 * stop.sigma_m).any())
+def approach_rows(runs: Sequence[ApproachRun]) -> list[dict[str, Any]]:
+    """Return Table I's three columns as rows: by its equations, as printed, and as measured; then by range.
 
-
-def handoffs(run: ApproachRun) -> int:
-    """How often another pair took over and found the target."""
-    seen = [stop.pair for stop in run.stops if stop.state == "tracked"]
-    return sum(a != b for a, b in pairwise(seen))
-
-
-def losses(run: ApproachRun) -> tuple[int, int]:
-    """How often the target was lost, and how often found again."""
-    states = ["tracked", *(stop.state for stop in run.stops)]
-    pairs = list(pairwise(states))
-    return pairs.count(("tracked", "lost")), pairs.count(("lost", "tracked"))
-
-
-def summary(runs: Sequence[ApproachRun]) -> dict[str, float]:
-    """Numbers over all runs: kept, lost, silently wrong, poses doubted, hand-offs, and errors, metres rms.
-
-    ``final`` is of the last stop of the runs that kept the target, ``untracked`` of the same stops without
-    looking, ``start`` of the first stereo, ``from_6_m`` and so on of the tracked stops of a range.
+    Errors are three times the rms, in centimetres, in the rover frame; under the last row, how the runs went.
     """
     kept = [run for run in runs if run.kept]
     began = [run for run in runs if run.stops]
-    lost = [losses(run) for run in began]
-    found: dict[str, float] = {
-        "runs": len(runs),
-        "kept": len(kept),
-        "silently_wrong": sum(any(map(silently_wrong, run.stops)) for run in runs),
-        "stops": sum(len(run.stops) for run in began),
-        "poses_doubted": sum(bool(stop.pose_doubt) for run in began for stop in run.stops),
-        "handoffs": sum(map(handoffs, began)),
-        "losses": sum(one for one, _ in lost),
-        "recoveries": sum(again for _, again in lost),
-    }
-    found |= _errors("start", [run.start_m for run in began])
-    found |= _errors("untracked", [run.stops[-1].untracked_m for run in kept])
-    found |= _errors("final", [run.final_error_m for run in kept])
-    for low, high in BINS_M:
-        stops = [s for run in began for s in run.stops if low <= s.range_m < high and s.state == "tracked"]
-        found[f"stops_from_{low:g}_m"] = len(stops)
-        found |= _errors(f"from_{low:g}_m", [stop.error_m for stop in stops])
-    return found
-
-
-def _errors(name: str, errors_m: Sequence[FloatArray]) -> dict[str, float]:
-    """Rms of the components and of the length of errors (3,), metres."""
-    table = np.array(errors_m).reshape(-1, 3)
-    rms = np.sqrt(np.mean(table**2, axis=0)) if len(table) else np.full(3, math.nan)
-    parts = {f"{name}_{axis}_rms_m": float(one) for axis, one in zip(AXES, rms, strict=True)}
-    return parts | {f"{name}_position_rms_m": float(np.sqrt(np.sum(rms**2)))}
-
-
-def approach_table(runs: Sequence[ApproachRun]) -> Table:
-    """Return Table I's three columns, by its equations, as printed, and as measured."""
-    found = summary(runs)
     theory = next(row for row in target_approach_budget() if row.name == "pancam")
     rows = [
-        ["stereo at the start", f"{theory.stereo_cm:.1f}", f"{PAPER_CM['stereo']}", *_cm(found, "start")],
-        [
+        _row("stereo at the start", [r.start_m for r in began], theory.stereo_cm, PAPER_CM["stereo"]),
+        _row(
             "at 1 m, not tracked",
-            f"{theory.untracked_cm:.1f}",
-            f"{PAPER_CM['untracked']}",
-            *_cm(found, "untracked"),
-        ],
-        ["at 1 m, tracked", f"{theory.tracked_cm:.2f}", f"{PAPER_CM['tracked']}", *_cm(found, "final")],
+            [r.stops[-1].untracked_m for r in kept],
+            theory.untracked_cm,
+            PAPER_CM["untracked"],
+        ),
+        _row("at 1 m, tracked", [r.stops[-1].error_m for r in kept], theory.tracked_cm, PAPER_CM["tracked"]),
     ]
     for low, high in BINS_M:
         far = f"{low:g} to {high:g} m" if math.isfinite(high) else f"beyond {low:g} m"
-        words = f"tracked, {far} ({found[f'stops_from_{low:g}_m']} stops)"
-        rows.append([words, "", "", *_cm(found, f"from_{low:g}_m")])
-    return Table(("3 rms, cm", "eqs. (1)-(4)", "paper", "range", "right", "below", "3-D"), rows)
-
-
-def _cm(found: dict[str, float], name: str) -> list[str]:
-    """Three times the rms errors, centimetres."""
-    numbers = [found[f"{name}_{axis}_rms_m"] for axis in (*AXES, "position")]
-    return ["-" if math.isnan(one) else f"{300 * one:.2f}" for one in numbers]
-
-
-def counted(runs: Sequence[ApproachRun]) -> str:
-    """Say in one line how the runs went."""
-    found = summary(runs)
-    return (
-        f"kept {found['kept']} of {found['runs']}, silently wrong {found['silently_wrong']}, "
-        f"hand-offs {found['handoffs']}, losses {found['losses']}, found again {found['recoveries']}, "
-        f"honest poses doubted {found['poses_doubted']} of {found['stops']} (1 in 1000 is chance)"
-    )
-
-
-def write_record(runs: Sequence[ApproachRun], folder: Path) -> None:
-    """Write stops.csv, record.json and error.png into ``folder`` (made if need be).
-
-    Raises
-    ------
-    OSError
-        If the folder or a file in it cannot be written.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    rows = [_csv_row(run.seed, index, stop) for run in runs for index, stop in enumerate(run.stops)]
-    write_csv(folder / "stops.csv", STOPS_CSV, rows)
-    document = {
-        "summary": {key: None if math.isnan(value) else value for key, value in summary(runs).items()},
-        "runs": [
-            {"seed": one.seed, "kept": one.kept, "error": one.error, "seconds": round(one.seconds, 1)}
-            for one in runs
-        ],
+        stops = [s for r in began for s in r.stops if low <= s.range_m < high and s.state == "tracked"]
+        rows.append(_row(f"tracked, {far}", [stop.error_m for stop in stops]))
+    counts = {
+        "runs": len(runs),
+        "kept": len(kept),
+        "silently wrong": sum(any(stop.silently_wrong for stop in run.stops) for run in runs),
+        "hand-offs": sum(run.handoffs for run in began),
+        "losses": sum(run.losses[0] for run in began),
+        "found again": sum(run.losses[1] for run in began),
+        "honest poses doubted": sum(bool(stop.pose_doubt) for run in began for stop in run.stops),
+        "stops": sum(len(run.stops) for run in began),
     }
-    write_json(folder / "record.json", document)
-    stops = [stop for run in runs for stop in run.stops]
-    if stops and plots.installed():
-        (folder / "error.png").write_bytes(plots.as_png(_errors_by_range(runs, stops)))
+    rows[-1] |= {"counts": counts, "notes": [", ".join(f"{name} {n}" for name, n in counts.items())]}
+    return rows
 
 
-def _csv_row(seed: int, index: int, stop: Stop) -> list[Any]:
-    """One stop as a row of stops.csv."""
-    start = [seed, index, stop.range_m, stop.pair, stop.state, *stop.error_m, *stop.sigma_m]
-    return [*start, stop.pixel_error_px, int(stop.renewed), *stop.untracked_m, stop.reason]
+def _row(
+    name: str,
+    errors_m: Sequence[Sequence[float]],
+    theory_cm: float | None = None,
+    paper_cm: float | None = None,
+) -> dict[str, Any]:
+    """A row of the table of errors (n, 3), metres; without errors it has no numbers."""
+    row = {"name": name, "stops": len(errors_m), "theory_cm": theory_cm, "paper_cm": paper_cm}
+    if not errors_m:
+        return row
+    rms = 300 * np.sqrt(np.mean(np.array(errors_m) ** 2, axis=0))
+    parts = {f"{axis}_cm": float(one) for axis, one in zip(AXES, rms, strict=True)}
+    return row | parts | {"position_cm": float(np.linalg.norm(rms))}
 
 
-def write_strip(run: ApproachRun, folder: Path) -> None:
-    """Write a run's pictures as strip_SEED.png into ``folder``; nothing for a run that did not begin.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
-    """
-    if run.stops:
-        (folder / f"strip_{run.seed}.png").write_bytes(pictures.encoded(strip(run), "png"))
-
-
-def strip(run: ApproachRun) -> Image:
-    """Return a run as one picture: a column a stop; the key picture, the left eye, the right eye."""
-    columns = []
-    for stop in run.stops:
-        colour = (80, 200, 80) if stop.state == "tracked" else (60, 60, 230)
-        tiles = []
-        for row, patch in enumerate(stop.patches):
-            side = patch.shape[0] * SCALE
-            large = cv2.resize(patch, (side, side), interpolation=cv2.INTER_NEAREST)
-            tile = cv2.cvtColor(large, cv2.COLOR_GRAY2BGR)
-            tone = (200, 160, 60) if row == 0 else colour
-            cv2.drawMarker(tile, (side // 2, side // 2), tone, cv2.MARKER_CROSS, 12, 1)
-            cv2.rectangle(tile, (0, 0), (side - 1, side - 1), tone, 1)
-            tiles.append(tile)
-        head = np.full((16, tiles[0].shape[1], 3), 255, np.uint8)
-        words = f"{stop.pair} {stop.range_m:.2f} m"
-        cv2.putText(head, words, (2, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
-        columns.append(np.vstack([head, *tiles]))
-    return np.asarray(np.hstack(columns), dtype=np.uint8)
-
-
-def _errors_by_range(runs: Sequence[ApproachRun], stops: Sequence[Stop]) -> Any:
-    """The errors over the range, with the track's own sigma."""
-    figure = plots.new(9.0, 9.0)
-    tracked = [stop for stop in stops if stop.state == "tracked"]
-    for k, axis in enumerate(figure.subplots(3, 1, sharex=True)):
-        for run in runs:
-            kept = [s for s in run.stops if s.state == "tracked"]
-            axis.plot(
-                [s.range_m for s in kept],
-                [100 * s.error_m[k] for s in kept],
-                color=plots.BLUE,
-                lw=0.7,
-                alpha=0.6,
-            )
-        if tracked:
-            ranges, bounds = np.array(sorted((s.range_m, 300 * s.sigma_m[k]) for s in tracked)).T
-            axis.fill_between(
-                ranges, -bounds, bounds, color=plots.RUST, alpha=0.15, lw=0, label="3 sigma, told"
-            )
-        axis.set_ylabel(f"{('along the line of sight', 'to its right', 'below it')[k]}, cm")
-        axis.grid(alpha=0.25)
-        axis.set_xscale("log")
-    axis.invert_xaxis()
-    axis.set_xticks([10, 6, 4, 2, 1.2], ["10", "6", "4", "2", "1.2"])
-    axis.set_xlabel("range, m")
-    figure.axes[0].legend(loc="upper right")
-    return figure
+def write_stops(path: Path, runs: Sequence[ApproachRun]) -> None:
+    """Write a row for each stop, three columns for each error; its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    vectors = {"error_m", "sigma_m", "untracked_m"}
+    names = [field.name for field in fields(Stop)]
+    columns = [
+        column for name in names
+        for column in ([f"{name[:-2]}_{axis}_m" for axis in AXES] if name in vectors else [name])
+    ]  # fmt: skip
+    rows = []
+    for run in runs:
+        for index, stop in enumerate(run.stops):
+            cells = [v if isinstance(v, tuple) else (v,) for v in astuple(stop)]
+            rows.append([run.seed, index, *(one for cell in cells for one in cell)])
+    write_csv(path, ("seed", "stop", *columns), rows)
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run the approaches; 1 if no target at all was kept."""
     parser = options(__doc__, 5, "approaches", as_json=True)
-    parser.add_argument(
-        "--mast", type=Path, metavar="MAST.yaml",
-        help="the mast file that is believed (default: the packaged one, from a simulated survey)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--on", choices=("rocks", "ground"), default="rocks",
-        help="what targets lie on (default rocks; ground: wherever there is texture)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR",
-        help="folder for stops.csv, record.json, a strip of pictures a run, and error.png",
-    )  # fmt: skip
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for stops.csv")
     args = parser.parse_args(words)
-    check_folder(args.out, "--out")
+    output.check_folder(args.out, "--out")
     true = load_rig(config_folder() / "sim" / "rocky8.yaml").rig
-    believed = load_rig(args.mast or config_folder() / "masts" / "rocky8_simulated.yaml").rig
-    if lacking := [pair for pair in true.stereo if pair not in believed.stereo]:
-        raise output.WrongUse(f"--mast {args.mast} has no stereo pair '{lacking[0]}'")
-    runs: dict[int, ApproachRun] = {}
-
-    def done(one: ApproachRun) -> None:
-        runs[one.seed] = one
-        if args.out is not None and not args.task:  # after every run: what is interrupted leaves its record
-            write_record([runs[seed] for seed in sorted(runs)], args.out)
-            write_strip(one, args.out)
-
-    tasks = [ApproachTask(true, believed, args.seed + index, args.on) for index in range(args.cases)]
-    found = run_cases(
-        args, "approaches", one_approach, tasks, lambda task: f"on {task.on}, seed {task.seed}",
-        found=_how, done=done,
+    believed = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig
+    tasks = [ApproachTask(true, believed, args.seed + index) for index in range(args.cases)]
+    runs = run_cases(
+        args, "approaches", one_approach, tasks, "seed {0.seed}".format,
+        failure=lambda run: run.error,
     )  # fmt: skip
-    if args.json:
-        output.print_json(summary(found))
-    else:
-        notes = [counted(found)]
-        notes += ["3 times the rms, along the line of sight, to its right and below it, in the rover frame"]
-        notes += [f"record: {args.out}"] if args.out is not None else []
-        title = f"Approach from 10 m to 1 m, targets on {args.on}, simulated rover"
-        output.print_table(title, *approach_table(found), notes)
-    return 0 if any(one.kept for one in found) else 1
-
-
-def _how(one: ApproachRun) -> str:
-    """How a run went, in words."""
-    return one.error or ("kept" if one.kept else f"lost: {one.stops[-1].reason}" if one.stops else "lost")
+    if args.out is not None:
+        write_stops(args.out / "stops.csv", runs)
+    show(args, approach_rows(runs), COLUMNS, "notes")
+    return 0 if any(one.kept for one in runs) else 1
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ file against the true rig, the joints' readings and counts, the reported motion,
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -154,7 +155,7 @@ class ApproachWorld:
         # The motion's error moves what was ahead, not the whole rover frame: it is of the displacement.
         return wrong.inverse @ true, np.diag(sigma**2)
 
-    def look(self, pair: tuple[str, str], pan_rad: float, tilt_rad: float) -> dict[str, Eye]:
+    def look(self, pair: Sequence[str], pan_rad: float, tilt_rad: float) -> dict[str, Eye]:
         """Point the head and take both pictures; the cameras are where the mast file says they are."""
         at = self._turned(pan_rad, tilt_rad)
         read = at + self._rng.normal(0.0, self.errors.joint_rad, 2)

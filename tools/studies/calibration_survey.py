@@ -1,4 +1,4 @@
-"""Surveys of the study of calibration: what is varied, one of them fitted and judged, and all together.
+"""Surveys of the study of calibration: variants, and one survey fitted and judged.
 
 One thing is varied at a time from the paper's survey (III, Table II): how many placements the mast is
 calibrated with, how many boards the cameras, how well the station measures, how many prisms there are, which
@@ -20,10 +20,10 @@ from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.survey.records import Sigma
+from hil_tests.support.sim_survey.plan import SurveyPlan
+from hil_tests.support.sim_survey.survey import simulate_survey
 from mastctl.calibration.landing import click, handoff_errors_px, pointing_error_px, seen
 from mastctl.calibration.run import FITS, Method
-from tools.sim_survey.plan import SurveyPlan
-from tools.sim_survey.survey import simulate_survey
 
 METHODS: tuple[Method, ...] = ("paper", "joint")
 PAPER_STATION_M = 0.002
@@ -35,7 +35,6 @@ class Variant:
 
     study: str
     label: str
-    value: float
     method: Method = "joint"
     mast_parameters: int = 6
     plan: SurveyPlan = field(default_factory=SurveyPlan)
@@ -46,27 +45,24 @@ def variants() -> tuple[Variant, ...]:
     base = SurveyPlan()
     found: list[Variant] = []
     for method in METHODS:
-        for count in (2, 3, 4, 5, 6, 8, 12, 18):
-            plan = replace(base, mast_boards=count)
-            found.append(Variant(f"placements, {method}", f"{count}", count, method, 6, plan))
-    for method in METHODS:
-        for count in (2, 4, 8, 12):
-            plan = replace(base, rings=tuple(replace(ring, boards=count) for ring in base.rings))
-            found.append(Variant(f"boards, {method}", f"{count}", count, method, 6, plan))
-    for method in METHODS:
-        for station_m in (0.0005, 0.001, 0.002, 0.004):
-            plan = replace(base, sigma=Sigma(station_m, 0.1))
-            label = f"{1000 * station_m:g} mm"
-            found.append(Variant(f"station, {method}", label, 1000 * station_m, method, 6, plan))
-    for prisms in (3, 4):
-        found.append(Variant("prisms", f"{prisms}", prisms, "joint", 6, replace(base, prisms=prisms)))
+        plans = {f"{n}": replace(base, mast_boards=n) for n in (2, 3, 4, 5, 6, 8, 12, 18)}
+        found += [Variant(f"placements, {method}", label, method, 6, plan) for label, plan in plans.items()]
+        rings = {n: tuple(replace(ring, boards=n) for ring in base.rings) for n in (2, 4, 8, 12)}
+        found += [
+            Variant(f"boards, {method}", f"{n}", method, 6, replace(base, rings=some))
+            for n, some in rings.items()
+        ]
+        found += [
+            Variant(f"station, {method}", f"{mm:g} mm", method, 6, replace(base, sigma=Sigma(mm / 1000, 0.1)))
+            for mm in (0.5, 1.0, 2.0, 4.0)
+        ]
+    found += [Variant("prisms", f"{n}", "joint", 6, replace(base, prisms=n)) for n in (3, 4)]
     for also in ("", "navcam"):
-        rings = tuple(replace(r, also=also) if r.pair == "hazcam" else r for r in base.rings)
+        some = tuple(replace(r, also=also) if r.pair == "hazcam" else r for r in base.rings)
         label = f"seen by {also} too" if also else "seen by hazcam"
-        found.append(Variant("hazcam boards", label, float(bool(also)), plan=replace(base, rings=rings)))
+        found.append(Variant("hazcam boards", label, plan=replace(base, rings=some)))
     paper = replace(base, sigma=Sigma(PAPER_STATION_M, 0.1))
-    for parameters in (4, 6, 8):
-        found.append(Variant("mast parameters", f"{parameters}", parameters, "paper", parameters, paper))
+    found += [Variant("mast parameters", f"{n}", "paper", n, paper) for n in (4, 6, 8)]
     return tuple(found)
 
 
@@ -271,117 +267,13 @@ def rms_px(errors: FloatArray) -> tuple[float, float]:
     return float(x), float(y)
 
 
-PAPER_TABLE_V: Mapping[int, Mapping[str, tuple[float, float]]] = {
-    6: {"pancam": (0.854, 1.102), "navcam": (1.129, 1.002)},
-    4: {"pancam": (2.871, 22.294), "navcam": (2.784, 7.934)},
-}
-
-
-@dataclass(frozen=True, eq=False)
-class VariantSummary:
-    """All surveys of one variant together."""
-
-    variant: Variant
-    surveys: int
-    failed: int
-    pointing_rms_px: Mapping[float, tuple[float, float]]
-    exact_rms_px: Mapping[float, tuple[float, float]]
-    handoff_rms_px: Mapping[Handoff, tuple[float, float]]
-    handoff_worst_px: Mapping[Handoff, float]
-    seconds: float
-
-    @property
-    def exact_px(self) -> float:
-        """Rms an axis of pointing after exact clicks, over all distances."""
-        return _together(self.exact_rms_px)
-
-    def handoff_px(self, name: str) -> float:
-        """Rms an axis of a hand-off, over all its distances; not-a-number where there was none."""
-        return _together({d: xy for (n, d), xy in self.handoff_rms_px.items() if n == name})
-
-    def handoff_most_px(self, name: str) -> float:
-        """Worst of a hand-off, over all its distances; not-a-number where there was none."""
-        return max((worst for (n, _), worst in self.handoff_worst_px.items() if n == name), default=np.nan)
-
-    @property
-    def pointing_px(self) -> float:
-        """Rms an axis of pointing after clicks with noise, over all distances."""
-        return _together(self.pointing_rms_px)
-
-
-@dataclass(frozen=True, eq=False)
-class CalibrationExperiment:
-    """The whole study."""
-
-    rig: Rig
-    seed: int
-    surveys: int
-    outcomes: tuple[SurveyOutcome, ...]
-    seconds: float
-
-    @property
-    def summaries(self) -> tuple[VariantSummary, ...]:
-        """One a variant, in the order of the study."""
-        variants = dict.fromkeys(outcome.variant for outcome in self.outcomes)
-        return tuple(
-            _summarise(variant, [o for o in self.outcomes if o.variant == variant]) for variant in variants
-        )
-
-    def of(self, study: str) -> tuple[SurveyOutcome, ...]:
-        """Return the outcomes of one study."""
-        return tuple(outcome for outcome in self.outcomes if outcome.variant.study == study)
-
-
 def survey_tasks(
-    rig: Rig, *, surveys: int, targets: int, seed: int, chosen: Sequence[Variant] | None = None
+    rig: Rig, *, surveys: int, targets: int, seed: int, chosen: Sequence[Variant]
 ) -> list[SurveyTask]:
-    """Return the tasks of a study, for `tools.studies.calibration_survey.one_survey`.
+    """Return the tasks of a study: so many surveys of each variant, with so many targets at each distance.
 
-    Parameters
-    ----------
-    rig
-        The true one.
-    surveys
-        Of each variant.
-    targets
-        Of each survey, at each distance, and for each hand-off.
-    seed
-        The same seed gives the same numbers, wherever the tasks run.
-    chosen
-        Variants; all of `variants` by default.
+    Every variant has the same seeds: what differs between two is then the variant rather than the draw.
     """
-    every = variants() if chosen is None else tuple(chosen)
-    # Every variant has the same seeds: what differs between two is then the variant rather than the draw.
     return [
-        SurveyTask(rig, variant, (seed, number), targets) for variant in every for number in range(surveys)
+        SurveyTask(rig, variant, (seed, number), targets) for variant in chosen for number in range(surveys)
     ]
-
-
-def _summarise(variant: Variant, outcomes: Sequence[SurveyOutcome]) -> VariantSummary:
-    good = [outcome for outcome in outcomes if not outcome.failure]
-
-    def rms(name: str) -> dict[Any, tuple[float, float]]:
-        keys = dict.fromkeys(key for outcome in good for key in getattr(outcome, name))
-        return {key: rms_px(np.concatenate([getattr(o, name)[key] for o in good])) for key in keys}
-
-    handoffs = dict.fromkeys(key for outcome in good for key in outcome.handoff_px)
-    worst = {
-        key: float(np.nanmax(np.linalg.norm(np.concatenate([o.handoff_px[key] for o in good]), axis=1)))
-        for key in handoffs
-    }
-    return VariantSummary(
-        variant,
-        len(outcomes),
-        len(outcomes) - len(good),
-        rms("pointing_px"),
-        rms("exact_px"),
-        rms("handoff_px"),
-        worst,
-        float(np.mean([o.seconds for o in good])) if good else 0.0,
-    )
-
-
-def _together(by_distance: Mapping[float, tuple[float, float]]) -> float:
-    """Rms an axis over all distances; not-a-number where there are none."""
-    values = np.array(list(by_distance.values()))
-    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")

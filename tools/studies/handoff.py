@@ -2,123 +2,126 @@
 
     .venv/bin/python -m tools.studies.handoff --simulated --targets 20 --out handed
 
-Targets are handed from Pancam to Navcam at 6 m and on to Hazcam at 2 m. ``--out`` gets a page, the tables,
-and handoffs.jsonl, by which ``mastctl calibrate --refine`` corrects body cameras.
+Targets are handed from Pancam to Navcam at 6 m and on to Hazcam at 2 m. ``--out`` gets targets.csv and
+handoffs.jsonl, by which ``mastctl calibrate --refine`` corrects body cameras.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calib.files.mast_file import load_rig
-from calib.geometry.rigid import FloatArray
-from drivers.sim.rover import SimulatedRover
+from calib.matching.handed_over import handoff_bias
 from mastctl.cli import output
 from mastctl.cli.output import check_folder
 from mastctl.cli.service import add_daemon_options, client_of, refuse_daemon_options
-from mastctl.cli.tasks import refuse_task_options, run_bar, tell_report
+from mastctl.cli.tasks import refuse_task_options, run_bar
 from mastctl.client import Client
 from mastctl.config import load_config
-from mastctl.devices.frames import camera_and_sequence
 from mastctl.experiment.simulated import Rover, SimulationTruth, running_rover
-from tools.command import end, options, run_cases
-from tools.studies.handoff_record import HandoffExperiment, HandoffRecord, summarise_handoffs
-from tools.studies.handoff_report import bias_sentences, handoff_table, write_handoff_report
-from tools.studies.handoff_run import STEPS, KnownPoint, run_handoff_experiment
+from mastctl.report.pages import write_csv
+from mastctl.watch.handoffs import HandoffLog
+from tools.command import end, options, run_cases, show
+from tools.studies.handoff_run import STEPS, HandoffRecord, run_handoff_experiment
 
-PICTURES_PER_STEP = 4
-TARGETS = {"ground": "textured ground", "corner": "bricks' corners", "face": "middles of bricks' faces"}
-MOST_BRICKS = 24  # what a scene takes
-MOST_POINTS = 9  # of one brick: its upper corners and its faces but the bottom
-HIDDEN_M = 0.003
-"""What stands before a point by less does not hide it: a ray at a corner meets the brick there or passes."""
+PAPER_WORST_PX: Mapping[str, float] = {"pancam to navcam": 2.5, "navcam to hazcam": 4.0}
+"""The paper's worst geometric hand-off, Pancam to Navcam at 6 m and Navcam to Hazcam at 2 m."""
 
-
-class BrickPoints:
-    """Corners and middles of faces of the simulated rover's bricks."""
-
-    def __init__(self, rover: SimulatedRover) -> None:
-        self._rover = rover
-
-    def points(self) -> Sequence[KnownPoint]:
-        """See `tools.studies.handoff_run.KnownPoints`."""
-        rover_from_site = self._rover.site_from_rover.inverse
-        found = []
-        for group, brick in enumerate(self._rover.scene.bricks):
-            # the corners at the bottom are in the ground
-            for kind, places in (("corner", brick.corners_m[:4]), ("face", brick.faces_m)):
-                found += [KnownPoint(kind, group, one) for one in np.asarray(rover_from_site.points(places))]
-        return found
-
-    def seen_px(self, frame_id: str, position_m: FloatArray) -> tuple[float, float] | None:
-        """See `tools.studies.handoff_run.KnownPoints`."""
-        truth = self._rover.frame_truth(*camera_and_sequence(frame_id))
-        camera = truth.camera_in_rover
-        pixel, valid = camera.project(position_m)
-        if not valid or not camera.holds(pixel):
-            return None
-        ray = camera.ray(pixel)
-        met_m = self._rover.scene.cast(
-            truth.site_from_rover.points(ray.origins_m), truth.site_from_rover.vectors(ray.directions)
-        )
-        if float(met_m) < float(np.linalg.norm(position_m - ray.origins_m)) - HIDDEN_M:
-            return None
-        return float(pixel[0]), float(pixel[1])
+COLUMNS = {
+    "hand-off": "{step}", "camera": "{camera}", "targets": "{targets}",
+    "failed": "{failed}",
+    "geometric rms x, y": "{geometric_rms_px[0]:.2f}, {geometric_rms_px[1]:.2f}",
+    "bias x, y": "{geometric_bias_px[0]:.2f}, {geometric_bias_px[1]:.2f}",
+    "worst": "{geometric_worst_px:.2f}",
+    "refined": "{accepted}", "rms": "{refined_rms_px:.2f}", "worst refined": "{refined_worst_px:.2f}",
+    "paper worst": "{paper_worst_px:g}",
+}  # fmt: skip
+CSV_COLUMNS = (
+    "handoff", "target", "range_m", "frame_id", "clicked_x_px", "clicked_y_px", "camera",
+    "geometric_x_px", "geometric_y_px", "search_sigma_major_px", "search_sigma_minor_px",
+    "verdict", "refined_x_px", "refined_y_px", "refined_sigma_x_px", "refined_sigma_y_px", "correlation",
+    "true_x_px", "true_y_px", "reason",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class HandoffTask:
-    """One target of a hand-off from a pair; with bricks, all of them, ``targets`` at most."""
+    """One target of a hand-off from a pair."""
 
     rover: Rover
     source: str
     index: int
     click_px: float
-    targets: int = 1
-    pictures: int = 0
 
 
-def one_handoff(task: HandoffTask) -> HandoffExperiment:
-    """Hand over one target, or all bricks of a step, on a rover of its own."""
+def one_handoff(task: HandoffTask) -> list[HandoffRecord]:
+    """Hand over one target on a rover of its own."""
     with running_rover(task.rover) as (_, client, rover):
         return run_handoff_experiment(
             client,
-            targets=task.targets,
+            targets=1,
             seed=task.rover.seed,
             click_px=task.click_px,
             truth=SimulationTruth(rover),
-            points=BrickPoints(rover) if task.rover.bricks else None,
-            pictures=task.pictures,
             first=task.index,
             chosen=(task.source,),
         )
 
 
-def joined_handoffs(parts: Sequence[HandoffExperiment]) -> HandoffExperiment:
-    """Return one experiment of many; its time is that of all targets one after another."""
-    records = [record for part in parts for record in part.records]
-    cameras = dict.fromkeys((row.step, row.camera) for part in parts for row in part.summaries)
-    kinds = dict.fromkeys(record.kind for record in records)
-    summaries = [
-        summarise_handoffs(step, kind, camera, records)
-        for step in dict.fromkeys(step for step, _ in cameras)
-        for kind in kinds
-        for of_step, camera in cameras
-        if of_step == step
-    ]
-    return replace(
-        parts[0],
-        records=tuple(records),
-        summaries=tuple(summaries),
-        seconds=sum(part.seconds for part in parts),
-    )
+def handoff_rows(records: Sequence[HandoffRecord]) -> list[dict[str, Any]]:
+    """Return the table's rows: one for each step and camera; lengths in pixels."""
+    groups: dict[str, list[HandoffRecord]] = {}
+    for record in records:
+        groups.setdefault(record.step, []).append(record)
+    rows = []
+    for step, mine in groups.items():
+        for camera in dict.fromkeys(one.camera for record in mine for one in record.handed) or [""]:
+            seen = [one for record in mine for one in record.handed if one.camera == camera]
+            geometric = _lengths([one.geometric_error_px for one in seen])
+            refined = _lengths([one.refined_error_px for one in seen])
+            verdicts = Counter(one.refined.verdict for one in seen)
+            rows.append(
+                {
+                    "step": step,
+                    "camera": camera,
+                    "targets": len(mine),
+                    "failed": sum(bool(record.error) for record in mine),
+                    "geometric_rms_px": geometric[0],
+                    "geometric_bias_px": geometric[1],
+                    "geometric_worst_px": geometric[2],
+                    "accepted": verdicts["accepted"],
+                    "verdicts": dict(verdicts),
+                    "refined_rms_px": None if refined[0] is None else float(np.hypot(*refined[0])),
+                    "refined_worst_px": refined[2],
+                    "paper_worst_px": PAPER_WORST_PX.get(step),
+                }
+            )
+    return rows
+
+
+def write_handoffs(folder: Path, records: Sequence[HandoffRecord]) -> None:
+    """Write targets.csv and handoffs.jsonl into ``folder`` (made if need be)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_csv(folder / "targets.csv", CSV_COLUMNS, [row for record in records for row in _csv_rows(record)])
+    log = HandoffLog(folder / "handoffs.jsonl")
+    log.path.unlink(missing_ok=True)
+    for record in records:
+        if record.matched is not None:
+            log.append(record.matched)
+
+
+def bias_sentences(records: Sequence[HandoffRecord]) -> list[str]:
+    """Return the constant offsets of three sigma and more as sentences, and their remedy."""
+    biases = handoff_bias([record.matched for record in records if record.matched is not None])
+    found = [one.sentence for one in biases if one.significant]
+    return [*found, "mastctl calibrate --refine corrects body cameras by handoffs.jsonl"] if found else []
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -135,12 +138,7 @@ def main(words: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     parser.add_argument(
         "--targets", type=output.at_least(1), metavar="N",
-        help="targets of each hand-off (default 10, with --bricks all that show)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--bricks", type=output.at_least(1), metavar="N",
-        help="put N bricks (at most 24) into the simulation, by turns at 2 m and at 6 m; their corners and "
-        "the middles of their faces are the targets",
+        default=10, help="targets of each hand-off (default 10)",
     )  # fmt: skip
     parser.add_argument(
         "--click-px", type=output.not_negative, default=0.2, metavar="PX",
@@ -148,23 +146,21 @@ def main(words: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     parser.add_argument(
         "--out", type=Path, metavar="DIR",
-        help="folder for report.html, targets.csv, handoffs.jsonl and record.json",
+        help="folder for targets.csv and handoffs.jsonl",
     )  # fmt: skip
     args = parser.parse_args(words)
     if args.mast_file is not None and not args.simulated:
         raise output.WrongUse("--mast-file belongs to --simulated; a running daemon has its own mast file")
-    if args.bricks is not None and not (args.simulated and args.bricks <= MOST_BRICKS):
-        raise output.WrongUse(f"--bricks {args.bricks}: 1 to {MOST_BRICKS} are possible, with --simulated")
     check_folder(args.out, "--out")
     if args.simulated:
-        return _tell(args, _simulated(args))
+        return _report(args, _simulated(args))
     refuse_task_options(args)
     with client_of(args) as client:
-        return _tell(args, _on_daemon(args, client))
+        return _report(args, _on_daemon(args, client))
 
 
-def _simulated(args: argparse.Namespace) -> HandoffExperiment:
-    """Run each target on a simulated rover of its own; bricks, all of a step on one."""
+def _simulated(args: argparse.Namespace) -> list[HandoffRecord]:
+    """Run each target on a simulated rover of its own."""
     refuse_daemon_options(args)
     stereo = load_rig(args.mast_file or load_config(None).mast_file).rig.stereo
     sources = [source for source, to, _ in STEPS if {source, to} <= set(stereo)]
@@ -173,61 +169,69 @@ def _simulated(args: argparse.Namespace) -> HandoffExperiment:
             "no_handoff", f"{args.mast_file} has neither pancam and navcam nor navcam and hazcam pairs"
         )
     mast_file = None if args.mast_file is None else args.mast_file.read_bytes()
-    rover = Rover("ptu_d46_70", args.seed, args.bricks or 0, mast_file)
-    shown = PICTURES_PER_STEP if args.out is not None else 0
-    if args.bricks:
-        most = args.targets or MOST_POINTS * args.bricks
-        tasks = [HandoffTask(rover, source, 0, args.click_px, most, shown) for source in sources]
-    else:
-        tasks = [
-            HandoffTask(rover, source, index, args.click_px, pictures=int(index < shown))
-            for source in sources
-            for index in range(args.targets or 10)
-        ]
+    rover = Rover("ptu_d46_70", args.seed, 0, mast_file)
+    tasks = [
+        HandoffTask(rover, source, index, args.click_px)
+        for source in sources
+        for index in range(args.targets)
+    ]
     parts = run_cases(
-        args,
-        "hand-off",
-        one_handoff,
-        tasks,
-        lambda task: f"from {task.source}, " + ("all bricks" if args.bricks else f"target {task.index}"),
-        failure=lambda part: next((record.error for record in part.records if record.error), ""),
-    )
-    return joined_handoffs(parts)
+        args, "hand-off", one_handoff, tasks, "from {0.source}, target {0.index}".format,
+        failure=lambda part: next((record.error for record in part if record.error), ""),
+    )  # fmt: skip
+    return [record for part in parts for record in part]
 
 
-def _on_daemon(args: argparse.Namespace, client: Client) -> HandoffExperiment:
+def _on_daemon(args: argparse.Namespace, client: Client) -> list[HandoffRecord]:
     """Run on a running daemon, with a progress bar on stderr, one step a target."""
-    targets = args.targets or 10
-    with run_bar(args, "hand-off", targets * len(STEPS)) as step:
+    with run_bar(args, "hand-off", args.targets * len(STEPS)) as step:
 
-        def show(record: HandoffRecord) -> None:
-            where = f"{record.step}, target {record.index}"
-            step(record.step, record.error and f"{where}: {record.error}")
+        def step_done(record: HandoffRecord) -> None:
+            step(record.step, record.error and f"{record.step}, target {record.index}: {record.error}")
 
         return run_handoff_experiment(
-            client,
-            targets=targets,
-            seed=args.seed,
-            click_px=args.click_px,
-            on_target=show,
-            pictures=PICTURES_PER_STEP if args.out is not None else 0,
+            client, targets=args.targets, seed=args.seed, click_px=args.click_px, on_target=step_done
         )
 
 
-def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
-    def show(notes: list[str]) -> None:
-        noise = f"clicks with {experiment.click_px:g} px of noise; lengths in px of the destination camera"
-        kinds = list(dict.fromkeys(row.kind for row in experiment.summaries))
-        if not kinds:
-            sys.stdout.write("\n".join(["no target was found to hand over", *notes]) + "\n")
-        for kind in kinds:
-            table = handoff_table([row for row in experiment.summaries if row.kind == kind])
-            title = f"Hand-off errors of {TARGETS[kind]}, px ({experiment.status.get('hardware')} hardware)"
-            last = [noise, *bias_sentences(experiment), *notes] if kind == kinds[-1] else []
-            output.print_table(title, *table.turned(), last)
+def _report(args: argparse.Namespace, records: Sequence[HandoffRecord]) -> int:
+    if args.out is not None:
+        write_handoffs(args.out, records)
+    rows = handoff_rows(records)
+    if rows:
+        rows[-1]["notes"] = bias_sentences(records)
+    show(args, rows, COLUMNS, "notes")
+    return 0 if any(record.handed for record in records) else 1
 
-    tell_report(args, partial(write_handoff_report, experiment), experiment.as_json, show)
-    return 0 if any(record.handed for record in experiment.records) else 1
+
+def _lengths(
+    errors_px: Iterable[tuple[float, float] | None],
+) -> tuple[tuple[float, float], tuple[float, float], float] | tuple[None, None, None]:
+    """Rms and mean (x, y) of the errors that exist, and the longest; None without any."""
+    errors = np.array([error for error in errors_px if error is not None])
+    if not len(errors):
+        return None, None, None
+    rms, mean = np.sqrt(np.mean(errors**2, axis=0)), errors.mean(axis=0)
+    worst = float(np.linalg.norm(errors, axis=1).max())
+    return (float(rms[0]), float(rms[1])), (float(mean[0]), float(mean[1])), worst
+
+
+def _csv_rows(record: HandoffRecord) -> list[list[Any]]:
+    start = [record.step, record.index, record.range_m, record.frame_id, *record.clicked_px]
+    if not record.handed:
+        return [[*start, *[""] * 13, record.error]]
+    rows = []
+    for one in record.handed:
+        axes = np.sqrt(np.maximum(np.linalg.eigvalsh(one.geometric.search_px2)[::-1], 0.0))
+        refined = one.refined
+        rows.append(
+            [
+                *start, one.camera, *one.geometric.pixel_px, *axes, refined.verdict, *refined.pixel_px,
+                *np.sqrt(np.diag(refined.covariance_px2)), refined.correlation,
+                *(one.true_px or ("", "")), refined.reason,
+            ]
+        )  # fmt: skip
+    return rows
 
 
 if __name__ == "__main__":

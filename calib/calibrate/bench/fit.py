@@ -10,9 +10,8 @@ Start (``calib.calibrate.starts.bench``), pulls bounded, what changed half-way t
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,17 +21,19 @@ from calib.adjust.changes import BenchChange, find_change
 from calib.adjust.drifts import find_drifts
 from calib.adjust.model_terms import Tested
 from calib.adjust.result import BenchCalibration
-from calib.adjust.robust import SurveyNotFitted, typical_length, weigh, without_blunders
+from calib.adjust.robust import SurveyNotFitted, judged_again, weigh, without_blunders
+from calib.adjust.scatter import with_scales
 from calib.adjust.solver import Minimum, minimise
+from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
-from calib.calibrate.bench.problem import BenchOptions, BenchProblem, without_terms
-from calib.calibrate.bench.told import choose, told
+from calib.calibrate.bench.problem import BenchOptions, BenchProblem, best_cut, without_terms
+from calib.calibrate.bench.statements import bench_calibration, choose
+from calib.calibrate.refusals import refuse_far, refuse_unsettled
 from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged
 from calib.survey.records import Survey
 
 WRONG_MINIMUM = 3.0
-"""A fit is refused if a camera's typical corner is this many times farther off than its sigma says, or than
-``corner_px`` of the survey where that is more: a print's errors are in no corner's own sigma."""
+"""A fit is refused if the typical corner is this many times farther off than its sigma."""
 
 SCAN_HUBER = 100.0
 """Length in sigmas from which pulls are bounded while changes are looked for: these are no blunders."""
@@ -87,24 +88,22 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     bench, problem, start = _look_for_changes(bench, every)
     _refuse_far(bench, problem, start)  # before blunders are looked for one by one where nothing fits
     chooses = bench.options.terms is None
+    if not chooses:
+        start = without_terms(start, set(every) - set(chosen))
+        problem = bench.problem(chosen, start).with_terms(problem.images, ())
+    cleaned = without_blunders(problem, start, bench.terms.images, bench.survey.sigma.corner_px)
     if chooses:
-        problem, fit = without_blunders(problem, start, bench.terms.images)
-        start, named = fit.state, every
-        chosen, tests = choose(bench, every, problem, fit)
-    start = without_terms(start, set(every) - set(chosen))
-    last = bench.problem(chosen, start).with_terms(problem.images, ())
-    problem, fit = without_blunders(last, start, bench.terms.images, bounded=not chooses)
-    _refuse_part(problem)
-    _refuse_far(bench, problem, fit.state)
+        start, named = cleaned.fit.state, every
+        chosen, tests = choose(bench, every, cleaned.problem, cleaned.fit)
+        start = without_terms(start, set(every) - set(chosen))
+        last = bench.problem(chosen, start).with_terms(cleaned.problem.images, ())
+        cleaned = judged_again(cleaned, last, start)
+    _refuse_part(cleaned.problem)
+    _refuse_far(bench, cleaned.problem, cleaned.fit.state)
     # counts and the least of corners are known; what a simulated or lucky bench has less is no knowledge
-    weighed = weigh(problem, fit, bench.terms.images, narrows=False)
-    if not weighed.fit.settled:
-        raise BenchNotFitted(
-            f"the fit did not settle: after {weighed.fit.steps} steps it was still finding better values, so "
-            "that neither they nor their sigmas are good. Take more pictures, at more pan and tilt angles "
-            "and distances"
-        )
-    return told(bench, (problem, fit), weighed, named, chosen, tests, began)
+    weighed = weigh(cleaned, narrows=False)
+    refuse_unsettled(weighed.fit, "pan and tilt angles and distances")
+    return bench_calibration(bench, cleaned.as_stated(), weighed, named, chosen, tests, began)
 
 
 def _look_for_changes(
@@ -120,19 +119,24 @@ def _look_for_changes(
     BenchNotFitted
         If a joint slipped, or a camera changed: nothing says which of its two states is the one to come.
     """
-    strays = {n: s for view in bench.views.values() for n, s in view.strays.items()}
+    wrong = {n: s for view in bench.views.values() for n, s in view.wrong.items()}
     tried: tuple[BenchChange, BenchProblem, Adjustment, Minimum[Estimate]] | None = None
     for left in range(CHANGES, -1, -1):
-        problem, fit = _roughly(bench, chosen, strays, bench.start)
-        if np.isfinite(fit.normal.cost) and bench.allow_inexact(problem, fit.state):
-            problem, fit = _roughly(bench, chosen, strays, fit.state)
+        problem = bench.seen(chosen, bench.start)
+        problem = problem.with_terms([replace(t, keep=t.keep & ~wrong[t.name]) for t in problem.images], ())
+        fit = minimise(problem, bench.start, weak=problem.weak, gain=1e-4)
+        if np.isfinite(fit.normal.cost):
+            order_px = bench.survey.sigma.corner_px
+            problem, _, _ = with_scales(problem, fit.state, bench.terms.images, order_px)
+            fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-4)
         problem = _without_lone_strays(problem, fit.state).with_huber(SCAN_HUBER)
         fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-6)
         if tried is not None:
             if not fit.normal.cost < MENDS * tried[3].normal.cost:
                 _, bench, problem, fit = tried
                 break
-            _refuse(tried[0])
+            if tried[0].board is None:
+                raise SomethingChanged(tried[0].sentence)
             tried = None
         if not np.isfinite(fit.normal.cost) or not left:
             break
@@ -143,7 +147,8 @@ def _look_for_changes(
         if change.sure:
             if any(drift.tells_more(change) for drift in find_drifts(problem, fit.state)):
                 break  # the verdict names it, with its size
-            _refuse(change)
+            if change.board is None:
+                raise SomethingChanged(change.sentence)
         else:
             tried, bench = (change, bench, problem, fit), bench.copied()
         if change.board is None:
@@ -153,21 +158,6 @@ def _look_for_changes(
             bench.split_placement(change.board, change.after)
         bench.begin()
     return bench, problem.with_huber(HUBER), fit.state
-
-
-def _refuse(change: BenchChange) -> None:
-    """Raise if it was no board that moved."""
-    if change.board is None:
-        raise SomethingChanged(change.sentence)
-
-
-def _roughly(
-    bench: BenchProblem, chosen: Sequence[str], strays: Mapping[str, Any], start: Estimate
-) -> tuple[Adjustment, Minimum[Estimate]]:
-    """The problem with some terms, without what single cameras showed to be wrong, and a first fit of it."""
-    problem = bench.seen(chosen, start)
-    problem = problem.with_terms([replace(t, keep=t.keep & ~strays[t.name]) for t in problem.images], ())
-    return problem, minimise(problem, start, weak=problem.weak, gain=1e-4)
 
 
 def _refuse_slip(bench: BenchProblem, state: Estimate) -> None:
@@ -203,22 +193,17 @@ def _without_lone_strays(problem: Adjustment, state: Estimate) -> Adjustment:
 
 def _refuse_part(problem: Adjustment) -> None:
     """Raise if all pictures of a placement or a camera from some one on, or up to it, had to be left out."""
-    boards = [
-        ("placement " + b[1], [t for t in problem.images if t.board == b]) for b in _each(problem, "board")
-    ]
-    cameras = [
-        (f"camera {c}", [t for t in problem.images if t.camera == c]) for c in _each(problem, "camera")
-    ]
-    for what, shown in (*boards, *cameras):
+    shown_by: dict[str, list[ImageTerm]] = {}
+    for term in problem.images:
+        for what in (f"placement {term.board[1]}", f"camera {term.camera}"):
+            shown_by.setdefault(what, []).append(term)
+    for what, shown in shown_by.items():
         out = np.array([not t.keep.any() for t in shown])
         if out.sum() < PART or out.all():
             continue
-        wrong = [
-            min((~out[:k]).sum() + out[k:].sum(), out[:k].sum() + (~out[k:]).sum())
-            for k in range(1, len(out))
-        ]
-        cut = int(np.argmin(wrong)) + 1
-        if wrong[cut - 1] <= 0.2 * out.sum():
+        cut, wrong = best_cut(out)
+        cut = min(max(cut, 1), len(out) - 1)
+        if wrong <= 0.2 * out.sum():
             raise BenchNotFitted(
                 f"{int(out.sum())} of {len(out)} pictures of {what} contradict the rest, all on one side of "
                 f"picture {shown[cut].name}: something changed before it. Fasten board, head and cameras, "
@@ -226,25 +211,16 @@ def _refuse_part(problem: Adjustment) -> None:
             )
 
 
-def _each(problem: Adjustment, what: str) -> list[Any]:
-    return list(dict.fromkeys(getattr(t, what) for t in problem.images))
-
-
 def _refuse_far(bench: BenchProblem, problem: Adjustment, state: Estimate) -> None:
-    """Raise if a camera's typical corner is far above its noise, or too many images were left out."""
-    for name in state.cameras:
-        mine = [t for t in problem.images if t.camera == name]
-        kept = [t for t in mine if t.keep.any()]
-        if len(kept) < max(2, len(mine) // 2):
-            raise BenchNotFitted(
-                f"camera {name}: {len(mine) - len(kept)} of its {len(mine)} pictures do not agree with the "
-                "rest. Check that pan counts right and tilt up, that each picture's placement is the right "
-                "one, and that nothing but the head moved"
-            )
-        typical, noise_px = typical_length(problem, state, kept, bench.survey.sigma.corner_px)
-        if typical > WRONG_MINIMUM:
-            raise BenchNotFitted(
-                f"camera {name}: the fit leaves {typical:.1f} times the stated noise of a corner "
-                f"({noise_px:g} px). It ended in a wrong minimum, the lens is not of this model, the "
-                "board's measures are wrong, or the sigmas are too small"
-            )
+    refuse_far(
+        problem,
+        state,
+        bench.survey.sigma.corner_px,
+        most=WRONG_MINIMUM,
+        dot="corner",
+        disagree=", and no slip, knock, other focus or moved board between two of them explains it. Check "
+        "that pan counts right and tilt up, that each picture's placement is the right one, and that nothing "
+        "but the head moved",
+        scatter="they are found badly, the board is printed inexactly, or corner_px is far too small",
+        coherent="the board's measures are wrong",
+    )

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from calib.adjust.adjustment import HUBER, Adjustment
 from calib.adjust.model_terms import axis_numbers, bow_of, candidate_terms, joint_numbers
-from calib.adjust.significance import typical_scale
 from calib.adjust.terms import ImageTerm, with_kept
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.bench import BenchNotFitted, BenchStart, SomethingChanged, bench_start
 from calib.calibrate.starts.views import ViewPoses, ViewsTooFew, view_poses
 from calib.geometry.cahvor import Kind
-from calib.geometry.rigid import FloatArray, Rigid
-from calib.survey.records import Survey, SurveyImage
+from calib.geometry.rigid import Rigid
+from calib.survey.records import Survey
 
 SUREST = 0.1
 """Part of ``corner_px`` below which no corner's own sigma counts: what neighbours share is not in it."""
@@ -48,7 +46,7 @@ def bench_terms(survey: Survey) -> BenchTerms:
     fitted: list[ImageTerm] = []
     checks: list[ImageTerm] = []
     notes: list[str] = []
-    standstills = _Standstills()
+    standstill, shown, count = None, set[tuple[str, str]](), 0
     for image in survey.images:
         corners = survey.corners.get(image.name)
         if corners is None or not len(corners.ids):
@@ -61,7 +59,13 @@ def bench_terms(survey: Survey) -> BenchTerms:
             continue
         on_head = survey.cameras[image.camera].on == "head"
         check = image.purpose == "check"
-        attitude = None if not on_head else -1 if check else standstills.of(image)
+        attitude = None if not on_head else -1
+        if on_head and not check:
+            key = (image.placement, image.pan_rad, image.tilt_rad, image.pan_approach, image.tilt_approach)
+            if key != standstill or (image.camera, image.board) in shown:
+                standstill, shown, count = key, set(), count + 1
+            shown.add((image.camera, image.board))
+            attitude = count - 1
         board = survey.boards[image.board]
         bend = np.stack(
             [board.in_board_m(corners.ids, bow)[:, 2] for bow in ((1.0, 0.0), (0.0, 1.0))], axis=1
@@ -84,24 +88,7 @@ def bench_terms(survey: Survey) -> BenchTerms:
             corners.ids,
         )
         (checks if check else fitted).append(term)
-    return BenchTerms(tuple(fitted), tuple(checks), standstills.count, tuple(notes))
-
-
-class _Standstills:
-    """Counts the head's standstills as images go by."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._key: tuple[object, ...] | None = None
-        self._shown: set[tuple[str, str]] = set()
-
-    def of(self, image: SurveyImage) -> int:
-        """The index of the standstill that an image belongs to."""
-        key = (image.placement, image.pan_rad, image.tilt_rad, image.pan_approach, image.tilt_approach)
-        if key != self._key or (image.camera, image.board) in self._shown:
-            self.count, self._key, self._shown = self.count + 1, key, set()
-        self._shown.add((image.camera, image.board))
-        return self.count - 1
+    return BenchTerms(tuple(fitted), tuple(checks), count, tuple(notes))
 
 
 MOVES = 4
@@ -109,9 +96,6 @@ MOVES = 4
 
 TURNABOUTS = 0.34
 """A board stood at two places in turn if no cut divides its pictures but for this part of the fewer ones."""
-
-INEXACT = 1.15
-"""Corners that are typically so many of their own sigmas off are less exact than noise leaves them."""
 
 
 @dataclass(frozen=True)
@@ -159,8 +143,6 @@ class BenchProblem:
         self.cameras = {t.camera: survey.cameras[t.camera] for t in self.terms.images}
         self.boards = tuple(dict.fromkeys(t.board[0] for t in self.terms.images))
         self.split: list[tuple[tuple[str, str], tuple[str, str], str]] = []
-        self.own_px = {t.name: t.sigma_px for t in (*self.terms.images, *self.terms.checks)}
-        self.inexact_m = 0.0
         self.views = self._views()
         self.begin()
 
@@ -198,12 +180,8 @@ class BenchProblem:
         there = np.array([t.name in elsewhere for t in shown])
         changes = np.flatnonzero(there[1:] != there[:-1])
         # A picture that says nothing clear may lie on either side: the change is where it divides best.
-        wrong = [
-            int(min((~there[:k]).sum() + there[k:].sum(), there[:k].sum() + (~there[k:]).sum()))
-            for k in range(len(shown) + 1)
-        ]
-        cut = int(np.argmin(wrong))
-        if wrong[cut] > TURNABOUTS * there.sum():
+        cut, wrong = best_cut(there)
+        if wrong > TURNABOUTS * there.sum():
             first = [shown[i + 1].name for i in changes[:3]]
             raise SomethingChanged(
                 f"board {board[0]} of placement {board[1]} stands at two places, now at one and now at the "
@@ -219,35 +197,26 @@ class BenchProblem:
 
     def split_placement(self, board: tuple[str, str], after: str) -> None:
         """Give the images of a board from one on a placement of their own."""
-        names = [i.name for i in self.survey.images]
-        first = names.index(after)
         moved = (board[0], f"{board[1]} from {after} on")
         self.split.append((board, moved, after))
-
-        def relabelled(terms: Sequence[ImageTerm]) -> tuple[ImageTerm, ...]:
-            return tuple(
-                replace(t, board=moved) if t.board == board and names.index(t.name) >= first else t
-                for t in terms
-            )
-
-        self.terms = replace(
-            self.terms, images=relabelled(self.terms.images), checks=relabelled(self.terms.checks)
-        )
+        self._change_from(after, lambda t: replace(t, board=moved) if t.board == board else t)
 
     def read_otherwise(self, joint: str, after: str, step_rad: float) -> None:
         """Take a joint to have been further on than it read, in the images from one on."""
+        key = f"{joint}_rad"
+        self._change_from(
+            after, lambda t: t if t.attitude is None else replace(t, **{key: getattr(t, key) + step_rad})
+        )
+
+    def _change_from(self, after: str, change: Callable[[ImageTerm], ImageTerm]) -> None:
+        """Change the terms of images from one on."""
         names = [i.name for i in self.survey.images]
-        first, key = names.index(after), f"{joint}_rad"
-
-        def turned(terms: Sequence[ImageTerm]) -> tuple[ImageTerm, ...]:
-            return tuple(
-                t
-                if t.attitude is None or names.index(t.name) < first
-                else replace(t, **{key: getattr(t, key) + step_rad})
-                for t in terms
-            )
-
-        self.terms = replace(self.terms, images=turned(self.terms.images), checks=turned(self.terms.checks))
+        later = set(names[names.index(after) :])
+        images, checks = (
+            tuple(change(t) if t.name in later else t for t in terms)
+            for terms in (self.terms.images, self.terms.checks)
+        )
+        self.terms = replace(self.terms, images=images, checks=checks)
 
     def _views(self) -> dict[str, ViewPoses]:
         """What each camera says by itself."""
@@ -307,45 +276,6 @@ class BenchProblem:
         problem = self.problem(chosen, start)
         return problem.with_terms(with_kept(problem.images, problem.unseen(start)), ())
 
-    def allow_inexact(self, problem: Adjustment, state: Estimate) -> bool:
-        """Take corners for as inexact on the board as a fit shows them, where their own sigmas are less.
-
-        A print, and a lens that is only nearly of its model, are off by more than noise leaves of a corner.
-        What is added stays below ``corner_px``: more is no print. Returns whether sigmas changed.
-        """
-        every = (*self.terms.images, *self.terms.checks)
-        per_m = _px_per_m(problem, state, every)
-        kept = [t for t in problem.images if t.keep.any()]
-        own = np.concatenate([self.own_px[t.name][t.keep] for t in kept])
-        scale = np.concatenate([per_m[t.name][t.keep] for t in kept])
-        sigma_px = np.concatenate([t.sigma_px[t.keep] for t in kept])
-        off = np.concatenate(problem.image_residuals(state, kept)).reshape(-1, 2)
-        square = np.sum(off**2, axis=1) * sigma_px**2
-
-        def typical(inexact_m: float) -> float:
-            return typical_scale(square / (own**2 + (inexact_m * scale) ** 2))
-
-        most_px2 = self.survey.sigma.corner_px**2 - float(np.median(own)) ** 2
-        most_m = float(np.sqrt(max(most_px2, 0.0)) / np.median(scale))
-        found_m = 0.0
-        if most_m > 0.0 and typical(0.0) > INEXACT**2:
-            found_m = (
-                most_m if typical(most_m) > 1.0 else float(brentq(lambda m: typical(m) - 1.0, 0.0, most_m))
-            )
-        if abs(found_m - self.inexact_m) < 0.1 * max(found_m, self.inexact_m, 1e-9):
-            return False
-        self.inexact_m = found_m
-
-        def less_sure(terms: Sequence[ImageTerm]) -> tuple[ImageTerm, ...]:
-            return tuple(
-                replace(t, sigma_px=np.hypot(self.own_px[t.name], found_m * per_m[t.name])) for t in terms
-            )
-
-        self.terms = replace(
-            self.terms, images=less_sure(self.terms.images), checks=less_sure(self.terms.checks)
-        )
-        return True
-
     def candidates(self) -> tuple[str, ...]:
         """Terms that pictures could determine: backlash only where the axis came from both sides."""
         found = []
@@ -360,12 +290,6 @@ class BenchProblem:
         return tuple(found)
 
 
-def _px_per_m(problem: Adjustment, state: Estimate, terms: Sequence[ImageTerm]) -> dict[str, FloatArray]:
-    """By image how many pixels (n,) a metre across the line of sight is where each of its corners is."""
-    away_m = problem.away_m(state, [replace(t, keep=np.ones_like(t.keep)) for t in terms])
-    return {t.name: state.cameras[t.camera].focal_px[0] / away_m[t.name] for t in terms}
-
-
 def _one_sided(term: str, joint: str, sides: set[int]) -> str:
     """Why a joint's backlash is not looked for."""
     if not sides & {-1, 1}:
@@ -375,6 +299,13 @@ def _one_sided(term: str, joint: str, sides: set[int]) -> str:
         f"{term} is not looked for: {joint} came to rest from {side} angles only, as in a head that "
         "approaches every goal from one side. Its play is then part of its zero, and no error"
     )
+
+
+def best_cut(there: np.ndarray) -> tuple[int, int]:
+    """Return before which of a row (n,) it changes sides, and for how many of them that is wrong."""
+    cuts = range(len(there) + 1)
+    wrong = [min((~there[:k]).sum() + there[k:].sum(), there[:k].sum() + (~there[k:]).sum()) for k in cuts]
+    return int(np.argmin(wrong)), int(min(wrong))
 
 
 def without_terms(state: Estimate, terms: set[str]) -> Estimate:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,19 +23,17 @@ from scipy.spatial.transform import Rotation
 from calib.adjust.terms import ImageTerm
 from calib.adjust.uncertainty import SEEN_RAD
 from calib.adjust.unknowns import Estimate
+from calib.calibrate.starts.agreeing import GROSS
 from calib.calibrate.starts.views import ViewPoses
 from calib.errors import CalibError
 from calib.geometry.rig import MAST_NAMES
 from calib.geometry.rigid import FloatArray, Rigid, rot_y, rot_z
 
-ROUNDS = 25
+ROUNDS = 12
 """Of weights; they settle in some ten."""
 
-SMALLEST_RAD, SMALLEST_M = 2e-3, 2e-3
-"""Misfits below these do not count as smaller."""
-
-GROSS = 8.0
-"""An image is doubtful if it misses by so many times the typical misfit."""
+SMALLEST = 2e-3
+"""Misfits below this do not count as smaller, radians and metres."""
 
 NEAR_RAD, NEAR_M = 0.1, 0.05
 """Poses of a board by single images that are the same place; what is nearer, least squares can tell apart."""
@@ -47,13 +46,12 @@ FEWEST_ATTITUDES = 4
 
 
 class BenchNotFitted(CalibError):
-    """The pictures do not determine what is asked of them, or contradict each other; the sentence says
-    how."""
+    """The pictures do not determine a rig, or contradict each other; the sentence says how."""
 
 
 class SomethingChanged(BenchNotFitted):
-    """A joint slipped, a camera was knocked or refocused, two boards have the same ids: more pictures mend
-    nothing, somebody has to."""
+    """A joint slipped, a camera was knocked or refocused, or two boards have the same ids: more pictures do
+    not help, a person has to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,14 +65,14 @@ class BenchStart:
     elsewhere: Mapping[tuple[str, str], frozenset[str]]
 
 
-@dataclass(frozen=True, eq=False)
-class _Tied:
-    """A camera tied to its boards: mount_from_camera, mast_from_board, and the latter as each image has
-    it."""
+class _Tied(NamedTuple):
+    """A camera tied to its boards: by image its board's place in the mast, and how far (angle and distance)
+    that is from where the others have it."""
 
     mount_from_camera: Rigid
     mast_from_board: dict[tuple[str, str], Rigid]
     by_image: dict[str, Rigid]
+    off: dict[str, FloatArray]
 
 
 def bench_start(images: Sequence[ImageTerm], views: Mapping[str, ViewPoses], attitudes: int) -> BenchStart:
@@ -108,7 +106,7 @@ def bench_start(images: Sequence[ImageTerm], views: Mapping[str, ViewPoses], att
             count = sum(t.board == board for t in mine)
             if count > weight.get(board, 0):
                 boards[board], weight[board] = pose, count
-        off = _far_off(mine, tied)
+        off = _far_off(tied)
         doubtful |= off
         for board in tied.mast_from_board:
             elsewhere.setdefault(board, set()).update(
@@ -171,26 +169,21 @@ def _tie(images: Sequence[ImageTerm], view: ViewPoses) -> _Tied:
     for _ in range(ROUNDS):
         seen = np.array([pose.rotation for pose in chosen])
         in_head, in_mast = _rotations(gimbals, seen, at, len(boards), weight)
-        chosen = [
-            _nearest(view.poses[t.name], (gimbals[i] @ in_head).T @ in_mast[at[i]])
-            for i, t in enumerate(images)
-        ]
+        wanted = (gimbals @ in_head).transpose(0, 2, 1) @ in_mast[at]
+        chosen = [_nearest(view.poses[t.name], turn) for t, turn in zip(images, wanted, strict=True)]
         seen = np.array([pose.rotation for pose in chosen])
         off = _angles(gimbals @ in_head @ seen, in_mast[at])
-        typical = max(float(np.median(off)), SMALLEST_RAD)
-        before, weight = weight, 1.0 / np.maximum(off, 0.5 * typical)
-        weight = weight / weight.max()
-        if np.abs(weight - before).max() < 1e-3:
-            break
-    good = off < GROSS * typical
+        typical = max(float(np.median(off)), SMALLEST)
+        weight = 0.5 * typical / np.maximum(off, 0.5 * typical)
     shifts = np.array([pose.translation_m for pose in chosen])
-    place, places = _places(gimbals, gimbals @ in_head, shifts, at, len(boards), good)
+    place, places = _places(gimbals, gimbals @ in_head, shifts, at, len(boards), off < GROSS * typical)
     head_from_camera = Rigid(in_head, place)
-    return _Tied(
-        head_from_camera,
-        {b: Rigid(in_mast[i], places[i]) for i, b in enumerate(boards)},
-        {t.name: Rigid(gimbals[i], np.zeros(3)) @ head_from_camera @ chosen[i] for i, t in enumerate(images)},
-    )
+    mast_from_board = {b: Rigid(in_mast[i], places[i]) for i, b in enumerate(boards)}
+    by_image = {
+        t.name: Rigid(gimbals[i], np.zeros(3)) @ head_from_camera @ chosen[i] for i, t in enumerate(images)
+    }
+    apart = {t.name: _apart(by_image[t.name], mast_from_board[t.board]) for t in images}
+    return _Tied(head_from_camera, mast_from_board, by_image, apart)
 
 
 def _rotations(
@@ -238,14 +231,14 @@ def _places(
             rcond=None,
         )[0]
         off = np.linalg.norm(rows @ solved - wanted, axis=1)
-        typical = max(float(np.median(off[good])), SMALLEST_M)
+        typical = max(float(np.median(off[good])), SMALLEST)
         weight = np.where(good, np.sqrt(1.0 / np.maximum(off, typical) * typical), 0.0)
     return solved[:3], solved[3:].reshape(-1, 3)
 
 
 def _nearest(poses: Sequence[Rigid], rotation: FloatArray) -> Rigid:
     """Of the poses of an image the one turned least from what the rest says."""
-    return max(poses, key=lambda pose: float(np.trace(pose.rotation.T @ rotation)))
+    return max(poses, key=lambda pose: float(np.sum(pose.rotation * rotation)))
 
 
 def _angles(one: FloatArray, other: FloatArray) -> FloatArray:
@@ -262,24 +255,20 @@ def _body(images: Sequence[ImageTerm], view: ViewPoses, boards: Mapping[tuple[st
     return votes[int(np.argmin(apart))]
 
 
-def _far_off(images: Sequence[ImageTerm], tied: _Tied) -> set[str]:
+def _far_off(tied: _Tied) -> set[str]:
     """Images whose board stands far from where the others have it."""
-    off = np.array([_apart(tied.by_image[t.name], tied.mast_from_board[t.board]) for t in images])
-    limits = np.maximum(GROSS * np.median(off, axis=0), (NEAR_RAD, NEAR_M))
-    return {t.name for t, far in zip(images, (off > limits).any(axis=1), strict=True) if far}
+    limits = np.maximum(GROSS * np.median(list(tied.off.values()), axis=0), (NEAR_RAD, NEAR_M))
+    return {name for name, off in tied.off.items() if (off > limits).any()}
 
 
 def _agreeing(images: Sequence[ImageTerm], tied: _Tied) -> set[str]:
     """Of images that have a board elsewhere, those that most others of them agree with."""
-    best: set[str] = set()
-    for one in images:
-        near = {
-            t.name
-            for t in images
-            if (_apart(tied.by_image[t.name], tied.by_image[one.name]) < (NEAR_RAD, NEAR_M)).all()
-        }
-        best = max(best, near, key=len)
-    return best
+    places = {t.name: tied.by_image[t.name] for t in images}
+    near = (
+        {name for name, place in places.items() if (_apart(place, one) < (NEAR_RAD, NEAR_M)).all()}
+        for one in places.values()
+    )
+    return max(near, key=len, default=set())
 
 
 def _apart(one: Rigid, other: Rigid) -> FloatArray:

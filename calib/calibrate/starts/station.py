@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -44,39 +44,34 @@ class AdjustedPrisms:
 
     Attributes
     ----------
-    names, places_in_rover_m
-        The prisms and (n, 3) their places, metres.
+    state
+        The places of the prisms, and the pose of every set-up.
     covariance
         (3n, 3n) of the places, metres squared. Where the whole set stands is known no better than the
         drawing says, however many set-ups there are.
-    rover_from_station
-        The pose of every set-up.
+    chi2, degrees_of_freedom
+        Of what was used.
+    settled
+        Whether the fit did.
     rejected
         Measurements left out: set-up and prism, or None and prism where the set-ups agree with each other
         on another place than the drawing's.
     doubt
         '' if what was used agrees; else a sentence.
-    chi2, degrees_of_freedom
-        Of what was used.
     """
 
-    names: tuple[str, ...]
-    places_in_rover_m: FloatArray
-    covariance: FloatArray
-    rover_from_station: Mapping[str, Rigid]
-    rejected: tuple[tuple[str | None, str], ...]
-    doubt: str
-    chi2: float
-    degrees_of_freedom: int
-
-
-@dataclass(frozen=True, eq=False)
-class _PrismFit:
     state: Estimate
     covariance: FloatArray
     chi2: float
-    freedom: int
+    degrees_of_freedom: int
     settled: bool
+    rejected: tuple[tuple[str | None, str], ...] = ()
+    doubt: str = ""
+
+    @property
+    def places_in_rover_m(self) -> FloatArray:
+        """(n, 3) the places of the prisms."""
+        return np.array(list(self.state.prisms_in_rover_m.values()))
 
 
 def adjust_prisms(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> AdjustedPrisms:
@@ -105,10 +100,12 @@ def adjust_prisms(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> Adjust
             raise NotAligned(f"set-up {setup}: {count} prisms where at least three are expected")
     drawing = survey.prisms_in_rover_m
     fit = _fit(survey, drawing, station)
-    rejected: list[tuple[str | None, str]] = []
-    while fit.chi2 > _limit(fit.freedom, false_alarm):
+    rejected, doubt = list[tuple[str | None, str]](), ""
+    while fit.chi2 > chdtri(fit.degrees_of_freedom, false_alarm):
         found = _culprit(survey, drawing, station, fit.chi2, false_alarm)
         if found is None:
+            rms = np.sqrt(fit.chi2 / fit.degrees_of_freedom)
+            doubt = f"the set-ups and the drawing of the prisms disagree by {rms:.1f} times their sigmas"
             break
         rejected.append(found)
         drawing, station = _without(drawing, station, *found)
@@ -118,25 +115,7 @@ def adjust_prisms(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> Adjust
             f"the prisms' places did not settle in {STEPS} steps: the set-ups stand too differently from the "
             "drawing; check the prisms' names and places"
         )
-    doubt = ""
-    if fit.chi2 > _limit(fit.freedom, false_alarm):
-        rms = np.sqrt(fit.chi2 / fit.freedom)
-        doubt = f"the set-ups and the drawing of the prisms disagree by {rms:.1f} times their sigmas"
-    places = fit.state.prisms_in_rover_m
-    return AdjustedPrisms(
-        tuple(places),
-        np.array(list(places.values())),
-        fit.covariance,
-        fit.state.rover_from_station,
-        tuple(rejected),
-        doubt,
-        fit.chi2,
-        fit.freedom,
-    )
-
-
-def _limit(freedom: int, false_alarm: float) -> float:
-    return float(chdtri(freedom, false_alarm))
+    return replace(fit, rejected=tuple(rejected), doubt=doubt)
 
 
 def _without(
@@ -167,13 +146,13 @@ def _culprit(
         with suppress(NotAligned):  # three on a line are no set-up
             left.append((_fit(survey, *_without(drawing, station, *one)).chi2, one))
     left.sort(key=lambda entry: entry[0])
-    clear = _limit(3, false_alarm)
-    if len(left) < 2 or now - left[0][0] < clear or left[1][0] - left[0][0] < _limit(1, false_alarm):
+    clear, apart = chdtri(3, false_alarm), chdtri(1, false_alarm)
+    if len(left) < 2 or now - left[0][0] < clear or left[1][0] - left[0][0] < apart:
         return None
     return left[0][1]
 
 
-def _fit(survey: Survey, drawing: Mapping[str, FloatArray], station: Sequence[StationTerm]) -> _PrismFit:
+def _fit(survey: Survey, drawing: Mapping[str, FloatArray], station: Sequence[StationTerm]) -> AdjustedPrisms:
     """Places and poses together: an adjustment without images, of the prisms that ``drawing`` holds."""
     places = survey.prisms_in_rover_m
     sigma_m = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
@@ -191,7 +170,7 @@ def _fit(survey: Survey, drawing: Mapping[str, FloatArray], station: Sequence[St
     at = np.concatenate([problem.at(("prism", name)) for name in places])
     covariance = covariance_of(fit.normal.matrix)[np.ix_(at, at)]
     freedom = 3 * (len(drawing) + len(station)) - len(problem.names)
-    return _PrismFit(fit.state, covariance, fit.normal.cost, freedom, fit.settled)
+    return AdjustedPrisms(fit.state, covariance, fit.normal.cost, freedom, fit.settled)
 
 
 GROSS = 1e-9
@@ -262,19 +241,19 @@ def _refined(
 ) -> tuple[dict[str, Rigid], dict[str, FloatArray]]:
     """Set-ups and prisms by all set-ups and the drawing together."""
     refined = adjust_prisms(survey, false_alarm=GROSS)
-    prisms = dict(zip(refined.names, refined.places_in_rover_m, strict=True))
+    setups, prisms = dict(refined.state.rover_from_station), dict(refined.state.prisms_in_rover_m)
     measured = {(p.setup, p.point): p.position_m for p in survey.station if p.kind == "prism"}
     for setup, name in refined.rejected:
         if setup is None:
             off = prisms[name] - survey.prisms_in_rover_m[name]
             sigma_m, where = survey.sigma.prism_cad_m, "in the drawing"
         else:
-            off = refined.rover_from_station[setup].points(measured[setup, name]) - prisms[name]
+            off = setups[setup].points(measured[setup, name]) - prisms[name]
             sigma_m, where = survey.sigma.station_m, f"of set-up {setup}"
         blunders.append(_outlier("prism", name, where, off, sigma_m))
     if refined.doubt:
         notes.append(refined.doubt)
-    return dict(refined.rover_from_station), prisms
+    return setups, prisms
 
 
 def _left_out(kind: Literal["prism", "tape"], pose: Alignment, sigma_m: float, where: str) -> list[Outlier]:

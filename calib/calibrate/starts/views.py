@@ -17,10 +17,12 @@ from calib.adjust.adjustment import HUBER, Adjustment
 from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
-from calib.calibrate.starts.stray_dots import stray_points
+from calib.calibrate.starts.agreeing import GROSS
+from calib.calibrate.starts.camera import centred_camera
+from calib.calibrate.starts.wrong_dots import wrong_points
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel, Kind
-from calib.geometry.rigid import FloatArray, Rigid
+from calib.geometry.rigid import Rigid
 
 FEWEST_POINTS = 8
 """An image with fewer points takes no part in a start."""
@@ -28,17 +30,13 @@ FEWEST_POINTS = 8
 IMAGES_FOR_LENS = 16
 """As many images, spread over all, are enough for a camera to start from."""
 
-GROSS = 6.0
-"""An image is left out of a start if its typical corner is so many times farther off than the typical
-image's, and above the noise."""
-
 NEARLY_AS_GOOD = 6.0
 """The second pose of an image counts if its typical corner is at most so many times farther off than the
 first's."""
 
 
 class ViewsTooFew(CalibError):
-    """The images of a camera do not fix it: too few, or none of a lens's."""
+    """The images of a camera do not fix it: too few, or no lens explains them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +49,7 @@ class ViewPoses:
         The camera with C at the origin, looking along z.
     poses
         By image name camera_from_board: the likeliest, and the other one if it is nearly as good.
-    strays
+    wrong
         By image name which of its points (n,) disagree with the rest of it.
     doubtful
         Images that no pose explains.
@@ -59,7 +57,7 @@ class ViewPoses:
 
     model: CameraModel
     poses: dict[str, tuple[Rigid, ...]]
-    strays: dict[str, np.ndarray]
+    wrong: dict[str, np.ndarray]
     doubtful: frozenset[str]
 
 
@@ -87,14 +85,16 @@ def view_poses(
     ViewsTooFew
         If no camera explains the images.
     """
-    strays = {t.name: _strays(t) for t in images}
-    clean = [replace(t, keep=t.keep & ~strays[t.name]) for t in images]
+    wrong = {t.name: _wrong(t) for t in images}
+    clean = [replace(t, keep=t.keep & ~wrong[t.name]) for t in images]
     clean = [t for t in clean if t.keep.sum() >= FEWEST_POINTS]
     if not clean:
         raise ViewsTooFew(f"{len(images)} images, none of which shows {FEWEST_POINTS} corners of a board")
     best: tuple[float, CameraModel] | None = None
     for focal in _focal_lengths(clean, size_px, focal_px):
-        found = _lens(clean, _pinhole(kind, size_px, focal), images_for_lens)
+        found = _lens(
+            clean, centred_camera(kind, size_px, focal, 2 if kind == "CAHVORE" else 0), images_for_lens
+        )
         if found is not None and (best is None or found[0] < best[0]):
             best = found
         if best is not None and best[0] < 3.0:
@@ -110,12 +110,12 @@ def view_poses(
             off[term.name] = found_poses[0][0]
     typical = max(float(np.median(list(off.values()))) if off else np.inf, 1.0)
     doubtful = {t.name for t in images if t.name not in off or off[t.name] > GROSS * typical}
-    return ViewPoses(model, poses, strays, frozenset(doubtful))
+    return ViewPoses(model, poses, wrong, frozenset(doubtful))
 
 
-def _strays(term: ImageTerm) -> np.ndarray:
+def _wrong(term: ImageTerm) -> np.ndarray:
     """Which points are not where the rest of their image says; none where so many are that it cannot tell."""
-    bad = stray_points(term.in_board_m[:, :2], term.pixels_px, term.sigma_px)
+    bad = wrong_points(term.in_board_m[:, :2], term.pixels_px, term.sigma_px)
     return bad if bad.mean() <= 0.25 else np.zeros_like(bad)
 
 
@@ -125,76 +125,35 @@ def _focal_lengths(
     """Focal lengths to start from, the likeliest first."""
     found = _focal_of_homographies(images, size_px)
     if focal_px is None:
-        return (
-            [found, 0.9 * max(size_px), 1.5 * max(size_px)]
-            if found
-            else [0.9 * max(size_px), 1.5 * max(size_px)]
-        )
+        return [*([found] if found else []), 0.9 * max(size_px), 1.5 * max(size_px)]
     near = [found] if found and 0.6 < found / focal_px < 1.7 else []
     return [focal_px, *near, 0.8 * focal_px, 1.25 * focal_px]
 
 
 def _focal_of_homographies(images: Sequence[ImageTerm], size_px: tuple[int, int]) -> float | None:
-    """The focal length that most slanted boards agree with, centre and square pixels taken for granted."""
-    middle = (np.array(size_px) - 1) / 2
-    scale = float(max(size_px))
-    values, weights = [], []
+    """The focal length of the typical slanted board, centre and square pixels taken for granted."""
+    found = []
     for term in images:
-        keep = term.keep
-        found, _ = cv2.findHomography(term.in_board_m[keep, :2], (term.pixels_px[keep] - middle) / scale)
-        if found is None:
-            continue
-        h = found / np.linalg.norm(found[:, 0])
-        one, two = h[:, 0], h[:, 1]
-        # h1.w.h2 = 0 and h1.w.h1 = h2.w.h2 with w = diag(x, x, 1), x = 1/f².
-        for a, b in (
-            (one[:2] @ two[:2], -one[2] * two[2]),
-            (one[:2] @ one[:2] - two[:2] @ two[:2], two[2] ** 2 - one[2] ** 2),
-        ):
-            if b * a > 0:
-                values.append(b / a)
-                weights.append(abs(a * b))
-    if not values:
-        return None
-    order = np.argsort(values)
-    part = np.cumsum(np.array(weights)[order])
-    typical = float(np.array(values)[order][np.searchsorted(part, part[-1] / 2)])
-    return float(scale / np.sqrt(typical))
-
-
-def _pinhole(kind: Kind, size_px: tuple[int, int], focal_px: float) -> CameraModel:
-    """A camera at the origin that looks along z."""
-    x, y, z = np.eye(3)
-    cx, cy = (np.array(size_px) - 1) / 2
-    return CameraModel.normalised(
-        kind, size_px, np.zeros(3), z, focal_px * x + cx * z, focal_px * y + cy * z, z,
-        cahvore_type=2 if kind == "CAHVORE" else 0,
-    )[0]  # fmt: skip
+        points = term.in_board_m[term.keep].astype(np.float32)
+        pixels = term.pixels_px[term.keep].astype(np.float32)
+        found.append(cv2.initCameraMatrix2D([points], [pixels], size_px)[0, 0])
+    good = [f for f in found if np.isfinite(f) and 0.1 < f / max(size_px) < 20.0]
+    return float(np.median(good)) if good else None
 
 
 def _lens(images: Sequence[ImageTerm], start: CameraModel, most: int) -> tuple[float, CameraModel] | None:
     """Typical residual in sigmas, and the camera with the lens fitted, its boards free."""
-    chosen = _spread(images, most)
-    terms, poses, size = [], {}, []
-    for term in chosen:
-        found = poses_of(start, term)
-        if found:
-            key = (term.name, "")
-            terms.append(replace(term, board=key, attitude=None))
-            poses[key] = found[0][1]
-            size.append(found[0][0])
-    if not terms:
+    some = np.unique(np.linspace(0, len(images) - 1, min(most, len(images))).astype(int))
+    placed = [(images[i], poses[0]) for i in some if (poses := poses_of(start, images[i]))]
+    if not placed:
         return None
-    good = np.array(size) <= GROSS * max(float(np.median(size)), 1.0)
-    terms = [t for t, g in zip(terms, good, strict=True) if g]
-    state = Estimate(
-        {terms[0].camera: start},
-        np.zeros(8),
-        {},
-        {t.board: poses[t.board] for t in terms},
-        {},
-        np.zeros((0, 2)),
-    )
+    limit = GROSS * max(float(np.median([size for _, (size, _) in placed])), 1.0)
+    terms, boards = [], {}
+    for term, (size, pose) in placed:
+        if size <= limit:
+            terms.append(replace(term, board=(term.name, ""), attitude=None))
+            boards[term.name, ""] = pose
+    state = Estimate({terms[0].camera: start}, np.zeros(8), {}, boards, {}, np.zeros((0, 2)))
     problem = Adjustment(terms, (), state, mast_parameters=0, huber=HUBER)
     fit = minimise(problem, state, weak=problem.weak, steps=60, gain=1e-6)
     if not np.isfinite(fit.normal.cost):
@@ -203,27 +162,6 @@ def _lens(images: Sequence[ImageTerm], start: CameraModel, most: int) -> tuple[f
     model = fit.state.cameras[terms[0].camera]
     # Boards that are free leave the camera's place open: put it back to where it began.
     return float(np.median(np.linalg.norm(off, axis=1))), model.moved(model.pose.inverse)
-
-
-def _spread(images: Sequence[ImageTerm], most: int) -> list[ImageTerm]:
-    """Some images, as different as can be: by where the board's middle is and how it is foreshortened."""
-    if len(images) <= most:
-        return list(images)
-    looks = np.array([_look(t) for t in images])
-    looks = (looks - looks.mean(axis=0)) / np.maximum(looks.std(axis=0), 1e-9)
-    chosen = [int(np.argmax([t.keep.sum() for t in images]))]
-    nearest = np.full(len(images), np.inf)
-    while len(chosen) < most:
-        nearest = np.minimum(nearest, np.linalg.norm(looks - looks[chosen[-1]], axis=1))
-        chosen.append(int(np.argmax(nearest)))
-    return [images[i] for i in chosen]
-
-
-def _look(term: ImageTerm) -> FloatArray:
-    """(6,) where the board's middle is, and the affine map near it: pixels per metre."""
-    keep = term.keep
-    points = np.column_stack([term.in_board_m[keep, :2], np.ones(int(keep.sum()))])
-    return np.asarray(np.linalg.lstsq(points, term.pixels_px[keep], rcond=None)[0].ravel())
 
 
 def poses_of(model: CameraModel, term: ImageTerm) -> list[tuple[float, Rigid]]:

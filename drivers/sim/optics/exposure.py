@@ -35,20 +35,14 @@ class ExposureSettings:
     reference_s
         The exposure time that gives the scene its own brightness, at gain 1; grey levels grow with time and
         gain. 0: they do not.
-    gain
-        Of a fixed exposure.
     auto
         Whether the camera sets time and gain itself, from ``exposure_s`` on.
-    target_dn
-        The mean grey level that it is after.
     share
         Of the way there, in its logarithm, that a frame's decision goes.
     lag_frames
         From the frame that is metered to the first one with what was decided.
     shortest_s, longest_s
         Bounds of the time; gain rises where the longest is too short.
-    most_gain
-        Bound of the gain.
     day_s, night_share
         Length of a day that the run begins at noon of, and the brightness of midnight over that of noon; 0:
         it stays noon.
@@ -137,16 +131,8 @@ class AutoExposure:
 
     Parameters
     ----------
-    settings
-        What it does.
-    exposure_s
-        Of the first frames.
-    start_s
-        When the simulation began.
     metered
         ``metered(time_s)``: a coarse picture of the moment at the scene's own brightness.
-    now_s
-        The simulation's clock.
     """
 
     def __init__(

@@ -65,10 +65,6 @@ class LensSettings:
         Distance of what is sharp, along the axis; 0: infinitely far.
     pitch_um
         From pixel to pixel; with a model's focal length in pixels it makes that in metres.
-    dust
-        Specks on the sensor's window.
-    dust_um
-        Their median diameter.
     dust_gap_um
         From the window to the pixels.
     """
@@ -88,12 +84,6 @@ class SimulatedLens:
 
     Attributes
     ----------
-    settings
-        What it is like.
-    camera
-        The model in its mounting frame.
-    name, seed
-        Fix where the dust lies.
     ranges
         ``ranges(origins_m, directions)``: how far rays go in the site frame, metres, nan for sky.
     """

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from drivers.interfaces import Image
-from drivers.sim.kept import kernels
+from drivers.sim.compiled import kernels
 from drivers.sim.optics.exposure import FrameExposure
 from drivers.sim.optics.lens import Float32
 
@@ -40,8 +40,6 @@ class Noise:
         Standard deviation that light adds at mid grey (128); grows as the root of the grey level.
     seed
         With ``camera`` and a frame's sequence number it fixes every pixel.
-    camera
-        The camera's name.
     """
 
     read_dn: float

@@ -51,8 +51,6 @@ class Shutter:
 
     Attributes
     ----------
-    camera
-        The model in its mounting frame.
     row_time_s
         From the exposure of one row to that of the next; 0: all rows at once.
     pose

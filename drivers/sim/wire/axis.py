@@ -46,8 +46,6 @@ class WireAxis:
         0 for pan, 1 for tilt: which faults concern it.
     falls_to_rad
         Where a limp axis falls to; None: friction holds it.
-    start_rad, time_s
-        Where the motor is at first, and since when.
     resumes
         Whether it goes on to where it was sent when a fault that held it is over.
     """

@@ -41,8 +41,6 @@ class Reply:
 
     Attributes
     ----------
-    data
-        The bytes as they leave the device.
     delay_s
         From the end of what it answers: of the received packet, or of the reply before it in the sequence.
     sender
@@ -268,12 +266,14 @@ class Line(ABC):
         return data
 
     def _want(self, up: bool) -> None:
-        self._wanted_up = up
+        with self._changed:
+            self._wanted_up = up
+            self._changed.notify_all()  # for a thread that waits for the opposite, which does not come now
         if self._closing or threading.current_thread() is self._thread:
             return
         self._wake()
         with self._changed:
-            while self._up != up and not self._ended:
+            while self._up != up and self._wanted_up == up and not self._ended:
                 self._changed.wait()
 
     def _run(self) -> None:

@@ -31,16 +31,10 @@ class Drive:
 
     Parameters
     ----------
-    model, table
-        The servo's.
-    axis
-        What it turns.
     zero_counts
         Raw count at axis angle 0.
     sign
         1 or -1: whether counts grow with the axis angle.
-    time_s
-        When it is switched on.
     """
 
     def __init__(

@@ -40,26 +40,14 @@ class SimulatedModel:
 
     Attributes
     ----------
-    name, number, firmware
-        As a ping answers.
-    registers
-        Its control table, without the indirect blocks.
     indirect
         The indirect blocks; ``indirect_low`` to ``indirect_high`` is what they may point to.
-    counts_per_turn
-        Counts of one turn of the output shaft.
     zero_counts
         Count in the middle of the turn that position control uses.
     velocity_unit_rad_per_s, acceleration_unit_rad_per_s2, current_unit_a
         One unit of the velocity, acceleration and current registers.
     modes
         Operating modes: 0 current, 1 velocity, 3 position, 4 extended, 5 current-based position, 16 PWM.
-    drive_bits
-        Bits that Drive Mode takes.
-    fast
-        It answers fast sync and bulk reads.
-    voltage_v
-        What it is fed with, the manual's recommendation.
     axes
         Servos in one case, each with an id and a table; they share the baud rate.
     """
@@ -424,10 +412,7 @@ MODELS: Mapping[str, SimulatedModel] = {model.name: model for model in _ALL}
 def model_named(name: str) -> SimulatedModel:
     """Return a model by its name in any common spelling: ``XM430-W350-T``, ``xm430_w350``.
 
-    Raises
-    ------
-    BadOptions
-        If there is none, with the nearest name.
+    Raises BadOptions if there is none, with the nearest name.
     """
     plain = str(name).lower().replace("-", "_")
     for suffix in ("", "_t", "_r"):

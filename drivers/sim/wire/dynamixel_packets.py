@@ -80,8 +80,6 @@ def fast_status_packets(blocks: list[tuple[int, int, bytes]], total: int) -> lis
 
     Parameters
     ----------
-    blocks
-        Error, id and data of each servo that answers, in order.
     total
         Data bytes that were asked of all servos of the list, and 4 for each of them.
     """

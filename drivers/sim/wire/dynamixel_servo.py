@@ -39,32 +39,23 @@ _BACKUP_KEY = b"\x43\x54\x52\x4c"
 class SimulatedServo:
     """One servo; every method is given the time and nothing runs by itself.
 
+    Raises BadOptions for an unknown model or register, or a value that the register cannot hold.
+
     Parameters
     ----------
     model
         Its name, in any spelling that `dynamixel_models.model_named` takes.
-    servo_id
-        Its id at first.
-    axis
-        What it turns.
     zero_counts
         Count at axis angle 0 (with homing offset 0 and normal direction); left out, the middle of the range.
     sign
         1 or -1: whether counts grow with the axis angle.
     settings
         Initial values of registers, by name; those of the EEPROM outlast a reboot.
-    time_s
-        When it is switched on.
 
     Attributes
     ----------
     mate
         The other servo in its case, with which it shares the baud rate; None for a servo of one axis.
-
-    Raises
-    ------
-    BadOptions
-        For an unknown model or register, or a value that the register cannot hold.
     """
 
     def __init__(

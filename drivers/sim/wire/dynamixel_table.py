@@ -43,8 +43,6 @@ class ControlTable:
 
     Parameters
     ----------
-    model
-        Whose table it is.
     live
         Computes the registers that the servo measures (present position and so on): name to value.
     """
@@ -81,10 +79,7 @@ class ControlTable:
     def read(self, address: int, length: int, time_s: float) -> bytes:
         """Return the bytes of a range.
 
-        Raises
-        ------
-        Refused
-            ACCESS where a byte of the range is not defined, DATA_LENGTH for no bytes.
+        Raises Refused (aCCESS where a byte of the range is not defined, DATA_LENGTH for no bytes).
         """
         if length == 0:
             raise InstructionRefused(DATA_LENGTH)
@@ -144,19 +139,12 @@ class ControlTable:
     def changes(self, address: int, data: bytes, *, locked: bool, expired: bool) -> list[RegisterChange]:
         """Return what a write would change; nothing is changed yet.
 
+        Raises Refused with the error number that the servo answers.
+
         Parameters
         ----------
-        address, data
-            Where and what.
         locked
             The EEPROM area is locked: torque is on, or the packet came to the secondary id.
-        expired
-            The bus watchdog has expired.
-
-        Raises
-        ------
-        Refused
-            With the error number that the servo answers.
         """
         if not data:
             raise InstructionRefused(DATA_LENGTH)

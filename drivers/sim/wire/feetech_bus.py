@@ -16,8 +16,6 @@ class FeetechBus:
 
     Parameters
     ----------
-    servos
-        Those on the line.
     echoes
         Whether the adapter is a half-duplex one that gives the host its own bytes back.
 

@@ -107,7 +107,9 @@ SCS_ROWS = """
 66 1 moving              r -
 69 2 present_current     r -
 """
-BAUDS = (1_000_000, 500_000, 250_000, 128_000, 115_200, 57_600, 38_400, 19_200)
+BAUDS = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
+"""Bits a second by code: address 6 of the maker's memory tables of STS and SCSCL servos."""
+
 RAM_FROM = 40
 
 
@@ -130,18 +132,12 @@ class SimulatedFeetech:
 
     Attributes
     ----------
-    name, number
-        The number stands in its memory.
-    cells
-        Its memory table.
     big_end
         Whether the high byte of a word comes first.
     turn_rad, counts
         What its encoder measures over how many counts.
     sync_read
         Whether it answers a read of several servos at once.
-    volts
-        What it is fed with.
     """
 
     name: str

@@ -27,25 +27,16 @@ _PROTECTIVE_UNIT_S = 0.01
 class SimulatedFeetechServo:
     """One servo; every method is given the time and nothing runs by itself.
 
+    Raises BadOptions for an unknown model or name, or a value that the memory cannot hold.
+
     Parameters
     ----------
     model
         A name of `feetech_memory.MODELS`.
-    servo_id
-        Its id at first.
-    axis
-        What it turns.
     settings
         Initial values of its memory by name; those of the EEPROM outlast the power switch.
     speed_unit_counts
         Counts a second of one unit of its speed: 1, or 50 in some firmware.
-    time_s
-        When it is switched on.
-
-    Raises
-    ------
-    BadOptions
-        For an unknown model or name, or a value that the memory cannot hold.
     """
 
     def __init__(

@@ -70,10 +70,10 @@ class _KernelLine(Line):
 class PtyLine(_KernelLine):
     """A serial line as a pseudo terminal; a context manager.
 
+    Raises BadOptions if ``link`` cannot be made there.
+
     Parameters
     ----------
-    device
-        What is at the other end.
     clock
         Time for the device: one that runs by itself (``SystemClock``), since the line waits in real time.
     faults
@@ -82,13 +82,6 @@ class PtyLine(_KernelLine):
         A stable path to make, a symbolic link to the terminal; one of the line's own when left out.
     wire_time
         Whether bytes take time and the host has to set the device's baud rate to be understood.
-    observer
-        Shown every piece that passes.
-
-    Raises
-    ------
-    BadOptions
-        If ``link`` cannot be made there.
 
     Attributes
     ----------
@@ -175,24 +168,14 @@ class PtyLine(_KernelLine):
 class TcpLine(_KernelLine):
     """A device behind a TCP port, one host at a time; a context manager.
 
+    Raises BadOptions if it cannot listen there.
+
     Parameters
     ----------
     device, clock, faults, wire_time, observer
         As of ``PtyLine``; by default bytes take no time, since the network is faster than the device's line.
     host, port
         Where to listen; port 0 is any free one.
-    banner
-        Sent to every host that connects.
-
-    Raises
-    ------
-    BadOptions
-        If it cannot listen there.
-
-    Attributes
-    ----------
-    host, port
-        Where it listens.
     """
 
     def __init__(

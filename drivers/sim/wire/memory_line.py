@@ -22,8 +22,6 @@ class MemoryLine(Line):
 
     Parameters
     ----------
-    device
-        What is at the other end.
     clock
         Time for the device, and what the line and its host wait on.
     faults, wire_time, observer
@@ -55,10 +53,7 @@ class MemoryLine(Line):
     def open(self, port: str, baud: int, device: str = "") -> MemoryEnd:
         """Return the host's end of the line, a `drivers.serial_line.ByteLine`; arguments as of `SerialLine`.
 
-        Raises
-        ------
-        LineLost
-            If another host has it, it is hung up, or ``port`` is another.
+        Raises LineLost if another host has it, it is hung up, or ``port`` is another.
         """
         detail = {"port": port, "while": "opening it"}
         if port != self.path or not self._up:
@@ -133,10 +128,7 @@ class MemoryEnd:
     def read(self, wait_s: float) -> bytes:
         """Return the bytes that have come or come within ``wait_s``, as soon as there are any; else none.
 
-        Raises
-        ------
-        LineLost
-            If the line is gone.
+        Raises LineLost.
         """
         until_s = self._clock.now_s() + wait_s
         with self._arrived:

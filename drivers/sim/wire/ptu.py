@@ -2,6 +2,7 @@
 
 What the unit does is known in `drivers.sim.wire.ptu_unit`. Wording follows the manuals and what drivers of
 real units parse; where no source gives any (C, user limits, step modes) it is like its neighbours'.
+Only the commands that drivers need are known; others are refused as illegal.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from drivers.errors import BadOptions
 from drivers.faults import nearest
@@ -21,7 +22,6 @@ from drivers.sim.wire.ptu_unit import CommandRefused, PtuUnit
 BAUD_RATES = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 _WORDS = re.compile(r"([A-Z]+)([+-]?\d+)?")
 _STEP_NAMES = {"F": "FULL", "H": "HALF", "Q": "QUARTER", "E": "EIGHTH", "A": "AUTO"}
-_POWER_NAMES = {"R": "REGULAR", "L": "LOW", "H": "HIGH", "O": "OFF"}
 _LIMIT_MODES = {
     "E": "Limit bounds are ENABLED (soft limits enabled)",
     "D": "Limit bounds are DISABLED (hard limits only: use care)",
@@ -43,21 +43,14 @@ def answer(unit: PtuUnit, words: bytes, time_s: float) -> str:
     """Carry out one command and return its answer, ``*`` or ``!`` and text."""
     text = words.decode("ascii", "replace").upper()
     try:
-        told = _carry_out(unit, text, time_s)
+        text_back = _carry_out(unit, text, time_s)
     except CommandRefused as refusal:
         return f"! {refusal}"
-    return "*" if told is None else f"* {told}"
+    return "*" if text_back is None else f"* {text_back}"
 
 
 def _carry_out(unit: PtuUnit, text: str, time_s: float) -> str | None:
     """One command's text behind the ``*``, if it has any. Raises Refused."""
-    if text.startswith("@"):
-        _set_host(unit, text, time_s)
-        return None
-    if unit.model.e_series and re.fullmatch(r"B[+-]?\d+(,[+-]?\d+){3}", text):
-        values = [int(word) for word in text[1:].split(",")]
-        unit.go_both(values[:2], values[2:], time_s)
-        return None
     found = _WORDS.fullmatch(text)
     if found is None:
         raise _illegal()
@@ -69,12 +62,9 @@ def _carry_out(unit: PtuUnit, text: str, time_s: float) -> str | None:
     if name[0] in unit.axes and name[1:] == "R":
         resolution = _E_SERIES_RESOLUTION if unit.model.e_series else _RESOLUTION
         return resolution.carry_out(unit, unit.axes[name[0]], number, time_s)
-    if name in ("RPS", "RTS"):
-        return _RESET_SPEED.carry_out(unit, unit.axes[name[1]], number, time_s)
-    if name[0] in unit.axes and name[1:2] in ("H", "M") and number is None:
-        return _power(unit, unit.axes[name[0]], name[1], name[2:])
-    if name[0] == "W" and name[1:2] in unit.axes and number is None:
-        return _step(unit, unit.axes[name[1]], name[2:])
+    if name[0] == "W" and name[1:] in unit.axes and number is None:
+        axis = unit.axes[name[1]]
+        return _value(unit, "{axis} in {value} step mode", axis, _STEP_NAMES[axis.mode])
     raise _illegal()
 
 
@@ -82,32 +72,28 @@ def _illegal() -> CommandRefused:
     return CommandRefused("Illegal Command Entered")
 
 
-def _told(unit: PtuUnit, words: str, axis: PtuAxis, value: object) -> str:
+def _value(unit: PtuUnit, words: str, axis: PtuAxis, value: object) -> str:
     """A query's answer: words with the value in them, or the value alone."""
     return words.format(axis=axis.name, value=value) if unit.verbose else str(value)
 
 
 @dataclass(frozen=True)
 class _Quantity:
-    """What an axis has: told without a number, set with one, unless it can only be told."""
+    """A quantity of an axis: reported without a number, set with one, unless it can only be read."""
 
     words: str
     value: Callable[[PtuAxis, float], object]
     put: Callable[[PtuUnit, PtuAxis, int, float], None] | None = None
 
     def carry_out(self, unit: PtuUnit, axis: PtuAxis, number: int | None, time_s: float) -> str | None:
-        """Tell or set it."""
+        """Report or set it."""
         if number is None:
-            return _told(unit, self.words, axis, self.value(axis, time_s))
+            return _value(unit, self.words, axis, self.value(axis, time_s))
         if self.put is None:
             raise _illegal()
         self.put(unit, axis, number, time_s)
         return None
 
-
-_RESET_SPEED = _Quantity(
-    "{axis} reset speed is {value} positions/sec", lambda a, t: a.now.reset_speed, PtuUnit.set_reset_speed
-)
 
 _E_SERIES_RESOLUTION = _Quantity("{value} seconds arc per position", lambda a, t: f"{a.told_arcsec:.6f}")
 
@@ -123,19 +109,9 @@ _QUANTITIES: Mapping[str, _Quantity] = {
     "S": _Quantity(
         "Target {axis} speed is {value} positions/sec", lambda a, t: a.now.speed, PtuUnit.set_speed
     ),
-    "D": _Quantity(
-        "Current {axis} speed is {value} positions/sec", lambda a, t: a.speed(t), PtuUnit.change_speed
-    ),
-    "U": _Quantity(
-        "Maximum {axis} speed is {value} positions/sec", lambda a, t: a.now.fastest, PtuUnit.set_fastest
-    ),
+    "U": _Quantity("Maximum {axis} speed is {value} positions/sec", lambda a, t: a.now.fastest),
     "L": _Quantity(
         "Minimum {axis} speed is {value} positions/sec", lambda a, t: a.now.slowest, PtuUnit.set_slowest
-    ),
-    "B": _Quantity(
-        "Current {axis} base speed is {value} positions/sec",
-        lambda a, t: a.now.base_speed,
-        PtuUnit.set_base_speed,
     ),
     "A": _Quantity(
         "{axis} acceleration is {value} positions/sec^2",
@@ -157,107 +133,47 @@ _QUANTITIES: Mapping[str, _Quantity] = {
 }
 
 
-def _switch(attribute: str, value: object, *, e_series: bool = False) -> _Plain:
-    """The command that switches a mode, one that maybe only E series units have."""
-
-    def carry_out(unit: PtuUnit, time_s: float) -> None:
-        if e_series and not unit.model.e_series:
-            raise _illegal()
-        setattr(unit, attribute, value)
-
-    return carry_out
+def _switch(attribute: str, value: object) -> _Plain:
+    """The command that switches a mode."""
+    return lambda unit, time_s: setattr(unit, attribute, value)
 
 
 # Commands that are whole words.
 _PLAIN: Mapping[str, _Plain] = {
-    "A": lambda u, t: u.wait(t),
     "S": _switch("slaved", True),
     "I": lambda u, t: u.immediate(t),
-    "H": lambda u, t: u.halt((u.pan, u.tilt), t),
-    "HP": lambda u, t: u.halt((u.pan,), t),
-    "HT": lambda u, t: u.halt((u.tilt,), t),
-    "R": lambda u, t: u.reset((u.tilt, u.pan), t),
-    "RP": lambda u, t: u.reset((u.pan,), t),
-    "RT": lambda u, t: u.reset((u.tilt,), t),
-    "RE": _switch("at_power_up", "E"),
-    "RD": _switch("at_power_up", "D"),
-    "C": lambda u, t: f"PTU is in {'pure velocity' if u.velocity else 'independent'} control mode",
-    "CI": lambda u, t: u.control(False, t),
-    "CV": lambda u, t: u.control(True, t),
-    "CEC": _switch("encoder", True, e_series=True),
-    "CED": _switch("encoder", False, e_series=True),
-    "PCE": _switch("continuous", True, e_series=True),
-    "PCD": _switch("continuous", False, e_series=True),
+    "H": lambda u, t: u.halt(t),
+    "R": lambda u, t: u.reset(t),
+    "C": lambda u, t: "PTU is in independent control mode",
+    "CI": lambda u, t: None,
     "L": lambda u, t: _LIMIT_MODES[u.limit_mode],
     "LE": _switch("limit_mode", "E"),
     "LD": _switch("limit_mode", "D"),
     "LU": _switch("limit_mode", "U"),
     "V": lambda u, t: u.model.version,
     "O": lambda u, t: f"Input {u.supply_v(t):.0f} VDC @ {u.temperature_c(t) * 1.8 + 32:.0f} degF",
-    "E": lambda u, t: f"Echoing {'ON' if u.echo else 'OFF'}",
     "EE": _switch("echo", True),
     "ED": _switch("echo", False),
-    "F": lambda u, t: f"ASCII {'verbose' if u.verbose else 'terse'} mode",
     "FV": _switch("verbose", True),
     "FT": _switch("verbose", False),
-    "DS": lambda u, t: u.keep("S"),
-    "DR": lambda u, t: u.keep("R"),
-    "DF": lambda u, t: u.keep("F"),
-    "U": lambda u, t: "Unit ID is 0" if u.verbose else "0",
+    "DS": lambda u, t: u.save(),
 }
-
-
-def _power(unit: PtuUnit, axis: PtuAxis, kind: str, level: str) -> str | None:
-    """Tell or set hold (``kind`` H) or move (M) power."""
-    held = kind == "H"
-    if level == "":
-        name = _POWER_NAMES[axis.now.hold if held else axis.now.move]
-        return _told(unit, f"{{axis}} in {{value}} {'hold' if held else 'move'} power mode", axis, name)
-    if level not in (("R", "L", "O") if held else ("R", "L", "H", "O")):
-        raise _illegal()
-    axis.now = replace(axis.now, hold=level) if held else replace(axis.now, move=level)
-    return None
-
-
-def _step(unit: PtuUnit, axis: PtuAxis, mode: str) -> str | None:
-    """Tell or set the step mode, which comes into force when the axis has been reset."""
-    if mode == "":
-        return _told(unit, "{axis} in {value} step mode", axis, _STEP_NAMES[axis.now.step_mode])
-    if mode not in STEPS:
-        raise _illegal()
-    axis.now = replace(axis.now, step_mode=mode)
-    return None
-
-
-def _set_host(unit: PtuUnit, text: str, time_s: float) -> None:
-    """Set the serial line's rate."""
-    found = re.fullmatch(r"@\((\d+),(\d+),([TF])\)", text)
-    if found is None or int(found[1]) not in BAUD_RATES:
-        raise _illegal()
-    unit.set_baud(int(found[1]), time_s)
 
 
 class SimulatedPtu:
     """A unit on a line (``drivers.sim.wire.line.WireDevice``).
 
+    Raises BadOptions for a model, step mode or baud rate that does not exist.
+
     Parameters
     ----------
     model
         A name of ``drivers.sim.wire.ptu_axis.MODELS``.
-    pan, tilt
-        What it turns.
     step_mode
         F, H, Q, E or A; as delivered when left out.
     signs
         Whether positions of pan and tilt grow (1) or fall (-1) with the axis angle. By default pan falls:
         the unit counts to the left, the mast to the right.
-    baud
-        Of its serial line at first.
-
-    Raises
-    ------
-    BadOptions
-        For a model, step mode or baud rate that does not exist.
     """
 
     def __init__(
@@ -293,7 +209,7 @@ class SimulatedPtu:
 
     @property
     def eeprom_writes(self) -> int:
-        """How often it was told to save."""
+        """How often it has saved."""
         return self._unit.eeprom_writes
 
     @property

@@ -36,7 +36,6 @@ _70 = {
     "fastest": 5600,
     "speed": 4000,
     "acceleration": 8000,
-    "base_speed": 228,
 }
 
 ARCSEC_RAD = math.radians(1 / 3600)
@@ -55,17 +54,13 @@ class PtuModel:
         What ``V`` answers.
     half_step_arcsec
         One half step of either axis, arc seconds.
-    pan, tilt
-        Lowest and highest position that a reset finds.
     fastest, slowest
         Largest and smallest speed, a second.
-    speed, acceleration, base_speed
-        Defaults.
     step_mode
         As delivered: a key of ``STEPS``.
     e_series
         Answers as an E series unit: a line feed in front of every answer, no echo at power-up, six decimals,
-        the commands B, CEC, PCE and the banner over TCP.
+        and the banner over TCP.
     unsure_arcsec
         What it takes for its half step before its first reset; None when it knows.
     """
@@ -78,7 +73,6 @@ class PtuModel:
     slowest: int = 31
     speed: int = 1000
     acceleration: int = 2000
-    base_speed: int = 57
     step_mode: str = "H"
     e_series: bool = False
     unsure_arcsec: float | None = None
@@ -108,18 +102,13 @@ MODELS: Mapping[str, PtuModel] = MappingProxyType(
 
 
 @dataclass(frozen=True)
-class AxisDefaults:
-    """What DS keeps and DR brings back, in positions."""
+class AxisPace:
+    """Speeds of an axis, positions a second, and its acceleration, positions a second squared."""
 
     speed: int
     acceleration: int
-    base_speed: int
     fastest: int
     slowest: int
-    reset_speed: int
-    hold: str = "R"
-    move: str = "R"
-    step_mode: str = "H"
 
 
 class PtuAxis:
@@ -131,8 +120,6 @@ class PtuAxis:
         ``Pan`` or ``Tilt``.
     model
         The unit's.
-    axis
-        What it turns.
     sign
         1 or -1: whether positions grow with the axis angle.
     step_mode
@@ -158,16 +145,13 @@ class PtuAxis:
         self.known = known
         self.mode = step_mode
         scale = 1 / STEPS[step_mode]
-        self.factory = AxisDefaults(
-            speed=round(model.speed * scale),
+        self._reset_speed = round(model.speed * scale)
+        self.now = AxisPace(
+            speed=self._reset_speed,
             acceleration=round(model.acceleration * scale),
-            base_speed=round(model.base_speed * scale),
             fastest=round(model.fastest * scale),
             slowest=model.slowest,
-            reset_speed=round(model.speed * scale),
-            step_mode=step_mode,
         )
-        self.now = self.factory
         self.user_low, self.user_high = self.limits()
         self.target = 0
         self.slaved: int | None = None
@@ -211,10 +195,6 @@ class PtuAxis:
         """Return the position as the unit tells it."""
         return "nan" if self.axis.no_number(time_s) else self.position(time_s)
 
-    def speed(self, time_s: float) -> int:
-        """Return how fast it goes, positions a second (signed)."""
-        return round(self._sign * self.axis.velocity_rad_per_s(time_s) / self.step_rad)
-
     def resting(self, time_s: float) -> bool:
         """Return whether it stands, and no part of a reset is left."""
         return not self._sweep and not self.axis.under_way(time_s)
@@ -226,17 +206,6 @@ class PtuAxis:
         stop = max(low, min(high, position))
         self.told_limit = low <= position <= high
         self._drive(time_s, stop, self.now.speed if speed is None else speed)
-
-    def turn(self, time_s: float, speed: int, low: int, high: int) -> None:
-        """Turn at a signed speed until one of two positions."""
-        if speed == 0:
-            self.halt(time_s)
-            return
-        stop = high if speed > 0 else low
-        if self.position(time_s) != stop:
-            self.told_limit = False
-        self.target = stop
-        self._drive(time_s, stop, abs(speed))
 
     def change_speed(self, time_s: float, speed: int) -> None:
         """Take another speed, also under way."""
@@ -254,14 +223,12 @@ class PtuAxis:
         self.target = round(self._sign * self.axis.rest_rad() / self.step_rad)
 
     def reset(self, time_s: float) -> None:
-        """Find both limits again, then go to zero; a new step mode comes into force."""
-        if self.now.step_mode != self.mode:
-            self._change_mode()
+        """Find both limits again, then go to zero."""
         low, high = self.limits()
         self._sweep = [low, high, 0]
         self.slaved = None
         self.told_limit = True
-        self._drive(time_s, low, self.now.reset_speed)
+        self._drive(time_s, low, self._reset_speed)
 
     def follow_reset(self, time_s: float, hit: Callable[[], None]) -> None:
         """Go on with a reset when a limit is reached; ``hit`` is told of each."""
@@ -270,7 +237,7 @@ class PtuAxis:
         reached = self._sweep.pop(0)
         if self._sweep:
             hit()
-            self._drive(time_s, self._sweep[0], self.now.reset_speed)
+            self._drive(time_s, self._sweep[0], self._reset_speed)
         else:
             self.known = True
             self.target = reached
@@ -286,17 +253,3 @@ class PtuAxis:
     def _drive(self, time_s: float, position: int, speed: int) -> None:
         step = self.step_rad
         self.axis.goal(time_s, self.angle_rad(position), max(1, speed) * step, self.now.acceleration * step)
-
-    def _change_mode(self) -> None:
-        """Speeds keep their meaning in the new steps."""
-        ratio = STEPS[self.mode] / STEPS[self.now.step_mode]
-        self.mode = self.now.step_mode
-        now = self.now
-        self.now = replace(
-            now,
-            speed=round(now.speed * ratio),
-            acceleration=round(now.acceleration * ratio),
-            base_speed=round(now.base_speed * ratio),
-            fastest=round(now.fastest * ratio),
-            reset_speed=round(now.reset_speed * ratio),
-        )

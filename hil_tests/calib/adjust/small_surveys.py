@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from calib.geometry.rig import Rig
 from calib.survey.records import Survey
 from calib.targets.boards import Dots
-from tools.sim_survey.plan import PAPER_RINGS, Ring, SurveyPlan, SurveyTruth, rover_from_head
-from tools.sim_survey.survey import simulate_survey
+from hil_tests.support.sim_survey.plan import PAPER_RINGS, Ring, SurveyPlan, SurveyTruth, rover_from_head
+from hil_tests.support.sim_survey.survey import simulate_survey
 
 
 def rings(boards: int, *pairs: str) -> tuple[Ring, ...]:
@@ -47,7 +47,7 @@ def held(made: tuple[Survey, SurveyTruth], joint: str, at_rad: float) -> Survey:
     rng = np.random.default_rng(3)
     images, dots = [], {}
     for image in survey.images:
-        image = replace(image, **{joint: at_rad})
+        image = replace(image, **dict[str, Any]({joint: at_rad}))
         model = truth.rig.cameras[image.camera].model
         assert image.pan_rad is not None and image.tilt_rad is not None
         head = rover_from_head(truth.rig.mast, image.pan_rad, image.tilt_rad)
@@ -68,7 +68,7 @@ def with_shifted_dots(
 ) -> Survey:
     """The survey with some dots of an image, or all, found ``shift_px`` (2,) aside."""
     pixels = survey.dots[image].pixels_px.copy()
-    pixels[which] += shift_px
+    pixels[which] += np.asarray(shift_px)
     return replace(survey, dots={**survey.dots, image: replace(survey.dots[image], pixels_px=pixels)})
 
 

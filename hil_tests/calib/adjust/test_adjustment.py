@@ -18,7 +18,7 @@ from calib.geometry.parameters import parameter_names, stepped
 from calib.geometry.rig import Rig
 from calib.survey.records import Sigma, Survey
 from hil_tests.calib.adjust.small_surveys import of_cameras, rings, survey_of
-from tools.sim_survey.plan import BOARD, SurveyPlan, rover_from_head
+from hil_tests.support.sim_survey.plan import BOARD, SurveyPlan, rover_from_head
 
 RELATIVE = 1e-5
 """Of central differences with steps of a few sigmas' thousandths."""

@@ -18,7 +18,7 @@ from calib.calibrate.survey import fit_joint
 from calib.geometry.rig import Rig
 from calib.survey.records import Survey
 from hil_tests.calib.adjust.small_surveys import survey_of, with_shifted_dots, with_swapped_dots
-from tools.sim_survey.blunders import (
+from hil_tests.support.sim_survey.blunders import (
     with_fewer_dots,
     with_moved_tape,
     with_scattered_dots,
@@ -182,41 +182,63 @@ def test_a_dot_that_few_others_check_is_judged_by_what_the_fit_leaves_of_it(
     term = ImageTerm(
         "one", "left", ("s", "p"), None, 0, 0, counts, counts, places, residual, np.ones(23), keep
     )
-    left = judge(problem_of(term, block), None, np.eye(2) / keep[20:].sum(), [term])  # type: ignore[arg-type]
+    left = judge(problem_of([term], [block]), None, np.eye(2) / keep[20:].sum(), [term])  # type: ignore[arg-type]
     assert left.images[0].keep.tolist() == [True] * 22 + [good]
 
 
 @pytest.mark.parametrize(
-    ("common_sigmas", "own_sigmas", "comes_back"), [(12.0, 0.5, True), (30.0, 0.5, False), (0.0, 3.0, False)]
+    ("common_sigmas", "own_sigmas", "tilted_sigmas", "comes_back"),
+    [(12.0, 0.5, 0.0, True), (30.0, 0.5, 0.0, False), (0.0, 0.5, 5.0, False), (0.0, 3.0, 0.0, True)],
 )
-def test_an_image_left_out_is_judged_by_what_its_dots_share_and_by_what_they_do_not(
-    common_sigmas: float, own_sigmas: float, comes_back: bool
+def test_an_image_left_out_is_judged_by_what_its_dots_share_beyond_noise(
+    common_sigmas: float, own_sigmas: float, tilted_sigmas: float, comes_back: bool
 ) -> None:
-    """Twenty dots under one place, which is known to five sigma of a dot (covariance 25).
+    """Twenty dots in a line under one place, which is known to five sigma of a dot (covariance 25).
 
     Off together by 12 they are off by 2.4 sigma of the prediction: 12² 20 / (1 + 25 · 20) = 5.7 and no
     reason, though each by itself is at 12² / 26 and their sum at 111, where 82 is the limit of forty numbers.
-    Off together by 30, each is beyond 2 ln 2000 = 15.2. Off by 3 to either side in turn they are no one
-    place: 3² 20 = 180, though each by itself is at 9 / 26.
+    Off together by 30, each is beyond 2 ln 2000 = 15.2. Off by -5 to 5 from end to end they are no one
+    place: 5² 20 / 3 = 184, though each by itself is at 25 / 26. Off by 3 to either side in turn they are
+    noisier than stated.
     """
     jacobian = np.tile(np.eye(2), (20, 1, 1))
-    residual = np.zeros((20, 2))
-    residual[:, 0] = common_sigmas + own_sigmas * np.resize([1.0, -1.0], 20)
+    residual, places = np.zeros((20, 2)), np.zeros((20, 3))
+    places[:, 0] = np.linspace(-1.0, 1.0, 20)
+    residual[:, 0] = common_sigmas + own_sigmas * np.resize([1.0, -1.0], 20) + tilted_sigmas * places[:, 0]
     block = ResidualBlock(residual.ravel(), jacobian.reshape(40, 2), np.arange(2), 2)
     counts = np.arange(20)
     none = np.zeros(20, dtype=bool)
     term = ImageTerm(
-        "one", "left", ("s", "p"), None, 0, 0, counts, counts, np.zeros((20, 3)), residual, np.ones(20), none
+        "one", "left", ("s", "p"), None, 0, 0, counts, counts, places, residual, np.ones(20), none
     )
-    left = judge(problem_of(term, block), None, 25.0 * np.eye(2), [term])  # type: ignore[arg-type]
+    left = judge(problem_of([term], [block]), None, 25.0 * np.eye(2), [term])  # type: ignore[arg-type]
     assert left.images[0].keep.tolist() == [comes_back] * 20
 
 
-def problem_of(term: ImageTerm, block: ResidualBlock) -> Any:
+@pytest.mark.parametrize(("shift_sigmas", "stays"), [(0.0, True), (1.5, False)])
+def test_an_image_with_two_noisy_rows_fails_by_a_common_shift_alone(shift_sigmas: float, stays: bool) -> None:
+    """Two rows of eight have three times the noise, as edges along rows of pixels; four images have not."""
+    rows, columns = np.divmod(np.arange(88), 11)
+    residual = np.random.default_rng(2).standard_normal((5, 88, 2))
+    residual[0, np.isin(rows, (3, 4))] *= 3.0
+    residual[0, :, 0] += shift_sigmas
+    places = np.stack([columns, rows, 0 * rows], axis=1) * 0.045
+    once = np.ones(88)
+    terms = [
+        ImageTerm(str(i), "left", ("s", str(i)), None, 0, 0, rows, columns, places, off, once, once > 0)
+        for i, off in enumerate(residual)
+    ]
+    rates = np.tile(np.eye(2), (88, 1))
+    blocks = [ResidualBlock(off.ravel(), rates, np.arange(2), 2) for off in residual]
+    left = judge(problem_of(terms, blocks), None, 1e-6 * np.eye(2), terms)  # type: ignore[arg-type]
+    assert [bool(image.keep.any()) for image in left.images] == [stays, True, True, True, True]
+
+
+def problem_of(terms: list[ImageTerm], blocks: list[ResidualBlock]) -> Any:
     return SimpleNamespace(
-        images=[term],
+        images=terms,
         station=[],
         huber=None,
-        image_blocks=lambda state, images: [block],
+        image_blocks=lambda state, images: blocks,
         station_blocks=lambda state, points: [],
     )

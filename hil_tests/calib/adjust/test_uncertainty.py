@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,16 +10,17 @@ import numpy as np
 import pytest
 
 from calib.adjust.result import Calibration
-from calib.adjust.uncertainty import _reason, pixel_covariance, pointing_covariance, rig_moved_along
+from calib.adjust.uncertainty import _reason, pixel_covariance, pointing_covariance
 from calib.calibrate.paper import fit_paper
 from calib.calibrate.survey import fit_joint
-from calib.geometry.covariance import pixel_rates
+from calib.geometry.covariance import moved_rig, pixel_rates
 from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
 from calib.geometry.stereo import triangulate
+from calib.survey.records import Click
 from hil_tests.calib.adjust.small_surveys import held, rings, survey_of
-from tools.sim_survey.plan import SurveyPlan
-from tools.sim_survey.survey import simulate_survey
+from hil_tests.support.sim_survey.plan import SurveyPlan
+from hil_tests.support.sim_survey.survey import simulate_survey
 
 SURVEYS = 16
 SMALL = SurveyPlan(rings=rings(2), mast_boards=5, check_boards=0)
@@ -84,13 +86,14 @@ def test_the_papers_sigmas_hold_its_scatter(navcams: Rig) -> None:
 def test_pixel_rates_are_those_of_differences(joint: Calibration) -> None:
     points = np.array([[4.0, 0.5, -0.5], [6.0, 1.0, 0.0]])
     for camera in ("navcam_left", "hazcam_right"):
-        _, rates = pixel_rates(joint.rig, joint.parameter_names, camera, 0.2, -0.3, points)
-        every = np.arange(len(joint.parameter_names))
+        rates = pixel_rates(joint.rig, joint.parameter_names, camera, 0.2, -0.3, points).to_rig
         for column, name in enumerate(joint.parameter_names):
-            step = np.zeros(len(every))
+            step = np.zeros(len(joint.parameter_names))
             step[column] = 1e-3 if name.split(".")[2][0] in "HV" else 1e-6
             ends = [
-                rig_moved_along(joint, every, s * step).camera_in_rover(camera, 0.2, -0.3).project(points)[0]
+                moved_rig(joint.rig, joint.parameter_names, s * step)
+                .camera_in_rover(camera, 0.2, -0.3)
+                .project(points)[0]
                 for s in (1, -1)
             ]
             difference = (ends[0] - ends[1]) / (2 * step[column])
@@ -136,6 +139,17 @@ def test_check_images_are_predicted_and_never_fitted(joint: Calibration) -> None
     assert checks and not any(i.used.any() for i in checks)
     assert {i.camera for i in checks} == set(joint.check_rms_px)
     assert max(max(rms) for rms in joint.check_rms_px.values()) < 3.0
+
+
+def test_a_check_click_that_its_camera_cannot_see_is_named(navcams: Rig) -> None:
+    survey = survey_of(navcams, 100, SMALL)
+    image = next(i for i in survey.images if i.camera == "navcam_left")
+    behind = replace(survey.station[0], kind="check", setup=image.setup, point="brick")
+    rover = fit_joint(survey).rover_from_station[image.setup]
+    behind = replace(behind, position_m=rover.inverse.points(np.array([-50.0, 0.0, 0.0])))
+    click = Click(image.name, "brick", np.array([10.0, 20.0]))
+    fit = fit_joint(replace(survey, station=(*survey.station, behind), clicks=(click,)))
+    assert fit.unseen_clicks == (click,)
 
 
 def landed(true: Rig, fit: Calibration, seed: int, distance_m: float, count: int) -> np.ndarray:

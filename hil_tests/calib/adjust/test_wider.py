@@ -14,7 +14,7 @@ from calib.adjust.unknowns import ResidualBlock
 from calib.calibrate.survey import fit_joint
 from calib.geometry.rig import Rig
 from calib.survey.records import Sigma, Survey
-from tools.sim_survey.blunders import (
+from hil_tests.support.sim_survey.blunders import (
     with_bowed_board,
     with_changed_focus,
     with_drifting_focus,
@@ -23,8 +23,8 @@ from tools.sim_survey.blunders import (
     with_moved_board,
     with_slipped_joint,
 )
-from tools.sim_survey.plan import Ring, SurveyPlan, SurveyTruth
-from tools.sim_survey.survey import simulate_survey
+from hil_tests.support.sim_survey.plan import Ring, SurveyPlan, SurveyTruth
+from hil_tests.support.sim_survey.survey import simulate_survey
 
 Made = tuple[Survey, SurveyTruth]
 RINGS = tuple(Ring("navcam", range_m, 3, np.radians(-10)) for range_m in (3.0, 6.0))

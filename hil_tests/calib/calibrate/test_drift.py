@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
-from calib.calibrate.scene.drift import ALARM_SIGMAS, VIEW_SIGMA, ViewShift, find_drift, view_change
-from tools.campaigns.sentinel import SIZE, FeatureSite, rig, shown
-from tools.campaigns.sentinel_days import RESTS, ChangedRig
+from calib.calibrate.drift import ALARM_SIGMAS, VIEW_SIGMA, ViewShift, find_drift, seen_again, view_change
+from calib.geometry.cahvor import CameraModel
+from hil_tests.support.feature_days import RESTS, SIZE, ChangedRig, FeatureSite, rig, shown
 
 SEED = 11
 
@@ -44,7 +45,7 @@ def test_a_change_is_named_with_its_size(truth: ChangedRig, what: str, value: fl
     assert drift.named.sigmas >= ALARM_SIGMAS
 
 
-def test_the_sentence_says_who_turned_how_far_about_what_and_how_sure_that_is() -> None:
+def test_the_sentence_has_the_camera_the_angle_the_axis_and_its_sigmas() -> None:
     drift = look_at(ChangedRig(turned={"navcam_left": np.array([0.0, 1.8e-3, 0.0])}))
     words = drift.sentence
     assert words.startswith("navcam_left turned 1.")
@@ -114,3 +115,18 @@ def test_one_eye_at_one_rest_cannot_tell_a_bump_from_a_slip_and_says_so() -> Non
     named = {drift.named.what, *drift.instead}
     assert {"tilt slipped"} < named
     assert "these pictures cannot separate them" in drift.sentence
+
+
+def test_features_are_seen_again_where_they_moved_and_not_elsewhere() -> None:
+    rng = np.random.default_rng(SEED)
+    scene, other = (
+        110.0 + 400.0 * cv2.GaussianBlur(rng.normal(0.0, 1.0, (480, 640)), (0, 0), 3.0) for _ in range(2)
+    )
+    now = np.roll(scene, (1, -2), axis=(0, 1))
+    now[:, :320] = other[:, :320]
+    camera = CameraModel("CAHV", (640, 480), np.zeros(3), [0, 0, 1], [600, 0, 319.5], [0, 600, 239.5])
+    pictures = ((one + rng.normal(0.0, 2.0, one.shape)).astype(np.float32) for one in (scene, now))
+    pixels, moved, sigma = seen_again(camera, *pictures)
+    assert len(pixels) > 20
+    assert (pixels[:, 0] > 300.0).all()
+    assert np.abs((moved - [-2.0, 1.0]) / sigma[:, None]).max() < 5.0

@@ -8,7 +8,7 @@ import pytest
 
 from calib.calibrate.bench.problem import bench_terms
 from calib.calibrate.families import FamilyScore, compare_families, earned
-from tools.sim_survey.bench import BenchCamera, BenchPlan, simulate_bench
+from hil_tests.support.sim_survey.bench import BenchCamera, BenchPlan, simulate_bench
 
 
 def test_the_model_that_made_the_pictures_earns_its_parameters() -> None:

@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.calibrate.body import corrected_covariance, corrected_rig, fit_body_pose
-from calib.calibrate.body_sights import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose, body_groups, body_sights
+from calib.calibrate.body import (
+    PRIOR_SHIFT_M,
+    PRIOR_TURN_RAD,
+    BodyPose,
+    corrected_covariance,
+    corrected_rig,
+    fit_body_pose,
+)
+from calib.calibrate.body_sights import body_groups, body_sights
 from calib.errors import NoCorrection
 from calib.files.mast_file import load_rig
 from calib.geometry.cahvor import CameraModel
@@ -234,10 +241,10 @@ def test_targets_at_one_range_leave_directions_to_the_prior_by_name(rig: Rig) ->
 def test_an_eye_that_moved_by_itself_is_told(rig: Rig) -> None:
     rng = np.random.default_rng(6)
     made = hand_offs({n: vectors(rig, n) for n in HAZCAMS}, rig, targets(rng, 24), rng)
-    apart = fit_body_pose(rig, HAZCAMS, made).eyes_apart
+    apart = fit_body_pose(rig, HAZCAMS, made).cameras_apart
     assert apart is not None and apart.sigmas < 3.5
     made = [with_found(one, HAZCAMS[1], (0.0, 1.0)) for one in made]
-    apart = fit_body_pose(rig, HAZCAMS, made).eyes_apart
+    apart = fit_body_pose(rig, HAZCAMS, made).cameras_apart
     assert apart is not None and apart.sigmas > 4
     assert abs(apart.offset_px[1] - 1.0) < 4 * np.sqrt(apart.covariance_px2[1, 1])
 

@@ -16,7 +16,7 @@ from calib.calibrate.survey import fit_joint
 from calib.geometry.rig import Rig
 from calib.survey.records import Sigma, Survey
 from hil_tests.calib.adjust.small_surveys import rings, survey_of, with_shifted_dots
-from tools.sim_survey.plan import Ring, SurveyPlan, rover_from_head
+from hil_tests.support.sim_survey.plan import Ring, SurveyPlan, rover_from_head
 
 SMALL = SurveyPlan(rings=rings(2), mast_boards=5, check_boards=1)
 NEAR_M, NEAR_RAD = 0.01, 0.02
@@ -115,8 +115,8 @@ def test_a_camera_without_dots_is_left_out_and_one_without_camera_images_refused
     right = {i.name for i in survey.images if i.camera == "navcam_right"}
     blind = replace(survey, dots={n: d for n, d in survey.dots.items() if n not in right})
     start = start_values(blind, 6)
-    assert set(start.in_rover) == {"navcam_left"}
+    assert set(start.references.in_rover) == {"navcam_left"}
     assert "camera navcam_right has no image with dots and is not calibrated" in start.notes
     fitted = tuple(i for i in survey.images if i.name not in right or i.purpose != "camera")
     with pytest.raises(SurveyNotFitted, match="navcam_right"):
-        start_values(replace(survey, images=fitted), 6, only_camera_images=True)
+        start_values(replace(survey, images=fitted), 6, by_purpose=True)

@@ -68,7 +68,7 @@ def test_a_file_read_and_written_is_the_same_to_the_last_bit(tmp_path: Path) -> 
         (
             "[0.0, 610.0, 350.0]",
             "[0.0, 610.0]",
-            "cameras.navcam.camera_matrix[1]: a list of 2 where 3 numbers",
+            "cameras.navcam.camera_matrix[1]: a list of 2 where a list of 3 numbers",
         ),
         ("    C: [0.05, -0.1, -0.1]\n", "", "cameras.navcam.C: the key is missing"),
         ("OPENCV8", "CAHVOR", "cameras.navcam.camera_matrix: CAHVOR has no 'camera_matrix'"),
@@ -81,7 +81,7 @@ def test_what_is_no_such_camera_is_refused_by_key(old: str, new: str, words: str
     assert words in str(refused.value)
 
 
-def test_a_lens_that_sees_next_to_nothing_of_its_image_is_refused_by_where_it_folds(tmp_path: Path) -> None:
+def test_a_lens_that_sees_hardly_any_of_its_image_is_refused(tmp_path: Path) -> None:
     numbers = "[0.5, 0.1, 0.001, -0.0005, 0.01, 0.8, 0.2, 0.03]"
     narrow = TEXT.replace("OPENCV8", "OPENCV4")
     with pytest.raises(BadFile) as refused:

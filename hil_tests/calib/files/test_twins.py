@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calib.files import CameraFile
+from calib.files.any_camera import LIMIT_PX, load_any, save_any
 from calib.files.mast_file import load_rig
-from calib.files.twin import held_as, kind_of_lens, nearest_cahvor, nearest_opencv, nearest_square, twin_error
+from calib.files.twin import as_kind, kind_of_lens, nearest_cahvor, nearest_opencv, nearest_square, twin_error
 from calib.geometry.cahvor import CameraModel
 from hil_tests.calib.geometry.camera_cases import plain
 from mastctl.config import load_config
@@ -98,6 +102,42 @@ def test_an_error_knows_of_a_camera_that_does_not_see_all_of_the_image() -> None
     assert twin_error(plain("CAHV"), folding).worst_px == np.inf
 
 
+def general(linearity: float, focal: float, skew_rad: float) -> CameraModel:
+    """A CAHVORE of type 3 whose entrance point does not move."""
+    ahead, down = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    across = np.array([0.0, 1.0, 0.0]) + skew_rad * down
+    return CameraModel(
+        "CAHVORE",
+        (640, 480),
+        C=np.zeros(3),
+        A=ahead,
+        H=focal * across + 319.5 * ahead,
+        V=focal * down + 239.5 * ahead,
+        O=ahead,
+        R=np.zeros(3),
+        E=np.zeros(3),
+        cahvore_type=3,
+        linearity=linearity,
+    )
+
+
+def test_a_lens_within_the_limit_is_taken_where_a_plainer_one_is_beyond(tmp_path: Path) -> None:
+    model = general(0.6, 400.0, 1e-3)
+    assert twin_error(model, nearest_opencv(model, "OPENCV5")).worst_px > LIMIT_PX
+    done = save_any(CameraFile(model, "head"), tmp_path / "camera.ros.yaml")
+    assert done.worst_px <= LIMIT_PX
+    read = load_any(tmp_path / "camera.ros.yaml")
+    assert isinstance(read, CameraFile)
+
+
+@pytest.mark.parametrize("linearity", [0.6, 0.8])
+@pytest.mark.parametrize("focal", [300.0, 400.0])
+def test_a_rational_lens_sees_what_the_camera_it_is_fitted_to_sees(linearity: float, focal: float) -> None:
+    """A skew, which no term of the lens holds, drives its fraction to fold just in the corners."""
+    model = general(linearity, focal, 1e-3)
+    assert twin_error(model, nearest_opencv(model, "OPENCV8")).worst_px < 0.3
+
+
 def packaged(name: str) -> CameraModel:
     return load_rig(load_config().mast_file).rig.cameras[name].model
 
@@ -105,9 +145,7 @@ def packaged(name: str) -> CameraModel:
 @pytest.mark.parametrize(
     ("name", "within_px"), [("pancam_left", 0.1), ("navcam_left", 0.5), ("hazcam_left", np.inf)]
 )
-def test_the_stated_error_of_a_plumb_bob_is_what_opencv_makes_of_its_numbers(
-    name: str, within_px: float
-) -> None:
+def test_the_stated_error_of_a_plumb_bob_is_that_of_opencv(name: str, within_px: float) -> None:
     """A fisheye says how far it is off instead of pretending."""
     model = packaged(name)
     near = nearest_opencv(model, "OPENCV5")
@@ -124,21 +162,21 @@ def test_the_stated_error_of_a_plumb_bob_is_what_opencv_makes_of_its_numbers(
     assert off.max() == pytest.approx(error.worst_px, rel=0.05)
 
 
-def test_a_lens_is_held_by_a_longer_one_and_by_a_shorter_one_that_loses_nothing() -> None:
+def test_a_lens_is_stored_by_any_family_that_loses_nothing() -> None:
     one = camera(PINHOLE["radtan"])
     assert one.kind == "OPENCV4"
     for kind in ("OPENCV4", "OPENCV5", "OPENCV8", "OPENCV12", "OPENCV14"):
-        held = held_as(one, kind)  # type: ignore[arg-type]
+        held = as_kind(one, kind)  # type: ignore[arg-type]
         assert held is not None and held.kind == kind
         assert twin_error(one, held).worst_px < NUMERICAL_PX
     longer = camera([*PINHOLE["radtan"], 0.0, 0.0, 0.0, 0.0])
-    back = held_as(longer, "OPENCV4")
+    back = as_kind(longer, "OPENCV4")
     assert back is not None and twin_error(one, back).worst_px < NUMERICAL_PX
-    assert held_as(camera(PINHOLE["plumb_bob"]), "OPENCV4") is None
-    assert held_as(one, "OPENCV_FISHEYE") is None
+    assert as_kind(camera(PINHOLE["plumb_bob"]), "OPENCV4") is None
+    assert as_kind(one, "OPENCV_FISHEYE") is None
     skewed = np.add(one.camera_matrix, 0.5 * np.outer([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
     leaning = CameraModel.of_matrix("OPENCV4", one.size_px, skewed, one.distortion, one.rotation, one.C)
-    assert held_as(leaning, "OPENCV5") is None
+    assert as_kind(leaning, "OPENCV5") is None
     near = nearest_opencv(leaning, "OPENCV5")
     assert near.camera_matrix[0, 1] == 0.0
     assert 0.01 < twin_error(leaning, near).worst_px < 0.5

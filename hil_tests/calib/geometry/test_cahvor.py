@@ -148,26 +148,6 @@ def test_shapes_follow_the_input() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_one_at_a_time_is_the_same_as_many(kind: str) -> None:
-    rng = np.random.default_rng(6)
-    for number in range(40):
-        model = random_model(rng, kind)
-        points = model.C + rng.normal(size=(40, 3)) * 10.0 ** rng.uniform(-2.5, 2.0, (40, 1))
-        pixels = np.concatenate([rng.uniform(-0.5, 1.5, (40, 2)) * SIZE, model.project(points)[0]])
-        many, many_valid = model.project(points)
-        ones = [model.project(point) for point in points]
-        assert [bool(valid) for _, valid in ones] == many_valid.tolist(), f"model {number} of seed 6"
-        scale = 1.0 + np.abs(many)
-        assert np.nanmax(np.abs(np.array([p for p, _ in ones]) - many) / scale, initial=0.0) <= 1e-9
-        rays = model.ray(pixels)
-        single = [model.ray(pixel) for pixel in pixels]
-        assert [bool(ray.valid) for ray in single] == rays.valid.tolist(), f"model {number} of seed 6"
-        for field in ("origins_m", "directions"):
-            gap = np.abs(np.array([getattr(ray, field) for ray in single]) - getattr(rays, field))
-            assert np.nanmax(gap, initial=0.0) <= 1e-9
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_moving_the_camera_is_moving_the_points(kind: str) -> None:
     rng = np.random.default_rng(7)
     for _ in range(20):
@@ -191,19 +171,6 @@ def test_moving_the_camera_is_moving_the_points(kind: str) -> None:
         assert moved.kind == model.kind and moved.size_px == model.size_px
 
 
-def test_a_moved_camera_is_the_camera_of_its_vectors() -> None:
-    """Built anew from the moved letters, it projects alike; so nothing of the old place is kept."""
-    rng = np.random.default_rng(8)
-    for kind in KINDS:
-        model = random_model(rng, kind)
-        model.project(model.C + model.A)  # fills whatever is kept for one point at a time
-        moved = model.moved(Rigid(Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3)))
-        anew = replace(moved)
-        point = moved.C + 2.0 * moved.A
-        assert np.abs(moved.project(point)[0] - anew.project(point)[0]).max() <= PIXEL_PX
-        assert np.abs(moved.ray(CENTER_PX).directions - anew.ray(CENTER_PX).directions).max() <= RAY
-
-
 def test_many_small_motions_do_not_wear_the_model() -> None:
     model = plain("CAHVORE", R=[0, 0.05, 0], E=[0.01, 0.02, 0.0])
     step = Rigid(Rotation.from_rotvec([0.01, -0.02, 0.03]).as_matrix(), np.zeros(3))
@@ -212,21 +179,6 @@ def test_many_small_motions_do_not_wear_the_model() -> None:
         moved = moved.moved(step)
     assert abs(np.linalg.norm(moved.A) - 1.0) <= 1e-11
     replace(moved)  # still a camera by its own rules
-
-
-def test_jacobian_is_the_difference_of_pixels() -> None:
-    rng = np.random.default_rng(9)
-    for kind in KINDS:
-        for _ in range(10):
-            model = random_model(rng, kind)
-            rays = model.ray(rng.uniform(50, 400, (50, 2)))
-            points = (rays.origins_m + 4.0 * rays.directions)[rays.valid]
-            _, jacobian, _ = model.project_jacobian(points)
-            for axis, unit in enumerate(np.eye(3)):
-                f = [model.project(points + k * 1e-4 * unit)[0] for k in (-2, -1, 1, 2)]
-                difference = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / 12e-4
-                miss = np.abs(jacobian[:, :, axis] - difference).max(axis=1)
-                assert (miss <= 1e-6 * np.linalg.norm(jacobian, axis=(1, 2))).all()
 
 
 def test_jacobians_on_the_lens_axis_are_finite_and_right() -> None:
@@ -285,7 +237,7 @@ moderate = st.floats(-3.0, 3.0)
 triples = st.one_of(st.tuples(numbers, numbers, numbers), st.tuples(moderate, moderate, moderate))
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+@settings(max_examples=300, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
 @given(
     kind=st.sampled_from(KINDS),
     c=triples,

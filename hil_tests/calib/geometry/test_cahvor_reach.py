@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import brentq
 
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.lens import angle_by_search
+from calib.geometry.lenses.round import RoundLens
 from hil_tests.calib.geometry.camera_cases import CENTER_PX, KINDS, SIZE, at_angle, plain, random_model
 
 PIXEL_PX = 1e-8
@@ -225,5 +225,6 @@ def test_the_search_finds_the_ray_of_a_point_that_was_laid_on_it() -> None:
         entrance_m = (theta / np.sin(theta) - 1.0) * (e[0] + e[1] * theta**2 + e[2] * theta**4)
         for range_m in (0.05, 2.0):
             lam, w = range_m * np.sin(theta), entrance_m + range_m * np.cos(theta)
-            found = angle_by_search(model.lens, lam, w)
+            assert isinstance(model.lens, RoundLens)
+            found = model.lens.entrance.search(lam, w)
             assert np.abs(found - theta).max() < 1e-11, (e, range_m)

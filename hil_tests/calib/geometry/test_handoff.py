@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -242,31 +240,6 @@ def test_covariances_are_those_of_the_whole_chain_by_differences(
     assert np.abs(told - pixels).max() < SAME_AS_DIFFERENCES * np.abs(pixels).max()
 
 
-def test_a_hand_off_with_a_stored_covariance_takes_a_small_part_of_what_differences_take(
-    repository: Path,
-) -> None:
-    believed = load_rig(repository / "configs/masts/rocky8_simulated.yaml").rig
-    known = stored_covariance(believed)
-    assert known is not None
-    exact = clicks(believed, PAIR, TARGET, AT)
-    at = replace(AT, sigma_rad=1e-4)
-
-    def seconds(work: Callable[[], object], times: int) -> float:
-        began = time.process_time()
-        for _ in range(times):
-            work()
-        return (time.process_time() - began) / times
-
-    def geometric() -> object:
-        return hand_off(believed, PAIR, HAZCAMS, at, exact[0], exact[1], calibration=known)
-
-    mine = known.of((*PAIR, *HAZCAMS))
-    whole = seconds(lambda: by_differences(believed, exact, at, None, mine), 1)
-    short = min(seconds(geometric, 5) for _ in range(3))
-    print(f"{1e3 * short:.1f} ms a hand-off, {whole / short:.0f} times less than by differences")
-    assert short < whole / 10
-
-
 @pytest.mark.parametrize("calibrated", [False, True])
 def test_clicks_whose_rays_pass_each_other_are_refused_with_gap_and_pixels(
     rig: Rig, uncertain: RigCovariance, calibrated: bool
@@ -287,7 +260,7 @@ def test_clicks_whose_rays_pass_each_other_are_refused_with_gap_and_pixels(
 
 
 @pytest.mark.parametrize(("added", "allowed_px"), [(PAIR, 4.0), (PAIR[1:], 3.0)], ids=["both", "right"])
-def test_cameras_added_by_hand_to_a_calibrated_mast_file_are_not_taken_for_exact(
+def test_cameras_added_by_hand_to_a_calibrated_file_are_not_exact(
     rig: Rig, added: tuple[str, ...], allowed_px: float
 ) -> None:
     parts = [(n, p) for n in PAIR if n not in added for p in parameter_names(rig.cameras[n].model.kind)[:5]]

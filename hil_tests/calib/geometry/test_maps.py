@@ -101,7 +101,7 @@ def pair() -> tuple[CameraModel, CameraModel]:
     return left, right
 
 
-def test_a_point_stands_in_the_same_row_of_a_rectified_pair_and_its_disparity_tells_its_depth() -> None:
+def test_a_rectified_pair_has_equal_rows_and_disparity_gives_depth() -> None:
     left, right = pair()
     rectified = rectified_pair(left, right)
     points = np.array([[0.2, 0.1, 2.0], [-0.5, 0.4, 5.0], [1.0, -0.6, 8.0]])

@@ -78,8 +78,8 @@ def test_chain_agrees_with_scipy(seed: int) -> None:
 
 
 def test_products_of_transforms_follow_their_names() -> None:
-    b_from_a = Rigid(Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), [1.0, 2.0, 3.0])
-    c_from_b = Rigid(Rotation.from_rotvec([-0.4, 0.2, 0.1]).as_matrix(), [-1.0, 0.5, 2.0])
+    b_from_a = Rigid(Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([1.0, 2.0, 3.0]))
+    c_from_b = Rigid(Rotation.from_rotvec([-0.4, 0.2, 0.1]).as_matrix(), np.array([-1.0, 0.5, 2.0]))
     point_in_a = np.array([0.3, -0.7, 5.0])
     c_from_a = c_from_b @ b_from_a
     np.testing.assert_allclose(

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from calib.geometry.cahvor import CameraModel
@@ -97,7 +98,7 @@ def hand_offs(
     return made
 
 
-def moved_hazcams(rig: Rig, turn: Rotation, shift_m: Sequence[float]) -> dict[str, dict[str, np.ndarray]]:
+def moved_hazcams(rig: Rig, turn: Rotation, shift_m: ArrayLike) -> dict[str, dict[str, np.ndarray]]:
     """The rig's Hazcams turned about the middle between them, then shifted."""
     own = {name: vectors(rig, name) for name in HAZCAMS}
     middle = np.mean([own[name]["C"] for name in HAZCAMS], axis=0)

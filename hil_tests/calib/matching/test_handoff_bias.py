@@ -40,7 +40,7 @@ def test_an_offset_is_told_with_its_sign_sigma_and_number() -> None:
     assert "px higher of where navcam puts them" in bias.sentence and "24 hand-offs" in bias.sentence
 
 
-def test_noise_alone_is_significant_as_rarely_as_stated_even_if_it_is_larger_than_stated() -> None:
+def test_larger_noise_alone_is_significant_as_rarely_as_stated() -> None:
     rng = np.random.default_rng(2)
     for true_px in (0.436, 1.5):
         chances = np.array(

@@ -75,7 +75,7 @@ def test_good_pictures_give_the_exact_place(good: Case) -> None:
         assert off @ np.linalg.solve(refined[name].covariance_px2, off) < 16.0
 
 
-def test_clicks_that_are_off_by_no_more_than_the_match_is_uncertain_need_no_allowance(good: Case) -> None:
+def test_clicks_within_the_uncertainty_of_the_match_need_no_allowance(good: Case) -> None:
     refined = good.refined(RefineSettings(click_px=0.0))
     assert {one.verdict for one in refined.values()} == {"accepted"}, refined
 

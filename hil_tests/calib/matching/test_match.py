@@ -233,6 +233,14 @@ def test_target_hidden_from_one_eye_is_refused() -> None:
     assert found.match.verdict in ("weak", "ambiguous", "border")
 
 
+def test_a_faint_target_is_matched_as_far_as_it_is_certain() -> None:
+    point = wall(6).hit(LEFT.position_m, LEFT.rays(np.array([200.0, 140.0])))
+    left, right = (seen(camera, 6, contrast_dn=4.0) for camera in (LEFT, RIGHT))
+    found = find_partner(left, LEFT.model, (200.0, 140.0), right, RIGHT.model).match
+    assert found.verdict == "good", found.reason
+    assert (np.abs(found.pixel_px - RIGHT.pixel(point)) < 3.0 * found.sigma_px).all()
+
+
 def test_target_outside_the_other_picture_is_at_the_border() -> None:
     away = Pinhole(np.zeros(3), 1.2, 0.0, FOCAL_PX, SIZE_PX)
     guess = facing_plane(LEFT.model, (180.0, 140.0), 4.0)
@@ -303,7 +311,7 @@ def test_a_picture_that_is_nothing_but_not_a_number_matches_nowhere() -> None:
     assert found.match.verdict == "weak" and "line" in found.match.reason
 
 
-def test_a_rough_surface_makes_the_place_less_certain_along_the_parallax_only() -> None:
+def test_a_rough_surface_adds_uncertainty_along_the_parallax_only() -> None:
     pixel = np.array([180.0, 140.0])
     point = wall(5).hit(LEFT.position_m, LEFT.rays(pixel))
     sigmas = []
@@ -473,7 +481,7 @@ def test_what_is_as_good_as_infinitely_far_has_a_partner(range_m: float) -> None
     assert found.sigma_px.max() < 0.2
 
 
-def test_a_relief_stays_on_the_target_where_the_head_turned_otherwise_than_was_read() -> None:
+def test_a_relief_stays_on_the_target_when_the_reading_was_wrong() -> None:
     """The encoder errs by 4 mrad, 5 px, between click and new picture: the mask moves with the target."""
     counts = np.ones((47, 47), np.float32)
     counts[:, 30:] = 0.0  # an edge 7 px right of the target
@@ -487,7 +495,7 @@ def test_a_relief_stays_on_the_target_where_the_head_turned_otherwise_than_was_r
     assert clicked.counts[23, 31] < 0.5
 
 
-def test_a_wide_eye_looks_for_what_a_narrow_pair_saw_of_a_rocks_edge_and_no_further() -> None:
+def test_a_wide_camera_searches_a_rocks_edge_as_far_as_the_pair_saw() -> None:
     """41 px of a Navcam are 109 px of a Pancam, of which its pair has looked up 47."""
     narrow = Pinhole(np.zeros(3), 0.0, 0.0, 3000.0, SIZE_PX)
     partner = Pinhole(np.array([0.0, 0.2, 0.0]), -0.05, 0.0, 3000.0, SIZE_PX)
@@ -508,7 +516,7 @@ def test_a_wide_eye_looks_for_what_a_narrow_pair_saw_of_a_rocks_edge_and_no_furt
     assert np.sqrt((normalised**2).mean()) < 1.5
 
 
-def test_a_surface_goes_through_the_grey_values_of_its_pixels_and_between_them_as_scipys_spline() -> None:
+def test_a_surface_interpolates_grey_values_as_scipys_spline() -> None:
     image = np.random.default_rng(3).integers(0, 256, (40, 50)).astype(np.uint8)
     surface = Surface.around(image, (12.0, 11.0), (30.0, 24.0))
     places = np.stack(np.meshgrid(np.arange(12.0, 31.0), np.arange(11.0, 25.0)), axis=-1)

@@ -169,7 +169,7 @@ def test_a_target_is_kept_while_the_rover_nears_it_with_wrong_odometry(begun: Tr
     assert renewed >= 1
 
 
-def test_the_picked_target_is_less_certain_than_the_followed_place_by_what_the_keys_handed_on(
+def test_each_change_of_key_adds_to_the_uncertainty_of_the_target(
     begun: Track,
 ) -> None:
     """2 cm of drift along the ground, to the right: that variance is added there, and nothing elsewhere."""
@@ -215,7 +215,7 @@ def nearer_by(ratio: float) -> float:
         (1.1, TrackSettings(renew_below=0.0, renew_shrunk=1.18), True),
     ],
 )
-def test_the_key_is_renewed_when_the_ground_looks_larger_or_otherwise_or_less_alike(
+def test_the_key_is_renewed_when_the_ground_looks_different(
     begun: Track, ratio: float, settings: TrackSettings, renewed: bool
 ) -> None:
     x_m = nearer_by(ratio)
@@ -261,7 +261,7 @@ def test_an_eye_that_sees_the_target_elsewhere_contradicts_however_far_off(
     assert look.track.state == "lost", look.found["right"]
 
 
-def test_a_lost_target_is_found_again_by_one_eye_and_stereo_if_that_eye_is_sure(begun: Track) -> None:
+def test_a_lost_target_is_found_by_stereo_if_one_camera_is_sure(begun: Track) -> None:
     """With the believed slope the right eye does not find the key picture; the left one does."""
     normal = np.array([0.0, 1.0, -0.3]) / np.hypot(1.0, 0.3)
     doubtful = replace(begun, key=replace(begun.key, normal=normal), state="lost")
@@ -320,9 +320,7 @@ def test_a_plain_surface_cannot_be_followed() -> None:
 
 
 @pytest.mark.parametrize(("sigma_px", "enough"), [(0.13, True), (0.35, False)])
-def test_texture_is_enough_to_begin_if_noise_moves_it_less_than_a_fifth_of_a_pixel(
-    sigma_px: float, enough: bool
-) -> None:
+def test_texture_is_enough_if_noise_moves_it_by_a_fifth_of_a_pixel(sigma_px: float, enough: bool) -> None:
     """Between two pictures of 2 grey levels' noise: sqrt(2) 2 / sqrt(l), l of the patch's weighted slopes."""
     field = random_texture(5, contrast_dn=1.0)[:241, :321] - 120.0
     x, y, sigma = 160, 120, SIZES.near_px
@@ -504,7 +502,7 @@ def test_a_place_that_may_have_drifted_too_far_is_not_called_tracked(begun: Trac
     np.testing.assert_array_equal(look.track.position_m, far.position_m)
 
 
-def test_what_looks_otherwise_from_nearer_is_told_as_less_certain_than_a_plane() -> None:
+def test_a_changed_look_from_nearer_is_less_certain_than_a_plane() -> None:
     """Another texture is mixed in, 14 parts in 100 of the correlation: doubly as much relief, and more."""
     left, near = eyes(0.0)["left"], pinholes(0.9)["left"]
     plane, pixel = Plane(TARGET, GROUND.normal), pinholes(0.0)["left"].pixel(TARGET)

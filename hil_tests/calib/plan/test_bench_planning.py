@@ -1,4 +1,4 @@
-"""What a picture would tell: against differences of the whole pointing, against shots that were taken."""
+"""What a picture would show: against differences of the whole pointing, against shots that were taken."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from calib.errors import CalibError
@@ -55,7 +54,7 @@ def standing(rig: Rig, placement: Placement, name: str = "p1", joint_sigma_rad: 
     return Knowledge(rig, {name: pose}, joint_sigma_rad)
 
 
-def test_pointing_depends_on_each_unknown_as_pointing_with_another_rig_does(rig: Rig) -> None:
+def test_pointing_rates_are_differences_between_rigs(rig: Rig) -> None:
     known = Knowledge(rig, {})
     where = Workspace(PAIR, (-0.7, 0.7), (-0.5, 0.1), ranges_m=(3.0,))
     aim = pointing(known, where)
@@ -98,12 +97,7 @@ def _landed(
     point = ray.origins_m + 3.0 * ray.directions
     pixels = [eye.project(point)[0] for eye in eyes]
     seen = [believed.camera_in_rover(name, *believed.joints.true_rad(read, sides)) for name in PAIR]
-    midpoint = triangulate(seen[0], seen[1], *pixels).position_m
-
-    def off_px(point_m: np.ndarray) -> np.ndarray:
-        return np.concatenate([eye.project(point_m)[0] - px for eye, px in zip(seen, pixels, strict=True)])
-
-    ranged = least_squares(off_px, midpoint, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+    ranged = triangulate(seen[0], seen[1], *pixels).position_m
     left = believed.cameras[PAIR[0]].model
     angles = solve(
         believed.mast, left, ranged, model.image_center_px, from_pan_rad=read[0], from_tilt_rad=read[1]
@@ -164,7 +158,7 @@ def test_an_attitude_that_showed_no_board_is_not_tried_again(rig: Rig) -> None:
     assert max(abs(second.shot.pan_rad - avoid[0][0]), abs(second.shot.tilt_rad - avoid[0][1])) >= 0.02
 
 
-def test_backlash_is_looked_for_from_both_sides_unless_the_head_comes_from_one(rig: Rig) -> None:
+def test_backlash_is_measured_from_both_sides_unless_one_is_chosen(rig: Rig) -> None:
     for one_sided, sides in ((False, {-1, 1}), (True, {0})):
         known = standing(rig, Placement(1.2, 0.0, 0.0, (20.0, 0.0)))
         aim = pointing(known, Workspace(PAIR, (-0.9, 0.9), (-0.6, 0.1), one_sided=one_sided))
@@ -176,7 +170,7 @@ def test_backlash_is_looked_for_from_both_sides_unless_the_head_comes_from_one(r
         assert {shot.pan_approach for shot in shots} == sides
 
 
-def test_a_second_placement_is_asked_for_where_it_tells_more_than_the_first_again(rig: Rig) -> None:
+def test_a_second_placement_is_requested_where_it_adds_more(rig: Rig) -> None:
     first = first_placement(Knowledge(rig, {}), sought(True))
     known = standing(rig, first)
     aim = pointing(known, Workspace(PAIR, (-0.9, 0.9), (-0.6, 0.1), one_sided=True))
@@ -220,7 +214,7 @@ def test_a_board_is_placed_from_one_picture_where_opencv_drew_it(rig: Rig) -> No
         rover_from_board(rig, "navcam_left", 0.3, -0.2, points[:3], pixels[:3])
 
 
-def test_what_pictures_told_of_body_cameras_stays_told_of_the_rest_where_attitudes_are_chosen(
+def test_information_from_body_cameras_counts_in_the_choice_of_attitudes(
     repository: Path,
 ) -> None:
     rig = replace(load_rig(repository / "configs/sim/rocky8.yaml").rig, provenance={})

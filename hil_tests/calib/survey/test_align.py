@@ -136,7 +136,7 @@ def test_of_three_points_the_distances_say_which_is_off() -> None:
     assert found.doubt.endswith("is one of a")
 
 
-def test_of_several_distances_that_disagree_the_worst_is_told_with_its_size() -> None:
+def test_the_worst_of_several_wrong_distances_is_named_with_its_size() -> None:
     """Tape a moved 5 mm towards b, and c 30 mm away from a."""
     tapes = np.array([(-0.44, -0.44, 0.0), (0.44, -0.44, 0.0), (-0.44, 0.44, 0.0)])
     moved = tapes + np.array([(0.005, 0, 0), (0, 0, 0), (0, 0.03, 0)])
@@ -188,7 +188,7 @@ def several_set_ups(
 ) -> tuple[Survey, np.ndarray]:
     """A survey of prisms whose drawing is off by 10 mm (one sigma), and where they are."""
     true = drawing + rng.normal(0, CAD_M, PRISMS.shape)
-    station = []
+    station: list[StationPoint] = []
     for number in range(setups):
         measured = some_pose(rng).points(true) + rng.normal(0, SIGMA_M, PRISMS.shape)
         for name, place in zip(NAMES, measured, strict=True):

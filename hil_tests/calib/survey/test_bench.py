@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib.errors import BadFile
-from calib.geometry.sensor_mode import SensorMode
+from calib.geometry.mode import SensorMode
 from calib.survey import writer as bench_writer
 from calib.survey.check import check_survey
 from calib.survey.reader import read_survey
@@ -170,7 +170,7 @@ def test_a_folder_of_another_bench_is_not_gone_on_with(tmp_path: Path) -> None:
         BenchFolder(tmp_path, {"wall": BOARD}, Sigma(0, 0, corner_px=0.2), {CAMERA.name: CAMERA}, {})
 
 
-def test_a_folder_goes_on_where_either_knows_no_sensor_mode_and_not_in_another(tmp_path: Path) -> None:
+def test_a_folder_does_not_go_on_in_another_sensor_mode(tmp_path: Path) -> None:
     def begun(name: str, mode: SensorMode | None) -> BenchFolder:
         eye, path = replace(CAMERA, sensor_mode=mode), tmp_path / name
         return BenchFolder(path, {"wall": BOARD}, Sigma(0, 0, corner_px=0.1), {CAMERA.name: eye}, {})
@@ -189,7 +189,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize("steps", range(6))
-def test_a_kill_between_any_two_files_leaves_images_with_all_corners_or_none(
+def test_a_kill_leaves_images_with_all_corners_or_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int
 ) -> None:
     bench = grown(tmp_path)

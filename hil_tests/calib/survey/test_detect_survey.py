@@ -16,9 +16,9 @@ from calib.survey.find_dots import detect_survey, expectations
 from calib.survey.records import Survey
 from calib.targets.dot_order import PredictedBoard, Upright
 from hil_tests.calib.targets.boards import gravel
-from tools.sim_survey.board import draw_board, photograph
-from tools.sim_survey.plan import Ring, SurveyPlan
-from tools.sim_survey.survey import simulate_survey
+from hil_tests.support.sim_survey.board import draw_board, photograph
+from hil_tests.support.sim_survey.plan import Ring, SurveyPlan
+from hil_tests.support.sim_survey.survey import simulate_survey
 
 RMS_PX = 0.03
 PICTURES = 6

@@ -15,9 +15,9 @@ from calib.geometry.rig import Rig
 from calib.survey.check import check_survey
 from calib.survey.records import StationPoint, Survey, SurveyFinding, SurveyImage
 from calib.targets.boards import Board
-from tools.sim_survey.blunders import with_moved_tape, with_swapped_boards, with_wrong_prism
-from tools.sim_survey.plan import SurveyPlan
-from tools.sim_survey.survey import simulate_survey
+from hil_tests.support.sim_survey.blunders import with_moved_tape, with_swapped_boards, with_wrong_prism
+from hil_tests.support.sim_survey.plan import SurveyPlan
+from hil_tests.support.sim_survey.survey import simulate_survey
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -303,7 +303,7 @@ def test_two_boards_mixed_up(good: Survey, rig: Rig) -> None:
     assert "times" in findings[0].message
 
 
-def test_a_camera_whose_placements_slipped_by_some_rows_is_one_error_and_not_one_an_image(
+def test_placements_of_a_camera_that_slipped_by_rows_are_one_error(
     good: Survey,
 ) -> None:
     mine = [i for i in good.images if i.camera == "navcam_left" and i.purpose == "mast"]

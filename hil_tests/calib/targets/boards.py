@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.geometry.cahvor import CameraModel
+from calib.geometry.cahvor import CameraModel, Kind
 from calib.geometry.rigid import Rigid
 from calib.targets.boards import Board
 from calib.targets.dot_order import PredictedBoard
-from tools.sim_survey.board import BoardLook, draw_board, photograph
+from hil_tests.support.sim_survey.board import BoardLook, draw_board, photograph
 
 BOARD = Board(10, 10, 0.08, 0.04, {})
 LOOK = BoardLook()
@@ -21,7 +21,7 @@ NAVCAM_PX, PANCAM_PX = 1290.0, 3441.0
 SIZE_PX = (1024, 768)
 
 
-def camera(focal_px: float, size_px: tuple[int, int] = SIZE_PX, kind: str = "CAHVOR") -> CameraModel:
+def camera(focal_px: float, size_px: tuple[int, int] = SIZE_PX, kind: Kind = "CAHVOR") -> CameraModel:
     """A camera at the origin that looks along z, x right, y down, with a little distortion."""
     x_px, y_px = ((n - 1) / 2 for n in size_px)
     return CameraModel(
@@ -40,7 +40,7 @@ def pose(range_m: float, tilt: tuple[float, float] = (0, 0), roll_deg: float = 0
     angle, around = np.radians(tilt)
     tilted = Rotation.from_rotvec(angle * np.array([np.cos(around), np.sin(around), 0]))
     turn = tilted * Rotation.from_rotvec([0, 0, np.radians(roll_deg)])
-    return Rigid(turn.as_matrix(), [*aside_m, range_m])
+    return Rigid(turn.as_matrix(), np.array([*aside_m, range_m]))
 
 
 def gravel(rng: np.random.Generator, size_px: tuple[int, int] = SIZE_PX) -> np.ndarray:

@@ -36,7 +36,7 @@ def test_a_board_is_read_as_it_was_written(tmp_path: Path, board: AnyBoard) -> N
     assert load_board(tmp_path / "board.yaml") == board
 
 
-def test_a_measured_bar_scales_all_lengths_and_a_second_one_tells_directions_apart(
+def test_one_measured_bar_scales_lengths_and_two_give_the_aspect(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "board.yaml"

@@ -111,7 +111,7 @@ def test_half_a_board_is_enough_and_what_is_covered_is_not_found(board: AnyBoard
     assert float(np.abs(off_px(board, found, TURN, place)).max()) < 0.2
 
 
-def test_a_board_that_reaches_out_of_the_picture_is_found_where_it_is_inside() -> None:
+def test_a_board_partly_outside_the_picture_is_found_where_visible() -> None:
     place = (0.12, 0.08, 0.5)
     found = corners_of(APRILGRID, drawn((APRILGRID, TURN, place)))
     off = off_px(APRILGRID, found, TURN, place)
@@ -240,3 +240,20 @@ def test_kalibrs_own_tags_are_upright() -> None:
     x, y = np.meshgrid(lower_left[0] + middles, lower_left[1] - 0.1 + middles)
     white = ~pattern_of(board).is_black(x, y)
     assert sum(int(bit) << (35 - k) for k, bit in enumerate(white.ravel())) == 0xD5D628584
+
+
+@pytest.mark.parametrize("from_top", [True, False])
+@pytest.mark.parametrize("turns", [0, 1, 2])
+def test_an_aprilgrid_of_opencvs_tags_gets_its_cause(from_top: bool, turns: int) -> None:
+    """OpenCV's dictionary holds each tag half a turn off Kalibr's; its GridBoard counts from the top."""
+    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    image = np.full((5 * 78 + 60, 6 * 78 + 60), 255, np.uint8)
+    for k in range(30):
+        row, column = divmod(k, 6)
+        top, left = 39 + (row if from_top else 4 - row) * 78, 39 + column * 78
+        tag = cv2.aruco.generateImageMarker(words, k, 60, borderBits=2)
+        image[top : top + 60, left : left + 60] = tag
+    picture = np.ascontiguousarray(np.rot90(cv2.GaussianBlur(image, (0, 0), 0.8), turns))
+    reason = why_not(APRILGRID, picture)
+    assert "each tag is half a turn off Kalibr's, as OpenCV's dictionary draws it" in reason
+    assert "mastctl board make --kind aprilgrid" in reason

@@ -42,7 +42,7 @@ def test_a_print_longer_down_than_across_keeps_its_width() -> None:
     assert np.allclose(places[:, :2], [[-0.1, -0.0501], [0.1, 0.0501]])
 
 
-def test_a_bow_lifts_the_middle_towards_who_looks_and_leaves_the_outer_corners() -> None:
+def test_a_bow_lifts_the_middle_and_leaves_the_outer_corners() -> None:
     board = Checkerboard(4, 4, 0.1)  # corners at -0.1, 0 and 0.1
     bent = board.in_board_m(board.ids, (0.002, 0.001)).reshape(3, 3, 3)
     assert np.allclose(bent[..., 2], [[0, -0.002, 0], [-0.001, -0.003, -0.001], [0, -0.002, 0]])

@@ -16,10 +16,8 @@ SIZE_PX = (640, 480)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_opencvs_camera_fits_our_corners_better_than_its_own(shared_data: Path, side: str) -> None:
-    pictures = sorted((shared_data / "opencv_stereo").glob(f"{side}*.jpg"))
-    if not pictures:
-        pytest.skip("OpenCV's stereo sample, shared/data/opencv_stereo, is not beside this checkout")
+def test_opencvs_camera_fits_our_corners_better_than_its_own(reference_data: Path, side: str) -> None:
+    pictures = sorted((reference_data / "opencv_stereo").glob(f"{side}*.jpg"))
     ours, theirs = [], []
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
     for path in pictures:

@@ -1,4 +1,4 @@
-"""Aravis's own fake GigE Vision camera as a process: aravis_fake.py SERIAL [LOST_RATIO].
+"""Aravis's own fake GigE Vision camera as a process: aravis_fake.py SERIAL.
 
 It is the library's, with ctypes declarations of its own: nothing of the driver is in it. It sends packets
 over the loopback, stamps frames by the wall clock, and draws a ramp that moves with the frame's number.
@@ -14,16 +14,12 @@ INTERFACE = "127.0.0.1"
 
 def main() -> None:
     """Serve until the standard input ends."""
-    serial, lost = sys.argv[1], float(sys.argv[2]) if len(sys.argv) > 2 else 0.0
-    arv, gobject = ctypes.CDLL("libaravis-0.8.so.0"), ctypes.CDLL("libgobject-2.0.so.0")
+    serial = sys.argv[1]
+    arv = ctypes.CDLL("libaravis-0.8.so.0")
     arv.arv_gv_fake_camera_new_full.restype = ctypes.c_void_p
     arv.arv_gv_fake_camera_new_full.argtypes = [ctypes.c_char_p] * 3
     arv.arv_gv_fake_camera_is_running.argtypes = [ctypes.c_void_p]
     camera = arv.arv_gv_fake_camera_new_full(INTERFACE.encode(), serial.encode(), None)
-    if lost:
-        gobject.g_object_set(
-            ctypes.c_void_p(camera), b"gvsp-lost-ratio", ctypes.c_double(lost), ctypes.c_void_p(None)
-        )
     print("ready" if arv.arv_gv_fake_camera_is_running(camera) else "cannot run", flush=True)
     sys.stdin.read()
 

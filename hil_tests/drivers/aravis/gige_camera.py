@@ -96,9 +96,9 @@ def _genicam(clock_readable: bool, more: bool) -> bytes:
     if clock_readable:
         words.append(_register("IntReg", "GevTimestampValue", LATCHED, 8))
         names.append("GevTimestampValue")
-    for name, address, high in floats:
+    for name, address, most in floats:
         words.append(
-            f'<Float Name="{name}"><pValue>{name}Reg</pValue><Min>0.1</Min><Max>{high}</Max></Float>'
+            f'<Float Name="{name}"><pValue>{name}Reg</pValue><Min>0.1</Min><Max>{most}</Max></Float>'
         )
         words.append(_register("FloatReg", f"{name}Reg", address, 8))
     flags = {"ChunkModeActive": CHUNKS, "ChunkEnable": CHUNK_ON} | (_MORE_FLAGS if more else {})
@@ -181,8 +181,8 @@ class GigeCamera:
         }  # fmt: skip
         for at, value in started.items():
             self._set(at, value)
-        self._set_float(EXPOSURE, 10_000.0)
-        self._set_float(RATE, 50.0)
+        self.set_float(EXPOSURE, 10_000.0)
+        self.set_float(RATE, 50.0)
         self._over = threading.Event()
         self._exposing = threading.Lock()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -221,28 +221,34 @@ class GigeCamera:
     def _set(self, at: int, value: int) -> None:
         struct.pack_into(">I", self._memory, at, value & 0xFFFFFFFF)
 
-    def _set_float(self, at: int, value: float) -> None:
+    def set_float(self, at: int, value: float) -> None:
         struct.pack_into(">d", self._memory, at, value)
 
     def _exposure_s(self) -> float:
         return float(struct.unpack_from(">d", self._memory, EXPOSURE)[0]) / 1e6
 
     def _obey(self) -> None:
-        """Answer commands (GVCP)."""
+        """Answer commands (GVCP); one that is sent again is answered again, and not obeyed twice."""
+        last: tuple[object, bytes] | None = None
+        answered = b""
         while not self._over.is_set():
             try:
                 packet, sender = self._socket.recvfrom(2048)
             except TimeoutError:
                 continue
+            if (sender, packet) == last:
+                if answered:
+                    self._socket.sendto(answered, sender)
+                continue
+            last, answered = (sender, packet), b""
             _, _, command, _, number = struct.unpack(">BBHHH", packet[:8])
             data = packet[8:]
             refused = command in (0x82, 0x86) and struct.unpack(">I", data[:4])[0] in self.refuses
             answer = struct.pack(">HH", 0, 0) if refused else self._answer(command, data)
             if answer is not None:
                 status = WRITE_PROTECTED if refused else 0
-                self._socket.sendto(
-                    struct.pack(">HHHH", status, command + 1, len(answer), number) + answer, sender
-                )
+                answered = struct.pack(">HHHH", status, command + 1, len(answer), number) + answer
+                self._socket.sendto(answered, sender)
 
     def _answer(self, command: int, data: bytes) -> bytes | None:
         """The data of an acknowledge; None for a command that has none."""
@@ -274,7 +280,7 @@ class GigeCamera:
             self._chunks_on[self._get(CHUNK_SELECTOR)] = self._get(CHUNK_ON)
         if at == EXPOSURE:
             steps = round(1e6 * self._exposure_s() / EXPOSURE_STEP_US)
-            self._set_float(EXPOSURE, EXPOSURE_STEP_US * max(1, steps))
+            self.set_float(EXPOSURE, EXPOSURE_STEP_US * max(1, steps))
         chunks = sum(self._chunks_on.values()) if self._get(CHUNKS) else 0
         self._set(PAYLOAD, self._get(WIDTH) * self._get(HEIGHT) + (8 + 16 * chunks if chunks else 0))
 

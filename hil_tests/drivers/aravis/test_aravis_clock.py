@@ -81,13 +81,19 @@ def test_a_window_ends_when_the_frame_comes_and_begins_with_its_trigger() -> Non
     assert early.begin_s == pytest.approx(50.499, abs=ROUNDING_S)  # the clock knows better than the trigger
 
 
-def test_without_readings_only_the_trigger_says_when_an_exposure_began() -> None:
+def test_a_frame_stamped_before_its_trigger_keeps_the_time_of_its_stamp() -> None:
+    """A camera may expose twice for one trigger: the second frame is not that of the next one."""
+    window = tied().window(50.5 + AHEAD_S, "start", 0.01, 50.506, 50.52)
+    assert window.begin_s == pytest.approx(50.499, abs=ROUNDING_S)
+
+
+def test_without_readings_the_trigger_bounds_the_beginning() -> None:
     clock = CameraClock(0.015)
     clock.arrived(50.5 + AHEAD_S, 50.52)
     assert clock.window(50.5 + AHEAD_S, "start", 0.01, 50.49, 50.52).begin_s == 50.49
 
 
-def test_a_wall_clock_that_was_set_makes_no_frame_older_or_newer_than_it_is() -> None:
+def test_a_wall_clock_that_was_set_changes_no_frames_age() -> None:
     wall, ahead_s = WallClock(), 1.7e9
     assert wall.ago_s(9.99 + ahead_s, 10.0 + ahead_s, 10.0) == 0.0  # nothing to compare with yet
     assert wall.ago_s(10.09 + ahead_s, 10.1 + ahead_s, 10.1) == pytest.approx(0.01, abs=1e-6)

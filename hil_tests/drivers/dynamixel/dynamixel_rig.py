@@ -1,32 +1,30 @@
 """A Dynamixel head on simulated servos behind a line in memory, and what only the tester knows about it.
 
 The simulator's registers and packets are its own (``drivers/sim/wire``), not the driver's. Everything runs on
-a clock that is turned: the test computes in its turn, and time passes only while it waits on that clock. With
-``real`` the line is a pseudo terminal and the clock the machine's, for what only a kernel can show.
+a clock that is turned: the test computes in its turn, and time passes only while it waits on that clock.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from drivers.clock import Clock, SystemClock
+from drivers.clock import Clock
 from drivers.dynamixel.head import DynamixelHead, open_head
 from drivers.errors import DriverError
 from drivers.faults import FaultPanel
 from drivers.interfaces import PanTilt, Reading
-from drivers.serial_line import OpenLine, SerialLine
 from drivers.sim.axis import AxisSettings
 from drivers.sim.wire.axis import WireAxis
+from drivers.sim.wire.carrier import WireDevice
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_packets import Instruction, InstructionParser
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
-from drivers.sim.wire.line import PtyLine
 from drivers.sim.wire.memory_line import MemoryLine
 from drivers.simulation_clock import SimulationClock
-from hil_tests.drivers.turned import START_S, Turned
+from hil_tests.drivers.turned import START_S, HangingHost, Turned
 
 COUNT_RAD = 2 * 3.141592653589793 / 4096
 SLOW_TO_BRAKE, QUICK_TO_BRAKE = (AxisSettings(COUNT_RAD, 0.0, -3.0, 3.0, 1.0, a) for a in (4.0, 20.0))
@@ -40,8 +38,8 @@ class Ear:
         self.heard: list[tuple[float, Instruction]] = []
         self._parser = InstructionParser()
 
-    def __call__(self, who: Literal["host", "device"], data: bytes, time_s: float) -> None:
-        if who == "host":
+    def __call__(self, sender: Literal["host", "device"], data: bytes, time_s: float) -> None:
+        if sender == "host":
             self.heard += [(time_s, one) for one in self._parser.feed(data)]
 
 
@@ -52,17 +50,14 @@ class Rig(Turned):
     clock: Clock
     axes: tuple[WireAxis, WireAxis]
     servos: list[SimulatedServo]
-    line: MemoryLine | PtyLine
+    line: MemoryLine
     options: dict[str, Any]
     panel: FaultPanel
+    host: HangingHost
     ear: Ear = field(default_factory=Ear)
 
-    @property
-    def open_line(self) -> OpenLine:
-        return SerialLine if isinstance(self.line, PtyLine) else self.line.open
-
     def open(self, **changes: Any) -> DynamixelHead:
-        return open_head({**self.options, **changes}, self.clock, self.open_line)
+        return open_head({**self.options, **changes}, self.clock, self.host)
 
     def angle_rad(self, axis: int) -> float:
         """Where an axis truly stands."""
@@ -78,27 +73,26 @@ def rig(
     models: tuple[str, str] = (X, X),
     starts_rad: tuple[float, float] = (0.0, 0.0),
     pan: dict[str, int] | None = None,
+    tilt: dict[str, int] | None = None,
     mechanism: AxisSettings = QUICK_TO_BRAKE,
-    real: bool = False,
+    waits_for_predecessor: bool = True,
+    far_end: Callable[[DynamixelBus], WireDevice] = lambda bus: bus,
 ) -> Iterator[Rig]:
-    """Two servos of a 12-bit or other kind; ``pan`` are initial registers of the pan servo."""
-    clock = SystemClock() if real else SimulationClock(start_s=START_S)
+    """Two servos of a 12-bit or other kind; ``pan`` and ``tilt`` are registers that they begin with."""
+    clock = SimulationClock(start_s=START_S)
     now_s = clock.now_s()
     panel, ear = FaultPanel(clock.now_s, ()), Ear()
     axes = (
         WireAxis(mechanism, panel, number=0, start_rad=starts_rad[0], time_s=now_s),
         WireAxis(mechanism, panel, number=1, start_rad=starts_rad[1], time_s=now_s),
     )
-    extra: list[dict[str, int]] = [pan or {}, {}]
+    extra = [pan or {}, tilt or {}]
     servos = [
         SimulatedServo(model, i + 1, axis, settings={"baud_rate": 3, **extra[i]}, time_s=now_s)
         for i, (model, axis) in enumerate(zip(models, axes, strict=True))
     ]
-    make = PtyLine if real else MemoryLine
-    with (
-        clock.at_work(),
-        make(DynamixelBus(servos), clock, panel, wire_time=False, observer=ear) as line,
-    ):
+    device = far_end(DynamixelBus(servos, waits_for_predecessor=waits_for_predecessor))
+    with clock.at_work(), MemoryLine(device, clock, panel, wire_time=False, observer=ear) as line:
         options = {
             "port": line.path,
             "pan": {"id": 1, "model": models[0], "limits_rad": [-2.5, 2.5]},
@@ -107,7 +101,7 @@ def rig(
             "acceleration_rad_per_s2": 15.0,
             "watchdog_s": 0.4,
         }
-        yield Rig(clock, axes, servos, line, options, panel, ear)
+        yield Rig(clock, axes, servos, line, options, panel, HangingHost(line.open, clock), ear)
 
 
 @contextmanager
@@ -120,6 +114,16 @@ def opened(**how: Any) -> Iterator[tuple[Rig, DynamixelHead]]:
             yield it, head
         finally:
             head.close()
+
+
+def faults_of(it: Rig, head: PanTilt) -> Sequence[str]:
+    """The faults of the first reading that has some."""
+
+    def faults() -> Sequence[str]:
+        reading = read_or_none(head)
+        return reading.faults if reading is not None else ()
+
+    return it.until(faults, "a fault")
 
 
 def read_or_none(head: PanTilt) -> Reading | None:

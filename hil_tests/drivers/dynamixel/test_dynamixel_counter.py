@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import random
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
-from drivers.clock import ManualClock
-from drivers.dynamixel.counter import Counter, TickCounters
+from drivers.dynamixel.counter import Counter
 
 PERIOD_S, WIRE_S = 0.02, 0.002
 
@@ -54,19 +51,3 @@ def test_after_a_slow_answer_the_quick_ones_before_it_still_count() -> None:
     assert counter.doubts(shown(now_s), now_s, now_s + 0.3) == ""
     now_s += PERIOD_S
     assert counter.doubts(shown(now_s - 0.02), now_s, now_s + WIRE_S)
-
-
-def test_a_doubted_answer_of_a_group_is_counted_as_a_stray() -> None:
-    """After a stray the line is listened to before it is asked again."""
-    clock, strays = ManualClock(100.0 + PERIOD_S + WIRE_S), list[Any]()
-    port = SimpleNamespace(clock=clock, name="a line")
-    exchange: Any = SimpleNamespace(port=port, stray=strays.append, where=lambda *words: {})
-    counters = TickCounters(exchange)
-    counters._known[1] = Counter(shown(100.0), 100.0, 100.0 + WIRE_S)
-    question: Any = SimpleNamespace(ticks={1: 2})
-    for late_s, doubted in ((0.0, False), (0.5, True)):
-        tick = shown(100.0 + PERIOD_S - late_s).to_bytes(2, "little")
-        status: Any = SimpleNamespace(servo_id=1, data=b"\xff\xff" + tick)
-        said = counters.doubts(question, status, 100.0 + PERIOD_S)
-        assert (said is not None, strays) == (doubted, [status] * doubted)
-    assert counters.doubts(question, SimpleNamespace(servo_id=2, data=b""), 0.0) is None  # type: ignore[arg-type]

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.feetech import packets
-from drivers.feetech.models import MODELS
+from drivers.feetech import servos as packets
+from drivers.feetech.servos import MODELS
 from drivers.sim.wire.feetech_packets import Instruction, InstructionParser, packet, renamed
 
 OF_THE_SDK = {
@@ -38,7 +38,7 @@ def ours() -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("what", OF_THE_SDK)
-def test_the_driver_sends_what_the_makers_sdk_sends_and_the_simulator_understands_it(what: str) -> None:
+def test_driver_and_simulator_have_the_packets_of_the_makers_sdk(what: str) -> None:
     frame = bytes.fromhex(OF_THE_SDK[what])
     assert ours()[what] == frame
     parser = InstructionParser()
@@ -50,7 +50,7 @@ NOISES = [b"", b"\xff", b"\xff\xff", b"\xff\xff\x01", b"\x00\xff\xff\xfe\xfa", b
 
 
 @pytest.mark.parametrize("noise", NOISES)
-def test_a_reply_is_found_behind_any_noise_and_a_wrong_byte_is_always_seen(noise: bytes) -> None:
+def test_a_reply_is_found_behind_noise_and_a_wrong_byte_is_seen(noise: bytes) -> None:
     reply = packet(2, 0x20, bytes(range(9)))
     buffer = bytearray(noise + reply)
     status = packets.take_status(buffer, at_end=True)
@@ -63,7 +63,7 @@ def test_a_reply_is_found_behind_any_noise_and_a_wrong_byte_is_always_seen(noise
             assert told is None or len(told.data) != 9, (at, change)
 
 
-def test_a_reply_in_pieces_is_waited_for_and_one_that_broke_off_is_dropped() -> None:
+def test_a_reply_in_pieces_is_awaited_and_a_broken_one_dropped() -> None:
     reply = packet(1, 0, b"abc")
     buffer = bytearray()
     for byte in reply[:-1]:
@@ -76,7 +76,7 @@ def test_a_reply_in_pieces_is_waited_for_and_one_that_broke_off_is_dropped() -> 
     assert renamed(reply, 2) == packet(2, 0, b"abc")
 
 
-def test_minus_is_a_bit_of_its_own_and_an_scs_turns_its_words_round() -> None:
+def test_minus_is_a_bit_and_an_scs_is_big_endian() -> None:
     offset, position = MODELS["STS3215"].registers["offset"], MODELS["STS3215"].registers["present_position"]
     assert offset.encode(-100, "little") == (0x800 | 100).to_bytes(2, "little")
     assert offset.decode(offset.encode(-100, "little"), "little") == -100

@@ -7,11 +7,10 @@ from contextlib import ExitStack
 
 import pytest
 
-from hil_tests.drivers.flir_ptu.ptu_bench import Bench
+from hil_tests.drivers.flir_ptu.scripted_ptu import Bench
 
 
 @pytest.fixture
-def opened(request: pytest.FixtureRequest) -> Iterator[Bench]:
-    """A bench in memory, or of the kind that a test is parametrized with."""
+def opened() -> Iterator[Bench]:
     with ExitStack() as stack:
-        yield Bench(stack, getattr(request, "param", "memory") == "pty")
+        yield Bench(stack)

@@ -7,10 +7,16 @@ The words are those printed in the manuals (PTU-D46 v2.14, E series v6.00).
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any
 
+from drivers.flir_ptu.head import FlirPtu, open_head
 from drivers.sim.wire.carrier import Reply
+from drivers.sim.wire.memory_line import MemoryLine
+from drivers.simulation_clock import SimulationClock
+from hil_tests.waiting import until
 
 OPTIONS: dict[str, Any] = {
     "pan": {"limits_rad": [-2.5, 2.5]}, "tilt": {"limits_rad": [-0.7, 0.5]}, "settle_s": 0.0,
@@ -59,25 +65,25 @@ class ScriptedPtu:
 
     def receive(self, data: bytes, time_s: float) -> Sequence[Reply]:
         *commands, self._rest = re.split(rb"[ \r\n]", self._rest + data)
-        replies = [self._reply(command.decode()) for command in commands if command]
+        replies = [self.reply(command.decode()) for command in commands if command]
         return [Reply(reply) for reply in replies if reply is not None]
 
     def poll(self, time_s: float) -> Sequence[Reply]:
         unasked, self.unasked = self.unasked, b""
         return [Reply(unasked)] if unasked else []
 
-    def _reply(self, written: str) -> bytes | None:
+    def reply(self, written: str) -> bytes | None:
         command = written.upper()
         self.heard.append(command)
         echo = self.echo
-        answer = self.answers.get(command, self._usual)
+        answer = self.answers.get(command, self.usual)
         text = answer(command) if callable(answer) else answer
         if text is None:
             return None
         echoed = f"{command if self.capitals else written} ".encode() if echo else b""
         return (echoed + self.start if self.e_series else self.start + echoed) + text + self.end
 
-    def _usual(self, command: str) -> bytes | None:
+    def usual(self, command: str) -> bytes | None:
         letters, argument = re.fullmatch(r"([A-Z]*)(-?\d*)", command).groups()  # type: ignore[union-attr]
         axis, rest = letters[:1], letters[1:]
         name = {"P": "Pan", "T": "Tilt"}.get(axis, "")
@@ -135,3 +141,53 @@ class ScriptedPtu:
         if not self.verbose:
             said = re.search(r"-?\d+(\.\d+)?", said)[0]  # type: ignore[index]
         return f"* {said}".encode()
+
+
+class Bench:
+    """Lines with scripted units, and heads on them; bytes take no time on the wire."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self._stack = stack
+        self.clock = SimulationClock(start_s=10.0)
+        stack.enter_context(self.clock.at_work())
+
+    def __call__(self, unit: ScriptedPtu | None = None, **options: Any) -> tuple[FlirPtu, ScriptedPtu]:
+        """Open a head on a unit; both are closed at the end."""
+        unit = unit or ScriptedPtu()
+        return self.head(self.line(unit), **options), unit
+
+    def line(self, unit: ScriptedPtu) -> MemoryLine:
+        return self._stack.enter_context(MemoryLine(unit, self.clock, wire_time=False))
+
+    def head(self, line: MemoryLine, **options: Any) -> FlirPtu:
+        head = open_head({**OPTIONS, "port": line.path, **options}, self.clock, line.open)
+        self._stack.callback(head.close)
+        return head
+
+    def settled(self, head: FlirPtu) -> tuple[float, float]:
+        """Read until the head has settled; return its angles."""
+        reading = head.read()
+        while reading.moving:
+            self.clock.sleep(0.002)
+            reading = head.read()
+        return reading.pan_rad, reading.tilt_rad
+
+    def rested(self, head: FlirPtu) -> None:
+        """Read until the head has stood for so long that it cannot be anywhere else."""
+        for _ in range(5):
+            head.read()
+            self.clock.sleep(0.5)
+
+    def until(self, holds: Callable[[], Any], what: str) -> Any:
+        return until(holds, what, clock=self.clock)
+
+    def begun(self, *targets: Callable[[], Any]) -> list[threading.Thread]:
+        """Start threads."""
+        threads = [self.clock.thread(target, "test") for target in targets]
+        for thread in threads:
+            thread.start()
+        return threads
+
+    def ended(self, *threads: threading.Thread) -> None:
+        """Wait for their end."""
+        self.until(lambda: not any(thread.is_alive() for thread in threads), "the threads' end")

@@ -13,33 +13,22 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 import pytest
 
-from drivers.errors import BadOptions, NoFreshFrame, StreamFailed, UnsupportedFormat
+from drivers.errors import NoFreshFrame, UnsupportedFormat
 from drivers.v4l2 import camera as camera_module
-from drivers.v4l2 import exposure, stream
+from drivers.v4l2 import exposure
 from drivers.v4l2.camera import V4l2Camera
 from drivers.v4l2.controls import CameraControl
 from drivers.v4l2.options import parse_options
-from hil_tests.drivers.v4l2.v4l2_sensor import AUTO, EXPOSURE, Sensor, SensorNode, Shot, use
+from hil_tests.drivers.v4l2.v4l2_sensor import AUTO, EXPOSURE, Sensor, SensorNode, Shot, TurnedClock, use
 from hil_tests.waiting import NET_S, until
 
 PERIOD_S = 0.040
 MARGIN_S = 0.002
 KINDS = ("start", "uvc", "end")
-
-
-class TurnedClock:
-    """A clock that tests set."""
-
-    time_s = 100.0
-
-    def now_s(self) -> float:
-        return self.time_s
-
-    def sleep(self, duration_s: float) -> None:
-        self.time_s += duration_s
 
 
 @dataclass
@@ -121,7 +110,7 @@ def bench(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_frame_that_an_automatic_stretched_in_the_dark_is_not_given_as_fresh(
+def test_a_frame_stretched_in_the_dark_is_not_given_as_fresh(
     monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     """25 frames/s by day; then it gets dark and each exposure lasts as long as its frame, 100 ms and more."""
@@ -133,8 +122,8 @@ def test_a_frame_that_an_automatic_stretched_in_the_dark_is_not_given_as_fresh(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", range(4))
-def test_no_frame_of_a_camera_that_stretches_drops_damages_and_jitters_is_given_as_fresh(
+@pytest.mark.parametrize("seed", range(2))
+def test_no_old_frame_of_an_unsteady_camera_is_given_as_fresh(
     monkeypatch: pytest.MonkeyPatch, kind: str, seed: int
 ) -> None:
     sensor = Sensor(kind, readout_s=0.030, late_s=MARGIN_S, seed=seed)
@@ -153,8 +142,8 @@ def test_no_frame_of_a_camera_that_stretches_drops_damages_and_jitters_is_given_
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("promised_hz", [25.0, 60.0, 5.0, None])
-def test_nor_of_one_that_keeps_another_rate_than_it_promised_or_promises_none(
+@pytest.mark.parametrize("promised_hz", [60.0, 5.0, None])
+def test_nor_of_one_that_keeps_another_rate_than_it_promised(
     monkeypatch: pytest.MonkeyPatch, kind: str, promised_hz: float | None
 ) -> None:
     """Also when it drops every second frame from the first on, so that no two neighbours ever come."""
@@ -169,12 +158,12 @@ def test_nor_of_one_that_keeps_another_rate_than_it_promised_or_promises_none(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_frames_of_before_a_change_of_exposure_are_judged_by_the_exposure_of_their_time(
+def test_frames_of_before_a_change_have_the_exposure_of_their_time(
     monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     """The exposure goes from 36 to 2 ms, twelve older frames still wait, and it shows three frames later."""
     sensor = Sensor(kind, readout_s=0.030, late_s=MARGIN_S, seed=3)
-    options = {"exposure_s": 0.036, "auto_exposure": {"longest_s": 0.04}}
+    options: dict[str, Any] = {"exposure_s": 0.036, "auto_exposure": {"longest_s": 0.04}}
     wanted = Wanted(0.036)
     monkeypatch.setattr(exposure.GROUPS, "join", lambda *ignored: wanted)
     with bench(monkeypatch, kind, controls=(AUTO, EXPOSURE), **options) as seen:
@@ -194,9 +183,7 @@ def test_frames_of_before_a_change_of_exposure_are_judged_by_the_exposure_of_the
 
 
 @pytest.mark.parametrize("kind", ["uvc", "end"])
-def test_an_exposure_whose_automatic_cannot_be_turned_off_is_not_known(
-    monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
+def test_an_exposure_that_stays_automatic_is_not_known(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     sensor = Sensor(kind, readout_s=0.030, late_s=MARGIN_S, seed=4)
     monkeypatch.setattr(SensorNode, "refused", (AUTO.id,))
     with bench(monkeypatch, kind, controls=(AUTO, EXPOSURE), exposure_s=0.004) as seen:
@@ -206,7 +193,7 @@ def test_an_exposure_whose_automatic_cannot_be_turned_off_is_not_known(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_stamp_a_little_ahead_of_the_clock_tells_nothing_later_than_the_clock(
+def test_a_stamp_ahead_of_the_clock_is_bounded_by_the_clock(
     monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     sensor = Sensor(kind, readout_s=0.001, late_s=0.0, seed=5)
@@ -217,35 +204,7 @@ def test_a_stamp_a_little_ahead_of_the_clock_tells_nothing_later_than_the_clock(
             seen.arrive(ahead if kind != "start" else shot)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            {"exposure_s": 0.1, "rate_hz": 25.0},
-            r"options.exposure_s is 0.1 s, longer than a frame at rate_hz 25 \(0.04 s\)",
-        ),
-        (
-            {"exposure_s": 0.01, "rate_hz": 25.0, "auto_exposure": {"longest_s": 0.05}},
-            r"options.auto_exposure.longest_s is 0.05 s, longer than a frame at rate_hz 25 \(0.04 s\)",
-        ),
-        ({"exposure_s": 0.04}, r"options.exposure_s is 0.04 s, longer than a frame at rate_hz 30"),
-    ],
-)
-def test_an_exposure_longer_than_a_frame_is_refused(options: dict[str, object], message: str) -> None:
-    with pytest.raises(BadOptions, match=message):
-        parse_options({"card": "a", **options}, "eye")
-
-
-def test_the_longest_automatic_exposure_is_a_frame_where_nothing_is_said() -> None:
-    for rate_hz in (30.0, 40.0, 200.0):
-        options = parse_options(
-            {"card": "a", "rate_hz": rate_hz, "exposure_s": 0.001, "auto_exposure": True}, "e"
-        )
-        assert options.auto_exposure is not None
-        assert options.auto_exposure.longest_s == pytest.approx(min(0.03, 1 / rate_hz))
-
-
-def test_an_exposure_longer_than_a_frame_at_the_cameras_own_rate_is_refused(
+def test_an_exposure_longer_than_the_cameras_own_frame_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     words = r"'exposure_s' is 0.1 s, longer than a frame at the camera's 25 Hz \(0.04 s\)"
@@ -256,12 +215,12 @@ def test_an_exposure_longer_than_a_frame_at_the_cameras_own_rate_is_refused(
         pass
 
 
-def test_a_hold_lets_a_pending_change_show_first_and_then_keeps_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hold_lets_a_pending_change_show_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """The other camera of the group decided on another exposure just before a measurement began."""
     sensor = Sensor("uvc", readout_s=0.030, late_s=0.0, seed=6)
     wanted = Wanted(0.036)
     monkeypatch.setattr(exposure.GROUPS, "join", lambda *ignored: wanted)
-    options = {"exposure_s": 0.036, "auto_exposure": {"longest_s": 0.04}}
+    options: dict[str, Any] = {"exposure_s": 0.036, "auto_exposure": {"longest_s": 0.04}}
     with bench(monkeypatch, "uvc", controls=(AUTO, EXPOSURE), **options) as seen:
         monkeypatch.setattr(camera_module, "HOLD_MOST_S", NET_S)
         monkeypatch.setattr(camera_module, "HOLD_PERIODS", 1e6)
@@ -295,60 +254,3 @@ def test_a_hold_lets_a_pending_change_show_first_and_then_keeps_it(monkeypatch: 
         thread.join(NET_S)
         seen.arrive(sensor.shoot(PERIOD_S, 0.002))
         assert seen.node.sets[-1] == (EXPOSURE.id, 100), "afterwards it is"
-
-
-def test_a_hold_on_a_camera_that_gives_no_frames_begins_all_the_same_and_holds(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    sensor = Sensor("uvc", readout_s=0.030, late_s=0.0, seed=6)
-    wanted = Wanted(0.036)
-    monkeypatch.setattr(exposure.GROUPS, "join", lambda *ignored: wanted)
-    options = {"exposure_s": 0.036, "auto_exposure": {"longest_s": 0.04}}
-    with bench(monkeypatch, "uvc", controls=(AUTO, EXPOSURE), **options) as seen:
-        for _ in range(6):
-            seen.arrive(sensor.shoot(PERIOD_S, 0.036))
-        sets = len(seen.node.sets)
-        wanted.exposure_s = 0.002
-        began_s = time.monotonic()
-        with seen.camera.exposure_held():
-            assert time.monotonic() - began_s < NET_S
-            for _ in range(5):
-                seen.arrive(sensor.shoot(PERIOD_S, 0.036))
-            assert len(seen.node.sets) == sets
-            with seen.camera.exposure_held():
-                pass
-            seen.arrive(sensor.shoot(PERIOD_S, 0.036))
-            assert len(seen.node.sets) == sets, "the inner hold's end is not the outer one's"
-        seen.arrive(sensor.shoot(PERIOD_S, 0.036))
-        assert seen.node.sets[-1] == (EXPOSURE.id, 20)
-
-
-def test_a_hold_that_meets_a_change_that_does_not_end_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    sensor = Sensor("uvc", readout_s=0.030, late_s=0.0, seed=6)
-    wanted = Wanted(0.036)
-    monkeypatch.setattr(exposure.GROUPS, "join", lambda *ignored: wanted)
-    options = {"exposure_s": 0.036, "auto_exposure": {"longest_s": 0.04}}
-    with bench(monkeypatch, "uvc", controls=(AUTO, EXPOSURE), **options) as seen:
-        for _ in range(6):
-            seen.arrive(sensor.shoot(PERIOD_S, 0.036))
-        hangs, back = threading.Event(), threading.Event()
-        set_value = stream.set_value
-
-        def hang(*args: object) -> object:
-            hangs.set()
-            assert back.wait(NET_S)
-            return set_value(*args)  # type: ignore[arg-type]
-
-        monkeypatch.setattr(stream, "set_value", hang)
-        wanted.exposure_s = 0.002
-        shot = sensor.shoot(PERIOD_S, 0.036)
-        seen.clock.time_s = shot.received_s
-        seen.node.put(shot)
-        assert hangs.wait(NET_S)
-        with (
-            pytest.raises(StreamFailed, match="still at a change of its exposure"),
-            seen.camera.exposure_held(),
-        ):
-            raise AssertionError("the block began")
-        assert not wanted.held
-        back.set()

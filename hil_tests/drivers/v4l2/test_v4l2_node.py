@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import struct
 from collections.abc import Callable
@@ -10,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import CameraBusy, DriverError, NoCamera, NoPermission, StreamFailed
+from drivers.errors import StreamFailed
 from drivers.v4l2 import abi, node
-from drivers.v4l2.node import Node, NotACamera
+from drivers.v4l2.node import Node
 
 Answers = dict[int, Callable[[Any], bytes]]
 
@@ -42,7 +43,7 @@ def answers(monkeypatch: pytest.MonkeyPatch) -> Answers:
     return answers
 
 
-def test_a_format_in_planes_has_the_first_ones_stride_and_the_length_of_each(answers: Answers) -> None:
+def test_a_format_in_planes_has_its_stride_and_all_lengths(answers: Answers) -> None:
     answers[abi.VIDIOC_QUERYCAP] = lambda _: capability(PLANES | STREAMING)
     planes = [(64 * 50, 64), (32 * 50, 32), (7, 7)]  # the last is what a driver left there
     told = struct.pack("<II4sII", 60, 50, b"NM12", 1, 8)
@@ -59,51 +60,38 @@ def test_a_format_in_planes_has_the_first_ones_stride_and_the_length_of_each(ans
     assert (found.length_bytes, found.planes_bytes) == (64 * 50 + 32 * 50, (64 * 50, 32 * 50))
 
 
-def test_a_format_in_one_piece_is_told_whole(answers: Answers) -> None:
-    answers[abi.VIDIOC_QUERYCAP] = lambda _: capability(CAPTURE | PLANES | STREAMING)
-    answers[abi.VIDIOC_G_FMT] = lambda argument: struct.pack(
-        "<I4xII4sIII", argument.type, 60, 50, b"Y16 ", 1, 128, 6400
+STARTED = 0x40045612  # VIDIOC_STREAMON of videodev2.h
+
+
+def refused_start(monkeypatch: pytest.MonkeyPatch, number: int) -> str:
+    """The message of a stream whose start the kernel refuses with a number."""
+
+    def ioctl(descriptor: int, request: int, argument: Any) -> int:
+        if request == STARTED:
+            raise OSError(number, os.strerror(number))
+        told = b""
+        if request == abi.VIDIOC_QUERYCAP:
+            told = capability(CAPTURE | STREAMING)
+        elif request == abi.VIDIOC_G_FMT:
+            told = struct.pack("<I4xII4sIII", argument.type, 1280, 720, b"YUYV", 1, 2560, 1843200)
+        elif request == abi.VIDIOC_G_PARM:  # capability, mode, and 1/30 s from frame to frame
+            told = struct.pack("<IIIII", argument.type, 0x1000, 0, 1, 30)
+        elif request == abi.VIDIOC_QUERYBUF:
+            argument.length = 4096
+        memoryview(argument).cast("B")[: len(told)] = told
+        return 0
+
+    monkeypatch.setattr(node.fcntl, "ioctl", ioctl)
+    monkeypatch.setattr(node.mmap, "mmap", lambda *_, **__: io.BytesIO())
+    monkeypatch.setattr(Node, "queue", lambda *_: None)
+    with Node("/dev/null", "navcam_left") as opened, pytest.raises(StreamFailed) as raised:
+        opened.start(4)
+    return str(raised.value)
+
+
+def test_a_bus_without_bandwidth_is_said_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert refused_start(monkeypatch, errno.ENOSPC) == (
+        "navcam_left: /dev/null does not start the stream: its USB bus has no bandwidth left for YUYV "
+        "1280x720 at 30 Hz; use the format MJPG, a smaller size or a lower rate, or a port of another "
+        "USB controller"
     )
-    with Node("/dev/null", "eye") as opened:
-        found = opened.current_format()
-    assert (found.code, found.size_px, found.stride_bytes) == ("Y16", (60, 50), 128)
-    assert (found.length_bytes, found.planes_bytes) == (6400, ())
-
-
-@pytest.mark.parametrize(
-    ("flags", "words"),
-    [
-        (META, "is a metadata node; the pictures come from the camera's other node"),
-        (OUTPUT, "is a video output, it gives no pictures"),
-        (CAPTURE, "cannot stream"),
-        (PLANES, "cannot stream"),
-        (STREAMING, "is no camera: it captures no video"),
-    ],
-)
-def test_a_node_without_pictures_says_what_it_is(answers: Answers, flags: int, words: str) -> None:
-    answers[abi.VIDIOC_QUERYCAP] = lambda _: capability(flags)
-    with pytest.raises(NotACamera) as raised:
-        Node("/dev/null", "eye")
-    assert words in str(raised.value)
-
-
-@pytest.mark.parametrize(
-    ("number", "kind", "words"),
-    [
-        (errno.EACCES, NoPermission, "no permission to open /dev/null"),
-        (errno.EPERM, NoPermission, "no permission to open /dev/null"),
-        (errno.ENXIO, NoCamera, "there is no /dev/null; is the camera connected?"),
-        (errno.EBUSY, CameraBusy, "/dev/null is in use by another program"),
-        (errno.EIO, StreamFailed, "/dev/null cannot be opened: Input/output error"),
-    ],
-)
-def test_why_a_node_does_not_open_is_said(
-    monkeypatch: pytest.MonkeyPatch, number: int, kind: type[DriverError], words: str
-) -> None:
-    def refuse(*_: object) -> int:
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr(node.os, "open", refuse)
-    with pytest.raises(kind) as raised:
-        Node("/dev/null", "eye")
-    assert words in str(raised.value)

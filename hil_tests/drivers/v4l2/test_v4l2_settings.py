@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from unittest.mock import Mock
-
 import pytest
 
-from calib.geometry.sensor_mode import SensorMode
-from drivers.errors import BadSetting, DriverError, NoCamera
-from drivers.interfaces import Adjustable
+from calib.geometry.mode import SensorMode
+from drivers.errors import BadSetting, StreamFailed
 from drivers.v4l2 import abi, settings, stream
 from drivers.v4l2.controls import CameraControl, ControlProblem
-from drivers.values_set import SETTLE_FRAMES, ValuesSet
+from drivers.values_set import SETTLE_FRAMES
 from hil_tests.drivers.v4l2.test_v4l2_never_old import bench
 from hil_tests.drivers.v4l2.v4l2_sensor import AUTO, EXPOSURE, Sensor, SensorNode, use
+from hil_tests.waiting import until
 
 GAIN = CameraControl(abi.CID_GAIN, "gain", "integer", 0, 255, 1, 100, True, {})
 AUTOGAIN = CameraControl(abi.CID_AUTOGAIN, "gain_automatic", "boolean", 0, 1, 1, 1, True, {})
@@ -25,13 +23,12 @@ VALUES = {AUTOGAIN.id: 1, GAIN.id: 16, FOCUS.id: 30}
 PERIOD_S = 0.04
 
 
-def test_a_frame_stamped_before_a_change_has_the_old_one_and_none_is_told_a_value_that_it_may_not_have(
+def test_a_frame_has_a_changed_setting_once_it_surely_shows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sensor = Sensor("uvc", readout_s=0.030, late_s=0.0, seed=6)
     with bench(monkeypatch, "uvc", controls=ALL, values=VALUES, exposure_s=0.036, gain=16) as seen:
         camera = seen.camera
-        assert isinstance(camera, Adjustable)
 
         def told(exposure_s: float = 0.036) -> dict[str, float | None]:
             seen.arrive(sensor.shoot(PERIOD_S, exposure_s))
@@ -84,32 +81,6 @@ def test_the_sensors_mode_is_as_far_as_the_driver_tells_it(
     assert found == SensorMode((16, 8), crop_px, sensor_px, (False, True))
 
 
-def test_a_driver_that_fails_to_tell_its_crop_is_used_without_and_one_that_is_gone_is_not(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    node = SensorNode("start", controls=(HFLIP, VFLIP))
-    node.values[HFLIP.id], node.values[VFLIP.id] = 1, 0
-    use(monkeypatch, node)
-    for error in (DriverError("cannot tell its crop: Input/output error"), NoCamera("it is gone")):
-        monkeypatch.setattr(node, "selection", Mock(side_effect=error))
-        if isinstance(error, NoCamera):
-            with pytest.raises(NoCamera):
-                stream.sensor_mode_of(node, (16, 8))  # type: ignore[arg-type]
-        else:
-            found = stream.sensor_mode_of(node, (16, 8))  # type: ignore[arg-type]
-            assert found == SensorMode((16, 8), flip=(True, False))
-
-
-def test_a_hold_waits_until_a_change_shows(monkeypatch: pytest.MonkeyPatch) -> None:
-    values = ValuesSet(1.0)
-    values.begin(10.0)
-    assert not values.settled and values.of(0, 9.9) == (1.0, 1.0) and values.of(1, 10.0) == (None, None)
-    values.end(2.0, 10.1)
-    assert [values.of(n, 10.2 + n)[0] for n in range(2, 2 + SETTLE_FRAMES)] == [None] * SETTLE_FRAMES
-    assert not values.settled and values.newest == 2.0
-    assert values.of(2 + SETTLE_FRAMES, 20.0) == (2.0, 2.0) and values.settled
-
-
 def test_bounds_are_the_cameras_and_the_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     with bench(monkeypatch, "uvc", controls=ALL, values=VALUES, focus=30) as seen:
         exposure, gain, focus = seen.camera.settings()
@@ -122,7 +93,7 @@ def test_bounds_are_the_cameras_and_the_frames(monkeypatch: pytest.MonkeyPatch) 
         assert highest_s == pytest.approx(0.0166), "whole steps, and no longer than a frame"
 
 
-def test_a_focus_that_no_restart_could_come_back_to_and_an_exposure_of_a_group_stand_fixed(
+def test_an_uncalibrated_focus_and_a_groups_exposure_stay_fixed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     options = {"exposure_s": 0.01, "auto_exposure": True}
@@ -133,19 +104,18 @@ def test_a_focus_that_no_restart_could_come_back_to_and_an_exposure_of_a_group_s
         assert refusals["gain"] == ""
 
 
-def test_what_was_changed_is_set_again_when_the_camera_is_opened_again(
+def test_what_was_changed_is_set_again_at_the_next_opening(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with bench(monkeypatch, "uvc", controls=ALL, values=VALUES, exposure_s=0.036, focus=30) as seen:
         seen.camera.adjust({"gain": 200.0, "exposure_s": 0.02, "focus": 35.0})
-        options = seen.camera.capture._options
-        assert (options.gain, options.exposure_s, options.focus) == (200, pytest.approx(0.02), 35)
         before = len(seen.node.sets)
-        seen.camera.capture._open()
+        seen.node.fail(StreamFailed("it gave no frame"))
+        until(lambda: seen.camera.counters.reopened == 1, "it is opened again")
         assert {(GAIN.id, 200), (EXPOSURE.id, 200), (FOCUS.id, 35)} <= set(seen.node.sets[before:])
 
 
-def test_a_camera_that_makes_another_of_it_is_told_and_one_that_refuses_is_not_believed(
+def test_a_value_the_camera_changed_or_refused_is_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with bench(monkeypatch, "uvc", controls=ALL, values=VALUES, focus=30) as seen:
@@ -161,11 +131,11 @@ def test_a_camera_that_makes_another_of_it_is_told_and_one_that_refuses_is_not_b
         monkeypatch.setattr(settings, "set_value", clamps)
         (note,) = seen.camera.adjust({"gain": 200.0})
         assert "gain is 64 where 200 was asked for" in note
-        assert seen.camera.capture._options.gain == 64
+        assert {one.name: one.value for one in seen.camera.settings()}["gain"] == 64
         seen.node.refused = (FOCUS.id,)
         with pytest.raises(BadSetting, match="focus was not changed: focus does not take 40"):
             seen.camera.adjust({"gain": 10.0, "focus": 40.0})
-        assert seen.camera.capture._options.focus == 30
+        assert {one.name: one.value for one in seen.camera.settings()}["focus"] == 30
 
 
 def test_a_refused_value_leaves_the_automatic_on(monkeypatch: pytest.MonkeyPatch) -> None:

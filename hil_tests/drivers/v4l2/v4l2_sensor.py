@@ -15,12 +15,29 @@ from pathlib import Path
 
 import numpy as np
 
+from drivers.clock import SystemClock
+from drivers.errors import DriverError
 from drivers.pixels import PictureFormat
 from drivers.v4l2 import abi, find, settings, stream
 from drivers.v4l2.controls import CameraControl, ControlProblem
 from drivers.v4l2.node import Dequeued, Identity
 
 SIZE_PX = (16, 8)
+
+
+class TurnedClock(SystemClock):
+    """A clock that tests set; threads and signals are the machine's."""
+
+    def __init__(self) -> None:
+        self.time_s = 100.0
+
+    def now_s(self) -> float:
+        return self.time_s
+
+    def sleep(self, duration_s: float) -> None:
+        self.time_s += duration_s
+
+
 EXPOSURE = CameraControl(abi.CID_EXPOSURE_ABSOLUTE, "exposure", "integer", 1, 10000, 1, 100, True, {})
 AUTO = CameraControl(
     abi.CID_EXPOSURE_AUTO, "auto_exposure", "menu", 0, 3, 1, 3, True, {1: "Manual", 3: "Auto"}
@@ -69,6 +86,7 @@ class SensorNode:
 
     path = Path("/dev/video7")
     refused: tuple[int, ...] = ()  # controls that take no value
+    failure: DriverError | None = None
 
     def __init__(
         self, kind: str, rate_hz: float | None = 25.0, controls: tuple[CameraControl, ...] = ()
@@ -96,10 +114,18 @@ class SensorNode:
             self.waiting.append(Dequeued(shot.sequence % 4, 128, flags, shot.sequence, shot.stamp_s))
         os.eventfd_write(self.ready, 2)  # once more: that it asks again says that it is through
 
+    def fail(self, error: DriverError) -> None:
+        """Have the next request for a frame fail."""
+        self.failure = error
+        os.eventfd_write(self.ready, 1)
+
     def dequeue(self) -> Dequeued | None:
         with self.lock:
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self.ready)
+            if self.failure is not None:
+                failure, self.failure = self.failure, None
+                raise failure
             return self.waiting.popleft() if self.waiting else None
 
     def bytes_of(self, buffer: Dequeued) -> memoryview:

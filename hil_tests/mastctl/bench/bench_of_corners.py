@@ -15,8 +15,8 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.plan.placements import Placement
 from calib.targets.boards import AnyBoard, Corners
+from hil_tests.support.sim_survey.plan import rover_from_head
 from mastctl.bench.eyes import BenchHead, BenchLook, SeenBoard
-from tools.sim_survey.plan import rover_from_head
 
 EDGE_PX = 3.0
 FLATTEST = math.cos(math.radians(72.0))

@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from bench_of_corners import CornerBench, SelfPlacing, TrueAxis
 
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.survey.records import Sigma
 from calib.targets.boards import Charuco
+from hil_tests.mastctl.bench.bench_of_corners import CornerBench, SelfPlacing, TrueAxis
 from mastctl.bench.eyes import BenchEyes, BenchHead
 from mastctl.bench.folder import RunFolder, survey_cameras
 from mastctl.bench.frame import RoverFrame, fit_in_rover

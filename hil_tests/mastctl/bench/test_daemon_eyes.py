@@ -6,12 +6,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig, save_rig
+from calib.geometry.mode import SensorMode
 from calib.geometry.rig import AxisJoint, JointErrors
-from calib.geometry.sensor_mode import SensorMode
 from calib.plan.placements import Placement
 from calib.targets.boards import Charuco
 from mastctl.bench import daemon_eyes
@@ -53,7 +52,7 @@ def eyes(client: Client, monkeypatch: pytest.MonkeyPatch) -> Iterator[DaemonEyes
     client.clear_faults()
 
 
-def test_a_look_shows_the_board_with_one_reading_and_tells_what_the_head_is(eyes: DaemonEyes) -> None:
+def test_a_look_shows_the_board_with_one_reading_and_describes_the_head(eyes: DaemonEyes) -> None:
     assert eyes.head.one_sided and eyes.head.count_rad == pytest.approx(5.6e-5, rel=0.01)
     left = eyes.head.rig.cameras["navcam_left"]
     whole = SensorMode(left.model.size_px, (0, 0, *left.model.size_px), left.model.size_px)
@@ -68,7 +67,7 @@ def test_a_look_shows_the_board_with_one_reading_and_tells_what_the_head_is(eyes
     assert eyes.seconds_each().keys() == set(CAMERAS)
 
 
-def test_a_head_whose_mast_file_has_joints_is_turned_to_the_readings_that_are_wanted(
+def test_a_head_with_joints_in_its_file_is_turned_to_wanted_readings(
     repository: Path, tmp_path: Path
 ) -> None:
     config = bench(repository)
@@ -79,15 +78,6 @@ def test_a_head_whose_mast_file_has_joints_is_turned_to_the_readings_that_are_wa
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
         look = DaemonEyes(client, CAMERAS, BOARD).look(0.05, -0.02)
     assert (look.pan_rad, look.tilt_rad) == (pytest.approx(0.05, abs=1e-4), pytest.approx(-0.02, abs=1e-4))
-
-
-def test_a_head_that_comes_from_both_sides_is_told_as_such(repository: Path) -> None:
-    config = bench(repository)
-    simulation = {**config.hardware.simulation, "head": "dynamixel_x"}
-    config = replace(config, hardware=replace(config.hardware, simulation=simulation))
-    with RunningDaemon(config) as daemon, Client(daemon.url) as client:
-        head = DaemonEyes(client, CAMERAS, BOARD).head
-    assert not head.one_sided and head.count_rad == pytest.approx(2 * np.pi / 4096)
 
 
 def test_a_camera_that_is_pulled_out_is_named_and_the_other_still_looks(
@@ -110,12 +100,6 @@ def test_when_no_camera_gives_a_picture_the_bench_waits_and_then_says_so(
     assert eyes.look(0.0, 0.0).found  # and goes on
 
 
-def test_a_head_that_is_silent_ends_the_look_in_a_sentence(client: Client, eyes: DaemonEyes) -> None:
-    client.set_fault("pan_tilt", "off")
-    with pytest.raises(BenchInterrupted):
-        eyes.look(0.3, -0.1)
-
-
 def test_pictures_in_the_dark_say_that_they_are_dark(client: Client, eyes: DaemonEyes) -> None:
     client.set_fault("navcam_left", "dark")
     look = eyes.look(0.0, 0.0)
@@ -123,20 +107,6 @@ def test_pictures_in_the_dark_say_that_they_are_dark(client: Client, eyes: Daemo
     client.set_fault("navcam_right", "dark")
     with pytest.raises(NoLight, match=r"navcam_left: the picture is dark.*; turn on a light"):
         eyes.look(0.0, 0.0)  # elsewhere it may be light: a search goes on
-
-
-def test_who_else_steers_is_named(client: Client, eyes: DaemonEyes) -> None:
-    with Client(client.url, name="Ana") as other, other.lease(), pytest.raises(BenchInterrupted, match="Ana"):
-        eyes.look(0.1, 0.0)
-
-
-def test_an_emergency_stop_ends_the_look_and_says_how_to_go_on(client: Client, eyes: DaemonEyes) -> None:
-    client.estop(name="Ana", reason="a hand in the way")
-    try:
-        with pytest.raises(BenchInterrupted, match="'mastctl reset' releases it"):
-            eyes.look(0.1, 0.0)
-    finally:
-        client.reset(name="Ana", reason="the hand is away")
 
 
 def test_beyond_the_limits_nothing_is_looked_at_and_nothing_ends(eyes: DaemonEyes) -> None:

@@ -13,8 +13,8 @@ from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.survey.records import Survey
 from calib.survey.writer import write_survey
-from tools.sim_survey.plan import Ring, SurveyPlan, SurveyTruth
-from tools.sim_survey.survey import simulate_survey
+from hil_tests.support.sim_survey.plan import Ring, SurveyPlan, SurveyTruth
+from hil_tests.support.sim_survey.survey import simulate_survey
 
 RIG_FILE = Path(__file__).resolve().parents[3] / "configs" / "sim" / "rocky8.yaml"
 RINGS = (Ring("navcam", 3.0, 4, -0.17), Ring("navcam", 6.0, 4, -0.17))

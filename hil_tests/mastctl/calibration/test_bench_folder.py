@@ -13,8 +13,8 @@ import pytest
 from calib.files.mast_file import load_rig
 from calib.geometry.covariance import stored_covariance
 from calib.survey.writer import write_survey
+from hil_tests.support.sim_survey.bench import BenchPlan, Mishap, simulate_bench
 from mastctl.cli.main import main
-from tools.sim_survey.bench import BenchPlan, Mishap, simulate_bench
 
 PLAN = BenchPlan(attitudes=9, checks=3, backlash_rad=0.004, count_rad=2 * np.pi / 4096)
 
@@ -75,52 +75,3 @@ def test_a_joint_that_slipped_leaves_no_mast_file(tmp_path: Path, capsys: pytest
     assert code == 1
     assert "tilt slipped by about 1" in told["error"]["message"]
     assert not (tmp_path / "m.yaml").exists()
-
-
-WHOLE = pytest.mark.long(2, "a whole command; the fit names it quickly in calib/calibrate/test_fit_bench.py")
-
-
-@WHOLE
-def test_a_board_that_moved_is_told_in_the_verdict(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    plan = replace(PLAN, backlash_rad=0.0, count_rad=0.0, mishaps=(Mishap("board", 6, 0.05),))
-    write_survey(simulate_bench(1, plan), tmp_path / "b")
-    code, told, _ = run(capsys, tmp_path / "b", "--out", tmp_path / "m.yaml")
-    assert code == 0
-    assert told["verdict"]["grade"] == "care"
-    assert any("moved during placement p1" in r["sentence"] for r in told["verdict"]["reasons"])
-
-
-def test_one_placement_alone_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    plan = replace(PLAN, backlash_rad=0.0, count_rad=0.0, placements=PLAN.placements[:1], attitudes=16)
-    write_survey(simulate_bench(1, plan), tmp_path / "b")
-    code, told, _ = run(capsys, tmp_path / "b", "--out", tmp_path / "m.yaml")
-    assert code == 0
-    assert any(
-        "put it up once more, at another distance" in r["sentence"] for r in told["verdict"]["reasons"]
-    )
-
-
-@WHOLE
-def test_a_print_less_exact_than_its_corners_are_found_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    plan = replace(PLAN, backlash_rad=0.0, count_rad=0.0, own_px=0.01, print_m=1e-4)
-    write_survey(simulate_bench(1, plan), tmp_path / "b")
-    code, told, _ = run(capsys, tmp_path / "b", "--out", tmp_path / "m.yaml")
-    assert code == 0
-    assert told["verdict"]["grade"] == "care"
-    (sentence,) = [r["sentence"] for r in told["verdict"]["reasons"] if "inexact print" in r["sentence"]]
-    assert sentence.startswith("corners are off by some 0.1 mm on the board") or "0.09" in sentence
-    (kind,) = [one for one in told["sigmas_found"] if one["kind"] == "dots of navcam_left"]
-    assert kind["key"] == "sigma_px"
-    assert kind["factor"] * kind["stated"] == pytest.approx(told["rms_px"]["navcam_left"][0], rel=0.3)
-
-
-def test_what_drives_a_head_is_refused_with_a_folder(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, told, _ = run(capsys, folder, "--out", tmp_path / "m.yaml", "--url", "http://localhost:1")
-    assert code == 2
-    assert "--url drives a head" in told["error"]["message"]

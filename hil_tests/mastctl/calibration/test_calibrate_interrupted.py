@@ -7,11 +7,9 @@ import os
 import pickle
 import resource
 import select
-import shutil
 import signal
 import subprocess
 import sys
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +20,6 @@ from calib.calibrate.paper import fit_paper
 from calib.files.mast_file import load_rig, save_rig
 from calib.survey.reader import read_survey
 from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey, write_folder
-from mastctl.calibration import detection
 from mastctl.calibration import run as calibration_run
 from mastctl.calibration.run import FITS
 from mastctl.cli.main import main
@@ -129,45 +126,6 @@ def test_a_full_disk_leaves_everything_as_it_was(survey: Path, kept: Path, tmp_p
     assert contents(tmp_path) == before
 
 
-def test_every_former_mast_file_is_kept_and_the_last_is_told(
-    survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "m.yaml"
-    written = []
-    for _ in range(4):
-        assert main(words(survey, out)) == 0
-        told = json.loads(capsys.readouterr().out)["mast_file"]
-        assert told["previous"] == (str(tmp_path / "m.previous.yaml") if written else None)
-        if written:
-            assert Path(told["previous"]).read_bytes() == written[-1]
-        # Two runs of one second may write the same: make each its own.
-        out.write_text(out.read_text() + f"# number {len(written)}\n")
-        written.append(out.read_bytes())
-    names = {"m.yaml", "m.previous.yaml", "m.previous-1.yaml", "m.previous-2.yaml"}
-    kept = contents(tmp_path)
-    assert set(kept) == names
-    assert set(kept.values()) == set(written)
-    assert main(words(survey, out)[:-1]) == 0
-    assert f"kept from before: {tmp_path / 'm.previous.yaml'}" in capsys.readouterr().out.replace("\n", "")
-
-
-def test_a_refused_save_does_not_multiply_former_files(
-    survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "m.yaml"
-    save_rig(navcam_rig(), out)
-    save_rig(navcam_rig(), out)
-    before = contents(tmp_path)
-
-    def full(descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    assert main(words(survey, out)) == 2
-    assert "No space left on device" in json.loads(capsys.readouterr().out)["error"]["message"]
-    assert contents(tmp_path) == before
-
-
 def test_a_report_that_cannot_be_written_does_not_hide_the_mast_file(
     survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -181,16 +139,6 @@ def test_a_report_that_cannot_be_written_does_not_hide_the_mast_file(
     assert error["code"] == "report_not_written"
     assert f"the mast file {out} is saved" in error["message"]
     load_rig(out)
-
-
-def test_a_second_report_keeps_the_first(
-    survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    written = iter(["one", "two"])
-    monkeypatch.setattr(pages, "page", lambda *ignored, **told: next(written))
-    for _ in range(2):
-        assert main(words(survey, tmp_path / "m.yaml", "--report", str(tmp_path / "r"))) == 0
-    assert contents(tmp_path / "r") == {"calibration.html": b"two", "calibration.previous.html": b"one"}
 
 
 WORKERS = """
@@ -222,25 +170,3 @@ def test_no_searching_process_outlives_the_command(tmp_path: Path) -> None:
             os.kill(worker, signal.SIGKILL)
         assert gone, "the worker outlived the command"
     assert it.returncode == -signal.SIGKILL
-
-
-def test_a_searching_process_that_is_ended_is_told(
-    survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = shutil.copytree(survey, tmp_path / "s")
-    table = (folder / "images.csv").read_text().splitlines()
-    table[1] += "one.png"
-    (folder / "images.csv").write_text("\n".join(table) + "\n")
-    dots = (folder / "dots.csv").read_text().splitlines()
-    (folder / "dots.csv").write_text("\n".join(d for d in dots if "left-001" not in d) + "\n")
-    (folder / "one.png").write_bytes(b"")
-    assert detection.missing(read_survey(folder))
-
-    def ended(*ignored: Any) -> None:
-        raise BrokenProcessPool("a process was terminated")
-
-    monkeypatch.setattr(detection, "detect_survey", ended)
-    assert main(words(folder, tmp_path / "m.yaml")) == 1
-    error = json.loads(capsys.readouterr().out)["error"]
-    assert error["code"] == "search_cut_short"
-    assert not (tmp_path / "m.yaml").exists()

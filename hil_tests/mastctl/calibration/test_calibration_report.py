@@ -11,13 +11,11 @@ from calib.adjust.goodness import Component
 from calib.adjust.outliers import Outlier
 from calib.adjust.result import Calibration, Degenerate
 from calib.adjust.robust import SurveyNotFitted
-from calib.adjust.uncertainty import rig_moved_along
 from calib.calibrate.paper import fit_paper
 from calib.calibrate.survey import fit_joint
-from calib.survey.records import Survey, SurveyFinding
+from calib.geometry.covariance import moved_rig
+from calib.survey.records import Click, Survey, SurveyFinding
 from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey
-from mastctl.calibration.checks import check_sizes
-from mastctl.calibration.drawn import boards
 from mastctl.calibration.landing import (
     CORNER,
     change_map,
@@ -27,7 +25,6 @@ from mastctl.calibration.landing import (
     uncertainty_map,
 )
 from mastctl.calibration.verdict import judge_calibration
-from mastctl.report import plots
 
 DRAWS = 100
 TURN_RAD = np.array([0.0, 0.0, 0.01])
@@ -61,10 +58,9 @@ def test_the_map_of_uncertainty_is_the_spread_of_drawn_rigs(fitted: tuple[Survey
     steps = rng.multivariate_normal(
         np.zeros(len(calibration.covariance)), calibration.covariance, DRAWS, method="eigh"
     )
-    columns = np.arange(len(calibration.parameter_names))
     errors = [
         pointing_error_px(
-            rig_moved_along(calibration, columns, step), rig, pair, pan, tilt, target, left, right
+            moved_rig(rig, calibration.parameter_names, step), rig, pair, pan, tilt, target, left, right
         )
         for step in steps
     ]
@@ -84,17 +80,6 @@ def test_a_turned_mast_changes_pointing_at_positions_but_not_at_clicks() -> None
     assert change_map(rig, replace(rig, cameras={}, stereo={}), "navcam", 6.0) is None
 
 
-@pytest.mark.long(1, "a scatter of four fits; each survey's check images are judged in the quick run")
-def test_check_images_are_as_far_off_as_the_survey_noise_explains() -> None:
-    ratios = []
-    for seed in range(10, 14):
-        survey, _ = navcam_survey(seed, check_boards=6)
-        for size in check_sizes(survey, fit_joint(survey, 6)).values():
-            assert size.seen_px < size.limit_px, seed
-            ratios.append((size.seen_px / size.expected_px) ** 2)
-    assert 0.4 < np.mean(ratios) < 1.8
-
-
 def test_the_worst_reason_decides(fitted: tuple[Survey, Calibration]) -> None:
     survey, calibration = fitted
     assert judge_calibration(survey, calibration).grade == "good"
@@ -109,6 +94,10 @@ def test_the_worst_reason_decides(fitted: tuple[Survey, Calibration]) -> None:
     assert judge_calibration(survey, exact, warnings=[tape]).grade == "care"
     unseen = replace(calibration, check_rms_px={})
     assert judge_calibration(survey, unseen).grade == "care"
+    lost = Click("image7", "brick", np.array([10.0, 20.0]))
+    blind = judge_calibration(survey, replace(calibration, unseen_clicks=(lost,)))
+    assert blind.grade == "bad"
+    assert any("image7 cannot show check point brick" in reason.sentence for reason in blind.reasons)
     prism = Outlier("prism", "prism p3 of set-up level", 50.0, 20.0, 0.02)
     care = judge_calibration(survey, replace(calibration, outliers=(prism,)))
     assert care.grade == "care"
@@ -141,7 +130,7 @@ def test_the_last_images_of_a_camera_left_out_cost_trust(
         assert all(f"changed before {names[0]}, the result is of before" in r.sentence for r in last)
 
 
-def test_prisms_that_scatter_more_than_the_tapes_of_their_station_cost_trust(
+def test_prisms_that_scatter_more_than_their_tapes_cost_trust(
     fitted: tuple[Survey, Calibration],
 ) -> None:
     survey, fit = fitted
@@ -153,18 +142,6 @@ def test_prisms_that_scatter_more_than_the_tapes_of_their_station_cost_trust(
         reasons = judge_calibration(survey, replace(fit, components=components)).reasons
         grades.append([r.grade for r in reasons if r.sentence.startswith("prisms scatter by")])
     assert grades == [["care"], []]
-
-
-def test_a_placement_whose_name_looks_like_a_formula_is_drawn(fitted: tuple[Survey, Calibration]) -> None:
-    survey, calibration = fitted
-    renamed = {
-        (setup, f"$\\{placement}$ <b>"): pose
-        for (setup, placement), pose in calibration.rover_from_board.items()
-    }
-    images = [replace(one, placement=f"$\\{one.placement}$ <b>") for one in calibration.images]
-    drawn = boards(replace(calibration, rover_from_board=renamed, images=tuple(images)), survey.board)
-    assert plots.as_png(drawn).startswith(b"\x89PNG")
-    assert any("$" in text.get_text() for text in drawn.axes[0].texts)
 
 
 def test_what_the_papers_method_made_is_judged_by_the_joint_fits_tests(

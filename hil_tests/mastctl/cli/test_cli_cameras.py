@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,7 +10,7 @@ import pytest
 from PIL import Image as PillowImage
 
 from mastctl.cli.main import main
-from mastctl.report.png_text import read_text, with_text
+from mastctl.report.png_text import with_text
 from mastctl.setup.camera_check import quality_of, sharpness
 
 PICTURE = np.random.default_rng(2).integers(0, 256, (48, 64), dtype=np.uint8)
@@ -25,17 +23,6 @@ def test_another_reader_finds_the_words_and_the_picture() -> None:
         opened.load()
         assert opened.text == WORDS  # type: ignore[attr-defined]
         assert np.array_equal(np.asarray(opened), PICTURE)
-
-
-def test_words_come_back() -> None:
-    assert read_text(with_text(PNG, WORDS)) == WORDS
-    assert read_text(PNG) == {}
-
-
-@pytest.mark.parametrize("broken", [b"", b"GIF89a", PNG[1:]])
-def test_what_is_no_png_is_refused(broken: bytes) -> None:
-    with pytest.raises(ValueError, match="no PNG"):
-        with_text(broken, WORDS)
 
 
 def test_the_quality_of_a_picture_is_plain_arithmetic() -> None:
@@ -66,15 +53,3 @@ def test_a_camera_that_is_not_there_is_told(capsys: pytest.CaptureFixture[str]) 
 def test_what_is_no_camera_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:
     code, words = refused(["camera", "check", "/dev/null"], capsys)
     assert code == 2 and "/dev/null is no video device" in words
-
-
-def test_wrong_use_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    code, words = refused(["camera", "grab", "x", "--out", str(tmp_path / "a.jpg")], capsys)
-    assert code == 2 and "a .png is expected" in words
-    code, words = refused(["camera", "check", "x", "--set", "gain"], capsys)
-    assert code == 2 and "--set gain: CONTROL=VALUE is expected" in words
-
-
-def test_a_list_is_one_document(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["camera", "list", "--json"]) == 0
-    assert set(json.loads(capsys.readouterr().out)) == {"cameras", "genicam", "refused"}

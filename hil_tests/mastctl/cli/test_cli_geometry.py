@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
-from mastctl.cli.main import MODULES, main
+from mastctl.cli.main import main
 
 # Cameras whose projections need no program: at the mast's origin, f = 1000, centre (320, 240), 0.2 m apart.
 MAST = """\
@@ -70,7 +70,7 @@ class Run:
         return [line.split(",") for line in self.out.splitlines()]
 
 
-def test_project_gives_a_row_for_every_point_and_empty_cells_for_those_without_a_pixel(
+def test_project_gives_a_row_per_point_and_empty_cells_without_a_pixel(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = Run("camera project camera.yaml --points points.csv", capsys)
@@ -84,93 +84,7 @@ def test_project_gives_a_row_for_every_point_and_empty_cells_for_those_without_a
     assert Run("camera project camera.yaml --points points.csv --json", capsys).out == run.out
 
 
-def opencv_mast(kind: str, distortion: str) -> None:
-    """A mast file with a pair of one of OpenCV's lenses in the place of the folder's."""
-    lens = f"""on: head
-    size_px: [1280, 960]
-    model: {kind}
-    camera_matrix: [[900, 0, 640], [0, 900, 480], [0, 0, 1]]
-    distortion: {distortion}
-    rotation: [[0, 1, 0], [0, 0, 1], [1, 0, 0]]
-"""
-    Path("mast.yaml").write_text(
-        "schema: mastctl/mast/1\nname: lenses\nmast: {translation_m: [0, 0, 0], rotation_rad: [0, 0, 0]}\n"
-        f"cameras:\n  eye_left:\n    {lens}    C: [0, -0.1, 0]\n  eye_right:\n    {lens}    C: [0, 0.1, 0]\n"
-        "stereo: {eye: [eye_left, eye_right]}\n"
-    )
-
-
-@pytest.mark.parametrize(
-    ("kind", "distortion", "pixel", "ends"),
-    [
-        (
-            "OPENCV5",
-            "[-0.31, 0.12, 0.001, -0.0007, -0.02]",
-            "5000,480",
-            "the lens folds at 59.0 degrees from its axis",
-        ),
-        ("OPENCV8", "[0, 0, 0, 0, 0, -2, 0, 0]", "", "the lens folds at 35.3 degrees from its axis"),
-        (
-            "OPENCV14",
-            "[0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1.45, 0]",
-            "640,-3000",
-            "plane ends 6.9 degrees from the axis",
-        ),
-        ("OPENCV_FISHEYE", "[-0.2, 0, 0, 0]", "5000,480", "the lens folds at 74.0 degrees from its axis"),
-        ("OPENCV_FISHEYE", "[1e6, -1e6, 1e6, 1e6]", "", ""),
-    ],
-)
-@pytest.mark.filterwarnings("error")
-def test_a_row_that_the_lens_does_not_see_is_empty_with_a_sentence_of_where_the_lens_ends(
-    folder: Path, capsys: pytest.CaptureFixture[str], kind: str, distortion: str, pixel: str, ends: str
-) -> None:
-    opencv_mast(kind, distortion)
-    where = "mast.yaml --camera eye_left --pan 0 --tilt 0"
-    # 0.5, 0.5 is the pole of the rational lens
-    Path("points.csv").write_text("x_m,y_m,z_m\n5,0,0\n0.1,0.2,5\n1,0.4,0.5\n")
-    Path("pixels.csv").write_text(f"x_px,y_px\n640,480\n{pixel or '600,400'}\n")
-    project = Run(f"camera project {where} --points points.csv", capsys)
-    ray = Run(f"camera ray {where} --pixels pixels.csv", capsys)
-    assert (project.code, ray.code) == (0, 0)
-    if ends:
-        told = [line for line in project.err.splitlines() if "points.csv: row" in line]
-        assert (
-            f"points.csv: row 2: (0.1, 0.2, 5) m is 88.9 degrees from the axis of this {kind} camera, which"
-            in told[0]
-        )
-        assert ends in told[0]
-        assert len(told) == sum(row == ["", ""] for row in project.rows())
-    assert bool(pixel) == ("pixels.csv: row" in ray.err)
-    if pixel:
-        assert (
-            f"pixels.csv: row 2: ({pixel.replace(',', ', ')}) px has no ray in this {kind} camera: "
-            in ray.err
-        )
-        assert ends in ray.err
-
-
-def test_of_many_empty_rows_some_are_told_and_the_rest_counted(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    Path("points.csv").write_text("x_m,y_m,z_m\n" + "-1,0,0\n" * 50)
-    lines = Run("camera project camera.yaml --points points.csv", capsys).err.splitlines()
-    assert len(lines) == 21
-    assert lines[-1].endswith("points.csv: 30 more rows are empty, the last is row 50")
-
-
-@pytest.mark.parametrize("distortion", ["[0, 0, 0, 0, 0, -2, 0, 0]", "[0, 0, 0, 0, 0, -0.3, 0, 0]"])
-@pytest.mark.filterwarnings("error")
-def test_two_clicks_that_meet_where_the_lens_sees_nothing_are_refused_without_nan(
-    folder: Path, capsys: pytest.CaptureFixture[str], distortion: str
-) -> None:
-    opencv_mast("OPENCV8", distortion)
-    run = Run("triangulate mast.yaml --pair eye --pan 0 --tilt 0 --left 640 480 --right 620 200", capsys)
-    assert run.code == 1
-    assert "the two pixels do not mean one point: their rays pass each other at 1" in run.err
-    assert "where eye_left sees nothing: the lens folds at" in run.err
-
-
-def test_project_with_a_mast_file_is_in_the_rover_frame_at_the_joint_angles(
+def test_project_with_a_mast_file_is_in_the_rover_frame_at_its_angles(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # Pan a quarter turn to the right: the head looks along the rover's y; its right is the rover's -x.
@@ -196,22 +110,6 @@ def test_ray_gives_origin_and_direction(folder: Path, capsys: pytest.CaptureFixt
     np.testing.assert_allclose(values, [[0, 0, 0, 1, 0, 0], [0, 0, 0, half, half, 0]], rtol=0, atol=1e-15)
 
 
-def test_rays_lead_back_to_their_pixels_bit_for_bit_through_csv(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rng = np.random.default_rng(6)
-    pixels = rng.uniform([0, 0], [640, 480], (200, 2))
-    Path("q.csv").write_text("x_px,y_px\n" + "".join(f"{x!r},{y!r}\n" for x, y in pixels.tolist()))
-    where = "mast.yaml --camera eye_right --pan -2.5 --tilt 0.3"
-    rays = np.array(Run(f"camera ray {where} --pixels q.csv", capsys).rows()[1:], dtype=float)
-    points = rays[:, :3] + 7.0 * rays[:, 3:]
-    Path("p.csv").write_text(
-        "x_m,y_m,z_m\n" + "".join(",".join(map(repr, p)) + "\n" for p in points.tolist())
-    )
-    back = np.array(Run(f"camera project {where} --points p.csv", capsys).rows()[1:], dtype=float)
-    np.testing.assert_allclose(back, pixels, rtol=0, atol=1e-9)
-
-
 def test_solve_puts_the_target_on_the_pixel(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = Run("solve mast.yaml --camera eye_left --target -3 2.5 -3.5 --pixel 100 -50.5 --json", capsys)
     assert (run.code, run.err) == (0, "")
@@ -227,15 +125,6 @@ def test_solve_puts_the_target_on_the_pixel(folder: Path, capsys: pytest.Capture
         origin = np.array(Run(rays, capsys).rows()[1][:3], dtype=float)
         assert solution["range_m"] == pytest.approx(math.dist(origin, (-3, 2.5, -3.5)), abs=1e-9)
     assert abs(solutions[0]["tilt_rad"]) <= math.pi / 2 < abs(solutions[1]["tilt_rad"])
-
-
-def test_solve_aims_at_the_image_centre_by_default(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    # eye_right, aimed ahead at the mast's own height: pan carries its 0.1 m, exactly asin(0.1/10).
-    best = Run("solve mast.yaml --camera eye_right --target 11 2 -3 --json", capsys).json["solutions"][0]
-    assert best["pan_rad"] == pytest.approx(-math.asin(0.01), abs=1e-12)
-    assert best["tilt_rad"] == pytest.approx(0.0, abs=1e-12)
-    table = Run("solve mast.yaml --camera eye_right --target 11 2 -3", capsys)
-    assert f"{-math.asin(0.01):.9f}" in table.out
 
 
 def test_an_unreachable_target_is_a_failure_with_its_own_code(
@@ -268,26 +157,6 @@ def test_triangulate_finds_the_point_and_how_well(folder: Path, capsys: pytest.C
     assert "11.000000" in Run(words, capsys).out
 
 
-def test_rays_that_do_not_meet_are_a_failure(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = "triangulate mast.yaml --pair eye --pan 0 --tilt 0 --left 310 240 --right 330 240 --json"
-    run = Run(words, capsys)
-    assert (run.code, json.loads(run.out)["error"]["code"]) == (1, "behind_camera")
-
-
-def test_pixels_of_two_things_are_a_failure_that_says_by_how_much(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    # The rows are the epipolar lines: 30 rows apart at a disparity of 20 columns. The file says nothing of
-    # its errors, so that 1 px is taken: with clicks of 0.2 px a row is good to the root of 2 (1 + 0.04).
-    words = "triangulate mast.yaml --pair eye --pan 0 --tilt 0 --left 330 240 --right 310 270 --json"
-    run = Run(words, capsys)
-    assert (run.code, json.loads(run.out)["error"]["code"]) == (1, "not_one_point")
-    assert "30.0 px off the epipolar line" in json.loads(run.out)["error"]["message"]
-    assert f"{30 / math.sqrt(2 * 1.04):.1f} sigma" in json.loads(run.out)["error"]["message"]
-    assert Run(words.replace("310 270", "310 243"), capsys).code == 0
-    assert Run(f"{words} --sigma-px 10", capsys).code == 0
-
-
 def test_budget_is_the_papers_table_1(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = Run("budget --json", capsys)
     assert run.code == 0
@@ -303,17 +172,6 @@ def test_budget_is_the_papers_table_1(folder: Path, capsys: pytest.CaptureFixtur
     assert "202.17" in Run("budget", capsys).out
 
 
-def test_convert_names_the_lens_it_took_and_how_far_that_is_off(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    told = json.loads(Run("camera convert mast.yaml eye.ros.yaml --camera eye_left --json", capsys).out)
-    taken = told["cameras"]["eye_left"]
-    assert taken["lens"] == "plumb_bob" and taken["worst_px"] < 1e-9
-    lines = Run("camera convert mast.yaml again.ros.yaml --camera eye_left", capsys).out.splitlines()
-    assert lines[1].startswith("eye_left, plumb_bob: worst ") and lines[1].endswith(" px rms over the image")
-    assert "cameras" not in Run("camera convert mast.yaml eye.yaml --camera eye_left --json", capsys).json
-
-
 def test_convert_says_what_the_target_cannot_hold(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = Run("camera convert mast.yaml eye.cahvor --camera eye_left --json", capsys)
     assert run.code == 0
@@ -325,13 +183,6 @@ def test_convert_says_what_the_target_cannot_hold(folder: Path, capsys: pytest.C
     assert yaml.safe_load(Path("eye.yaml").read_text())["C"] == [0.0, -0.1, 0.0]
 
 
-def test_a_conversion_in_place_keeps_the_version_before(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert Run("camera convert camera.yaml camera.yaml", capsys).code == 0
-    assert Path("camera.previous.yaml").read_text() == CAMERA
-
-
 def test_a_mast_file_is_not_replaced_by_one_of_its_cameras(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -341,42 +192,20 @@ def test_a_mast_file_is_not_replaced_by_one_of_its_cameras(
 
 WRONG_USE = [
     "",
-    "slove",
-    "camera",
-    "camera paint",
-    "solve mast.yaml",
-    "solve mast.yaml --camera eye_left --target 1 2",
-    "solve mast.yaml --camera eye_left --target 1 2 x",
     "solve mast.yaml --camera eye_left --target 1 2 nan",
-    "solve mast.yaml --camera eye_left --target 1 2 -inf",
-    "solve mast.yaml --camera eye_left --target 1 2 1_0",
     "solve mast.yaml --camera eye_lift --target 1 2 3",
     "solve mast.yaml --camera body_left --target 1 2 3",
-    "solve mast.yaml --cam eye_left --target 1 2 3",
-    "solve camera.yaml --camera eye_left --target 1 2 3",
     "solve absent.yaml --camera eye_left --target 1 2 3",
-    "solve . --camera eye_left --target 1 2 3",
-    "camera project mast.yaml --points points.csv",
-    "camera project mast.yaml --camera eye_left --points points.csv",
     "camera project mast.yaml --camera eye_left --pan 0 --points points.csv",
-    "camera project camera.yaml --pan 0 --tilt 0 --points points.csv",
-    "camera project camera.yaml --camera eye_left --points points.csv",
     "camera project camera.yaml --points pixels.csv",
-    "camera project camera.yaml --points absent.csv",
-    "camera project points.csv --points points.csv",
-    "camera ray camera.yaml --pixels points.csv",
-    "camera convert mast.yaml out.yaml",
-    "camera convert camera.yaml out.json",
     "camera convert camera.yaml absent/out.yaml",
-    "triangulate mast.yaml --pair ear --pan 0 --tilt 0 --left 1 1 --right 1 1",
     "triangulate mast.yaml --pair eye --pan 0 --left 1 1 --right 1 1",
     "triangulate mast.yaml --pair eye --pan 0 --tilt 0 --left 1 1 --right 1 1 --sigma-px 0",
-    "budget now",
 ]
 
 
 @pytest.mark.parametrize("words", WRONG_USE)
-def test_wrong_use_and_bad_input_end_with_2_and_one_line_and_change_nothing(
+def test_wrong_use_and_bad_input_end_with_2_and_change_nothing(
     words: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
@@ -393,41 +222,6 @@ def test_wrong_use_and_bad_input_end_with_2_and_one_line_and_change_nothing(
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-@pytest.mark.parametrize(
-    ("words", "phrases"),
-    [
-        ("slove", ["'slove'", "'solve'"]),
-        ("solve mast.yaml --camera eye_lift --target 1 2 3", ["'eye_lift'", "'eye_left'", "mast.yaml"]),
-        ("solve mast.yaml --camera eye_left --target 1 2 nan", ["'nan'", "finite"]),
-        ("camera project camera.yaml --points pixels.csv", ["pixels.csv", "x_px,y_px", "x_m,y_m,z_m"]),
-        ("camera project mast.yaml --camera eye_left --pan 0 --points points.csv", ["--tilt"]),
-        ("solve absent.yaml --camera eye_left --target 1 2 3", ["absent.yaml", "No such file"]),
-    ],
-)
-def test_a_refusal_names_what_is_wrong_and_what_would_be_right(
-    words: str, phrases: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    error = Run(words, capsys).err
-    assert all(phrase in error for phrase in phrases), error
-
-
-def test_control_characters_of_a_file_do_not_reach_the_terminal(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    Path("evil.csv").write_bytes(b"\x1b[31mx\x07,y\r\n")
-    run = Run("camera project camera.yaml --points evil.csv", capsys)
-    assert run.code == 2
-    assert run.err.strip().isprintable()
-
-
-def test_notes_go_to_stderr_and_stdout_stays_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    Path("long.yaml").write_text(MAST.replace("A: [1, 0, 0]", "A: [1.001, 0, 0]"))
-    run = Run("solve long.yaml --camera eye_left --target 5 2 -3 --json", capsys)
-    assert run.code == 0
-    assert json.loads(run.out)["solutions"]
-    assert "cameras.eye_left: |A| = 1.001" in run.err
-
-
 def test_a_defect_is_told_in_one_line(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -439,21 +233,6 @@ def test_a_defect_is_told_in_one_line(
     assert (run.code, json.loads(run.out)["error"]["code"]) == (1, "internal")
 
 
-def test_every_command_helps(capsys: pytest.CaptureFixture[str]) -> None:
-    for words in ("--help", "camera --help", "camera project --help", "solve --help", "budget --help"):
-        run = Run(words, capsys)
-        assert run.code == 0
-        assert run.out.startswith("usage: mastctl")
-    assert all(command in Run("--help", capsys).out for names in MODULES.values() for command in names)
-    assert Run("--version", capsys).out.startswith("mastctl ")
-
-
-def _process(folder: Path, *words: str, **options: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "mastctl", *words], cwd=folder, capture_output=True, text=True, **options
-    )
-
-
 def test_a_geometry_command_does_not_load_what_it_does_not_need(folder: Path) -> None:
     script = (
         "import sys; from mastctl.cli.main import main\n"
@@ -462,17 +241,6 @@ def test_a_geometry_command_does_not_load_what_it_does_not_need(folder: Path) ->
         "sys.exit(f'loaded {slow}' if slow else code)"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-def test_the_whole_help_loads_nothing_that_is_slow() -> None:
-    script = (
-        "import sys; from mastctl.cli.main import build_parser\n"
-        "build_parser([])\n"
-        "slow = {'numpy', 'yaml', 'cv2', 'numba', 'fastapi', 'httpx', 'rich', 'scipy'} & set(sys.modules)\n"
-        "sys.exit(f'loaded {slow}' if slow else 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
@@ -514,18 +282,6 @@ def test_a_full_disk_is_a_failure_in_one_line(folder: Path) -> None:
     assert done.stderr.splitlines() == ["mastctl: No space left on device"]
 
 
-def test_closed_streams_are_no_reason_to_fail(folder: Path) -> None:
-    shell = '"$0" -m mastctl budget >&- && "$0" -m mastctl solve 2>&-; test $? = 2'
-    done = subprocess.run(["sh", "-c", shell, sys.executable], capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-
-
-def test_the_module_runs_as_the_command_does(folder: Path) -> None:
-    done = _process(folder, "budget", "--json")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert len(json.loads(done.stdout)["cameras"]) == 3
-
-
 def test_maps_are_written_for_a_camera_and_for_a_pair(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -539,9 +295,3 @@ def test_maps_are_written_for_a_camera_and_for_a_pair(
     run = Run("camera maps mast.yaml --pair eye --out pair.npz", capsys)
     assert run.code == 0
     assert {"left_map_x", "right_map_y", "Q", "left_K"} <= set(np.load("pair.npz"))
-
-
-@pytest.mark.parametrize("words", ["--camera eye_left --out a.txt", "--pair yes --out a.npz", "--out a.npz"])
-def test_maps_of_nothing_are_refused(words: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert Run(f"camera maps mast.yaml {words}", capsys).code == 2
-    assert not Path("a.npz").exists()

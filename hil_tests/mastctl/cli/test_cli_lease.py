@@ -56,19 +56,3 @@ def test_taking_over_needs_a_reason(run: Run, daemon: RunningDaemon) -> None:
         code, lease, _ = run("lease", "take", "--reason", "the bench is empty")
         assert code == 0
         assert run("point", *ANGLES, "--lease", lease)[0] == 0
-
-
-def test_commands_of_one_person_are_one_party(run: Run, daemon: RunningDaemon) -> None:
-    started = json.loads(run("point", *ANGLES, "--no-wait", "--json")[1])["id"]
-    with Client(daemon.url) as client:
-        client.wait(started)
-    assert run("point", *ANGLES)[0] == 0
-    assert "@" in daemon.service.leases._party  # type: ignore[operator]
-
-
-@pytest.mark.parametrize("act", ["renew", "release"])
-def test_without_its_id_nothing_becomes_of_a_lease(run: Run, act: str) -> None:
-    code, out, _ = run("lease", act, "--json")
-    assert (code, "--lease is missing" in json.loads(out)["error"]["message"]) == (2, True)
-    code, out, _ = run("lease", act, "--lease", "ä\n", "--json")
-    assert (code, json.loads(out)["error"]["code"]) == (1, "lease_unknown")

@@ -72,30 +72,6 @@ def test_the_mast_file_is_shown_replaced_and_put_back(
     assert main(["mast", "use", "none.yaml", *url]) == 2
 
 
-def test_faults_of_what_is_not_simulated_are_refused(pair: BOTH, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fault", "list", "--url", pair[0].url]) == 2
-    assert "simulated rover only" in capsys.readouterr().err
-    assert main(["fault", "set", "navcam_left", "noise", "sigma", "--url", pair[0].url]) == 2
-    assert "'sigma' where NAME=VALUE" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("before", [["--url", "{}"], ["--url={}"], ["--json", "--url", "{}"]])
-def test_the_address_may_stand_before_the_command(
-    pair: BOTH, capsys: pytest.CaptureFixture[str], before: list[str]
-) -> None:
-    words = [word.format(pair[0].url) for word in before]
-    assert "control" in said(capsys, *words, "lease", "show", "--json")
-    assert main([*words, "status", "--url", "http://127.0.0.1:1"]) == 2
-    assert "--url is there twice" in capsys.readouterr().err + capsys.readouterr().out or "--json" in words
-
-
-def test_the_environment_names_the_daemon(
-    pair: BOTH, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("MASTCTL_URL", pair[0].url)
-    assert json.loads(said(capsys, "mast", "show", "--json"))["mast"]["file"] == "little.yaml"
-
-
 def leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
     inner: list[Any] = [one for one in parser._actions if isinstance(one, argparse._SubParsersAction)]
     if not inner:

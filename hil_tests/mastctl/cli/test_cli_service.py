@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +14,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import NoReply
-from hil_tests.mastctl.service_fakes import FakeHardware, FakePointing, FakeResult, ScriptedLoop
+from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop
 from hil_tests.waiting import NET_S
 from mastctl.cli.main import main
 from mastctl.daemon import RunningDaemon
@@ -70,9 +67,9 @@ def test_status_for_programs_and_for_people(run: Run, pair: BOTH) -> None:
 def test_status_waits_for_a_daemon_that_carries_out_commands(run: Run, pair: BOTH) -> None:
     assert document(run("status", "--wait", "60", "--json"))["state"] == "ready"
     assert run("estop", "--name", "Ana", "--reason", "sparks")[0] == 0
-    code, _, told = run("status", "--wait", "0.2")
-    assert code == 1
-    assert "not ready after 0.2 s: the daemon is stopped" in told and "sparks" in told
+    code, _, told = run("status", "--wait", "60")
+    assert code == 1 and "not ready after" not in told, "it does not wait for what no waiting ends"
+    assert "the daemon is stopped" in told and "sparks" in told and "mastctl reset" in told
 
 
 def test_status_waits_for_a_daemon_that_is_not_there_yet(capsys: pytest.CaptureFixture[str]) -> None:
@@ -81,39 +78,6 @@ def test_status_waits_for_a_daemon_that_is_not_there_yet(capsys: pytest.CaptureF
     error = json.loads(capsys.readouterr().out)["error"]
     assert error["code"] == "not_ready" and "no daemon answers" in error["message"]
     assert main(["status", "--wait", "9", "--url", "mars"]) == 2, "what no waiting mends is told at once"
-
-
-def test_the_wait_for_a_daemon_that_hangs_ends_with_its_time(capsys: pytest.CaptureFixture[str]) -> None:
-    ended, ready = threading.Event(), b'{"state": "ready", "mast": {}}'
-
-    def hang(listener: socket.socket) -> None:
-        line, _ = listener.accept()
-        with line:
-            line.recv(65536)
-            ended.wait(NET_S / 3)  # less than the usual patience with one request
-            with suppress(OSError):
-                line.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%s" % (len(ready), ready))
-
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        thread = threading.Thread(target=hang, args=(listener,))
-        thread.start()
-        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
-        code = main(["status", "--wait", "0.2", "--json", "--url", url])
-        ended.set()
-        thread.join(NET_S)
-    error = json.loads(capsys.readouterr().out)["error"]
-    assert code == 1 and error["code"] == "not_ready"
-    assert "not ready after 0.2 s" in error["message"] and "did not answer" in error["message"]
-
-
-def test_status_tells_faults(run: Run, pair: BOTH) -> None:
-    def fail(name: str) -> None:
-        raise NoReply("no answer on the bus", device="pan_tilt")
-
-    pair[1].head.hook = fail
-    with pytest.raises(NoReply):
-        pair[0].service.devices.read()
-    assert "fault: pan_tilt: no answer on the bus" in run("status")[1]
 
 
 def test_point_in_each_of_its_forms(
@@ -154,26 +118,6 @@ def test_point_in_each_of_its_forms(
     assert requests["angles"] == {"pan_rad": 0.5, "tilt_rad": -0.25, "pointings": 1}
 
 
-def test_point_shows_a_person_steps_and_residual(run: Run) -> None:
-    code, out, log = run("point", "--angles", "0.1", "0.1")
-    assert code == 0
-    assert "✓ look" in log
-    assert "+0.250 ± 0.050" in out
-    assert "-0.500 ± 0.060" in out
-    assert "pointing 1: looked at in frame navcam_left-000001-x-y\n" in out
-
-
-def test_point_shows_a_person_why_there_is_no_residual(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    blind = FakeResult(None, None, (FakePointing(None, None, "", note="no picture was taken"),))
-    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(lambda *any: blind))
-    assert "pointing 1: no picture was taken\n" in run("point", "--angles", "0.1", "0.1")[1]
-
-
-def test_point_without_waiting_tells_the_id(run: Run) -> None:
-    first = document(run("point", "--angles", "0.1", "0.1", "--no-wait", "--json"))["id"]
-    assert first.startswith("000001-")
-
-
 def test_a_failed_operation_ends_with_1_and_its_reason(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*ignored: Any) -> None:
         raise NoReply("the head does not answer", device="pan_tilt")
@@ -192,25 +136,9 @@ def test_a_failed_operation_ends_with_1_and_its_reason(run: Run, monkeypatch: py
     [
         (("point", "--angles", "0", "1.5"), "outside_limits"),
         (("point", "--angles", "0", "nan"), "wrong_use"),
-        (("point", "--angles", "0"), "wrong_use"),
-        (("point",), "wrong_use"),
-        (("point", "--angles", "0", "0", "--position", "1", "2", "3"), "wrong_use"),
-        (("point", "--camera", "navcam_left"), "wrong_use"),
-        (("point", "--angles", "0", "0", "--at", "1", "2"), "wrong_use"),
-        (("point", "--angles", "0", "0", "--frame", "rover"), "wrong_use"),
-        (("point", "--angles", "0", "0", "--pointings", "3"), "wrong_use"),
-        (("point", "--pixel", "navcam_left", "f", "x", "2"), "wrong_use"),
         (("point", "--pixel", "navcam_left", "f", "1", "2"), "frame_unknown"),
-        (("point", "--position", "1", "2", "3", "--aim", "navcam_left", "1", "inf"), "wrong_use"),
-        (("point", "--position", "1", "2", "3", "--aim", "hazcam_left", "1", "1"), "bad_aim"),
-        (("point", "--camera", "mastcam", "--at", "1", "2"), "unknown_camera"),
-        (("snapshot", "mastcam", "--out", "x.png"), "unknown_camera"),
-        (("snapshot", "navcam_left", "--out", "x.gif"), "wrong_use"),
-        (("snapshot", "navcam_left"), "wrong_use"),
         (("snapshot", "navcam_left", "--out", "no/such/folder/x.png"), "file_system"),
-        (("snapshot", "navcam_left", "--out", "x.png", "--frame-id", "?"), "frame_unknown"),
         (("status", "--config", "nowhere.yaml", "--url", "mars"), "bad_url"),
-        (("experiment", "pointing", "--targets", "1", "--out", "/proc/x"), "file_system"),
     ],
 )
 def test_wrong_use_and_bad_input_end_with_2(
@@ -235,8 +163,10 @@ def test_wrong_use_and_bad_input_end_with_2(
 
 
 def test_stop_tells_what_it_stopped(run: Run, pair: BOTH) -> None:
-    assert document(run("stop", "--json")) == {"stopped": True, "operation": None}
-    assert run("stop")[:2] == (0, "stopped\n")
+    told = document(run("stop", "--json"))
+    reached = told.pop("reached")
+    assert told == {"stopped": True, "operation": None}
+    assert run("stop")[:2] == (0, f"stopped at {reached}\n")
     assert pair[1].head.calls == [("stop",), ("stop",)]
 
 
@@ -250,17 +180,6 @@ def test_a_snapshot_becomes_a_file(run: Run, pair: BOTH, tmp_path: Path) -> None
     jpeg = tmp_path / "left.jpg"
     assert run("snapshot", "navcam_left", "--out", str(jpeg), "--frame-id", shot["frame_id"])[0] == 0
     assert jpeg.read_bytes()[:3] == b"\xff\xd8\xff"
-
-
-def test_no_daemon_is_one_line_and_1(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    url = f"unix:{tmp_path}/none.sock"
-    for words in (
-        ("status",),
-        ("point", "--angles", "0", "0"),
-        ("snapshot", "a", "--out", "a.png"),
-    ):
-        assert main([*words, "--url", url]) == 1
-        assert capsys.readouterr().err == f"mastctl: no daemon answers at {url}; 'mastctl run' starts one\n"
 
 
 @pytest.mark.parametrize("word", ["stop", "estop"])
@@ -291,18 +210,6 @@ def test_the_address_comes_from_the_configuration(
     assert capsys.readouterr().err.startswith(
         f"mastctl: {config}: limit: unknown key; the nearest known is 'limits'"
     )
-
-
-def test_run_refuses_a_bad_configuration_in_one_line(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    config = tmp_path / "daemon.yaml"
-    config.write_text("schema: mastctl/config/1\nmast_file: [\n")
-    assert main(["run", "--config", str(config)]) == 2
-    out, log = capsys.readouterr()
-    assert out == ""
-    assert log.startswith(f"mastctl: {config}: line ")
-    assert log.count("\n") == 1
 
 
 ENCODES = """

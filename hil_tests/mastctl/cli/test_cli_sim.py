@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import socket
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -93,33 +91,6 @@ def test_servos_of_two_models_answer_the_plain_sdk(repository: Path) -> None:
         assert running.end(signal.SIGTERM)[:2] == (0, "")
 
 
-def test_feetech_servos_behind_an_echoing_adapter_are_found_by_the_scan(
-    repository: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with sim(repository, "feetech", "--pty", "--echo", "--json") as running:
-        facts = json.loads(running.first)
-        words = ["servo", "scan", facts["port"], "--family", "feetech", "--baud", "1000000", "--json"]
-        assert main(words) == 0
-        found = json.loads(capsys.readouterr().out)["servos"]
-        assert [(one["id"], one["model"]) for one in found] == [(1, "STS3215"), (2, "STS3215")]
-        assert running.end(signal.SIGTERM)[:2] == (0, "")
-
-
-def test_a_ptu_behind_tcp_greets_as_an_e_series_unit_does(repository: Path) -> None:
-    with sim(repository, "ptu", "--tcp", "0", "--model", "d48e") as running:
-        assert running.first.startswith("socket://127.0.0.1:")
-        with socket.create_connection(("127.0.0.1", int(running.first.rpartition(":")[2])), NET_S) as host:
-            heard = b""
-            while not heard.endswith(b"unit\r\n"):
-                heard += host.recv(1000)
-            host.sendall(b"TR ")
-            heard = b""
-            while not heard.endswith(b"position\r\n"):
-                heard += host.recv(1000)
-            assert heard == b"\n* 23.142857 seconds arc per position\r\n"
-        assert running.end(signal.SIGTERM)[0] == 0
-
-
 def test_faults_come_from_a_script_and_live(repository: Path, tmp_path: Path) -> None:
     script = tmp_path / "script.yaml"
     script.write_text("faults: [{device: pan_tilt, word: wrong, offset_rad: -0.1, axis: 1}]\n")
@@ -136,38 +107,13 @@ def test_faults_come_from_a_script_and_live(repository: Path, tmp_path: Path) ->
         assert ask(running.first, b"TP ") == b"TP * Current Tilt position is 0\r\n"
 
 
-def test_the_end_of_standard_input_ends_it_only_when_asked_to(repository: Path) -> None:
-    with sim(repository, "ptu", "--pty", "--until-eof") as running:
-        assert running.process.communicate(timeout=NET_S)[0] == b""
-        assert running.process.returncode == 0
-    with sim(repository, "ptu", "--pty") as running:
-        assert running.process.stdin is not None
-        running.process.stdin.close()
-        running.process.stdin = None
-        assert ask(running.first, b"PP ").startswith(b"PP *")
-        assert running.end(signal.SIGTERM)[0] == 0
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["ptu"], "one of the arguments --pty --tcp is required"),
-        (["dynamixel", "--tcp", "0"], "--pty"),
         (["ptu", "--pty", "--model", "d48"], "did you mean 'd48e'?"),
-        (["ptu", "--pty", "--step-mode", "X"], "step mode 'X'"),
-        (["ptu", "--pty", "--baud", "1234"], "no baud rate 1234"),
         (["ptu", "--tcp", "x"], "--tcp is 'x', expected [HOST:]PORT"),
-        (["ptu", "--tcp", "70000"], "a port from 0 to 65535"),
-        (["ptu", "--tcp", "0", "--link", "x"], "--link goes with --pty"),
-        (["ptu", "--pty", "--link", "/nowhere/tty"], "cannot be made"),
         (["ptu", "--pty", "--faults", "nowhere.yaml"], "nowhere.yaml"),
         (["dynamixel", "--pty", "--servo", "xm430_w350"], "expected MODEL:ID"),
-        (["dynamixel", "--pty", "--servo", "xm430_w350:253"], "an id from 0 to 252"),
-        (["dynamixel", "--pty", "--servo", "xm43_w350:1"], "did you mean 'xm430_w350'?"),
-        (["dynamixel", "--pty", "--baud", "1234"], "--baud is 1234, expected one of"),
-        (["dynamixel", "--pty", "--return-delay", "255"], "expected 0 to 254"),
-        (["feetech", "--pty", "--model", "sts3251"], "did you mean 'sts3250'?"),
-        (["feetech", "--pty", "--baud", "9600"], "--baud is 9600, expected one of 1000000"),
     ],
 )
 def test_wrong_use_is_one_line_and_exit_code_2(
@@ -182,13 +128,3 @@ def test_wrong_use_is_one_line_and_exit_code_2(
     assert message in json.loads(capsys.readouterr().out)["error"]["message"]
     assert held() <= before
     assert signal.getsignal(signal.SIGTERM) == handler
-
-
-def test_no_line_is_left_of_one_that_was_killed_but_its_link(repository: Path, tmp_path: Path) -> None:
-    link = tmp_path / "ptu"
-    with sim(repository, "ptu", "--pty", "--link", str(link)) as running:
-        os.kill(running.process.pid, signal.SIGKILL)
-        running.process.wait()
-    assert link.is_symlink()
-    with sim(repository, "ptu", "--pty", "--link", str(link)) as running:
-        assert ask(running.first, b"PP ").startswith(b"PP *")

@@ -1,36 +1,102 @@
-"""The commands of tokens: one is shown once, the list shows none, and wrong use is one line."""
+"""The commands of tokens: one is shown once, the list shows none, and they go where the daemon reads them."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from hil_tests.mastctl.service_fakes import CONFIG, little_mast_file
+from hil_tests.mastctl.web.network import Network, network_daemon
+from hil_tests.waiting import until
 from mastctl.cli.main import main
+from mastctl.client import Client, ClientError
 from mastctl.http.tokens import TokenList
 
 
-def test_a_token_is_made_listed_and_revoked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    there = ["--state", str(tmp_path)]
+@pytest.fixture
+def net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network]:
+    """A daemon that requires tokens and keeps its state where its unit says, as systemd has it."""
+    monkeypatch.delenv("MASTCTL_TOKEN", raising=False)
+    with network_daemon(monkeypatch, tmp_path) as made:
+        monkeypatch.setenv("MASTCTL_URL", made.url)
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "user"))
+        yield made
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Path:
+    """The state folder of a daemon that has run and has ended."""
+    TokenList(tmp_path).first_run()
+    return tmp_path
+
+
+def test_a_token_is_made_where_the_running_daemon_reads_it(
+    net: Network, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["token", "new", "--name", "wall", "--role", "view"]) == 0
+    token = capsys.readouterr().out.strip()
+    assert "wall" in [one.name for one in net.tokens.read() or ()]
+    assert not (tmp_path / "user").exists()
+    assert main(["token", "list", "--json"]) == 0
+    assert "wall" in [one["name"] for one in json.loads(capsys.readouterr().out)["tokens"]]
+    with Client(net.url, token=token) as client:
+        until(lambda: admitted(client), "the daemon to know the token")
+
+
+def admitted(client: Client) -> bool:
+    try:
+        return client.session()["role"] == "view"
+    except ClientError:
+        return False
+
+
+def test_a_configuration_of_no_running_daemon_makes_no_token(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("MASTCTL_URL", raising=False)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "user"))
+    config = tmp_path / "rover.yaml"
+    (tmp_path / "little.yaml").write_bytes(little_mast_file())
+    config.write_text(CONFIG.format(listen="{port: 1, hosts: [rover.test]}"))
+    for words in (["new", "--name", "wall", "--role", "view"], ["list"], ["revoke", "wall"]):
+        assert main(["token", *words, "--config", str(config)]) != 0
+        said = capsys.readouterr().err
+        assert "no daemon answers at http://127.0.0.1:1" in said and "--state FOLDER" in said
+    assert not (tmp_path / "user").exists()
+
+
+def test_a_token_is_made_listed_and_revoked_in_a_folder_that_a_daemon_kept(
+    kept: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there = ["--state", str(kept)]
     assert main(["token", "new", "--name", "wall", "--role", "view", *there]) == 0
     text = capsys.readouterr().out.strip()
     assert len(text) == 43
     assert main(["token", "list", "--json", *there]) == 0
     shown = capsys.readouterr().out
-    assert [one["name"] for one in json.loads(shown)["tokens"]] == ["wall"]
-    held = TokenList(tmp_path).read()
-    assert held is not None and text not in shown and held[0].sha256 not in shown
+    assert "wall" in [one["name"] for one in json.loads(shown)["tokens"]]
+    listed = TokenList(kept).read()
+    assert listed is not None and text not in shown and listed[-1].sha256 not in shown
     assert main(["token", "revoke", "wall", *there]) == 0
-    assert TokenList(tmp_path).read() == ()
+    assert [one.name for one in TokenList(kept).read() or ()] == ["view", "operate", "admin"]
 
 
-def test_what_cannot_be_is_one_line_and_the_code_of_wrong_use(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_folder_that_no_daemon_kept_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["new", "--name", "wall", "--role", "view"], ["list"], ["revoke", "wall"]):
+        for folder in (tmp_path, tmp_path / "nowhere"):
+            assert main(["token", *words, "--state", str(folder)]) == 2
+            assert f"{folder}: no daemon has kept its state here" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_command_without_its_token_is_referred_to_the_variable(
+    net: Network, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert main(["token", "revoke", "nobody", "--state", str(tmp_path)]) == 2
-    assert "there is no token 'nobody'" in capsys.readouterr().err
-    assert main(["token", "list", "--state", str(tmp_path / "nowhere"), "--json"]) == 0
-    assert main(["token", "new", "--name", "a", "--role", "root", "--state", str(tmp_path)]) == 2
-    assert main(["run", "--listen", "8420"]) == 2
-    assert "HOST:PORT" in capsys.readouterr().err
+    for token in ("", "wrong"):
+        monkeypatch.setenv("MASTCTL_TOKEN", token)
+        assert main(["status"]) == 1
+        said = capsys.readouterr().err
+        assert "MASTCTL_TOKEN" in said and net.url in said and "Bearer" not in said

@@ -19,7 +19,7 @@ from calib.files.mast_file import save_rig
 from drivers.clock import SystemClock
 from drivers.errors import NoFreshFrame, NoReply
 from drivers.faults import FaultPanel
-from drivers.interfaces import CameraSetting, Frame
+from drivers.interfaces import Camera, CameraInfo, CameraSetting, Frame
 from drivers.sim.axis import AxisSettings
 from drivers.sim.heads import HeadSettings
 from drivers.sim.pan_tilt import SimulatedPanTilt
@@ -43,7 +43,7 @@ def open_head(low_rad: float = -2.0, high_rad: float = 2.0, name: str = "") -> S
     return SimulatedPanTilt(HeadSettings("in memory", axis, axis), clock, FaultPanel(clock.now_s, ()))
 
 
-class NoiseCamera:
+class NoiseCamera(Camera):
     """A free-running camera of 50 Hz that sees noise, and gives the first frame after the moment asked for.
 
     It has a gain in steps of 4, and a focus.
@@ -52,15 +52,14 @@ class NoiseCamera:
     however late on a busy machine the second one is asked.
     """
 
-    period_s, trigger = PERIOD_S, ""
-
     def __init__(self, seed: int = 0) -> None:
         self._seed = seed
         self.gain = 8.0
         self._closed = threading.Event()
 
-    def recent_times(self) -> list[object]:
-        return []
+    @property
+    def info(self) -> CameraInfo:
+        return CameraInfo(period_s=PERIOD_S)
 
     def settings(self) -> list[CameraSetting]:
         focus = CameraSetting("focus", 30.0, 0.0, 250.0)

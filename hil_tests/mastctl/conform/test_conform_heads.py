@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import threading
@@ -16,7 +15,7 @@ import pytest
 
 from drivers.errors import DriverError, NoReply
 from drivers.interfaces import Reading
-from hil_tests.mastctl.conform.conform_world import HERE, configuration, open_head
+from hil_tests.mastctl.conform.conform_world import HERE, open_head
 from mastctl.cli.main import main
 from mastctl.conform.checks import run_checks
 from mastctl.conform.devices import check_head
@@ -85,12 +84,6 @@ def clipped(head: Right, pan: float, tilt: float, speed: float | None) -> Any:
 def numbers_only(head: Right, pan: float, tilt: float, speed: float | None) -> Any:
     """Takes what is no number for nothing to do."""
     return (pan, tilt, speed) if all(map(math.isfinite, (pan, tilt, speed or 1.0))) else None
-
-
-def wrong_error(head: Right, pan: float, tilt: float, speed: float | None) -> Any:
-    if not all(map(math.isfinite, (pan, tilt))):
-        raise ValueError("no number")
-    return pan, tilt, speed
 
 
 class Queues(Right):
@@ -184,13 +177,10 @@ class StaysOpen(Right):
         self.right.stop()
 
 
-stamps = itertools.count()
 BROKEN: list[tuple[str, str, type[Right]]] = [
-    ("not a number", "head.reading", reads(lambda head, r: replace(r, pan_rad=math.nan))),
     ("degrees", "head.reading", reads(lambda head, r: replace(r, tilt_rad=r.tilt_rad + 90.0))),
     ("an old stamp", "head.reading", reads(lambda head, r: replace(r, time_s=r.time_s - 0.5))),
     ("another clock", "head.reading", reads(lambda head, r: replace(r, time_s=time.time()))),
-    ("moving by a word", "head.reading", reads(lambda head, r: replace(r, moving="no"))),
     ("one fault as a text", "head.reading", reads(lambda head, r: replace(r, faults="hot"))),
     ("a fault", "head.reading", reads(lambda head, r: replace(r, faults=["pan is hot"]))),
     ("no reading", "head.reading", reads(lambda head, r: None)),
@@ -209,7 +199,6 @@ BROKEN: list[tuple[str, str, type[Right]]] = [
     ("full speed", "head.speed", moves(lambda head, p, t, s: (p, t, 1.5))),
     ("goals bent to the limits", "head.limits", moves(clipped)),
     ("goals of no number taken", "head.not_a_number", moves(numbers_only)),
-    ("an error of Python", "head.not_a_number", moves(wrong_error)),
     ("slow answers", "head.deadlines", Slow),
     ("close once only", "head.close", ClosesOnce),
     ("open for ever", "head.close", StaysOpen),
@@ -225,6 +214,15 @@ def test_a_broken_head_is_found_by_the_check_meant_for_it(name: str, kind: type[
     checks = [check for check in HEADS.checks if check.name == name]
     (outcome,) = run_checks(checks, trial(kind()), motion=True)
     assert outcome.state == "failed" and "\n" not in outcome.message, outcome
+
+
+def test_a_move_that_a_busy_machine_delays_is_no_fault_of_the_driver() -> None:
+    delayed = iter([False, False, False, True, False])  # the first three ways are too short to tell
+    kind = moves(lambda head, p, t, s: waits(head, p, t, s) if next(delayed) else (p, t, s))
+    (outcome,) = run_checks(
+        [check for check in HEADS.checks if check.name == "head.move"], trial(kind()), motion=True
+    )
+    assert outcome.state == "passed", outcome
 
 
 def test_a_right_head_keeps_every_promise() -> None:
@@ -255,7 +253,7 @@ def test_a_head_that_hangs_ends_the_checks_and_is_told(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("answer", [RuntimeError("no"), NoReply("no"), None])
-def test_a_head_that_tells_nothing_true_from_the_start_fails_and_is_never_moved(
+def test_a_head_that_reads_nothing_true_at_the_start_is_never_moved(
     answer: Exception | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sent: list[Any] = []
@@ -314,11 +312,3 @@ def test_the_command_checks_a_driver_by_its_name(capsys: pytest.CaptureFixture[s
     ):
         assert main(wrong) == 2
         assert json.loads(capsys.readouterr().out)["error"]["code"] == code
-
-
-def test_a_head_of_a_configuration_is_no_faster_than_its_limits(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    words = ["conform", "--config", str(configuration(tmp_path)), "--head", "--motion", "--json"]
-    assert main([*words, "--speed", "3", "--only", "head.speed"]) == 0
-    assert "asked 0.250" in json.loads(capsys.readouterr().out)["checks"][0]["message"]  # half of the limit

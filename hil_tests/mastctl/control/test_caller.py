@@ -26,6 +26,7 @@ def test_who_tells_no_name_is_anonymous() -> None:
     assert {told_name(header) for header in (None, "", "  ", "\t")} == {ANONYMOUS}
 
 
+@example("a" * 500)
 @example("\u00c2\u00a1\x80")  # UTF-8 but for its last sign
 @given(st.text())
 def test_any_header_makes_a_name_of_one_printable_line(header: str) -> None:

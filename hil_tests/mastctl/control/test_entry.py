@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,11 @@ import pytest
 
 from drivers.clock import ManualClock
 from drivers.errors import NoReply
-from hil_tests.waiting import NET_S, joined
+from hil_tests.waiting import NET_S
 from mastctl.control.audit import AuditLog
 from mastctl.control.caller import Caller
 from mastctl.control.entry import ESTOP, JOG, POINT, POSE, STOP, Command, CommandEntry, CommandRequest
-from mastctl.control.idempotency import Answer, Answers
+from mastctl.control.idempotency import Answers
 from mastctl.control.lease import LeaseTable
 from mastctl.control.publisher import Publisher
 from mastctl.errors import MastctlError, NotNow
@@ -33,7 +32,7 @@ class World:
         self.runs = False
         self.leases = LeaseTable(self.clock, lambda: self.runs)
         self.path = path
-        small = {} if strangers is None else {"file_bytes": 50_000, "files": 2}
+        small: dict[str, Any] = {} if strangers is None else {"file_bytes": 50_000, "files": 2}
         self.audit = AuditLog(path, **small)
         self.strangers = AuditLog(strangers, **small)
         self.deadlines: list[tuple[str, float, float]] = []
@@ -69,7 +68,7 @@ class World:
     def asked(self, caller: Caller = BENCH, **others: Any) -> CommandRequest:
         return CommandRequest(caller, self.clock.now_s(), **others)
 
-    def act(self) -> Answer:
+    def act(self) -> dict[str, Any]:
         self.acts += 1
         return {"id": f"00000{self.acts}-abcd"}
 
@@ -92,19 +91,7 @@ def refused(code: str, act: Callable[[], object]) -> str:
     return str(refusal.value)
 
 
-def test_a_request_that_is_no_json_is_recorded_and_published_with_text_in_its_place(world: World) -> None:
-    deep: list[Any] = []
-    for _ in range(5000):
-        deep = [deep]
-    for request in ({"range_m": float("inf")}, {"range_m": [float("nan"), -float("inf")]}, {"deep": deep}):
-        world.entry.run(POSE, world.asked(request=request), dict)
-    recorded = [line["request"] for line in world.lines()]
-    assert recorded[:2] == [{"range_m": "inf"}, {"range_m": ["nan", "-inf"]}]
-    assert isinstance(recorded[2], str)
-    assert [one.value["request"] for one in world.published] == recorded
-
-
-def test_a_record_says_who_under_which_lease_what_when_and_with_which_result(world: World) -> None:
+def test_a_record_has_caller_lease_request_time_and_result(world: World) -> None:
     lease = world.leases.acquire(BENCH)
     request = {"pan_rad": 0.1, "tilt_rad": 0.2}
     world.entry.run(POINT, world.asked(request=request, lease=lease.id, key="k"), world.act)
@@ -129,8 +116,8 @@ def test_an_operations_end_is_a_line_of_its_own(world: World) -> None:
     assert len(world.lines()) == 2
 
 
-def test_an_operation_that_ends_before_its_command_is_recorded_has_both_lines_in_order(world: World) -> None:
-    def act() -> Answer:
+def test_an_early_end_of_an_operation_is_recorded_after_its_command(world: World) -> None:
+    def act() -> dict[str, Any]:
         world.entry.ended("000001-abcd", "done", None)
         return world.act()
 
@@ -140,7 +127,7 @@ def test_an_operation_that_ends_before_its_command_is_recorded_has_both_lines_in
 
 @pytest.mark.parametrize("error", [NoReply("no answer"), ZeroDivisionError("secret")])
 def test_what_fails_is_recorded_with_its_code_and_raised(world: World, error: Exception) -> None:
-    def act() -> Answer:
+    def act() -> dict[str, Any]:
         raise error
 
     with pytest.raises(type(error)):
@@ -172,11 +159,11 @@ def test_a_stop_asks_for_nothing_acts_and_is_recorded_after(world: World) -> Non
     world.refuses = "stopped"
     told: list[int] = []
 
-    def act() -> Answer:
+    def act() -> dict[str, Any]:
         told.append(len(world.published))
         return {"stopped": True, "operation": "000001-abcd"}
 
-    locks = [world.leases._lock, world.entry._matching, world.entry._answers._changed]
+    locks: list[Any] = [world.leases._lock, world.entry._matching, world.entry._answers._changed]
     for lock in locks:
         lock.__enter__()  # whoever holds them holds no stop
     try:
@@ -209,41 +196,15 @@ def test_a_command_sent_twice_acts_once_and_both_are_recorded(world: World) -> N
 def test_an_answer_is_given_again_after_the_lease_under_which_it_was_made(world: World) -> None:
     lease = world.leases.acquire(BENCH, for_s=5.0)
     asked = world.asked(key="k", lease=lease.id)
-    answer = world.entry.run(POINT, asked, world.act)
+    answer: dict[str, Any] = world.entry.run(POINT, asked, world.act)
     world.clock.advance(6.0)
     world.leases.acquire(ROVER)
     assert world.entry.run(POINT, asked, world.act) == answer
     assert world.acts == 1
 
 
-def test_a_replay_while_the_first_is_at_work_under_a_lease_waits_for_it_and_holds_no_lock(
-    world: World,
-) -> None:
-    inside, go = threading.Event(), threading.Event()
-
-    def slow() -> Answer:
-        inside.set()
-        assert go.wait(NET_S)
-        return world.act()
-
-    asked, got = world.asked(key="k"), list[Answer]()
-    threads = [
-        threading.Thread(target=lambda: got.append(world.entry.run(POINT, asked, slow))) for _ in range(3)
-    ]
-    threads[0].start()
-    assert inside.wait(NET_S)
-    for thread in threads[1:]:
-        thread.start()
-    assert world.leases.control() is not None
-    refused("leased", lambda: world.leases.acquire(ROVER))
-    world.entry.first(STOP, world.asked(ROVER), lambda: {"stopped": True})
-    go.set()
-    joined(*threads)
-    assert got == [{"id": "000001-abcd"}] * 3
-
-
 def test_an_operation_is_given_what_is_left_of_its_time(world: World) -> None:
-    def slow() -> Answer:
+    def slow() -> dict[str, Any]:
         world.clock.advance(2.0)
         return world.act()
 
@@ -266,48 +227,30 @@ def test_what_does_not_steer_is_let_through_whoever_steers(world: World) -> None
     assert world.acts == 2
 
 
-def test_the_record_of_who_began_what_is_bounded(world: World) -> None:
-    for _ in range(300):
-        world.entry.run(POINT, world.asked(), world.act)
-    for number in range(300):
-        world.entry.ended(f"x{number}", "done", None)
-    assert len(world.entry._began) == 256
-    assert len(world.entry._ended) == 256
-
-
-def test_the_newest_256_records_stay_to_be_heard_of_whenever_what_they_began_ended(world: World) -> None:
-    world.entry.run(POINT, world.asked(), world.act)
-    world.entry.ended("000001-abcd", "done", None)
-    assert [one.key for one in world.published] == ["1", "1.end"]
-    for _ in range(300):
-        world.entry.run(POSE, world.asked(), dict)
-    assert [one.key for one in world.published] == [str(number) for number in range(46, 302)]
-
-
 def test_of_heartbeats_the_first_is_recorded_and_what_is_refused(world: World) -> None:
     for _ in range(3):
         world.entry.run(JOG, world.asked(deadline_s=9.0), lambda: {"id": "000001-abcd", "taken": True})
     world.entry.run(JOG, world.asked(), lambda: {"id": None, "taken": False})
     world.leases.acquire(BENCH)
-    refused("leased", lambda: world.entry.run(JOG, world.asked(ROVER), dict))
+    refused("leased", lambda: world.entry.run(JOG, world.asked(ROVER), dict[str, Any]))
     world.entry.ended("000001-abcd", "done", None)
     told = [(line.get("result"), line.get("ended")) for line in world.lines()]
     assert told == [("ok", None), ("leased", None), (None, "000001-abcd")]
     assert world.deadlines == [("000001-abcd", 9.0, 9.0)]
 
 
-def test_what_steers_and_was_asked_for_before_a_stop_is_not_carried_out_after_it(world: World) -> None:
+def test_a_move_requested_before_a_stop_is_not_done_after_it(world: World) -> None:
     early = world.asked(last_stop=world.leases.last_stop)
-    world.entry.first(STOP, world.asked(ROVER), dict)
+    world.entry.first(STOP, world.asked(ROVER), dict[str, Any])
     words = refused("stopped", lambda: world.entry.run(POINT, early, world.act))
     assert "asked for before a stop came" in words and world.acts == 0
-    world.entry.run(POSE, early, dict)  # moves nothing
+    world.entry.run(POSE, early, dict[str, Any])  # moves nothing
     world.entry.run(POINT, world.asked(last_stop=world.leases.last_stop), world.act)
     assert world.acts == 1 and world.ended_by_stop == []
 
 
 def test_what_begins_while_a_stop_comes_is_ended_by_it(world: World) -> None:
-    def act() -> Answer:
+    def act() -> dict[str, Any]:
         world.leases.stop_came()
         return world.act()
 

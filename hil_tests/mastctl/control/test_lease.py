@@ -7,10 +7,12 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.clock import ManualClock
-from hil_tests.waiting import joined
+from drivers.clock import ManualClock, SystemClock
+from drivers.errors import NoReply
+from hil_tests.waiting import joined, until
+from mastctl.control import lease as lease_module
 from mastctl.control.caller import Caller
-from mastctl.control.lease import LONGEST_S, REMEMBERED, SHORTEST_S, Lease, Leased, LeaseTable, WhoSteers
+from mastctl.control.lease import LONGEST_S, SHORTEST_S, Lease, Leased, LeaseTable, WhoSteers
 from mastctl.errors import BadRequest, MastctlError, NotNow
 
 BENCH = Caller("bench")
@@ -25,7 +27,10 @@ class World:
         self.runs = False
         self.changes: list[WhoSteers | None] = []
         self.gave_way: list[str] = []
-        self.leases = LeaseTable(self.clock, lambda: self.runs, self.changes.append, self.give_way)
+        self.leases = self.leases_of(self.give_way)
+
+    def leases_of(self, give_way: Callable[[str], object]) -> LeaseTable:
+        return LeaseTable(self.clock, lambda: self.runs, self.changes.append, give_way)
 
     def give_way(self, why: str) -> None:
         self.runs = False
@@ -92,7 +97,7 @@ def test_a_lease_holds_up_to_its_end_and_not_at_it(world: World) -> None:
     refused("leased", lambda: world.leases.acquire(ROVER))
     world.clock.advance(0.001)
     assert world.leases.control() is None
-    assert "its 10 s were over" in refused("lease_over", lambda: world.leases.renew(lease.id))
+    assert "the lease was not renewed for 10 s" in refused("lease_over", lambda: world.leases.renew(lease.id))
     refused("lease_over", lambda: world.steer(BENCH, lease))
     world.leases.acquire(ROVER)
 
@@ -123,7 +128,7 @@ def test_who_takes_over_steers_and_the_former_holder_hears_by_whom_and_why(world
     refused("lease_over", lambda: world.leases.release(former.id))  # the former id releases nobody else's
 
 
-def test_without_a_lease_whoever_starts_something_steers_until_it_has_ended(world: World) -> None:
+def test_without_a_lease_the_client_that_starts_something_steers(world: World) -> None:
     world.steer(BENCH, starts=True)
     assert world.leases.control() == WhoSteers("bench", "operation")
     assert world.leases.told() == {"holder": "bench", "kind": "operation", "for_s": None, "until": None}
@@ -186,25 +191,8 @@ def test_each_change_is_told_once_an_end_by_time_when_somebody_asks(world: World
     assert told == [("bench", 110.0), ("bench", 120.0), None, ("rover", 101.0), None]
 
 
-def test_the_ends_of_the_last_leases_are_remembered_and_no_more(world: World) -> None:
-    leases = []
-    for _ in range(REMEMBERED + 1):
-        leases.append(world.leases.acquire(BENCH))
-        world.leases.release(leases[-1].id)
-    refused("lease_unknown", lambda: world.leases.renew(leases[0].id))
-    refused("lease_over", lambda: world.leases.renew(leases[1].id))
-
-
-def test_an_id_of_any_signs_is_unknown_and_no_defect(world: World) -> None:
-    world.leases.acquire(BENCH)
-    for lease_id in ("", "é" * 9, "\x00", "x" * 10000):
-        refused("lease_unknown", lambda lease_id=lease_id: world.leases.renew(lease_id))  # type: ignore[misc]
-
-
 @pytest.mark.parametrize("by", ["command", "lease", "take"])
-def test_a_lease_that_gives_way_ends_for_whoever_comes_and_what_runs_is_stopped_first(
-    world: World, by: str
-) -> None:
+def test_a_preemptible_lease_ends_for_the_next_client_after_a_stop(world: World, by: str) -> None:
     lease = world.leases.acquire(BENCH, for_s=60.0, preemptible=True)
     world.steer(BENCH, lease, starts=True)
     if by == "command":
@@ -217,23 +205,6 @@ def test_a_lease_that_gives_way_ends_for_whoever_comes_and_what_runs_is_stopped_
     assert len(world.gave_way) == 1
     assert "rover" in world.gave_way[0]
     assert "rover" in refused("lease_over", lambda: world.steer(BENCH, lease))
-
-
-def test_a_lease_that_gives_way_stops_nothing_where_nothing_runs(world: World) -> None:
-    world.leases.acquire(BENCH, preemptible=True)
-    world.steer(ROVER)
-    assert world.gave_way == []
-    assert world.leases.control() is None
-
-
-def test_a_lease_that_gives_way_is_renewed_and_stands_against_nobody_but_ends_by_time(world: World) -> None:
-    lease = world.leases.acquire(BENCH, for_s=10.0, preemptible=True)
-    world.clock.advance(9.0)
-    world.leases.renew(lease.id)
-    world.clock.advance(9.0)
-    world.steer(BENCH, lease)
-    world.clock.advance(1.0)
-    assert "its 10 s were over" in refused("lease_over", lambda: world.steer(BENCH, lease))
 
 
 def test_a_stop_ends_a_lease_that_gives_way_and_no_other(world: World) -> None:
@@ -251,7 +222,7 @@ def test_a_stop_ends_a_lease_that_gives_way_and_no_other(world: World) -> None:
     world.steer(BENCH, world.leases.acquire(BENCH, preemptible=True))
 
 
-def test_a_lease_that_ends_with_a_stop_gives_way_to_nobody_and_is_over_when_one_comes(world: World) -> None:
+def test_a_lease_that_ends_with_a_stop_ends_with_nothing_else(world: World) -> None:
     lease = world.leases.acquire(BENCH, ends_with_stop=True)
     refused("leased", lambda: world.steer(ROVER))
     refused("leased", lambda: world.leases.acquire(ROVER))
@@ -262,16 +233,6 @@ def test_a_lease_that_ends_with_a_stop_gives_way_to_nobody_and_is_over_when_one_
         assert world.leases.was_stopped(lease) and world.leases.control() is None
     assert "the head was stopped" in refused("lease_over", lambda: world.steer(BENCH, lease))
     assert world.gave_way == []
-
-
-def test_a_lease_that_is_taken_ends_with_a_stop_that_came_while_it_was_being_asked_for(world: World) -> None:
-    before = world.leases.last_stop
-    world.leases.stop_came()
-    lease = world.leases.take(BENCH, "the run begins", last_stop=before)
-    assert world.leases.control() is None
-    assert "the head was stopped" in refused("lease_over", lambda: world.steer(BENCH, lease))
-    lease = world.leases.take(BENCH, "another begins", last_stop=world.leases.last_stop)
-    world.steer(BENCH, lease)
 
 
 def test_a_lease_ends_with_the_token_or_the_session_that_it_was_granted_to(world: World) -> None:
@@ -302,7 +263,7 @@ def test_what_a_silent_holder_began_is_stopped_when_its_lease_runs_out(world: Wo
     assert world.runs
     world.clock.advance(0.2)
     assert world.leases.stopped_silent(lease)
-    assert world.gave_way == ["rover began it and has fallen silent: its 2 s were over"]
+    assert world.gave_way == ["rover began it and has fallen silent: the lease was not renewed for 2 s"]
 
 
 @pytest.mark.parametrize("how", ["released", "taken over"])
@@ -316,3 +277,48 @@ def test_a_lease_that_did_not_run_out_leaves_what_runs_alone(world: World, how: 
     world.clock.advance(5.0)
     assert world.leases.stopped_silent(lease)
     assert world.runs and not world.gave_way
+
+
+@pytest.mark.parametrize("how", ["acquired", "taken over"])
+def test_the_stop_for_a_silent_holder_is_sent_until_the_head_confirms(
+    monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    monkeypatch.setattr(lease_module, "AGAIN_S", 0.01)
+    runs, sent = [True], list[str]()
+
+    def unconfirmed_twice(why: str) -> None:
+        runs.clear()  # the operation ends in any case
+        sent.append(why)
+        if len(sent) < 3:
+            raise NoReply("the head did not answer", device="pan_tilt")
+
+    leases = LeaseTable(SystemClock(), lambda: bool(runs), give_way=unconfirmed_twice)
+    if how == "acquired":
+        runs.clear()
+        lease = leases.acquire(ROVER, for_s=SHORTEST_S, stops_when_silent=True)
+    else:
+        lease = leases.take(ROVER, "it is my turn", for_s=SHORTEST_S, stops_when_silent=True)
+    with leases.steering(ROVER, lease.id):
+        runs[:] = [True]
+    until(lambda: len(sent) == 3, "the stop that the head confirms")
+    assert set(sent) == {"rover began it and has fallen silent: the lease was not renewed for 1 s"}
+    leases.close()
+
+
+def test_what_another_began_meanwhile_is_not_stopped_for_a_silent_holder(world: World) -> None:
+    lease = world.leases.acquire(ROVER, for_s=2.0)
+    world.steer(ROVER, lease, starts=True)
+    world.clock.advance(3.0)
+    world.leases.take(BENCH, "it hangs")
+    assert world.leases.stopped_silent(lease)
+    assert world.runs and not world.gave_way
+
+
+def test_a_refused_command_does_not_make_its_client_the_owner_of_what_runs(world: World) -> None:
+    world.steer(BENCH, starts=True)
+    lease = world.leases.take(ROVER, "it is my turn")
+    with pytest.raises(NotNow), world.leases.steering(ROVER, lease.id):
+        raise NotNow("busy", "operation 000001 is running")
+    world.leases.release(lease.id)
+    world.steer(BENCH)
+    assert "bench steers" in refused("leased", lambda: world.steer(ROVER))

@@ -15,11 +15,6 @@ from mastctl.devices.limits import Limits
 
 
 @pytest.fixture
-def hardware(clock: Turned) -> FakeHardware:
-    return FakeHardware(clock=clock)
-
-
-@pytest.fixture
 def machine(clock: Turned) -> StateMachine:
     return StateMachine(clock)
 
@@ -105,8 +100,3 @@ def test_a_fault_of_a_camera_is_published_and_changes_no_state(
         assert facts.value.frame_id == frame.frame_id and not hasattr(facts.value, "image")
         clock.until(lambda: machine.publisher.newest("fault", "navcam_left") == (), "its end")
     assert machine.standing.word == "ready"
-
-
-def test_readings_are_published_as_they_come(devices: Devices, machine: StateMachine) -> None:
-    reading = devices.read()
-    assert machine.publisher.newest("joints", HEAD).time_s >= reading.time_s

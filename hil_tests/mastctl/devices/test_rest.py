@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from drivers.interfaces import Reading
 from hil_tests.mastctl.devices.turned import Turned
-from hil_tests.mastctl.motion.pointing_world import World, click, run
 from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from mastctl.devices.devices import Devices
-from mastctl.devices.joint_history import DITHER_RAD, JointHistory, RestWatch, dithers
+from mastctl.devices.joint_history import DITHER_RAD, JointHistory, RestWatch
 from mastctl.devices.limits import Limits
-from mastctl.motion.requests import AnglesTarget, PointRequest
-from mastctl.motion.results import PointingError
 
 XM430_RAD = 2 * math.pi / 4096
 """A count of a 12-bit servo."""
@@ -61,11 +57,8 @@ def never(time_s: float) -> bool:
     ("count_rad", "levels"),
     [
         (XM430_RAD, 2),
-        (XM430_RAD, 3),
         (XM430_RAD, 4),
-        (D46_HALF_STEP_RAD, 3),
         (D46_HALF_STEP_RAD, 6),
-        (1e-5, 9),
     ],
 )
 def test_a_head_whose_counts_dither_comes_to_rest_whatever_its_word(
@@ -86,13 +79,6 @@ def test_a_head_that_stands_is_at_rest_after_the_dwell() -> None:
 def test_a_head_that_creeps_never_rests(speed_rad_per_s: float, flickers: bool) -> None:
     said = flicker(1) if flickers else never
     assert first_rest_s(lambda time_s: speed_rad_per_s * time_s, said) is None
-
-
-@pytest.mark.parametrize("speed_rad_per_s", [0.012, 0.05])
-def test_a_creep_in_counts_never_rests(speed_rad_per_s: float) -> None:
-    for phase in np.linspace(0, 1, 9):
-        angle = lambda time_s: counted(speed_rad_per_s * time_s + phase * XM430_RAD)  # noqa: B023, E731
-        assert first_rest_s(angle, never) is None, phase
 
 
 def test_a_slow_creep_under_a_dither_never_rests() -> None:
@@ -118,55 +104,12 @@ def test_a_head_that_rings_beyond_a_dither_never_rests(hz: float) -> None:
     assert first_rest_s(ring, flicker(3)) is None
 
 
-def test_a_ringing_that_dies_out_rests_when_it_is_small() -> None:
-    ring: Angle = lambda time_s: 0.05 * math.exp(-time_s) * math.sin(2 * math.pi * 3 * time_s)  # noqa: E731
-    rest_s = first_rest_s(ring, never, within_s=20.0)
-    assert rest_s is not None
-    assert 0.05 * math.exp(-(rest_s - 1.0)) <= DITHER_RAD
-
-
 def test_a_head_that_always_says_that_it_moves_does_not_rest() -> None:
     assert first_rest_s(lambda time_s: 0.3, lambda time_s: True) is None
     assert first_rest_s(dither(XM430_RAD, 2, 5), lambda time_s: time_s > 0.01) is None
 
 
 # In a pointing
-
-
-@pytest.mark.parametrize("levels", [2, 3])
-def test_pointings_of_a_head_that_dithers_end_well(levels: int) -> None:
-    for seed in range(6):
-        world = World()
-        random = np.random.default_rng(seed)
-
-        def shaken(reading: Reading, random: np.random.Generator = random) -> Reading:
-            pan, tilt = XM430_RAD * (random.integers(levels, size=2) - (levels - 1) / 2)
-            moving = reading.moving or bool(random.random() < 0.5)
-            return replace(
-                reading, pan_rad=reading.pan_rad + pan, tilt_rad=reading.tilt_rad + tilt, moving=moving
-            )
-
-        world.reading = shaken
-        result, _ = run(world, click(world.shoot(), 90.0, 70.0))
-        assert result.pointings[0].residual_px is not None, seed
-
-
-def test_a_head_that_does_not_settle_is_told_with_what_was_seen() -> None:
-    world, random = World(), np.random.default_rng(1)
-
-    def shaken(reading: Reading) -> Reading:
-        return (
-            replace(reading, pan_rad=reading.pan_rad + random.uniform(-0.0045, 0.0045))
-            if world.moves
-            else reading
-        )
-
-    world.reading = shaken
-    with pytest.raises(
-        PointingError, match=r"readings lie within 0\.00[789]\d rad in pan and 0\.0000 rad"
-    ) as end:
-        run(world, PointRequest(AnglesTarget(0.2, -0.3)))
-    assert end.value.code == "did_not_settle"
 
 
 # In frames and in the status
@@ -200,10 +143,11 @@ def test_frames_of_a_head_that_dithers_at_rest_were_taken_at_rest() -> None:
         (lambda n: n % 2 == 1, lambda n: shaking(n) + (0.01 if n > 57 else 0.0)),
         (lambda n: n > 57, lambda n: 0.0),
         (lambda n: n > 30, shaking),
+        (lambda n: n % 8 > 0, shaking),
         (lambda n: n % 2 == 1, lambda n: 0.0002 * n),
         (lambda n: n % 2 == 1, lambda n: 3 * shaking(n)),
     ],
-    ids=["goes off", "begins to move", "says so all the time", "creeps", "shakes more"],
+    ids=["goes off", "begins to move", "says so all the time", "says so mostly", "creeps", "shakes more"],
 )
 def test_frames_of_a_head_that_moves_were_taken_in_motion(
     flags: Callable[[int], bool], angle: Callable[[int], float]
@@ -219,11 +163,6 @@ def test_a_dither_is_no_rest_within_a_second_of_a_move() -> None:
     assert at_the_end(made)
     made.add(Reading(0.0, 0.0, True, 13.0))
     assert made.newest is not None and made.newest.moving
-
-
-def test_too_few_readings_tell_no_dither() -> None:
-    assert not dithers([Reading(0.0, 0.0, False, 0.2 * n) for n in range(6)])
-    assert not dithers([Reading(0.0, 0.0, False, 0.05 * n) for n in range(12)])
 
 
 def test_the_service_takes_a_head_that_dithers_for_one_at_rest(clock: Turned) -> None:

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from calib.geometry.rig import AxisJoint, JointErrors
-from drivers.clock import ManualClock
-from drivers.errors import BadOptions
+from drivers.clock import ManualClock, SystemClock
 from drivers.interfaces import AxisMotion, Reading
-from drivers.sim.heads import head_settings, with_joints
+from drivers.sim.heads import head_settings
 from drivers.sim.pan_tilt import SimulatedPanTilt
+from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from mastctl.devices import judge
 from mastctl.devices.devices import Devices
-from mastctl.devices.joint_history import USUAL_PLAY_RAD, HeadReading, JointHistory
+from mastctl.devices.joint_history import HeadReading, JointHistory
 from mastctl.devices.judge import KeepOutJudge
 from mastctl.devices.limits import Limits
 
@@ -30,10 +30,10 @@ half the play, and 4 times that in the second harmonic."""
 LIMITS = Limits((-2.5, 2.5), (-1.4, 1.4), 1.0)
 
 
-def simulated(**more: Any) -> SimulatedPanTilt:
+def simulated(clock: ManualClock, **more: Any) -> SimulatedPanTilt:
     told = {"pan_harmonics_rad": HARMONICS, "tilt_harmonics_rad": HARMONICS, "backlash_rad": BACKLASH_RAD}
     settings = head_settings({"preset": "dynamixel_x", "sag_rad": 0.0} | told | more)
-    return SimulatedPanTilt(settings, ManualClock(100.0))
+    return SimulatedPanTilt(settings, clock)
 
 
 TOLD = JointErrors(AxisJoint(HARMONICS, BACKLASH_RAD), AxisJoint(HARMONICS, BACKLASH_RAD))
@@ -43,13 +43,13 @@ TOLD = JointErrors(AxisJoint(HARMONICS, BACKLASH_RAD), AxisJoint(HARMONICS, BACK
 class Bench:
     """A simulated head, read as the daemon does."""
 
-    head: SimulatedPanTilt
+    options: dict[str, Any] = field(default_factory=dict)
     joints: JointErrors = TOLD
     history: JointHistory = field(init=False)
 
     def __post_init__(self) -> None:
-        self.clock = self.head._clock
-        assert isinstance(self.clock, ManualClock)
+        self.clock = ManualClock(100.0)
+        self.head = simulated(self.clock, **self.options)
         self.history = JointHistory(self.joints)
         self.devices = object.__new__(Devices)  # of it only `goal` is asked: no thread, no camera
         self.devices._joints = self.joints
@@ -69,8 +69,8 @@ class Bench:
         return np.subtract(self.here.true_rad, self.head.true_joints(self.clock.now_s()))
 
 
-def test_true_angles_are_those_of_the_simulated_gears_after_moves_to_and_fro() -> None:
-    bench, rng = Bench(simulated()), np.random.default_rng(3)
+def test_true_angles_are_those_of_the_simulated_gears() -> None:
+    bench, rng = Bench(), np.random.default_rng(3)
     bench.go(0.4, -0.3)
     place = np.array([0.4, -0.3])
     for number in range(60):
@@ -84,7 +84,7 @@ def test_true_angles_are_those_of_the_simulated_gears_after_moves_to_and_fro() -
 
 @pytest.mark.parametrize("approach_rad", [0.0, 0.02])
 def test_goals_bring_the_axes_to_true_angles_within_half_a_count(approach_rad: float) -> None:
-    bench, rng = Bench(simulated(approach_rad=approach_rad)), np.random.default_rng(5)
+    bench, rng = Bench({"approach_rad": approach_rad}), np.random.default_rng(5)
     bench.go(0.2, 0.2)
     place = np.array([0.2, 0.2])
     for number in range(40):
@@ -96,22 +96,11 @@ def test_goals_bring_the_axes_to_true_angles_within_half_a_count(approach_rad: f
         assert np.abs(off).max() < 0.51 * COUNT_RAD, f"seed 5, move {number}: {off}"
 
 
-def test_by_way_of_a_corner_an_axis_comes_from_the_side_that_the_corner_leaves_it_on() -> None:
-    bench = Bench(simulated(count_rad=1e-6))
-    bench.go(0.2, 0.2)
-    wanted, corner = (0.9, -0.4), (1.2, -0.9)
-    goal = bench.devices.goal(wanted, bench.here, [corner])
-    bench.go(*corner)
-    bench.go(*goal)
-    off = np.subtract(bench.head.true_joints(bench.clock.now_s()), wanted)
-    assert np.abs(off).max() < ORDER_RAD
-
-
 @pytest.mark.parametrize("turnover_rad", [-0.2, 0.3])
-def test_a_goal_near_the_turnover_of_the_weight_is_for_the_side_from_which_the_driver_comes(
+def test_a_goal_near_the_turnover_counts_the_side_of_approach(
     turnover_rad: float,
 ) -> None:
-    bench = Bench(simulated())
+    bench = Bench()
     hangs = AxisMotion(1.0, rising_below_rad=turnover_rad)
     bench.devices.door._stated = {"pan": AxisMotion(1.0), "tilt": hangs}
     for past_rad in (-0.007, -0.003, 0.003, 0.007):  # from it, in readings: the true angle is 5 mrad away
@@ -120,20 +109,6 @@ def test_a_goal_near_the_turnover_of_the_weight_is_for_the_side_from_which_the_d
         goal_rad = bench.devices.goal((0.1, wanted_rad), bench.here)[1]
         comes_to_rad = TOLD.tilt.true_rad(goal_rad, hangs.turn_to(goal_rad))
         assert comes_to_rad == pytest.approx(wanted_rad, abs=1e-12), past_rad
-
-
-def test_a_true_rig_with_joints_makes_the_simulated_head_err_by_them() -> None:
-    plain = head_settings({"preset": "dynamixel_x"})
-    erring = with_joints(plain, TOLD)
-    assert (erring.pan.harmonics_rad, erring.tilt.backlash_rad) == (HARMONICS, BACKLASH_RAD)
-    assert with_joints(plain, JointErrors()) is plain
-    for more, words in (
-        ({"pan_harmonics_rad": HARMONICS}, "one of them"),
-        ({"approach_rad": 0.0035}, "take up"),
-    ):
-        told = head_settings({"preset": "dynamixel_x", "backlash_rad": 0.001} | more)
-        with pytest.raises(BadOptions, match=words):
-            with_joints(told, TOLD)
 
 
 def rows(*pans: float, joints: JointErrors | None = None) -> JointHistory:
@@ -158,21 +133,6 @@ def test_the_side_is_not_known_before_the_head_has_gone_through_its_play() -> No
     assert approach(0.5, 0.51, 0.49, joints=wide) == -1.0
 
 
-def test_without_a_stated_backlash_the_side_is_told_by_a_usual_one_and_angles_stay() -> None:
-    assert approach(0.5, 0.5 + 1.01 * USUAL_PLAY_RAD) == 1.0
-    newest = rows(0.5, 0.6).newest
-    assert newest is not None and newest.true_rad == (newest.pan_rad, newest.tilt_rad)
-
-
-def test_another_mast_files_joints_hold_for_what_was_read_before() -> None:
-    made = rows(0.3, 0.5, 0.5)
-    made.use_joints(TOLD)
-    joints = made.at_exposure(1.06, 1.07, 1.08, "head")
-    at = joints.pan_rad - BACKLASH_RAD / 2
-    true = at + sum(c * math.cos(i * at) + s * math.sin(i * at) for i, (c, s) in enumerate(HARMONICS, 1))
-    assert joints.approach[0] == 1.0 and joints.true_rad[0] == pytest.approx(true, abs=1e-12)
-
-
 def test_a_head_says_from_which_side_it_comes_by_itself() -> None:
     gravity = AxisMotion(1.0, 0.02, rising_below_rad=0.3)
     assert (gravity.turn_to(0.1), gravity.turn_to(0.4), AxisMotion(1.0).turn_to(0.1)) == (1, -1, 0)
@@ -185,3 +145,15 @@ def test_the_sun_is_kept_out_where_the_head_reads_it() -> None:
     low, high = judge._as_read(joint, (0.1, 0.3))
     assert max(joint.true_rad(low, side) for side in (-1, 0, 1)) == pytest.approx(0.1, abs=1e-12)
     assert min(joint.true_rad(high, side) for side in (-1, 0, 1)) == pytest.approx(0.3, abs=1e-12)
+
+
+def test_what_the_devices_read_is_true_by_their_rigs_joints() -> None:
+    hardware = FakeHardware()
+    hardware.head.pan_rad = 0.7
+    devices = Devices(hardware, LIMITS, "0" * 64, SystemClock(), replace(rig(), joints=TOLD))
+    try:
+        reading = devices.read()
+        assert reading.true_rad == pytest.approx(TOLD.true_rad((0.7, 0.0), reading.approach))
+        assert abs(reading.true_rad[0] - 0.7) > 1e-3
+    finally:
+        devices.close()

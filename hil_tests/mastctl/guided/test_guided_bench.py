@@ -6,12 +6,13 @@ import os
 import signal
 from pathlib import Path
 
+import psutil
 import pytest
 import yaml
 
+from hil_tests.support.living_daemon import started, written
 from hil_tests.waiting import until
 from mastctl.client import Client
-from tools.living_daemon import started, written
 
 BOUND_S = 300.0
 """A look takes a second; many, where others use the machine."""
@@ -34,16 +35,11 @@ def gone(pid: int) -> bool:
 
 def children(pid: int) -> list[int]:
     """Processes that a process has started and that are at work."""
-    found = []
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        found += [int(word) for word in (task / "children").read_text().split()]
-    return found
+    return [child.pid for child in psutil.Process(pid).children()]
 
 
 @pytest.mark.long(2, "draws a bench at full speed for two daemons; each step has a quick test in test_guide")
-def test_a_run_whose_daemon_is_killed_leaves_nobody_behind_goes_on_with_the_next_and_obeys_a_stop(
-    tmp_path: Path, repository: Path
-) -> None:
+def test_a_run_outlives_its_killed_daemon_only_as_a_folder_to_go_on(tmp_path: Path, repository: Path) -> None:
     path = config(tmp_path, repository)
 
     def pictures(client: Client) -> int:

@@ -13,7 +13,7 @@ import pytest
 from calib.errors import BadFile
 from hil_tests.waiting import joined
 from mastctl.control.caller import ROLES
-from mastctl.http.tokens import MOST_TOKENS, TokenList, TokenRefused
+from mastctl.http.tokens import TokenList, TokenRefused
 
 
 def mode(path: Path) -> int:
@@ -31,7 +31,7 @@ def text_of(tokens: TokenList, role: str) -> str:
     return tokens.file_of(role).read_text().strip()  # type: ignore[arg-type]
 
 
-def test_the_first_run_makes_one_token_of_256_bits_for_each_role_for_its_user_only(tokens: TokenList) -> None:
+def test_the_first_run_makes_a_private_256_bit_token_for_each_role(tokens: TokenList) -> None:
     texts = {role: text_of(tokens, role) for role in ROLES}
     assert len(set(texts.values())) == 3
     assert {len(text) for text in texts.values()} == {43}, "32 bytes in base64 without padding"
@@ -54,39 +54,21 @@ def test_the_second_run_makes_none(tokens: TokenList) -> None:
     assert tokens.path.read_bytes() == before
 
 
-def test_a_revoked_token_of_the_first_run_leaves_no_file_and_is_not_made_again(tokens: TokenList) -> None:
+def test_a_revoked_token_of_a_role_is_not_made_again(tokens: TokenList) -> None:
     tokens.revoke("admin")
     assert not tokens.file_of("admin").exists()
     assert [one.name for one in tokens.first_run()] == ["view", "operate"]
 
 
-@pytest.mark.parametrize("name", ["", "a b", "a/b", "x" * 41, "admin", "a\nb"])
-def test_a_name_that_is_none_or_is_taken_is_refused(tokens: TokenList, name: str) -> None:
+@pytest.mark.parametrize("name", ["", "a/b", "x" * 41, "admin"])
+def test_an_empty_bad_or_taken_name_is_refused(tokens: TokenList, name: str) -> None:
     with pytest.raises(TokenRefused):
         tokens.new(name, "view")
 
 
-def test_what_is_not_there_cannot_be_revoked_and_who_is_there_is_said(tokens: TokenList) -> None:
-    with pytest.raises(TokenRefused, match="there are: view, operate, admin"):
-        tokens.revoke("somebody")
-
-
-def test_there_is_a_bound_of_tokens(tokens: TokenList) -> None:
-    entry = json.loads(tokens.path.read_text())["tokens"][0]
-    document = {
-        "schema": "mastctl/tokens/1",
-        "tokens": [{**entry, "name": f"t{i}"} for i in range(MOST_TOKENS)],
-    }
-    tokens.path.write_text(json.dumps(document))
-    with pytest.raises(TokenRefused, match="revoke one first"):
-        tokens.new("more", "view")
-
-
 @pytest.mark.parametrize("name", ["tokens.json", "admin.token"])
-@pytest.mark.parametrize("others", [0o640, 0o604, 0o620])
-def test_what_other_users_may_touch_is_refused_with_what_mends_it(
-    tokens: TokenList, name: str, others: int
-) -> None:
+@pytest.mark.parametrize("others", [0o640, 0o602])
+def test_a_file_open_to_other_users_is_refused(tokens: TokenList, name: str, others: int) -> None:
     (tokens.folder / name).chmod(others)
     with pytest.raises(BadFile, match="chmod 600"):
         tokens.read()

@@ -23,7 +23,6 @@ from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.keep_out import Pair
 from mastctl.devices.limits import Limits
-from mastctl.devices.ways import Way, duration_s
 from mastctl.errors import NotKnown
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import PixelTarget, PointRequest
@@ -156,7 +155,7 @@ class World:
     reading_sigma_rad = (1e-5, 1e-5)
     counts_rad: Mapping[str, float] = field(default_factory=dict)
 
-    def goal(self, true_rad: Pair, here: HeadReading, corners: Sequence[Pair] = ()) -> Pair:
+    def goal(self, true_rad: Pair, here: HeadReading) -> Pair:
         return true_rad  # joints that read true
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
@@ -182,8 +181,8 @@ class World:
             raise NotKnown("frame_unknown", f"frame {frame_id} was not taken here")
         return self._frames[frame_id]
 
-    def way(self, here: Pair, goal: Pair) -> Way:
-        return Way((goal,), duration_s(here, (goal,), self.speed_rad_per_s))
+    def check_from(self, here: Pair, goal: Pair) -> None:
+        LIMITS.check(*goal)
 
     def newest_frames(self) -> dict[str, StampedFrame | None]:
         return dict.fromkeys(MOUNTS)

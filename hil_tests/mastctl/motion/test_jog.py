@@ -47,8 +47,9 @@ class Watched:
     def read(self) -> Reading:
         return self.head.read()
 
-    def axis_motion(self) -> Any:
-        return self.head.axis_motion()
+    @property
+    def info(self) -> Any:
+        return self.head.info
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         self.moves.append((self.head.read(), (pan_rad, tilt_rad)))
@@ -212,7 +213,7 @@ def test_a_stop_is_the_last_word(rig: Rig) -> None:
     assert len(rig.head.moves) == moves and not rig.devices.read().moving
 
 
-def test_nameless_heartbeats_begin_a_jog_after_a_stop_when_none_came_for_half_a_second(rig: Rig) -> None:
+def test_nameless_heartbeats_begin_a_jog_only_half_a_second_after_a_stop(rig: Rig) -> None:
     stops: list[object] = [object()]
     jogs = Jogs(rig.operations, rig.devices, rig.clock, last_stop=lambda: stops[-1])
     stick, still, counted = Beat((RATE, 0.0)), Beat((0.0, 0.0)), Beat((RATE, 0.0), sequence=8)
@@ -299,7 +300,7 @@ def test_the_head_slides_along_a_keep_out_and_never_nearer_than_its_margin(rig: 
     assert lowest >= -0.8 + 0.02 - COUNT_RAD
 
 
-def test_faster_than_the_limit_is_as_fast_as_the_limit_in_the_same_direction(rig: Rig) -> None:
+def test_faster_than_the_limit_is_the_limit_in_the_same_direction(rig: Rig) -> None:
     rig.place(-0.9, 0.0)
     rig.jogs.beat(Beat((4.0, 2.0)))
     rig.pass_by(0.05)
@@ -309,16 +310,7 @@ def test_faster_than_the_limit_is_as_fast_as_the_limit_in_the_same_direction(rig
     assert tilt - reading.tilt_rad == pytest.approx(reach[1], abs=0.01)
 
 
-def test_limits_hold_whatever_rates_come(rig: Rig) -> None:
-    rig.place(0.8, 0.5)
-    for rates in ((3.0, 3.0), (-3.0, 3.0), (1.0, -3.0), (-1.0, -3.0)):
-        rig.beats(*rates, 1.5)
-        for _, (pan, tilt) in rig.head.moves:
-            assert -1.0 <= pan <= 1.0 and -1.2 <= tilt <= 0.6
-            assert not (abs(pan) < 0.52 and tilt < -0.78)
-
-
-def test_where_time_stands_a_client_that_is_gone_does_not_keep_the_head_for_ever(
+def test_where_time_stands_a_client_that_is_gone_frees_the_head(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mastctl.motion.jog.GONE_S", 0.2)
@@ -332,37 +324,6 @@ def test_where_time_stands_a_client_that_is_gone_does_not_keep_the_head_for_ever
     assert operation.state == "done"
     assert "nothing was heard of its client" in operation.result.ended_because
     assert rig.head.stops >= 1
-
-
-def test_two_clients_that_begin_while_what_was_stopped_still_ends_do_not_make_time_stand_still(
-    rig: Rig,
-) -> None:
-    """A simulation's time passes while all wait on its clock: nobody may keep a lock meanwhile."""
-
-    def slow_to_end(record: Any, cancelled: threading.Event) -> None:
-        while not cancelled.is_set():
-            rig.clock.sleep(0.05)
-        rig.clock.sleep(2.0)
-
-    refused: list[str] = []
-
-    def begin() -> None:
-        with rig.clock.at_work():
-            try:
-                rig.jogs.beat(Beat((RATE, 0.0), sequence=1))
-            except NotNow as error:
-                refused.append(error.code)
-
-    with rig.clock.at_work():
-        rig.operations.start({}, slow_to_end)
-        rig.clock.sleep(0.2)
-        rig.operations.stop()
-        clients = [threading.Thread(target=begin, daemon=True) for _ in range(2)]
-        for client in clients:
-            client.start()
-    for client in clients:
-        client.join(60.0)
-    assert refused == ["stopping", "stopping"]
 
 
 def test_a_jog_begins_before_or_after_what_needs_a_head_that_rests(rig: Rig) -> None:

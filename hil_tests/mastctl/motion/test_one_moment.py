@@ -16,14 +16,6 @@ def detail(steps: list[Step], name: str) -> dict[str, object]:
     return dict(next(step.detail for step in steps if step.name == name))
 
 
-def test_eyes_that_expose_together_need_no_further_picture() -> None:
-    world = World()
-    _, steps = run(world, click(world.shoot(), 90.0, 70.0))
-    for name in ("stereo", "eyes"):
-        assert detail(steps, name)["dt_s"] == {"navcam_right": 0.0}
-        assert "image_speed_px_per_s" not in detail(steps, name)
-
-
 def test_eyes_that_expose_apart_measure_what_stands_still() -> None:
     world = moving_world(0.0)
     result, steps = run(world, click(world.shoot(), 90.0, 70.0))
@@ -51,21 +43,6 @@ def test_what_moves_by_half_a_pixel_between_the_eyes_is_not_measured() -> None:
         run(world, click(world.shoot(), 90.0, 70.0))
     assert told.value.code == "target_moving" and told.value.step == "stereo"
     assert not world.moves
-
-
-def test_the_same_speed_does_no_harm_where_the_eyes_are_nearly_together() -> None:
-    found = checked(moving_world(60.0, late_s=0.002))
-    assert found["image_speed_px_per_s"] == pytest.approx(60.0, abs=1.0)
-    assert found["moved_px"] == pytest.approx(0.12, abs=0.01)
-
-
-def test_an_eye_that_exposes_before_the_first_one_counts_alike() -> None:
-    still = checked(moving_world(0.0, late_s=-LATE_S))
-    assert still["dt_s"] == {"navcam_right": pytest.approx(-LATE_S)}
-    assert "image_speed_px_per_s" in still
-    with pytest.raises(PointingError, match=r"0\.6\d px between exposures 10\.0 ms apart") as told:
-        checked(moving_world(62.0, late_s=-LATE_S))
-    assert told.value.code == "target_moving"
 
 
 def test_what_is_gone_a_moment_later_is_not_measured() -> None:

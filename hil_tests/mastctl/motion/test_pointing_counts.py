@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from calib.files.mast_file import load_rig
-from drivers.interfaces import AxisReport, Reporting
+from drivers.interfaces import AxisReport
 from mastctl.motion.results import counts_told
 
 COUNT_RAD = math.tau / 4096
 
 
-class Counting(Reporting):
+class Counting:
     """A head of 12-bit servos that stands 0.4 counts beside the commanded pan."""
 
     def report(self) -> dict[str, AxisReport]:
@@ -34,11 +34,3 @@ def test_counts_and_the_pixels_that_they_leave(repository: Path) -> None:
     # One 12-bit count is 1.96 pixels of the navigation camera (f = 1280 px): 1280 tan(0.0879 deg).
     assert told["pan"]["left_px"] == pytest.approx(-0.4 * 1.96 * math.cos(0.3), abs=0.01)
     assert "left_rad" not in told["tilt"]  # nothing was commanded
-
-
-def test_a_head_without_counts_adds_nothing() -> None:
-    assert counts_told(object(), 0.0, None) == {}
-
-
-def test_joint_angles_alone_have_no_pixels() -> None:
-    assert "left_px" not in counts_told(Counting(), 0.0, None)["counts"]["pan"]

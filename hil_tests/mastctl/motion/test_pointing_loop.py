@@ -10,8 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.geometry.mode import rig_in_mode
-from calib.geometry.sensor_mode import Mode
 from hil_tests.mastctl.motion.pointing_world import (
     LIMITS,
     SIZE_PX,
@@ -58,28 +56,7 @@ def test_a_clicked_pixel_lands_on_the_aim_and_the_residual_is_the_true_one(
         assert max(pointing.residual_sigma_px) < MEASURED_PX
 
 
-@pytest.mark.parametrize("mirrored", ["navcam_left", "navcam_right"])
-def test_a_pair_one_of_whose_cameras_is_mirrored_points_like_any_other(mirrored: str) -> None:
-    """The click and the aim are in the left picture, mirrored or not."""
-    world = World()
-    world.image = lambda camera, number, image: image[:, ::-1].copy() if camera == mirrored else image
-
-    def plain(x_px: float) -> float:
-        return SIZE_PX[0] - 1 - x_px if mirrored == "navcam_left" else x_px
-
-    frame = world.shoot()
-    point_m = world.true_point(frame, plain(75.0), 50.0)
-    believed = rig_in_mode(rig(), mirrored, Mode(flip=(True, False)))
-    result, _ = run(world, click(frame, 75.0, 50.0), believed)
-    for pointing in result.pointings:
-        x_px, y_px = world.true_pixel(pointing.frame_id, point_m)
-        true_px = np.array([plain(x_px), y_px]) - MIDDLE_PX
-        assert pointing.residual_px is not None
-        assert np.abs(np.array(pointing.residual_px) - true_px).max() < MEASURED_PX
-        assert np.abs(true_px).max() < 0.5
-
-
-def test_a_position_is_told_as_sure_as_the_pixels_and_the_match_it_comes_from() -> None:
+def test_a_position_is_as_sure_as_the_pixels_and_the_match_behind_it() -> None:
     """Of range, by hand: the disparity's sigma (two pixels, and the match) times r² / (f b)."""
     for pixel_sigma_px in (0.2, 0.02):
         world = World()
@@ -143,7 +120,7 @@ def test_any_pixel_of_another_camera_can_be_the_aim() -> None:
     assert np.abs(np.array(last.residual_px) - truth).max() < MEASURED_PX
 
 
-def test_a_frame_from_before_the_head_moved_still_serves_while_the_target_is_in_view() -> None:
+def test_a_frame_from_another_pose_serves_while_the_target_is_in_view() -> None:
     world, pixel = World(), (150.0, 120.0)
     frame = world.shoot()
     point = world.true_point(frame, *pixel)
@@ -159,7 +136,7 @@ def test_a_frame_from_a_pose_that_looks_elsewhere_is_refused_by_name() -> None:
     world = World()
     frame = world.shoot()
     world.place(1.0, -0.5)
-    with pytest.raises(PointingError, match=frame.frame_id) as refusal:
+    with pytest.raises(PointingError, match="since the clicked image of navcam_left") as refusal:
         run(world, click(frame, 150.0, 120.0))
     assert refusal.value.code == "not_in_view"
     assert not world.moves
@@ -176,15 +153,6 @@ def test_a_position_is_pointed_at_and_its_missing_residual_is_explained(frame: s
     assert np.allclose(world.true_pixel(pointing.frame_id, np.array([4.0, 0.7, 0.0])), MIDDLE_PX, atol=1e-6)
     assert np.allclose(pointing.predicted_px, MIDDLE_PX, atol=1e-6)
     assert [step.name for step in steps] == ["rest", "solve", "before", "limits", "move", "settle", "look"]
-
-
-def test_joint_angles_are_taken_up_without_a_picture() -> None:
-    world = World()
-    result, _ = run(world, PointRequest(AnglesTarget(0.4, -0.2)))
-    assert world.moves == [(0.4, -0.2)]
-    assert result.position_m is None
-    assert result.pointings[0].measured_pan_rad == pytest.approx(0.4)
-    assert result.pointings[0].residual_px is None
 
 
 def test_the_record_names_every_step_in_order_with_plain_numbers() -> None:
@@ -209,7 +177,7 @@ def test_the_new_picture_is_exposed_after_the_head_has_settled() -> None:
     assert new.exposure_began_s >= settled.started_s + settled.duration_s
 
 
-def test_a_target_beyond_the_limits_is_refused_with_how_far_and_nothing_moves() -> None:
+def test_a_target_beyond_the_limits_is_refused_and_nothing_moves() -> None:
     world = World()
     steps: list[Step] = []
     loop = PointingLoop(rig(), world, LIMITS, world.clock)
@@ -253,7 +221,7 @@ def test_what_makes_no_sense_for_any_rig_never_becomes_a_request(words: str) -> 
 
 
 @pytest.mark.parametrize("code", BAD)
-def test_a_request_that_cannot_be_met_is_refused_by_its_code_and_nothing_moves(code: str) -> None:
+def test_a_request_that_cannot_be_met_is_refused_and_nothing_moves(code: str) -> None:
     world = World()
     world.shoot()
     with pytest.raises(PointingError) as refusal:
@@ -261,15 +229,6 @@ def test_a_request_that_cannot_be_met_is_refused_by_its_code_and_nothing_moves(c
     assert refusal.value.code == code.strip()
     assert str(refusal.value)
     assert "\n" not in str(refusal.value)
-    assert not world.moves
-
-
-def test_a_click_beside_the_overlap_of_the_eyes_is_refused() -> None:
-    world = World()
-    world.place(0.0, -1.1)  # at 1.5 m the right eye does not see the left edge of the left picture
-    with pytest.raises(PointingError) as refusal:
-        run(world, click(world.shoot(), 30.0, 140.0))
-    assert refusal.value.code in ("target_border", "target_not_found", "target_ambiguous")
     assert not world.moves
 
 

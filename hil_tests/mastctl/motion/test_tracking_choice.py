@@ -14,13 +14,11 @@ from calib.errors import CalibError
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid, carried_covariance
-from calib.matching.handoff import Eye
-from calib.matching.track import KeyPicture, Track
 from mastctl.devices.limits import Limits
 from mastctl.errors import MastctlError
 from mastctl.motion.pairs import choose_pairs
 from mastctl.motion.settings import HandoffRules, PairBounds
-from mastctl.motion.track import HELD_UP_S, Carried, RoverPose, check_follows, motion_between, stands
+from mastctl.motion.track import HELD_UP_S, RoverPose, check_follows, motion_between, stands
 
 
 @pytest.fixture(scope="module")
@@ -110,9 +108,7 @@ def test_poses_come_in_order(before_s: float, now_s: float | None, code: str) ->
     ("before_s", "now_s", "later_s"),
     [
         (1e12, 17.5, 0.01),
-        (1e12, -1e12, 0.0),
         (5.0 + HELD_UP_S, 4.99, 0.0),
-        (5.0, 4.9, HELD_UP_S),
         (5.0, 5.0, HELD_UP_S + 0.01),
         (5.0, None, HELD_UP_S + 0.01),
     ],
@@ -127,7 +123,6 @@ def test_a_pose_that_cannot_have_been_on_its_way_so_long_has_another_clock(
     ("before_s", "now_s", "later_s", "code"),
     [
         (5.0 + HELD_UP_S, 5.0, 0.0, "pose_runs_backwards"),
-        (6.0, 5.0, HELD_UP_S - 1.0, "pose_runs_backwards"),
         (5.0, None, HELD_UP_S, "pose_without_time"),
     ],
 )
@@ -164,20 +159,3 @@ def test_a_covariance_carried_on_moves_points_as_the_motions_themselves_do() -> 
         x, y, z = onward.points(point)
         rate = np.hstack([np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]]), np.eye(3)])
         assert rate @ carried @ rate.T == pytest.approx(moves.T @ moves, abs=2e-3 * np.abs(moves).max() ** 2)
-
-
-def test_what_jumped_poses_are_uncertain_by_has_no_variance_below_zero(rig: Rig) -> None:
-    """A slip along one direction, turned onto an axis: rounding alone makes -1e-20 of the others' nothing."""
-    key = KeyPicture(
-        Eye(np.zeros((48, 64), np.float32), rig.cameras["navcam_left"].model), np.zeros(2), np.ones(3)
-    )
-    begun = Carried(Track("tracked", np.array([5.0, 0.5, 0.0]), 1e-4 * np.eye(3), key), pose(0.0))
-    for heading in np.arange(0.1, 3.1, 0.1):
-        along = np.array([0.0, 0.0, 0.0, math.cos(heading), math.sin(heading), 0.0])
-        far = replace(pose(1.0, 4.0), covariance=0.01**2 * np.outer(along, along))
-        back = replace(pose(2.0, 0.1, heading), covariance=np.zeros((6, 6)))
-        jumped, _ = begun.to(far, np.zeros(3), 0.3)
-        assert jumped.jumped
-        carried, reason = jumped.to(back, np.zeros(3), 0.3)
-        assert (reason, carried.jumped) == ("", False)
-        assert carried.track.motion_covariance[3, 3] == pytest.approx(0.01**2)

@@ -16,7 +16,7 @@ from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import FloatArray, Rigid
 from hil_tests.waiting import until
-from mastctl.client import Client, ClientError
+from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.targets import texture_mask
@@ -85,7 +85,7 @@ class Drive:
         w, x, y, z = pose["quaternion"]
         return Rigid(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(pose["position_m"]))
 
-    def to(self, x_m: float, y_m: float, heading_rad: float, told: bool = True) -> dict[str, Any]:
+    def to(self, x_m: float, y_m: float, heading_rad: float) -> dict[str, Any]:
         """Drive there; return the track after the look from there."""
         before = self.true()
         self._client.stand(x_m, y_m, heading_rad, 0.02, -0.01)
@@ -95,18 +95,12 @@ class Drive:
         off = self._rng.normal(0.0, 1.0, 6)
         error = Rigid(Rotation.from_rotvec(sigma[1] * off[:3]).as_matrix(), sigma[0] * off[3:])
         self._told = self._told @ motion @ error
-        return self.tell(sigma) if told else {}
+        return self.tell(sigma)
 
     def tell(self, sigma: tuple[float, float]) -> dict[str, Any]:
         x, y, z, w = Rotation.from_matrix(self._told.rotation).as_quat().tolist()
         position = self._told.translation_m.tolist()
         answer = self._client.pose(position, (w, x, y, z), sigma=sigma)
-        return self._client.wait_track(answer["operation"])
-
-    def told_to_stand(self) -> dict[str, Any]:
-        """The track after a pose that says that the rover stands where it last was said to."""
-        pose = self._client.status()["pose"]
-        answer = self._client.pose(pose["position_m"], pose["quaternion"], sigma=(0.005, 0.002))
         return self._client.wait_track(answer["operation"])
 
 
@@ -158,74 +152,3 @@ def test_an_approach_over_http_hands_over_and_keeps_its_target(client: Client, d
     for landed in record.found.values():
         assert landed.found_px == pytest.approx(landed.geometric_px, abs=1.0), "the mast file is true"
     assert 0.0 < record.joints.sigma_rad < 4e-4, "a joint's reading is known to less than half a pixel"
-
-
-def test_the_told_pose_moves_the_site_and_not_the_truth(client: Client, daemon: RunningDaemon) -> None:
-    drive = Drive(client)
-    drive.to(1.0, 0.5, 0.3)
-    assert client.true_pose()["position_m"][:2] == [1.0, 0.5]
-    told = client.status()["pose"]["position_m"]
-    assert told != client.true_pose()["position_m"]
-    assert told == pytest.approx(client.true_pose()["position_m"], abs=0.2)
-    with pytest.raises(ClientError, match="off the simulated ground"):
-        client.stand(30.0, 0.0, 0.0)
-
-
-def test_a_missing_eye_is_told_and_the_other_serves(client: Client, daemon: RunningDaemon) -> None:
-    drive = Drive(client)
-    target_m = begun(client, daemon)
-    client.set_fault("navcam_right", "intermittent", probability=1.0)
-    track = drive.to(0.2, 0.0, 0.0)
-    assert track["state"] == "tracking", track["reason"]
-    assert track["pixels"]["navcam_right"]["verdict"] == "no_frame"
-    assert "navcam_right: no answer" in track["pixels"]["navcam_right"]["reason"]
-    assert off_m(track, drive, target_m) < 0.05
-    client.set_fault("navcam_left", "intermittent", probability=1.0)
-    client.set_fault("hazcam_left", "intermittent", probability=1.0)
-    client.set_fault("hazcam_right", "intermittent", probability=1.0)
-    track = drive.to(0.4, 0.0, 0.0)
-    assert (track["state"], track["misses"]) == ("lost", 1)
-    assert "navcam_left: no answer" in track["reason"]
-    assert "navcam_right: no answer" in track["reason"]
-    client.clear_faults()
-    track = client.wait_track(client.look())
-    assert track["state"] == "tracking", track["reason"]
-    assert off_m(track, drive, target_m) < 0.03
-
-
-def test_a_pose_that_lies_does_not_make_another_stone_of_it(client: Client, daemon: RunningDaemon) -> None:
-    drive = Drive(client)
-    target_m = begun(client, daemon)
-    drive.to(0.5, 0.8, 0.0, told=False)  # the odometer claims that nothing happened
-    track = drive.told_to_stand()
-    assert track["state"] == "lost"
-    assert track["reason"]
-    track = drive.tell((0.02, HEADING_RAD))
-    assert track["state"] == "tracking", track["reason"]
-    assert off_m(track, drive, target_m) < 0.03
-
-
-def test_bad_starts_are_refused_with_one_sentence(client: Client, daemon: RunningDaemon) -> None:
-    Drive(client)
-    client.wait(client.point(pan_rad=0.0, tilt_rad=0.1))
-    shot = client.snapshot("navcam_left")
-    for x_px, y_px, words in ((200.0, 30.0, "texture"), (3.0, 150.0, "border")):
-        operation = client.start_track(pixel=("navcam_left", shot.frame_id, x_px, y_px))
-        track = client.wait_track(operation)
-        assert track["state"] == "idle"
-        assert words in track["reason"], track["reason"]
-        assert client.operation(operation)["state"] == "failed"
-    track = client.wait_track(client.start_track(position_m=[3.0, 0.0, -0.6]))
-    assert track["state"] == "idle"
-    assert "m from it; at most" in track["reason"], track["reason"]
-    track = client.wait_track(client.start_track(position_m=[-0.2, 0.0, 0.2]))
-    assert "no stereo pair sees the target" in track["reason"]
-
-
-def test_a_position_on_the_ground_starts_a_track(client: Client, daemon: RunningDaemon) -> None:
-    Drive(client)
-    target_m = begun(client, daemon)
-    client.stop_track()
-    track = client.wait_track(client.start_track(position_m=target_m.tolist(), frame="site"))
-    assert track["state"] == "tracking", track["reason"]
-    assert track["position_m"] == pytest.approx(target_m, abs=0.05)

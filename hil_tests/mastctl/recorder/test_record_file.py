@@ -16,8 +16,6 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 
-from calib.geometry.mode import in_mode
-from calib.geometry.sensor_mode import Mode
 from drivers.recordings.mcap_file import BadRecording, McapContents, McapEntry, read_items
 from hil_tests.mastctl.recorder.recorder_world import (
     CONFIG,
@@ -30,10 +28,8 @@ from hil_tests.mastctl.recorder.recorder_world import (
     recorder,
     told,
 )  # fmt: skip
-from hil_tests.mastctl.service_fakes import rig
-from mastctl.recorder.messages import calibration
 from mastctl.recorder.repair import repair
-from mastctl.recorder.writer import Attached, Clocks, RecordFile
+from mastctl.recorder.writer import Clocks, RecordFile
 
 
 @pytest.fixture(scope="module")
@@ -133,20 +129,18 @@ def test_the_tree_of_frames_puts_a_point_where_the_mast_file_sees_it(recorded: P
     camera = CameraCalibration.FromString(told_there.data)
     turn, place = rover_from["navcam_left"]
     model = rig.camera_in_rover("navcam_left", 0.25, 0.0)
-    for pixel in ([511.5, 383.5], [100.0, 700.0], [900.0, 50.0]):
+    for pixel in ([511.5, 383.5], [100.0, 700.0], [900.0, 50.0], [0.0, 0.0], [1023.0, 767.0]):
         ray = model.ray(np.array(pixel))
         point = ray.origins_m + 1e5 * ray.directions
         inside = turn.T @ (point - place)
         seen, _ = cv2.projectPoints(
             inside[None], np.zeros(3), np.zeros(3), np.array(camera.K).reshape(3, 3), np.array(camera.D)
         )
-        assert np.linalg.norm(seen.ravel() - pixel) < 0.5
+        assert np.linalg.norm(seen.ravel() - pixel) < 0.2  # the plumb_bob itself is 0.19 px off at worst
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_cut_off_at_any_byte_it_holds_every_chunk_before_and_repair_makes_it_whole(
-    tmp_path: Path, seed: int
-) -> None:
+def test_cut_off_at_any_byte_it_keeps_the_chunks_before_for_repair(tmp_path: Path, seed: int) -> None:
     whole = tmp_path / "whole.mcap"
     small(whole)
     data = whole.read_bytes()
@@ -180,21 +174,6 @@ def test_a_chunk_that_was_damaged_is_passed_over_and_told(tmp_path: Path) -> Non
     assert (repaired.messages, repaired.damaged) == (20, 1)
 
 
-def test_random_damage_never_ends_in_anything_but_a_shorter_reading(tmp_path: Path) -> None:
-    path = tmp_path / "fuzzed.mcap"
-    small(path)
-    data, chance = path.read_bytes(), np.random.default_rng(11)
-    for _ in range(300):
-        changed = bytearray(data)
-        for place in chance.integers(8, len(data), chance.integers(1, 4)):
-            changed[place] = chance.integers(0, 256)
-        path.write_bytes(changed)
-        found = McapContents()
-        there = numbers(path, found)
-        assert sorted(set(there)) == there and set(there) <= set(range(30)), changed
-        assert len(there) == 30 or found.damaged or not found.complete, changed
-
-
 def test_segments_become_one_file_with_each_attached_file_once(tmp_path: Path) -> None:
     parts = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     for part in parts:
@@ -221,22 +200,3 @@ def test_what_is_no_recording_is_refused_in_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(BadRecording, match="is no MCAP file"):
         repair([text], tmp_path / "out.mcap")
     assert not (tmp_path / "out.mcap").exists()
-
-
-def test_the_same_file_attached_again_stands_there_once_and_another_beside_it(tmp_path: Path) -> None:
-    file = RecordFile(tmp_path / "a.mcap", [CONFIG], {}, Clocks(0.0, 10**18))
-    file.attach(CONFIG, 10**18)
-    file.attach(Attached("other.yaml", b"other"), 10**18)
-    file.finish()
-    with (tmp_path / "a.mcap").open("rb") as opened:
-        assert [one.name for one in make_reader(opened).iter_attachments()] == [CONFIG.name, "other.yaml"]
-
-
-def test_a_camera_whose_picture_is_mirrored_has_no_calibration_that_others_know() -> None:
-    model = rig().cameras["navcam_left"].model
-    told = {}
-    for flip in ((True, False), (True, True)):
-        message, about = calibration("eye", in_mode(model, Mode(flip=flip)), 0)
-        told[flip] = message is None, about["plumb_bob"]
-    assert told[True, False] == (True, {"none": "the picture is mirrored, and no camera of this kind is"})
-    assert not told[True, True][0] and told[True, True][1]["worst_px"] < 1e-6, "upside down it is only turned"

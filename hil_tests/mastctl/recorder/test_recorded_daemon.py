@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from drivers.recordings.mcap_file import McapEntry, read_items
-from hil_tests.mastctl.recorder.recorder_world import files, told
+from hil_tests.mastctl.recorder.recorder_world import told
 from hil_tests.waiting import until
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
@@ -51,15 +51,6 @@ def client(daemon: RunningDaemon) -> Iterator[Client]:
         yield one
 
 
-def test_a_simulated_rover_records_nothing_before_it_is_asked_to(client: Client, folder: Path) -> None:
-    client.wait(client.point(pan_rad=0.1, tilt_rad=-0.1))
-    assert client.recordings()["recorder"]["recording"] is False
-    assert files(folder) == []
-    with pytest.raises(ClientError, match="no run is recorded") as refused:
-        client.stop_recording()
-    assert refused.value.code == "not_recording"
-
-
 def test_a_run_holds_what_was_asked_seen_and_found(client: Client, daemon: RunningDaemon) -> None:
     begun = client.start_recording("rock 7")
     assert begun["run"].endswith("-rock-7")
@@ -90,23 +81,6 @@ def test_a_run_holds_what_was_asked_seen_and_found(client: Client, daemon: Runni
     assert commands.count("point") >= 2
     assert len({one["word"] for one in told(path, "/state")}) > 1
     assert len({one["pan_rad"] for one in told(path, "/joints")}) > 1
-
-
-def test_a_run_is_of_the_mast_file_in_use_though_nothing_was_recorded_as_it_came(
-    client: Client, daemon: RunningDaemon
-) -> None:
-    used = daemon.service.config.mast_file
-    other = used.with_name("other.yaml")
-    other.write_bytes(used.read_bytes() + b"# another\n")
-    client.use_mast(other.name)
-    digest = client.status()["mast"]["digest"]
-    client.start_recording("measured")
-    path = Path(client.stop_recording()["file"])
-    assert [(one.name, one.data) for one, _ in read_whole(path).masts.values()] == [
-        (other.name, other.read_bytes())
-    ]
-    assert {one["mast_digest"] for one in told(path, "/camera/navcam_left/cahvor")} == {digest}
-    assert {one["digest"] for one in told(path, "/mast")} == {digest}
 
 
 def _state_of(path: Path, operation: str) -> str:

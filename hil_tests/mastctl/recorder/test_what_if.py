@@ -137,19 +137,6 @@ def test_the_command_tells_a_table_and_draws_a_page(
     assert page.count("data:image/jpeg") == 2 * len(CLICKS_PX) and page.count("data:image/png") == 1
 
 
-def test_a_mast_file_without_the_cameras_says_which(files: dict[str, Path], tmp_path: Path) -> None:
-    rig = load_rig(files["right"]).rig
-    fewer = replace(
-        rig,
-        cameras={name: one for name, one in rig.cameras.items() if not name.startswith("navcam")},
-        stereo={name: eyes for name, eyes in rig.stereo.items() if name != "navcam"},
-        fit={},
-    )
-    save_rig(fewer, tmp_path / "fewer.yaml")
-    answers = would_be(read_whole(files["wrong run"]), tmp_path / "fewer.yaml")
-    assert {one.error for one in answers} == {"the mast file has no camera navcam_left"}
-
-
 def test_what_cannot_be_worked_out_is_named() -> None:
     records = {
         "1": {"state": "done", "request": {"position_m": [1, 2, 3]}, "result": {"pointings": [{}]}},

@@ -23,27 +23,22 @@ CALLS = ("open", "write", "fsync", "replace", "unlink", "link", "close", "fchmod
 
 @dataclass
 class Recorder:
-    """Stands before ``os`` for one folder: notes the calls, and fails or cuts one of them.
+    """Stands before ``os`` for one folder: notes the calls, and fails one of them.
 
     Attributes
     ----------
     fail_at, error
         The number of the call that fails, and with what.
-    cut_at
-        The number of the call before which everything ends (`Cut`), as by a kill.
     """
 
     folder: Path
     fail_at: int = -1
     error: int = errno.EIO
-    cut_at: int = -1
     calls: list[tuple[Any, ...]] = field(default_factory=list)
     _files: dict[int, str] = field(default_factory=dict)
 
     def count(self) -> None:
         number = len(self.calls)
-        if number == self.cut_at:
-            raise Cut
         if number == self.fail_at:
             self.calls.append(("failed",))
             raise OSError(self.error, os.strerror(self.error))
@@ -109,10 +104,6 @@ class Recorder:
             patch.setattr(os, "link", two("link"))
             patch.setattr(os, "unlink", unlinked)
             yield self
-
-
-class Cut(BaseException):
-    """The process is killed here."""
 
 
 @dataclass

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,8 +11,9 @@ from typing import Any
 import pytest
 
 from calib.errors import BadFile
-from calib.files.atomic import previous_path, save_bytes
-from hil_tests.mastctl.safety.crash_states import Cut, Recorder, crash_states
+from calib.files.atomic import save_bytes
+from hil_tests.mastctl.safety.crash_states import Recorder, crash_states
+from hil_tests.support.kills import kill_writers
 from mastctl.safety.state_file import StateFile
 
 SCHEMA = "mastctl/test/1"
@@ -75,33 +74,9 @@ def test_a_disk_that_refuses_any_one_call_leaves_the_old_or_the_new(
     assert refused >= 5
 
 
-@pytest.mark.parametrize(("save", "read"), WRITERS)
-def test_a_process_that_ends_before_any_call_leaves_the_old_or_the_new_and_the_next_save_works(
-    tmp_path: Path, save: Callable[[Path], None], read: Callable[[Path], Any]
-) -> None:
-    cut = 0
-    for number in range(100):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        begun(folder, save)
-        with Recorder(folder, cut_at=number).installed():
-            try:
-                save(folder)
-            except Cut:
-                cut += 1
-        assert read(folder) in (OLD, NEW)
-        if cut == number:
-            break
-        save(folder)
-        assert read(folder) == NEW
-        if save is save_state:
-            assert [path.name for path in folder.iterdir()] == ["state.json"]
-    assert cut >= 5
-
-
 @pytest.mark.parametrize("old", [OLD, None])
 @pytest.mark.parametrize(("save", "read"), WRITERS)
-def test_after_a_power_cut_at_any_call_the_disk_holds_the_old_or_the_new_and_the_new_once_told(
+def test_a_power_cut_at_any_call_leaves_the_old_or_the_new(
     tmp_path: Path, save: Callable[[Path], None], read: Callable[[Path], Any], old: dict[str, str] | None
 ) -> None:
     folder = tmp_path / "recorded"
@@ -123,35 +98,6 @@ def test_after_a_power_cut_at_any_call_the_disk_holds_the_old_or_the_new_and_the
             assert found == NEW
         states += 1
     assert states > 20
-
-
-def test_a_power_cut_between_write_and_sync_is_found_out(tmp_path: Path) -> None:
-    """The judge itself: a careless writer does not pass."""
-    folder = tmp_path / "careless"
-    folder.mkdir()
-    path = folder / "state.json"
-
-    def careless() -> None:
-        descriptor = os.open(folder / "new", os.O_WRONLY | os.O_CREAT)
-        os.write(descriptor, b"new")
-        os.close(descriptor)
-        (folder / "new").replace(path)
-
-    path.write_bytes(b"old")
-    with Recorder(folder).installed() as recorder:
-        careless()
-    found = {
-        held.get(str(path)) for _, held in crash_states({str(path): b"old"}, recorder.calls, str(folder))
-    }
-    assert b"" in found
-
-
-def test_the_version_before_survives_a_power_cut_once_a_save_is_over(tmp_path: Path) -> None:
-    folder = tmp_path / "recorded"
-    folder.mkdir()
-    begun(folder, save_mast)
-    save_mast(folder)
-    assert previous_path(folder / "rig.yaml").read_bytes() == OLD["value"].encode()
 
 
 @pytest.mark.parametrize(
@@ -181,28 +127,7 @@ def test_a_state_file_is_for_its_user_only(tmp_path: Path) -> None:
     assert state(tmp_path).path.stat().st_mode & 0o777 == 0o600
 
 
-def test_what_is_no_json_is_not_written(tmp_path: Path) -> None:
-    state(tmp_path).write(OLD)
-    for bad in (float("nan"), object()):
-        with pytest.raises((ValueError, TypeError)):
-            state(tmp_path).write({"value": bad})
-    assert state(tmp_path).read() == OLD
-
-
-def kills(*options: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tools.campaigns.kills", "state", *options]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-def test_processes_killed_while_they_write_leave_whole_files() -> None:
-    done = kills("--cases", "60")
-    assert done.returncode == 0, done.stdout + done.stderr
-    found = {what: int(number) for number, _, what in (one.partition(" ") for one in done.stdout.split(", "))}
+def test_processes_killed_while_they_write_leave_whole_files(tmp_path: Path) -> None:
+    found = kill_writers(tmp_path, 60, seed=1)
     assert found["kills"] == 60
     assert found["in the middle of a save"] > 0
-
-
-def test_the_campaign_of_kills_sees_a_careless_writer() -> None:
-    done = kills("--cases", "500", "--careless")
-    assert done.returncode == 1
-    assert "seed 1" in done.stdout

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import os
-import resource
 import select
 import socket
 import stat
 import tempfile
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,16 +16,14 @@ from typing import Any
 import pytest
 
 from drivers.errors import DriverError
-from hil_tests.mastctl.service_fakes import CONFIG, Hang, fake_daemon
+from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, Hang, fake_daemon
 from hil_tests.waiting import NET_S, until
 from mastctl.cli.main import main
 from mastctl.client import Client
-from mastctl.errors import MastctlError
 from mastctl.safety import stop_socket as stop_socket_module
-from mastctl.safety import stop_threads as stop_threads_module
 from mastctl.safety.state_folder import StateFolder, usual_folder
 from mastctl.safety.stop_line import NoAnswer, ask
-from mastctl.safety.stop_socket import SILENT_PEERS, StopSocket
+from mastctl.safety.stop_socket import StopSocket
 
 
 class Stops:
@@ -37,11 +33,11 @@ class Stops:
         self.asked: list[tuple[Any, ...]] = []
         self.latched: list[tuple[Any, ...]] = []
 
-    def stop_told(self) -> dict[str, Any]:
+    def stop_told(self) -> Any:
         self.asked.append(("stop",))
         return {"stopped": True, "operation": None}
 
-    def estop(self, reason: str | None, name: str | None) -> dict[str, Any]:
+    def estop(self, reason: str | None, name: str | None) -> Any:
         self.asked.append(("estop", reason, name))
         return {"stopped": True, "latched": True, "name": name}
 
@@ -96,16 +92,7 @@ def test_a_line_that_ends_with_the_senders_side_counts(door: StopSocket) -> None
         assert made.recv(4096).startswith(b"stop {")
 
 
-def test_a_line_may_come_in_pieces_and_only_the_first_counts(door: StopSocket, stops: Stops) -> None:
-    with peer(door.path) as made:
-        for piece in (b"s", b"to", b"p\nstop\nestop x: y\n"):
-            made.sendall(piece)
-            time.sleep(0.02)
-        assert made.recv(4096).startswith(b"stop {")
-    assert stops.asked == [("stop",)]
-
-
-@pytest.mark.parametrize("data", [b"\n", b"go\n", b"stop now\n", b"\xff\xfe\n", b"GET / HTTP/1.1\r\n\r\n"])
+@pytest.mark.parametrize("data", [b"\n", b"stop now\n", b"\xff\xfe\n"])
 def test_what_is_no_stop_is_told_what_is_expected(door: StopSocket, stops: Stops, data: bytes) -> None:
     assert "where 'stop' or 'estop NAME: REASON' is expected" in said(door.path, data)
     assert stops.asked == []
@@ -122,18 +109,8 @@ def test_only_its_user_may_connect(door: StopSocket) -> None:
     assert stat.S_IMODE(door.path.stat().st_mode) == 0o600
 
 
-def test_it_leaves_the_umask_alone_which_is_every_threads(
-    tmp_path: Path, stops: Stops, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Two threads that change it at once and back can leave 0o177 behind.
-    monkeypatch.setattr(os, "umask", lambda mask: pytest.fail(f"umask {mask:#o}"))
-    made = StopSocket(tmp_path / "stop.sock", stops)
-    assert stat.S_IMODE(made.path.stat().st_mode) == 0o600
-    made.close()
-
-
 def test_a_stop_that_fails_is_told(door: StopSocket, stops: Stops, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse() -> dict[str, Any]:
+    def refuse() -> Any:
         raise DriverError("the cable is cut")
 
     monkeypatch.setattr(stops, "stop_told", refuse)
@@ -155,68 +132,15 @@ def test_a_stop_that_hangs_is_told_in_time_and_the_next_still_latches(
     hang.let_go()
 
 
-def test_a_stop_that_no_thread_can_send_any_more_is_told_at_once(
-    door: StopSocket, stops: Stops, monkeypatch: pytest.MonkeyPatch
+def test_silent_peers_by_the_hundred_do_not_keep_a_stop_out(
+    door: StopSocket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hang = Hang()
-    monkeypatch.setattr(stops, "stop_told", hang)
-    monkeypatch.setattr(stop_threads_module, "OVERDUE_S", -1.0)
-    senders = [peer(door.path) for _ in range(stop_socket_module.THREADS)]
-    for count, sender in enumerate(senders, 1):
-        sender.sendall(b"stop\n")
-        until(lambda count=count: len(door._threads._began_s) == count, "the stop is under way")
-    told = said(door.path, b"estop Ana: sparks\n")
-    assert told.startswith(f"failed: {len(senders)} stops are under way") and "switch its power off" in told
-    assert stops.latched == [("sparks", "Ana")]
-    hang.let_go()
-    for sender in senders:
-        sender.close()
-
-
-def test_who_goes_before_the_answer_hurts_nobody(
-    door: StopSocket, stops: Stops, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    hang = Hang()
-    monkeypatch.setattr(stops, "stop_told", hang)
-    with peer(door.path) as made:
-        made.sendall(b"stop\n")
-        until(lambda: door._threads._began_s, "the stop is under way")
-    hang.let_go()
-    monkeypatch.undo()
-    assert said(door.path, b"stop\n").startswith("stop {")
-
-
-def test_silent_peers_by_the_hundred_do_not_keep_a_stop_out(door: StopSocket) -> None:
+    monkeypatch.setattr(stop_socket_module, "SILENT_S", 1e6)
     with contextlib.ExitStack() as stack:
         for _ in range(500):
             stack.enter_context(peer(door.path))
         for _ in range(20):
             assert said(door.path, b"stop\n").startswith("stop {")
-        until(lambda: len(door._peers) <= SILENT_PEERS, "the oldest go")
-
-
-def test_silent_peers_who_come_again_and_again_do_not_keep_a_stop_out(door: StopSocket) -> None:
-    ended = threading.Event()
-
-    def crowd() -> None:
-        while not ended.is_set():
-            held = []
-            with contextlib.suppress(OSError):
-                for _ in range(100):
-                    held.append(peer(door.path))
-            for one in held:
-                one.close()
-
-    threads = [threading.Thread(target=crowd) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    try:
-        for _ in range(8):
-            assert ask(door.path, "stop")["stopped"] is True
-    finally:
-        ended.set()
-        for thread in threads:
-            thread.join(NET_S)
 
 
 def test_silent_peers_are_left_after_a_while(door: StopSocket, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,29 +148,6 @@ def test_silent_peers_are_left_after_a_while(door: StopSocket, monkeypatch: pyte
     with peer(door.path) as made:
         assert select.select([made], [], [], NET_S)[0]
         assert made.recv(10) == b""
-
-
-def test_a_process_without_descriptors_still_takes_stops(door: StopSocket) -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    held: list[int] = []
-    until(lambda: len(door._spares) == stop_socket_module.SPARES, "the descriptors that are kept")
-    ends = [socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) for _ in range(30)]  # the peers' own
-    try:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
-        with contextlib.suppress(OSError):
-            while True:
-                held.append(os.open(os.devnull, os.O_RDONLY))
-        for end in ends:
-            end.settimeout(NET_S)
-            end.connect(str(door.path))
-            end.sendall(b"stop\n")
-            assert end.recv(4096).startswith(b"stop {")
-    finally:
-        for descriptor in held:
-            os.close(descriptor)
-        for end in ends:
-            end.close()
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_a_socket_that_a_dead_daemon_left_is_replaced(tmp_path: Path, stops: Stops) -> None:
@@ -260,11 +161,6 @@ def test_a_socket_that_a_dead_daemon_left_is_replaced(tmp_path: Path, stops: Sto
     until(lambda: not path.exists(), "the end")
     with pytest.raises(NoAnswer, match="no daemon listens"):
         ask(path, "stop")
-
-
-def test_a_path_that_is_too_long_is_told(tmp_path: Path, stops: Stops) -> None:
-    with pytest.raises(MastctlError, match="is longer than the 100 bytes"):
-        StopSocket(tmp_path / ("x" * 100) / "stop.sock", stops)
 
 
 def test_a_daemon_whose_event_loop_is_blocked_takes_a_stop_here(
@@ -293,7 +189,7 @@ def test_a_daemon_whose_event_loop_is_blocked_takes_a_stop_here(
 # The command
 
 
-def test_the_command_takes_the_socket_where_there_is_one_and_http_where_not(
+def test_the_stop_command_prefers_the_socket_to_http(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path, config=CONFIG + "state: {{folder: s}}\n") as (daemon, hardware):
@@ -337,13 +233,43 @@ def test_the_commands_work_with_a_broken_configuration(
         assert [len(one) for one in asked] == [2, 0]
 
 
-def test_where_nobody_is_found_the_usual_address_is_asked_in_spite_of_a_broken_configuration(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.fixture
+def usual(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[str, FakeHardware]]:
+    """A daemon at the packaged configuration's address, found by that address alone; and its hardware."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with fake_daemon(monkeypatch, tmp_path, f"{{port: {port}}}") as (daemon, hardware):
+        assert daemon.service.stop_socket is not None
+        daemon.service.stop_socket.close()
+        monkeypatch.delenv("MASTCTL_URL", raising=False)
+        monkeypatch.setattr("mastctl.config.default_config", lambda: tmp_path / "daemon.yaml")
+        monkeypatch.setattr("mastctl.packaged.default_config", lambda: tmp_path / "daemon.yaml")
+        yield daemon.url, hardware
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["stop"],
+        ["estop", "--name", "Ana"],
+        ["point", "--angles", "0.1", "0"],
+    ],
+)
+def test_a_daemon_of_another_user_is_commanded_only_by_its_name(
+    usual: tuple[str, FakeHardware],
+    words: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "home"))
-    monkeypatch.delenv("MASTCTL_URL", raising=False)
-    (tmp_path / "daemon.yaml").write_text("schema: [")
-    code = main(["stop", "--config", str(tmp_path / "daemon.yaml")])
-    words = capsys.readouterr().err
-    assert "asking the usual address http://127.0.0.1:8420" in words
-    assert code in (0, 1)  # somebody may listen there
+    url, hardware = usual
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "getuid", lambda: 4242)
+        assert main(words) == 1
+        said = capsys.readouterr().err
+        assert f"the daemon at {url} was started by" in said and "--url" in said
+        assert ("stop",) not in hardware.head.calls
+        assert main(["status"]) == 0, "reading is free"
+        assert "ready" in capsys.readouterr().out
+        assert main(["stop", "--url", url]) == 0
+    assert f"at {url}" in capsys.readouterr().out

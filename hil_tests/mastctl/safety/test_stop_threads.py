@@ -11,7 +11,7 @@ from hil_tests.waiting import NET_S, until
 from mastctl.safety.stop_threads import OVERDUE_S, StopsHang, StopThreads
 
 
-def test_a_stop_is_refused_when_as_many_as_there_are_threads_are_overdue_and_only_then() -> None:
+def test_a_stop_is_refused_only_when_every_thread_is_overdue() -> None:
     clock, free, entered = ManualClock(), threading.Event(), []
 
     def hangs() -> str:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
-import signal
-import subprocess
 import sys
 import threading
 import time
@@ -21,15 +18,12 @@ import pytest
 
 from calib.files.mast_file import save_rig
 from drivers import open_hardware as door
-from drivers.absent import FIRST_WAIT_S, LONGEST_WAIT_S
 from drivers.errors import BadFrame, BadOptions, DriverError, LineLost, NoReply
-from drivers.interfaces import Frame
-from hil_tests import forks
+from drivers.interfaces import CameraInfo, Frame
 from hil_tests.mastctl.service_fakes import FakeCamera, FakeHead, Hang, rig
-from hil_tests.waiting import NET_S, until
-from mastctl.cli.main import main
+from hil_tests.waiting import until
 from mastctl.config import load_config
-from mastctl.motion.requests import AnglesTarget, PixelTarget, PointRequest
+from mastctl.motion.requests import AnglesTarget, PointRequest
 from mastctl.service.service import Service
 
 CAMERAS = ("navcam_left", "navcam_right", "hazcam_left")
@@ -55,7 +49,9 @@ class SmallEye(Eye):
 
 
 class SmallEyeThatSaysSo(SmallEye):
-    size_px = (16, 12)
+    @property
+    def info(self) -> CameraInfo:
+        return CameraInfo(size_px=(16, 12))
 
 
 @dataclass
@@ -169,20 +165,6 @@ def test_an_absent_camera_joins_by_itself_and_its_fault_goes(bench: Bench, tmp_p
     assert all(eye.closed for eye in bench.eyes.values())
 
 
-def test_requests_for_an_absent_camera_do_not_hasten_its_openings(bench: Bench, tmp_path: Path) -> None:
-    bench.before_eye["hazcam_left"] = Away(NoReply("no answer"))
-    began_s = time.monotonic()
-    with serving(tmp_path) as service:
-        for _ in range(100):
-            with pytest.raises(DriverError, match="no answer"):
-                service.snapshot("hazcam_left", fresh=True)
-        tries = len([name for name, _ in bench.calls if name == "hazcam_left"])
-        least_s = sum(min(FIRST_WAIT_S * 2**number, LONGEST_WAIT_S) for number in range(tries - 1))
-        assert least_s < time.monotonic() - began_s, f"{tries} openings"
-        main = threading.get_ident()
-        assert main not in {thread for _, thread in bench.calls}
-
-
 @pytest.mark.parametrize("kind", [SmallEye, SmallEyeThatSaysSo])
 def test_a_camera_that_joins_with_another_size_is_a_fault_and_not_served(
     bench: Bench, tmp_path: Path, kind: type[Eye]
@@ -221,21 +203,6 @@ def test_a_head_that_is_absent_refuses_the_start(bench: Bench, tmp_path: Path) -
     assert bench.calls == [], "no camera is touched before the head is there"
 
 
-def test_a_pixel_is_refused_while_the_other_eye_is_absent(bench: Bench, tmp_path: Path) -> None:
-    bench.before_eye["navcam_right"] = Away(LineLost("nothing at /dev/video7"))
-    with serving(tmp_path) as service:
-        frame = service.snapshot("navcam_left", fresh=True)
-        moves = [call for call in bench.heads[0].calls if call[0] == "move"]
-        done = service.steering.point(
-            PointRequest(PixelTarget("navcam_left", frame.frame_id, 30.0, 20.0)), {}
-        )
-        until(lambda: service.operations.get(done.id).state != "running", "the pointing's end")
-        record = service.operations.get(done.id)
-        assert record.state == "failed"
-        assert "nothing at /dev/video7" in str(record.error)
-        assert [call for call in bench.heads[0].calls if call[0] == "move"] == moves
-
-
 def test_a_factory_that_blocks_is_named_and_the_service_starts_without_it(
     bench: Bench, tmp_path: Path, hasty: None, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -254,84 +221,6 @@ def test_a_factory_that_blocks_is_named_and_the_service_starts_without_it(
         hang.let_go()
         until(lambda: not told(service, "navcam_left"), "joined")
         assert service.snapshot("navcam_left", fresh=True).camera == "navcam_left"
-
-
-def test_a_camera_that_is_opened_after_the_end_is_closed_again(
-    bench: Bench, tmp_path: Path, hasty: None
-) -> None:
-    hang = bench.before_eye["navcam_left"] = Hang()
-    with serving(tmp_path):
-        pass
-    hang.let_go()
-    until(lambda: "navcam_left" in bench.eyes and bench.eyes["navcam_left"].closed, "closed")
-
-
-def test_a_head_whose_factory_blocks_refuses_the_start_in_a_sentence(
-    bench: Bench, tmp_path: Path, hasty: None, caplog: pytest.LogCaptureFixture
-) -> None:
-    hang = bench.before_head = Hang()
-    with (
-        caplog.at_level(logging.WARNING),
-        pytest.raises(NoReply, match="pan_tilt: driver 'bench_of_test:head' did not open it within") as seen,
-    ):
-        Service.open(load_config(configuration(tmp_path)))
-    assert "\n" not in str(seen.value)
-    assert "pan_tilt: driver 'bench_of_test:head' is still opening it" in caplog.text
-    hang.let_go()
-    until(lambda: bench.heads and bench.heads[0].calls == [("close",)], "what came late is closed")
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_every_ending_signal_ends_a_start_that_hangs_in_a_factory(tmp_path: Path, number: int) -> None:
-    (tmp_path / "hanging.py").write_text(
-        "import sys, time\n\n\ndef head():\n    print('in the factory', file=sys.stderr, flush=True)\n"
-        "    time.sleep(60)\n"
-    )
-    text = configuration(tmp_path).read_text().replace("bench_of_test:head", "hanging:head")
-    (tmp_path / "daemon.yaml").write_text(text)
-    run = forks.Popen(
-        [*forks.MASTCTL, "run", "--config", str(tmp_path / "daemon.yaml")],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert run.stderr is not None
-        while "in the factory" not in (line := run.stderr.readline()):
-            assert line, "it ended before"
-        run.send_signal(number)
-        rest = run.communicate(timeout=NET_S)[1]
-    finally:
-        run.kill()
-        run.wait()
-    assert run.returncode == 0, rest
-    assert "Traceback" not in rest
-
-
-def test_a_command_that_wants_one_picture_does_not_promise_to_wait(
-    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    bench.before_eye["navcam_left"] = Away(LineLost("nothing at /dev/video7"))
-    config, out = str(configuration(tmp_path)), str(tmp_path / "picture.png")
-    assert main(["camera", "grab", "navcam_left", "--config", config, "--out", out]) == 1
-    told = capsys.readouterr().err.strip().splitlines()[-1]
-    assert told == "mastctl: navcam_left: nothing at /dev/video7"
-
-
-def test_another_mast_file_is_taken_while_a_camera_is_absent_or_has_another_size(
-    bench: Bench, tmp_path: Path
-) -> None:
-    away = bench.before_eye["navcam_left"] = Away(NoReply("no answer"))
-    with serving(tmp_path) as service:
-        save_rig(rig(), tmp_path / "other.yaml")
-        service.masts.load("other.yaml")
-        bench.kind = SmallEyeThatSaysSo
-        away.come()
-        until(lambda: "16x12 px" in "".join(told(service, "navcam_left")), "the fault")
-        service.masts.load("little.yaml")
-        assert "16x12 px" in "".join(told(service, "navcam_left"))
-        assert service.snapshot("navcam_right", fresh=True).camera == "navcam_right"
 
 
 def test_a_stop_is_not_kept_by_a_camera_that_is_absent_or_blocks(

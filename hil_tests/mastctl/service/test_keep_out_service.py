@@ -1,4 +1,4 @@
-"""Keep-outs in the whole service: a pointing goes round by corners, or says why it cannot."""
+"""Keep-outs in the whole service: a pointing through one is refused with the nearest free goal."""
 
 from __future__ import annotations
 
@@ -29,42 +29,33 @@ def service() -> Iterator[Service]:
     made.close()
 
 
-def pointed(service: Service, pan_rad: float, tilt_rad: float) -> dict[str, Any]:
+def pointed(service: Service, pan_rad: float, tilt_rad: float) -> Any:
     name = service.steering.point(PointRequest(AnglesTarget(pan_rad, tilt_rad)), {}).id
     until(lambda: service.operations.get(name).ended_s is not None, f"the end of operation {name}")
     return service.operations.get(name).told()
 
 
-def test_a_pointing_goes_round_a_keep_out_and_arrives(service: Service) -> None:
-    assert pointed(service, -0.8, -0.6)["state"] == "done"
-    record = pointed(service, 0.8, -0.6)
-    assert record["state"] == "done", record["error"]
-    steps = [step["name"] for step in record["steps"]]
-    assert steps.count("corner") == 2 and steps[-2:] == ["move", "settle"]
-    for step in record["steps"]:
-        if step["name"] == "corner":
-            assert step["detail"]["tilt_rad"] >= -0.4 + 0.02
-    reading = service.devices.read()
-    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx((0.8, -0.6), abs=1e-3)
-
-
-def test_what_cannot_be_reached_is_said_with_the_keep_outs_names(service: Service) -> None:
+def test_a_pointing_through_a_keep_out_names_it_and_a_free_goal(service: Service) -> None:
+    before = service.devices.read()
     record = pointed(service, 2.0, 0.0)
-    assert record["state"] == "failed" and record["error"]["code"] == "no_way"
-    assert "(deck, wall) within the limits" in record["error"]["message"]
+    assert record["state"] == "failed" and record["error"]["code"] == "keep_out"
+    assert "may pass the keep-out wall" in record["error"]["message"]
+    assert "the nearest goal that is free from there is pan 1.478, tilt 0 rad" in record["error"]["message"]
+    assert service.devices.read().pan_rad == before.pan_rad
+    assert pointed(service, 1.478, 0.0)["state"] == "done"
     with pytest.raises(KeptOut, match="keep-out deck"):
         service.steering.point(PointRequest(AnglesTarget(0.0, -0.5)), {})
 
 
-def test_a_head_in_a_keep_out_is_a_fault_and_a_pointing_leads_it_out_first(service: Service) -> None:
+def test_a_head_in_a_keep_out_is_a_fault_and_may_only_leave_it(service: Service) -> None:
     rover = service.hardware.simulation
     assert rover is not None
     rover.pan_tilt.move(0.2, -0.45)  # by hand
     service.clock.sleep(5.0)
-    service.devices.read()
+    pan_rad = service.devices.read().pan_rad
     assert "in_keep_out" in [fault.code for fault in service.devices.faults()]
     record = pointed(service, 0.0, 0.2)
-    assert record["state"] == "done", record["error"]
-    (corner,) = [step["detail"] for step in record["steps"] if step["name"] == "corner"]
-    assert corner["pan_rad"] == pytest.approx(0.2, abs=1e-3) and corner["tilt_rad"] > -0.4
+    assert record["error"]["code"] == "keep_out"
+    assert "the one move that is taken from there is out, to" in record["error"]["message"]
+    assert pointed(service, pan_rad, 0.2)["state"] == "done"
     assert "in_keep_out" not in [fault.code for fault in service.devices.faults()]

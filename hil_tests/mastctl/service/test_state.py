@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from drivers.interfaces import AxisMotion
-from mastctl.control.standing import Latched, Residual, Standing, StandingFault
+from hil_tests.waiting import present
+from mastctl.control.standing import Standing, StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.limits import Limits
@@ -20,7 +22,7 @@ REST = State(
     started_s=40.0,
     version="1",
     hardware="real",
-    mast={"file": "a.yaml"},
+    mast={"file": "a.yaml", "name": "a", "digest": "0"},
     former_mast=None,
     limits=Limits((-2.0, 2.0), (-1.0, 1.0), 0.5),
     axes={"pan": AxisMotion(1.0, 0.1, math.inf, 5e-5), "tilt": AxisMotion(1.0)},
@@ -30,15 +32,8 @@ REST = State(
     track=TrackStatus(),
     faults=(),
 )
-MOVING = HeadReading(0.1, -0.2, True, 99.75, true_rad=(0.1, -0.2))
 OF_THE_HEAD = StandingFault("head", "no_reply", "the head is silent", 98.5, "it answers")
 OF_A_CAMERA = replace(OF_THE_HEAD, device="navcam_left")
-
-
-def test_moving_is_what_the_head_said_last() -> None:
-    assert [replace(REST, reading=one).told()["moving"] for one in (None, REST.reading, MOVING)] == [
-        False, False, True,
-    ]  # fmt: skip
 
 
 def test_ages_count_to_the_moment_of_the_snapshot_and_are_never_below_zero() -> None:
@@ -60,38 +55,12 @@ def test_ages_count_to_the_moment_of_the_snapshot_and_are_never_below_zero() -> 
     for later_s, ages_s in ((0.0, (0.25, 0.5, 1.5, 60.0)), (-5.0, (0.0, 0.0, 0.0, 55.0))):
         told = replace(state, now_s=100.0 + later_s).told()
         camera, fault = told["cameras"]["navcam_left"], told["faults"][0]
-        assert (told["joints"]["age_s"], camera["age_s"], fault["for_s"], told["uptime_s"]) == ages_s
+        assert (present(told["joints"])["age_s"], camera["age_s"], fault["for_s"], told["uptime_s"]) == ages_s
     assert (camera["frame_id"], camera["sequence"], camera["exposure_s"]) == ("id", 7, 0.01)
 
 
 def test_what_is_not_known_yet_is_null() -> None:
-    told = replace(REST, reading=None).told()
+    told: Any = replace(REST, reading=None).told()
     names = ("joints", "operation", "target", "last_residual", "pose", "former_mast")
     assert [told[name] for name in names] == [None] * len(names)
     assert set(told["cameras"]["navcam_left"].values()) == {None}
-
-
-def test_what_is_known_is_told() -> None:
-    residual = Residual((0.25, -0.5), (0.1, 0.2), "2")
-    standing = Standing(
-        "stopped", "why", 97.5, operation="3", target={"pan_rad": 0.5}, residual=residual,
-        latch=Latched("Ana", "a hand", "2026-01-02T03:04:05Z"),
-    )  # fmt: skip
-    told = replace(REST, standing=standing, hardware="simulated", former_mast={"file": "b.yaml"}).told()
-    assert (told["state"], told["reason"], told["state_for_s"]) == ("stopped", "why", 2.5)
-    assert told["estop"] == {"name": "Ana", "reason": "a hand", "at": "2026-01-02T03:04:05Z"}
-    assert told["simulated"] and not REST.told()["simulated"]
-    assert (told["operation"], told["target"], told["former_mast"]) == (
-        "3",
-        {"pan_rad": 0.5},
-        {"file": "b.yaml"},
-    )
-    assert told["last_residual"] == {
-        "residual_px": [0.25, -0.5], "residual_sigma_px": [0.1, 0.2], "operation": "2",
-    }  # fmt: skip
-    assert told["joints"] == {
-        "pan_rad": 0.1, "tilt_rad": -0.2, "true_pan_rad": 0.103, "true_tilt_rad": -0.198,
-        "pan_approach": 1.0, "tilt_approach": 0.0, "measured_s": 99.75, "age_s": 0.25,
-    }  # fmt: skip
-    limits = {"pan_rad": [-2.0, 2.0], "tilt_rad": [-1.0, 1.0], "speed_rad_per_s": 0.5}
-    assert {key: told["limits"][key] for key in limits} == limits

@@ -12,7 +12,6 @@ import pytest
 from calib.files.mast_file import save_rig
 from hil_tests.mastctl.service_fakes import HTTP, FakeHardware, rig
 from hil_tests.waiting import until
-from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 
@@ -32,7 +31,7 @@ pan_tilt: {{driver: fake}}
 limits: {{pan_rad: [-2.0, 2.0], tilt_rad: [-1.0, 1.0], speed_rad_per_s: 0.5}}
 """
 
-ANGLES = {"pan_rad": 0.3, "tilt_rad": -0.2}
+ANGLES: dict[str, object] = {"pan_rad": 0.3, "tilt_rad": -0.2}
 
 
 def started(
@@ -100,41 +99,3 @@ def test_what_needs_a_picture_is_refused_in_a_sentence(
     assert "mast file has no" not in error["message"], "the mast file is not what lacks it"
     assert re.search("configured|no longer kept|not kept|unknown", error["message"]), error
     assert "move" not in {call[0] for call in calls[len(before) :]}
-
-
-def test_commands_and_page_serve_a_head_alone(
-    bare: RunningDaemon, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["status", "--url", bare.url]) == 0
-    assert main(["point", "--url", bare.url, "--angles", "0.1", "0"]) == 0
-    assert main(["stop", "--url", bare.url]) == 0
-    capsys.readouterr()
-    assert main(["snapshot", "navcam_left", "--url", bare.url, "--out", "never.png"]) != 0
-    told = capsys.readouterr().err.strip().splitlines()[-1]
-    assert "navcam_left is not configured" in told
-    answer = HTTP.post(f"{bare.url}/api/v1/mast", json={"file": "little.yaml"})
-    assert answer.status_code == 200, answer.text
-
-
-def test_one_eye_of_a_pair_is_not_said_to_be_missing_from_the_mast_file(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    cameras = "cameras: {navcam_left: {driver: fake}, hazcam_left: {driver: fake}}"
-    mounted = ("navcam_left", "hazcam_left")
-    with started(monkeypatch, tmp_path, cameras, mounted) as daemon:
-        for camera, reason in (
-            (
-                "navcam_left",
-                "the other camera of the stereo pair navcam, navcam_right, is not in the configuration",
-            ),
-            ("hazcam_left", "hazcam_left is in no stereo pair of the mast file"),
-        ):
-            answer = HTTP.get(f"{daemon.url}/api/v1/snapshot/{camera}")
-            frame_id = next(value for key, value in answer.headers.items() if key.endswith("frame-id"))
-            body = {"pixel": {"camera": camera, "frame_id": frame_id, "x_px": 30, "y_px": 20}}
-            error = outcome(daemon, "track", body)
-            assert error["code"] == "no_stereo"
-            assert reason in error["message"]
-            assert outcome(daemon, "point", body).get("code") != "no_stereo", "one camera points alone"
-        error = outcome(daemon, "track", {"position_m": [6.0, 0.0, 0.0]})
-        assert "none is configured with both cameras" in error["message"]

@@ -12,12 +12,11 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import yaml
 
-from drivers.clock import Clock
 from hil_tests.drivers.turned import turned
 from hil_tests.waiting import until
 from mastctl.cli.main import main
@@ -26,67 +25,38 @@ SHIFTED = '''
 """The same cameras with stamps that are off by a known time; a picture never comes before its stamp."""
 
 import dataclasses
-import threading
-import time
 
-from bench_rig import head
 from bench_rig.camera import FloorCamera
-
+from bench_rig.head import BenchHead
+from drivers.registry import Driver
 
 class Shifted(FloorCamera):
-    def __init__(self, mast_file, name, early_s=0.0, uncertainty_s=None, plain=False, waits=True):
-        super().__init__(mast_file, name)
-        self.early_s, self.plain, self.waits = early_s, plain, waits
-        if uncertainty_s is not None:
-            self.uncertainty_s = uncertainty_s
+    def __init__(self, options, context):
+        super().__init__(options, context)
+        self.early_s, self.plain = options.get("early_s", 0.0), options.get("plain", False)
+        self.waits = options.get("waits", True)
+        if options.get("uncertainty_s") is not None:
+            self.uncertainty_s = options["uncertainty_s"]
 
     def next_frame(self, exposed_after_s, timeout_s):
-        after_s = exposed_after_s + self.early_s if self.waits else time.monotonic()
+        after_s = exposed_after_s + self.early_s if self.waits else self._clock.now_s()
         frame = super().next_frame(after_s, timeout_s)
         if self.plain:
             frame.image[:] = 90
         told = dataclasses.replace(frame, mid_exposure_s=frame.mid_exposure_s - self.early_s)
         if self.waits:
-            time.sleep(max(0.0, told.mid_exposure_s + told.exposure_s - time.monotonic()))
+            self._clock.sleep(max(0.0, told.mid_exposure_s + told.exposure_s - self._clock.now_s()))
         if hasattr(self, "uncertainty_s"):
             object.__setattr__(told, "mid_uncertainty_s", self.uncertainty_s)
         return told
 
+def open_head(options, context):
+    HEADS.append(BenchHead({}, context))
+    return HEADS[-1]
 
-class Hanging(FloorCamera):
-    def next_frame(self, exposed_after_s, timeout_s):
-        HANGS.set()
-        time.sleep(600.0)
-
-
-def head_that_tells():
-    told = head.open_head(speed_rad_per_s=1.0)
-    HEADS.append(told)
-    return told
-
-
+HEAD, SHIFTED = Driver(open_head), Driver(Shifted)
 HEADS = []
-HANGS = threading.Event()
 '''
-
-
-class TurnedEvent:
-    """A `threading.Event` whose waits end by a turned clock."""
-
-    def __init__(self, clock: Clock) -> None:
-        self._signal, self._is_set = clock.signal(), False
-
-    def set(self) -> None:
-        with self._signal:
-            self._is_set = True
-            self._signal.notify_all()
-
-    def is_set(self) -> bool:
-        return self._is_set
-
-    def wait(self, timeout_s: float) -> bool:
-        with self._signal:
-            return self._is_set or self._signal.wait(timeout_s)
 
 
 @pytest.fixture
@@ -94,28 +64,21 @@ def turned_package(package: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[P
     """The package on a turned clock: pictures take no time, however busy the machine is."""
     with turned() as it:
         clock = it.clock
-        shims = {
-            "time": SimpleNamespace(monotonic=clock.now_s, sleep=clock.sleep),
-            "threading": SimpleNamespace(Event=lambda: TurnedEvent(clock), Lock=threading.Lock),
-        }
-        monkeypatch.setitem(sys.modules, "turned_time", SimpleNamespace(**shims))
-        for path in (*(package / "bench_rig").glob("*.py"), package / "shifted_rig.py"):
-            text = path.read_text().replace("import threading\nimport time\n", IMPORTS)
-            path.write_text(text.replace("PERIOD_S, EXPOSURE_S, TEXEL_M = 0.1,", ODD_PERIOD))
+        camera = package / "bench_rig" / "camera.py"
+        camera.write_text(camera.read_text().replace("PERIOD_S, EXPOSURE_S, TEXEL_M = 0.1,", ODD_PERIOD))
         monkeypatch.setattr("drivers.clock.SystemClock", lambda: clock)
         yield package
 
 
 # Else each way of the head would show the same few phases of a pixel, and the same errors of the matcher.
 ODD_PERIOD = "PERIOD_S, EXPOSURE_S, TEXEL_M = 0.0937,"
-IMPORTS = "from turned_time import threading, time\n"
 
 
 @pytest.fixture
 def package(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The package of the page and the shifting driver, importable."""
-    page = (repository / "docs" / "drivers.md").read_text()
-    sources = dict(re.findall(r"`(bench_rig/\w+\.py)`[^\n]*:\n\n```\w+\n(.*?)```", page, re.DOTALL))
+    package = repository / "docs" / "examples" / "bench_rig"
+    sources = {name: (package / name).read_text() for name in ("bench_rig/head.py", "bench_rig/camera.py")}
     (tmp_path / "bench_rig").mkdir()
     (tmp_path / "bench_rig" / "__init__.py").touch()
     for name, text in sources.items():
@@ -145,10 +108,10 @@ def config(folder: Path, repository: Path, cameras: dict[str, dict[str, object]]
     text = {
         "schema": "mastctl/config/1",
         "mast_file": "mast.yaml",
-        "pan_tilt": {"driver": "shifted_rig:head_that_tells"},
+        "pan_tilt": {"driver": "shifted_rig:HEAD"},
         "cameras": {
             name: {
-                "driver": f"shifted_rig:{more.get('make', 'Shifted')}",
+                "driver": f"shifted_rig:{more.get('make', 'SHIFTED')}",
                 "options": {"mast_file": str(folder / "mast.yaml"), "name": name}
                 | {key: value for key, value in more.items() if key not in ("offset_s", "make")},
             }
@@ -161,12 +124,12 @@ def config(folder: Path, repository: Path, cameras: dict[str, dict[str, object]]
     return str(folder / "config.yaml")
 
 
-def sync(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, dict[str, object]]]:
+def sync(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, Any]]:
     code = main(["camera", "sync", "--json", *words])
     return code, json.loads(capsys.readouterr().out)
 
 
-def test_both_eyes_offsets_are_measured_within_three_sigma_and_told_where_they_contradict(
+def test_offsets_are_measured_within_three_sigma_and_compared(
     turned_package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One camera is right; the other's pictures are 31 ms later than stamped, of which 10 ms are known."""
@@ -186,33 +149,6 @@ def test_both_eyes_offsets_are_measured_within_three_sigma_and_told_where_they_c
     assert later and float(later[1]) == pytest.approx(21.0, abs=3e3 * right["sigma_s"] + 0.1)
     head = sys.modules["shifted_rig"].HEADS[-1]
     assert head.at(math.inf) == (0.0, 0.0), "the head is where it was"
-
-
-def test_pictures_older_than_their_stamps_are_told_unless_the_driver_says_how_uncertain_it_is(
-    turned_package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """As a buffered capture does: one is silent about it, one states 0.2 s, one shows a plain wall."""
-    file = config(
-        turned_package,
-        repository,
-        {
-            "navcam_left": {"early_s": -0.120},
-            "navcam_right": {"early_s": -0.120, "uncertainty_s": 0.2},
-            "pancam_left": {"plain": True},
-        },
-    )
-    code, told = sync(capsys, "--config", file, "--seconds", "12", "--amplitude", "0.06", "--speed", "0.3")
-    assert code == 0, told
-    for name in ("navcam_left", "navcam_right"):
-        camera = told["cameras"][name]
-        assert abs(camera["offset_s"] + 0.120) < 3 * camera["sigma_s"] + 1e-4, told
-    early = re.search(r"taken (\d+\.\d) ms earlier", told["cameras"]["navcam_left"]["warning"])
-    assert early and float(early[1]) == pytest.approx(
-        120.0, abs=3e3 * told["cameras"]["navcam_left"]["sigma_s"] + 0.1
-    )
-    assert told["cameras"]["navcam_right"]["warning"] is None
-    assert told["cameras"]["pancam_left"]["offset_s"] is None
-    assert "too plain" in told["cameras"]["pancam_left"]["failure"]
 
 
 def test_a_signal_stops_the_head_where_it_is(
@@ -240,84 +176,6 @@ def test_a_signal_stops_the_head_where_it_is(
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_stamps_of_another_clock_are_told_as_that(
-    turned_package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Of the calendar's, and of one that something else started."""
-    file = config(
-        turned_package,
-        repository,
-        {
-            "navcam_left": {"early_s": -1.7e9, "waits": False},
-            "navcam_right": {"early_s": 5000.0, "waits": False},
-        },
-    )
-    code, told = sync(capsys, "--config", file, "--seconds", "3")
-    assert code == 1, told
-    left, right = (told["cameras"][name]["failure"] for name in ("navcam_left", "navcam_right"))
-    assert re.search(r"stamps are 1[67]\d{8}\.\d s later than the moments at which its frames came", left)
-    assert re.search(r"stamps are 500\d\.\d s earlier than the moments at which its frames came", right)
-    assert "CLOCK_MONOTONIC" in left
-
-
-@pytest.fixture
-def soon(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A camera's driver that does not come back is given up soon."""
-    from mastctl.setup import sync_sweep as sweep
-
-    monkeypatch.setattr(sweep, "FRAME_TIMEOUT_S", 0.5)
-    monkeypatch.setattr(sweep, "GRACE_S", 0.5)
-
-
-@pytest.mark.usefixtures("soon")
-def test_a_camera_whose_driver_hangs_is_told_of_and_the_other_one_measured(
-    turned_package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = config(turned_package, repository, {"navcam_left": {"make": "Hanging"}, "navcam_right": {}})
-    code, told = sync(capsys, "--config", file, "--seconds", "10")
-    assert code == 0 and told["cameras"]["navcam_right"]["offset_s"] is not None, told
-    assert "did not come back" in told["cameras"]["navcam_left"]["failure"]
-
-
-@pytest.mark.usefixtures("soon")
-def test_nothing_moves_where_no_camera_gives_a_picture(
-    turned_package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = config(turned_package, repository, {"navcam_left": {"make": "Hanging"}})
-    moves: list[tuple[object, ...]] = []
-    from mastctl.devices.devices import Devices
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Devices, "move", lambda self, *goal: moves.append(goal))
-        code, told = sync(capsys, "--config", file, "--seconds", "10")
-    assert code == 1 and "did not come back" in told["cameras"]["navcam_left"]["failure"]
-    assert not moves
-
-
-def test_a_signal_ends_it_while_a_cameras_driver_hangs(
-    package: Path, repository: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from mastctl.setup import sync_sweep as sweep
-
-    monkeypatch.setattr(sweep, "FRAME_TIMEOUT_S", 300.0)
-    monkeypatch.setattr(sweep, "END_S", 0.5)
-    file = config(package, repository, {"navcam_left": {"make": "Hanging"}})
-
-    def hangs() -> bool:
-        event = getattr(sys.modules.get("shifted_rig"), "HANGS", None)
-        return event is not None and event.is_set()
-
-    def interrupt() -> None:
-        until(hangs, "the driver hangs")
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    thread = threading.Thread(target=interrupt)
-    thread.start()
-    code, told = sync(capsys, "--config", file)
-    thread.join()
-    assert code == 1 and told["error"]["code"] == "stopped"
-
-
 def test_a_sweep_that_would_pass_a_limit_moves_nothing(
     package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -326,13 +184,3 @@ def test_a_sweep_that_would_pass_a_limit_moves_nothing(
     assert code == 1 and "0.06" in told["error"]["message"] and "limit" in told["error"]["message"]
     head = sys.modules["shifted_rig"].HEADS[-1]
     assert head.at(time.monotonic())[0] == 0.0
-
-
-def test_a_camera_that_is_not_on_the_head_or_not_configured_is_refused(
-    package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = config(package, repository, {"navcam_left": {}, "hazcam_left": {}})
-    for name, words in (("hazcam_left", "is not on the head"), ("navcam_rihgt", "is not configured")):
-        code, told = sync(capsys, name, "--config", file)
-        assert code == 2 and words in told["error"]["message"] and "navcam_left" in told["error"]["message"]
-    assert "shifted_rig" not in sys.modules, "nothing was opened"

@@ -6,20 +6,14 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from calib.files.mast_file import load_rig
-from calib.geometry.cahvor import CameraModel
 from drivers.errors import BadOptions
-from drivers.hardware import DeviceSettings
 from hil_tests.waiting import until
-from mastctl.config import load_config
 from mastctl.packaged import config_folder
-from mastctl.testing.daemons import config_for_a_test, resized, with_width
+from mastctl.testing.daemons import config_for_a_test
 
 HOLDER = """
 import os, sys, threading, time
@@ -85,33 +79,6 @@ def test_its_process_ends_when_the_one_that_made_it_is_killed(
     until(lambda: not runs(serving[0]), "its end")
 
 
-XDIST = """
-import os, subprocess, sys
-os.environ["PYTEST_XDIST_WORKER"] = "gw0"
-worker = subprocess.Popen([sys.executable, "-c", sys.argv[1], sys.argv[2], "alone"])  # outlives this one
-os.write(1, b"%d\\n" % worker.pid)
-worker.wait()
-"""
-
-
-def test_its_process_ends_when_the_pytest_of_its_worker_is_killed_and_the_worker_lives_on(
-    tmp_path: Path,
-) -> None:
-    command = [sys.executable, "-c", XDIST, HOLDER, str(tmp_path / "log")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as made:
-        assert made.stdout is not None
-        worker, serving = (int(made.stdout.readline()) for _ in range(2))
-        try:
-            assert runs(worker) and runs(serving)
-            made.kill()
-            until(lambda: not runs(serving), "its end")
-            assert runs(worker)
-        finally:
-            made.kill()
-            for pid in filter(runs, (worker, serving)):
-                os.kill(pid, 9)
-
-
 def test_a_configuration_with_a_real_device_is_refused(tmp_path: Path) -> None:
     text = (config_folder() / "default.yaml").read_text()
     path = tmp_path / "bench.yaml"
@@ -135,35 +102,6 @@ def test_what_is_not_said_is_quick_and_what_is_said_holds(tmp_path: Path) -> Non
     own.write_text((config_folder() / "default.yaml").read_text().replace("samples: 2", "samples: 4"))
     assert section(str(own)) == (4, "max")
     assert config_for_a_test(None, None, {}, tmp_path).listen.port == 0
-
-
-@pytest.mark.parametrize("width_px", [320, 640, 2048])
-def test_a_camera_with_fewer_pixels_sees_the_same(width_px: int) -> None:
-    """A pixel's edges scale about the picture's edge, half a pixel beyond the first centre."""
-    rig = load_rig(config_folder() / "sim" / "rocky8.yaml").rig
-    points_m = np.random.default_rng(3).uniform([3, -2, -2], [9, 2, 1], (200, 3))
-    for name in ("navcam_left", "pancam_right"):
-        before: CameraModel = rig.cameras[name].model
-        after = resized(before, width_px)
-        factor = width_px / before.size_px[0]
-        assert after.size_px == (width_px, round(before.size_px[1] * factor))
-        seen, valid = before.project(points_m)
-        wanted = (seen[valid] + 0.5) * factor - 0.5
-        assert valid.any()
-        np.testing.assert_allclose(after.project(points_m)[0][valid], wanted, atol=1e-9)
-
-
-@pytest.mark.parametrize("width_px", [0, 63, 4097, 320.0, "320", True])
-def test_a_width_that_is_none_is_refused(width_px: object, tmp_path: Path) -> None:
-    with pytest.raises(BadOptions, match="expected a whole number from 64 to 4096"):
-        with_width(load_config(), width_px, tmp_path)  # type: ignore[arg-type]
-
-
-def test_a_true_rig_that_is_not_there_is_named(tmp_path: Path) -> None:
-    config = load_config()
-    hardware = replace(config.hardware, simulation={"rover": "nowhere.yaml"}, pan_tilt=DeviceSettings("sim"))
-    with pytest.raises(BadOptions, match=r"simulation\.rover: .*nowhere\.yaml"):
-        with_width(replace(config, hardware=hardware), 320, tmp_path)
 
 
 REFUSED = {

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from calib.files.mast_file import load_rig, save_rig
+from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import rot_y
+from hil_tests.support.feature_days import ChangedRig, about
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
-from tools.campaigns.sentinel_days import ChangedRig, changed, smaller
 
 BY = 2
 """The Navcams have so many times fewer pixels along each side."""
@@ -32,17 +33,15 @@ def small(rig: Rig) -> Rig:
 
 
 @contextmanager
-def small_rover(repository: Path, folder: Path, speed: float | str = "max") -> Iterator[RunningDaemon]:
+def small_rover(repository: Path, folder: Path) -> Iterator[RunningDaemon]:
     """A running daemon; what is true differs from its mast file as on the packaged rover."""
     config = load_config(repository / "configs/default.yaml")
     save_rig(small(load_rig(config.mast_file).rig), folder / "mast.yaml")
     save_rig(small(load_rig(repository / "configs/sim/rocky8.yaml").rig), folder / "true.yaml")
     hardware = config.hardware
-    simulation = {
-        **hardware.simulation, "speed": speed, "samples": 1, "rover": str(folder / "true.yaml"),
-    }  # fmt: skip
+    changes = {"speed": "max", "samples": 1, "rover": str(folder / "true.yaml")}
     cameras = {name: one for name, one in hardware.cameras.items() if name.startswith("navcam")}
-    hardware = replace(hardware, simulation=simulation, cameras=cameras)
+    hardware = replace(hardware, simulation={**hardware.simulation, **changes}, cameras=cameras)
     config = replace(
         config,
         listen=Listen(port=0),
@@ -71,11 +70,6 @@ def bumped(rig: Rig, camera: str, turn_rad: tuple[float, float, float]) -> Rig:
     return _with(rig, camera, ChangedRig(turned={camera: np.array(turn_rad)}))
 
 
-def refocused(rig: Rig, camera: str, part: float) -> Rig:
-    """A camera whose focal length is longer by a part."""
-    return _with(rig, camera, ChangedRig(focal={camera: part}))
-
-
 def _with(rig: Rig, camera: str, truth: ChangedRig) -> Rig:
     one = rig.cameras[camera]
     model = changed(one.model, camera, truth)
@@ -92,3 +86,24 @@ def slipped(rig: Rig, pan_rad: float, tilt_rad: float) -> Rig:
         vectors = {letter: turn @ getattr(one.model, letter) for letter in "CAHVO"}
         cameras[name] = replace(one, model=replace(one.model, **vectors)) if one.on == "head" else one
     return replace(rig, mast=mast, cameras=cameras)
+
+
+def changed(model: CameraModel, eye: str, truth: ChangedRig) -> CameraModel:
+    """A camera of the head as a change leaves it: turned about its own place, its focal length another."""
+    t = truth.turned.get(eye, np.zeros(3))
+    turn = about(2, t[2]) @ about(1, t[1]) @ about(0, t[0])
+    longer = 1.0 + truth.focal.get(eye, 0.0)
+    vectors = {}
+    for letter in "HV":
+        vector = getattr(model, letter)
+        along = float(model.A @ vector) * model.A
+        vectors[letter] = turn @ (along + longer * (vector - along))
+    vectors |= {"A": turn @ model.A, "O": turn @ model.O}
+    return replace(model, **vectors)
+
+
+def smaller(model: CameraModel, by: int) -> CameraModel:
+    """The same view in ``by`` times fewer pixels along each side; (0, 0) is the middle of the first pixel."""
+    width, height = model.size_px
+    h, v = (vector / by + (0.5 / by - 0.5) * model.A for vector in (model.H, model.V))
+    return replace(model, size_px=(width // by, height // by), H=h, V=v)

@@ -9,37 +9,11 @@ import numpy as np
 import pytest
 
 from hil_tests.mastctl.watch.histories import DAY_S, NOON_S, bumped, honest, pointing, stored_rig
-from mastctl.watch.evidence import Expected, Judge, Sums, sums_of
+from mastctl.watch.evidence import Expected, Judge, sums_of
 from mastctl.watch.residuals import LOG_THRESHOLD, Windows, verdict_of
 
 CAMERAS = ("pancam_left", "navcam_left", "navcam_right")
 BUMP_RAD = 2e-3
-DAYS = 3000
-POINTINGS = 12
-
-
-@pytest.mark.long(1, "statistics over thousands of days; that the evidence is a fair bet is tested quickly")
-def test_thousands_of_honest_days_raise_no_more_false_alarms_than_stated() -> None:
-    rng = np.random.default_rng(20)
-    root = rng.normal(0.0, 0.5, (4, 4))
-    judge = Judge(root @ root.T, ("a", "b"))
-    alarms, averages = 0, []
-    for _ in range(DAYS):
-        wrong = root @ rng.normal(0.0, 1.0, 4)
-        sums, loudest = None, -math.inf
-        for number in range(POINTINGS):
-            rates = rng.normal(0.0, 1.0, (2, 4))
-            turned = np.zeros((2, 6))
-            turned[:, 3 * (number % 2) : 3 * (number % 2) + 3] = rng.normal(0.0, 1000.0, (2, 3))
-            off = rates @ wrong + rng.normal(0.0, 0.3, 2)
-            one = sums_of(Expected(0.09 * np.eye(2), rates, turned), (off[0], off[1]), 0.0)
-            sums = one if sums is None else sums + one
-            evidence = judge.weigh(sums)
-            loudest = max(loudest, evidence.log_evidence)
-        alarms += loudest >= LOG_THRESHOLD
-        averages.append(evidence.times**2)
-    assert alarms <= 3, f"{alarms} of {DAYS} honest days, seed 20"
-    assert np.mean(averages) == pytest.approx(1.0, abs=0.02)  # the square has its stated mean
 
 
 def test_evidence_is_a_fair_bet_while_the_mast_file_holds() -> None:
@@ -58,7 +32,7 @@ def test_evidence_is_a_fair_bet_while_the_mast_file_holds() -> None:
     assert np.mean(ratios) == pytest.approx(1.0, abs=5 * np.std(ratios) / math.sqrt(len(ratios)))
 
 
-def test_an_honest_rig_raises_no_alarm_and_its_residuals_are_within_what_is_expected() -> None:
+def test_an_honest_rig_raises_no_alarm_and_stays_within_expectation() -> None:
     stored = stored_rig()
     for seed in range(25):
         rng = np.random.default_rng(seed)
@@ -122,7 +96,7 @@ def test_one_false_match_is_no_drift() -> None:
     assert evidence is not None and evidence.log_evidence < LOG_THRESHOLD
 
 
-def test_false_matches_that_other_eyes_did_not_confirm_are_no_drift_and_a_bump_is_one() -> None:
+def test_unconfirmed_false_matches_are_no_drift_and_a_bump_is_one() -> None:
     stored = stored_rig()
     for what, turn_rad, expected in (("false", 0.0, "good"), ("bump", BUMP_RAD, "drifts")):
         rng = np.random.default_rng(6)
@@ -135,10 +109,3 @@ def test_false_matches_that_other_eyes_did_not_confirm_are_no_drift_and_a_bump_i
                 one = replace(one, confirmed=False, off_px=off)
             windows.add(one)
         assert verdict_of(windows.evidence(), 12).word == expected, what
-
-
-def test_sums_are_those_of_their_parts() -> None:
-    one = Sums(1, np.eye(2), np.ones(2), 3.0, 5.0)
-    both = one + Sums(2, 2 * np.eye(2), np.zeros(2), 1.0, 4.0)
-    assert (both.count, both.square, both.first_s) == (3, 4.0, 4.0)
-    assert ((both - one).count, (both - one).square) == (2, 1.0)

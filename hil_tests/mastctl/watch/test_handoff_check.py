@@ -88,14 +88,6 @@ def test_a_turned_body_pair_is_told_after_enough_hand_offs(
     assert len(read_log(tmp_path / "h.jsonl").handoffs) == 20
 
 
-def test_hand_offs_without_an_offset_tell_none(rig: Rig) -> None:
-    selfcheck = check(None)
-    for one in handed(rig, 20):
-        selfcheck.add(one)
-    assert selfcheck.told() == {"handoffs": 20, "offsets": []}
-    selfcheck.close()
-
-
 def test_only_hand_offs_of_the_mast_file_in_use_count(rig: Rig) -> None:
     selfcheck = check(None)
     for one in [*handed(rig, 12, 0.004), *handed(rig, 5, 0.0, OTHER)]:
@@ -105,17 +97,6 @@ def test_only_hand_offs_of_the_mast_file_in_use_count(rig: Rig) -> None:
     assert selfcheck.told() == {"handoffs": 5, "offsets": []}
     selfcheck.use_mast(DIGEST)
     assert len(selfcheck.told()["offsets"]) == 2
-
-
-def test_what_was_written_down_before_counts_after_a_restart(rig: Rig, tmp_path: Path) -> None:
-    writer = HandoffLog(tmp_path / "h.jsonl")
-    for one in handed(rig, 12, 0.004):
-        writer.append(one)
-    selfcheck = check(tmp_path / "h.jsonl")
-    until(lambda: selfcheck.told()["handoffs"] == 12, "the record is read")
-    assert len(selfcheck.told()["offsets"]) == 2
-    assert selfcheck.faults() == ()
-    selfcheck.close()
 
 
 def full(tmp_path: Path) -> Path:
@@ -144,34 +125,6 @@ def test_a_record_that_cannot_be_written_is_a_fault_and_nothing_else(
     assert fault.message.startswith(str(path)) and "hand-offs count, and wait" in fault.message
     assert "\n" not in fault.message
     selfcheck.close()
-
-
-def test_what_waited_is_written_down_when_the_file_can_be_written_again(rig: Rig, tmp_path: Path) -> None:
-    path = folder_in_the_way(tmp_path)
-    selfcheck = check(path)
-    one, two, three = handed(rig, 3)
-    selfcheck.add(one)
-    selfcheck.add(two)
-    until(lambda: any(one.code == "unwritable" for one in selfcheck.faults()), "the fault")
-    path.rmdir()
-    selfcheck.add(three)
-    selfcheck.close()
-    assert not [each for each in selfcheck.faults() if each.code == "unwritable"]
-    clicks = [each.clicks_px.tolist() for each in read_log(path).handoffs]
-    assert clicks == [each.clicks_px.tolist() for each in (one, two, three)]
-
-
-def test_a_spoilt_record_is_a_fault_and_what_comes_counts(rig: Rig, tmp_path: Path) -> None:
-    path = tmp_path / "h.jsonl"
-    path.write_text("something else\nthat is no record\n")
-    selfcheck = check(path)
-    selfcheck.add(handed(rig, 1)[0])
-    until(lambda: len(selfcheck.faults()) == 2, "neither read nor written")
-    assert [one.code for one in selfcheck.faults()] == ["unreadable", "unwritable"]
-    assert "line 1" in selfcheck.faults()[0].message
-    assert selfcheck.told()["handoffs"] == 1
-    selfcheck.close()
-    assert path.read_text().startswith("something else\n")
 
 
 def test_a_file_that_hangs_keeps_nobody_waiting(

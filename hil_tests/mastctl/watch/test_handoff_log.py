@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,14 +39,6 @@ def test_what_is_appended_is_read_back_to_the_last_digit(tmp_path: Path) -> None
     assert read.handoffs[1].name == "hand-off of 2026-01-02T03:04:05.678+00:00 (handoffs.jsonl line 2)"
     assert list(read.handoffs[0].found) == ["hazcam_left"]
     assert read.handoffs[0].landed["hazcam_right"].found_px is None
-
-
-def test_many_writers_do_not_mix_their_lines(tmp_path: Path) -> None:
-    path = tmp_path / "h.jsonl"
-    with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda index: HandoffLog(path).append(one(index)), range(40)))
-    seen = sorted(float(h.landed["hazcam_left"].geometric_px[0]) for h in read_log(path).handoffs)
-    assert seen == [300.25 + index for index in range(40)]
 
 
 def test_a_line_that_a_crash_cut_short_is_passed_over_and_then_taken_away(tmp_path: Path) -> None:
@@ -95,23 +86,16 @@ LEFT = "destinations/hazcam_left"
     ("change", "place", "words"),
     [
         (changed("schema", "mastctl/handoff/2"), "line 2.schema", "mastctl/handoff/1"),
-        (changed("extra", 1), "line 2.extra", "unknown key"),
         (changed("time", "yesterday"), "line 2.time", "ISO 8601"),
-        (changed("source", ["navcam_left"]), "line 2.source", "right camera"),
         (changed("source", ["the left", "right"]), "line 2.source", "letters, digits"),
         (changed("sigma_px", 0), "line 2.sigma_px", "above zero"),
         (changed("joint_sigma_rad", -1.0), "line 2.joint_sigma_rad", "zero or more"),
         (changed("left_px", ["1", "2"]), "line 2.left_px[0]", "a number"),
-        (changed("destinations/the front", {}), "line 2.destinations.the front", "letters, digits"),
         (changed(f"{LEFT}/verdict", "good"), "line 2.destinations.hazcam_left.verdict", "accepted"),
         (changed(f"{LEFT}/found_px", None), "line 2.destinations.hazcam_left.found_px", "2 numbers"),
         (
             changed(f"{LEFT}/found_covariance_px2", [[1, 2], [2, 1]]),
             "line 2.destinations.hazcam_left.found_covariance_px2", "covariance",
-        ),
-        (
-            changed(f"{LEFT}/found_covariance_px2", [[1, 0], [0]]),
-            "line 2.destinations.hazcam_left.found_covariance_px2[1]", "2 numbers",
         ),
     ],
 )  # fmt: skip
@@ -125,14 +109,3 @@ def test_a_bad_line_is_refused_by_its_number_and_key(
     with pytest.raises(BadFile) as caught:
         read_log(path)
     assert caught.value.place == place and words in caught.value.reason
-
-
-def test_a_broken_line_before_the_last_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "h.jsonl"
-    whole = json.dumps(line_of(one()))
-    path.write_text(f"{whole}\n{whole[:50]}\n{whole}\n")
-    with pytest.raises(BadFile, match=r"line 2: is no JSON"):
-        read_log(path)
-    path.write_text("[" * 5000 + "\n" + whole + "\n")
-    with pytest.raises(BadFile, match="line 1"):
-        read_log(path)

@@ -9,18 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.errors import BadFile
-from calib.geometry.rig import Rig
 from drivers.interfaces import COARSE_COUNT_RAD
-from hil_tests.mastctl.service_fakes import Hang
-from hil_tests.mastctl.watch.histories import DAY_S, NOON_S, bumped, pointing, stored_rig
-from hil_tests.waiting import NET_S, until
+from hil_tests.mastctl.watch.histories import NOON_S, bumped, pointing, stored_rig
+from hil_tests.waiting import until
 from mastctl.control.records import Operation
 from mastctl.motion.results import Step
 from mastctl.watch import pointings as journal_module
-from mastctl.watch import residuals as health_module
 from mastctl.watch.pointings import FILE, Journal, Measured, measured_by, measured_of
-from mastctl.watch.residuals import CalibrationHealth, Windows
+from mastctl.watch.residuals import CalibrationHealth
 
 STORED = stored_rig()
 
@@ -98,16 +94,6 @@ def test_a_file_that_is_full_is_written_anew_with_what_counts(
     assert journal.read()[-2:] == known[-2:]
 
 
-def test_a_folder_that_is_no_folder_is_told(tmp_path: Path) -> None:
-    (tmp_path / FILE).mkdir()
-    with pytest.raises(BadFile, match="cannot be"):
-        Journal(tmp_path / FILE).read()
-    health = CalibrationHealth(tmp_path, STORED, lambda: NOON_S)
-    health.ended(STORED, ended_pointing())
-    until(lambda: health.told()["write_error"], "the file is told")
-    health.close()
-
-
 def test_a_drift_is_told_after_a_restart_and_ends_with_another_mast_file(tmp_path: Path) -> None:
     for one in history(6, 2e-3):
         Journal(tmp_path / FILE).add(one, [])
@@ -121,39 +107,6 @@ def test_a_drift_is_told_after_a_restart_and_ends_with_another_mast_file(tmp_pat
     health.use_mast(STORED)
     until(lambda: health.verdict.word == "drifts", "it drifts")
     health.close()
-
-
-def test_a_pointing_that_ends_as_the_mast_file_is_exchanged_is_judged_by_neither(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for one in history(6, 2e-3):
-        Journal(tmp_path / FILE).add(one, [])
-    health = CalibrationHealth(tmp_path, STORED, lambda: NOON_S + 600.0)
-    until(lambda: health.verdict.word == "drifts", "it drifts")
-    kept, judged, seen = Hang(), Hang(), Windows
-
-    def windows(rig: Rig, digest: str) -> Windows:
-        judged()
-        return seen(rig, digest)
-
-    monkeypatch.setattr(health_module, "Windows", windows)
-    monkeypatch.setattr(Journal, "add", kept)
-    health._queue.put(history(1)[0])
-    assert kept.entered.wait(NET_S)
-    health.use_mast(replace(STORED, digest="0" * 64))
-    kept.let_go()
-    assert judged.entered.wait(NET_S)
-    assert health.verdict.word == "few" and health.told()["newest"] == []
-    judged.let_go()
-    health.close()
-
-
-def test_pointings_of_last_month_do_not_count(tmp_path: Path) -> None:
-    for one in history(6, 2e-3):
-        Journal(tmp_path / FILE).add(one, [])
-    health = CalibrationHealth(tmp_path, STORED, lambda: NOON_S + 30 * DAY_S)
-    health.close()
-    assert (health.verdict.word, health.verdict.pointings) == ("few", 0)
 
 
 def test_a_mast_file_that_does_not_say_how_sure_it_is_is_not_judged_by(tmp_path: Path) -> None:

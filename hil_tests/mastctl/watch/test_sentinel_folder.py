@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.calibrate.scene.drift import SceneChange, SceneDrift
+from calib.calibrate.drift import SceneChange, SceneDrift
 from calib.errors import BadFile
 from mastctl.watch import reference as folder_module
 from mastctl.watch.looks import is_due
@@ -25,7 +25,7 @@ from mastctl.watch.reference import (
     read_reference,
     save_reference,
 )
-from mastctl.watch.sentinel import findings, standing
+from mastctl.watch.sentinel import standing
 
 NOW = datetime(2026, 5, 4, 12, 0, tzinfo=UTC)
 RESTS = [(0.0, -0.2), (0.5, -0.2)]
@@ -90,17 +90,6 @@ def test_looks_are_added_line_by_line_and_a_torn_one_costs_only_itself(tmp_path:
     assert looks[1]["silent"] == ["eye at rest 2"]
 
 
-@pytest.mark.parametrize(
-    "row", ["[]", "{}", "7", '{"time": 3, "views": 1}', '{"time": "x"}', "\x00", "[" * 100000]
-)
-def test_lines_that_are_no_looks_are_left_out(row: str, tmp_path: Path) -> None:
-    reference = save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
-    (tmp_path / LOOKS).write_text(row + "\n")
-    add_look(tmp_path, reference, NOW.isoformat(), SceneDrift(2, (), (), None))
-    assert len(read_looks(tmp_path, reference)) == 1
-    assert findings(tmp_path, "d" * 64)["level"] == "good"
-
-
 def test_a_disk_that_is_full_costs_the_new_reference_and_not_the_old(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -161,7 +150,7 @@ def history(sizes: list[float], sigma: float = 1e-4) -> list[dict[str, Any]]:
     return looks
 
 
-def test_a_change_that_grew_is_told_as_slow_with_its_rate_and_one_that_came_at_once_is_not() -> None:
+def test_a_change_that_grew_is_slow_with_a_rate_and_a_step_is_not() -> None:
     rng = np.random.default_rng(2)
     days = np.arange(1, 31)
     reference = Reference((NOW - timedelta(days=30, hours=1)).isoformat(), "d" * 64, (), (), Path())
@@ -178,10 +167,9 @@ def test_a_change_that_grew_is_told_as_slow_with_its_rate_and_one_that_came_at_o
     assert abs((NOW - since) / timedelta(days=1) - 20) < 3
 
 
-def test_a_clock_that_was_set_back_is_told_and_does_not_stop_the_looks() -> None:
+def test_a_clock_that_was_set_back_does_not_stop_the_looks() -> None:
     reference = Reference((NOW + timedelta(days=3)).isoformat(), "d" * 64, (), (), Path())
     assert "at a time 3 days ahead of this clock" in standing(reference, [], NOW).sentence
-    assert "ahead of this clock" in standing(reference, [day(-2)], NOW).sentence
     assert is_due(reference, (NOW + timedelta(days=3, hours=1)).isoformat(), 86400.0, NOW)
     assert not is_due(reference, NOW.isoformat(), 86400.0, NOW + timedelta(minutes=1))
 
@@ -193,13 +181,6 @@ def test_a_look_is_due_at_the_references_time_of_day() -> None:
     assert not is_due(reference, yesterday, 86400.0, morning)
     assert is_due(reference, yesterday, 86400.0, morning + timedelta(minutes=1))
     assert not is_due(reference, None, 86400.0, datetime(2026, 5, 1, 20, 0, tzinfo=UTC))
-
-
-def test_what_was_found_long_ago_says_so() -> None:
-    old = standing(REFERENCE_OF_A_WEEK, [day(30, "eye turned"), day(20, "eye turned")], NOW)
-    assert "since 30 days (last looked 20 days ago)" in old.sentence
-    blind = standing(REFERENCE_OF_A_WEEK, [day(5), *(day(ago, views=0) for ago in (4, 3, 2, 1))], NOW)
-    assert (blind.level, "4 looks since then saw nothing they knew" in blind.sentence) == ("unsure", True)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mastctl.client import Client, ClientError
+from mastctl.client import Client
 
 pytestmark = pytest.mark.mastctl(picture_width_px=512, scene={"relief_m": 0.0, "rocks": 0})
 
@@ -44,34 +44,3 @@ def test_a_board_is_seen_from_when_it_is_put_there_until_it_is_taken_away(mast_c
     mast_client.take_board("bench")
     assert mast_client.boards() == {}
     assert markers_seen(mast_client) == {}
-
-
-BAD = {
-    "nothing is printed on it": ("x", {}, "bad_options", "there is no board 'x' yet"),
-    "no such kind": ("x", {"board": {"kind": "chess"}}, "bad_board", "board.kind"),
-    "too large a marker": (
-        "x",
-        {"board": {**BOARD, "marker_m": 0.1}},
-        "bad_board",
-        "board.marker_m: 0.1 where less",
-    ),
-    "far off": ("x", {"board": BOARD, "position_m": [100.0, 0, 0]}, "bad_options", "within 28 m"),
-    "rolled up": ("x", {"board": BOARD, "bow_m": [0.2, 0.0]}, "bad_options", "0.05 m at most"),
-    "turned twice": (
-        "x",
-        {"board": BOARD, "turned_rad": [0, 0, 0], "quaternion": [1, 0, 0, 0]},
-        "bad_request",
-        "both",
-    ),
-    "no turn": ("x", {"board": BOARD, "quaternion": [0, 0, 0, 0]}, "bad_request", "not zero"),
-    "a name that is none": ("a b", {"board": BOARD}, "bad_request", "name"),
-}
-
-
-def test_a_board_that_cannot_be_is_refused_and_none_is_there(mast_client: Client) -> None:
-    for case, (name, other, code, words) in BAD.items():
-        with pytest.raises(ClientError) as error:
-            mast_client.put_board(name, **{"position_m": [1.6, 0.0, -1.3], **other})
-        assert error.value.code == code, case
-        assert words in str(error.value), case
-        assert mast_client.boards() == {}, case

@@ -73,14 +73,3 @@ def test_no_file_outside_the_site_is_served(client: TestClient, tmp_path: Path, 
     build(tmp_path)
     answer = client.get(httpx.URL(f"http://127.0.0.1{path}"))
     assert answer.status_code == 404
-
-
-def test_another_sites_page_may_lead_to_the_documentation_and_not_read_it(
-    client: TestClient, tmp_path: Path
-) -> None:
-    build(tmp_path)
-    other = {"Sec-Fetch-Site": "cross-site"}
-    leads = {**other, "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
-    assert client.get("/docs/", headers=leads).status_code == 200
-    assert client.get("/docs/", headers=other).status_code == 403
-    assert client.post("/docs/", headers={"Origin": "http://other.test"}).status_code == 403

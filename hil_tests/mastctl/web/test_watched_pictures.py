@@ -71,7 +71,7 @@ def test_a_watcher_who_leaves_as_a_picture_comes_holds_none(others: set[threadin
     watched.close()
 
 
-def test_a_picture_that_comes_as_the_one_before_is_taken_is_not_sent_after_it() -> None:
+def test_no_image_is_sent_while_one_is_on_its_way() -> None:
     watched = WatchedCameras(FakeCameras(), SystemClock())
     watcher = Watcher(watched, "slow", (LEFT,), lambda: None, ready=True)
     first, second, third = (Picture(frame(k, np.zeros((4, 4), np.uint8), b"", LEFT), b"") for k in range(3))
@@ -84,34 +84,8 @@ def test_a_picture_that_comes_as_the_one_before_is_taken_is_not_sent_after_it() 
     assert watcher.take() == [third]
 
 
-def test_a_watcher_whose_second_camera_has_no_thread_is_none(
-    monkeypatch: pytest.MonkeyPatch, others: set[threading.Thread]
-) -> None:
-    cameras = FakeCameras()
-    watched = WatchedCameras(cameras, SystemClock())
-    start, started = threading.Thread.start, list[str]()
-
-    def once(thread: threading.Thread) -> None:
-        if started:
-            raise RuntimeError("can't start new thread")
-        started.append(thread.name)
-        start(thread)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(pictures.threading.Thread, "start", once)  # type: ignore[attr-defined]
-        with pytest.raises(RuntimeError, match="can't start"):
-            watched.watch((LEFT, RIGHT), lambda: None)
-    until(lambda: not pictures_threads() - others, "nobody watches")
-    assert cameras.held == Counter()
-    there = threading.Event()
-    again = watched.watch((LEFT, RIGHT), there.set)  # both cameras have their threads now
-    until(lambda: {LEFT, RIGHT} <= cameras.glances.keys(), "a picture of each")
-    again.end()
-    watched.close()
-
-
 @pytest.mark.parametrize(("every", "apart_s"), [(False, pictures.APART_S), (True, pictures.NEXT_S)])
-def test_who_watches_every_picture_gets_the_next_one(every: bool, apart_s: float) -> None:
+def test_a_viewer_of_every_image_gets_the_next_one(every: bool, apart_s: float) -> None:
     cameras, there = FakeCameras(), threading.Event()
     watched = WatchedCameras(cameras, SystemClock())
     watcher = watched.watch((LEFT,), there.set, every=every)

@@ -19,7 +19,7 @@ def test_metrics_are_read_by_prometheus_own_parser(pair: BOTH) -> None:
     assert {"mastctl_info", "mastctl_state", "mastctl_uptime_seconds", "process_open_fds"} <= found
 
 
-def test_a_daemon_whose_head_is_read_is_ready_and_one_that_is_stopped_says_why_not(pair: BOTH) -> None:
+def test_a_daemon_is_ready_when_its_head_is_read_and_not_stopped(pair: BOTH) -> None:
     url = f"{pair[0].url}/api/v1"
     assert HTTP.get(f"{url}/health/live").json() == {"live": True}
     until(lambda: HTTP.get(f"{url}/health/ready").status_code == 200, "the first reading")
@@ -29,8 +29,3 @@ def test_a_daemon_whose_head_is_read_is_ready_and_one_that_is_stopped_says_why_n
     error = answer.json()["error"]
     assert error["code"] == "not_ready"
     assert error["message"].startswith("stopped: ") and "a dog is near the mast" in error["message"]
-
-
-def test_another_sites_page_reads_no_metrics(pair: BOTH) -> None:
-    answer = HTTP.get(f"{pair[0].url}/metrics", headers={"Sec-Fetch-Site": "cross-site"})
-    assert answer.status_code == 403

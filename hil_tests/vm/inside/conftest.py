@@ -16,7 +16,7 @@ from drivers.v4l2.node import Node
 BUS = ("platform:vivid-000", "platform:vivid-001")
 RATE_HZ = 25.0
 TURNED_CLOCK = "time-travel" in Path("/proc/cmdline").read_text()
-"""Nothing takes time here but waiting (tools/virtual_machine/boot.py); in QEMU everything does."""
+"""Nothing takes time here but waiting (support/virtual_machine/boot.py); in real time everything does."""
 
 STEADY = {
     "timestamp_source": "start_of_exposure",

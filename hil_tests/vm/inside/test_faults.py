@@ -19,18 +19,9 @@ from hil_tests.waiting import NET_S, until
 
 from .conftest import BUS, VIVID, inject, options
 
-PERIOD_S = 0.04
-
 
 def fresh(camera: V4l2Camera) -> None:
     camera.next_frame(time.monotonic(), NET_S)
-
-
-def test_dropped_frames_are_counted(camera: V4l2Camera) -> None:
-    inject(0, "percentage_of_dropped_buffers", 50)
-    until(lambda: camera.counters.dropped > 5, "frames are dropped")
-    fresh(camera)
-    assert camera.counters.damaged == 0 and camera.counters.reopened == 0
 
 
 def test_a_damaged_frame_is_not_given(camera: V4l2Camera) -> None:
@@ -45,13 +36,6 @@ def test_a_damaged_frame_is_not_given(camera: V4l2Camera) -> None:
 def test_a_fatal_streaming_error_is_got_over(camera: V4l2Camera) -> None:
     fresh(camera)
     inject(0, "inject_fatal_streaming_error")
-    until(lambda: camera.counters.reopened == 1, "the camera is opened again")
-    fresh(camera)
-
-
-def test_a_refused_queue_is_got_over(camera: V4l2Camera) -> None:
-    fresh(camera)
-    inject(0, "inject_vidioc_qbuf_error")
     until(lambda: camera.counters.reopened == 1, "the camera is opened again")
     fresh(camera)
 
@@ -75,14 +59,6 @@ def test_a_refusal_while_opening_is_told_and_leaves_nothing(control: str, words:
     fresh(camera)
     camera.close()
     assert held() <= before
-
-
-def test_a_stream_error_while_it_is_opened_again_is_tried_again(camera: V4l2Camera) -> None:
-    fresh(camera)
-    inject(0, "inject_vidioc_streamon_error")
-    inject(0, "inject_fatal_streaming_error")
-    until(lambda: camera.counters.reopened == 1, "the camera is opened again")
-    fresh(camera)
 
 
 def test_a_disconnected_camera_is_lost_and_comes_back_while_the_other_goes_on(camera: V4l2Camera) -> None:
@@ -201,20 +177,3 @@ def test_a_user_without_permission_is_told_which_group_has_it(mode: int, group: 
     os.waitpid(child, 0)
     node.chmod(0o600)
     assert words in told and f"no permission to open {node}" in told
-
-
-def test_opening_and_closing_again_and_again_leaves_nothing() -> None:
-    before = held()
-    for index in range(40):
-        if index % 4 == 1:
-            inject(0, "inject_vidioc_streamon_error")
-        if index % 4 == 2:
-            inject(0, "inject_vidioc_reqbufs_error")
-        try:
-            camera = open_camera(options(), name="left")
-        except StreamFailed:
-            continue
-        if index % 4 == 3:
-            inject(0, "inject_fatal_streaming_error")
-        camera.close()
-    assert held() <= before

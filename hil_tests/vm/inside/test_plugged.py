@@ -29,6 +29,6 @@ def test_the_cameras_are_found_and_opened_by_what_is_written(
     sizes = {name: camera.model.size_px for name, camera in load_rig(config.mast_file).rig.cameras.items()}
     for name, settings in config.hardware.cameras.items():
         with closing(open_camera(settings.options, name=name)) as camera:
-            assert camera.size_px == sizes[name]
+            assert camera.info.size_px == sizes[name]
     findings = list(doctor.examine(str(folder / "config.yaml"), lambda url: None))
     assert {one.what for one in findings if one.level == "bad"} == {"port"}, "only the head is missing"

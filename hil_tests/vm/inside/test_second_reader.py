@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import time
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 from drivers.clock import SystemClock
 from drivers.v4l2 import find
 from drivers.v4l2.capture import Capture
+from drivers.v4l2.controls import list_controls
+from drivers.v4l2.find import Address
 from drivers.v4l2.options import parse_options
 from hil_tests.vm.inside.conftest import BUS, options
 
@@ -74,8 +77,13 @@ def test_multi_planar_frames_are_the_same_to_the_last_bit(tmp_path: Path, code: 
     assert np.array_equal(ours, theirs)
 
 
-def test_moved_pictures_are_told_apart(tmp_path: Path) -> None:
-    """The comparison can fail: of two pictures of a moving scene one at least is not theirs."""
-    first, second = our_bytes(2, controls={"horizontal_movement": "Move Left"})
-    theirs = by_v4l2_ctl(tmp_path / "frame", "YUYV", (640, 480))
-    assert not (np.array_equal(first, theirs) and np.array_equal(second, theirs))
+def test_controls_are_those_that_v4l2_ctl_lists_compound_ones_too() -> None:
+    with find.open_node(Address(bus=BUS[0]), "left") as node:
+        found = list_controls(node)
+        told = subprocess.run(
+            ["v4l2-ctl", "-d", str(node.path), "--list-ctrls"], capture_output=True, text=True, timeout=60
+        ).stdout
+    theirs = re.findall(r"^ *\w+ (0x[0-9a-f]{8}) \(", told, re.MULTILINE)
+    assert len(theirs) > 20 and sorted(f"{one.id:#010x}" for one in found) == sorted(theirs)
+    compound = [one.name for one in found if one.kind.startswith("type ")]
+    assert "u16_8x16_matrix" in compound and "u16_8x16_matrix" in told, (compound, told)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from calib.geometry.sensor_mode import Mode, SensorMode, mode_between
+from calib.geometry.mode import Mode, SensorMode, mode_between
 from drivers.errors import BadFrame
 from drivers.v4l2 import find
 from drivers.v4l2.camera import open_camera
@@ -42,7 +42,7 @@ def seen(size_px: tuple[int, int], **controls: object) -> tuple[SensorMode, np.n
     steady = {"test_pattern": "100% Color Squares", "horizontal_flip": 0, "vertical_flip": 0, **controls}
     camera = open_camera(options(1, size_px=list(size_px), rate_hz=None, controls=steady), name="right")
     try:
-        return camera.sensor_mode, camera.next_frame(time.monotonic(), NET_S).image.astype(int)
+        return camera.info.sensor_mode, camera.next_frame(time.monotonic(), NET_S).image.astype(int)
     finally:
         camera.close()
 
@@ -50,13 +50,6 @@ def seen(size_px: tuple[int, int], **controls: object) -> tuple[SensorMode, np.n
 def same(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether two pictures agree but for the edges of squares, where vivid mixes two pixels' colors."""
     return bool((one == other).mean() > 0.97)
-
-
-def test_a_webcam_tells_its_flips_and_no_crop() -> None:
-    camera = open_camera(options(0, controls={"horizontal_flip": 1}), name="left")
-    camera.close()
-    open_camera(options(0, controls={"horizontal_flip": 0}), name="left").close()
-    assert camera.sensor_mode == SensorMode(SENSOR, flip=(True, False))
 
 
 @pytest.mark.usefixtures("hdmi")
@@ -73,13 +66,3 @@ def test_crop_and_flips_are_read_as_the_pictures_show_them() -> None:
     assert mode_between(FULL, mode) == Mode((160, 96, 320, 240)) and same(part, full[96:336, 160:480])
     with pytest.raises(BadFrame, match="--camera right --crop 160 96 320 240 --out"):
         check_mode("right", mode, FULL)
-
-
-@pytest.mark.usefixtures("hdmi")
-def test_a_scaled_picture_is_told_by_its_size_and_one_composed_aside_not_at_all() -> None:
-    v4l2_ctl("--set-selection", "target=crop,flags=0,left=0,top=0,width=640,height=480")
-    mode, _ = seen((320, 240))
-    assert mode == SensorMode((320, 240), (0, 0, *SENSOR), SENSOR)
-    assert mode_between(FULL, mode) == Mode(binning=(2, 2))
-    v4l2_ctl("--set-selection", "target=compose,flags=0,left=40,top=20,width=160,height=120")
-    assert seen((320, 240))[0] == SensorMode((320, 240))

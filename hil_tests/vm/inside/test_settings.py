@@ -8,12 +8,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.errors import BadSetting
 from drivers.v4l2 import find
 from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.values_set import SETTLE_FRAMES
-from hil_tests.vm.inside.conftest import BUS, VIVID, inject, options
-from hil_tests.waiting import NET_S, until
+from hil_tests.vm.inside.conftest import BUS, options
+from hil_tests.waiting import NET_S
 
 
 @pytest.fixture
@@ -63,36 +62,3 @@ def test_a_gain_is_changed_while_frames_come_and_each_frame_has_its_own(camera: 
     assert told == 77.0 and unknown <= SETTLE_FRAMES + 1
     with camera.exposure_held():
         assert camera.next_frame(time.monotonic(), NET_S).settings["gain"] == 77.0
-
-
-def test_a_hold_begins_when_a_change_shows(camera: V4l2Camera) -> None:
-    settled(camera)
-    camera.adjust({"gain": 30.0})
-    with camera.exposure_held():
-        assert camera.next_frame(0.0, NET_S).settings["gain"] == 30.0
-
-
-def test_a_camera_that_was_unplugged_comes_back_with_it(camera: V4l2Camera) -> None:
-    settled(camera)
-    camera.adjust({"gain": 55.0})
-    (VIVID / "unbind").write_text("vivid.0")
-    until(lambda: bool(camera.capture.lost), "the loss")
-    with pytest.raises(Exception, match=r"no camera matches|connected"):
-        camera.adjust({"gain": 60.0})
-    (VIVID / "bind").write_text("vivid.0")
-    until(lambda: camera.counters.reopened >= 1, "the camera is opened again")
-    assert settled(camera) == 55.0 and by_v4l2_ctl("gain") == 55
-
-
-def test_an_automatic_that_is_on_is_told_and_turned_off_by_a_value(camera: V4l2Camera) -> None:
-    inject(0, "gain_automatic", 1)
-    gain = next(one for one in camera.settings() if one.name == "gain")
-    assert gain.automatic and gain.value is None
-    camera.adjust({"gain": 20.0})
-    assert by_v4l2_ctl("gain_automatic") == 0 and by_v4l2_ctl("gain") == 20
-
-
-def test_a_setting_that_vivid_lacks_is_refused(camera: V4l2Camera) -> None:
-    assert [one.name for one in camera.settings()] == ["gain"]
-    with pytest.raises(BadSetting, match="it has no control for focus"):
-        camera.adjust({"focus": 3.0})

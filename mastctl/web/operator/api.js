@@ -1,23 +1,16 @@
 // Requests to the daemon. At most four are under way besides stops, so that a browser, which opens six
 // connections, always has one free for a stop.
-import { kept } from "./dom.js";
 import { inDegrees } from "./words.js";
 
 const PREFIX = "/api/v1";
 const AT_ONCE = 4;
 const ANSWER_MS = 20000;
 
-const words = new Uint32Array(1);
-crypto.getRandomValues(words);
-/** By which this page is told from others; `me.name` is what its user is called, for people. */
-export const client = `page-${words[0].toString(36)}`;
-export const NAME = "mastctl name";
-export const me = { name: kept(NAME) ?? "" };
-const called = () => (me.name ? `${me.name}, ${client}` : client);
-/** A name, or words about people, without what tells one page of theirs from another. */
-export const person = (words) => words.replace(/, page-[0-9a-z]+/g, "");
-/** A header holds bytes: those of UTF-8. */
-const bytes = (text) => String.fromCharCode(...new TextEncoder().encode(text));
+/** This page as the daemon knows it, from stop.js, which came first: `me.name` is what its user is called. */
+export const me = window.mastctl;
+export const { client, NAME } = me;
+/** A name, or a message about people, without what tells one page of theirs from another. */
+export const person = (message) => message.replace(/, page-[0-9a-z]+/g, "");
 
 export class Refusal extends Error {
   constructor(status, code, message, detail) {
@@ -43,17 +36,19 @@ function done() {
   else free += 1;
 }
 
-/** What still waits here when a stop is pressed is never sent: nothing moves by it afterwards. */
-function dropWaiting() {
+/** Commands that still wait when a stop is pressed are never sent: nothing moves by them afterwards. */
+document.addEventListener("stop", ({ detail }) => {
+  if (detail.state !== "sent") return;
   const dropped = waiting.filter(({ method }) => method !== "GET");
   waiting.splice(0, waiting.length, ...waiting.filter(({ method }) => method === "GET"));
   for (const { refuse } of dropped) refuse(new Refusal(0, "stopped", "It was not sent: STOP was pressed before."));
-}
+});
 
 async function sent(method, path, body, options) {
-  const headers = { "Mastctl-Client": bytes(called()) };
+  const headers = { "Mastctl-Client": me.header };
   if (held.lease && method !== "GET") headers["Mastctl-Lease"] = held.lease;
   if (method !== "GET") headers["Content-Type"] = "application/json";
+  if (options.token) headers.Authorization = `Bearer ${options.token}`;
   let answer;
   try {
     answer = await fetch(PREFIX + path, {
@@ -86,18 +81,9 @@ export async function ask(method, path, body, options = {}) {
 export const get = (path, options) => ask("GET", path, undefined, options);
 export const post = (path, body, options) => ask("POST", path, body, options);
 
-/** Stops wait for nothing here. */
-function first(path, body) {
-  const answer = sent("POST", path, body, { ms: 4000, priority: "high", keepalive: true });
-  dropWaiting();
-  return answer;
-}
-export const stop = () => first("/stop", {});
-/** It latches: nothing moves until somebody releases it with a reason. */
-export const estop = () => first("/estop", { reason: "pressed on the page", name: called() });
-/** Nor does the question whether anybody is there. */
+/** These wait for no other request: whether the daemon lives, */
 export const live = () => sent("GET", "/health/live", null, { ms: 2000 });
-/** Neither do heartbeats, of which one is under way at a time, nor what is said on leaving. */
+/** heartbeats, of which one is under way at a time, and what is sent on leaving. */
 export const beat = (body) => sent("POST", "/jog", body, { ms: 2000, keepalive: true });
 export const parting = (method, path) => sent(method, path, {}, { keepalive: true }).catch(() => null);
 

@@ -11,8 +11,8 @@ export class Control {
   constructor(alarm, taken) {
     [this.alarm, this.taken] = [alarm, taken];
     this.words = byId("control");
-    [this.name, this.more] = [h("span", { class: "name" }), h("span")];
-    put(this.words, this.name, this.more);
+    [this.name, this.comma, this.more] = [h("span", { class: "name" }), h("span", { class: "comma" }), h("span", { class: "more" })];
+    put(this.words, this.name, this.comma, this.more);
     this.button = byId("take");
     this.button.addEventListener("click", () => this.press());
     setInterval(() => held.lease && this.renew(), RENEW_MS);
@@ -46,10 +46,10 @@ export class Control {
     const gone = left !== null && left <= 0;
     const mine = held.lease !== null && this.own();
     const whose = control?.holder.endsWith(client) ? "you" : control && person(control.holder);
-    if (mine) this.say("you", ", renewed");
+    if (mine) this.say("you", "renewed");
     else if (!control || gone) this.say("nobody", "");
-    else if (control.kind === "operation") this.say(whose, ", while it runs");
-    else this.say(person(control.holder), `, ${forTime(left)} left`);
+    else if (control.kind === "operation") this.say(whose, "while it runs");
+    else this.say(person(control.holder), `${forTime(left)} left`);
     this.words.parentElement.dataset.whose = mine ? "mine" : control && !gone && !control.holder.endsWith(client) ? "other" : "nobody";
     if (this.sure && (mine || gone || control?.kind !== "lease")) this.sure = false;
     say(this.button, !this.may ? "View only" : this.sure ? "Take it from them?" : mine ? "Release" : control && !gone && control.kind === "lease" ? "Take over" : "Take");
@@ -58,6 +58,7 @@ export class Control {
 
   say(name, more) {
     say(this.name, name);
+    say(this.comma, more && ", ");
     say(this.more, more);
     set(this.name, "title", name);
   }

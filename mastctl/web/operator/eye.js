@@ -4,15 +4,17 @@ import { camera as called, deg, number } from "./words.js";
 
 const STALE_S = 1.0;
 const OLD_S = 1.0;
+const MOVING_S = 5.0; // an image of a moving head is shown for so long: it is no place to click in any case
 const LOUPE_PX = 21; // image pixels across
 const ZOOM = 8;
 const SHAKES_PX = 10; // of the screen: a hand that clicks or a thumb that holds moves by less
 const HELD_MS = 500;
 
 export class Eye {
-  constructor(name, choose) {
+  constructor(name, choose, turning = () => false) {
     this.name = name;
     this.choose = choose;
+    this.turning = turning; // whether the head turns now
     this.facts = null;
     this.cursor = null;
     this.marks = {};
@@ -32,9 +34,9 @@ export class Eye {
       onpointerup: (event) => this.released(event), onpointercancel: () => this.cancelled(), oncontextmenu: (event) => event.preventDefault(), onkeydown: (event) => this.key(event), onblur: () => this.left(),
     }, this.canvas, this.over, this.loupe, this.stale);
     this.save = h("a", { class: "save", download: "", hidden: true }, "PNG");
-    this.question = h("div", { class: "follow", role: "group", "aria-label": "Follow it?", hidden: true }, h("button", { type: "button", class: "go", onclick: () => this.follow() }, "Follow it"), h("button", { type: "button", onclick: () => this.leave() }, "Leave it"));
-    this.element = h("figure", { class: "eye", "data-camera": name, "data-stale": "" }, this.frame, this.question,
-      h("figcaption", {}, h("strong", {}, called(name)), this.age, this.facing, this.where, this.save));
+    this.question = h("div", { class: "follow", role: "group", "aria-label": "Follow it?", hidden: true }, h("button", { type: "button", class: "go", onclick: () => this.follow() }, "Follow it"), h("button", { type: "button", onclick: () => this.leave() }, "Cancel"));
+    this.element = h("figure", { class: "eye", "data-camera": name, "data-stale": "" }, this.frame,
+      h("figcaption", {}, this.question, h("strong", {}, called(name)), this.age, this.facing, this.where, this.save));
   }
 
   show(facts, bitmap) {
@@ -56,16 +58,18 @@ export class Eye {
     document.dispatchEvent(new CustomEvent("image-shown", { detail: { ...facts, shown_ms: performance.timeOrigin + performance.now() } }));
   }
 
-  /** Whether the image is of now; a slow camera's own period is allowed. */
+  /** Whether the image is of now; a slow camera's own period is allowed. A moving head's image is shown as moving. */
   fresh(nowMs) {
     const ageS = this.facts ? ageOf(this.facts, nowMs) : Infinity;
     const slow = this.intervals.length ? 2.5 * [...this.intervals].sort((a, b) => a - b)[Math.floor(this.intervals.length / 2)] : 0;
     this.isStale = !(ageS <= Math.max(STALE_S, Math.min(slow, 10)));
-    set(this.element, "data-stale", this.isStale);
-    const told = this.facts ? `${number(Math.ceil(10 * ageS) / 10, 1)} s old` : "no image yet"; // until it is told again
-    say(this.age, told + (this.facts ? this.coarse : ""));
+    const moving = ageS <= MOVING_S && (this.facts.moving || (this.isStale && this.turning()));
+    set(this.element, "data-moving", moving);
+    set(this.element, "data-stale", this.isStale && !moving);
+    const age = this.facts ? `${number(Math.ceil(10 * ageS) / 10, 1)} s old` : "no image yet"; // until the next reading
+    say(this.age, age + (this.facts ? this.coarse : ""));
     set(this.age, "data-old", ageS > OLD_S);
-    say(this.stale, this.facts ? `Image ${told}: not of now` : "No image yet");
+    say(this.stale, moving ? "Moving" : this.facts ? `Image ${age}: not of now` : "No image yet");
     if (this.facts) say(this.facing, `${deg(this.facts.pan_rad)} ${deg(this.facts.tilt_rad)}`);
   }
 
@@ -124,6 +128,7 @@ export class Eye {
   propose(pixel, facts) {
     this.proposed = { pixel, facts };
     this.question.hidden = false;
+    set(this.question, "data-side", pixel[0] < this.canvas.width / 2 ? "right" : "left"); // beside the target, below the loupe
     this.mark("box", pixel, "click", "follow?");
   }
 

@@ -9,7 +9,7 @@ export class HeadPanel {
   constructor(events) {
     this.events = events;
     this.figures = h("div", { class: "bars" });
-    this.rose = s("svg", { class: "rose", viewBox: "-128 -112 256 224", role: "img" });
+    this.rose = s("svg", { class: "rose", viewBox: "-136 -112 272 224", role: "img" });
     this.map = s("svg", { class: "map", viewBox: "0 0 220 150", role: "img" });
     this.note = h("p", { class: "quiet" });
     this.sunNote = h("p", { class: "quiet", id: "sun-note" });

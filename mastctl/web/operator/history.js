@@ -1,65 +1,89 @@
-// The last hours: joints and temperatures over time, and what happened; asked for while somebody has it open.
+// What came since the page was opened: the joints over time, and what happened. Nothing is stored in the daemon.
 import { byId, h, put, s, say } from "./dom.js";
-import { get, person } from "./api.js";
-import { camera as called, degrees, forTime, inDegrees, number } from "./words.js";
+import { person } from "./api.js";
+import { degrees, forTime, inDegrees, number } from "./words.js";
 import { hiddenTable, plot } from "./plots.js";
 
-const AGAIN_MS = 10000;
-const SPANS_S = [["10 minutes", 600], ["1 hour", 3600], ["10 hours", 36000]];
+const AGAIN_MS = 2000;
+const APART_S = 2; // between two samples
+const MOST_S = 3600;
+const SPANS_S = [["10 minutes", 600], ["1 hour", MOST_S]];
 const PARTS = 1000; // of the time axis
-const SHOWN = 60; // events in words
+const EVENTS = 300; // kept
+const SHOWN = 60; // as text
+const QUIET = ["lease.renew", "jog"]; // commands that repeat
+
+const nowS = () => performance.now() / 1000;
+const joined = (first, more) => (more ? `${first}: ${more}` : first);
+const roundTime = (seconds) => (seconds > 7200 ? `${seconds / 3600} h` : `${seconds / 60} min`);
 
 export class History {
-  constructor() {
+  constructor(events) {
+    this.samples = [];
+    this.happened = [];
+    this.faults = new Map();
     this.span = h("select", { "aria-label": "How far back", onchange: () => this.draw() }, SPANS_S.map(([words, value]) => h("option", { value }, words)));
     this.plots = h("div", { class: "plots" });
     this.list = h("table", { class: "figures list" });
     this.table = hiddenTable();
     this.said = h("p", { class: "quiet" });
-    this.whole = h("details", { ontoggle: () => this.look() }, h("summary", {}, "Joints, temperatures and events over time"), h("p", {}, "The last ", this.span), this.plots, this.table.place, this.said, h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Events" }, this.list));
+    this.whole = h("details", { ontoggle: () => this.draw() }, h("summary", {}, "Joints and events since the page was opened"), h("p", {}, "The last ", this.span), this.plots, this.table.place, this.said, h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Events" }, this.list));
     put(byId("history"), this.whole);
-    setInterval(() => document.hidden || this.look(), AGAIN_MS);
+    events.addEventListener("joints", ({ detail }) => this.take(detail.value));
+    events.addEventListener("state", ({ detail: { value } }) => {
+      if (value.state === this.state) return;
+      this.state = value.state;
+      this.note(joined(value.state, value.reason), !["fault", "stopped"].includes(value.state));
+    });
+    events.addEventListener("fault", ({ detail: { key, value } }) => {
+      const before = this.faults.get(key) ?? [];
+      this.faults.set(key, value.map((one) => one.code));
+      for (const one of value) if (!before.includes(one.code)) this.note(joined(key, one.message), false);
+      if (before.length && !value.length) this.note(`${key}: the fault is over`, true);
+    });
+    events.addEventListener("command", ({ detail: { value } }) => {
+      const good = value.result === "ok" || value.state === "done";
+      if (value.result && !(good && QUIET.includes(value.command))) this.note(joined(`${value.who}: ${value.command}`, good ? "" : value.message), good);
+      else if (value.ended) this.note(joined(`${value.ended}: ${value.state}`, value.message), good);
+    });
+    setInterval(() => document.hidden || this.draw(), AGAIN_MS);
   }
 
-  async look() {
-    if (!this.whole.open) return;
-    try {
-      this.told = await get("/history");
-      this.draw();
-    } catch (error) {
-      say(this.said, error.message);
-    }
+  take({ pan_rad: pan, tilt_rad: tilt }) {
+    const time = nowS(), last = this.samples.at(-1);
+    if (last && time - last.time < APART_S) Object.assign(last, { pan, tilt });
+    else this.samples.push({ time, pan, tilt });
+    while (time - this.samples[0].time > MOST_S) this.samples.shift();
+  }
+
+  note(words, well) {
+    this.happened.push({ time: nowS(), words, well });
+    if (this.happened.length > EVENTS) this.happened.shift();
   }
 
   draw() {
-    const { told } = this;
-    if (!told) return;
-    const span = Number(this.span.value);
-    const events = told.events.filter((one) => one.age_s <= span);
-    const pan = told.pan_rad.map(degrees), tilt = told.tilt_rad.map(degrees);
-    const axes = Object.entries(told.temperatures_c);
-    put(this.plots,
-      this.over("Joints, °", [["pan", pan, "of-x"], ["tilt", tilt, "of-y"]], events, span, "°"),
-      axes.length ? this.over("Temperatures, °C", axes.map(([name, values], k) => [name, values, k ? "of-y" : "of-x"]), events, span, " °C") : h("p", { class: "quiet" }, "The driver of this head reports no temperatures."));
+    if (!this.whole.open) return;
+    const now = nowS(), span = Number(this.span.value);
+    const within = (one) => now - one.time <= span;
+    const samples = this.samples.filter(within), events = this.happened.filter(within);
+    put(this.plots, this.over(samples, events, span, now));
     const newest = events.slice(-SHOWN).reverse();
-    say(this.said, events.length ? `${events.length} events, marked below the plots; the newest ${newest.length}:` : "Nothing has happened in this time.");
-    put(this.list, newest.map((one) => h("tr", {}, h("td", { class: "n" }, `${forTime(one.age_s)} ago`), h("td", { class: one.well ? "" : "bad" }, person(inDegrees(one.words))))));
-    this.table.fill(["s ago", "pan °", "tilt °", ...axes.map(([name]) => `${called(name)} °C`)], told.age_s.map((age, k) => [number(age, 0), number(pan[k], 2, true), number(tilt[k], 2, true), ...axes.map(([, values]) => number(values[k], 1))]).filter((_, k) => told.age_s[k] <= span).reverse().slice(0, 200));
+    say(this.said, events.length ? `${events.length} events, marked below the plot; the newest ${newest.length}:` : "Nothing has happened in this time.");
+    put(this.list, newest.map((one) => h("tr", {}, h("td", { class: "n" }, `${forTime(now - one.time)} ago`), h("td", { class: one.well ? "" : "bad" }, person(inDegrees(one.words))))));
+    this.table.fill(["s ago", "pan °", "tilt °"], samples.slice(-200).reverse().map((one) => [number(now - one.time, 0), number(degrees(one.pan), 2, true), number(degrees(one.tilt), 2, true)]));
   }
 
-  /** Lines over the time that is asked for, the present on the right; events as ticks at the foot. */
-  over(words, lines, events, span, unit) {
-    const { age_s: ages } = this.told;
-    const first = Math.max(0, ages.findIndex((age) => age <= span) - 1); // from where the line comes in
-    const drawn = lines.map(([name, values, kind]) => [name, values.map((value, k) => [Math.min(span, ages[k]), value]).slice(ages.some((age) => age <= span) ? first : -1).filter(([, value]) => value !== null), kind]);
-    const all = drawn.flatMap(([, points]) => points.map(([, value]) => value));
-    const now = drawn.map(([name, points]) => `${name} ${number(points.at(-1)?.[1] ?? null, 1, true)}${unit}`).join(", ");
-    if (!all.length) return null;
+  /** Pan and tilt over the chosen time, the present on the right; events as ticks at the foot. */
+  over(samples, events, span, now) {
+    if (!samples.length) return null;
+    const at = (time) => PARTS * (1 - (now - time) / span);
+    const lines = [["pan", "of-x"], ["tilt", "of-y"]].map(([name, kind]) => [name, kind, samples.map((one) => [at(one.time), degrees(one[name])])]);
+    const all = lines.flatMap(([, , points]) => points.map(([, value]) => value));
     const [low, high] = [Math.floor(Math.min(...all) - 0.5), Math.ceil(Math.max(...all) + 0.5)];
-    const at = (age) => PARTS * (1 - Math.min(1, age / span));
-    return [h("p", { class: "quiet" }, `${words}: `, drawn.map(([name, , kind], k) => [k ? "  " : "", h("span", { class: kind }, `${k ? "╌" : "─"} ${name}`)])),
-      plot({ label: `${words} over the last ${forTime(span)}; now ${now}; ${events.length} events`, count: PARTS + 1, low, high, ticks: [[high, number(high, 0)], [low, number(low, 0)]], height: 104, kind: "over-time" }, (x, y) => [
-        events.map((one) => s("path", { class: one.well ? "tick" : "tick worse", d: `M${x(at(one.age_s))} 100V92` }, s("title", {}, one.words))),
-        drawn.map(([, points, kind]) => s("polyline", { class: `line ${kind}`, points: [...points, [0, points.at(-1)?.[1]]].filter(([, value]) => value !== undefined).map(([age, value]) => `${x(at(age)).toFixed(1)},${y(value).toFixed(1)}`).join(" ") }))])];
+    const latest = lines.map(([name, , points]) => `${name} ${number(points.at(-1)[1], 1, true)}°`).join(", ");
+    return [h("p", { class: "quiet" }, "Joints, °: ", lines.map(([name, kind], k) => [k ? "  " : "", h("span", { class: kind }, `${k ? "╌" : "─"} ${name}`)])),
+      plot({ label: `Joints over the last ${forTime(span)}; now ${latest}; ${events.length} events`, count: PARTS + 1, low, high, ticks: [[high, number(high, 0)], [low, number(low, 0)]], axis: [[0, `${roundTime(span)} ago`], [PARTS / 2, roundTime(span / 2)], [PARTS, "now"]], height: 104, kind: "over-time" }, (x, y) => [
+        events.map((one) => s("path", { class: one.well ? "tick" : "tick worse", d: `M${x(at(one.time))} 100V92` }, s("title", {}, one.words))),
+        lines.map(([, kind, points]) => s("polyline", { class: `line ${kind}`, points: [...points, [PARTS, points.at(-1)[1]]].map(([place, value]) => `${x(place).toFixed(1)},${y(value).toFixed(1)}`).join(" ") }))])];
   }
 }

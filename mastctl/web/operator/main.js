@@ -1,6 +1,6 @@
 // The page: what is always in sight, and the panels told of what changes.
 import { byId, h, keep, kept, put, say, set } from "./dom.js";
-import { NAME, estop, get, me, person, post, stop } from "./api.js";
+import { NAME, ask as request, get, me, person, post } from "./api.js";
 import { forTime, inDegrees, sentence } from "./words.js";
 import { Bench } from "./bench.js";
 import { Control } from "./control.js";
@@ -47,38 +47,18 @@ function notice(words) {
   noticeTimer = setTimeout(() => place.remove(), 8000);
 }
 
-// STOP and E-STOP: no lease, no confirmation, no queue; Escape does what STOP does wherever the focus is.
-async function press(button, send, name, done) {
-  button.dataset.pressed = "sent";
-  target.disarm(`${name} was pressed`);
+// The stops are in stop.js. Whatever was chosen before one is not sent after it.
+document.addEventListener("stop", ({ detail: { title, state } }) => {
+  if (state === "failed") failedAfter = command;
+  if (state !== "sent") return;
+  target.disarm(`${title} was pressed`);
   for (const eye of views.eyes.values()) eye.leave();
-  const failed = byId("stop-failed");
-  try {
-    await send();
-    failed.hidden = true;
-    button.dataset.pressed = "confirmed";
-    say(byId("said"), done);
-  } catch (error) {
-    failed.hidden = false;
-    failedAfter = command;
-    failed.textContent = `${name} IS NOT CONFIRMED. ${error.message} Use the switch in the supply.`;
-    button.dataset.pressed = "failed";
-  }
-  setTimeout(() => { button.dataset.pressed = ""; }, 1200);
-}
+});
 /** A stop that was carried out late, or a head that rests when the connection is back, ends the alarm. */
 const stopConfirmed = () => { byId("stop-failed").hidden = true; };
 let doubted = false; // a stop was not confirmed, and the connection was lost since
 let command = 0; // number of the newest that was told
 let failedAfter = 0;
-const stopNow = () => press(byId("stop"), stop, "STOP", "Stopped.");
-const latchNow = () => press(byId("latch"), estop, "E-STOP", "Emergency stop. Nothing moves until it is released.");
-for (const [id, now] of [["stop", stopNow], ["latch", latchNow]]) {
-  byId(id).addEventListener("pointerdown", (event) => { if (event.button === 0) { event.preventDefault(); now(); } });
-  byId(id).addEventListener("keydown", (event) => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); if (!event.repeat) now(); } });
-  byId(id).addEventListener("click", (event) => { if (event.detail === 0) now(); }); // a screen reader's or a switch's press
-}
-document.addEventListener("keydown", (event) => { if (event.key === "Escape" && !event.repeat) stopNow(); }, { capture: true });
 
 /** A dialogue that leaves the stops within reach: of the browser's own kinds one shuts them out, the other nothing. */
 function ask(dialog) {
@@ -107,15 +87,15 @@ new Failure(events, announce);
 new OperationList(events);
 const bench = new Bench(events, speak);
 new Reports(events);
-new History();
+new History(events);
 
 // What is pushed
 
 let since = 0;
 let latched = "";
-let releasing; // whose stop the dialog is about
 function standing(now) {
   set(byId("state"), "data-word", now.state);
+  views.turning = ["moving", "stopping"].includes(now.state);
   const before = byId("word").textContent;
   say(byId("word"), WORDS[now.state] ?? now.state);
   say(byId("reason"), now.estop ? "" : sentence(person(inDegrees(now.reason ?? "")))); // the latch tells who and why itself
@@ -133,7 +113,7 @@ function standing(now) {
   set(byId("latch"), "aria-pressed", String(Boolean(latch)));
   const entries = now.estops ?? [];
   const words = latch ? ` by ${entries.map((one) => `${person(one.name)}: ${one.reason}`).join("; by ")}. Nothing moves until it is released, not even after a restart of the daemon. ` : "";
-  if (words !== latched) put(byId("estop"), h("span", {}, h("strong", {}, "Emergency stop"), words), ...entries.map((one, index) => h("button", { type: "button", id: index ? `release-${index}` : "release", onclick: () => { releasing = one.name; ask(byId("reset")); } }, index || entries.length > 1 ? `Release ${person(one.name)}’s …` : "Release …")));
+  if (words !== latched) put(byId("estop"), h("span", {}, h("strong", {}, "Emergency stop"), words), ...(latch ? [h("button", { type: "button", id: "release", onclick: () => ask(byId("reset")) }, "Release …")] : []));
   latched = words;
   for (const button of byId("estop").querySelectorAll("button")) button.disabled = !may;
   document.title = `${now.state} – mastctl`;
@@ -166,6 +146,7 @@ events.addEventListener("operation", (event) => {
 events.addEventListener("connected", () => { byId("lost").hidden = true; doubted = !byId("stop-failed").hidden; head.goal(); refresh(); recording.look(); residuals.look(); mastFile.look(); jog.look(); control.again(); });
 events.addEventListener("lost", () => {
   byId("lost").hidden = false;
+  views.turning = false;
   jog.release();
   say(byId("reason"), `When it was last heard it was ${byId("word").textContent}.`);
   say(byId("word"), "no connection");
@@ -244,7 +225,7 @@ async function enter() {
 byId("login-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   try {
-    await post("/login", { token: byId("token").value.trim() });
+    await request("POST", "/session", {}, { token: byId("token").value.trim() });
     byId("token").value = "";
     say(byId("login-said"), "");
     enter();
@@ -255,7 +236,7 @@ byId("login-form").addEventListener("submit", async (event) => {
 byId("logout").addEventListener("click", async () => {
   try {
     await control.leave();
-    await post("/logout");
+    await request("DELETE", "/session");
     location.reload();
   } catch (error) {
     alarm(error.message);
@@ -275,8 +256,8 @@ document.addEventListener("keydown", (event) => {
   if (key === "?") (byId("keys").open ? answered : ask)(byId("keys"));
   if (key === "p" && !document.querySelector("dialog[open]")) target.send();
 });
-const tellName = () => say(byId("name-open"), me.name ? `as ${me.name}` : "Your name …");
-tellName();
+const showName = () => { say(byId("name-open"), me.name ? `as ${me.name}` : "Your name …"); set(byId("name-open"), "title", me.name || null); };
+showName();
 byId("name-open").addEventListener("click", () => {
   byId("name").value = me.name;
   ask(byId("named"));
@@ -286,7 +267,7 @@ byId("name-form").addEventListener("submit", (event) => {
   event.preventDefault();
   me.name = byId("name").value.trim();
   keep(NAME, me.name);
-  tellName();
+  showName();
   answered(byId("named"));
 });
 document.addEventListener("no-session", () => ask(byId("login")));
@@ -294,7 +275,7 @@ for (const dialog of document.querySelectorAll("dialog")) dialog.querySelector("
 byId("reset-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   try {
-    await post("/reset", { reason: byId("reset-reason").value, name: byId("reset-name").value, latched_by: releasing });
+    await post("/reset", { reason: byId("reset-reason").value, name: byId("reset-name").value });
     answered(byId("reset"));
   } catch (error) {
     say(byId("reset-said"), error.message);

@@ -1,18 +1,30 @@
 // Small plots of one thing after the other, the newest on the right; what they show stands in a table too.
 import { h, put, s } from "./dom.js";
+import { clock } from "./words.js";
 
 const WIDTH = 280;
 const LEFT = 40;
 const FOOT = 8;
+const AXIS = 14; // below the plot: when each was
 
-/** A plot over `count` things: `draw(x, y)` makes its marks, of an index and of a value from `low` to `high`. */
-export function plot({ label, count, low = 0, high, ticks, height = 84, kind = "" }, draw) {
+/** A plot over `count` things: `draw(x, y)` makes its marks, of an index and of a value from `low` to `high`.
+ *  `axis` names some of the indices by their time. */
+export function plot({ label, count, low = 0, high, ticks, axis, height = 84, kind = "" }, draw) {
   const x = (k) => (count > 1 ? LEFT + 8 + ((WIDTH - LEFT - 18) * k) / (count - 1) : (LEFT + WIDTH) / 2);
   const y = (value) => 8 + ((height - 8 - FOOT) * (high - value)) / (high - low);
-  return s("svg", { class: `plot ${kind}`, viewBox: `0 0 ${WIDTH} ${height}`, role: "img", "aria-label": label },
+  return s("svg", { class: `plot ${kind}`, viewBox: `0 0 ${WIDTH} ${height + AXIS}`, role: "img", "aria-label": label },
+    axis.map(([k, words]) => [
+      s("path", { class: "ring", d: `M${x(k)} ${height - FOOT}v4` }),
+      s("text", { class: `tickname time ${k === 0 && count > 1 ? "start" : k === count - 1 ? "end" : ""}`, x: k === 0 && count > 1 ? LEFT : k === count - 1 ? WIDTH : x(k), y: height + 8 }, words)]),
     s("path", { class: "ring", d: `M${LEFT} 4V${height - FOOT + 4}M${LEFT} ${y(Math.max(low, 0))}H${WIDTH - 4}` }),
     ticks.map(([value, words]) => s("text", { class: "tickname end", x: LEFT - 4, y: y(value) + 4 }, words)),
     draw(x, y));
+}
+
+/** The axis of things that were at some times, ms of this browser's clock: the first, the middle and the last. */
+export function timesOf(all) {
+  const last = all.length - 1;
+  return [...new Set([0, last > 3 ? Math.round(last / 2) : 0, last])].map((k) => [k, clock(all[k])]);
 }
 
 /** Which of a few names stood for each of many things: a strip under a plot. */

@@ -2,7 +2,7 @@
 import { byId, h, put, s, say } from "./dom.js";
 import { get } from "./api.js";
 import { camera as called, clock, number, sentence } from "./words.js";
-import { hiddenTable, plot } from "./plots.js";
+import { hiddenTable, plot, timesOf } from "./plots.js";
 
 const SHOWN = 40;
 const REACHES_PX = [0.1, 0.25, 0.5, 1, 2, 5, 10, 50, 200];
@@ -73,7 +73,7 @@ export class Residuals {
   inTurn(all, reach) {
     const [x, y] = all.at(-1).residual_px;
     return [h("p", { class: "quiet" }, "One after the other, px: ", h("span", { class: "of-x" }, "● x"), "  ", h("span", { class: "of-y" }, "○ y"), ", bars of one sigma"),
-      plot({ label: `The newest ${all.length} residuals one after the other, the last ${number(x, 2, true)} and ${number(y, 2, true)} px`, count: all.length, low: -reach, high: reach, ticks: [[reach, `+${reach}`], [0, "0"], [-reach, `\u2212${reach}`]], height: 104, kind: "history" }, (across, up) =>
+      plot({ label: `The newest ${all.length} residuals one after the other, the last ${number(x, 2, true)} and ${number(y, 2, true)} px`, count: all.length, low: -reach, high: reach, ticks: [[reach, `+${reach}`], [0, "0"], [-reach, `\u2212${reach}`]], axis: timesOf(all.map((one) => 1000 * one.time_s)), height: 104, kind: "history" }, (across, up) =>
         all.map((one, k) => ["of-x", "of-y"].map((kind, axis) => {
           const [value, sigma, place] = [one.residual_px[axis], one.match_sigma_px[axis], across(k) + (axis ? 2.5 : -2.5)];
           return s("g", { class: kind }, s("path", { d: `M${place} ${up(value - sigma)}V${up(value + sigma)}` }), s("circle", { cx: place, cy: up(value), r: 2.6 }));

@@ -64,8 +64,7 @@ export class Settings {
       value: one.value === null ? "" : plain(one.value), "aria-label": `${NAMES[one.name] ?? one.name} of ${called(now.camera)}`,
     })]));
     put(this.rows, now.settings.map((one) => h("tr", {}, h("th", { scope: "row" }, NAMES[one.name] ?? one.name),
-      h("td", {}, this.fields.get(one), ` ${one.unit}`),
-      h("td", { class: "words" }, one.refusal ? sentence(`it ${one.refusal}`) : `${plain(one.minimum)} to ${plain(one.maximum)}${one.automatic ? ", automatic" : ""}`))));
+      h("td", {}, this.fields.get(one), ` ${one.unit}`, h("div", { class: "quiet" }, one.refusal ? sentence(`it ${one.refusal}`) : `${plain(one.minimum)} to ${plain(one.maximum)}${one.automatic ? ", automatic" : ""}`)))));
     this.draw();
   }
 

@@ -8,7 +8,7 @@ import { placeIn, shownBy } from "./truth.js";
 
 const STEPS = {
   rest: "the head rests", frames: "a fresh pair is taken", target: "the clicked point is found again", stereo: "found in the other camera", triangulate: "range",
-  before: "pictures from before the move", solve: "joint angles", limits: "limits", corner: "round a keep-out", move: "the head is sent", settle: "it has arrived and rests",
+  before: "pictures from before the move", solve: "joint angles", limits: "limits", move: "the head is sent", settle: "it has arrived and rests",
   look: "new pictures", measure: "the target is found in them", eyes: "the other camera confirms it", repeat: "a later picture repeats it",
 };
 
@@ -26,6 +26,7 @@ const HOW = [
   ["Drag", "a box round a target, then confirm, to follow it; on a touch screen hold a finger on it"],
   ["← ↑ → ↓", "move the cross-hair of a focused image (Shift: 10 px, Alt: 0.1 px)", "keys"],
   ["Enter, T", "choose its point; follow it", "keys"],
+  ["P", "point at what was chosen", "keys"],
 ];
 
 /** An operation's steps, shut once it has ended. */
@@ -109,8 +110,8 @@ export class Target {
     const mine = ++this.number;
     this.click = { camera: eye.name, pixel, facts, old: facts ? ageWords(facts) : "" };
     this.preview = null;
+    if (facts?.moving) return this.refuse("The head moved while this image was exposed. Click when it rests.", "frame_moving");
     if (!facts || eye.isStale) return this.refuse(`The image of ${called(eye.name)} is not of now, so nothing in it can be clicked. ${this.click.old}`, "stale");
-    if (facts.moving) return this.refuse("The head moved while this image was exposed. Click when it rests.", "frame_moving");
     this.state = "asked";
     this.say(`Chosen: ${called(eye.name)}, x ${number(pixel[0], 1)}, y ${number(pixel[1], 1)}. ${this.click.old} Looking for it.`);
     this.draw();

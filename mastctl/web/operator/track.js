@@ -1,8 +1,8 @@
 // The track: by whom the target is seen, and the approach look by look: range, error, camera in use.
 import { byId, h, put, s, say } from "./dom.js";
 import { post } from "./api.js";
-import { camera as called, deg, forTime, inDegrees, metres, number } from "./words.js";
-import { hiddenTable, plot, roundUp, strip } from "./plots.js";
+import { camera as called, clock, deg, forTime, inDegrees, metres, number } from "./words.js";
+import { hiddenTable, plot, roundUp, strip, timesOf } from "./plots.js";
 import { ageWords } from "./eye.js";
 import { placeIn, shownBy } from "./truth.js";
 
@@ -73,7 +73,7 @@ export class TrackPanel {
     [this.status, this.id] = [status, status.id];
     if (status.range_m !== null && !status.predicted && !status.misses && status.looks !== this.trail.at(-1)?.look) {
       const covariance = status.covariance_m2;
-      const look = { look: status.looks, pair: status.pair, range: status.range_m, sigma: covariance ? Math.sqrt(covariance[0][0] + covariance[1][1] + covariance[2][2]) : null, error: null, off: [] };
+      const look = { look: status.looks, at: Date.now() - 1000 * status.age_s, pair: status.pair, range: status.range_m, sigma: covariance ? Math.sqrt(covariance[0][0] + covariance[1][1] + covariance[2][2]) : null, error: null, off: [] };
       this.trail = [...this.trail.slice(1 - KEPT), look];
       if (this.simulated) this.judge(look, status);
     }
@@ -122,19 +122,19 @@ export class TrackPanel {
     const stands = pose ? row("Rover at", `${number(pose.position_m[0], 2, true)}, ${number(pose.position_m[1], 2, true)} m, ${deg(2 * Math.atan2(pose.quaternion[3], pose.quaternion[0]), 1)}`) : null;
     this.drawApproach(none ? [] : this.trail);
     if (none) return put(this.head, stands ? h("table", { class: "figures" }, stands) : null);
-    const last = status.state === "tracking" && !status.predicted ? this.trail.at(-1) : null; // else it is of a place that was
+    const last = status.state === "tracking" && !status.predicted ? this.trail.at(-1) : null; // else it is of a past place
+    const hands = status.handoffs.length ? row("Hand-offs", status.handoffs.map((one) => h("div", {}, `${called(one.from_pair)} → ${called(one.to_pair)} at ${metres(one.range_m, 2)}`))) : null;
     put(this.head,
       h("p", {}, h("strong", { class: `word ${status.state}` }, status.state), " ", inDegrees(status.reason)),
-      h("table", { class: "figures" },
+      h("table", { class: "figures" }, !on ? null : [
         status.pair ? row("In use", called(status.pair)) : null,
         status.range_m !== null ? row("Range", metres(status.range_m) + (status.predicted ? " (carried over)" : "")) : null,
         last?.sigma == null ? null : row("One sigma", `${mm(last.sigma)} mm`),
         last?.error == null ? null : row("Truly off", `${mm(last.error)} mm${last.off.length ? `, ${number(Math.max(...last.off), 2)} px` : ""}`),
         Object.entries(status.pixels ?? {}).map(([name, eye]) => row(called(name), eye.x_px === null ? eye.verdict.replaceAll("_", " ") : `${number(eye.x_px, 1)}, ${number(eye.y_px, 1)} px`)),
-        on ? row("Last look", this.looked = h("span")) : null,
-        row("Looks, misses", `${status.looks}, ${status.misses}`),
-        status.handoffs.length ? row("Hand-offs", status.handoffs.map((one) => h("div", {}, `${called(one.from_pair)} → ${called(one.to_pair)} at ${metres(one.range_m, 2)}`))) : null,
-        stands));
+        row("Last look", this.looked = h("span")),
+        row("Looks, misses", `${status.looks}, ${status.misses}`)],
+        hands, stands));
     this.ago();
   }
 
@@ -142,8 +142,8 @@ export class TrackPanel {
     const drawn = trail.length > 1;
     put(this.plots, drawn ? [this.ranges(), this.errors(), strip(trail.map((one) => called(one.pair ?? "")), `Camera in use, now ${called(trail.at(-1).pair ?? "")}`)] : null);
     const judged = trail.some((one) => one.error !== null);
-    this.table.fill(["look", "camera", "range m", "sigma mm", ...(judged ? ["truly off mm", "px"] : [])], !drawn ? [] : trail.toReversed().map((one) =>
-      [one.look, called(one.pair ?? ""), number(one.range, 3), mm(one.sigma), ...(judged ? [mm(one.error), one.off.length ? number(Math.max(...one.off), 2) : number(null)] : [])]));
+    this.table.fill(["look", "at", "camera", "range m", "sigma mm", ...(judged ? ["truly off mm", "px"] : [])], !drawn ? [] : trail.toReversed().map((one) =>
+      [one.look, clock(one.at), called(one.pair ?? ""), number(one.range, 3), mm(one.sigma), ...(judged ? [mm(one.error), one.off.length ? number(Math.max(...one.off), 2) : number(null)] : [])]));
   }
 
   /** The range of each look; a hand-off is a line between two. */
@@ -151,7 +151,7 @@ export class TrackPanel {
     const { trail } = this;
     const high = roundUp(Math.max(...trail.map((one) => one.range)));
     return [h("p", { class: "quiet" }, "Range, m, look by look"),
-      plot({ label: `Range over ${trail.length} looks, now ${metres(trail.at(-1).range)}`, count: trail.length, high, ticks: [[high, number(high, 0)], [0, "0"]], kind: "approach" }, (x, y) => [
+      plot({ label: `Range over ${trail.length} looks, now ${metres(trail.at(-1).range)}`, count: trail.length, high, ticks: [[high, number(high, 0)], [0, "0"]], axis: timesOf(trail.map((one) => one.at)), kind: "approach" }, (x, y) => [
         trail.map((one, k) => (k && one.pair !== trail[k - 1].pair ? s("path", { class: "handoff", d: `M${(x(k) + x(k - 1)) / 2} 4V76` }) : null)),
         s("polyline", { class: "line", points: trail.map((one, k) => `${x(k)},${y(one.range)}`).join(" ") }),
         s("circle", { class: "tip newest", cx: x(trail.length - 1), cy: y(trail.at(-1).range), r: 3 })])];
@@ -167,7 +167,7 @@ export class TrackPanel {
     const last = trail.at(-1);
     const now = [last.error === null ? null : `truly ${mm(last.error)} mm off`, last.sigma === null ? null : `one sigma ${mm(last.sigma)} mm`].filter(Boolean).join(", ");
     return [h("p", { class: "quiet" }, judged ? "Truly off, mm, beside one sigma (band)" : "One sigma of its place, mm"),
-      plot({ label: `Error of the place: ${now} at ${metres(last.range)}`, count: trail.length, high, ticks: [[high, number(high, high < 1 ? 1 : 0)], [0, "0"]], kind: "approach errors" }, (x, y) => [
+      plot({ label: `Error of the place: ${now} at ${metres(last.range)}`, count: trail.length, high, ticks: [[high, number(high, high < 1 ? 1 : 0)], [0, "0"]], axis: timesOf(trail.map((one) => one.at)), kind: "approach errors" }, (x, y) => [
         s("polygon", { class: "band", points: [...trail.map((one, k) => `${x(k)},${y(1000 * (one.sigma ?? 0))}`), `${x(trail.length - 1)},${y(0)}`, `${x(0)},${y(0)}`].join(" ") }),
         trail.map((one, k) => {
           const value = judged ? one.error : one.sigma;

@@ -10,6 +10,7 @@ export class Views {
     this.eyes = new Map();
     this.images = new Images((facts, bitmap) => this.shown(facts, bitmap));
     this.groups = [];
+    this.turning = false;
     setInterval(() => this.eyes.forEach((eye) => eye.fresh(performance.now())), 100);
     document.addEventListener("visibilitychange", () => this.watch());
   }
@@ -31,7 +32,7 @@ export class Views {
     keep("mastctl view", key ?? "");
     put(byId("tabs"), this.groups.map(([name]) => h("button", { type: "button", "aria-pressed": String(name === key), onclick: () => this.choosePair(name) }, name.replaceAll("_", " "))));
     const names = this.names();
-    this.eyes = new Map(names.map((name) => [name, this.eyes.get(name) ?? new Eye(name, this.choose)]));
+    this.eyes = new Map(names.map((name) => [name, this.eyes.get(name) ?? new Eye(name, this.choose, () => this.turning)]));
     put(byId("eyes"), [...this.eyes.values()].map((eye) => eye.element));
     this.watch();
     document.dispatchEvent(new CustomEvent("views-changed"));

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from dynamixel_sdk import GroupBulkRead, GroupBulkWrite, GroupSyncRead, GroupSyncWrite, PacketHandler
+from dynamixel_sdk import GroupSyncRead, PacketHandler
 
 from drivers.clock import ManualClock
 from drivers.sim.axis import AxisSettings
@@ -48,7 +48,6 @@ class DirectPort:
         self.is_using = False
         self.received = b""
         self.senders: list[int] = []
-        self.sent = b""
         self._buffer = b""
 
     def getBaudRate(self) -> int:
@@ -58,8 +57,7 @@ class DirectPort:
         self._buffer = b""
 
     def writePort(self, packet: list[int]) -> int:
-        self.sent = bytes(packet)
-        replies = self.bus.receive(self.sent, self.clock.now_s())
+        replies = self.bus.receive(bytes(packet), self.clock.now_s())
         self.senders = [reply.sender for reply in replies]
         self.received = self._buffer = b"".join(reply.data for reply in replies)
         return len(packet)
@@ -118,16 +116,6 @@ class Host:
         assert result == 0, result
         return int(error)
 
-    def instruct(self, servo_id: int, code: int, *parameters: int) -> tuple[int, int]:
-        """Any instruction: the result and the error byte."""
-        packet = [0] * (10 + len(parameters))
-        packet[4:8] = [servo_id, 3 + len(parameters), 0, code]
-        packet[8 : 8 + len(parameters)] = parameters
-        assert self.sdk.txPacket(self.port, packet) == 0  # txRxPacket does not wait for every answer
-        self.port.is_using = False
-        answer, result = self.sdk.rxPacket(self.port, False)
-        return result, answer[8] if result == 0 else 0
-
     def sync_read(self, address: int, size: int, *ids: int, fast: bool = False) -> tuple[int, dict[int, int]]:
         """The result, and the values of those that the SDK calls available."""
         group = GroupSyncRead(self.port, self.sdk, address, size)
@@ -136,26 +124,3 @@ class Host:
         result = group.fastSyncRead() if fast else group.txRxPacket()
         there = [i for i in ids if group.isAvailable(i, address, size)]
         return result, {i: group.getData(i, address, size) for i in there}
-
-    def bulk_read(self, *wanted: tuple[int, int, int], fast: bool = False) -> tuple[int, dict[int, int]]:
-        """As `sync_read`, with id, address and size of each."""
-        group = GroupBulkRead(self.port, self.sdk)
-        for entry in wanted:
-            assert group.addParam(*entry)
-        result = group.fastBulkRead() if fast else group.txRxPacket()
-        there = [w for w in wanted if group.isAvailable(*w)]
-        return result, {w[0]: group.getData(*w) for w in there}
-
-    def sync_write(self, address: int, size: int, values: Mapping[int, int]) -> int:
-        """Write a value to each id."""
-        group = GroupSyncWrite(self.port, self.sdk, address, size)
-        for servo_id, value in values.items():
-            assert group.addParam(servo_id, list(value.to_bytes(size, "little", signed=value < 0)))
-        return int(group.txPacket())
-
-    def bulk_write(self, *entries: tuple[int, int, int, int]) -> int:
-        """Write id, address, size, value of each."""
-        group = GroupBulkWrite(self.port, self.sdk)
-        for servo_id, address, size, value in entries:
-            assert group.addParam(servo_id, address, size, list(value.to_bytes(size, "little")))
-        return int(group.txPacket())

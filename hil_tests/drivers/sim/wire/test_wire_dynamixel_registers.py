@@ -10,7 +10,7 @@ from pathlib import Path
 import dynamixel_easy_sdk
 import pytest
 
-from drivers.sim.wire.dynamixel_models import MODELS, SimulatedModel
+from drivers.sim.wire.dynamixel_models import MODELS
 
 FOLDER = Path(dynamixel_easy_sdk.__file__).parent / "control_table"
 FILES = {name: f"{name}.model" for name in MODELS} | {
@@ -52,30 +52,6 @@ def test_addresses_and_sizes() -> None:
         assert not theirs - ours, name
 
 
-def test_indirect_blocks() -> None:
-    for name in MODELS:
-        model = MODELS[name]
-        rows = {
-            row[2]: int(row[0]) for row in sections(name)["control table"] if row[2].startswith("Indirect")
-        }
-        first = model.indirect[0]
-        assert first.address == rows["Indirect Address 1"], name
-        assert first.data == rows["Indirect Data 1"], name
-        kinds = model.indirect_bytes
-        for word, kind in (("Address", "address"), ("Data", "data")):
-            for end in ("Write", "Read"):
-                assert kinds[rows[f"Indirect {word} {end}"]][0] == kind, name
-        # The k-th address goes with the k-th data byte, also where the wheel splits writing from reading.
-        at = rows["Indirect Address Read"], rows["Indirect Data Read"]
-        assert kinds[at[0]][1] == 2 * kinds[at[1]][1], name
-
-
-def test_model_number() -> None:
-    for name in MODELS:
-        index = dict(line.split() for line in (FOLDER / "dynamixel.model").read_text().splitlines()[1:])
-        assert index[str(MODELS[name].number)] == f"{name}.model", name
-
-
 def test_units() -> None:
     for name in MODELS:
         model = MODELS[name]
@@ -88,27 +64,3 @@ def test_units() -> None:
         assert info["value_of_zero_radian_position"] == model.zero_counts, name
         units = {row[0]: float(row[1]) for row in sections(name)["unit info"]}
         assert model.velocity_unit_rad_per_s == pytest.approx(units["Present Velocity"], rel=2e-3), name
-
-
-def signed_names(model: SimulatedModel) -> set[str]:
-    return {r.name for r in model.registers if r.low < 0}
-
-
-def test_the_tables_are_sound() -> None:
-    for name in MODELS:
-        model = MODELS[name]
-        used = [byte for r in model.registers for byte in range(r.address, r.address + r.size)]
-        used += model.indirect_bytes
-        assert len(used) == len(set(used)), name
-        for register in model.registers:
-            assert register.low <= register.high, name
-            assert (
-                not register.writable
-                or register.low <= register.initial <= register.high
-                or (register.name.startswith("goal_"))
-            )
-            assert register.from_bytes(register.to_bytes(register.low)) == register.low, name
-            assert register.from_bytes(register.to_bytes(register.high)) == register.high, name
-        assert {"homing_offset", "present_position", "present_velocity", "goal_position"} <= signed_names(
-            model
-        ), name

@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # slow to load, and every worker loads this file
 
 BOUND_MS = 1e3 * NET_S
 STALE = "const STALE_S = 1.0;"
-OLD_MS = 1e3 * (NET_S + 1.0)
+OLD_MS = int(1e3 * (NET_S + 1.0))
 """So far the page's clock is turned to make an image old, or a stream silent."""
 
 
@@ -67,8 +67,8 @@ class Visit:
         return [where for where, _ in self.asked]
 
     def frame(self, camera: str = "navcam_left") -> Any:
-        """The image of a camera, once it is fresh."""
-        self.page.wait_for_selector(f".eye[data-camera={camera}]:not([data-stale])")
+        """The image of a camera, once it is fresh and of a head at rest."""
+        self.page.wait_for_selector(f".eye[data-camera={camera}]:not([data-stale], [data-moving])")
         return self.page.locator(f".eye[data-camera={camera}] .frame")
 
     def choose(
@@ -91,7 +91,7 @@ class Visit:
 
     def serious(self, context: str | None = None) -> list[Any]:
         """What axe finds that shuts somebody out, in a part of the page or all of it."""
-        from axe_playwright_python.sync_playwright import Axe
+        from axe_playwright_python.sync_playwright import Axe  # type: ignore[import-untyped]
 
         return [
             (each["id"], each["nodes"][0]["html"][:160], each["nodes"][0].get("failureSummary"))
@@ -128,7 +128,7 @@ def visit(browser: Browser) -> Iterator[Callable[..., Visit]]:
             page.clock.install()
         one = Visit(page, url)
         made.append(one)
-        page.on("console", lambda said: said.type == "error" and one.complaints.append(said.text))
+        page.on("console", lambda said: one.complaints.extend([said.text] if said.type == "error" else []))
         page.on("pageerror", lambda error: one.complaints.append(str(error)))
         page.on("request", lambda sent: one.asked.append((_named(sent), sent.post_data or "")))
         page.on("websocket", lambda line: one.asked.append((f"WS {line.url}", "")))

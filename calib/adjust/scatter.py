@@ -1,0 +1,270 @@
+"""How much the dots of each image scatter about a smooth map of their own: a variance component an image.
+
+Over one board, what a fit leaves of an image's dots is a smooth function of the place on the board if
+anything moved the image as a whole, whatever it was: a polynomial takes it up. What is left is the dots' own
+noise, its sum of squares chi-square times the square of their sigma. So every image says for itself how
+noisy it is, before anybody asks whether it agrees with the others; and a whole image that is tested with
+that sigma is tested for coherent shifts alone.
+
+Images of a camera that agree with each other have one scale, their camera's; luck changes none. Nothing is
+taken for more exact than stated here. Scales end at `MOST`, or `ORDER` times what the survey states of all
+dots: gross blunders are no noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtrc, fdtrc
+
+from calib.adjust.adjustment import Adjustment
+from calib.adjust.significance import typical_scale
+from calib.adjust.terms import ImageTerm, scattered_images, widened_images
+from calib.adjust.unknowns import Estimate
+from calib.geometry.rigid import FloatArray
+
+MOST = 6.0
+"""Noise is at most so many times what is stated: five times is what a careless focus makes of it."""
+
+ORDER = 2.0
+"""Or until a dot's sigma is so many times what the survey states of all dots: dots come with sigmas of their
+own that may be much less, and a near board shows its print's errors most."""
+
+ODD = 0.001
+"""An image has a scale of its own, and a camera another than stated, if chance makes that less often."""
+
+DEGREES = ((60, 3), (24, 2), (10, 1))
+"""Fewest dots for a polynomial of that degree; an image with fewer has its camera's scale."""
+
+BEYOND = 4.0
+"""A dot so many times farther off than the typical one is no noise."""
+
+STEPS = 10
+PULL = 2.5
+"""Beyond so many times the typical residual a dot pulls no harder."""
+
+
+class Scatter(NamedTuple):
+    """Mean square of an image's dots about their smooth map, in stated sigmas, and its degrees of freedom."""
+
+    square: float
+    freedom: float
+
+
+class Scales(NamedTuple):
+    """By camera what its dots' stated sigmas have to be multiplied by, and by image besides."""
+
+    cameras: Mapping[str, float]
+    images: Mapping[str, float]
+
+    def of(self, image: ImageTerm) -> float:
+        """Return what an image's sigmas have to be multiplied by in all."""
+        return self.cameras.get(image.kind, 1.0) * self.images.get(image.name, 1.0)
+
+
+def scatter(image: ImageTerm, residual: FloatArray, judged: np.ndarray | None = None) -> Scatter | None:
+    """Return how much an image's dots scatter, their residuals (2n,) being in its sigmas; None of too few.
+
+    The farthest are left out as blunders, unless these were ``judged``: then all that passed (n,) count.
+    """
+    off = residual.reshape(-1, 2)
+    seen = np.isfinite(off).all(axis=1) & (True if judged is None else judged)
+    degree = next((degree for fewest, degree in DEGREES if seen.sum() >= fewest), 0)
+    if not degree:
+        return None
+    places = image.in_board_m[seen, :2]
+    middle = places.mean(axis=0)
+    size = max(float(np.abs(places - middle).max()), 1e-9)
+    statistic, _ = off_smooth((places - middle) / size, off[seen], np.ones(int(seen.sum())), degree)
+    kept = statistic if judged is not None else statistic[statistic <= BEYOND**2 * typical_scale(statistic)]
+    taken = (degree + 1) * (degree + 2)
+    return Scatter(float(kept.mean()) / 2.0, float(2 * len(kept) - taken)) if 2 * len(kept) > taken else None
+
+
+def scales(found: Mapping[str, tuple[ImageTerm, Scatter]], order_px: float) -> Scales:
+    """Return the scales of cameras and images.
+
+    Parameters
+    ----------
+    found
+        By image its term, with stated sigmas, and how much it scatters in these.
+    order_px
+        What the survey states of all its dots, one sigma.
+    """
+    cameras: dict[str, float] = {}
+    images: dict[str, float] = {}
+    for kind in dict.fromkeys(term.kind for term, _ in found.values()):
+        mine = {name: one for name, (term, one) in found.items() if term.kind == kind}
+        squares, freedom = np.array(list(mine.values())).T
+        typical = _median(squares, freedom)
+        like = np.array([not _odd(one, typical, np.inf) for one in mine.values()])
+        if like.any():
+            typical = float(np.sum((squares * freedom)[like]) / freedom[like].sum())
+        together = float(freedom[like].sum())
+        if not (typical > 1.0 and chdtrc(together, typical * together) < ODD):
+            typical = 1.0
+        most = [_most(found[name][0], order_px) for name in mine]
+        cameras[kind] = min(float(np.sqrt(typical)), *most)
+        sure = np.inf if typical == 1.0 else max(together, 1.0)
+        for name, limit in zip(mine, most, strict=True):
+            images[name] = _own(mine[name], cameras[kind], sure, limit)
+    return Scales(cameras, {name: own for name, own in images.items() if own != 1.0})
+
+
+def own_scales(
+    problem: Adjustment,
+    state: Estimate,
+    images: Sequence[ImageTerm],
+    cameras: Mapping[str, float],
+    order_px: float,
+) -> dict[str, float]:
+    """Return by image what its sigmas count times beside its camera's: of images that were not fitted.
+
+    Parameters
+    ----------
+    problem, state
+        A fit; the images are with stated sigmas.
+    cameras
+        By kind of measurement what stated sigmas count times.
+    order_px
+        As of `scales`.
+    """
+    found = scattering(problem, state, images)
+    return {
+        name: _own(one, cameras.get(term.kind, 1.0), np.inf, _most(term, order_px))
+        for name, (term, one) in found.items()
+    }
+
+
+def with_scales(
+    problem: Adjustment, state: Estimate, images: Sequence[ImageTerm], order_px: float
+) -> tuple[Adjustment, tuple[ImageTerm, ...], Scales]:
+    """Return a problem and all its images, with every dot, by sigmas as large as their scatter shows.
+
+    Parameters
+    ----------
+    problem
+        Its images' sigmas do not count, but what of them is kept.
+    images
+        All, in the same order, with every dot and stated sigmas.
+    state
+        A first fit: what is left of an image may be large, but has to be smooth.
+    order_px
+        As of `scales`.
+    """
+    found = scales(scattering(problem, state, images), order_px)
+    every = widened_images(scattered_images(images, found.images), found.cameras)
+    kept = [replace(whole, keep=term.keep) for whole, term in zip(every, problem.images, strict=True)]
+    return problem.with_terms(kept, problem.station), every, found
+
+
+def scattering(
+    problem: Adjustment, state: Estimate, images: Sequence[ImageTerm]
+) -> dict[str, tuple[ImageTerm, Scatter]]:
+    """Return by image its term and its scatter, of those that show it."""
+    residuals = problem.image_residuals(state, [_whole(term) for term in images])
+    measured = ((term, scatter(term, off)) for term, off in zip(images, residuals, strict=True))
+    return {term.name: (term, one) for term, one in measured if one is not None}
+
+
+def typical_excess(problem: Adjustment, state: Estimate, images: Sequence[ImageTerm]) -> float:
+    """Return how many of its sigmas, as they are now, the typical image scatters; 1 if none shows it."""
+    found = [one.square for _, one in scattering(problem, state, images).values()]
+    return float(np.sqrt(np.median(found))) if found else 1.0
+
+
+def print_error_m(problem: Adjustment, state: Estimate) -> float:
+    """Return how far the typical corner is printed beside its place on the board, metres an axis.
+
+    It is the same in all pictures, where noise is another in each; 0 where chance makes them agree as much.
+    """
+    sums: dict[tuple[str, int], tuple[FloatArray, FloatArray]] = {}
+    shown = [t for t in problem.images if t.keep.any() and t.ids is not None and t.board not in problem.held]
+    for term, block in zip(shown, problem.image_blocks(state, shown), strict=True):
+        axes = state.rover_from_board[term.board].rotation[:, :2]
+        by_place = block.rates(("board", term.board))[:, 3:].reshape(-1, 2, 3) @ axes
+        off = block.residual.reshape(-1, 2)
+        assert term.ids is not None
+        for corner, rates, residual in zip(term.ids[term.keep].tolist(), by_place, off, strict=True):
+            key = (term.board[0], corner)
+            matrix, pull = sums.get(key, (np.zeros((2, 2)), np.zeros(2)))
+            sums[key] = matrix + rates.T @ rates, pull + rates.T @ residual
+    known = [(matrix, pull) for matrix, pull in sums.values() if np.linalg.det(matrix) > 0.0]
+    agree = sum(float(pull @ np.linalg.solve(matrix, pull)) for matrix, pull in known)
+    if not known or chdtrc(2 * len(known), agree) >= ODD:
+        return 0.0
+    return float(np.sqrt((agree - 2 * len(known)) / sum(float(np.trace(matrix)) for matrix, _ in known)))
+
+
+def off_smooth(
+    places: FloatArray, values: FloatArray, sigma: FloatArray, degree: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return how far points are from a polynomial of the others.
+
+    Parameters
+    ----------
+    places, values
+        (n, 2) where each point is, of the order of one, and what is smooth over these.
+    sigma
+        (n,) of a value's coordinate.
+    degree
+        Of the polynomial.
+
+    Returns
+    -------
+    FloatArray, FloatArray
+        (n,) each point's chi-square, of two degrees of freedom, and its distance.
+    """
+    x, y = places.T
+    terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
+    weight = 1 / sigma**2
+    for _ in range(STEPS):
+        root = np.sqrt(weight)[:, None]
+        numbers = np.linalg.lstsq(root * terms, root * values, rcond=None)[0]
+        off = np.linalg.norm(terms @ numbers - values, axis=1)
+        size = off / sigma
+        size = size / max(1.0, float(np.median(size)))
+        weight = np.minimum(1.0, PULL / np.maximum(size, PULL)) ** 2 / sigma**2
+        if not (size > PULL).any():
+            break
+    root = np.sqrt(weight)[:, None]
+    share = np.linalg.norm(np.linalg.qr(root * terms)[0], axis=1) ** 2
+    # A point alone in its corner bends the polynomial to itself: judge it by what that leaves.
+    return (off / sigma) ** 2 / np.maximum(1 - share, 0.1), off
+
+
+def _whole(term: ImageTerm) -> ImageTerm:
+    return term if term.keep.all() else replace(term, keep=np.ones_like(term.keep))
+
+
+def _most(term: ImageTerm, order_px: float) -> float:
+    """The largest scale that is noise."""
+    return max(MOST, ORDER * order_px / float(np.median(term.sigma_px)))
+
+
+def _own(one: Scatter, camera: float, freedom: float, most: float) -> float:
+    """What an image's sigmas count times beside its camera's; nothing becomes smaller than stated."""
+    if not _odd(one, camera**2, freedom):
+        return 1.0
+    least = min(camera, 1.0)
+    return min(max(float(np.sqrt(one.square)), least), max(most, camera)) / camera
+
+
+def _odd(one: Scatter, typical: float, freedom: float) -> bool:
+    """Whether an image's scatter is not that of others, larger or smaller, of which so much is known."""
+    ratio = one.square / max(typical, 1e-300)
+    if np.isinf(freedom):
+        above = float(chdtrc(one.freedom, one.freedom * ratio))
+    else:
+        above = float(fdtrc(one.freedom, freedom, ratio))
+    return 2 * min(above, 1.0 - above) < ODD
+
+
+def _median(values: FloatArray, weights: FloatArray) -> float:
+    """The weighted median."""
+    order = np.argsort(values)
+    part = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(part, part[-1] / 2)])

@@ -1,0 +1,233 @@
+"""The statements of a bench's fit: sigmas, gains of terms, expected check images, gauges."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import chdtrc
+
+from calib.adjust.adjustment import Adjustment
+from calib.adjust.changes import reading_rates
+from calib.adjust.drifts import by_other_placements, find_drifts
+from calib.adjust.goodness import goodness
+from calib.adjust.model_terms import TERM_KINDS, Tested, candidate_terms, choose_terms, moves_px, term_motions
+from calib.adjust.outliers import name_outliers
+from calib.adjust.result import BenchCalibration, CheckExpected, ImageResiduals, TermGain, rig_of
+from calib.adjust.robust import Weighed
+from calib.adjust.scatter import own_scales, print_error_m
+from calib.adjust.significance import chance_of_sum, rare_sum
+from calib.adjust.solver import Minimum, covariance_of
+from calib.adjust.terms import ImageTerm, lens_notes, scattered_images
+from calib.adjust.uncertainty import image_residuals, open_directions, rms_by_camera, sigma_by_key
+from calib.adjust.unknowns import Estimate
+from calib.calibrate.bench.problem import BenchProblem
+from calib.calibrate.starts.wrong_dots import wrong_points
+from calib.geometry.covariance import RigCovariance
+from calib.geometry.rigid import FloatArray
+
+UNPREDICTED = 3e-5
+"""Check images of a camera were not predicted if chance makes them so far off in fewer benches than this."""
+
+
+def choose(
+    bench: BenchProblem, candidates: Sequence[str], problem: Adjustment, fit: Minimum[Estimate]
+) -> tuple[tuple[str, ...], dict[str, Tested]]:
+    """The terms that are significant, and every term's test."""
+    covariance = covariance_of(fit.normal.matrix, problem.weak)
+    total, freedom = goodness(problem, fit.state, covariance)
+    every = candidate_terms(bench.boards)
+    values = problem.values(fit.state, *TERM_KINDS)
+    return choose_terms(
+        {term: every[term] for term in candidates},
+        problem.names,
+        values,
+        covariance,
+        total / max(freedom, 1.0),
+        max(freedom, 1.0),
+        term_motions(problem, fit.state, {term: every[term] for term in candidates}),
+    )
+
+
+def bench_calibration(
+    bench: BenchProblem,
+    stated: tuple[Adjustment, Minimum[Estimate]],
+    weighed: Weighed,
+    candidates: Sequence[str],
+    chosen: Sequence[str],
+    tests: Mapping[str, Tested],
+    began: float,
+) -> BenchCalibration:
+    """Put together what the fit says; chi-square is that of the stated sigmas."""
+    problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
+    first = stated[1]
+    total, freedom = goodness(stated[0], first.state, covariance_of(first.normal.matrix, stated[0].weak))
+    for one in weighed.components:
+        if one.wrong or one.generous:
+            bench.notes.append(
+                f"{one.kind} scatter by {one.factor:.2f} ± {one.factor_sigma:.2f} times the stated "
+                "sigma; they count with that"
+            )
+    # A parameter that is not seen keeps what is weakly known of it, and is reported as open.
+    rig, mine = rig_of(bench.survey, state), problem.unknowns.of_kinds("mast", "joints", "camera")
+    known = RigCovariance(tuple(problem.names[i] for i in mine), covariance[np.ix_(mine, mine)])
+    sigma = sigma_by_key(rig, known.names, known.covariance)
+    rig_numbers = problem.unknowns.of_kinds("camera", "mast")
+    order_px = bench.survey.sigma.corner_px
+    own = own_scales(problem, state, bench.terms.checks, weighed.factors, order_px)
+    checks = scattered_images(bench.terms.checks, own)
+    scatter = {t.name: t.scatter for t in (*weighed.images, *checks)}
+    images = image_residuals(bench.survey, problem, state, bench.terms.images, bench.terms.checks, scatter)
+    checked = _checked(images, bench.terms.checks)
+    return BenchCalibration(
+        rig=rig,
+        parameter_names=known.names,
+        covariance=known.covariance,
+        sigma=sigma,
+        terms=_gains(bench, candidates, chosen, tests, problem, state),
+        rms_px=rms_by_camera(images),
+        check_rms_px=rms_by_camera(checked),
+        checks=_expected(checks, weighed, checked),
+        images=images,
+        outliers=name_outliers(problem, state, covariance, weighed.images),
+        degenerate=open_directions(problem, covariance[np.ix_(rig_numbers, rig_numbers)]),
+        gauges=_gauges(bench, chosen),
+        notes=(*bench.notes, *lens_notes(rig, sigma)),
+        chi2=total,
+        degrees_of_freedom=freedom,
+        chi2_probability=float(chdtrc(freedom, total)) if freedom > 0 else float("nan"),
+        placements=by_other_placements(problem, state),
+        drifts=find_drifts(problem, state),
+        components=weighed.components,
+        joint_rad=problem.joint_rad,
+        inexact_m=print_error_m(problem, state),
+        rover_from_board=state.rover_from_board,
+        bows_m=state.bows_m,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _expected(
+    checks: Sequence[ImageTerm], weighed: Weighed, checked: Sequence[ImageResiduals]
+) -> dict[str, CheckExpected]:
+    """By camera what check images should be off by, each by its own scatter."""
+    used = {image.name: image.used for image in checked}
+    terms = [replace(t, keep=used[t.name]) for t in checks if used[t.name].any()]
+    expected = {}
+    for camera in dict.fromkeys(t.camera for t in terms):
+        mine = [t for t in terms if t.camera == camera]
+        weights = check_weights(weighed, mine)
+        names = {t.name for t in mine}
+        square = sum(float(np.sum(i.residuals_px[i.used] ** 2)) for i in checked if i.name in names)
+        expected[camera] = CheckExpected(
+            float(np.sqrt(weights.mean())),
+            float(np.sqrt(rare_sum(UNPREDICTED, weights) / len(weights))),
+            chance_of_sum(square, weights),
+        )
+    return expected
+
+
+def check_weights(weighed: Weighed, terms: Sequence[ImageTerm]) -> FloatArray:
+    """Return what the squares of independent unit errors count in the sum of squares of a camera's check
+    images, (m,), px²: their corners, m numbers in all, scatter as those that were fitted; all images hang on
+    one calibration and share its error; on one reading, all of one standstill.
+    """
+    problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
+    scatter = {c.kind: c.weighed for c in weighed.components}
+    exact = problem.at_rest()
+    standstills = list(dict.fromkeys((t.pan_rad, t.tilt_rad, t.approach) for t in terms))
+    by_all, by_readings, own_px = [], [], []
+    blocks = exact.image_blocks(state, terms)
+    by_reading = reading_rates(exact, state, terms, [block.residual for block in blocks])
+    for term, block, read in zip(terms, blocks, by_reading, strict=True):
+        sigma_px = np.repeat(term.sigma_px[term.keep], 2)[:, None]
+        rates = np.zeros((len(sigma_px), len(covariance)))
+        rates[:, block.columns] = sigma_px * block.jacobian
+        readings = np.zeros((len(sigma_px), len(standstills), 2))
+        if term.attitude is not None and problem.joint_rad > 0:
+            at = standstills.index((term.pan_rad, term.tilt_rad, term.approach))
+            readings[:, at] = sigma_px * problem.joint_rad * read
+        by_all.append(rates)
+        by_readings.append(readings.reshape(len(rates), -1))
+        own_px.append(scatter.get(term.kind, 1.0) * sigma_px)
+    rates = np.concatenate(by_all)
+    touched = rates.any(axis=0)
+    root = _root(covariance[np.ix_(touched, touched)])
+    shared = np.hstack([rates[:, touched] @ root, np.concatenate(by_readings)])
+    together = np.linalg.svd(shared, compute_uv=False) ** 2
+    weights = np.sort(np.concatenate(own_px)[:, 0] ** 2)[::-1]
+    weights[: len(together)] += together
+    return weights
+
+
+def _gains(
+    bench: BenchProblem,
+    candidates: Sequence[str],
+    chosen: Sequence[str],
+    tests: Mapping[str, Tested],
+    problem: Adjustment,
+    state: Estimate,
+) -> tuple[TermGain, ...]:
+    """Every term with what it gains."""
+    every = candidate_terms(bench.boards)
+    _, now = choose(bench, chosen, problem, Minimum(state, problem.with_huber(None).normal(state), True, 0))
+    moves = moves_px(
+        problem, state, {term: every[term] for term in chosen}, problem.values(state, *TERM_KINDS)
+    )
+    found = []
+    for term in candidates:
+        test = now[term] if term in chosen else tests[term]
+        found.append(
+            TermGain(
+                every[term], term in chosen, test.values, test.sigma, test.chi2, test.chance,
+                moves.get(term, float("nan")),
+            )
+        )  # fmt: skip
+    return tuple(found)
+
+
+def _gauges(bench: BenchProblem, chosen: Sequence[str]) -> tuple[str, ...]:
+    """What pictures cannot know, and how it was fixed."""
+    known = bench.options.rover_from_board
+    if known is not None:
+        where = (
+            f"the rover frame hangs on placement {known[0][1]} of board {known[0][0]}, whose pose was stated"
+        )
+    elif bench.options.rover_from_mast is not None:
+        where = "the mast stands in the rover frame as was stated, with no uncertainty"
+    else:
+        where = (
+            "the rover frame is the mast's at zero angles (z down along the pan axis): where the "
+            "vehicle is, pictures cannot show"
+        )
+    gauges = [
+        where,
+        "its origin is where the pan axis is nearest to the tilt axis: pictures determine no other height "
+        "along it",
+        "pan is zero where the tilt axis points to y, tilt where the head's x lies square to pan. An "
+        "offset of either would turn the frame or all head cameras, and is none",
+        "every length is as long as the boards were measured: 0.1 % there is 0.1 % of every range",
+    ]
+    if "tilt harmonic 1" in chosen:
+        gauges.append(
+            "the first harmonic of tilt is encoder and an arm's sag together: pictures cannot separate them"
+        )
+    return tuple(gauges)
+
+
+def _checked(images: Sequence[ImageResiduals], checks: Sequence[ImageTerm]) -> list[ImageResiduals]:
+    """The check images, less corners that disagree with the rest of their own image."""
+    wrong = {t.name: wrong_points(t.in_board_m[:, :2], t.pixels_px, t.sigma_px) for t in checks}
+    return [
+        replace(i, used=np.isfinite(i.residuals_px).all(axis=1) & ~wrong[i.name])
+        for i in images
+        if i.name in wrong
+    ]
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """A square root of a covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

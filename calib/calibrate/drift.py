@@ -1,0 +1,363 @@
+"""Finds changes since reference pictures were taken: in their differences, tested, and named.
+
+Each view (a camera at a rest of the head) is looked at again; its features have moved by little. A robust fit
+turns them into four numbers: shift x and y of the picture's middle, a turn about it, a change of scale.
+Things that moved by themselves (rocks, shadows' edges) are left out there. The numbers of all views are then
+explained by one change at a time: a camera turned in the head, a lens refocused, a joint slipped, the rover
+turned under the mast. Light and weather spoil a view as a whole, so each view has an error of its own beside
+that of its features, and each rest one of both joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from calib.adjust.significance import MEDIAN_OF_TWO, chance, sigmas
+from calib.errors import CalibError
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
+from calib.matching.patch import match_patch
+from calib.matching.verdict import MatchSettings
+from calib.matching.warp import Grey, facing_plane
+
+ALARM_SIGMAS = 6.0
+"""A change is reported from here on, if two looks one after the other say so."""
+
+JOINT_SIGMA_RAD = 2e-4
+"""What a rest of the head is off by chance, each time."""
+
+VIEW_SIGMA = np.array([0.1, 0.1, 1e-4, 1e-4])
+"""The motion of a whole view by light, weather and temperature: px, px, rad, part of the scale."""
+
+AS_GOOD = 9.0
+"""A change that explains a chi-square less by this little would do as well."""
+
+LEAST_FEATURES = 8
+LEAST_PART, MOST_SPREAD_PX = 0.4, 1.5
+"""Fewer of a view's features that move as one, or less alike, and it says nothing: fog, another scene."""
+
+NEAREST_M, FARTHEST_M = 1.0, 30.0
+"""What is seen is taken to lie on level ground under the rover, within these ranges."""
+
+MOST_FEATURES = 60
+QUALITY, APART_PX, EDGE_PX = 0.02, 40, 26
+SEARCH_PX = 30.0
+"""How far a feature is looked for: a bump or slip of some 20 mrad in a Navcam."""
+
+FLOOR_PX = 0.03
+_RANGE_M = 5.0
+_SETTINGS = MatchSettings(half_px=14, roughness=0.0)
+
+_TUKEY = 4.0
+_BIT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class ViewShift:
+    """The features of one view, then and now.
+
+    camera, pose, pan_rad, tilt_rad
+        Who looked, at which of the reference rests, and where that was (true angles).
+    pixels_px
+        (n, 2) in the reference picture.
+    moved_px
+        (n, 2) now less then.
+    sigma_px
+        (n,) of each coordinate of ``moved_px``.
+    """
+
+    camera: str
+    pose: int
+    pan_rad: float
+    tilt_rad: float
+    pixels_px: FloatArray
+    moved_px: FloatArray
+    sigma_px: FloatArray
+
+
+class ViewChange(NamedTuple):
+    """Shift x, y (px), turn (rad), scale; their covariance (4, 4); which part of the features agrees."""
+
+    numbers: FloatArray
+    covariance: FloatArray
+    agreeing: float
+
+
+@dataclass(frozen=True, eq=False)
+class SceneChange:
+    """One thing that would explain the differences.
+
+    Attributes
+    ----------
+    what
+        ``NAME turned``, ``NAME refocused``, ``pan slipped``, ``tilt slipped``, ``rover turned``.
+    values, covariance
+        Of the change (k,), (k, k): radians about x, y, z of the head (of the rover for ``rover turned``),
+        the part of the focal length, or radians of the joint.
+    sigmas
+        How unlikely the differences are without it.
+    """
+
+    what: str
+    values: FloatArray
+    covariance: FloatArray
+    sigmas: float
+
+    @property
+    def sentence(self) -> str:
+        """The change as a person says it: ``navcam_left turned 1.8 mrad about y, 9 sigma``."""
+        size = 1e3 * self.values
+        if self.what.endswith(" refocused"):
+            return f"{self.what}: focal length {0.1 * size[0]:+.3f} %, {self.sigmas:.0f} sigma"
+        if len(size) == 1:
+            return f"{self.what} by {size[0]:+.2f} mrad, {self.sigmas:.0f} sigma"
+        main = int(np.abs(size).argmax())
+        about = f"{abs(size[main]):.2f} mrad about {'-' if size[main] < 0 else ''}{'xyz'[main]}"
+        whole = float(np.linalg.norm(size))
+        rest = "" if abs(size[main]) > 0.9 * whole else f" ({whole:.2f} in all)"
+        return f"{self.what} {about}{rest}, {self.sigmas:.0f} sigma"
+
+
+@dataclass(frozen=True, eq=False)
+class SceneDrift:
+    """What a look says: views that told something and not, the changes by likelihood, and the one to name.
+
+    ``named`` is the plainest change that explains nearly all; None below ``ALARM_SIGMAS``. ``instead`` are
+    others that would do as well: these pictures cannot tell them from it. ``missing`` says why a camera, or
+    one at a rest, gave no picture.
+    """
+
+    views: int
+    silent: tuple[str, ...]
+    changes: tuple[SceneChange, ...]
+    named: SceneChange | None
+    instead: tuple[str, ...] = ()
+    missing: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def sentence(self) -> str:
+        """What is to be told, '' if nothing is."""
+        if self.named is None:
+            return ""
+        other = (
+            f" (or {' or '.join(self.instead)}: these pictures cannot separate them)" if self.instead else ""
+        )
+        return self.named.sentence + other
+
+
+def view_change(shift: ViewShift, size_px: tuple[int, int]) -> ViewChange | None:
+    """Return how a view as a whole changed, None if too few of its features moved as one."""
+    count = len(shift.pixels_px)
+    if count < LEAST_FEATURES:
+        return None
+    rates = _rates(shift.pixels_px, size_px)
+    numbers = np.concatenate([np.median(shift.moved_px, axis=0), [0.0, 0.0]])
+    wide = 1.4826 * np.median(np.abs(shift.moved_px - numbers[:2]))
+    spread = max(float(wide), float(np.median(shift.sigma_px)))
+    sigma = np.hypot(shift.sigma_px, 0.02)
+    normal = np.eye(4)
+    weights = np.ones(count)
+    for _ in range(12):
+        off = np.linalg.norm(shift.moved_px - rates @ numbers, axis=1)
+        cut = _TUKEY * np.hypot(sigma, spread)
+        weights = np.where(off < cut, (1.0 - (off / cut) ** 2) ** 2, 0.0)
+        if np.count_nonzero(weights) < LEAST_FEATURES:
+            return None
+        weighted = rates * (weights / sigma**2)[:, None, None]
+        normal = np.einsum("nij,nik->jk", weighted, rates)
+        numbers = np.linalg.solve(normal, np.einsum("nij,ni->j", weighted, shift.moved_px))
+        left = np.linalg.norm(shift.moved_px - rates @ numbers, axis=1)[weights > 0.1]
+        spread = float(np.median(left)) if len(left) else spread
+    agreeing = float(np.mean(weights > 0.1))
+    if agreeing < LEAST_PART or spread > MOST_SPREAD_PX:
+        return None
+    scatter = max(1.0, (spread / float(np.median(sigma))) ** 2 / MEDIAN_OF_TWO)
+    covariance = np.asarray(scatter * np.linalg.inv(normal) + np.diag(VIEW_SIGMA**2), dtype=np.float64)
+    return ViewChange(numbers, covariance, agreeing)
+
+
+def find_drift(rig: Rig, shifts: Sequence[ViewShift], joint_sigma_rad: float = JOINT_SIGMA_RAD) -> SceneDrift:
+    """Return what differences between reference pictures and new ones say of a rig.
+
+    Parameters
+    ----------
+    rig
+        The mast file's.
+    shifts
+        The views, each camera at each rest once.
+    joint_sigma_rad
+        What a rest of the head is off by chance, then and now, one sigma.
+    """
+    told: list[tuple[ViewShift, ViewChange]] = []
+    silent = []
+    for shift in shifts:
+        change = view_change(shift, rig.cameras[shift.camera].model.size_px)
+        if change is None:
+            silent.append(f"{shift.camera} at rest {shift.pose}")
+        else:
+            told.append((shift, change))
+    if not told:
+        return SceneDrift(0, tuple(silent), (), None)
+    y = np.concatenate([change.numbers for _, change in told])
+    columns = _columns(rig, [shift for shift, _ in told])
+    covariance = _noise(told, columns, joint_sigma_rad)
+    inverse = np.linalg.inv(covariance)
+    changes = []
+    for what, rates in _explanations(rig, columns).items():
+        normal = rates.T @ inverse @ rates
+        if np.linalg.cond(normal) > 1e12:
+            continue
+        values = np.linalg.solve(normal, rates.T @ inverse @ y)
+        gain = float(values @ normal @ values)
+        left = max(float(y @ inverse @ y) - gain, 0.0)
+        freedom = max(len(y) - len(values), 1)
+        scale = max(1.0, left / freedom)
+        by_chance = chance(gain, len(values), scale, freedom)
+        spread = np.asarray(scale * np.linalg.inv(normal), dtype=np.float64)
+        changes.append((gain / scale, SceneChange(what, values, spread, sigmas(by_chance))))
+    per_number = float(np.log(len(y)))  # what a number more must explain: Schwarz's criterion
+    changes.sort(key=lambda one: per_number * len(one[1].values) - one[0])
+    ranked = [change for _, change in changes]
+    best = ranked[0] if ranked and ranked[0].sigmas >= ALARM_SIGMAS else None
+    instead = []
+    if best is not None:
+        explained = {change.what: gain for gain, change in changes}
+        instead = [
+            change.what
+            for change in ranked
+            if change is not best and explained[change.what] > explained[best.what] - AS_GOOD
+        ]
+    return SceneDrift(len(told), tuple(silent), tuple(ranked), best, tuple(instead))
+
+
+def _explanations(rig: Rig, columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
+    """By change: how the views' numbers (4v,) follow it (4v, k)."""
+    found = {}
+    for name, camera in rig.cameras.items():
+        if camera.on == "head" and f"cameras.{name}.turn.x" in columns:
+            found[f"{name} turned"] = np.column_stack(
+                [columns[f"cameras.{name}.turn.{axis}"] for axis in "xyz"]
+            )
+            found[f"{name} refocused"] = columns[f"cameras.{name}.scale"][:, None]
+    for joint in ("pan", "tilt"):
+        found[f"{joint} slipped"] = columns[joint][:, None]
+    found["rover turned"] = np.column_stack([columns[f"rover.{axis}"] for axis in "xyz"])
+    return found
+
+
+def _noise(
+    told: Sequence[tuple[ViewShift, ViewChange]], columns: dict[str, FloatArray], joint_sigma_rad: float
+) -> FloatArray:
+    """Covariance (4v, 4v): each view's own, and each rest's joint errors, of then and of now."""
+    size = 4 * len(told)
+    covariance = np.zeros((size, size))
+    for at, (_, change) in enumerate(told):
+        covariance[4 * at : 4 * at + 4, 4 * at : 4 * at + 4] = change.covariance
+    poses = np.repeat([shift.pose for shift, _ in told], 4)
+    for pose in np.unique(poses):
+        for joint in ("pan", "tilt"):
+            mine = np.where(poses == pose, columns[joint], 0.0)
+            covariance += 2.0 * joint_sigma_rad**2 * np.outer(mine, mine)
+    return covariance
+
+
+def _columns(rig: Rig, shifts: Sequence[ViewShift]) -> dict[str, FloatArray]:
+    """By number that may change: how the views' numbers follow it (4v,)."""
+    views = [_responses(rig, shift) for shift in shifts]
+    names = list(dict.fromkeys(name for view in views for name in view))
+    nothing = np.zeros(4)
+    return {name: np.concatenate([view.get(name, nothing) for view in views]) for name in names}
+
+
+def _responses(rig: Rig, shift: ViewShift) -> dict[str, FloatArray]:
+    """By number that may change: how a view's four numbers, taken from its own features, follow it."""
+    model, changed = _changed(rig, shift.camera, shift.pan_rad, shift.tilt_rad)
+    pixels = shift.pixels_px
+    rays = model.ray(pixels)
+    points = rays.origins_m + _ranges_m(rays.origins_m, rays.directions)[:, None] * rays.directions
+    rates = _rates(pixels, model.size_px).reshape(-1, 4)
+    moved_px = [np.nan_to_num(other.project(points)[0] - pixels).ravel() / _BIT for other in changed.values()]
+    numbers = np.linalg.lstsq(rates, np.column_stack(moved_px), rcond=None)[0]
+    return {name: np.asarray(numbers[:, k], dtype=np.float64) for k, name in enumerate(changed)}
+
+
+@lru_cache(maxsize=1024)
+def _changed(
+    rig: Rig, camera: str, pan_rad: float, tilt_rad: float
+) -> tuple[CameraModel, dict[str, CameraModel]]:
+    """A camera in the rover, and by number that may change: as it is after a bit of that."""
+    model = rig.camera_in_rover(camera, pan_rad, tilt_rad)
+    changed = {
+        "pan": rig.camera_in_rover(camera, pan_rad + _BIT, tilt_rad),
+        "tilt": rig.camera_in_rover(camera, pan_rad, tilt_rad + _BIT),
+    }
+    for axis, turn in zip("xyz", (rot_x, rot_y, rot_z), strict=True):
+        changed[f"rover.{axis}"] = model.moved(Rigid(turn(_BIT), np.zeros(3)))
+    held = rig.cameras[camera]
+    if held.on == "head":
+        in_head = {
+            f"turn.{axis}": held.model.turned(_BIT * row) for axis, row in zip("xyz", np.eye(3), strict=True)
+        }
+        for part, moved in (in_head | {"scale": held.model.zoomed(_BIT)}).items():
+            joined = replace(rig, cameras={camera: replace(held, model=moved)}, stereo={})
+            changed[f"cameras.{camera}.{part}"] = joined.camera_in_rover(camera, pan_rad, tilt_rad)
+    return model, changed
+
+
+def _ranges_m(origins_m: FloatArray, directions: FloatArray) -> FloatArray:
+    """How far rays (n, 3) of the rover frame go to level ground at z = 0; where they do not, to far away."""
+    down = directions[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ranges = np.where((down > 0.0) & (origins_m[:, 2] < 0.0), -origins_m[:, 2] / down, FARTHEST_M)
+    return np.asarray(np.clip(ranges, NEAREST_M, FARTHEST_M))
+
+
+def _rates(pixels: FloatArray, size_px: tuple[int, int]) -> FloatArray:
+    """(n, 2, 4): how pixels follow shift x, y, turn and scale of their picture."""
+    arm = pixels - (np.array(size_px) - 1.0) / 2.0
+    rates = np.zeros((len(pixels), 2, 4))
+    rates[:, 0, 0] = rates[:, 1, 1] = 1.0
+    rates[:, 0, 2], rates[:, 1, 2] = -arm[:, 1], arm[:, 0]
+    rates[:, :, 3] = arm
+    return rates
+
+
+def seen_again(camera: CameraModel, then: Grey, now: Grey) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return features of a picture (n, 2), how far they have moved (n, 2) and its sigma (n,), all in pixels.
+
+    Parameters
+    ----------
+    camera
+        That took both, in any frame.
+    then, now
+        (h, w) grey.
+    """
+    image = np.clip(np.rint(then), 0, 255).astype(np.uint8)
+    corners = cv2.goodFeaturesToTrack(image, 4 * MOST_FEATURES, QUALITY, APART_PX, blockSize=15)
+    pixels: list[FloatArray] = []
+    moved: list[FloatArray] = []
+    sigmas: list[float] = []
+    width, height = camera.size_px
+    for corner in [] if corners is None else np.rint(corners[:, 0].astype(np.float64)):
+        if len(pixels) == MOST_FEATURES:
+            break
+        if not (EDGE_PX <= corner[0] < width - EDGE_PX and EDGE_PX <= corner[1] < height - EDGE_PX):
+            continue
+        try:
+            plane = facing_plane(camera, corner, _RANGE_M)
+            match = match_patch(then, camera, corner, plane, now, camera, SEARCH_PX, _SETTINGS)
+        except CalibError:
+            continue
+        if match.verdict == "good":
+            pixels.append(corner)
+            moved.append(match.pixel_px - corner)
+            sigmas.append(float(np.hypot(np.sqrt(np.trace(match.covariance_px2) / 2.0), FLOOR_PX)))
+    count = len(pixels)
+    return np.reshape(pixels, (count, 2)), np.reshape(moved, (count, 2)), np.array(sigmas)

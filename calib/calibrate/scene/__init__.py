@@ -1,1 +1,0 @@
-"""Pictures of a still scene at many angles, as measurements of cameras, axes and joints."""

@@ -1,0 +1,302 @@
+"""Cameras as mrcal and Kalibr write them.
+
+mrcal's ``.cameramodel`` is a Python mapping in text, one camera with its pose. ``extrinsics`` are rt_fromref:
+a rotation vector and a translation from the reference frame, whose name the file has no place for, to camera
+axes. LENSMODEL_CAHVOR and LENSMODEL_CAHVORE_linearity=p hold fx fy cx cy, alpha and beta, R0 R1 R2, and E0 E1
+E2. O is (sin α cos β, sin β, cos α cos β) in camera axes. Since 2.5 ``extrinsics`` are called ``rt_cam_ref``
+too; before 1.0 the lens stood under ``lens_model`` or, as DISTORTION_..., under ``distortion_model``. They
+are exact twins of ours if H and V are at right angles. LENSMODEL_PINHOLE and OPENCV4, 5, 8, 12 are read too,
+and OPENCV5 and 8 written where asked for. Source: https://mrcal.secretsauce.net/cameramodels.html and
+lensmodels.html.
+
+Kalibr's camchain has cameras ``cam0``, ``cam1``, ... in YAML, each placed against the one before.
+``camera_model: pinhole`` with ``distortion_model`` radtan (k1 k2 p1 p2), equidistant (k1 k2 k3 k4) or none.
+``T_cn_cnm1`` (4, 4) maps coordinates in the camera before to this one's; Kalibr gives cam0 none, and then
+the chain's frame is ``cam0``. This writer gives cam0 one too, from the frame of its cameras' poses, as
+mrcal does. Source: https://github.com/ethz-asl/kalibr/wiki/yaml-formats.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.errors import BadFile
+from calib.files import LARGEST_IMAGE_PX, CameraFile, build_model, digest_of
+from calib.files.opencv_ros import (
+    LENSES,
+    Loose,
+    Reading,
+    as_camera_file,
+    coefficients,
+    lens_camera,
+    lens_pose,
+    matrix44,
+    matrix_of,
+    pose_of,
+    read_document,
+    row,
+)
+from calib.files.twin import FISHEYE
+from calib.files.yaml_text import kind_of, parse_mapping
+from calib.geometry.cahvor import FREE, CameraModel, Kind
+from calib.geometry.rigid import Rigid
+
+UNKNOWN_FRAME = "unknown"
+_INPUTS = re.compile(rb"""['"]optimization_inputs['"]\s*:\s*b(?:'[^']*'|"[^"]*")\s*,?""")
+_BEGINS = re.compile(rb"(?:\s|#[^\n]*\n)*\{")
+_CAHVORE = re.compile(r"LENSMODEL_CAHVORE_linearity=([-+0-9.eE]+)")
+_OPENCV = {"LENSMODEL_PINHOLE": 0} | {f"LENSMODEL_OPENCV{count}": count for count in (4, 5, 8, 12)}
+_MRCAL_LENS = ("lensmodel", "lens_model", "distortion_model")
+_MRCAL_POSE = ("rt_cam_ref", "extrinsics")
+_MRCAL_READ = (
+    *(*_MRCAL_LENS, *_MRCAL_POSE, "intrinsics", "imagersize"),
+    *("icam_intrinsics", "icam_intrinsics_optimization_inputs"),
+)
+_MRCAL_MARK = re.compile(
+    rb"['\"](?:lensmodel|lens_model|distortion_model)['\"]\s*:\s*b?['\"](?:LENSMODEL|DISTORTION)_"
+)
+
+
+def looks_like_mrcal(data: bytes) -> bool:
+    """Return whether the bytes begin like a .cameramodel."""
+    return _BEGINS.match(data[:4096]) is not None and _MRCAL_MARK.search(data) is not None
+
+
+def parse_mrcal(data: bytes, path: str | Path) -> CameraFile:
+    """Read a .cameramodel; ``path`` is for messages only. Its frame is ``unknown``.
+
+    Raises
+    ------
+    BadFile
+        If it is no camera: which key, what it holds, what is expected.
+    """
+    bare = _INPUTS.sub(b"", data)
+    notes: tuple[str, ...] = ("optimization_inputs: not read",) if bare != data else ()
+    # A mapping of numbers, words and lists in Python's form is one in YAML's too.
+    top = Loose(path, "", parse_mapping(bare, path))
+    lens_key, pose_key = top.need(*_MRCAL_LENS), top.need(*_MRCAL_POSE)
+    for key in ("intrinsics", "imagersize"):
+        top.need(key)
+    top.values["lensmodel"] = top.text(lens_key).replace("DISTORTION", "LENSMODEL", 1)
+    name = top.text("lensmodel")
+    width, height = top.integers("imagersize", 2, 1, LARGEST_IMAGE_PX)
+    pose = top.vector(pose_key, count=6)
+    frame_from_camera = Rigid(Rotation.from_rotvec(pose[:3]).as_matrix(), pose[3:]).inverse
+    notes += top.unread(_MRCAL_READ)
+    if name in _OPENCV:
+        numbers = top.vector("intrinsics", count=4 + _OPENCV[name])
+        camera = lens_camera(
+            top, "pinhole", (width, height), matrix_of(numbers[:4]), numbers[4:], frame_from_camera
+        )
+        return as_camera_file(camera, top, UNKNOWN_FRAME, digest_of(data), notes)
+    model, model_notes = _cahvor(top, name, (width, height), frame_from_camera)
+    return CameraFile(model, UNKNOWN_FRAME, {}, {}, (*notes, *model_notes), Path(path), digest_of(data))
+
+
+def _cahvor(
+    top: Loose, name: str, size_px: tuple[int, int], frame_from_camera: Rigid
+) -> tuple[CameraModel, tuple[str, ...]]:
+    """The camera of LENSMODEL_CAHVOR or LENSMODEL_CAHVORE, with notes."""
+    match = _CAHVORE.fullmatch(name)
+    if name != "LENSMODEL_CAHVOR" and match is None:
+        expected = (
+            "PINHOLE, OPENCV4, 5, 8 or 12, CAHVOR or CAHVORE (mrcal-convert-lensmodel makes one of others)"
+        )
+        raise top.bad("lensmodel", f"{kind_of(name)} where LENSMODEL_{expected} is expected")
+    numbers = top.vector("intrinsics", count=12 if match else 9)
+    fx, fy, cx, cy, alpha, beta = numbers[:6].tolist()
+    if fx * fy < 0.0:
+        raise top.bad(
+            "intrinsics", f"focal lengths {fx:g}, {fy:g} of two signs: a mirrored image is not read"
+        )
+    x, y, z = frame_from_camera.rotation.T
+    o = np.array([math.sin(alpha) * math.cos(beta), math.sin(beta), math.cos(alpha) * math.cos(beta)])
+    vectors = {
+        "C": frame_from_camera.translation_m,
+        "A": z,
+        "H": fx * x + cx * z,
+        "V": fy * y + cy * z,
+        "O": frame_from_camera.vectors(o),
+        "R": numbers[6:9],
+    }
+    kind: Kind = "CAHVOR"
+    cahvore_type, linearity = 0, None
+    if match:
+        kind, vectors["E"] = "CAHVORE", numbers[9:]
+        try:
+            linearity = float(match[1])
+        except ValueError:
+            raise top.bad("lensmodel", f"linearity '{match[1][:20]}' where a number is expected") from None
+        if not abs(linearity) <= 100.0:
+            raise top.bad("lensmodel", f"linearity {linearity:g} where a number from -100 to 100 is expected")
+        cahvore_type = {1.0: 1, 0.0: 2}.get(linearity, 3)
+    return build_model(top.path, "", kind, size_px, vectors, cahvore_type, linearity)
+
+
+def format_mrcal(camera: CameraModel, frame: str) -> bytes:
+    """Return a camera as a .cameramodel; its H and V are at right angles."""
+    if camera.kind in FREE:
+        name, pose = f"LENSMODEL_{camera.kind}", lens_pose(camera)
+        numbers = [*camera.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *camera.distortion]
+    else:
+        name, numbers, pose = _numbers_of(camera)
+    camera_from_frame = pose.inverse
+    turn = Rotation.from_matrix(camera_from_frame.rotation).as_rotvec()
+    lines = [
+        f"# reference frame: {frame!r}; the centre of the first pixel is (0, 0)",
+        "{",
+        f"    'lensmodel':  '{name}',",
+        f"    'intrinsics': {row(numbers)},",
+        "    # extrinsics are rt_fromref: rotation vector, translation in metres",
+        f"    'extrinsics': {row([*turn, *camera_from_frame.translation_m])},",
+        f"    'imagersize': [{camera.size_px[0]}, {camera.size_px[1]}],",
+        "}",
+    ]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _numbers_of(model: CameraModel) -> tuple[str, list[float], Rigid]:
+    """Lens model, intrinsics and pose of a camera of the CAHV family."""
+    hc, vc = float(model.H @ model.A), float(model.V @ model.A)
+    pose = model.pose
+    x, y, _ = pose.rotation.T
+    core = [float(model.H @ x), float(model.V @ y), hc, vc]
+    if model.kind == "CAHV":
+        return "LENSMODEL_PINHOLE", core, pose
+    o = pose.rotation.T @ model.O
+    axis = [math.atan2(o[0], o[2]), math.asin(min(1.0, max(-1.0, float(o[1]))))]
+    numbers = [*core, *axis, *model.R.tolist()]
+    if model.kind == "CAHVOR":
+        return "LENSMODEL_CAHVOR", numbers, pose
+    linearity = np.format_float_positional(model.linearity, unique=True, trim="0")
+    return f"LENSMODEL_CAHVORE_linearity={linearity}", [*numbers, *model.E.tolist()], pose
+
+
+def refuse_mirrored(model: CameraModel, path: str | Path) -> None:
+    """Refuse a camera whose image is mirrored: mrcal's CAHVOR has no such one."""
+    if np.cross(model.H, model.V) @ model.A < 0.0:
+        raise BadFile(path, "", "the image is mirrored (H x V is against A); no such format can hold that")
+
+
+_CAMERA = re.compile(r"cam(0|[1-9][0-9]?)")
+_LENSES = ("radtan", "equidistant", "none")
+_KALIBR_READ = (
+    "camera_model",
+    "intrinsics",
+    "distortion_model",
+    "distortion_coeffs",
+    "resolution",
+    "T_cn_cnm1",
+)
+
+
+def looks_like_kalibr(document: Mapping[str, object]) -> bool:
+    """Return whether a YAML file's keys are those of a camchain."""
+    first = document.get("cam0")
+    return isinstance(first, dict) and "camera_model" in first
+
+
+def parse_kalibr(data: bytes, path: str | Path) -> dict[str, Reading]:
+    """Read all cameras of a camchain, by name, each or its refusal; ``path`` is for messages only.
+
+    Raises
+    ------
+    BadFile
+        If it is no camchain: which key, what it holds, what is expected.
+    """
+    document, notes_before = read_document(data, path)
+    top = Loose(path, "", document)
+    names = [name for name in top.values if _CAMERA.fullmatch(name)]
+    if names != [f"cam{at}" for at in range(len(names))] or not names:
+        raise BadFile(
+            path, "", f"{', '.join(names) or 'no camera'} where cam0, cam1, ... in order is expected"
+        )
+    first = top.values["cam0"]
+    frame = UNKNOWN_FRAME if isinstance(first, dict) and "T_cn_cnm1" in first else "cam0"
+    notes_before = (*notes_before, *top.unread(names))
+    readings: dict[str, Reading] = {}
+    camera_from_frame = Rigid.identity()
+    lost: BadFile | None = None
+    for name in names:
+        try:
+            section = Loose(path, name, top.values[name])
+            if lost is None:
+                try:
+                    camera_from_frame = _step(section) @ camera_from_frame
+                except BadFile as refusal:
+                    lost = refusal
+            if lost is not None:
+                raise lost
+            readings[name] = _kalibr_camera(
+                section, camera_from_frame.inverse, frame, digest_of(data), notes_before
+            )
+        except BadFile as refusal:
+            readings[name] = refusal
+    return readings
+
+
+def _step(section: Loose) -> Rigid:
+    """The transform from the camera before."""
+    if "T_cn_cnm1" in section:
+        return _pose(section)
+    if section.place != "cam0":
+        raise section.bad("T_cn_cnm1", "the key is missing; it places the camera against the one before")
+    return Rigid.identity()
+
+
+def _pose(section: Loose) -> Rigid:
+    rows = section.values["T_cn_cnm1"]
+    if not isinstance(rows, list) or len(rows) != 4:
+        raise section.bad("T_cn_cnm1", f"{kind_of(rows)} where four lists of four numbers are expected")
+    inner = Loose(section.path, section.place, {f"T_cn_cnm1[{at}]": one for at, one in enumerate(rows)})
+    return pose_of(section, "T_cn_cnm1", np.array([inner.vector(key, count=4) for key in inner.values]))
+
+
+def _kalibr_camera(
+    section: Loose, frame_from_camera: Rigid, frame: str, digest: str, notes_before: Sequence[str]
+) -> CameraFile:
+    for key in ("camera_model", "intrinsics", "distortion_model", "resolution"):
+        section.need(key)
+    if section.values["camera_model"] != "pinhole":
+        raise section.bad(
+            "camera_model", f"{kind_of(section.values['camera_model'])}; only 'pinhole' is read"
+        )
+    lens = section.choice("distortion_model", _LENSES)
+    notes = list(notes_before)
+    numbers = section.numbers("distortion_coeffs") if "distortion_coeffs" in section else np.zeros(0)
+    if not len(numbers) and lens != "none":
+        section.need("distortion_coeffs")
+        raise section.bad("distortion_coeffs", f"an empty list where 4 numbers are expected for '{lens}'")
+    distortion = coefficients(section, "distortion_coeffs", lens, numbers, notes)
+    notes += section.unread((*_KALIBR_READ, "cam_overlaps", "rostopic"))
+    width, height = section.integers("resolution", 2, 1, LARGEST_IMAGE_PX)
+    matrix = matrix_of(section.vector("intrinsics", count=4))
+    camera = lens_camera(section, LENSES[lens][0], (width, height), matrix, distortion, frame_from_camera)
+    return as_camera_file(camera, section, frame, digest, notes)
+
+
+def format_kalibr(cameras: Mapping[str, CameraModel], frame: str) -> bytes:
+    """Return the cameras, all placed in one frame, as a camchain in their order; names go into comments."""
+    lines = [f"# T_cn_cnm1 of cam0 maps coordinates in the frame {frame!r}, metres, to cam0's"]
+    before = Rigid.identity()
+    for at, (name, camera) in enumerate(cameras.items()):
+        pose = matrix44(lens_pose(camera).inverse @ before)
+        before = lens_pose(camera)
+        lines += [
+            f"cam{at}:  # {name}",
+            "  camera_model: pinhole",
+            f"  intrinsics: {row(camera.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]])}",
+            f"  distortion_model: {'equidistant' if camera.kind == FISHEYE else 'radtan'}",
+            f"  distortion_coeffs: {row(camera.distortion if len(camera.distortion) else np.zeros(4))}",
+            f"  resolution: [{camera.size_px[0]}, {camera.size_px[1]}]",
+            f"  rostopic: /{name}/image_raw",
+            "  T_cn_cnm1:",
+            *(f"  - {row(one)}" for one in pose),
+        ]
+    return ("\n".join(lines) + "\n").encode()

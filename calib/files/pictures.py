@@ -1,0 +1,57 @@
+"""Pictures from files, decoded by OpenCV without a line of its libraries on stderr."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+PNG_BEGINS = b"\x89PNG\r\n\x1a\n"
+AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+"""Grey, all bits of a sample, and not turned as a camera's tag may ask."""
+
+# What OpenCV logs goes past Python's handlers; each caller says itself what is wrong.
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+
+def decode_picture(data: bytes, flags: int = AS_STORED) -> NDArray[Any]:
+    """Return the pixels of a picture file, (h, w) or (h, w, 3), as cv2.imdecode does with the flags.
+
+    Raises
+    ------
+    ValueError
+        With the reason as the end of a sentence: it is cut short, damaged, or no picture.
+    """
+    if (spoiled := spoiled_png(data)) is not None:
+        raise ValueError(spoiled)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    except cv2.error:
+        image = None
+    if image is None:
+        is_jpeg = data.startswith(b"\xff\xd8\xff")
+        raise ValueError("it is cut short or damaged" if is_jpeg else "a PNG or JPEG file is expected")
+    return np.asarray(image)
+
+
+def spoiled_png(data: bytes) -> str | None:
+    """Return why a PNG file cannot be decoded, None if each of its chunks is whole (or it is no PNG).
+
+    libpng writes about such files to stderr past every Python handler; so it does not get them.
+    """
+    if not data.startswith(PNG_BEGINS):
+        return None
+    at = len(PNG_BEGINS)
+    while at + 12 <= len(data):
+        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return "a part of it is damaged"
+        if data[at + 4 : at + 8] == b"IEND":
+            return None
+        at = end + 4
+    return "it is cut short"

@@ -1,0 +1,244 @@
+"""One camera's knowledge of a target: a line of sight, and how far along it the target may be.
+
+Along the line counts the inverse range, 1/m: the pixel of a far target in another view depends on it almost
+linearly, and infinity is 0. What another view of the same thing shows (of the same camera, once the head has
+turned, if it is off the axes) says more about it, by as much as the two views stand apart and no more than
+mast file, joint readings and matches allow.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.errors import CalibError
+from calib.geometry.covariance import RIG_PX, RigCovariance, moved_rig
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, ReadOnlyArrays, frozen_array
+
+NORMAL_95 = 1.96
+FARTHEST_M = 1e5
+"""The assumed range of a target whose range cannot be measured."""
+_STEP_RAD = 1e-5
+_STEP_SIGMA = 1e-2
+_ROUNDS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Sight(ReadOnlyArrays):
+    """A pixel of a picture, and what is known of the range of what it shows.
+
+    Attributes
+    ----------
+    camera, joints_rad, pixel_px
+        Whose picture, the true (pan, tilt) then, and (2,) the pixel.
+    inverse_m, inverse_sigma_m
+        1/range from the ray's origin, and one sigma of it, both 1/m; a sigma of 0: the range was given.
+    """
+
+    camera: str
+    joints_rad: tuple[float, float]
+    pixel_px: FloatArray
+    inverse_m: float
+    inverse_sigma_m: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pixel_px", frozen_array(self.pixel_px, (2,)))
+
+    @property
+    def range_m(self) -> float:
+        """The likeliest range, `FARTHEST_M` at most."""
+        return 1.0 / max(self.inverse_m, 1.0 / FARTHEST_M)
+
+    @property
+    def range_interval_m(self) -> tuple[float, float | None]:
+        """The ranges that are 95 % likely; None for infinity."""
+        near = self.inverse_m + NORMAL_95 * self.inverse_sigma_m
+        far = self.inverse_m - NORMAL_95 * self.inverse_sigma_m
+        return 1.0 / max(near, 1.0 / FARTHEST_M), None if far <= 1.0 / FARTHEST_M else 1.0 / far
+
+    def position_m(self, rig: Rig) -> FloatArray:
+        """Return the likeliest place (3,) of the target, rover frame. Raises CalibError."""
+        origin, direction = _ray(rig, self)
+        return origin + self.range_m * direction
+
+
+@dataclass(frozen=True, eq=False)
+class SeenFrom:
+    """Where a view should show what a sight is of.
+
+    Attributes
+    ----------
+    pixel_px, along_px_m
+        (2,) at the likeliest range, and (2,) how it moves with the inverse range, px for 1/m.
+    covariance_px2
+        (2, 2) of all but the range: the sight's own pixel, mast file, joint readings of both views.
+    """
+
+    pixel_px: FloatArray
+    along_px_m: FloatArray
+    covariance_px2: FloatArray
+
+    def whole_px2(self, inverse_sigma_m: float) -> FloatArray:
+        """Return the covariance (2, 2) with the range's part."""
+        along = inverse_sigma_m * self.along_px_m
+        return self.covariance_px2 + np.outer(along, along)
+
+
+def unknown_range(nearest_m: float) -> tuple[float, float]:
+    """Return inverse range and sigma, 1/m, whose 95 % reach from ``nearest_m`` to infinity."""
+    return 0.5 / nearest_m, 0.5 / nearest_m / NORMAL_95
+
+
+def range_to_plane(
+    rig: Rig, camera: str, joints_rad: tuple[float, float], pixel_px: FloatArray, point_m: FloatArray,
+    normal: FloatArray,
+) -> float:  # fmt: skip
+    """Return the range, metres, at which a pixel's ray meets a plane of the rover frame.
+
+    Raises
+    ------
+    CalibError
+        If the pixel has no ray, or its ray goes along the plane or away from it.
+    """
+    origin, direction = _ray(rig, Sight(camera, joints_rad, pixel_px, 0.0, 0.0))
+    towards = float(direction @ normal) / float(np.linalg.norm(normal))
+    away = float((point_m - origin) @ normal) / float(np.linalg.norm(normal))
+    if abs(towards) < 1e-3 or not 0.0 < away / towards < FARTHEST_M:
+        place = ", ".join(f"{value:g}" for value in pixel_px)
+        raise CalibError(f"the ray of pixel ({place}) of {camera} does not meet the plane")
+    return away / towards
+
+
+def seen_from(
+    rig: Rig,
+    sight: Sight,
+    camera: str,
+    joints_rad: tuple[float, float],
+    *,
+    sigma_px: float,
+    sigma_rad: tuple[float, float] = (0.0, 0.0),
+    calibration: RigCovariance | None = None,
+) -> SeenFrom:
+    """Return where a camera should show what a sight is of.
+
+    Parameters
+    ----------
+    camera, joints_rad
+        The camera of the view, and the true (pan, tilt) then.
+    sigma_px
+        Of each coordinate of the sight's pixel.
+    sigma_rad
+        Of each view's readings of pan and tilt; of two views at one pose they are the same error.
+    calibration
+        Covariance of the rig; without one the view is taken to be wrong by `RIG_PX`, if the head has turned.
+
+    Raises
+    ------
+    CalibError
+        If the sight's pixel has no ray, or the camera cannot project the place.
+    """
+
+    def pixel(rig: Rig, sight: Sight, joints: tuple[float, float]) -> FloatArray:
+        found, seen = rig.camera_in_rover(camera, *joints).project(sight.position_m(rig))
+        if not bool(seen):
+            raise CalibError(f"{camera} cannot see what {sight.camera} sees at {sight.range_m:.3g} m")
+        return np.asarray(found)
+
+    now_px = pixel(rig, sight, joints_rad)
+    step = max(0.01 * sight.inverse_m, 1e-4)
+    farther = replace(sight, inverse_m=sight.inverse_m + step)
+    along = (pixel(rig, farther, joints_rad) - now_px) / step
+    columns = []
+    for shift in np.eye(2):
+        moved = replace(sight, pixel_px=sight.pixel_px + 0.5 * shift)
+        columns.append(sigma_px * (pixel(rig, moved, joints_rad) - now_px) / 0.5)
+    same_pose = camera == sight.camera and joints_rad == sight.joints_rad
+    if not same_pose:
+        for axis in range(2):
+            turned = replace(sight, joints_rad=_turned(sight.joints_rad, axis))
+            for then, there in ((sight, _turned(joints_rad, axis)), (turned, joints_rad)):
+                columns.append(sigma_rad[axis] * (pixel(rig, then, there) - now_px) / _STEP_RAD)
+    covariance = sum(np.outer(column, column) for column in columns)
+    if calibration is None:
+        covariance = covariance + (0.0 if same_pose else RIG_PX**2) * np.eye(2)
+    elif not same_pose:
+        known = calibration.of([sight.camera, camera])
+        rates = np.zeros((2, len(known.names)))
+        for number, (name, sigma) in enumerate(
+            zip(known.names, np.sqrt(np.diag(known.covariance)), strict=True)
+        ):
+            if sigma > 0.0:
+                step_by = _STEP_SIGMA * float(sigma)
+                other = moved_rig(rig, (name,), np.array([step_by]))
+                then, there = sight, joints_rad
+                if name.startswith("joints."):  # what was read stays
+                    read = rig.joints.read_rad
+                    then = replace(sight, joints_rad=other.joints.true_rad(read(sight.joints_rad)))
+                    there = other.joints.true_rad(read(joints_rad))
+                rates[:, number] = (pixel(other, then, there) - now_px) / step_by
+        covariance = covariance + rates @ known.covariance @ rates.T
+    return SeenFrom(now_px, along, np.asarray(covariance))
+
+
+def shown(
+    rig: Rig,
+    sight: Sight,
+    camera: str,
+    joints_rad: tuple[float, float],
+    pixel_px: FloatArray,
+    expected: SeenFrom,
+    sigma_px: float,
+) -> Sight:
+    """Return what is known after a view has shown the thing at a pixel: a sight by that view.
+
+    Parameters
+    ----------
+    pixel_px, sigma_px
+        (2,) where it was found, and one sigma of each coordinate.
+    expected
+        As `seen_from` returns it.
+
+    Raises
+    ------
+    CalibError
+        As `seen_from`.
+    """
+    inverse, sigma = sight.inverse_m, sight.inverse_sigma_m
+    if sigma > 0.0:
+        weight = np.linalg.inv(expected.covariance_px2 + sigma_px**2 * np.eye(2))
+        model = rig.camera_in_rover(camera, *joints_rad)
+        prior, along = 1.0 / sigma**2, expected.along_px_m
+        for _ in range(_ROUNDS):
+            at = replace(sight, inverse_m=inverse)
+            left = pixel_px - np.asarray(model.project(at.position_m(rig))[0])
+            information = prior + float(along @ weight @ along)
+            step = (float(along @ weight @ left) + prior * (sight.inverse_m - inverse)) / information
+            inverse = max(inverse + step, 0.0)
+        sigma = 1.0 / math.sqrt(information)
+    origin, direction = _ray(rig, sight)
+    there = Sight(camera, joints_rad, pixel_px, 0.0, 0.0)
+    other_origin, other_direction = _ray(rig, there)
+    with_it = float(direction @ other_direction)
+    depth = with_it + inverse * float((origin - other_origin) @ other_direction)
+    if not (depth > 0.0 and with_it > 0.0):
+        raise CalibError(
+            f"the target that {sight.camera} sees at {1 / max(inverse, 1e-5):.3g} m is not before {camera}"
+        )
+    return replace(there, inverse_m=inverse / depth, inverse_sigma_m=sigma * with_it / depth**2)
+
+
+def _ray(rig: Rig, sight: Sight) -> tuple[FloatArray, FloatArray]:
+    """Origin (3,) and unit direction (3,) of a sight, rover frame."""
+    rays = rig.camera_in_rover(sight.camera, *sight.joints_rad).ray(sight.pixel_px)
+    if not bool(rays.valid):
+        place = ", ".join(f"{value:g}" for value in sight.pixel_px)
+        raise CalibError(f"pixel ({place}) of {sight.camera} has no ray")
+    return np.asarray(rays.origins_m), np.asarray(rays.directions)
+
+
+def _turned(joints_rad: tuple[float, float], axis: int) -> tuple[float, float]:
+    pan, tilt = joints_rad
+    return (pan + _STEP_RAD, tilt) if axis == 0 else (pan, tilt + _STEP_RAD)

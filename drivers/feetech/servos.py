@@ -1,0 +1,673 @@
+"""Feetech's servos: their memory, packets, transactions on a line, and what is done with them on the bench.
+
+Sources: the maker's memory tables of STS/SMS and SCSCL servos, its protocol manual and the addresses in its
+SDK. The maker states no backlash. A count of speed is one count a second in the maker's SDK of 2020, and 50
+in that of 2025: it depends on the firmware and has to be configured (``speed_unit_counts``).
+
+A packet is ``FF FF``, id, length, instruction or status, data, and an inverted sum. The sum has eight bits:
+one wrong byte is always seen, several pass once in 256. Nothing is stuffed. A reply has no sequence number
+and does not say what was asked. What proves a sample is:
+
+- **Length.** Each question asks for another number of bytes, `STARTS` of them in turn; another length is no
+  answer.
+- **Token** (STS, SMS). Just before it, each question writes a number into the torque limit of both servos, up
+  to `TOKENS` steps of 0.1 % below what is configured, and reads it back within the answer. Together that is
+  the number of a question out of `STARTS * TOKENS`: a reply is distinguished from any up to 271 questions
+  late.
+- **Agreement** (SCS, which has no such register). For `LATE_S` after a reply that was lost, wrong or one too
+  many, each question is asked twice, by two lengths, and the answers have to fit. This proves less: a reply
+  that is later than that, or two that are late alike, are taken.
+
+What is read for one register is asked twice around a silence, by two lengths, and has to agree.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from types import MappingProxyType
+from typing import Literal
+
+from drivers.clock import Clock
+from drivers.errors import BadOptions, BadReply, DriverError, LineLost, NoReply, WrongDevice
+from drivers.faults import nearest
+from drivers.serial_line import OpenLine, SerialLine
+from drivers.servo_bus.bench import FoundServo, Scan, ServoFacts, changing, check_change, scanned
+from drivers.servo_bus.course import ServoSample
+from drivers.servo_bus.exchange import ATTEMPTS, again
+from drivers.servo_bus.link import REPLY_TIMEOUT_S, BusLink
+from drivers.servo_bus.port import QUIET_S, PacketFormat, Status
+
+BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
+"""By their code: the maker's SMS_STS.h (2021, 2025), SCSCL.h (2018, 2020) and memory tables, address 6.
+
+lerobot's table (57,600, 38,400, 19,200 for the codes 5 to 7) contradicts the maker's.
+"""
+
+# ERRBIT_VOLTAGE, ANGLE, OVERHEAT, OVERELE, OVERLOAD of the maker's scservo_sdk (protocol_packet_handler.py).
+STATUS_WORDS = MappingProxyType(
+    {
+        0x01: "input voltage out of its limits",
+        0x02: "angle sensor fault",
+        0x04: "overheating",
+        0x08: "overcurrent",
+        0x20: "overload",
+    }
+)
+POSITION_MODE = 0
+UNLOCKED, LOCKED = 0, 1
+FIRST_RAM_ADDRESS = 40
+
+
+@dataclass(frozen=True)
+class Register:
+    """One entry of a memory table.
+
+    Attributes
+    ----------
+    sign_bit
+        The bit that says minus; the rest is the size of the number. None for a number of zero or more.
+    """
+
+    name: str
+    address: int
+    size: int = 1
+    sign_bit: int | None = None
+
+    @property
+    def permanent(self) -> bool:
+        """Whether it lies in the EEPROM, which wears."""
+        return self.address < FIRST_RAM_ADDRESS
+
+    def decode(self, data: bytes, order: Literal["little", "big"]) -> int:
+        """Return the value of the register's bytes."""
+        word = int.from_bytes(data, order)
+        if self.sign_bit is None:
+            return word
+        size = word & ((1 << self.sign_bit) - 1)
+        return -size if word >> self.sign_bit & 1 else size
+
+    def encode(self, value: int, order: Literal["little", "big"]) -> bytes:
+        """Return a value as the register's bytes; OverflowError if it does not fit."""
+        if value < 0 and self.sign_bit is not None:
+            value = -value | 1 << self.sign_bit
+        return value.to_bytes(self.size, order)
+
+
+def _table(*more: Register) -> Mapping[str, Register]:
+    """The registers that all series have where SCS and STS have them, and more."""
+    common = (
+        Register("firmware_major", 0), Register("firmware_minor", 1), Register("model_number", 3, 2),
+        Register("id", 5), Register("baud", 6), Register("return_delay", 7), Register("response_level", 8),
+        Register("min_angle_limit", 9, 2), Register("max_angle_limit", 11, 2),
+        Register("temperature_limit", 13), Register("max_voltage_limit", 14),
+        Register("min_voltage_limit", 15), Register("max_torque", 16, 2),
+        Register("unload_condition", 19), Register("torque_enable", 40),
+        Register("goal_position", 42, 2), Register("goal_time", 44, 2), Register("goal_speed", 46, 2),
+        Register("present_position", 56, 2, 15), Register("present_velocity", 58, 2, 15),
+        Register("present_load", 60, 2, 10), Register("present_voltage", 62),
+        Register("present_temperature", 63), Register("status", 65), Register("moving", 66),
+    )  # fmt: skip
+    return MappingProxyType({r.name: r for r in sorted((*common, *more), key=lambda r: r.address)})
+
+
+STS = _table(
+    Register("protective_current", 28, 2), Register("offset", 31, 2, 11), Register("operating_mode", 33),
+    Register("protective_torque", 34), Register("protective_time", 35), Register("overload_torque", 36),
+    Register("acceleration", 41), Register("torque_limit", 48, 2), Register("lock", 55),
+    Register("present_current", 69, 2, 15),
+)  # fmt: skip
+SCS = _table(Register("protective_torque", 37), Register("protective_time", 38), Register("lock", 48))
+
+
+@dataclass(frozen=True)
+class FeetechModel:
+    """One kind of servo; attributes as of `drivers.servo_bus.settings.CountedModel`.
+
+    Attributes
+    ----------
+    number
+        What stands in its memory; None for a whole series, of which it is not compared.
+    """
+
+    name: str
+    number: int | None
+    registers: Mapping[str, Register]
+    order: Literal["little", "big"]
+    turn_rad: float
+    counts_per_turn: int
+    speed_unit_counts: int = 1
+    current_unit_A: float | None = None
+    low_count: int = 0
+    backlash_rad: float | None = None
+
+    @property
+    def high_count(self) -> int:
+        """The highest position limit."""
+        return self.counts_per_turn - 1
+
+    @property
+    def centre_count(self) -> int:
+        """The middle of its range."""
+        return self.counts_per_turn // 2
+
+    @property
+    def count_rad(self) -> float:
+        """One count."""
+        return self.turn_rad / self.counts_per_turn
+
+    @property
+    def velocity_unit_rad_per_s(self) -> float:
+        """One count of speed."""
+        return self.speed_unit_counts * self.count_rad
+
+    @property
+    def acceleration_unit_rad_per_s2(self) -> float:
+        """One count of acceleration, 100 counts a second squared; of an SCS what is taken for it."""
+        return 100 * self.count_rad
+
+    @property
+    def is_scs(self) -> bool:
+        """Whether it is of the SCS series: no torque limit, no acceleration, no read of several servos."""
+        return self.order == "big"
+
+
+def _sts(name: str, number: int | None) -> FeetechModel:
+    return FeetechModel(name, number, STS, "little", math.tau, 4096, current_unit_A=0.0065)
+
+
+def _scs(name: str, number: int | None) -> FeetechModel:
+    return FeetechModel(name, number, SCS, "big", math.radians(300), 1024)
+
+
+# Model numbers: lerobot's MODEL_NUMBER_TABLE; the maker publishes none.
+MODELS: Mapping[str, FeetechModel] = MappingProxyType(
+    {
+        model.name: model
+        for model in (
+            _sts("STS3215", 777), _sts("STS3250", 2825), _sts("SM8512BL", 11272), _scs("SCS0009", 1284),
+            _sts("STS", None), _sts("SMS", None), _scs("SCS", None),
+        )
+    }
+)  # fmt: skip
+"""By name; a series, such as ``STS``, takes any servo of it: 4096 counts a turn, or 1024 over 300 degrees."""
+
+MODELS_BY_NUMBER = {model.number: model for model in MODELS.values() if model.number is not None}
+
+
+def model_named(name: str) -> FeetechModel:
+    """Return the model that a configuration names. Raises BadOptions, with the nearest known name."""
+    found = MODELS.get(str(name).upper())
+    if found is None:
+        raise BadOptions(
+            f"there is no Feetech servo {name!r}{nearest(str(name).upper(), MODELS)}; one that is not in the "
+            "table is named by its series: STS, SMS or SCS"
+        )
+    return found
+
+
+def status_words(error: int) -> str:
+    """Return what a status says, in plain words; empty for a servo that is well."""
+    words = [word for bit, word in STATUS_WORDS.items() if error & bit]
+    unknown = error & ~sum(STATUS_WORDS)
+    return " and ".join(words + ([f"unknown status bits 0x{unknown:02x}"] if unknown else []))
+
+
+HEADER = b"\xff\xff"
+BROADCAST_ID, HIGHEST_ID = 254, 252
+PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
+STATUS_BYTES = 6  # of a reply without data
+LONGEST_PACKET = 250
+
+
+@dataclass(frozen=True)
+class FeetechStatus:
+    """A servo's reply; its error byte says how the servo is, and refuses nothing."""
+
+    servo_id: int
+    error: int
+    data: bytes
+    refused: int = 0
+
+    @property
+    def alert(self) -> bool:
+        """Whether the servo reports a fault of its own."""
+        return self.error != 0
+
+
+def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
+    """Return the bytes of an instruction."""
+    body = bytes((servo_id, len(parameters) + 2, instruction)) + parameters
+    return HEADER + body + bytes((~sum(body) & 0xFF,))
+
+
+def sync_read_packet(address: int, length: int, servo_ids: tuple[int, ...]) -> bytes:
+    """Return a read of the same bytes of several servos, which answer in this order."""
+    return instruction_packet(BROADCAST_ID, SYNC_READ, bytes((address, length, *servo_ids)))
+
+
+def sync_write_packet(address: int, data: Mapping[int, bytes]) -> bytes:
+    """Return a write of equally many bytes to each of several servos, by id; nobody answers it."""
+    length = max(map(len, data.values()), default=0)
+    body = b"".join(bytes((servo_id,)) + one for servo_id, one in data.items())
+    return instruction_packet(BROADCAST_ID, SYNC_WRITE, bytes((address, length)) + body)
+
+
+def take_status(buffer: bytearray, *, at_end: bool = False) -> FeetechStatus | None:
+    """Take the first whole packet whose sum fits out of a buffer; None when there is none yet.
+
+    Parameters
+    ----------
+    buffer
+        Bytes as they came in; what was used or dropped is removed.
+    at_end
+        No more bytes will come: a header whose packet is not whole was noise, look behind it.
+    """
+    while True:
+        start = buffer.find(HEADER)
+        if start < 0:
+            del buffer[: len(buffer) - buffer.endswith(b"\xff")]
+            return None
+        del buffer[:start]
+        if len(buffer) >= STATUS_BYTES or (len(buffer) >= 3 and buffer[2] > HIGHEST_ID + 1):
+            end = 4 + buffer[3]
+            if buffer[2] <= HIGHEST_ID + 1 and STATUS_BYTES <= end <= LONGEST_PACKET:
+                if len(buffer) < end and not at_end:
+                    return None
+                whole = bytes(buffer[:end])
+                if len(whole) == end and whole[-1] == ~sum(whole[2:-1]) & 0xFF:
+                    del buffer[:end]
+                    return FeetechStatus(whole[2], whole[4], whole[5:-1])
+        elif not at_end:
+            return None
+        del buffer[:1]
+
+
+FORMAT = PacketFormat(
+    take_status,
+    instruction_packet,
+    lambda address, length: bytes((address, length)),
+    STATUS_BYTES,
+    {PING: "ping", READ: "read", WRITE: "write"},
+    {},
+    sync_write_packet(40, {}),
+)
+
+
+STARTS, TOKENS = 17, 16
+FIRST_START = 24  # of what is read, up to torque_enable
+LATE_S = 1.0
+SAME_COUNTS = 2  # apart at most, of two answers of an axis that stands
+AGREEING_TRIES = 5
+POLL_BYTES = 24 + 2 * (6 + 47)  # a write and a read of both servos, and two replies of the longest question
+
+
+@dataclass
+class Questions:
+    """Which question comes next, and until when late replies may come; outlasts a line of the head."""
+
+    numbers: itertools.count[int] = field(default_factory=itertools.count)
+    doubted_until_s: float = -math.inf
+
+
+class FeetechLink(BusLink):
+    """One open line and its transactions, as of `BusLink`.
+
+    Parameters
+    ----------
+    port, baud, reply_timeout_s, urgent, clock, open_line
+        As of `BusLink`.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        baud: int,
+        reply_timeout_s: float = REPLY_TIMEOUT_S,
+        urgent: Callable[[], bool] = lambda: False,
+        *,
+        questions: Questions | None = None,
+        clock: Clock | None = None,
+        open_line: OpenLine = SerialLine,
+    ) -> None:
+        super().__init__(port, baud, reply_timeout_s, FORMAT, urgent, clock, open_line)
+        self._questions = questions or Questions()
+
+    def ping(self, servo_id: int) -> int:
+        """Return the status of a servo that is there. Raises NoReply, BadReply, LineLost."""
+        return self.exchange.ask(servo_id, PING, b"", 0).error
+
+    def ping_all(self) -> tuple[list[int], int]:
+        """Ask who is on the line.
+
+        Raises LineLost, BadReply.
+
+        Returns
+        -------
+        list of int, int
+            The ids that answered; and how many bytes came that were no reply: two servos spoke at once.
+        """
+        port = self._port
+        port.send(instruction_packet(BROADCAST_ID, PING), 0)
+        port.deadline_s = self.clock.now_s() + port.reply_timeout_s + 253 * (0.0005 + 6 * port.byte_s)
+        found, before = [], port.received_bytes
+        while (status := port.receive()) is not None:
+            found.append(status.servo_id)
+        port.suspect = False
+        noise = port.received_bytes - before - 6 * (len(found) + port.echoes)
+        return sorted(set(found)), max(0, noise)
+
+    def proven(self, servo_id: int, register: Register, model: FeetechModel) -> int:
+        """Return a register's value, said twice around a silence by replies of two lengths.
+
+        Raises BadReply if the answers contradict one another again and again; NoReply, LineLost.
+        """
+        size, before = register.size, None
+        for more in range(AGREEING_TRIES):
+            data = self.exchange.read(servo_id, register.address, size + more % 2, register.name)[:size]
+            if data == before:
+                return register.decode(data, model.order)
+            before = data
+            self.quiet(QUIET_S)
+        raise BadReply(
+            f"servo {servo_id} on {self.name} contradicts itself about {register.name}",
+            detail=self.exchange.where(servo_id, "read", register.name),
+        )
+
+    def block(self, servo_id: int, address: int, length: int) -> bytes:
+        """Return bytes of one servo's memory, asked one time after a silence. Raises as `proven`."""
+        self.quiet(QUIET_S)
+        return self.exchange.read(servo_id, address, length, "memory")
+
+    def write(self, servo_id: int, register: Register, value: int, model: FeetechModel) -> None:
+        """Set a register and wait for the servo's word. Raises NoReply, BadReply, LineLost."""
+        data = bytes((register.address,)) + register.encode(value, model.order)
+        self.exchange.ask(servo_id, WRITE, data, 0, register.name)
+
+    def write_unanswered(self, servo_id: int, register: Register, value: int, model: FeetechModel) -> None:
+        """Set a register of a servo that may keep silent about it; an answer is dropped. Raises LineLost."""
+        data = bytes((register.address,)) + register.encode(value, model.order)
+        self._port.send(instruction_packet(servo_id, WRITE, data), 0)
+        self._port.drain()
+
+    def group_write(self, address: int, data: Mapping[int, bytes]) -> None:
+        """Write equally many bytes to each servo with one packet, unanswered. Raises LineLost, BadReply."""
+        self._port.send(sync_write_packet(address, data), 0)
+
+    def shout(self, address: int, data: Mapping[int, bytes], copies: int) -> None:
+        """Write to each servo by a packet of its own, at once and whatever is under way. Raises LineLost."""
+        packets = b"".join(sync_write_packet(address, {one: data[one]}) for one in data)
+        self._port.suspect = True
+        self._port.send_now(copies * packets)
+
+    def samples(self, servos: Mapping[int, tuple[FeetechModel, int]]) -> dict[int, ServoSample]:
+        """Return what servos say about their motion now, by id.
+
+        Raises NoReply, BadReply, LineLost if one is silent, or an answer is not of this question.
+
+        Parameters
+        ----------
+        servos
+            Of each id its model, all of one series, and its full torque limit, 0.1 %.
+        """
+        number = next(self._questions.numbers)
+        start, token = FIRST_START + number % STARTS, number % TOKENS
+        if any(model.is_scs for model, _ in servos.values()):
+            return self._asked_singly(servos, start)
+        end = 71
+        limits = {one: limit - token for one, (_, limit) in servos.items()}
+        told = {one: limit.to_bytes(2, "little") for one, limit in limits.items()}
+        length, ids = end - start, tuple(servos)
+        question = sync_write_packet(48, told) + sync_read_packet(start, length, ids)
+        try:
+            sent_s = self._port.send(question, len(ids) * (STATUS_BYTES + length))
+            taken = self._replies(ids, length)
+        except LineLost as error:
+            raise self.exchange.placed(error, ids, "sync read") from error
+        received_s = self.clock.now_s()
+        found = {}
+        for one, status in taken.items():
+            values = _values(servos[one][0], start, status.data)
+            if values["torque_limit"] != limits[one]:
+                self.exchange.stray(status)
+                raise BadReply(
+                    f"servo {one} on {self.name}: a reply to another question (late, or repeated): it holds "
+                    f"the torque limit {values['torque_limit']} where {limits[one]} was written with the "
+                    "question",
+                    detail=self.exchange.where(one, "sync read", "torque_limit"),
+                )
+            values["torque_limit"] = servos[one][1]
+            found[one] = ServoSample(values, status.alert, sent_s, received_s)
+        return found
+
+    def _replies(self, ids: Sequence[int], length: int) -> dict[int, Status]:
+        """The replies to a sync read, in the order asked, one of each servo. Raises NoReply, LineLost."""
+        taken: dict[int, Status] = {}
+        for one in ids:
+            while True:
+                status = self._port.receive()
+                if status is None:
+                    raise self.exchange.silence(one, "sync read", f"{length} bytes")
+                if status.servo_id == one and len(status.data) == length:
+                    taken[one] = status
+                    break
+                self.exchange.stray(status)
+                if (
+                    status.servo_id in ids
+                    and len(status.data) == length
+                    and status != taken.get(status.servo_id)
+                ):
+                    raise BadReply(
+                        f"servo {status.servo_id} on {self.name} answers out of turn",
+                        detail=self.exchange.where(status.servo_id, "sync read", ""),
+                    )
+        return taken
+
+    def _asked_singly(
+        self, servos: Mapping[int, tuple[FeetechModel, int]], start: int
+    ) -> dict[int, ServoSample]:
+        """The same of servos that answer one at a time: said twice where a late reply may be under way."""
+        try:
+            found = self._round(servos, start)
+            if self.clock.now_s() < self._questions.doubted_until_s:
+                before, next_start = found, FIRST_START + next(self._questions.numbers) % STARTS
+                found = self._round(servos, next_start)
+                for one, sample in found.items():
+                    self._see_same(one, servos[one][0].speed_unit_counts, before[one], sample)
+        except LineLost:
+            raise
+        except DriverError:
+            self._questions.doubted_until_s = self.clock.now_s() + LATE_S
+            raise
+        return found
+
+    def _round(self, servos: Mapping[int, tuple[FeetechModel, int]], start: int) -> dict[int, ServoSample]:
+        """One answer of each servo. Raises NoReply, BadReply, LineLost."""
+        found = {}
+        for one, (model, _) in servos.items():
+            sent_s = self.clock.now_s()
+            status = self.exchange.ask(one, READ, bytes((start, 67 - start)), 67 - start, "motion")
+            values = _values(model, start, status.data)
+            found[one] = ServoSample(values, status.alert, sent_s, self.clock.now_s())
+            if self._port.suspect:
+                raise BadReply(f"{self.name}: more came than was asked for")
+        return found
+
+    def _see_same(self, one: int, unit: int, before: ServoSample, after: ServoSample) -> None:
+        """See that two samples can follow one another. Raises BadReply."""
+        told = max(abs(sample.values["present_velocity"]) for sample in (before, after))
+        speed = unit * (told + (unit > 1))  # less than one unit more is not told
+        most = SAME_COUNTS + speed * (after.received_s - before.sent_s)
+        if abs(after.counts - before.counts) > most:
+            raise BadReply(
+                f"servo {one} on {self.name} says {before.counts} and then {after.counts} counts, where a "
+                "reply was lost before: one of them is late",
+                detail=self.exchange.where(one, "read", "present_position"),
+            )
+
+
+def open_link(
+    port: str,
+    baud: int,
+    reply_timeout_s: float = REPLY_TIMEOUT_S,
+    urgent: Callable[[], bool] = lambda: False,
+    *,
+    questions: Questions | None = None,
+    clock: Clock | None = None,
+    open_line: OpenLine = SerialLine,
+) -> FeetechLink:
+    """Open a line and find out whether its adapter echoes; parameters and errors as of `FeetechLink`."""
+    link = FeetechLink(
+        port, baud, reply_timeout_s, urgent, questions=questions, clock=clock, open_line=open_line
+    )
+    try:
+        link.find_echo()
+    except BaseException:
+        link.close()
+        raise
+    return link
+
+
+def _values(model: FeetechModel, start: int, data: bytes) -> dict[str, int]:
+    """The registers in a block by name, and what a course asks for beside them."""
+    values = {}
+    for register in model.registers.values():
+        at = register.address - start
+        if register.address >= 40 and at + register.size <= len(data):
+            values[register.name] = register.decode(data[at : at + register.size], model.order)
+    values["moving_status"] = 2 * values["moving"]  # a profile is under way
+    values["profile_acceleration"] = values.get("acceleration", 1)
+    values["profile_velocity"] = values["goal_speed"]
+    values.setdefault("present_current", 0)
+    return values
+
+
+def scan(
+    port: str,
+    bauds: Sequence[int],
+    reply_timeout_s: float,
+    clock: Clock | None = None,
+    open_line: OpenLine = SerialLine,
+) -> Scan:
+    """Ask at every baud rate who is there, as `scanned`; the rest as of `FeetechLink`."""
+    opened = partial(open_link, port, reply_timeout_s=reply_timeout_s, clock=clock, open_line=open_line)
+    return scanned(bauds, opened, _there)
+
+
+def _there(link: FeetechLink) -> tuple[list[FoundServo], int]:
+    ids, noise = link.ping_all()
+    found = []
+    for servo_id in ids:
+        with suppress(NoReply):
+            found.append(_found(link, servo_id))
+    return found, noise
+
+
+def _found(link: FeetechLink, servo_id: int) -> FoundServo:
+    model, number, firmware = identify(link, servo_id)
+    words = status_words(again(link, lambda: link.ping(servo_id)))
+    return FoundServo(
+        link.baud, servo_id, number, model.name, firmware, tuple(words.split(" and ")) if words else ()
+    )
+
+
+def identify(link: FeetechLink, servo_id: int) -> tuple[FeetechModel, int, str]:
+    """Return a servo's model, the number in its memory, and its firmware.
+
+    One that is not in the table is taken by the byte order that its memory states. Raises NoReply, BadReply,
+    LineLost.
+    """
+    before = b""
+    for _ in range(ATTEMPTS + 1):
+        data = again(link, lambda: link.block(servo_id, 0, 5))
+        if data == before:
+            break
+        before = data
+    little, big = data[3] | data[4] << 8, data[3] << 8 | data[4]
+    firmware = f"{data[0]}.{data[1]}"
+    for number, order in ((little, "little"), (big, "big")):
+        model = MODELS_BY_NUMBER.get(number)
+        if model is not None and model.order == order:
+            return model, number, firmware
+    return (MODELS["SCS"], big, firmware) if data[2] == 1 else (MODELS["STS"], little, firmware)
+
+
+def facts(link: FeetechLink, servo_id: int) -> ServoFacts:
+    """Read every register of a servo that the table knows. Raises NoReply, BadReply, LineLost."""
+    model, number, firmware = identify(link, servo_id)
+    registers = model.registers.values()
+    end = max(register.address + register.size for register in registers)
+    data = again(link, lambda: link.block(servo_id, 0, end))
+    values = {r.name: r.decode(data[r.address : r.address + r.size], model.order) for r in registers}
+    name = model.name if model.number else f"{model.name} (number {number}, not in the table)"
+    return ServoFacts(servo_id, name, firmware, values, _words(model, values))
+
+
+def _words(model: FeetechModel, values: Mapping[str, int]) -> dict[str, str]:
+    """What numbers mean."""
+    words = {
+        name: f"{math.degrees((values[name] - model.centre_count) * model.count_rad):.3f} deg from its middle"
+        for name in ("min_angle_limit", "max_angle_limit", "goal_position", "present_position")
+    }
+    for name in ("max_voltage_limit", "min_voltage_limit", "present_voltage"):
+        words[name] = f"{values[name] / 10:.1f} V"
+    for name in ("max_torque", "torque_limit", "present_load"):
+        if name in values:
+            words[name] = f"{values[name] / 10:.1f} %"
+    words["baud"] = f"{BAUD_RATES[values['baud']]} baud" if values["baud"] < len(BAUD_RATES) else "unknown"
+    words["status"] = status_words(values["status"]) or "well"
+    words["torque_enable"] = "on" if values["torque_enable"] else "off"
+    words["lock"] = "EEPROM locked" if values["lock"] else "EEPROM unlocked"
+    if "offset" in values:
+        turn = f"{math.degrees(values['offset'] * model.count_rad):.3f} deg"
+        words["offset"] = f"{turn}, part of every position; mastctl never writes it"
+    return words
+
+
+def set_id(
+    link: FeetechLink, old: int, new: int, new_baud: int | None = None, *, torque_off: bool = False
+) -> None:
+    """Give a servo another id, and another baud rate if asked; see that it took them.
+
+    A change that is broken off says what the servo is left with. Raises BadOptions for ids or a baud rate
+    that cannot be; WrongDevice if the new id is taken, or torque is on and ``torque_off`` is not given;
+    NoReply, BadReply, LineLost if it cannot be reached, before or afterwards.
+    """
+    check_change(link, old, new, new_baud, BAUD_RATES)
+    model, _, _ = identify(link, old)
+    if old != new:
+        with suppress(NoReply):
+            link.ping(new)
+            raise WrongDevice(f"id {new} is taken by another servo; choose another")
+        link.quiet(0.05)
+    registers = model.registers
+    if link.proven(old, registers["torque_enable"], model):
+        if not torque_off:
+            raise WrongDevice(
+                f"the torque of servo {old} is on: support what hangs on it and give --torque-off"
+            )
+        link.write(old, registers["torque_enable"], 0, model)
+    link.write(old, registers["lock"], UNLOCKED, model)
+    with changing(link, "feetech", old, new_baud) as change:
+        try:
+            if old != new:
+                change.ids = [old, new]
+                link.write_unanswered(old, registers["id"], new, model)
+                if change.new_baud is not None:
+                    link.ping(new)  # before its rate changes
+                    change.ids = [new]
+            if change.new_baud is not None:
+                change.bauds.append(change.new_baud)
+                link.write_unanswered(new, registers["baud"], BAUD_RATES.index(change.new_baud), model)
+                link.set_baud(change.new_baud)
+            link.write(new, registers["lock"], LOCKED, model)
+        except BaseException:  # it has the one id or the other, and its EEPROM stays unlocked under neither
+            for servo_id in {new, old}:
+                with suppress(DriverError):
+                    link.write(servo_id, registers["lock"], LOCKED, model)
+            raise
+        link.ping(new)

@@ -1,1 +1,0 @@
-"""Pan/tilt heads of the security world that speak Pelco-D or Pelco-P."""

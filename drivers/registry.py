@@ -1,0 +1,229 @@
+"""The drivers of heads and cameras: those of this repository and of other packages, found and opened alike.
+
+A package names its drivers by entry points in the groups ``mastctl.heads`` and ``mastctl.cameras``. Each is a
+`Driver`, or a factory that takes the options as keywords. A configuration may also name either of them as
+``package.module:name``. Foreign code may do anything while it is imported and called; one sentence says so.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from inspect import getattr_static
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+from drivers.clock import Clock, SystemClock
+from drivers.errors import BadOptions
+from drivers.faults import nearest
+from drivers.interfaces import Camera, PanTilt
+
+Kind = Literal["head", "camera"]
+GROUPS: Mapping[Kind, str] = MappingProxyType({"head": "mastctl.heads", "camera": "mastctl.cameras"})
+OURS = "mastctl"
+"""The distribution whose drivers come before those of the same name in another package."""
+
+METHODS: Mapping[type, tuple[str, ...]] = MappingProxyType(
+    {PanTilt: ("read", "move", "stop", "close"), Camera: ("next_frame", "close")}
+)
+"""The methods that every device has."""
+
+HardwareKind = Literal["real", "simulated", "replayed", "mixed"]
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a driver gets beside its options.
+
+    Attributes
+    ----------
+    name
+        The device's name, for errors and logs.
+    clock
+        The time of all devices of the configuration.
+    folder
+        Where relative paths in options start: the configuration's folder.
+    simulation
+        The configuration's section of that name.
+    shared
+        What devices of one configuration have in common, by a key of the driver's own, such as one simulated
+        rover. What has a ``close`` is closed after the devices.
+    """
+
+    name: str
+    clock: Clock = field(default_factory=SystemClock)
+    folder: Path = Path()
+    simulation: Mapping[str, Any] = field(default_factory=dict)
+    shared: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Driver:
+    """A driver of heads or cameras.
+
+    Attributes
+    ----------
+    open
+        ``open(options, context)`` returns a `PanTilt` or `Camera`. Raises BadOptions and DriverError.
+    hardware
+        What its devices are; devices of a ``real`` one may say that they are simulated (``info``).
+    any_clock
+        Whether it waits on the context's clock alone, so that it runs at any ``simulation.speed``.
+    read_options
+        ``read_options(options)`` checks options without a device and returns them as the driver has them.
+        Raises BadOptions.
+    halt
+        ``halt(options)`` stops a head that no daemon drives any more, and returns the actions on each axis in
+        plain words. Raises DriverError if the head did not confirm.
+    """
+
+    open: Callable[[Mapping[str, Any], Context], Any]
+    hardware: HardwareKind = "real"
+    any_clock: bool = False
+    read_options: Callable[[Mapping[str, Any]], Any] | None = None
+    halt: Callable[[Mapping[str, Any]], Sequence[str]] | None = None
+
+
+@dataclass(frozen=True)
+class InstalledDriver:
+    """A driver that an installed package offers.
+
+    Attributes
+    ----------
+    kind, name
+        The device that it drives, and its name in a configuration.
+    path
+        ``package.module:name`` of the `Driver` or factory.
+    distribution, version
+        Of the package.
+    """
+
+    kind: Kind
+    name: str
+    path: str
+    distribution: str
+    version: str
+
+    @property
+    def package(self) -> str:
+        """The distribution with its version."""
+        return f"{self.distribution} {self.version}".strip()
+
+
+def installed_drivers() -> Sequence[InstalledDriver]:
+    """Return the drivers that installed packages offer, heads first, by name; imports none of them."""
+    return _installed(tuple((folder, _changed_ns(folder)) for folder in sys.path))
+
+
+def _changed_ns(folder: str) -> int:
+    """When something was put into a folder or taken out of it last; 0 for none."""
+    try:
+        return Path(folder).stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+@lru_cache(maxsize=1)
+def _installed(folders: tuple[tuple[str, int], ...]) -> Sequence[InstalledDriver]:
+    """What these folders offer: all their packages are read for it, 12 ms of processor time."""
+    from importlib.metadata import entry_points  # loads 50 modules
+
+    every, found = entry_points(), []
+    for kind, group in GROUPS.items():
+        for entry in sorted(every.select(group=group), key=lambda entry: (entry.name, entry.value)):
+            name, version = ("", "") if entry.dist is None else (entry.dist.name, entry.dist.version)
+            found.append(InstalledDriver(kind, entry.name, entry.value, name, version))
+    return tuple(dict.fromkeys(found))
+
+
+def kinds_of(driver: str) -> set[Kind]:
+    """Return which devices a driver of that name drives; nothing for one that no package offers."""
+    return {one.kind for one in installed_drivers() if one.name == driver}
+
+
+def driver_of(kind: Kind, driver: str, device: str) -> Driver:
+    """Return a driver by its name in a configuration.
+
+    Parameters
+    ----------
+    kind
+        The device that it is to drive.
+    driver
+        The name by which a package offers it, or its path ``package.module:name``.
+    device
+        Put before a message.
+
+    Raises
+    ------
+    BadOptions
+        If no package offers it for this kind, several do, or it cannot be imported.
+    """
+    path = driver if ":" in driver else _path_of(kind, driver, device)
+    found = _object(path, device)
+    return found if isinstance(found, Driver) else Driver(lambda options, context: found(**options))
+
+
+def _path_of(kind: Kind, driver: str, device: str) -> str:
+    installed = installed_drivers()
+    named = [one for one in installed if one.name == driver]
+    fitting = [one for one in named if one.kind == kind]
+    fitting = [one for one in fitting if one.distribution == OURS] or fitting
+    if len(fitting) == 1:
+        return fitting[0].path
+    if fitting:
+        packages = " and ".join(one.package for one in fitting)
+        raise BadOptions(f"{packages} both offer a driver {driver!r}; uninstall one of them", device=device)
+    if named:
+        words = f"driver {driver!r} of {named[0].package} is for a {named[0].kind}, not for a {kind}"
+        raise BadOptions(words, device=device)
+    known = [one.name for one in installed if one.kind == kind]
+    raise BadOptions(
+        f"there is no driver {driver!r}{nearest(driver, known)}; a driver from outside is named "
+        f"package.module:name, or as its package names it in the group {GROUPS[kind]}",
+        device=device,
+    )
+
+
+def _object(name: str, device: str) -> Any:
+    """The driver or callable that ``package.module:name`` names. Raises BadOptions."""
+    module_name, _, attribute = name.partition(":")
+    try:
+        found: Any = importlib.import_module(module_name)
+    except (Exception, SystemExit) as error:  # whatever a foreign module does while it is imported
+        words = f"driver {name!r}: cannot import {module_name!r} ({one_line(error)})"
+        raise BadOptions(words, device=device) from error
+    for part in attribute.split("."):
+        if not hasattr(found, part):
+            raise BadOptions(f"driver {name!r}: {module_name!r} has no {attribute!r}", device=device)
+        found = getattr(found, part)
+    if not callable(found) and not isinstance(found, Driver):
+        raise BadOptions(f"driver {name!r}: {attribute!r} cannot be called", device=device)
+    return found
+
+
+def one_line(error: BaseException) -> str:
+    """Return a foreign error as one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def whole(device: Any, kind: type) -> Any:
+    """Return a device with all members of `PanTilt` or `Camera`.
+
+    One that is not derived from the class keeps its own members; the others are the class's.
+    """
+    if isinstance(device, kind):
+        return device
+    members = {
+        name: _member(device, name)
+        for name in vars(kind)
+        if not name.startswith("_") and (name in METHODS[kind] or getattr_static(device, name, None))
+    }
+    return type(f"Outside{kind.__name__}", (kind,), members)()
+
+
+def _member(device: object, name: str) -> property:
+    return property(lambda self: getattr(device, name))

@@ -1,1 +1,0 @@
-"""The live view: what the daemon publishes, shown in Foxglove or Lichtblick on this machine."""

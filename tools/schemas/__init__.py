@@ -1,1 +1,0 @@
-"""JSON Schemas of the files that a person writes, taken from the readers themselves."""
