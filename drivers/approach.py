@@ -1,11 +1,13 @@
-"""From which side an axis of a real head approaches its goal, to take the backlash of its gear up. No I/O."""
+"""Goals that a head accepts, and from which side an axis approaches one to take its backlash up. No I/O."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
+
+from drivers.errors import OutOfRange
 
 Approach = Literal["none", "positive", "negative", "gravity"]
 APPROACHES: tuple[Approach, ...] = get_args(Approach)
@@ -85,3 +87,18 @@ def legs_to(
     start = min(max(goal - turn * stretch, low), high)
     before = places is not None and all(turn * (start - place) >= 0 for place in places)
     return [goal] if before or not turn or start == goal else [start, goal]
+
+
+def check_goal(
+    angles_rad: Sequence[float],
+    limits_rad: Sequence[tuple[float, float]],
+    speed_rad_per_s: float | None,
+    device: str = "",
+) -> None:
+    """Pass pan and tilt within their limits, and a speed above zero or none. Raises OutOfRange."""
+    if speed_rad_per_s is not None and not speed_rad_per_s > 0:
+        raise OutOfRange(f"speed {speed_rad_per_s} rad/s is not a positive number", device=device)
+    for name, angle, (low, high) in zip(("pan", "tilt"), angles_rad, limits_rad, strict=True):
+        if not low <= angle <= high:
+            words = f"{name} {angle:.4f} rad is outside the head's limits {low:.4f} to {high:.4f} rad"
+            raise OutOfRange(words, device=device)

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from drivers.dynamixel.packets import GroupQuestion
 from drivers.errors import BadReply, DriverError, LineLost
-from drivers.servo_bus.exchange import Exchange
-from drivers.servo_bus.port import QUIET_S, Status
+from drivers.servo_bus.exchange import BusLink
+from drivers.servo_bus.port import QUIET_S, StatusPacket
 
 MODULUS_S = 32.768
 STEP_S = 0.001
@@ -34,7 +34,7 @@ class Counter:
         self._tick = tick
         self._earliest_s, self._latest_s = sent_s - STEP_S, received_s  # when it began to show that
 
-    def doubts(self, tick: int, sent_s: float, received_s: float) -> str:
+    def mismatch(self, tick: int, sent_s: float, received_s: float) -> str:
         """Take an answer as of its question, or say in words why it cannot be and take nothing.
 
         Returns
@@ -61,16 +61,16 @@ class Counter:
 class TickCounters:
     """Which servo's counter showed what when; for the thread that has the line."""
 
-    def __init__(self, exchange: Exchange) -> None:
-        self._exchange = exchange
-        self._clock = exchange.port.clock
+    def __init__(self, link: BusLink) -> None:
+        self._link = link
+        self._clock = link.clock
         self._known: dict[int, Counter] = {}
 
     def forget(self, servo_id: int) -> None:
         """Get to know a servo's counter anew: it restarts."""
         self._known.pop(servo_id, None)
 
-    def unmet(self, question: GroupQuestion) -> DriverError | None:
+    def learn(self, question: GroupQuestion) -> DriverError | None:
         """Get to know the counters of a group's servos; returns why that failed. Raises LineLost."""
         for servo_id, at in question.ticks.items():
             if servo_id not in self._known:
@@ -82,18 +82,18 @@ class TickCounters:
                     return error
         return None
 
-    def doubts(self, question: GroupQuestion, status: Status, sent_s: float) -> BadReply | None:
+    def mismatch(self, question: GroupQuestion, status: StatusPacket, sent_s: float) -> BadReply | None:
         """Return why a reply that just came is not to this question; None if it is, or holds no counter."""
         servo_id = status.servo_id
         if servo_id not in question.ticks:
             return None
         at = question.ticks[servo_id]
         tick = int.from_bytes(status.data[at : at + 2], "little")
-        doubts = self._known[servo_id].doubts(tick, sent_s, self._clock.now_s())
-        if not doubts:
+        mismatch = self._known[servo_id].mismatch(tick, sent_s, self._clock.now_s())
+        if not mismatch:
             return None
-        self._exchange.stray(status)
-        return self._bad(servo_id, "group read", doubts)
+        self._link.note_unexpected(status)
+        return self._bad(servo_id, "group read", mismatch)
 
     def _meet(self, servo_id: int, tick_address: int) -> None:
         """Get to know a counter: by two answers, each after a silence, that agree about it.
@@ -103,23 +103,23 @@ class TickCounters:
         shapes = iter(MEETING_SHAPES)
         for shape in shapes:
             counter = Counter(*self._tick(servo_id, tick_address, shape))
-            doubts = counter.doubts(*self._tick(servo_id, tick_address, next(shapes)))
-            if not doubts:
+            mismatch = counter.mismatch(*self._tick(servo_id, tick_address, next(shapes)))
+            if not mismatch:
                 self._known[servo_id] = counter
                 return
-        words = f"no two replies are of the moments that they were asked for: {doubts}"
+        words = f"no two replies are of the moments that they were asked for: {mismatch}"
         raise self._bad(servo_id, "read", words)
 
     def _tick(self, servo_id: int, address: int, shape: tuple[int, int]) -> tuple[int, float, float]:
         """The counter in a reply of so many bytes around it, and when that was asked and came."""
         before, after = shape
-        self._exchange.quiet(QUIET_S)
+        self._link.quiet(QUIET_S)
         sent_s = self._clock.now_s()
-        data = self._exchange.read(servo_id, address - before, before + 2 + after, "realtime_tick")
+        data = self._link.read(servo_id, address - before, before + 2 + after, "realtime_tick")
         return int.from_bytes(data[before : before + 2], "little"), sent_s, self._clock.now_s()
 
     def _bad(self, servo_id: int, word: str, words: str) -> BadReply:
         return BadReply(
-            f"servo {servo_id} on {self._exchange.port.name}: {words}",
-            detail=self._exchange.where(servo_id, word, "realtime_tick"),
+            f"servo {servo_id} on {self._link.name}: {words}",
+            detail=self._link.where(servo_id, word, "realtime_tick"),
         )

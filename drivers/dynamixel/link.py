@@ -1,12 +1,12 @@
 """Transactions with servos on one line, each answer proven to be of its question.
 
-A `Link` belongs to one thread at a time. A reply says who speaks, and not what was asked. What proves that it
-is of its question:
+A `Link` belongs to one thread at a time. A reply says who speaks, and not what was requested. What proves
+that it is of its question:
 
 - Where it holds the servo's millisecond counter, that shows the moment of the question (`counter`).
 - Where it does not, `Link.proven` asks twice around a silence and wants one answer; what is read for one
   register differs in length from what is read for another (`registers.Register.window`).
-- Of a group read the replies come in the order asked, one of each servo, or none counts.
+- Of a group read the replies come in the order requested, one of each servo, or none counts.
 - A reply without data (to a write, a restart) proves nothing: who must be certain reads afterwards.
 """
 
@@ -37,8 +37,8 @@ from drivers.dynamixel.packets import (
 from drivers.dynamixel.registers import Register
 from drivers.errors import BadReply, DriverError, LineLost, Refused
 from drivers.serial_line import OpenLine, SerialLine
-from drivers.servo_bus.link import REPLY_TIMEOUT_S, BusLink
-from drivers.servo_bus.port import QUIET_S, PacketFormat, Status
+from drivers.servo_bus.exchange import REPLY_TIMEOUT_S, BusLink
+from drivers.servo_bus.port import QUIET_S, PacketFormat, StatusPacket
 
 PING_REPLY_BYTES = 14
 FORMAT = PacketFormat(
@@ -77,12 +77,12 @@ class Link(BusLink):
         open_line: OpenLine = SerialLine,
     ) -> None:
         super().__init__(port, baud, reply_timeout_s, FORMAT, urgent, clock, open_line)
-        self._counters = TickCounters(self.exchange)
+        self._counters = TickCounters(self)
         self._group_questions: dict[tuple[Part, ...], GroupQuestion] = {}
 
     def ping(self, servo_id: int) -> Pinged:
         """Ask one servo who it is. Raises NoReply, BadReply, LineLost."""
-        return _pinged(self.exchange.ask(servo_id, PING, b"", 3))
+        return _pinged(self.ask(servo_id, PING, b"", 3))
 
     def ping_all(self) -> tuple[list[Pinged], int]:
         """Ask who is on the line; takes its whole window of about a second.
@@ -94,7 +94,7 @@ class Link(BusLink):
         list of Pinged, int
             Who answered, by id; and how many bytes came that were no reply (two servos of one id?).
         """
-        port = self._port
+        port = self.port
         question = instruction_packet(BROADCAST_ID, PING)
         port.send(question, 0)
         port.deadline_s = self.clock.now_s() + port.reply_timeout_s + 253 * (0.003 + 14 * port.byte_s)
@@ -115,8 +115,8 @@ class Link(BusLink):
         BadReply if answers contradict one another again and again, or are of another moment; NoReply,
         Refused, LineLost.
         """
-        asked = {register.window: register for register in registers if tick_at(*register.window) is None}
-        found = self._agreed(servo_id, asked)
+        requested = {register.window: register for register in registers if tick_at(*register.window) is None}
+        found = self._agreed(servo_id, requested)
         for register in registers:
             if register.window not in found:
                 found[register.window] = self.block(Part(servo_id, *register.window)).statuses[servo_id].data
@@ -130,26 +130,28 @@ class Link(BusLink):
     def heard(self, servo_id: int, register: Register) -> int:
         """Return what a register seems to be, asked one time and after a silence; raises as `proven`."""
         self.quiet(QUIET_S)
-        return register.decode(self.exchange.read(servo_id, *register.window, register.name))
+        return register.decode(self.read(servo_id, *register.window, register.name))
 
-    def _agreed(self, servo_id: int, asked: dict[tuple[int, int], Register]) -> dict[tuple[int, int], bytes]:
+    def _agreed(
+        self, servo_id: int, requested: dict[tuple[int, int], Register]
+    ) -> dict[tuple[int, int], bytes]:
         """What is said twice in a row, around a silence, of each window."""
         found: dict[tuple[int, int], bytes] = {}
-        before = {window: self._outcome(servo_id, register) for window, register in asked.items()}
+        before = {window: self._outcome(servo_id, register) for window, register in requested.items()}
         tries_left = AGREEING_TRIES
-        while asked:
+        while requested:
             if not tries_left:
-                names = " and ".join(register.name for register in asked.values())
+                names = " and ".join(register.name for register in requested.values())
                 raise BadReply(
                     f"servo {servo_id} on {self.name} contradicts itself about {names}",
-                    detail=self.exchange.where(servo_id, "read", names),
+                    detail=self.where(servo_id, "read", names),
                 )
             tries_left -= 1
             self.quiet(QUIET_S)
-            for window, register in tuple(asked.items()):
+            for window, register in tuple(requested.items()):
                 now = self._outcome(servo_id, register)
                 if _same(now, before[window]):
-                    del asked[window]
+                    del requested[window]
                     if isinstance(now, Refused):
                         raise now
                     found[window] = now
@@ -159,7 +161,7 @@ class Link(BusLink):
     def _outcome(self, servo_id: int, register: Register) -> bytes | Refused:
         """One answer to a question for a register's window, or its refusal; raises NoReply, LineLost."""
         try:
-            return self.exchange.read(servo_id, *register.window, register.name)
+            return self.read(servo_id, *register.window, register.name)
         except Refused as refused:
             return refused
 
@@ -169,18 +171,18 @@ class Link(BusLink):
         Raises NoReply, BadReply, Refused, LineLost.
         """
         data = register.address.to_bytes(2, "little") + register.encode(value)
-        self.exchange.ask(servo_id, WRITE, data, 0, register.name)
+        self.ask(servo_id, WRITE, data, 0, register.name)
 
     def write_unanswered(self, servo_id: int, register: Register, value: int) -> None:
         """Set a register of a servo that is set to keep silent; an answer is dropped. Raises LineLost."""
         data = register.address.to_bytes(2, "little") + register.encode(value)
-        self._port.send(instruction_packet(servo_id, WRITE, data), 0)
-        self._port.drain()
+        self.port.send(instruction_packet(servo_id, WRITE, data), 0)
+        self.port.drain()
 
     def reboot(self, servo_id: int) -> None:
         """Restart a servo: torque drops. Raises NoReply, BadReply, Refused, LineLost."""
         self._counters.forget(servo_id)
-        self.exchange.ask(servo_id, REBOOT, b"", 0)
+        self.ask(servo_id, REBOOT, b"", 0)
 
     def block(self, part: Part) -> GroupAnswer:
         """Read one block of one servo, which is there. Raises as `group_read`, and what is missing."""
@@ -202,21 +204,21 @@ class Link(BusLink):
         question = self._group_questions.get(key)
         if question is None:
             question = self._group_questions[key] = group_question(parts)
-        if (unmet := self._counters.unmet(question)) is not None:
+        if (failure := self._counters.learn(question)) is not None:
             now_s = self.clock.now_s()
-            return GroupAnswer({}, dict.fromkeys(question.parts, unmet), now_s, now_s)
+            return GroupAnswer({}, dict.fromkeys(question.parts, failure), now_s, now_s)
         try:
-            sent_s = self._port.send(question.packet, question.reply_bytes)
+            sent_s = self.port.send(question.packet, question.reply_bytes)
             statuses, wrong = self._replies(question, sent_s)
         except LineLost as error:
-            raise self.exchange.placed(error, list(question.parts), "group read") from error
+            raise self.placed(error, list(question.parts), "group read") from error
         received_s = self.clock.now_s()
         missing = {}
         if len(statuses) < len(question.parts):
             for servo_id, part in question.parts.items():
                 if servo_id not in statuses:
                     addresses = f"addresses {part.address} to {part.address + part.length - 1}"
-                    silence = wrong.get(servo_id) or self.exchange.silence(servo_id, "group read", addresses)
+                    silence = wrong.get(servo_id) or self.silence(servo_id, "group read", addresses)
                     missing[servo_id] = silence
         return GroupAnswer(statuses, missing, sent_s, received_s)
 
@@ -226,11 +228,11 @@ class Link(BusLink):
         Raises LineLost, BadReply.
         """
         try:
-            self._port.send(group_write_packet(parts), 0)
+            self.port.send(group_write_packet(parts), 0)
         except LineLost as error:
-            raise self.exchange.placed(error, [part.servo_id for part in parts], "group write") from error
+            raise self.placed(error, [part.servo_id for part in parts], "group write") from error
 
-    def shout(self, parts: Sequence[Part], copies: int = 1) -> None:
+    def write_at_once(self, parts: Sequence[Part], copies: int = 1) -> None:
         """Write to each of several servos by a packet of its own, at once and whatever is under way.
 
         Nobody answers, nothing is listened to before, and one servo's packet does not hang on another's: what
@@ -238,41 +240,41 @@ class Link(BusLink):
         """
         packets = b"".join(group_write_packet([part]) for part in parts)
         try:
-            self._port.send_now(copies * packets)
+            self.port.send_now(copies * packets)
         except LineLost as error:
-            raise self.exchange.placed(error, [part.servo_id for part in parts], "group write") from error
+            raise self.placed(error, [part.servo_id for part in parts], "group write") from error
 
     def _replies(
         self, question: GroupQuestion, sent_s: float
-    ) -> tuple[dict[int, Status], dict[int, DriverError]]:
+    ) -> tuple[dict[int, StatusPacket], dict[int, DriverError]]:
         """The replies to a group read until all have come or the deadline passes.
 
         They come in the order of the list; where they do not, or a servo says two things, none is certain.
         """
         parts = question.parts
         waited = list(parts)
-        taken: dict[int, Status] = {}
+        taken: dict[int, StatusPacket] = {}
         wrong: dict[int, DriverError] = {}
-        while waited and (status := self._port.receive()) is not None:
+        while waited and (status := self.port.receive()) is not None:
             servo_id = status.servo_id
             if servo_id not in parts or len(status.data) != (0 if status.refused else parts[servo_id].length):
-                self.exchange.stray(status)
+                self.note_unexpected(status)
             elif status.refused:
-                wrong[servo_id] = self.exchange.refusal(status, "group read", "")
+                wrong[servo_id] = self.refusal(status, "group read", "")
                 waited = _behind(waited, servo_id)
-            elif (doubts := self._counters.doubts(question, status, sent_s)) is not None:
-                wrong[servo_id] = doubts
+            elif (mismatch := self._counters.mismatch(question, status, sent_s)) is not None:
+                wrong[servo_id] = mismatch
             elif servo_id in waited:
                 taken[servo_id] = status
                 waited = _behind(waited, servo_id)
             else:
-                self.exchange.stray(status)
+                self.note_unexpected(status)
                 if status != taken.get(servo_id):
                     return {}, wrong
         return taken, wrong
 
 
-def _pinged(status: Status) -> Pinged:
+def _pinged(status: StatusPacket) -> Pinged:
     """What the data of a ping's reply say."""
     model = int.from_bytes(status.data[:2], "little")
     return Pinged(status.servo_id, model, status.data[2], status.alert)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from drivers.dynamixel.models import TICK_ADDRESSES
 from drivers.errors import DriverError
-from drivers.servo_bus.port import Status
+from drivers.servo_bus.port import StatusPacket
 
 HEADER = b"\xff\xff\xfd\x00"
 START = b"\xff\xff\xfd"
@@ -66,25 +66,6 @@ def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"")
     return packet + crc16(packet).to_bytes(2, "little")
 
 
-@dataclass(frozen=True)
-class StatusPacket:
-    """A servo's reply: who sent it, its error byte (bit 7 is the hardware alert), its data, unstuffed."""
-
-    servo_id: int
-    error: int
-    data: bytes
-
-    @property
-    def refused(self) -> int:
-        """The error number, 0 for none; the alert bit is no refusal."""
-        return self.error & 0x7F
-
-    @property
-    def alert(self) -> bool:
-        """Whether the servo has a hardware error."""
-        return bool(self.error & ALERT)
-
-
 def take_status(buffer: bytearray, *, at_end: bool = False) -> StatusPacket | None:
     """Take the first whole status packet out of a buffer; None when there is none yet.
 
@@ -118,7 +99,8 @@ def take_status(buffer: bytearray, *, at_end: bool = False) -> StatusPacket | No
                     del buffer[:length]
                     if packet[7] == STATUS and length >= SHORTEST_STATUS:
                         body = packet[8 : length - 2].replace(STUFFED, START)
-                        return StatusPacket(packet[4], body[0], body[1:])
+                        error = body[0]
+                        return StatusPacket(packet[4], error, body[1:], error & ~ALERT, bool(error & ALERT))
                     continue  # an instruction: the adapter's echo
             elif not at_end and buffer.find(HEADER, 1) < 0:
                 return None  # a second header inside means that this one is noise
@@ -147,7 +129,7 @@ class GroupAnswer:
     The servos measured after ``sent_s`` and before ``received_s``, seconds of CLOCK_MONOTONIC.
     """
 
-    statuses: Mapping[int, Status]
+    statuses: Mapping[int, StatusPacket]
     missing: Mapping[int, DriverError]
     sent_s: float
     received_s: float

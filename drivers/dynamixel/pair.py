@@ -18,9 +18,8 @@ from drivers.dynamixel.servo import Reboots, Servo, motion_blocks
 from drivers.dynamixel.settings import DynamixelAxisSettings, DynamixelSettings
 from drivers.errors import DriverError
 from drivers.serial_line import OpenLine, SerialLine
-from drivers.servo_bus.axis import ServoAxis
 from drivers.servo_bus.course import ServoSample
-from drivers.servo_bus.pair import BRAKE_COPIES, ServoPair
+from drivers.servo_bus.pair import BRAKE_COPIES, ServoAxis, ServoPair
 
 log = logging.getLogger(__name__)
 
@@ -81,7 +80,7 @@ class Pair(ServoPair[Link, Axis]):
             if goal is not None:
                 parts.append(axis.servo.part("goal_position", goal))
         if parts:
-            self.link.shout(parts, BRAKE_COPIES)
+            self.link.write_at_once(parts, BRAKE_COPIES)
 
     def stood(self, axis: Axis) -> str:
         """Command one axis to stand, unless its watchdog has stopped it; as `ServoPair.stood`."""
@@ -105,7 +104,7 @@ class Pair(ServoPair[Link, Axis]):
                     return single.missing[part.servo_id]
         return next(iter(answer.missing.values()))
 
-    def glance(self, register: str) -> list[int | None]:
+    def quick_values(self, register: str) -> list[int | None]:
         """Return what a register of both servos seems to be, None where no answer came.
 
         Where it decides anything ask for it by `Servo.get`. Raises LineLost, BadReply.

@@ -129,11 +129,11 @@ class Servo(ServoTable):
         A ping's reply is as long as one that holds the hardware error: it is not to be under way then.
         """
         try:
-            held = self.get_all("model_number", "firmware")
+            stored = self.get_all("model_number", "firmware")
         except (NoReply, Refused):
             pinged = identified(self._link, self._servo_id, self.name)
             return pinged.model_number, pinged.firmware
-        return held["model_number"], held["firmware"]
+        return stored["model_number"], stored["firmware"]
 
     def stand(self) -> None:
         """Make where the servo is its goal, if it is of the model configured and its torque is on.
@@ -142,8 +142,8 @@ class Servo(ServoTable):
         BadReply, Refused, LineLost.
         """
         registers = self._registers
-        asked = (registers["model_number"], registers["torque_enable"])
-        if self._link.proven(self._servo_id, *asked) != [self._settings.model.number, 1]:
+        requested = (registers["model_number"], registers["torque_enable"])
+        if self._link.proven(self._servo_id, *requested) != [self._settings.model.number, 1]:
             return
         low, high = self._settings.limit_counts
         goal = min(max(self.look_once().counts, low), high)
@@ -206,30 +206,30 @@ class Servo(ServoTable):
         a value.
         """
         wanted = self._wanted()
-        held = self.get_all(*wanted)
-        different = {name: value for name, value in wanted.items() if held[name] != value}
+        stored = self.get_all(*wanted)
+        different = {name: value for name, value in wanted.items() if stored[name] != value}
         if not different:
             return
-        told = ", ".join(f"{name} {value}" for name, value in different.items())
+        changes = ", ".join(f"{name} {value}" for name, value in different.items())
         torque = self.get("torque_enable")
         if torque:
             if not self._head.torque_off_at_start:
                 raise WrongDevice(
-                    f"{self.name} must be set to {told}, which it takes only with torque off, but torque is "
-                    "on and the axis may fall. Support it and set torque_off_at_start: true, or switch the "
-                    "servo off and on"
+                    f"{self.name} must be set to {changes}, which it takes only with torque off, but torque "
+                    "is on and the axis may fall. Support it and set torque_off_at_start: true, or switch "
+                    "the servo off and on"
                 )
             self.dropped = True
             self.set("torque_enable", 0)
-        log.info("%s: setting %s", self.name, told)
+        log.info("%s: setting %s", self.name, changes)
         for name in sorted(different, key=lambda n: n != "operating_mode"):  # a new mode resets others
             self.set(name, different[name])
 
     def _wanted(self) -> dict[str, int]:
         """The permanent settings, by register."""
         settings, model = self._settings, self._settings.model
-        held = self.get_all("drive_mode", "secondary_id", "homing_offset")
-        drive, secondary, homing = held["drive_mode"], held["secondary_id"], held["homing_offset"]
+        stored = self.get_all("drive_mode", "secondary_id", "homing_offset")
+        drive, secondary, homing = stored["drive_mode"], stored["secondary_id"], stored["homing_offset"]
         if drive & SLAVE_BIT:
             raise WrongDevice(
                 f"{self.name} is the slave of a pair (drive mode {drive}); a head needs single servos"
@@ -261,8 +261,8 @@ class Servo(ServoTable):
         An old goal is void: the present position is the goal before anything can move. A watchdog that has
         tripped is cleared here, which makes this the deliberate act of arming anew.
         """
-        held = self.get_all("torque_enable", "bus_watchdog")
-        torque, tripped = bool(held["torque_enable"]), held["bus_watchdog"] != 0
+        stored = self.get_all("torque_enable", "bus_watchdog")
+        torque, tripped = bool(stored["torque_enable"]), stored["bus_watchdog"] != 0
         counts = self.check_place()
         if tripped:
             self.clear_watchdog(counts)

@@ -64,18 +64,18 @@ class ServoTable:
                 if refused is not None:
                     raise
                 refused = error  # it may be that of another write
-            held = self.get(register)
-            if held == value:
+            stored = self.get(register)
+            if stored == value:
                 return
             self._link.quiet(LATE_S if refused is None else QUIET_S)
-        raise WrongDevice(f"{self.name} holds {held} in {register} after {value} was written to it")
+        raise WrongDevice(f"{self.name} holds {stored} in {register} after {value} was written to it")
 
     def clear_watchdog(self, goal: int) -> None:
         """Clear a watchdog that has tripped; raises as `set`.
 
         Once cleared, the servo may go on to its old goal: that is void in the same moment.
         """
-        self._link.shout([self.part("bus_watchdog", 0), self.part("goal_position", goal)])
+        self._link.write_at_once([self.part("bus_watchdog", 0), self.part("goal_position", goal)])
         self.set("bus_watchdog", 0)
 
     def part(self, register: str, value: int) -> Part:

@@ -1,6 +1,6 @@
 """A pan/tilt head of two Feetech servos (`drivers.interfaces.PanTilt`).
 
-One thread owns the bus (`drivers.servo_bus.head`). A servo has no watchdog: its goals are lent to it. Of a
+One thread owns the bus (`drivers.servo_bus.head`). A servo has no watchdog: its goals are sent in parts. Of a
 way only as much is sent as its axis goes in ``lease_s``, and every poll sends more of it, so that both axes
 stand soon after this process has died. Nothing here moves the head but `move`.
 
@@ -35,11 +35,10 @@ from drivers.feetech.servos import (
 from drivers.options import OptionReader
 from drivers.registry import Driver
 from drivers.serial_line import OpenLine, SerialLine
-from drivers.servo_bus.axis import ServoAxis
 from drivers.servo_bus.course import ServoSample, Truth
 from drivers.servo_bus.exchange import ATTEMPTS, again
 from drivers.servo_bus.head import BusHead
-from drivers.servo_bus.pair import BRAKE_COPIES, ServoPair, SessionWatch
+from drivers.servo_bus.pair import BRAKE_COPIES, ServoAxis, ServoPair, SessionWatch
 from drivers.servo_bus.rest import come_to_rest, halt_axes
 from drivers.servo_bus.session import GivenUp
 from drivers.servo_bus.settings import (
@@ -96,7 +95,7 @@ class FeetechSettings(HeadSettings[FeetechAxisSettings]):
 
     @property
     def silence_s(self) -> float:
-        """How long nothing may be sent so that both axes have come to the end of what was lent to them."""
+        """How long nothing may be sent so that both axes have come to the end of what was sent to them."""
         return self.lease_s + 2 * self.speed_rad_per_s / self.acceleration_rad_per_s2 if self.lease_s else 0.0
 
 
@@ -186,10 +185,10 @@ class FeetechServo:
         entry, model = self._registers[register], self._settings.model
         for _ in range(ATTEMPTS):
             again(self._link, lambda: self._link.write(self.servo_id, entry, value, model))
-            held = self.get(register)
-            if held == value:
+            stored = self.get(register)
+            if stored == value:
                 return
-        raise WrongDevice(f"{self.name} holds {held} in {register} after {value} was written to it")
+        raise WrongDevice(f"{self.name} holds {stored} in {register} after {value} was written to it")
 
     def check_identity(self) -> None:
         """See that the servo is the one configured, and that it answers every instruction.
@@ -227,8 +226,8 @@ class FeetechServo:
         """Return what the servo says about its motion, asked one time; raises as `FeetechLink.samples`."""
         if not self.torque_limit:  # each question writes it: it must never rise above the servo's own
             self._bound_torque()
-        asked = {self.servo_id: (self._settings.model, self.torque_limit)}
-        sample = self._link.samples(asked)[self.servo_id]
+        requested = {self.servo_id: (self._settings.model, self.torque_limit)}
+        sample = self._link.samples(requested)[self.servo_id]
         self.truth.check(sample)
         return sample
 
@@ -283,16 +282,16 @@ class FeetechServo:
         different = {name: value for name, value in wanted.items() if self.get(name) != value}
         if not different:
             return
-        told = ", ".join(f"{name} {value}" for name, value in different.items())
+        changes = ", ".join(f"{name} {value}" for name, value in different.items())
         if self.get("torque_enable"):
             if not self._head.torque_off_at_start:
                 raise WrongDevice(
-                    f"{self.name} must be set to {told} with its torque off, and its torque is on: support "
-                    "the axis and set torque_off_at_start: true, or switch the servo off and on"
+                    f"{self.name} must be set to {changes} with its torque off, and its torque is on: "
+                    "support the axis and set torque_off_at_start: true, or switch the servo off and on"
                 )
             self.dropped = True
             self.set("torque_enable", 0)
-        log.info("%s: setting %s", self.name, told)
+        log.info("%s: setting %s", self.name, changes)
         self._unlocked(different)
 
     def _unlocked(self, values: Mapping[str, int], answered: bool = True) -> None:
@@ -373,7 +372,7 @@ def fault_words(name: str, error: int) -> str:
 
 
 class FeetechAxis(ServoAxis[FeetechServo, FeetechAxisSettings]):
-    """One axis, to which its way is lent."""
+    """One axis, whose way is sent in parts."""
 
     def __init__(
         self, servo: FeetechServo, clock: Clock, settings: FeetechAxisSettings, head: FeetechSettings
@@ -396,7 +395,7 @@ class FeetechAxis(ServoAxis[FeetechServo, FeetechAxisSettings]):
             goal = motion.more_of_the_way(self.stretch())
         if goal is not None:
             self.servo.send_leg(motion.profile or self.servo.profile, goal)
-            motion.lent(goal)
+            motion.note_sent(goal)
 
 
 class FeetechPair(ServoPair[FeetechLink, FeetechAxis]):
@@ -414,8 +413,10 @@ class FeetechPair(ServoPair[FeetechLink, FeetechAxis]):
 
     def samples(self) -> list[ServoSample]:
         """Return what both servos say about their motion now; raises as `FeetechLink.samples`."""
-        asked = {axis.servo.servo_id: (axis.settings.model, axis.servo.torque_limit) for axis in self.axes}
-        found = self.link.samples(asked)
+        requested = {
+            axis.servo.servo_id: (axis.settings.model, axis.servo.torque_limit) for axis in self.axes
+        }
+        found = self.link.samples(requested)
         for axis in self.axes:
             axis.servo.truth.check(found[axis.servo.servo_id])
         return [found[axis.servo.servo_id] for axis in self.axes]
@@ -425,7 +426,7 @@ class FeetechPair(ServoPair[FeetechLink, FeetechAxis]):
         return axis.servo.sample()
 
     def send_goals(self, goals: Sequence[int], speeds: Sequence[int]) -> Sequence[int]:
-        """Write profile and goal of both axes with one packet, as far as goals are lent; returns that.
+        """Write profile and goal of both axes with one packet, as far as the lease allows; returns that.
 
         Raises LineLost, BadReply.
         """
@@ -434,7 +435,7 @@ class FeetechPair(ServoPair[FeetechLink, FeetechAxis]):
             axis.motion.profile = axis.servo.profile[0], speed
             sent.append(axis.stretch())
             address, data[axis.servo.servo_id] = axis.servo.goal_bytes(axis.motion.profile, sent[-1])
-            axis.motion.lent(sent[-1])
+            axis.motion.note_sent(sent[-1])
         self.link.group_write(address, data)
         return sent
 
@@ -450,7 +451,7 @@ class FeetechPair(ServoPair[FeetechLink, FeetechAxis]):
                     entry.encode(goal, axis.settings.model.order),
                 )
         if data:
-            self.link.shout(address, data, BRAKE_COPIES)
+            self.link.write_at_once(address, data, BRAKE_COPIES)
 
     def stood(self, axis: FeetechAxis) -> str:
         """Command one axis to stand, as `ServoPair.stood`. Raises DriverError."""
@@ -458,8 +459,8 @@ class FeetechPair(ServoPair[FeetechLink, FeetechAxis]):
         goal = servo.stand()
         if goal is None:
             return "has its torque off"
-        if (held := servo.get("goal_position")) != goal:  # nobody answers the packet that says so
-            raise NoReply(f"{servo.name} did not take the command to stand, its goal is {held}")
+        if (stored := servo.get("goal_position")) != goal:  # nobody answers the packet that says so
+            raise NoReply(f"{servo.name} did not take the command to stand, its goal is {stored}")
         return "was commanded to stand where it is, and holds"
 
 
@@ -556,7 +557,7 @@ class FeetechWatch(SessionWatch[FeetechAxis]):
             self._see_speed(axis)
 
     def _see_speed(self, axis: FeetechAxis) -> None:
-        """Brake an axis that turns much faster than it was told."""
+        """Brake an axis that turns much faster than was commanded."""
         sample, name, profile = axis.motion.sample, axis.servo.name, axis.motion.profile
         assert sample is not None
         before = self._before.get(name)

@@ -6,7 +6,7 @@ in that of 2025: it depends on the firmware and has to be configured (``speed_un
 
 A packet is ``FF FF``, id, length, instruction or status, data, and an inverted sum. The sum has eight bits:
 one wrong byte is always seen, several pass once in 256. Nothing is stuffed. A reply has no sequence number
-and does not say what was asked. What proves a sample is:
+and does not say what was requested. What proves a sample is:
 
 - **Length.** Each question asks for another number of bytes, `STARTS` of them in turn; another length is no
   answer.
@@ -38,9 +38,8 @@ from drivers.faults import nearest
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.bench import FoundServo, Scan, ServoFacts, changing, check_change, scanned
 from drivers.servo_bus.course import ServoSample
-from drivers.servo_bus.exchange import ATTEMPTS, again
-from drivers.servo_bus.link import REPLY_TIMEOUT_S, BusLink
-from drivers.servo_bus.port import QUIET_S, PacketFormat, Status
+from drivers.servo_bus.exchange import ATTEMPTS, REPLY_TIMEOUT_S, BusLink, again
+from drivers.servo_bus.port import QUIET_S, PacketFormat, StatusPacket
 
 BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
 """By their code: the maker's SMS_STS.h (2021, 2025), SCSCL.h (2018, 2020) and memory tables, address 6.
@@ -224,21 +223,6 @@ STATUS_BYTES = 6  # of a reply without data
 LONGEST_PACKET = 250
 
 
-@dataclass(frozen=True)
-class FeetechStatus:
-    """A servo's reply; its error byte says how the servo is, and refuses nothing."""
-
-    servo_id: int
-    error: int
-    data: bytes
-    refused: int = 0
-
-    @property
-    def alert(self) -> bool:
-        """Whether the servo reports a fault of its own."""
-        return self.error != 0
-
-
 def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
     """Return the bytes of an instruction."""
     body = bytes((servo_id, len(parameters) + 2, instruction)) + parameters
@@ -257,7 +241,7 @@ def sync_write_packet(address: int, data: Mapping[int, bytes]) -> bytes:
     return instruction_packet(BROADCAST_ID, SYNC_WRITE, bytes((address, length)) + body)
 
 
-def take_status(buffer: bytearray, *, at_end: bool = False) -> FeetechStatus | None:
+def take_status(buffer: bytearray, *, at_end: bool = False) -> StatusPacket | None:
     """Take the first whole packet whose sum fits out of a buffer; None when there is none yet.
 
     Parameters
@@ -281,7 +265,8 @@ def take_status(buffer: bytearray, *, at_end: bool = False) -> FeetechStatus | N
                 whole = bytes(buffer[:end])
                 if len(whole) == end and whole[-1] == ~sum(whole[2:-1]) & 0xFF:
                     del buffer[:end]
-                    return FeetechStatus(whole[2], whole[4], whole[5:-1])
+                    # its error byte says how the servo is, and refuses nothing
+                    return StatusPacket(whole[2], whole[4], whole[5:-1], 0, whole[4] != 0)
         elif not at_end:
             return None
         del buffer[:1]
@@ -339,7 +324,7 @@ class FeetechLink(BusLink):
 
     def ping(self, servo_id: int) -> int:
         """Return the status of a servo that is there. Raises NoReply, BadReply, LineLost."""
-        return self.exchange.ask(servo_id, PING, b"", 0).error
+        return self.ask(servo_id, PING, b"", 0).error
 
     def ping_all(self) -> tuple[list[int], int]:
         """Ask who is on the line.
@@ -351,7 +336,7 @@ class FeetechLink(BusLink):
         list of int, int
             The ids that answered; and how many bytes came that were no reply: two servos spoke at once.
         """
-        port = self._port
+        port = self.port
         port.send(instruction_packet(BROADCAST_ID, PING), 0)
         port.deadline_s = self.clock.now_s() + port.reply_timeout_s + 253 * (0.0005 + 6 * port.byte_s)
         found, before = [], port.received_bytes
@@ -368,41 +353,41 @@ class FeetechLink(BusLink):
         """
         size, before = register.size, None
         for more in range(AGREEING_TRIES):
-            data = self.exchange.read(servo_id, register.address, size + more % 2, register.name)[:size]
+            data = self.read(servo_id, register.address, size + more % 2, register.name)[:size]
             if data == before:
                 return register.decode(data, model.order)
             before = data
             self.quiet(QUIET_S)
         raise BadReply(
             f"servo {servo_id} on {self.name} contradicts itself about {register.name}",
-            detail=self.exchange.where(servo_id, "read", register.name),
+            detail=self.where(servo_id, "read", register.name),
         )
 
     def block(self, servo_id: int, address: int, length: int) -> bytes:
         """Return bytes of one servo's memory, asked one time after a silence. Raises as `proven`."""
         self.quiet(QUIET_S)
-        return self.exchange.read(servo_id, address, length, "memory")
+        return self.read(servo_id, address, length, "memory")
 
     def write(self, servo_id: int, register: Register, value: int, model: FeetechModel) -> None:
         """Set a register and wait for the servo's word. Raises NoReply, BadReply, LineLost."""
         data = bytes((register.address,)) + register.encode(value, model.order)
-        self.exchange.ask(servo_id, WRITE, data, 0, register.name)
+        self.ask(servo_id, WRITE, data, 0, register.name)
 
     def write_unanswered(self, servo_id: int, register: Register, value: int, model: FeetechModel) -> None:
         """Set a register of a servo that may keep silent about it; an answer is dropped. Raises LineLost."""
         data = bytes((register.address,)) + register.encode(value, model.order)
-        self._port.send(instruction_packet(servo_id, WRITE, data), 0)
-        self._port.drain()
+        self.port.send(instruction_packet(servo_id, WRITE, data), 0)
+        self.port.drain()
 
     def group_write(self, address: int, data: Mapping[int, bytes]) -> None:
         """Write equally many bytes to each servo with one packet, unanswered. Raises LineLost, BadReply."""
-        self._port.send(sync_write_packet(address, data), 0)
+        self.port.send(sync_write_packet(address, data), 0)
 
-    def shout(self, address: int, data: Mapping[int, bytes], copies: int) -> None:
+    def write_at_once(self, address: int, data: Mapping[int, bytes], copies: int) -> None:
         """Write to each servo by a packet of its own, at once and whatever is under way. Raises LineLost."""
         packets = b"".join(sync_write_packet(address, {one: data[one]}) for one in data)
-        self._port.suspect = True
-        self._port.send_now(copies * packets)
+        self.port.suspect = True
+        self.port.send_now(copies * packets)
 
     def samples(self, servos: Mapping[int, tuple[FeetechModel, int]]) -> dict[int, ServoSample]:
         """Return what servos say about their motion now, by id.
@@ -420,42 +405,42 @@ class FeetechLink(BusLink):
             return self._asked_singly(servos, start)
         end = 71
         limits = {one: limit - token for one, (_, limit) in servos.items()}
-        told = {one: limit.to_bytes(2, "little") for one, limit in limits.items()}
+        tokens = {one: limit.to_bytes(2, "little") for one, limit in limits.items()}
         length, ids = end - start, tuple(servos)
-        question = sync_write_packet(48, told) + sync_read_packet(start, length, ids)
+        question = sync_write_packet(48, tokens) + sync_read_packet(start, length, ids)
         try:
-            sent_s = self._port.send(question, len(ids) * (STATUS_BYTES + length))
+            sent_s = self.port.send(question, len(ids) * (STATUS_BYTES + length))
             taken = self._replies(ids, length)
         except LineLost as error:
-            raise self.exchange.placed(error, ids, "sync read") from error
+            raise self.placed(error, ids, "sync read") from error
         received_s = self.clock.now_s()
         found = {}
         for one, status in taken.items():
             values = _values(servos[one][0], start, status.data)
             if values["torque_limit"] != limits[one]:
-                self.exchange.stray(status)
+                self.note_unexpected(status)
                 raise BadReply(
                     f"servo {one} on {self.name}: a reply to another question (late, or repeated): it holds "
                     f"the torque limit {values['torque_limit']} where {limits[one]} was written with the "
                     "question",
-                    detail=self.exchange.where(one, "sync read", "torque_limit"),
+                    detail=self.where(one, "sync read", "torque_limit"),
                 )
             values["torque_limit"] = servos[one][1]
             found[one] = ServoSample(values, status.alert, sent_s, received_s)
         return found
 
-    def _replies(self, ids: Sequence[int], length: int) -> dict[int, Status]:
-        """The replies to a sync read, in the order asked, one of each servo. Raises NoReply, LineLost."""
-        taken: dict[int, Status] = {}
+    def _replies(self, ids: Sequence[int], length: int) -> dict[int, StatusPacket]:
+        """The replies to a sync read, in the order requested, one of each servo. Raises NoReply, LineLost."""
+        taken: dict[int, StatusPacket] = {}
         for one in ids:
             while True:
-                status = self._port.receive()
+                status = self.port.receive()
                 if status is None:
-                    raise self.exchange.silence(one, "sync read", f"{length} bytes")
+                    raise self.silence(one, "sync read", f"{length} bytes")
                 if status.servo_id == one and len(status.data) == length:
                     taken[one] = status
                     break
-                self.exchange.stray(status)
+                self.note_unexpected(status)
                 if (
                     status.servo_id in ids
                     and len(status.data) == length
@@ -463,7 +448,7 @@ class FeetechLink(BusLink):
                 ):
                     raise BadReply(
                         f"servo {status.servo_id} on {self.name} answers out of turn",
-                        detail=self.exchange.where(status.servo_id, "sync read", ""),
+                        detail=self.where(status.servo_id, "sync read", ""),
                     )
         return taken
 
@@ -490,23 +475,23 @@ class FeetechLink(BusLink):
         found = {}
         for one, (model, _) in servos.items():
             sent_s = self.clock.now_s()
-            status = self.exchange.ask(one, READ, bytes((start, 67 - start)), 67 - start, "motion")
+            status = self.ask(one, READ, bytes((start, 67 - start)), 67 - start, "motion")
             values = _values(model, start, status.data)
             found[one] = ServoSample(values, status.alert, sent_s, self.clock.now_s())
-            if self._port.suspect:
+            if self.port.suspect:
                 raise BadReply(f"{self.name}: more came than was asked for")
         return found
 
     def _see_same(self, one: int, unit: int, before: ServoSample, after: ServoSample) -> None:
         """See that two samples can follow one another. Raises BadReply."""
-        told = max(abs(sample.values["present_velocity"]) for sample in (before, after))
-        speed = unit * (told + (unit > 1))  # less than one unit more is not told
+        reported = max(abs(sample.values["present_velocity"]) for sample in (before, after))
+        speed = unit * (reported + (unit > 1))  # less than one unit more is not reported
         most = SAME_COUNTS + speed * (after.received_s - before.sent_s)
         if abs(after.counts - before.counts) > most:
             raise BadReply(
                 f"servo {one} on {self.name} says {before.counts} and then {after.counts} counts, where a "
                 "reply was lost before: one of them is late",
-                detail=self.exchange.where(one, "read", "present_position"),
+                detail=self.where(one, "read", "present_position"),
             )
 
 

@@ -20,7 +20,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from drivers.absent import Absence, stop_at_last
-from drivers.approach import rising_below_rad
+from drivers.approach import check_goal, rising_below_rad
 from drivers.clock import Clock, ClockLock, SystemClock, deadlines_on
 from drivers.errors import BadReply, DriverError, HardwareFault, LineLost, NoReply
 from drivers.flir_ptu import protocol as ask
@@ -28,7 +28,6 @@ from drivers.flir_ptu.axis import StepAxis, StepCount
 from drivers.flir_ptu.conversation import Conversation, StopCameFirst
 from drivers.flir_ptu.options import DEVICE, Options, options_from
 from drivers.flir_ptu.unit import SupplyWatch, checked_version, measure, ready_axes
-from drivers.goals import check_goal
 from drivers.interfaces import AxisMotion, HeadInfo, PanTilt, Reading
 from drivers.registry import Driver
 from drivers.serial_line import OpenLine, SerialLine

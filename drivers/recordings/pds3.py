@@ -378,14 +378,6 @@ def looks_like_pds3(data: bytes) -> bool:
     return _FIRST.match(data[:4096]) is not None
 
 
-def read_label(path: str | Path) -> LabelBlock:
-    """Read the label at the beginning of a file.
-
-    Raises BadFile if the file cannot be read or does not begin with a PDS3 label.
-    """
-    return _label(read_bytes(path, MAX_FILE_BYTES), path)
-
-
 def read_product(path: str | Path, with_image: bool = True) -> PdsProduct:
     """Read a label and, unless ``image`` is false, the image that it points to.
 

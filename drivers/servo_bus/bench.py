@@ -9,7 +9,7 @@ from shlex import quote
 from typing import TypeVar
 
 from drivers.errors import BadOptions, DriverError, WrongDevice
-from drivers.servo_bus.link import BusLink
+from drivers.servo_bus.exchange import BusLink
 
 HIGHEST_ID = 252
 L = TypeVar("L", bound=BusLink)
@@ -105,12 +105,12 @@ class Change:
         """Say what the servo is left with, and how to go on."""
         ids, bauds = " or ".join(map(str, self.ids)), " or ".join(map(str, self.bauds))
         scan = f"'mastctl servo scan {self.line} --baud {bauds.replace(' or', '')}' shows which"
-        told = f"the servo is left with the id {ids} at {bauds} baud: {scan}"
+        sentence = f"the servo is left with the id {ids} at {bauds} baud: {scan}"
         if self.new_baud is None:
-            return told
+            return sentence
         new, old = self.ids[-1], self.bauds[0]
         command = f"mastctl servo set-id {self.line} {new} {new} --baud {old} --new-baud {self.new_baud}"
-        return f"{told}, and '{command}' gives the id {new} its rate"
+        return f"{sentence}, and '{command}' gives the id {new} its rate"
 
 
 @contextmanager

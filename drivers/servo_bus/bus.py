@@ -3,7 +3,7 @@
 Between calls the thread runs its own round (`Bus` asks it when to come back): reading the servos, feeding
 their watchdogs, coming back after a lost line. Nobody else ever touches the line.
 
-A stop does not queue: it breaks off what is under way (`Bus.urgent` is asked by the line), and no move that
+A stop does not queue: it breaks off what is under way (`Bus.urgent` is queried by the line), and no move that
 was called before it begins after it.
 """
 
@@ -57,7 +57,7 @@ class _Job:
         """Wait until it has been run; return whether that was within ``timeout_s``."""
         with self._signal:
             if not self._ended:
-                self._signal.wait(timeout_s)  # told once, and of nothing else
+                self._signal.wait(timeout_s)  # notified once, and of nothing else
             return self._ended
 
 
@@ -67,7 +67,7 @@ class Bus:
     Parameters
     ----------
     between
-        Called in the thread whenever nothing is asked; returns the time of the clock, seconds, at which it
+        Called in the thread whenever no call waits; returns the time of the clock, seconds, at which it
         wants to run again. It must keep what goes wrong itself; what it raises is only logged.
     clock
         Every wait runs on it; the machine's when left out.

@@ -150,14 +150,14 @@ class AxisCourse:
         reach = math.ceil(reach_rad / self.settings.model.count_rad) + 1
         return min(max(self.goal, sample.counts - reach), sample.counts + reach)
 
-    def lent(self, goal: int) -> None:
+    def note_sent(self, goal: int) -> None:
         """Note that so much of the way was sent."""
         self._sent_before = self.sent
         self.sent = None if goal == self.goal else goal
         self._sampled = False
 
     def more_of_the_way(self, stretch: int) -> int | None:
-        """Return what to send next where a way is lent, which never goes back; None for nothing."""
+        """Return what to send next where a way is sent in parts, which never go back; None for nothing."""
         sample = self._sample
         if sample is None or not self.holds or not self._sampled:
             return None
@@ -276,11 +276,11 @@ class AxisCourse:
         if self.profile is None:
             return ""
         acceleration = values.get("profile_acceleration", self.profile[0])  # not in every block
-        held = acceleration, values["profile_velocity"]
-        if held == self.profile:
+        stored = acceleration, values["profile_velocity"]
+        if stored == self.profile:
             return ""
         return (
-            f"{self.name} holds the profile acceleration {held[0]} and velocity {held[1]} where "
+            f"{self.name} holds the profile acceleration {stored[0]} and velocity {stored[1]} where "
             f"{self.profile[0]} and {self.profile[1]} were sent (0 is as fast as it can)"
         )
 

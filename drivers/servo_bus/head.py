@@ -14,10 +14,9 @@ from contextlib import suppress
 from typing import Any, TypeVar
 
 from drivers.absent import LAST_STOP_S, Absence, stop_at_last
-from drivers.approach import rising_below_rad
+from drivers.approach import check_goal, rising_below_rad
 from drivers.clock import Clock, SystemClock, deadlines_on
 from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
-from drivers.goals import check_goal
 from drivers.interfaces import AxisMotion, AxisReport, HeadInfo, PanTilt, Reading
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.bus import Bus
@@ -106,7 +105,7 @@ class BusHead(PanTilt):
     def stop(self) -> None:
         """Brake both axes; each then holds, or lets go when it stands, as its ``at_stop`` says.
 
-        Each is told to brake by itself before anything is asked, and what else was under way on the line is
+        Each is commanded to brake by itself before any request, and what else was under way on the line is
         broken off for it; a move that waits for its turn is not begun. After the watchdog has stopped the
         head this is the deliberate act that arms it anew.
 
@@ -114,9 +113,9 @@ class BusHead(PanTilt):
         ------
         LineLost, NoReply, BadReply
             If a servo did not confirm. The driver then keeps silent until its watchdog has stopped it, a
-            further stop included: both were told to brake when the line was given up, and every packet more
-            would feed the watchdog of one that did not hear it. With ``watchdog_s: 0`` nothing can be fed:
-            a stop tries a line that is away at once.
+            further stop included: both were commanded to brake when the line was given up, and every packet
+            more would feed the watchdog of one that did not hear it. With ``watchdog_s: 0`` nothing can be
+            fed: a stop tries a line that is away at once.
         """
         away = None if self.settings.silence_s else self._stop_away
         self._call("stop", self._stop_now, first=True, away=away)

@@ -1,4 +1,4 @@
-"""The line to servos: packets sent, replies gathered until a deadline, what nobody asked for dropped.
+"""The line to servos: packets sent, replies gathered until a deadline, unrequested bytes dropped.
 
 Every wait gives way to a stop; a stop itself goes out whatever is under way. What a packet is, a
 `PacketFormat` knows.
@@ -21,39 +21,35 @@ SLICE_S = 0.005  # how soon a wait sees that it has to give way
 REPLY_UNDER_WAY_S = 0.01  # how long it then lets a reply come in that would collide with what is sent next
 
 
-class Status(Protocol):
-    """A reply as a servo gave it."""
+@dataclass(frozen=True)
+class StatusPacket:
+    """A servo's reply.
 
-    @property
-    def servo_id(self) -> int:
-        """Who speaks."""
-        ...
+    Attributes
+    ----------
+    servo_id
+        Of its sender.
+    error
+        Its error byte.
+    data
+        The requested bytes.
+    refused
+        Why the servo did not do as instructed; 0 if it did.
+    alert
+        Whether it reports a fault of its own.
+    """
 
-    @property
-    def data(self) -> bytes:
-        """What it was asked for."""
-        ...
-
-    @property
-    def error(self) -> int:
-        """Its error byte."""
-        ...
-
-    @property
-    def refused(self) -> int:
-        """Why it did not do what it was asked to; 0 if it did."""
-        ...
-
-    @property
-    def alert(self) -> bool:
-        """Whether it reports a fault of its own."""
-        ...
+    servo_id: int
+    error: int
+    data: bytes
+    refused: int
+    alert: bool
 
 
 class Take(Protocol):
     """Takes packets out of what came in."""
 
-    def __call__(self, buffer: bytearray, *, at_end: bool = False) -> Status | None:
+    def __call__(self, buffer: bytearray, *, at_end: bool = False) -> StatusPacket | None:
         """Return the next reply and drop it and all before it; ``at_end`` if no more will come."""
         ...
 
@@ -196,7 +192,7 @@ class Port:
         """Send bytes whatever else wants the line or is under way on it. Raises LineLost."""
         self._line.write(data)
 
-    def receive(self, take: Take | None = None) -> Status | None:
+    def receive(self, take: Take | None = None) -> StatusPacket | None:
         """Return the next status packet, or None when the deadline passes first.
 
         ``take`` finds it where it looks otherwise. After a None the port counts as suspect: the reply may

@@ -69,19 +69,19 @@ def halt_axes(pair: ServoPair[Any, Any]) -> list[str]:
 
     Raises NoReply if an axis did not confirm, or still moves; the other was commanded all the same.
     """
-    told: dict[str, str] = {}
+    confirmed: dict[str, str] = {}
     failed: dict[str, object] = {}
     for _ in range(HALT_TRIES):  # each once before any of them again
         for axis in pair.axes:
-            if axis.servo.name not in told:
+            if axis.servo.name not in confirmed:
                 try:
-                    told[axis.servo.name] = pair.stood(axis)
+                    confirmed[axis.servo.name] = pair.stood(axis)
                 except DriverError as error:
                     failed[axis.servo.name] = error
-    missing = {name: error for name, error in failed.items() if name not in told}
+    missing = {name: error for name, error in failed.items() if name not in confirmed}
     for axis in pair.axes:
         name = axis.servo.name
-        if name in told:
+        if name in confirmed:
             try:
                 stands, sample = rests(axis.servo.look, pair.clock, HALT_REST_S, Rest())
                 if not stands and sample.values.get("torque_enable", True):
@@ -91,4 +91,4 @@ def halt_axes(pair: ServoPair[Any, Any]) -> list[str]:
     if missing:
         words = "; ".join(f"{name}: {error}" for name, error in missing.items())
         raise NoReply(f"not halted, it may still move: {words}")
-    return [f"{name} {words}" for name, words in told.items()]
+    return [f"{name} {words}" for name, words in confirmed.items()]

@@ -15,9 +15,8 @@ from typing import Any
 from drivers.clock import Clock
 from drivers.errors import DriverError, LineLost, NoReply, WatchdogTripped
 from drivers.interfaces import Reading
-from drivers.servo_bus.axis import ServoAxis
 from drivers.servo_bus.course import STANDS_S
-from drivers.servo_bus.pair import ServoPair, SessionWatch
+from drivers.servo_bus.pair import ServoAxis, ServoPair, SessionWatch
 from drivers.servo_bus.rest import Rest, rests
 from drivers.servo_bus.settings import HeadSettings
 
@@ -147,7 +146,7 @@ class ServoSession:
             As `look`, and if the servos do not confirm the goals: silence stops them.
         NoReply, BadReply, Refused, WrongDevice, LineLost
             If they cannot be asked or set. Nothing moves, or where the goals were sent and then no answer
-            came, both were told to brake.
+            came, both were commanded to brake.
         """
         self.look()
         self._watch.check_free()
@@ -164,7 +163,7 @@ class ServoSession:
         ]
         try:
             self._send_goals(goals, speeds)
-        except DriverError:  # whoever is told that it failed takes it to stand
+        except DriverError:  # the caller assumes that it stands
             with suppress(LineLost):
                 self.pair.brake()
             raise
@@ -175,16 +174,16 @@ class ServoSession:
         for _ in range(ATTEMPTS):
             sent = self.pair.send_goals(goals, speeds)
             self._poll()
-            held = [motion.sample.values["goal_position"] for motion in motions if motion.sample]
+            stored = [motion.sample.values["goal_position"] for motion in motions if motion.sample]
             wanted = [motion.goal for motion in motions]  # a short first leg may have ended already
-            if held == list(sent) or held == wanted:
+            if stored == list(sent) or stored == wanted:
                 return
         self._watch.look_soon()
         self._watch.look()
         if self._watch.tripped:
             raise WatchdogTripped("the servos' bus watchdog stopped the head before the goals came")
         raise GivenUp(  # one axis may be under way: silence stops it
-            NoReply(f"the servos hold the goals {held} where {list(sent)} were sent {ATTEMPTS} times")
+            NoReply(f"the servos hold the goals {stored} where {list(sent)} were sent {ATTEMPTS} times")
         )
 
     def stop(self) -> None:
@@ -230,21 +229,21 @@ class ServoSession:
         return confirmed(axes, self._confirm, self._clock)
 
     def _confirm(self, axis: Axis) -> None:
-        """See that an axis brakes as it was told, or tell it again; raises as `Pair.samples`, `Servo.set`."""
+        """See that an axis brakes, or command it again; raises as `Pair.samples`, `Servo.set`."""
         motion = axis.motion
-        told = motion.goal
+        goal = motion.goal
         sample = self.pair.sample(axis)
         motion.take(sample)
         if sample.alert and motion.holds and not axis.servo.get("torque_enable"):
             motion.limp()
         if not motion.holds:
             return
-        held = sample.values["goal_position"]
-        strange = held != told or self._watch.tripped
+        stored = sample.values["goal_position"]
+        strange = stored != goal or self._watch.tripped
         if strange and self._watch.has_stopped(axis):
             axis.take_hold()
             self._watch.arm_axis(axis)
-        elif held != told or not motion.braking_well(told, axis.acceleration_rad_per_s2):
+        elif stored != goal or not motion.braking_well(goal, axis.acceleration_rad_per_s2):
             axis.brake()
 
     def end(self, until_s: float) -> bool:

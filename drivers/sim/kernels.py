@@ -1285,9 +1285,3 @@ def render_tiles(
                     light = pixel_light(world, view, place, bundle, n, in_block, hits, y, x, 1 < q <= SHARING)
                     if light == light:
                         image[y, x] = min(light, 255.0)
-
-
-ENTRIES: tuple[Any, ...] = (
-    cast_rays, hold_rays, lay_pebbles, noisy_levels, over_ground, render_tiles, shadow_rays,
-)  # fmt: skip
-"""What Python calls; compiled into these is the rest."""

@@ -174,11 +174,6 @@ class Brick:
 
     corners_m: Float64
 
-    @property
-    def faces_m(self) -> Float64:
-        """(5, 3) the middles of the top and of the four sides."""
-        return np.array([self.corners_m[list(face)].mean(axis=0) for face in (_TOP, *_SIDES)])
-
 
 def make_brick(
     x_m: float,

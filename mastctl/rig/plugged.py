@@ -24,7 +24,7 @@ from drivers.feetech import servos as feetech
 from drivers.flir_ptu import workshop as flir_ptu
 from drivers.flir_ptu.workshop import Facts
 from drivers.servo_bus.bench import FoundServo, Scan
-from drivers.servo_bus.link import REPLY_TIMEOUT_S
+from drivers.servo_bus.exchange import REPLY_TIMEOUT_S
 from drivers.servo_bus.settings import CountedModel
 from drivers.v4l2 import find
 from drivers.v4l2.node import Node, capture_nodes

@@ -1,14 +1,75 @@
-"""A simulated bus of Feetech servos: bytes of the host in, answers of the servos out, in their order."""
+"""A simulated bus of Feetech servos: bytes of the host in, answers of the servos out, in their order.
+
+Packets are from the maker's protocol manual; the driver's are its own: ``FF FF ID LENGTH CODE PARAMETERS
+SUM``. The length counts what follows it, the sum is the low byte of all behind the header, inverted. A reply
+has the servo's status where an instruction has its code.
+"""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
-from drivers.sim.wire import feetech_packets as packets
 from drivers.sim.wire.carrier import Reply
-from drivers.sim.wire.feetech_packets import BROADCAST, Instruction, InstructionParser
 from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
+
+BROADCAST = 0xFE
+HEADER = b"\xff\xff"
+PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
+_LONGEST = 250
+
+
+def packet(servo_id: int, code: int, body: bytes = b"") -> bytes:
+    """Return the bytes of an instruction or, with the status as its code, of a reply."""
+    inside = bytes((servo_id, len(body) + 2, code)) + body
+    return HEADER + inside + bytes((~sum(inside) & 0xFF,))
+
+
+def renamed(data: bytes, servo_id: int) -> bytes:
+    """Return a reply as if another servo had sent it, with a sum that fits."""
+    return packet(servo_id & 0xFF, data[4], data[5:-1]) if len(data) > 5 else data
+
+
+@dataclass(frozen=True)
+class FeetechInstruction:
+    """One packet from the host whose sum fits."""
+
+    servo_id: int
+    code: int
+    parameters: bytes
+
+
+class FeetechInstructionParser:
+    """Finds packets in any bytes, in any chunks; never raises, holds at most one packet's bytes."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> list[FeetechInstruction]:
+        """Take bytes of the line, return the packets that they complete."""
+        self._buffer += data
+        found: list[FeetechInstruction] = []
+        while True:
+            start = self._buffer.find(HEADER)
+            if start < 0:
+                del self._buffer[: len(self._buffer) - self._buffer.endswith(b"\xff")]
+                return found
+            del self._buffer[:start]
+            if len(self._buffer) < 4:
+                return found
+            end = 4 + self._buffer[3]
+            if self._buffer[2] == 0xFF or not 6 <= end <= _LONGEST:
+                del self._buffer[:1]
+                continue
+            if len(self._buffer) < end:
+                return found
+            whole = bytes(self._buffer[:end])
+            if whole[-1] == ~sum(whole[2:-1]) & 0xFF:
+                found.append(FeetechInstruction(whole[2], whole[4], whole[5:-1]))
+                del self._buffer[:end]
+            else:
+                del self._buffer[:1]
 
 
 class FeetechBus:
@@ -25,13 +86,13 @@ class FeetechBus:
         Bits a second of the host, set by who knows it; a servo with another rate hears nothing.
     """
 
-    renamed = staticmethod(packets.renamed)
+    renamed = staticmethod(renamed)
 
     def __init__(self, servos: Iterable[SimulatedFeetechServo], *, echoes: bool = False) -> None:
         self.servos = list(servos)
         self.echoes = echoes
         self.host_baud: int | None = None
-        self._parser = InstructionParser()
+        self._parser = FeetechInstructionParser()
         self._lock = threading.RLock()
 
     @property
@@ -54,24 +115,24 @@ class FeetechBus:
                 servo.update(time_s)
             return ()
 
-    def _answer(self, instruction: Instruction, time_s: float) -> list[Reply]:
+    def _answer(self, instruction: FeetechInstruction, time_s: float) -> list[Reply]:
         here = [s for s in self.servos if s.hears(time_s) and s.baud == self.baud]
         for servo in here:
             servo.update(time_s)
         code, parameters = instruction.code, instruction.parameters
-        if code == packets.SYNC_WRITE and instruction.servo_id == BROADCAST and len(parameters) > 1:
+        if code == SYNC_WRITE and instruction.servo_id == BROADCAST and len(parameters) > 1:
             self._sync_write(parameters, here, time_s)
             return []
-        if code == packets.SYNC_READ and instruction.servo_id == BROADCAST and len(parameters) > 1:
+        if code == SYNC_READ and instruction.servo_id == BROADCAST and len(parameters) > 1:
             return self._sync_read(parameters, here, time_s)
         replies: list[Reply] = []
         for servo in here:
             if instruction.servo_id in (servo.servo_id, BROADCAST):
                 servo_id, delay_s, level = servo.servo_id, servo.return_delay_s, servo.answers_writes
                 data = _done(servo, code, parameters, time_s)
-                own = instruction.servo_id != BROADCAST or code == packets.PING
-                if data is not None and own and (level or code in (packets.PING, packets.READ)):
-                    answer = packets.packet(servo_id, servo.status(time_s), data)
+                own = instruction.servo_id != BROADCAST or code == PING
+                if data is not None and own and (level or code in (PING, READ)):
+                    answer = packet(servo_id, servo.status(time_s), data)
                     replies.append(Reply(answer, delay_s, servo_id))
         return replies
 
@@ -84,7 +145,7 @@ class FeetechBus:
             if servo is None:
                 break
             data = servo.read(address, length, time_s)
-            answer = packets.packet(servo_id, servo.status(time_s), data)
+            answer = packet(servo_id, servo.status(time_s), data)
             replies.append(Reply(answer, servo.return_delay_s, servo_id))
         return replies
 
@@ -100,17 +161,11 @@ class FeetechBus:
 
 def _done(servo: SimulatedFeetechServo, code: int, parameters: bytes, time_s: float) -> bytes | None:
     """Carry out one instruction; returns the data of its answer, None for one that is not answered."""
-    if code == packets.PING:
+    if code == PING:
         return b""
-    if code == packets.READ and len(parameters) == 2:
+    if code == READ and len(parameters) == 2:
         return servo.read(parameters[0], parameters[1], time_s)
-    if code == packets.WRITE and len(parameters) > 1:
+    if code == WRITE and len(parameters) > 1:
         servo.write(parameters[0], parameters[1:], time_s)
-        return b""
-    if code == packets.REG_WRITE and len(parameters) > 1:
-        servo.reg_write(parameters[0], parameters[1:])
-        return b""
-    if code == packets.ACTION:
-        servo.action(time_s)
         return b""
     return None

@@ -62,7 +62,6 @@ class SimulatedFeetechServo:
         self.memory = {cell.name: cell.initial for cell in self.model.cells}
         self.memory |= {"model": self.model.number, **given}
         self._kept = dict(self.memory)
-        self._registered: tuple[int, bytes] | None = None
         self._raised = 0
         self._pressing_since_s: float | None = None
         self._zero = self.model.counts // 2
@@ -159,17 +158,6 @@ class SimulatedFeetechServo:
                 moved = moved or cell.name in ("goal_position", "torque_enable")
         if moved and self.memory["torque_enable"] == 1:
             self._go(time_s)
-
-    def reg_write(self, address: int, data: bytes) -> None:
-        """Keep a write for `action`."""
-        self._registered, self.memory["async_write"] = (address, data), 1
-
-    def action(self, time_s: float) -> None:
-        """Carry out what `reg_write` kept."""
-        if self._registered is not None:
-            (address, data), self._registered = self._registered, None
-            self.memory["async_write"] = 0
-            self.write(address, data, time_s)
 
     def _put(self, name: str, value: int, address: int, time_s: float) -> None:
         if name == "torque_enable" and value != self.memory[name]:

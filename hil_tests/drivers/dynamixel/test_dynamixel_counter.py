@@ -22,25 +22,25 @@ def test_a_true_answer_follows_the_servos_own_clock(rate: float) -> None:
     for _ in range(3000):  # 60 s: the counter wraps at 32.768 s
         now_s += PERIOD_S
         measured_s = now_s + random.Random(now_s).random() * WIRE_S
-        assert counter.doubts(shown(measured_s, rate), now_s, now_s + WIRE_S) == ""
+        assert counter.mismatch(shown(measured_s, rate), now_s, now_s + WIRE_S) == ""
 
 
 @pytest.mark.parametrize("late_s", [0.01, 0.02, 0.5, 16.0])
 def test_an_answer_from_another_moment_is_doubted_and_not_remembered(late_s: float) -> None:
     counter = Counter(shown(100.0), 100.0, 100.0 + WIRE_S)
     now_s = 100.0 + PERIOD_S
-    assert "from another moment" in counter.doubts(shown(now_s - late_s), now_s, now_s + WIRE_S)
-    assert counter.doubts(shown(now_s), now_s, now_s + WIRE_S) == ""
+    assert "from another moment" in counter.mismatch(shown(now_s - late_s), now_s, now_s + WIRE_S)
+    assert counter.mismatch(shown(now_s), now_s, now_s + WIRE_S) == ""
 
 
 def test_a_servo_that_restarted_is_doubted() -> None:
     counter = Counter(shown(100.0), 100.0, 100.0 + WIRE_S)
-    assert counter.doubts(3, 100.0 + PERIOD_S, 100.0 + PERIOD_S + WIRE_S)
+    assert counter.mismatch(3, 100.0 + PERIOD_S, 100.0 + PERIOD_S + WIRE_S)
 
 
 def test_answers_that_are_each_a_little_later_do_not_carry_it_along() -> None:
     counter, now_s, late_s = Counter(shown(100.0), 100.0, 100.0 + WIRE_S), 100.0, 0.0
-    while not counter.doubts(shown(now_s - late_s), now_s, now_s + 0.05):  # each asked for as long as 50 ms
+    while not counter.mismatch(shown(now_s - late_s), now_s, now_s + 0.05):  # each asked for as long as 50 ms
         now_s, late_s = now_s + PERIOD_S, late_s + 0.001
         assert late_s < 0.2, "the counter was carried along"
     assert late_s < 0.1
@@ -48,6 +48,6 @@ def test_answers_that_are_each_a_little_later_do_not_carry_it_along() -> None:
 
 def test_after_a_slow_answer_the_quick_ones_before_it_still_count() -> None:
     counter, now_s = Counter(shown(100.0), 100.0, 100.0 + WIRE_S), 100.0 + PERIOD_S
-    assert counter.doubts(shown(now_s), now_s, now_s + 0.3) == ""
+    assert counter.mismatch(shown(now_s), now_s, now_s + 0.3) == ""
     now_s += PERIOD_S
-    assert counter.doubts(shown(now_s - 0.02), now_s, now_s + WIRE_S)
+    assert counter.mismatch(shown(now_s - 0.02), now_s, now_s + WIRE_S)

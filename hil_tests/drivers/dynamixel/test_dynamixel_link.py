@@ -39,7 +39,7 @@ def always(*replies: Reply) -> Callable[[Instruction, int], Sequence[Reply]]:
 
 def asked(link: Link, servo_id: int, register: Register) -> int:
     """A register's value by one question, proven by nothing."""
-    data = link.exchange.read(servo_id, register.address, register.size, register.name)
+    data = link.read(servo_id, register.address, register.size, register.name)
     return register.decode(data)
 
 

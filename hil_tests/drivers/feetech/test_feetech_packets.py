@@ -8,8 +8,8 @@ from __future__ import annotations
 import pytest
 
 from drivers.feetech import servos as packets
-from drivers.feetech.servos import MODELS
-from drivers.sim.wire.feetech_packets import Instruction, InstructionParser, packet, renamed
+from drivers.servo_bus.port import StatusPacket
+from drivers.sim.wire.feetech_bus import FeetechInstruction, FeetechInstructionParser, packet, renamed
 
 OF_THE_SDK = {
     "ping": "ff ff 01 02 01 fb",
@@ -23,7 +23,7 @@ OF_THE_SDK = {
 
 def ours() -> dict[str, bytes]:
     """The same by the driver."""
-    sts, scs = MODELS["STS3215"], MODELS["SCS0009"]
+    sts, scs = packets.MODELS["STS3215"], packets.MODELS["SCS0009"]
     goal = sts.registers["goal_position"]
     told = [goal.encode(count, "little") + bytes((0, 0, 0x60, 9)) for count in (2048, 2058)]
     write, read = packets.WRITE, packets.FORMAT.read_parameters(56, 8)
@@ -41,9 +41,9 @@ def ours() -> dict[str, bytes]:
 def test_driver_and_simulator_have_the_packets_of_the_makers_sdk(what: str) -> None:
     frame = bytes.fromhex(OF_THE_SDK[what])
     assert ours()[what] == frame
-    parser = InstructionParser()
+    parser = FeetechInstructionParser()
     found = [one for byte in b"\xff\x01" + frame for one in parser.feed(bytes((byte,)))]
-    assert found == [Instruction(frame[2], frame[4], frame[5:-1])]
+    assert found == [FeetechInstruction(frame[2], frame[4], frame[5:-1])]
 
 
 NOISES = [b"", b"\xff", b"\xff\xff", b"\xff\xff\x01", b"\x00\xff\xff\xfe\xfa", b"\xff" * 9]
@@ -69,16 +69,16 @@ def test_a_reply_in_pieces_is_awaited_and_a_broken_one_dropped() -> None:
     for byte in reply[:-1]:
         buffer.append(byte)
         assert packets.take_status(buffer) is None
-    buffer.append(reply[-1])
-    assert packets.take_status(buffer) == packets.FeetechStatus(1, 0, b"abc")
+    assert packets.take_status(bytearray(reply)) == StatusPacket(1, 0, b"abc", 0, False)
     half = bytearray(reply[:6] + packet(2, 0, b"d"))
-    assert packets.take_status(half, at_end=True) == packets.FeetechStatus(2, 0, b"d")
+    assert packets.take_status(half, at_end=True) == StatusPacket(2, 0, b"d", 0, False)
     assert renamed(reply, 2) == packet(2, 0, b"abc")
 
 
 def test_minus_is_a_bit_and_an_scs_is_big_endian() -> None:
-    offset, position = MODELS["STS3215"].registers["offset"], MODELS["STS3215"].registers["present_position"]
+    registers = packets.MODELS["STS3215"].registers
+    offset, position = registers["offset"], registers["present_position"]
     assert offset.encode(-100, "little") == (0x800 | 100).to_bytes(2, "little")
     assert offset.decode(offset.encode(-100, "little"), "little") == -100
     assert position.decode(bytes((0x05, 0x80)), "little") == -5
-    assert position.decode(bytes((0x01, 0xF4)), MODELS["SCS0009"].order) == 500
+    assert position.decode(bytes((0x01, 0xF4)), packets.MODELS["SCS0009"].order) == 500
