@@ -292,17 +292,6 @@ def test_a_move_that_hung_while_a_stop_went_out_is_followed_by_a_stop(
     assert [call[0] for call in hardware.head.calls] == ["stop", "move", "stop"]
 
 
-def test_a_stop_that_hangs_says_that_the_head_may_still_move(
-    devices: Devices, hardware: FakeHardware, clock: Turned
-) -> None:
-    hang = Hang(clock)
-    hardware.head.hook = hang
-    hang.reached()
-    with pytest.raises(NoReply, match="may still move"):
-        devices.stop()
-    hang.let_go()
-
-
 def test_a_stop_reaches_a_head_that_only_fails_to_read(devices: Devices, hardware: FakeHardware) -> None:
     def fail(name: str) -> None:
         if name == "read":

@@ -274,6 +274,3 @@ def test_rest_after_a_move_of_before_the_stop_proves_nothing(
     hardware.head.hook = lambda name: None
     devices.move(0.3, 0.1)
     clock.until(lambda: devices.faults() == (), "the end of the fault")
-
-
-# What else a driver is asked

@@ -44,10 +44,9 @@ def kinds(folder: Path) -> dict[str, list[str]]:
 
 
 def test_killed_at_any_moment_it_leaves_all_but_the_end_and_that_is_whole(tmp_path: Path) -> None:
-    results = kills(24, 6, 7, tmp_path)
+    results = kills(8, 7, tmp_path)
     assert [one.wrong for one in results if one.wrong] == []
-    # How much the end is, in seconds, the campaign asks of a quiet machine.
-    assert sum(one.recorded for one in results) > 0
+    assert all(one.recorded for one in results)
 
 
 def test_nothing_is_recorded_without_a_ring_until_a_run_begins(tmp_path: Path) -> None:

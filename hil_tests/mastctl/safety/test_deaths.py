@@ -31,7 +31,6 @@ GOAL_RAD = 0.95
 SPEED_RAD_PER_S = 0.05  # the way takes 19 s: a stop on a busy machine still comes before its end
 STANDS_S = 0.3
 SAME_RAD = 1e-4
-DRIVERS = ["dynamixel", "flir_ptu"]
 
 
 @dataclass
@@ -66,9 +65,9 @@ class Bench:
         return forks.run(command, timeout=NET_S)
 
 
-@pytest.fixture(params=DRIVERS)
+@pytest.fixture
 def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
-    driver, _, watchdog = request.param.partition(" with ")
+    driver, _, watchdog = getattr(request, "param", "dynamixel").partition(" with ")
     with made(driver, tmp_path, bool(watchdog)) as one:
         yield one
 
@@ -164,14 +163,7 @@ def test_a_frozen_daemons_head_is_stopped_by_the_watchdog_for_good(tmp_path: Pat
         assert abs(bench.pan_rad - stood_at_rad) < 0.01
 
 
-@pytest.mark.parametrize(
-    "bench",
-    [
-        "flir_ptu",
-        pytest.param("dynamixel", marks=pytest.mark.long(3, "the same before the other driver of a head")),
-    ],
-    indirect=True,
-)
+@pytest.mark.parametrize("bench", ["flir_ptu"], indirect=True)
 def test_without_a_free_descriptor_a_stop_comes_through_its_socket(bench: Bench) -> None:
     with daemon_process(bench.folder, bench.config) as daemon, Client(line(daemon)) as client:
         bench.under_way(client)
@@ -190,9 +182,7 @@ def connected(url: str) -> Any:
     return socket.create_connection((host, int(port)), NET_S)
 
 
-def test_a_full_disk_keeps_no_stop_from_the_head_and_latches_later(
-    bench: Bench,
-) -> None:
+def test_a_full_disk_keeps_no_stop_from_the_head_and_latches_later(bench: Bench) -> None:
     with daemon_process(bench.folder, bench.config) as daemon, Client(line(daemon)) as client:
         bench.under_way(client)
         _, hard = resource.prlimit(daemon.pid, resource.RLIMIT_FSIZE)
@@ -223,14 +213,6 @@ def test_a_full_disk_keeps_no_stop_from_the_head_and_latches_later(
     assert max(abs(bench.truth(step_s)[0] - before_rad) for step_s in steps) < 2e-3  # a count of the servo
 
 
-@pytest.mark.parametrize(
-    "bench",
-    [
-        "dynamixel",
-        pytest.param("flir_ptu", marks=pytest.mark.long(3, "the same before the other driver of a head")),
-    ],
-    indirect=True,
-)
 def test_with_a_full_log_pipe_stops_of_both_kinds_come_through_both_doors(bench: Bench) -> None:
     pipe = Pipe()
     with (
@@ -248,6 +230,3 @@ def test_with_a_full_log_pipe_stops_of_both_kinds_come_through_both_doors(bench:
         assert present(client.status()["estop"])["name"] == "Cem"
     os.close(pipe.read)
     os.close(pipe.write)
-
-
-# The machine's clock

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import random
 import threading
 from pathlib import Path
@@ -14,7 +13,7 @@ import pytest
 
 from calib.errors import BadFile
 from drivers.errors import DriverError
-from hil_tests.mastctl.outside_daemon import daemon_process, free_port, line, under_way, write_config
+from hil_tests.mastctl.outside_daemon import daemon_process, line, write_config
 from hil_tests.mastctl.service_fakes import CONFIG, Hang, fake_daemon
 from hil_tests.waiting import NET_S, present, until
 from mastctl.client import Client, ClientError
@@ -371,25 +370,6 @@ def test_a_disk_that_hangs_delays_an_emergency_stop_by_little(
 
 
 # A daemon in a process of its own
-
-
-def test_killed_right_after_the_answer_it_comes_back_latched(tmp_path: Path) -> None:
-    config = write_config(tmp_path, f"{{port: {free_port()}}}")
-    with daemon_process(tmp_path, config) as daemon, Client(line(daemon)) as client:
-        under_way(client)
-        told = client.estop(reason="sparks", name="Ana")
-        os.kill(daemon.pid, 9)
-        assert told["kept"] is True
-    (tmp_path / "head.log").unlink()
-    with daemon_process(tmp_path, config) as daemon, Client(line(daemon)) as client:
-        assert present(client.status()["estop"])["name"] == "Ana"
-        with pytest.raises(ClientError, match="latched"):
-            client.point(pan_rad=0.1, tilt_rad=0.0)
-        assert not (tmp_path / "head.log").exists()
-        client.reset(reason="looked", name="Ben")
-        os.kill(daemon.pid, 9)
-    with daemon_process(tmp_path, config) as daemon, Client(line(daemon)) as client:
-        assert client.status()["estop"] is None
 
 
 def test_a_second_daemon_of_one_state_folder_does_not_touch_the_head(tmp_path: Path) -> None:

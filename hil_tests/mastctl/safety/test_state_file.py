@@ -13,7 +13,6 @@ import pytest
 from calib.errors import BadFile
 from calib.files.atomic import save_bytes
 from hil_tests.mastctl.safety.crash_states import Recorder, crash_states
-from hil_tests.support.kills import kill_writers
 from mastctl.safety.state_file import StateFile
 
 SCHEMA = "mastctl/test/1"
@@ -125,9 +124,3 @@ def test_what_is_no_state_is_told_in_one_sentence(tmp_path: Path, data: bytes, w
 def test_a_state_file_is_for_its_user_only(tmp_path: Path) -> None:
     state(tmp_path).write(NEW)
     assert state(tmp_path).path.stat().st_mode & 0o777 == 0o600
-
-
-def test_processes_killed_while_they_write_leave_whole_files(tmp_path: Path) -> None:
-    found = kill_writers(tmp_path, 60, seed=1)
-    assert found["kills"] == 60
-    assert found["in the middle of a save"] > 0

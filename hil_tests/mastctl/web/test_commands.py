@@ -90,13 +90,6 @@ def test_while_one_program_has_the_lease_another_moves_nothing(
     assert moves(pair[1]) == 2
 
 
-def test_a_stop_and_a_pose_need_no_lease(bench: Client, rover: Client, pair: Pair) -> None:
-    with bench.lease():
-        assert rover.stop()["stopped"]
-        rover.pose([0, 0, 0], [1, 0, 0, 0])
-    assert ("stop",) in pair[1].head.calls
-
-
 def test_a_stop_of_one_operation_leaves_others_and_their_leases_alone(
     monkeypatch: pytest.MonkeyPatch, pair: Pair, bench: Client, rover: Client
 ) -> None:

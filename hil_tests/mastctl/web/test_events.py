@@ -141,21 +141,6 @@ def test_what_is_no_topic_is_refused_in_a_sentence_both_ways(standing: BOTH, que
         assert "'weather'" in told["message"] and "operation" in told["message"]
 
 
-def test_a_listener_that_stalls_holds_nobody(pair: BOTH) -> None:
-    daemon, _ = pair
-    publisher = daemon.service.machine.publisher
-    before = publisher.listeners
-    with socket_of(daemon.url, "?topics=fault") as stalled, listening(daemon.url, "?topics=fault") as events:
-        until(lambda: publisher.listeners == before + 2, "both listen")
-        stalled.socket.settimeout(None)
-        for _ in range(2000):
-            publisher.publish("fault", "x" * 5000, ())
-        publisher.publish("fault", "last", ())
-        assert first(events, lambda e: e["key"] == "last")
-        with httpx.Client(base_url=f"{daemon.url}/api/v1", **PLAIN) as http:
-            assert http.post("/stop").status_code == 200
-
-
 def test_it_ends_with_the_daemon_after_its_last_words(pair: BOTH, monkeypatch: pytest.MonkeyPatch) -> None:
     daemon, _ = pair
 
