@@ -138,8 +138,6 @@ class Device:
         wanted = {name: value for name, value in by_options.items() if value is not None}
         self.values, others = set_up(arv, camera, {**wanted, **self._adjusted})
         self.problems += others
-        if self._is_gige and options.packet_bytes is not None:
-            arv("camera_gv_set_packet_size", camera, options.packet_bytes)
         self._ask_chunks()
         self._find_latch()
         self.sensor_mode = self._sensor_mode()

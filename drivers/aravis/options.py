@@ -13,7 +13,7 @@ from drivers.pixels import GENICAM
 
 OPTIONS = (
     "serial", "address", "id", "format", "size_px", "offset_px", "rate_hz", "colour", "features",
-    "exposure_s", "gain", "trigger_source", "trigger", "stamp", "margin_s", "packet_bytes", "buffers",
+    "exposure_s", "gain", "trigger_source", "trigger", "stamp", "margin_s", "buffers",
 )  # fmt: skip
 SOFTWARE = "Software"
 Stamped = Literal["start", "end", "either"]
@@ -46,8 +46,6 @@ class AravisOptions:
     margin_s
         How much later than the end of its exposure the first packet of a frame may come at best, seconds: for
         cameras whose clock cannot be read.
-    packet_bytes
-        Of a GigE Vision packet; None: Aravis finds the largest that passes.
     buffers
         How many frames may lie here while this process is held up.
     """
@@ -67,7 +65,6 @@ class AravisOptions:
     trigger: str = ""
     stamp: Stamped = "either"
     margin_s: float = 0.01
-    packet_bytes: int | None = None
     buffers: int = 8
 
     @property
@@ -129,7 +126,6 @@ def parse_options(options: Mapping[str, Any], name: str) -> AravisOptions:
         trigger=read.text("trigger", "a text", usual.trigger),
         stamp=stamp,
         margin_s=read.number("margin_s", usual.margin_s, 0.0, 1.0),
-        packet_bytes=read.whole("packet_bytes", None, 576, 16000),
         buffers=read.whole("buffers", usual.buffers, 3, 64),
     )
 

@@ -79,7 +79,7 @@ class FlirPtu(PanTilt):
         self._finishing = False  # whether a thread sends last stretches
         self._leg_due = False  # whether it waits for its turn: readings one after another leave it none
         self._count = StepCount()
-        self._supply = SupplyWatch(options, self._time)
+        self._supply = SupplyWatch(self._time)
         self._absence = Absence()
         self._deaf = False  # to limit hits
         self._closed = False

@@ -45,10 +45,6 @@ class Options:
         Of moves that name no speed, and of all; None leaves them as the unit has them.
     settle_s
         How long both axes must stand at their targets to count as settled.
-    supply_V
-        Lowest and highest supply; None: not below 0.8 of what it was when the unit was opened.
-    hottest_C
-        Above this temperature of the unit, °C, there is a fault.
     """
 
     port: str
@@ -58,8 +54,6 @@ class Options:
     speed_rad_per_s: float | None = None
     acceleration_rad_per_s2: float | None = None
     settle_s: float = 0.1
-    supply_V: tuple[float, float] | None = None
-    hottest_C: float = 60.0
 
 
 def options_from(values: Mapping[str, Any]) -> Options:
@@ -80,20 +74,7 @@ def options_from(values: Mapping[str, Any]) -> Options:
         speed_rad_per_s=read.number("speed_rad_per_s", None, 1e-4, 20.0),
         acceleration_rad_per_s2=read.number("acceleration_rad_per_s2", None, 1e-4, 100.0),
         settle_s=read.number("settle_s", 0.1, 0.0, 10.0),
-        supply_V=_supply(read),
-        hottest_C=read.number("hottest_C", 60.0, 0.0, 150.0),
     )
-
-
-def _supply(read: OptionReader) -> tuple[float, float] | None:
-    """Read the bounds of the supply."""
-    if read.values.get("supply_V") is None:
-        return None
-    expected = "[low, high] in volts, low below high"
-    low, high = read.pair("supply_V", expected)
-    if not low < high:
-        raise read.bad("supply_V", expected)
-    return low, high
 
 
 def _axis(options: OptionReader, name: str) -> AxisOptions:

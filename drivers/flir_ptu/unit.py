@@ -8,7 +8,7 @@ a middle answer of pan is taken, and tilt for its moment on the straight line be
 around it, if tilt turns evenly there.
 
 The manuals' answer to ``O`` is ``Input 30 VDC @ 86 degF``; units with more sensors list more temperatures.
-They give no bounds for all models, so these are the configuration's, or what was there at the start.
+They give no bounds for all models, so the bound is by what was there at the start.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ RECOMPUTE_S = 10.0  # PA and TA take seconds, the manual says
 SUPPLY_EVERY_S = 5.0
 """How often a resting unit is asked."""
 SUPPLY_DIP = 0.8
-"""Below this part of what it was at the start a supply counts as fallen, where no bounds are configured."""
+"""Below this part of what it was at the start a supply has fallen."""
+HOTTEST_C = 60.0
+"""Above this temperature of the unit, °C, there is a fault."""
 
 _VOLTS = re.compile(r"(\d+(?:\.\d+)?) ?V")
 _DEGREES_F = re.compile(r"(-?\d+(?:\.\d+)?) ?(?:deg)?F\b")
@@ -244,15 +246,14 @@ def supply_of(text: str) -> Supply | None:
     return Supply(float(volts[0]), (max(float(one) for one in degrees) - 32) / 1.8)
 
 
-def supply_words(now: Supply, at_start: Supply, options: Options) -> tuple[str, ...]:
+def supply_words(now: Supply, at_start: Supply) -> tuple[str, ...]:
     """Say what is wrong with the supply or the temperature; empty if nothing is."""
     words = []
-    low, high = options.supply_V or (SUPPLY_DIP * at_start.volts, float("inf"))
-    if not low <= now.volts <= high:
-        expected = f"{low:.1f} to {high:.1f} V" if options.supply_V else f"{low:.1f} V or more"
-        words.append(f"the supply is {now.volts:.1f} V, expected {expected}")
-    if now.hottest_c > options.hottest_C:
-        words.append(f"the unit is at {now.hottest_c:.0f} °C, expected {options.hottest_C:.0f} °C at most")
+    low = SUPPLY_DIP * at_start.volts
+    if now.volts < low:
+        words.append(f"the supply is {now.volts:.1f} V, expected {low:.1f} V or more")
+    if now.hottest_c > HOTTEST_C:
+        words.append(f"the unit is at {now.hottest_c:.0f} °C, expected {HOTTEST_C:.0f} °C at most")
     return tuple(words)
 
 
@@ -267,9 +268,8 @@ class SupplyWatch:
         When it is judged next, on the clock.
     """
 
-    def __init__(self, options: Options, clock: Clock) -> None:
+    def __init__(self, clock: Clock) -> None:
         self.words: tuple[str, ...] = ()
-        self._options = options
         self._clock = clock
         self._at_start: Supply | None = None  # None: this unit does not tell
         self.due_s = 0.0
@@ -292,7 +292,7 @@ class SupplyWatch:
             supply = _supply(talk)
             if supply is None:
                 return  # damaged: asked again by the next reading
-            words = supply_words(supply, self._at_start, self._options)
+            words = supply_words(supply, self._at_start)
             if not words:
                 break
         self.words, self.due_s = words, self._clock.now_s() + SUPPLY_EVERY_S

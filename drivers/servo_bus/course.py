@@ -15,7 +15,6 @@ FASTEST_RAD_PER_S = 15.0  # no servo of the tables turns faster
 LEAP_RAD = 0.05
 STILL_RAD = 5e-4
 STUCK_S = 1.0
-STANDS_S = 0.1
 IN_POSITION_BIT, PROFILE_BIT = 0x01, 0x02
 
 
@@ -240,13 +239,6 @@ class AxisCourse:
             return False
         in_position = self._arrived(sample) or not self.holds
         return in_position and now_s - self._rest[1] >= self._settle_s
-
-    def stands(self, now_s: float) -> bool:
-        """Whether the axis has stood for a while, wherever that is."""
-        sample = self._sample
-        if sample is None or self._rest is None or self._speed(sample) > 1:
-            return False
-        return now_s - self._rest[1] >= max(self._settle_s, STANDS_S)
 
     def at_goal(self) -> bool:
         """Whether nothing is under way: it stands at its last goal, or holds nothing."""

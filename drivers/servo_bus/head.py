@@ -55,7 +55,7 @@ class BusHead(PanTilt):
         self._clock = deadlines_on(self._stamps)
         self._open_line = open_line
         self._absence = Absence()
-        self._closed = self._stop_owed = False
+        self._closed = False
         self._state = threading.Lock()
         self._bus = Bus(settings.port, self._round, self._clock)
         self._session: ServoSession | None = self._connect()
@@ -95,15 +95,10 @@ class BusHead(PanTilt):
                 f"speed {speed:g} rad/s is less than the {slowest:.4f} rad/s that the servos know"
             )
         capped = min(speed, self.settings.speed_rad_per_s)
-
-        def move(session: ServoSession) -> None:
-            session.move((pan_rad, tilt_rad), capped)
-            self._stop_owed = False
-
-        self._call("move", move, moves=True)
+        self._call("move", lambda session: session.move((pan_rad, tilt_rad), capped), moves=True)
 
     def stop(self) -> None:
-        """Brake both axes; each then holds, or lets go when it stands, as its ``at_stop`` says.
+        """Brake both axes; each then holds.
 
         Each is commanded to brake by itself before any request, and what else was under way on the line is
         broken off for it; a move that waits for its turn is not begun. After the watchdog has stopped the
@@ -118,7 +113,7 @@ class BusHead(PanTilt):
             fed: a stop tries a line that is away at once.
         """
         away = None if self.settings.silence_s else self._stop_away
-        self._call("stop", self._stop_now, first=True, away=away)
+        self._call("stop", ServoSession.stop, first=True, away=away)
 
     def close(self) -> None:
         """Stop, leave each servo as its ``at_close`` says, and let go of the line; never raises.
@@ -224,27 +219,8 @@ class BusHead(PanTilt):
             self._absence.note(error, self._clock.now_s())
             return
         self._session, self._motions = session, [axis.motion for axis in session.pair.axes]
-        try:
-            if self._stop_owed:  # as at_stop says
-                self._stop_now(session)
-        except GivenUp as given_up:
-            self._give_up(session, given_up.error)
-            return
-        finally:
-            if self._session is not None:
-                self._absence.end()
-                log.warning("%s is back: limits and modes checked, the head stands still", self.settings.port)
-
-    def _stop_now(self, session: ServoSession) -> None:
-        """Stop, which is owed no longer once both axes have confirmed it; raises as `ServoSession.stop`."""
-        owed = False
-        try:
-            session.stop()
-        except (GivenUp, Overtaken):
-            owed = self._stop_owed
-            raise
-        finally:
-            self._stop_owed = owed
+        self._absence.end()
+        log.warning("%s is back: limits and modes checked, the head stands still", self.settings.port)
 
     def _give_up(self, session: ServoSession, error: DriverError) -> None:
         """Have both axes brake, close the line, and try again when the watchdogs must have stopped them."""
@@ -252,15 +228,15 @@ class BusHead(PanTilt):
             session.pair.brake()
         session.pair.close()
         now_s = self._clock.now_s()
-        self._session, self._stop_owed = None, self._stop_owed or session.lets_go
+        self._session = None
         self._absence.note(error, now_s, self.settings.silence_s)
         log.warning("%s; trying again in %.1f s", error, self._absence.again_s - now_s)
 
     def _stop_away(self, left_until_s: float | None = None) -> None:
         """Command both axes to stand over a line that is away, opened for that alone.
 
-        To make them ready takes longer than a stop may; that comes next, and ends with the stop once more.
-        With ``left_until_s``, as of `leave`, both axes are left. Raises `Overtaken` where closing is to end.
+        To make them ready takes longer than a stop may; that comes next. With ``left_until_s``, as of
+        `leave`, both axes are left. Raises `Overtaken` where closing is to end.
         """
         if self._bus.urgent():  # to open a network's line takes half a second
             raise Overtaken
@@ -277,7 +253,7 @@ class BusHead(PanTilt):
             pair.close()
         if failed:
             raise stop_error(pair, failed)
-        self._stop_owed, self._absence.again_s = True, self._clock.now_s()
+        self._absence.again_s = self._clock.now_s()
 
     def _close_now(self) -> None:
         session, self._session = self._session, None

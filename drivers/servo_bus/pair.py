@@ -91,11 +91,6 @@ class ServoAxis(Generic[S, A]):
         self.motion.begin(self.servo.take_hold())
         self.motion.profile = self.servo.profile
 
-    def let_go(self) -> None:
-        """Switch the torque off; raises as `Servo.set`."""
-        self.servo.set("torque_enable", 0)
-        self.motion.limp()
-
     def halt(self) -> int | None:
         """Take where the axis stands if it brakes now as its goal; returns that, None if it holds nothing."""
         if not self.motion.holds or self.motion.sample is None:

@@ -15,7 +15,6 @@ from typing import Any
 from drivers.clock import Clock
 from drivers.errors import DriverError, LineLost, NoReply, WatchdogTripped
 from drivers.interfaces import Reading
-from drivers.servo_bus.course import STANDS_S
 from drivers.servo_bus.pair import ServoAxis, ServoPair, SessionWatch
 from drivers.servo_bus.rest import Rest, rests
 from drivers.servo_bus.settings import HeadSettings
@@ -26,9 +25,8 @@ Axis = ServoAxis[Any, Any]
 ATTEMPTS, PATIENCE_S = 3, 0.15  # of a poll, before it counts as failed
 FAILED_POLLS = 2  # in a row, before the servos are set up anew
 STOP_PATIENCE_S = 0.2  # how long a stop asks for a confirmation that does not come
-STANDS_WITHIN_S = 2.5  # how long a stop waits for an axis to stand before its torque goes off
-LEFT_WITHIN_S = 1.2  # and a closing, for both axes together
-KEPT = "%s did not come to rest after a stop: its torque stays on"
+STANDS_S = 0.1
+LEFT_WITHIN_S = 1.2  # how long a closing waits for both axes to stand before their torque goes off
 
 
 class GivenUp(Exception):
@@ -67,8 +65,6 @@ class ServoSession:
         self._watch = watch
         self._heard_s = -math.inf
         self._failed_polls = 0
-        self._to_let_go: list[Axis] = []
-        self._let_go_until_s = 0.0
 
     def look(self) -> None:
         """Read both servos and see whether they are as they should be.
@@ -115,7 +111,6 @@ class ServoSession:
         self._watch.heard_again(silence_s)
         for axis in self.pair.axes:
             axis.go_on()
-        self._let_go()
         if all(axis.motion.settled(now_s) for axis in self.pair.axes):
             self.poll_due_s = now_s + self._head.resting_poll_s
 
@@ -154,7 +149,6 @@ class ServoSession:
             if not axis.motion.holds:
                 axis.take_hold()
                 self._watch.arm()
-        self._to_let_go = []
         self.poll_once()
         speeds = [axis.settings.velocity_counts(speed_rad_per_s) for axis in self.pair.axes]
         goals = [
@@ -187,7 +181,7 @@ class ServoSession:
         )
 
     def stop(self) -> None:
-        """Brake both axes; each then holds, or lets go as soon as it stands, as its ``at_stop`` says.
+        """Brake both axes; each then holds.
 
         Raises GivenUp if a servo did not confirm: silence lets the watchdogs stop what this could not.
         """
@@ -196,27 +190,6 @@ class ServoSession:
             raise GivenUp(stop_error(self.pair, failed))
         if self._watch.tripped:
             self._watch.end_trip()
-        self._let_go_until_s = self._clock.now_s() + STANDS_WITHIN_S
-        self._to_let_go = [axis for axis in self.pair.axes if axis.settings.at_stop == "torque_off"]
-        self._let_go()
-
-    @property
-    def lets_go(self) -> bool:
-        """Whether an axis is to stand before its torque goes off."""
-        return bool(self._to_let_go)
-
-    def _let_go(self) -> None:
-        """Switch off the torque of the axes that a stop left to stand first, and do. Raises DriverError."""
-        now_s = self._clock.now_s()
-        for axis in tuple(self._to_let_go):
-            if axis.hardware_error and not axis.motion.holds:
-                self._to_let_go.remove(axis)
-            elif not axis.motion.holds or axis.motion.stands(now_s):
-                axis.let_go()  # also where a move that was broken off has taken hold
-                self._to_let_go.remove(axis)
-            elif now_s > self._let_go_until_s:
-                log.warning(KEPT, axis.servo.name)
-                self._to_let_go.remove(axis)
 
     def _stop_each(self) -> dict[Axis, DriverError]:
         """Brake each axis by itself; returns those that did not confirm, and why."""
@@ -296,7 +269,7 @@ def leave(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError], until_
                 stands, sample = rests(axis.servo.look, pair.clock, within_s, Rest(STANDS_S))
                 limp = stands or not sample.values.get("torque_enable", True)
                 if not limp:
-                    log.warning(KEPT, axis.servo.name)
+                    log.warning("%s did not come to rest after a stop: its torque stays on", axis.servo.name)
             except DriverError as error:
                 limp = False
                 words = "%s keeps its torque, for it does not say whether it stands: %s"

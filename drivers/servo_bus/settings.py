@@ -73,8 +73,8 @@ class ServoAxisSettings(ApproachedAxis):
 
     Attributes
     ----------
-    at_stop, at_close
-        Whether the servo then holds, or its torque is switched off (a tilt axis may fall).
+    at_close
+        Whether the servo holds when the head is closed, or its torque is switched off (a tilt axis may fall).
     settle_rad
         How near to its goal the axis counts as in position.
     """
@@ -82,7 +82,6 @@ class ServoAxisSettings(ApproachedAxis):
     servo_id: int
     model: CountedModel
     zero_counts: int
-    at_stop: Rest = "hold"
     at_close: Rest = "hold"
     settle_rad: float = 0.01
 
@@ -177,7 +176,7 @@ class HeadSettings(Generic[A]):
 
 AXIS_KEYS = (
     "id", "model", "zero_counts", "sign", "limits_rad", "approach", "approach_rad", "gravity_turnover_rad",
-    "at_stop", "at_close", "settle_rad",
+    "at_close", "settle_rad",
 )  # fmt: skip
 """What the options of an axis hold, whatever the servo."""
 
@@ -214,7 +213,6 @@ def axis_values(
         "approach": read.one_of("approach", "none", APPROACHES),
         "approach_rad": read.number("approach_rad", 0.0, 0.0, 0.5),
         "gravity_turnover_rad": read.number("gravity_turnover_rad", math.pi / 2, -math.pi, math.pi),
-        "at_stop": read.one_of("at_stop", "hold", ("hold", "torque_off")),
         "at_close": read.one_of("at_close", "hold", ("hold", "torque_off")),
         "settle_rad": read.number("settle_rad", max(0.001, 3 * model.count_rad), model.count_rad, 0.1),
     }

@@ -101,7 +101,7 @@ OPTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "feetech": (feetech_settings, {**PORT, "pan": STS, "tilt": {**STS, "id": 2}}),
     "flir_ptu": (
         flir_ptu.options_from,
-        {**PORT, "pan": TURNED, "tilt": TURNED, "supply_V": [10.0, 30.0]},
+        {**PORT, "pan": TURNED, "tilt": TURNED},
     ),
     "v4l2": (lambda options: v4l2.parse_options(options, "cam"), V4L2),
     "aravis": (lambda options: aravis.parse_options(options, "cam"), {"serial": "1", "exposure_s": 0.01}),

@@ -321,27 +321,6 @@ def test_a_move_that_waits_when_a_stop_comes_is_not_begun() -> None:
         bus.close(lambda: None, NET_S)
 
 
-@pytest.mark.parametrize("held", [0, 1], ids=["pan", "tilt"])
-def test_a_stop_that_breaks_off_a_move_leaves_no_torque_on(held: int) -> None:
-    with rig() as it:
-        for axis in ("pan", "tilt"):
-            it.options[axis]["at_stop"] = "torque_off"
-        head = it.open()
-        head.stop()
-        it.until(lambda: not any(servo.table["torque_enable"] for servo in it.servos), "no torque")
-        mover = it.beside(lambda: failed_move(head))
-        it.until(lambda: it.servos[held].table["torque_enable"], "torque")
-        head.stop()
-        mover.wait()
-        it.until(lambda: not any(servo.table["torque_enable"] for servo in it.servos), "no torque")
-        head.close()
-
-
-def failed_move(head: DynamixelHead) -> None:
-    with suppress(DriverError):
-        head.move(0.5, 0.3)
-
-
 @pytest.mark.parametrize("silent", [None, 0, 1], ids=["none", "pan", "tilt"])
 def test_without_a_watchdog_a_stop_tries_a_line_that_is_away_at_once(
     silent: int | None, monkeypatch: pytest.MonkeyPatch
