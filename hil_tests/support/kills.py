@@ -25,6 +25,7 @@ from drivers.clock import SystemClock
 from drivers.recordings.mcap_file import McapContents, McapEntry, read_items
 from hil_tests.waiting import until
 from mastctl.config import load_config
+from mastctl.control.publisher import Publisher
 from mastctl.devices.frames import StampedFrame
 from mastctl.packaged import default_config
 from mastctl.recorder import recorder as recorder_module
@@ -61,23 +62,24 @@ def record_until_killed(folder: Path, mast: AttachedMast, seed: int) -> None:
     clock = SystemClock()
     recorder_module.SEGMENTS = SEGMENTS
     settings = RecordSettings(ring_s=600.0, free_mb=0.0)
-    recorder = Recorder(settings, folder, mast, [], {}, clock)
+    publisher = Publisher()
+    Recorder(settings, folder, mast, [], {"hardware": "simulated"}, publisher, _not_kept, clock)
     number, next_s = 0, time.monotonic()
     while True:
         number += 1
         now_s = clock.now_s()
-        recorder.tell("command", str(number), {"number": number}, now_s)
+        publisher.publish("command", str(number), {"number": number})
         if number % FRAME_EVERY == 0:
             image = pixels.integers(0, 256, (48, 64), np.uint8)
             facts = (f"f{number}", "navcam_left", number, now_s, 0.001, 0.0, 0.0, False, mast.file.digest)
-            recorder.tell(
-                "frame",
-                "navcam_left",
-                StampedFrame(*facts, image, true_pan_rad=0.0, true_tilt_rad=0.0),
-                now_s,
-            )
+            frame = StampedFrame(*facts, image, true_pan_rad=0.0, true_tilt_rad=0.0)
+            publisher.publish("frame", frame.camera, frame)
         next_s += STEP_S
         time.sleep(max(0.0, next_s - time.monotonic()))
+
+
+def _not_kept(frame_id: str) -> StampedFrame:
+    raise AssertionError(f"the frame {frame_id} is published whole")
 
 
 def judged(folder: Path, mast: AttachedMast) -> Killed:

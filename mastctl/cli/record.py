@@ -1,4 +1,4 @@
-"""``mastctl record`` and ``mastctl replay``: recordings begun, ended, listed, looked into, mended, played."""
+"""``mastctl record`` and ``mastctl replay``: begin, end, list, inspect, repair and serve recordings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add record and replay."""
-    record = subparsers.add_parser("record", help="begin and end a recording, list, look into and mend them")
+    record = subparsers.add_parser("record", help="begin and end a recording; list, inspect and repair them")
     acts = record.add_subparsers(dest="act", metavar="ACT", required=True)
 
     start = acts.add_parser("start", help="have the daemon record until 'record stop'")
@@ -93,7 +93,7 @@ def _show(args: argparse.Namespace) -> int:
     from mastctl.recorder.recorded import read_whole
 
     recording = read_whole(args.file)
-    told = recording.told()
+    told = recording.summary()
     if args.json:
         output.print_json(told)
         return 0
@@ -114,7 +114,7 @@ def _show(args: argparse.Namespace) -> int:
 
 def _state(recording: Recording) -> str:
     """Whether it is whole, and what would be done about it."""
-    told = recording.told()
+    told = recording.summary()
     if told["complete"] and not told["damaged"]:
         return "whole"
     parts = [f"{told['damaged']} damaged chunks"] if told["damaged"] else []
@@ -203,7 +203,7 @@ def _show_what_if(what_if: Any, page: Path | None) -> None:
     from mastctl.recorder import what_if_report as report
 
     for title, table in (
-        ("pointings", report.short_table(what_if)),
+        ("pointings", report.pointing_table(what_if)),
         ("hand-offs", report.handoff_table(what_if)),
     ):
         if table.rows:

@@ -1,4 +1,4 @@
-"""Pictures, cameras and frames as Foxglove's messages: what each becomes, without any file in it."""
+"""Images, cameras, frames and operations as messages of a recording."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from calib.files.opencv_ros import lens_pose
 from calib.files.twin import TwinError, even_axes, nearest_opencv, twin_error
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.rig import Rig
+from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import Rigid, quaternion_of
 from mastctl.as_json import as_json
 from mastctl.devices.frames import StampedFrame
+from mastctl.recorder.schemas import CameraRecord, TargetRecord
 
 TARGET_M = 0.1
 TARGET_COLOUR = (0.9, 0.2, 0.1, 0.8)
 
 
 def picture(frame: StampedFrame, time_ns: int) -> Message:
-    """Return a picture: a camera's JPEG as it came, else the pixels as they are.
+    """Return an image: a camera's JPEG as it came, else the pixels as they are.
 
     Pixels are not made PNG: the chunk around them is compressed by zstd, which takes a fifth of PNG's time
     for three per cent more bytes.
@@ -52,15 +53,24 @@ def picture(frame: StampedFrame, time_ns: int) -> Message:
     )
 
 
-def calibration(name: str, model: CameraModel, time_ns: int) -> tuple[Message | None, dict[str, Any]]:
+def calibration(
+    name: str, camera: RigCamera, digest: str, time_ns: int
+) -> tuple[Message | None, CameraRecord]:
     """Return the nearest ``plumb_bob`` camera (None if there is none) and the camera itself, as JSON."""
-    told: dict[str, Any] = {"camera": name, "model": _model_told(model)}
+    model = camera.model
+
+    def record(near: dict[str, Any]) -> CameraRecord:
+        return {
+            "camera": name, "model": _model_record(model), "plumb_bob": near, "on": camera.on,
+            "mast_digest": digest,
+        }  # fmt: skip
+
     if np.linalg.det([model.H, model.V, model.A]) < 0.0:
-        return None, told | {"plumb_bob": {"none": "the picture is mirrored, and no camera of this kind is"}}
+        return None, record({"none": "the image is mirrored, and no plumb_bob camera is"})
     try:
         near, error_px = _nearest(model)
     except ValueError as error:
-        return None, told | {"plumb_bob": {"none": str(error)}}
+        return None, record({"none": str(error)})
     width, height = model.size_px
     message = CameraCalibration(
         timestamp=_stamp(time_ns),
@@ -73,7 +83,7 @@ def calibration(name: str, model: CameraModel, time_ns: int) -> tuple[Message | 
         R=np.eye(3).ravel().tolist(),
         P=np.hstack([near.camera_matrix, np.zeros((3, 1))]).ravel().tolist(),
     )
-    return message, told | {"plumb_bob": _near_told(error_px)}
+    return message, record(_distance(error_px))
 
 
 @lru_cache(maxsize=64)
@@ -84,8 +94,8 @@ def _nearest(model: CameraModel) -> tuple[CameraModel, TwinError]:
 
 
 def transforms(rig: Rig, pan_rad: float, tilt_rad: float, time_ns: int) -> Message:
-    """Return where mast, head and cameras stand at true joint angles: rover <- mast <- head <- cameras, and
-    those on the body.
+    """Return the poses of mast, head and cameras at true joint angles: rover <- mast <- head <- cameras, and
+    those of body cameras.
     """
     mast = rig.mast
     known: list[tuple[str, str, Rigid]] = [
@@ -114,25 +124,25 @@ def _transform(parent: str, child: str, parent_from_child: Rigid, time_ns: int) 
     return message
 
 
-def pointings_told(operation: Mapping[str, Any]) -> Sequence[dict[str, Any]]:
-    """Return each pointing of an operation's record that measured a residual, as ``/residual`` has it."""
-    result = operation.get("result") or {}
-    rows = result.get("pointings") or []
-    told = [{"operation": operation.get("id"), "pointing": at, **row} for at, row in enumerate(rows, start=1)]
-    return [row for row in told if row.get("residual_px") is not None]
+def residuals(operation: Mapping[str, Any]) -> Sequence[dict[str, Any]]:
+    """Return each pointing of an operation's record that measured a residual, as `ResidualRecord`."""
+    rows = enumerate((operation.get("result") or {}).get("pointings") or [], start=1)
+    records = [{"operation": operation.get("id"), "pointing": number, **row} for number, row in rows]
+    return [one for one in records if one.get("residual_px") is not None]
 
 
-def target_told(operation: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return where an operation's target stands, as the topic ``/target`` has it; None if nobody knows."""
+def target(operation: Mapping[str, Any]) -> TargetRecord | None:
+    """Return where an operation's target is; None if that is not known."""
     result = operation.get("result") or {}
     if not result.get("position_m"):
         return None
-    told = {name: result.get(name) for name in ("position_m", "range_m")}
-    return {"operation": operation.get("id"), **told}
+    return {
+        "operation": operation["id"], "position_m": result["position_m"], "range_m": result.get("range_m")
+    }  # fmt: skip
 
 
 def target_scene(position_m: Sequence[float], time_ns: int) -> Message:
-    """Return a target as viewers draw it: a ball at its place in the rover frame."""
+    """Return a target as viewers draw it: a ball at its position in the rover frame."""
     scene = SceneUpdate()
     entity = scene.entities.add(timestamp=_stamp(time_ns), frame_id="rover", id="target")
     ball = entity.spheres.add()
@@ -143,20 +153,20 @@ def target_scene(position_m: Sequence[float], time_ns: int) -> Message:
     return scene
 
 
-def _model_told(model: CameraModel) -> dict[str, Any]:
-    told: dict[str, Any] = {"model": model.kind, "size_px": list(model.size_px)}
-    told |= {letter: as_json(getattr(model, letter)) for letter in model.letters if letter != "D"}
+def _model_record(model: CameraModel) -> dict[str, Any]:
+    record: dict[str, Any] = {"model": model.kind, "size_px": list(model.size_px)}
+    record |= {letter: as_json(getattr(model, letter)) for letter in model.letters if letter != "D"}
     if len(model.distortion):
-        told |= {key: as_json(getattr(model, key)) for key in ("distortion", "camera_matrix", "rotation")}
+        record |= {key: as_json(getattr(model, key)) for key in ("distortion", "camera_matrix", "rotation")}
     if model.kind == "CAHVORE":
-        told |= {"type": int(model.cahvore_type), "linearity": float(model.linearity)}
-    return told
+        record |= {"type": int(model.cahvore_type), "linearity": float(model.linearity)}
+    return record
 
 
-def _near_told(error: TwinError) -> dict[str, Any]:
+def _distance(error: TwinError) -> dict[str, Any]:
     """How far the nearest camera is; null where it does not see all of the image."""
-    told = {"rms_px": error.rms_px, "worst_px": error.worst_px}
-    return {name: value if np.isfinite(value) else None for name, value in told.items()}
+    distance: dict[str, Any] = as_json({"rms_px": error.rms_px, "worst_px": error.worst_px})
+    return distance
 
 
 def _stamp(time_ns: int) -> Timestamp:

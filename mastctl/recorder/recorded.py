@@ -37,7 +37,7 @@ class Recording:
     found
         What each of them holds, and how it ended.
     facts
-        Words that were written at its start.
+        The metadata at its start.
     masts
         Attached mast files by digest, the first one first.
     config
@@ -67,7 +67,7 @@ class Recording:
             raise BadRecording(f"{self.path}: no mast file is attached to it")
         return next(iter(self.masts.values()))
 
-    def told(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """Return what it holds as JSON."""
         first = [one.first_ns for one in self.found if one.first_ns is not None]
         last = [one.last_ns for one in self.found if one.last_ns is not None]
@@ -135,11 +135,11 @@ class _Reader:
             elif isinstance(item, Attachment):
                 self._attached(file, Attached(item.name, bytes(item.data), item.media_type))
             elif isinstance(item, McapEntry) and item.channel.topic in ("/operation", "/handoff"):
-                self._told(item)
+                self._record(item)
 
     def _attached(self, file: Path, one: Attached) -> None:
-        told = self.facts.get(f"sha256 {one.name}")
-        if told is not None and told != one.digest and one.digest not in self.masts:
+        digest = self.facts.get(f"sha256 {one.name}")
+        if digest is not None and digest != one.digest and one.digest not in self.masts:
             log.warning("%s: %s is not what it was when the recording began", file, one.name)
         try:
             schema = parse_mapping(one.data, one.name).get("schema")
@@ -150,17 +150,17 @@ class _Reader:
         except BadFile as error:
             log.warning("%s: an attached file cannot be used: %s", file, error)
 
-    def _told(self, item: McapEntry) -> None:
+    def _record(self, item: McapEntry) -> None:
         try:
-            told = json.loads(item.message.data)
+            record = json.loads(item.message.data)
         except (ValueError, RecursionError):
             return
-        if not isinstance(told, dict):
+        if not isinstance(record, dict):
             return
         if item.channel.topic == "/handoff":
-            self.handoffs.append(told)
-        elif isinstance(told.get("id"), str):
-            self.operations[told["id"]] = told
+            self.handoffs.append(record)
+        elif isinstance(record.get("id"), str):
+            self.operations[record["id"]] = record
 
 
 def replay_files(recording: Recording, folder: Path, listen: dict[str, Any]) -> Path:

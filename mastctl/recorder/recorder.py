@@ -1,11 +1,11 @@
-"""The recorder: what the daemon publishes, written down without anybody waiting for it.
+"""The recorder: what the daemon publishes, written to MCAP files without delaying the daemon.
 
-Whoever tells it something leaves it in a queue that is bounded by its bytes; what does not fit is dropped,
-counted and told, in the recording too. A thread of its own does everything that touches the disk, which may
-be slow, full or gone: then there is a standing fault, and the daemon goes on.
+One thread reads what is published and does everything that touches the disk, which may be slow, full or
+gone: then there is a standing fault, and the daemon goes on. The publisher keeps what the thread has not read
+yet, up to a bound beyond which the oldest values are dropped and counted, in the recording too.
 
 One file is written at a time: the ring's newest segment, or a run. Each begins with mast file, configuration,
-cameras and what was known last, so that it can be read alone.
+cameras and the newest of what was known, so that it can be read alone.
 """
 
 from __future__ import annotations
@@ -17,56 +17,39 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from calib.geometry.rig import Rig
 from drivers.clock import Clock
-from mastctl.answers import RecorderTold, RecordingDeleted, RecordingEnded, RecordingListed
+from mastctl.answers import RecorderTold, RecordingDeleted, RecordingEnded, RecordingListed, Recordings
 from mastctl.as_json import readable
+from mastctl.control.publisher import TOPICS, Publisher, Topic
 from mastctl.control.standing import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError, NotKnown, NotNow, Unable
-from mastctl.recorder.entries import Entries
+from mastctl.recorder.entries import Entries, Entry
+from mastctl.recorder.folder import MB, Recorded, RecordFolder
 from mastctl.recorder.settings import RecordSettings
-from mastctl.recorder.shelf import MB, Recorded, Shelf
 from mastctl.recorder.writer import Attached, Clocks, RecordFile
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 NAME = "recorder"
-QUEUE_BYTES = 64 << 20
-QUEUE_LENGTH = 20_000
+NOT_RECORDED: frozenset[Topic] = frozenset({"bench"})
+"""A bench calibration's own folder has all of it."""
 SEGMENTS = 6
 AFTER_FAULT_S = 10.0
 SAME_FAULT_S = 600.0
-AGAIN_S = 5.0
-ROOM_AGAIN = 1.1
+RETRY_S = 5.0
+RESUME_FREE = 1.1
 SLOW_S = 5.0
 ANSWER_S = 5.0
 CLOSE_S = 3.0
-SMALL_BYTES = 1000
-WAIT_S = 0.25
-ANOTHER_RUN = "another run begins"
-
-
-@dataclass(frozen=True)
-class RecordedNews:
-    """One thing that was published, on its way to the file."""
-
-    topic: str
-    key: str
-    value: Any
-    time_s: float
-
-    @property
-    def bytes(self) -> int:
-        """About how much memory it holds."""
-        if isinstance(self.value, StampedFrame):
-            return len(self.value.jpeg) or self.value.image.nbytes
-        return SMALL_BYTES
+WAIT_S = 0.1
+NEXT_RUN = "another run begins"
 
 
 @dataclass(frozen=True)
@@ -84,7 +67,7 @@ class _Now:
     file: RecordFile | None = None
     run: str | None = None
     begun_s: float = 0.0
-    words: StandingFault | None = None
+    fault: StandingFault | None = None
     retry_s: float = 0.0
     keep_at_s: float | None = None
     keep_why: str = ""
@@ -92,18 +75,20 @@ class _Now:
 
 
 class Recorder:
-    """Writes down what it is told; safe to use from any thread.
+    """Records what is published, and runs that are begun and ended; safe to use from any thread.
 
     Parameters
     ----------
     settings, folder
-        How much, and where; ``settings.ring_s`` must be resolved.
+        How much, and where.
     mast
         The mast file in use.
     others
         What else is attached: the configuration.
     facts
-        Words for each file: hardware, version.
+        Of each file: ``hardware``, its kind; ``version``.
+    publisher, frame_by_id
+        What is recorded, and where the images are; ``frame_by_id`` raises MastctlError for one that is gone.
     clock
         The daemon's, which stamps what is recorded. The disk's own times go by the machine's.
     """
@@ -115,62 +100,46 @@ class Recorder:
         mast: AttachedMast,
         others: list[Attached],
         facts: dict[str, str],
+        publisher: Publisher,
+        frame_by_id: Callable[[str], StampedFrame],
         clock: Clock,
     ) -> None:
-        self.settings = settings
-        self._ring_s = settings.ring_s or 0.0
-        self._shelf = Shelf(folder)
-        self._mast = mast
-        self._others = others
         self._facts = facts
+        self.use_settings(settings, others)
+        self._folder = RecordFolder(folder)
+        self._mast = mast
         self._clock = clock
+        self._frame_by_id = frame_by_id
         self._entries = Entries(mast.rig, mast.file.digest)
-        self._lock = threading.Condition()  # held for an append or a hand-over, never for longer
-        self._queue: deque[RecordedNews] = deque()
-        self._acts: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
-        self._queued_bytes = 0
+        self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
+        self._requests_lock = threading.Lock()
+        self._closing = False
         self._dropped: Counter[str] = Counter()
         self._kept_before: dict[tuple[str, str], float] = {}
         self._standing: set[tuple[str, str]] = set()
         self._now = _Now()
         self._busy_since_s: tuple[float, float] | None = None
-        self._closing = False
+        self._news = publisher.subscribe(*(TOPICS - NOT_RECORDED), every=True)
         self._thread = threading.Thread(target=self._work, name=NAME, daemon=True)
         self._thread.start()
 
-    # For everybody: nothing here waits for the disk, but `start_run` and `stop_run`
-
-    def tell(self, topic: str, key: str, value: Any, time_s: float | None = None) -> None:
-        """Leave something to be written down; never waits, never raises."""
-        now = self._now
-        mast = isinstance(value, AttachedMast)  # never left out: all later pictures are measured by it
-        if not (self._ring_s or now.run or self._acts or mast or topic in Entries.STICKY):
-            return  # nothing is recorded
-        one = RecordedNews(topic, key, value, self._clock.now_s() if time_s is None else time_s)
-        with self._lock:
-            full = self._queued_bytes + one.bytes > QUEUE_BYTES or len(self._queue) >= QUEUE_LENGTH
-            if (full and not mast) or self._closing:
-                self._dropped[topic] += 1
-                return
-            self._queue.append(one)
-            self._queued_bytes += one.bytes
-            self._lock.notify()
-
-    def missed(self, topic: str, count: int) -> None:
-        """Count what never came to be told: newer values took its place."""
-        with self._lock:
-            self._dropped[topic] += count
+    # For any thread: only what is asked of the writing thread waits for the disk, and that bounded
 
     def use_mast(self, mast: AttachedMast) -> None:
-        """Put another mast file into the recording, for what comes from now on."""
-        self.tell("mast_file", "in_use", mast)
+        """Attach another mast file, for what comes from now on."""
+        self._request(lambda: self._use_mast(mast))
 
     def use_settings(self, settings: RecordSettings, others: list[Attached]) -> None:
         """Keep as much as this, in the same folder; attach something else from the next file on."""
-        with self._lock:
-            self.settings, self._ring_s, self._others = settings, settings.ring_s or 0.0, others
+        self._ring_s = settings.ring_of(self._facts["hardware"])
+        self._settings, self._others = settings, others
 
-    def told(self) -> RecorderTold:
+    def add_handoff(self, line: dict[str, Any]) -> None:
+        """Record a hand-off, a line of the log of hand-offs."""
+        time_s = self._clock.now_s()
+        self._request(lambda: self._write([Entry("handoff", line["time"], line, time_s)]))
+
+    def summary(self) -> RecorderTold:
         """Return what is recorded now, as JSON: the run's name, sizes in 10⁶ bytes, what was dropped."""
         now = self._now
         file = now.file
@@ -181,39 +150,38 @@ class Recorder:
             "file": None if file is None else file.path.name,
             "size_mb": 0.0 if file is None else file.size_mb,
             "dropped": self._dropped_so_far(),
-            "fault": None if now.words is None else now.words.message,
-            "folder": str(self._shelf.folder),
+            "fault": None if now.fault is None else now.fault.message,
+            "folder": str(self._folder.path),
         }
 
-    def free_mb(self) -> float | None:
-        """Return how much the disk has free, 10⁶ bytes; None if it does not say. Asks the disk."""
+    def listing(self) -> Recordings:
+        """Return every recording, and what is recorded now, as ``GET /recordings`` has it.
+
+        Raises
+        ------
+        Unable
+            ``unreadable``.
+        """
         try:
-            return self._shelf.free_bytes() / MB
+            free_mb = self._folder.free_bytes() / MB
         except OSError:
-            return None
+            free_mb = None
+        return {"recordings": self._recordings(), "recorder": self.summary(), "free_mb": free_mb}
 
     def faults(self) -> tuple[StandingFault, ...]:
         """Return what keeps it from recording."""
-        found = [one for one in (self._now.words,) if one is not None]
+        found = [one for one in (self._now.fault,) if one is not None]
         busy, file = self._busy_since_s, self._now.file
         waits_s = 0.0 if file is None else file.disk_waits_s
         if busy is None and waits_s > SLOW_S:
             busy = time.monotonic() - waits_s, self._clock.now_s() - waits_s
         if busy is not None and time.monotonic() - busy[0] > SLOW_S:
-            words = f"{self._shelf.folder} does not answer; the record may lack events of this time"
-            found.append(StandingFault(NAME, "slow", words, busy[1], "the disk answers"))
+            message = f"{self._folder.path} does not answer; the record may lack events of this time"
+            found.append(StandingFault(NAME, "slow", message, busy[1], "the disk answers"))
         return tuple(found)
 
-    def recordings(self) -> list[RecordingListed]:
-        """Return what lies in the folder, as JSON. Raises Unable ``unreadable``."""
-        try:
-            return [one.told() for one in self._shelf.all()]
-        except OSError as error:
-            words = f"{self._shelf.folder} cannot be read: {error.strerror or error}"
-            raise Unable("unreadable", words) from None
-
     def file(self, name: str, file: str) -> Path:
-        """Return a file of a recording, by the names that `recordings` tells.
+        """Return a file of a recording, by the names that `listing` has.
 
         Raises
         ------
@@ -233,7 +201,7 @@ class Recorder:
         return found
 
     def delete(self, name: str) -> RecordingDeleted:
-        """Delete a run, or what a fault kept; return what is left, as `recordings`.
+        """Delete a run, or what a fault kept; return the recordings that are left.
 
         Raises
         ------
@@ -244,20 +212,10 @@ class Recorder:
         Unable
             ``unwritable`` if the disk refuses, ``unreadable``; ``slow`` if it does not answer in time.
         """
-        return self._asked(lambda: self._delete(name))
-
-    def _found(self, name: str) -> Recorded:
-        try:
-            found = next((one for one in self._shelf.all() if one.name == name), None)
-        except OSError as error:
-            words = f"{self._shelf.folder} cannot be read: {error.strerror or error}"
-            raise Unable("unreadable", words) from None
-        if found is None:
-            raise NotKnown("recording_unknown", f"there is no recording {name[:80]}")
-        return found
+        return self._result(lambda: self._delete(name))
 
     def start_run(self, name: str) -> RecorderTold:
-        """Begin a run and return `told`.
+        """Begin a run and return `summary`.
 
         Raises
         ------
@@ -266,7 +224,7 @@ class Recorder:
         Unable
             ``unwritable``, ``disk_low``; ``slow`` if the disk does not answer in time.
         """
-        return self._asked(lambda: self._start_run(name))
+        return self._result(lambda: self._start_run(name))
 
     def stop_run(self) -> RecordingEnded:
         """End the run and return its name and size; what is recorded then is the ring again.
@@ -276,68 +234,85 @@ class Recorder:
         NotNow
             ``not_recording``.
         Unable
-            ``run_gone`` if its file is there no longer; ``slow`` if the disk does not answer in time.
+            ``run_gone`` if its file was removed; ``slow`` if the disk does not answer in time.
         """
-        return self._asked(self._stop_run)
+        return self._result(self._stop_run)
 
     def close(self) -> None:
-        """Write down what waits and end the file; bounded. Does nothing the second time."""
-        with self._lock:
+        """Write what was published so far and end the file; bounded. Does nothing the second time."""
+        with self._requests_lock:
             self._closing = True
-            self._lock.notify()
+        self._news.close()
         self._thread.join(CLOSE_S)
         if self._thread.is_alive():
-            log.error("%s does not answer; the newest second is not written down", self._shelf.folder)
+            log.error("%s does not answer; the newest second is not recorded", self._folder.path)
+
+    def _request(self, act: Callable[[], T]) -> Future[T]:
+        """Have the writing thread do something."""
+        answer: Future[T] = Future()
+        with self._requests_lock:
+            if self._closing:
+                answer.set_exception(Unable("closing", "the service is closing"))
+            else:
+                self._requests.append((act, answer))
+        return answer
+
+    def _result(self, act: Callable[[], T]) -> T:
+        """Have the writing thread do something, and wait for its result."""
+        try:
+            return self._request(act).result(ANSWER_S)
+        except TimeoutError:
+            message = f"{self._folder.path} did not answer within {ANSWER_S:g} s; the recorder goes on trying"
+            raise Unable("slow", message) from None
+
+    def _recordings(self) -> list[RecordingListed]:
+        return [one.as_json() for one in self._all()]
+
+    def _all(self) -> list[Recorded]:
+        try:
+            return self._folder.all()
+        except OSError as error:
+            message = f"{self._folder.path} cannot be read: {error.strerror or error}"
+            raise Unable("unreadable", message) from None
+
+    def _found(self, name: str) -> Recorded:
+        found = next((one for one in self._all() if one.name == name), None)
+        if found is None:
+            raise NotKnown("recording_unknown", f"there is no recording {name[:80]}")
+        return found
 
     def _dropped_so_far(self) -> dict[str, int]:
-        with self._lock:
-            return dict(self._dropped)
-
-    def _asked(self, act: Callable[[], T]) -> T:
-        """Have the writing thread do something, and wait for it."""
-        answer: Future[T] = Future()
-        with self._lock:
-            if self._closing:
-                raise Unable("closing", "the service is closing")
-            self._acts.append((act, answer))
-            self._lock.notify()
-        try:
-            return answer.result(ANSWER_S)
-        except TimeoutError:
-            words = f"{self._shelf.folder} did not answer within {ANSWER_S:g} s; the recorder goes on trying"
-            raise Unable("slow", words) from None
+        """How many values were not recorded, by topic; ``overtaken``: that the publisher did not keep."""
+        lost = self._news.lost
+        return dict(self._dropped) | ({"overtaken": lost} if lost else {})
 
     # In the writing thread
 
     def _work(self) -> None:
         while True:
-            with self._lock:
-                if not self._queue and not self._acts and not self._closing:
-                    self._lock.wait(WAIT_S if self._awake else None)
-                batch, self._queue, self._queued_bytes = self._queue, deque(), 0
-                acts, self._acts = self._acts, deque()
-                closing = self._closing
+            with self._requests_lock:
+                closing, requests, self._requests = self._closing, self._requests, deque()
+            news = self._news.wait(0.0 if requests else WAIT_S)
             self._busy_since_s = time.monotonic(), self._clock.now_s()
-            self._guarded(lambda batch=batch: self._write(batch))  # type: ignore[misc]
-            for act, answer in acts:
+            time_s = self._clock.now_s()
+            entries = [Entry(one.topic, one.key, one.value, time_s) for one in news]
+            self._guarded(lambda entries=entries: self._write(entries))  # type: ignore[misc]
+            for act, answer in requests:
                 self._answer(act, answer)
             self._guarded(self._look_after)
             self._busy_since_s = None
-            if closing:
+            if closing and not news:
                 self._guarded(self._end_file)
                 return
-
-    @property
-    def _awake(self) -> bool:
-        """Whether there is something to look after without being told anything."""
-        return self._now.file is not None or self._now.keep_at_s is not None
+            if self._news.closed and not news:
+                time.sleep(WAIT_S)  # the publisher was closed first
 
     def _answer(self, act: Callable[[], Any], answer: Future[Any]) -> None:
         try:
             answer.set_result(act())
         except OSError as error:
             self._failed(error)
-            answer.set_exception(Unable("unwritable", self._now.words.message if self._now.words else ""))
+            answer.set_exception(Unable("unwritable", self._now.fault.message if self._now.fault else ""))
         except MastctlError as error:
             answer.set_exception(error)
         except Exception as error:  # a defect must not end the thread
@@ -345,7 +320,7 @@ class Recorder:
             answer.set_exception(error)
 
     def _guarded(self, work: Callable[[], None]) -> None:
-        """Whatever the disk does, the thread goes on."""
+        """Do something; whatever the disk does, the thread goes on."""
         try:
             work()
         except OSError as error:
@@ -354,61 +329,61 @@ class Recorder:
             log.exception("the recorder met a defect of the program")
 
     def _failed(self, error: OSError) -> None:
-        """Give the file up, as a killed daemon leaves it, and try another one in a while."""
-        words = f"{self._shelf.folder} cannot be written: {error.strerror or error}; nothing is recorded"
+        """Give the file up, as a killed daemon leaves it, and try another one after a while."""
+        message = f"{self._folder.path} cannot be written: {error.strerror or error}; nothing is recorded"
         if self._now.run is not None:
-            words += f", and the run {self._now.run} has ended"
-        self._stands("unwritable", words, "it can be written again")
+            message += f", and the run {self._now.run} has ended"
+        self._set_fault("unwritable", message, "it can be written again")
         if self._now.file is not None:
             with contextlib.suppress(OSError):
                 self._now.file.abandon()
         self._now.file, self._now.run = None, None
-        self._now.retry_s = time.monotonic() + AGAIN_S
+        self._now.retry_s = time.monotonic() + RETRY_S
 
-    def _stands(self, code: str, words: str, until: str) -> None:
-        before = self._now.words
+    def _set_fault(self, code: str, message: str, until: str) -> None:
+        before = self._now.fault
         since_s = self._clock.now_s() if before is None or before.code != code else before.since_s
-        self._now.words = StandingFault(NAME, code, words, since_s, until)
+        self._now.fault = StandingFault(NAME, code, message, since_s, until)
         if before is None or before.code != code:
-            log.error("%s", words)
+            log.error("%s", message)
 
-    def _write(self, batch: deque[RecordedNews]) -> None:
-        """Put what was told into the file, if there is one to be written."""
-        dropped = self._dropped_so_far()
-        for at, one in enumerate(batch):
+    def _write(self, entries: list[Entry]) -> None:
+        """Write what was published into the file, if there is one to be written."""
+        for at, one in enumerate(entries):
             try:
-                self._notice(one)
+                self._notice_fault(one)
                 if self._now.file is None and not self._open_ring():
-                    self._remember(one)
+                    self._entries.remember(one)
                     continue
                 assert self._now.file is not None
+                if one.topic == "frame" and not isinstance(one.value, StampedFrame):
+                    one = replace(one, value=self._frame_by_id(one.value.frame_id))
                 self._entries.write(self._now.file, one, time.monotonic())
+            except MastctlError:  # the frame is gone
+                self._dropped[one.topic] += 1
             except OSError:
-                for rest in list(batch)[at:]:
-                    self.missed(rest.topic, 1)
-                    self._remember(rest)
+                self._dropped.update(rest.topic for rest in entries[at:])
+                for rest in entries[at:]:
+                    self._entries.remember(rest)
                 raise
-            except Exception:  # a value of a kind that nobody expected must not end the recording
-                self.missed(one.topic, 1)
+            except Exception:  # a value of an unexpected kind must not end the recording
+                self._dropped[one.topic] += 1
                 log.exception("the message %s %s cannot be recorded", one.topic, one.key)
-        if dropped and self._now.file is not None:
-            self._entries.tell_dropped(self._now.file, dropped, self._clock.now_s(), time.monotonic())
+        if (dropped := self._dropped_so_far()) and self._now.file is not None:
+            self._entries.write_dropped(self._now.file, dropped, self._clock.now_s(), time.monotonic())
 
-    def _remember(self, one: RecordedNews) -> None:
-        """Keep what the next file must begin with."""
-        self._entries.remember(one)
-        if isinstance(one.value, AttachedMast):
-            self._mast = one.value
-            self._entries.use_mast(one.value.rig, one.value.file.digest)
+    def _use_mast(self, mast: AttachedMast) -> None:
+        self._mast = mast
+        self._entries.use_mast(mast.rig, mast.file.digest)
+        file = self._now.file
+        if file is not None:
+            time_s = self._clock.now_s()
+            file.attach(mast.file, file.clocks.ns(time_s))
+            self._entries.write_cameras(file, time_s, time.monotonic())
 
-    def _notice(self, one: RecordedNews) -> None:
-        """See what changes the recording itself: another mast file, a fault."""
-        if isinstance(one.value, AttachedMast):
-            self._remember(one)
-            if self._now.file is not None:
-                self._now.file.attach(one.value.file, self._now.file.clocks.ns(one.time_s))
-                self._entries.tell_cameras(self._now.file, one.time_s, time.monotonic())
-        if one.topic != "fault" or one.key == NAME:  # a disk that is full is not told to keep more
+    def _notice_fault(self, one: Entry) -> None:
+        """Have the ring kept soon after a fault that is new."""
+        if one.topic != "fault" or one.key == NAME:  # a disk that is full is not asked to keep more
             return
         now_s = time.monotonic()
         standing = {(one.key, fault.code) for fault in one.value}
@@ -421,7 +396,7 @@ class Recorder:
         self._kept_before |= dict.fromkeys(new, now_s)
 
     def _look_after(self) -> None:
-        """Flush, go on to the next file, keep what a fault wants kept, stay within the bounds."""
+        """Flush, go on to the next file, keep the ring after a fault, stay within the bounds."""
         now, now_s = self._now, time.monotonic()
         if now.keep_at_s is not None and (now_s >= now.keep_at_s or self._closing):
             self._keep()
@@ -429,22 +404,23 @@ class Recorder:
         if file is None or self._gone(file):
             return
         file.flush_if_due(now_s)
-        if file.size == now.judged_bytes or self._room_is_low():
+        if file.size == now.judged_bytes or self._disk_is_low():
             return
         now.judged_bytes = file.size
         if now.run is not None:
-            if file.size > self.settings.run_mb * MB:
-                name, mb = now.run, self.settings.run_mb
+            if file.size > self._settings.run_mb * MB:
+                name, mb = now.run, self._settings.run_mb
                 self._end_file()
-                self._stands("run_full", f"the run {name} has ended: it has {mb:g} MB", ANOTHER_RUN)
+                self._set_fault("run_full", f"the run {name} has ended: it has {mb:g} MB", NEXT_RUN)
         elif (
-            now_s - now.begun_s > self._ring_s / SEGMENTS or file.size > self.settings.ring_mb * MB / SEGMENTS
+            now_s - now.begun_s > self._ring_s / SEGMENTS
+            or file.size > self._settings.ring_mb * MB / SEGMENTS
         ):
             self._end_file(wait=False)
-            self._shelf.trim_ring(self._ring_s, self.settings.ring_mb)
+            self._folder.trim_ring(self._ring_s, self._settings.ring_mb)
 
     def _gone(self, file: RecordFile) -> bool:
-        """End a file that somebody took away, so that it is not written on where nobody finds it."""
+        """End a file that was moved or deleted; return whether it was."""
         if file.in_place:
             return False
         run, how = self._now.run, f"its file {file.path} was deleted or moved while it was recorded"
@@ -452,24 +428,24 @@ class Recorder:
         if run is None:
             log.warning("another segment of the ring begins: %s", how)
         else:
-            self._stands("run_gone", f"the run {run} has ended: {how}", ANOTHER_RUN)
+            self._set_fault("run_gone", f"the run {run} has ended: {how}", NEXT_RUN)
         return True
 
-    def _room_is_low(self) -> bool:
-        """End the recording before the disk is full, the ring's oldest first; whether it was ended."""
-        least = self.settings.free_mb * MB
-        while self._shelf.free_bytes() < least:
-            if self._shelf.drop_oldest_segment():
+    def _disk_is_low(self) -> bool:
+        """End the recording before the disk is full, the ring's oldest first; return whether it was ended."""
+        least = self._settings.free_mb * MB
+        while self._folder.free_bytes() < least:
+            if self._folder.drop_oldest_segment():
                 continue
-            free_mb = self._shelf.free_bytes() / MB
+            free_mb = self._folder.free_bytes() / MB
             run = "" if self._now.run is None else f", and the run {self._now.run} has ended"
-            words = (
-                f"the disk of {self._shelf.folder} has {free_mb:.0f} MB free where "
-                f"{self.settings.free_mb:g} MB are left to others; nothing is recorded{run}"
+            message = (
+                f"the disk of {self._folder.path} has {free_mb:.0f} MB free where "
+                f"{self._settings.free_mb:g} MB are left to others; nothing is recorded{run}"
             )
             self._end_file()
-            self._stands("disk_low", words, "there is more room")
-            self._now.retry_s = time.monotonic() + AGAIN_S
+            self._set_fault("disk_low", message, "there is more room")
+            self._now.retry_s = time.monotonic() + RETRY_S
             return True
         return False
 
@@ -479,30 +455,30 @@ class Recorder:
         now.keep_at_s = None
         if now.run is None:
             self._end_file()
-        if name := self._shelf.keep_ring(now.keep_why, self.settings.kept_mb):
+        if name := self._folder.keep_ring(now.keep_why, self._settings.kept_mb):
             log.warning("the recording around a fault is kept: %s", name)
 
     def _open_ring(self) -> bool:
         """Open the ring's next segment, if there is to be one now."""
         if not self._ring_s or time.monotonic() < self._now.retry_s:
             return False
-        return self._open(lambda: self._shelf.next_segment(), None)
+        return self._open(lambda: self._folder.next_segment(), None)
 
     def _open(self, path: Callable[[], Path], run: str | None) -> bool:
-        """Open a file, tell it what was known last; False if there is no room."""
-        self._shelf.prepare()
-        room = ROOM_AGAIN if self._now.words is not None and self._now.words.code == "disk_low" else 1.0
-        if self._shelf.free_bytes() < room * self.settings.free_mb * MB:
-            self._room_is_low()
-            self._now.retry_s = time.monotonic() + AGAIN_S
-            if self._shelf.free_bytes() < room * self.settings.free_mb * MB:
+        """Open a file and write what was known last; False if the disk is low."""
+        self._folder.prepare()
+        factor = RESUME_FREE if self._now.fault is not None and self._now.fault.code == "disk_low" else 1.0
+        if self._folder.free_bytes() < factor * self._settings.free_mb * MB:
+            self._disk_is_low()
+            self._now.retry_s = time.monotonic() + RETRY_S
+            if self._folder.free_bytes() < factor * self._settings.free_mb * MB:
                 return False
         clocks = Clocks(self._clock.now_s(), time.time_ns())
         facts = self._facts | ({} if run is None else {"run": run})
         self._now.file = RecordFile(path(), [self._mast.file, *self._others], facts, clocks)
         self._now.begun_s, self._now.run = time.monotonic(), run
-        if run is not None or (self._now.words is not None and self._now.words.until != ANOTHER_RUN):
-            self._now.words = None
+        if run is not None or (self._now.fault is not None and self._now.fault.until != NEXT_RUN):
+            self._now.fault = None
         self._entries.begin(self._now.file, self._clock.now_s(), time.monotonic())
         return True
 
@@ -516,35 +492,35 @@ class Recorder:
         if self._now.run is not None:
             raise NotNow("recording", f"the run {self._now.run} is recorded already; end it first")
         self._end_file()
-        self._shelf.prepare()
-        path = self._shelf.next_run(name)
+        self._folder.prepare()
+        path = self._folder.next_run(name)
         if not self._open(lambda: path, path.stem):
-            words = self._now.words
-            raise Unable("disk_low", "there is no room" if words is None else words.message)
+            fault = self._now.fault
+            raise Unable("disk_low", "the disk is full" if fault is None else fault.message)
         log.info("run %s is recorded", path.stem)
-        return self.told()
+        return self.summary()
 
     def _delete(self, name: str) -> RecordingDeleted:
         one = self._found(name)
         if one.kind == "ring":
-            words = "the ring is written over and over; record.ring_s in the configuration says how long"
-            raise NotNow("recording", words)
+            message = "the ring is overwritten by itself; record.ring_s in the configuration says when"
+            raise NotNow("recording", message)
         if name == self._now.run:
             raise NotNow("recording", f"the run {name} is recorded; end it first")
         try:
-            self._shelf.delete(one)
+            self._folder.delete(one)
         except OSError as error:
             raise Unable("unwritable", f"{name} cannot be deleted: {error.strerror or error}") from None
         log.info("the recording %s was deleted", name)
-        return {"recordings": self.recordings()}
+        return {"recordings": self._recordings()}
 
     def _stop_run(self) -> RecordingEnded:
         file, run = self._now.file, self._now.run
         if file is None or run is None:
             raise NotNow("not_recording", "no run is recorded; 'record start' begins one")
         if self._gone(file):
-            assert self._now.words is not None
-            raise Unable("run_gone", self._now.words.message)
+            assert self._now.fault is not None
+            raise Unable("run_gone", self._now.fault.message)
         self._end_file()
         log.info("run %s has ended", run)
         dropped = self._dropped_so_far()

@@ -1,10 +1,13 @@
-"""What the topics of a recording hold: Foxglove's protobuf messages, and JSON with a schema for our own."""
+"""What the topics of a recording hold: Foxglove's protobuf messages, and our own records as JSON.
+
+The JSON schema of a record is made from its type: the one that the daemon publishes or answers with, or the
+one below that the recorder fills.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -17,130 +20,112 @@ from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message
 from mcap.well_known import MessageEncoding, SchemaEncoding
+from pydantic import TypeAdapter
+from typing_extensions import TypedDict
+
+from mastctl.answers import CommandTold, Count, Json, MastTold, PointingTold
+from mastctl.control.lease import WhoSteers
+from mastctl.control.records import Operation
+from mastctl.control.standing import Standing, StandingFault
+from mastctl.frame_facts import FrameFacts
 
 PROTOBUF: Mapping[str, type[Message]] = {
-    "foxglove.CompressedImage": CompressedImage,
-    "foxglove.RawImage": RawImage,
-    "foxglove.CameraCalibration": CameraCalibration,
-    "foxglove.FrameTransforms": FrameTransforms,
-    "foxglove.SceneUpdate": SceneUpdate,
+    kind.DESCRIPTOR.full_name: kind
+    for kind in (CompressedImage, RawImage, CameraCalibration, FrameTransforms, SceneUpdate)
 }
 """The messages that Foxglove, Lichtblick and Rerun draw."""
 
-_NUMBER = {"type": "number"}
-_TEXT = {"type": "string"}
-_TEXT_OR_NONE = {"type": ["string", "null"]}
-_SECONDS = {"type": "number", "description": "seconds of the daemon's monotonic clock"}
-_ANGLE = {"type": "number", "description": "radians"}
-_SIDE = {"type": "number", "description": "1 from smaller readings, -1 from larger, 0 not known"}
-_TRULY = {
-    "true_pan_rad": _ANGLE, "true_tilt_rad": _ANGLE, "pan_approach": _SIDE, "tilt_approach": _SIDE,
-}  # fmt: skip
-_PIXEL = {"type": ["array", "null"], "items": {"type": ["number", "null"]}, "description": "x, y in pixels"}
-_POINT = {"type": ["array", "null"], "items": _NUMBER, "description": "x, y, z in metres, rover frame"}
-_ANY = {"type": ["object", "null"]}
 
-_PROPERTIES: Mapping[str, Mapping[str, Any]] = {
-    "frame": {
-        "frame_id": _TEXT, "camera": _TEXT, "sequence": {"type": "integer"}, "mid_exposure_s": _SECONDS,
-        "exposure_s": _NUMBER, "pan_rad": _ANGLE, "tilt_rad": _ANGLE, "moving": {"type": "boolean"},
-        "mast_digest": {"type": "string", "description": "SHA-256 of the mast file in use"},
-        **_TRULY,
-        "settings": {"type": "object", "description": "exposure, gain, ... that it had; null: not known"},
-        "colour": {"type": "boolean", "description": "whether the daemon used the picture in colour"},
-    },
-    "cahvor": {
-        "camera": _TEXT, "mast_digest": _TEXT,
-        "model": {"type": "object", "description": "the camera in its frame, as a mast file holds it"},
-        "plumb_bob": {"type": "object", "description": "how far the nearest plumb_bob is from it, pixels"},
-    },
-    "joints": {
-        "pan_rad": _ANGLE, "tilt_rad": _ANGLE, "moving": {"type": "boolean"}, "time_s": _SECONDS, **_TRULY,
-    },
-    "target": {"operation": _TEXT, "position_m": _POINT, "range_m": {"type": ["number", "null"]}},
-    "residual": {
-        "operation": _TEXT, "pointing": {"type": "integer"}, "camera": _TEXT, "frame_id": _TEXT,
-        "aim_px": _PIXEL, "target_px": _PIXEL, "residual_px": _PIXEL, "residual_sigma_px": _PIXEL,
-        "measured_pan_rad": _ANGLE, "measured_tilt_rad": _ANGLE,
-        "true_pan_rad": _ANGLE, "true_tilt_rad": _ANGLE,
-    },
-    "operation": {
-        "id": _TEXT, "state": _TEXT, "request": _ANY, "created_s": _SECONDS,
-        "steps": {"type": "array", "items": {"type": "object"}}, "result": _ANY, "error": _ANY,
-    },
-    "handoff": {
-        "schema": _TEXT, "time": _TEXT, "source": {"type": "array"}, "destinations": {"type": "object"},
-    },
-    "state": {
-        "word": _TEXT, "reason": _TEXT, "since_s": _SECONDS, "sequence": {"type": "integer"},
-        "operation": _TEXT_OR_NONE, "track": _TEXT_OR_NONE, "target": _ANY, "residual": _ANY, "latch": _ANY,
-    },
-    "fault": {
-        "device": _TEXT,
-        "faults": {
-            "type": "array",
-            "items": {
-                "type": "object",
-                "properties": {
-                    "device": _TEXT, "code": _TEXT, "message": _TEXT, "since_s": _SECONDS, "until": _TEXT,
-                },
-            },
-        },
-    },
-    "command": {
-        "number": {"type": "integer"}, "time": _TEXT, "monotonic_s": _SECONDS, "command": _TEXT, "who": _TEXT,
-        "role": _TEXT, "via": _TEXT, "request": _ANY, "result": _TEXT, "operation": _TEXT_OR_NONE,
-    },
-    "track": {
-        "sequence": {"type": "integer"}, "state": _TEXT, "reason": _TEXT, "id": _TEXT_OR_NONE,
-        "predicted": {"type": "boolean"}, "position_m": _POINT, "looks": {"type": "integer"},
-        "misses": {"type": "integer"},
-    },
-    "lease": {"holder": _TEXT, "kind": _TEXT, "until_s": {"type": ["number", "null"]}},
-    "mast": {"file": _TEXT, "name": _TEXT, "digest": _TEXT},
-    "recorder": {
-        "dropped": {"type": "object", "description": "messages that were not written, by topic, so far"},
-        "reason": _TEXT,
-    },
-}  # fmt: skip
+class JointsRecord(TypedDict):
+    """A reading of the head: radians as read and true, and the side of approach (1 from smaller readings,
+    -1 from larger, 0 not known); seconds of the daemon's monotonic clock."""
+
+    pan_rad: float
+    tilt_rad: float
+    moving: bool
+    time_s: float
+    true_pan_rad: float
+    true_tilt_rad: float
+    pan_approach: float
+    tilt_approach: float
 
 
-OWN_TOPICS = tuple(topic for topic in _PROPERTIES if topic not in ("frame", "cahvor", "handoff", "recorder"))
-"""Topics of JSON that are named as their schemas are, and that the daemon publishes."""
+class CameraRecord(TypedDict):
+    """A camera in its frame as a mast file has it, and how far the nearest plumb_bob camera is, pixels."""
+
+    camera: str
+    on: str
+    mast_digest: str
+    model: Json
+    plumb_bob: Json
 
 
-@dataclass(frozen=True)
-class Described:
-    """How a channel is announced: the encoding of its messages, and that of its schema, ``data``."""
+class TargetRecord(TypedDict):
+    """A target in the rover frame."""
 
-    message: str
-    schema: str
-    data: bytes
+    operation: str
+    position_m: list[float]
+    range_m: float | None
+
+
+class ResidualRecord(PointingTold):
+    """A pointing that measured a residual."""
+
+    operation: str
+    pointing: Count
+
+
+class FaultRecord(TypedDict):
+    """All that is wrong with one device."""
+
+    device: str
+    faults: list[StandingFault]
+
+
+class DroppedRecord(TypedDict):
+    """How many values were not written so far, by topic."""
+
+    dropped: dict[str, Count]
+    reason: str
+
+
+RECORDS: Mapping[str, Any] = {
+    "cahvor": CameraRecord,
+    "command": CommandTold,
+    "fault": FaultRecord,
+    "frame": FrameFacts,
+    "joints": JointsRecord,
+    "lease": WhoSteers,
+    "mast": MastTold,
+    "operation": Operation,
+    "recorder": DroppedRecord,
+    "residual": ResidualRecord,
+    "state": Standing,
+    "target": TargetRecord,
+}
+"""The type of each kind of JSON message; any object where there is none."""
 
 
 @cache
-def described(schema: str) -> Described:
-    """Return how a channel is announced; ``schema`` is ``foxglove.MESSAGE`` or ``mastctl.`` and a topic."""
-    if schema.startswith("foxglove."):
-        return Described(MessageEncoding.Protobuf, SchemaEncoding.Protobuf, descriptor_set(schema))
-    data = json.dumps(json_schema(schema.removeprefix("mastctl."))).encode()
-    return Described(MessageEncoding.JSON, SchemaEncoding.JSONSchema, data)
+def encodings(kind: str) -> tuple[str, str, bytes]:
+    """Return how a kind of message is announced: its encoding, that of its schema, and the schema.
+
+    ``kind`` is ``foxglove.MESSAGE`` or ``mastctl.`` and a key of `RECORDS`.
+    """
+    if kind in PROTOBUF:
+        return MessageEncoding.Protobuf, SchemaEncoding.Protobuf, _file_descriptors(kind)
+    schema = json.dumps(_json_schema(kind.removeprefix("mastctl."))).encode()
+    return MessageEncoding.JSON, SchemaEncoding.JSONSchema, schema
 
 
-def json_schema(topic: str) -> dict[str, Any]:
-    """Return the JSON schema of one of our own topics; of one that is not listed, any object."""
-    known = dict(_PROPERTIES.get(topic, {}))
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": f"mastctl.{topic}",
-        "type": "object",
-        "properties": known,
-    }
+def _json_schema(kind: str) -> dict[str, Any]:
+    record = RECORDS.get(kind)
+    schema = {"type": "object"} if record is None else TypeAdapter(record).json_schema(mode="serialization")
+    return schema | {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": f"mastctl.{kind}"}
 
 
-@cache
-def descriptor_set(name: str) -> bytes:
-    """Return a protobuf message's file with all that it imports, as MCAP wants its schema."""
+def _file_descriptors(name: str) -> bytes:
+    """A protobuf message's file with all that it imports, as MCAP wants its schema."""
     seen: dict[str, FileDescriptor] = {}
 
     def add(file: FileDescriptor) -> None:

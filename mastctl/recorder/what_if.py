@@ -1,4 +1,4 @@
-"""What if: the pointings and hand-offs of a recording, worked out again with another mast file.
+"""What if: the pointings and hand-offs of a recording, evaluated again with another mast file.
 
 A pointing's record holds the pixels in which the pair saw the target, with the joint angles there; the angles
 that were commanded, and those that were reached; and the pixel in which the target was seen then. With
@@ -7,7 +7,7 @@ at those follows from where it was seen, since the way between the two angles is
 file's. What the servos left of the command is taken as it was. With the recording's own mast file the
 recorded residual comes out again.
 
-The sigma told is that of another run's residual: of the matches, of the range from the pair's matches, and of
+The reported sigma is that of another run's residual: of the matches, of the range from the pair's matches, and of
 what the servos leave, as scattered over the recording.
 """
 
@@ -122,14 +122,14 @@ def seen_in(
     operations
         Records by id.
     frames
-        Facts of recorded frames by id, for their joint angles and mast file; a record tells what is missing.
+        Facts of recorded frames by id, for their joint angles and mast file.
     """
     found: list[SeenAgain] = []
     others: dict[str, str] = {}
     for name, record in operations.items():
         if "pixel" not in (record.get("request") or {}):
             if set(record.get("request") or {}) & {"position_m", "pan_rad"}:
-                others[name] = "it had no picture in which anything could be measured"
+                others[name] = "it had no image in which anything could be measured"
             continue
         try:
             found += _pointings(name, record, frames)
@@ -137,8 +137,8 @@ def seen_in(
             others[name] = f"its record does not hold enough ({type(error).__name__}: {error})"
             continue
         if not any(one.operation == name for one in found):
-            words = (record.get("error") or {}).get("message", "")
-            others[name] = f"it {record.get('state', 'did not end')}: {words}".rstrip(": ")
+            message = (record.get("error") or {}).get("message", "")
+            others[name] = f"it {record.get('state', 'did not end')}: {message}".rstrip(": ")
     return found, others
 
 
@@ -163,11 +163,11 @@ def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) 
             sigmas = [steps["target", 1]["sigma_px"], steps["stereo", 1]["sigma_px"]]
             pair_facts, otherwise = frames.get(pair_ids[0]), (rest["pan_rad"], rest["tilt_rad"])
         else:
-            before, eyes = steps["measure", number - 1], steps["eyes", number - 1]
-            if len(eyes["confirmed_by"]) != 1:
+            before, pair_step = steps["measure", number - 1], steps["eyes", number - 1]
+            if len(pair_step["confirmed_by"]) != 1:
                 continue  # another pair gave the range; the record of the first pointing says enough
-            pair = aim_camera, str(eyes["confirmed_by"][0])
-            pixels = [before["pixel_px"], eyes[pair[1]]["pixel_px"]]
+            pair = aim_camera, str(pair_step["confirmed_by"][0])
+            pixels = [before["pixel_px"], pair_step[pair[1]]["pixel_px"]]
             sigmas = [before["sigma_px"], before["sigma_px"]]
             last = results[number - 2]
             pair_facts = frames.get(steps["look", number - 1]["frame_ids"][0])
@@ -228,28 +228,28 @@ def _residual(rig: Rig, seen: SeenAgain) -> tuple[tuple[float, float], float, Fl
     chosen = min(solutions, key=lambda s: max(abs(s.pan_rad - pan), abs(s.tilt_rad - tilt)))
     ray = rig.camera_in_rover(seen.aim_camera, *joints.true_rad(seen.measured_rad, came)).ray(seen.target_px)
     range_m = float(np.linalg.norm(target - ray.origins_m))
-    stands = ray.origins_m + range_m * ray.directions
+    position_m = ray.origins_m + range_m * ray.directions
     commanded = joints.read_rad((chosen.pan_rad, chosen.tilt_rad), came)
     reached = commanded[0] + float(seen.left_rad[0]), commanded[1] + float(seen.left_rad[1])
-    there = rig.camera_in_rover(seen.aim_camera, *joints.true_rad(reached, came))
-    pixel, _ = there.project(stands)
+    camera = rig.camera_in_rover(seen.aim_camera, *joints.true_rad(reached, came))
+    pixel, _ = camera.project(position_m)
     return commanded, range_m, np.asarray(pixel - seen.aim_px, dtype=float)
 
 
 def _sigma(rig: Rig, seen: SeenAgain, servo_rad: FloatArray) -> FloatArray:
     """(2,) one sigma of another run's residual, by what each measured number moves it."""
-    _, _, here = _residual(rig, seen)
+    _, _, residual_px = _residual(rig, seen)
 
     def moved(change: Callable[[], SeenAgain], step: float) -> FloatArray:
-        _, _, there = _residual(rig, change())
-        return (there - here) / step
+        _, _, changed_px = _residual(rig, change())
+        return (changed_px - residual_px) / step
 
     variance = np.square(seen.target_sigma_px)
-    for eye, axis in np.ndindex(2, 2):
+    for camera, axis in np.ndindex(2, 2):
         pixels = seen.pair_px.copy()
-        pixels[eye, axis] += STEP_PX
+        pixels[camera, axis] += STEP_PX
         rate = moved(lambda pixels=pixels: replace(seen, pair_px=pixels), STEP_PX)  # type: ignore[misc]
-        variance = variance + np.square(rate * seen.pair_sigma_px[eye, axis])
+        variance = variance + np.square(rate * seen.pair_sigma_px[camera, axis])
     for joint in range(2):
         commanded = list(seen.commanded_rad)
         commanded[joint] -= STEP_RAD
@@ -297,12 +297,12 @@ def rms(rows: Sequence[FloatArray]) -> tuple[float, float] | None:
 
 
 def _camera_of(frame_id: str) -> str:
-    """The camera in a frame's id: what stands before its count, mast file and run."""
+    """The camera in a frame's id: the part before its count, mast file and run."""
     return frame_id.rsplit("-", 3)[0]
 
 
 def _joints(facts: Any, otherwise: tuple[float, float]) -> tuple[tuple[float, float], Approach]:
-    """Joint angles of a recorded frame as read, or what the step before it read, and from which side."""
+    """Joint angles of a recorded frame as read, or those of the step before it, and from which side."""
     if facts is None:
         return (float(otherwise[0]), float(otherwise[1])), UNKNOWN
     approach = float(facts.get("pan_approach", 0.0)), float(facts.get("tilt_approach", 0.0))

@@ -1,4 +1,4 @@
-"""A what-if told: tables for a terminal and a page, JSON, residual vectors, and pictures."""
+"""A what-if as tables for a terminal, as JSON, and as a page with the residual vectors."""
 
 from __future__ import annotations
 
@@ -7,22 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from calib.files.mast_file import StoredRig
 from calib.geometry.rigid import FloatArray
-from drivers.errors import BadFrame
-from drivers.recordings.frames import McapFrame
+from mastctl.as_json import as_json
 from mastctl.recorder.recorded import Recording
 from mastctl.recorder.what_if import HandedAgain, WouldBe, rms
-from mastctl.report import pages, pictures, plots
+from mastctl.report import pages, plots
 from mastctl.report.pictures import Figure
 from mastctl.report.tables import Table, number, x_y
-
-CROP_PX, SCALE = 6, 40
-PICTURED = 12
-RUST, BLUE = (14, 68, 193), (139, 111, 31)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +44,11 @@ class WhatIf:
             "rms_px": {
                 key: {"recorded": rms(was), "would_be": rms(would)} for key, was, would in self.columns()
             },
-            "pointings": [_pointing_told(one) for one in self.pointings],
-            "handoffs": [_handoff_told(one) for one in self.handoffs],
+            "pointings": [_pointing_record(one) for one in self.pointings],
+            "handoffs": [
+                {name: value for name, value in as_json(one).items() if name != "name"}
+                for one in self.handoffs
+            ],
             "not_worked_out": dict(self.others),
         }
 
@@ -83,10 +80,9 @@ def summary_table(what_if: WhatIf) -> Table:
 
 
 def pointing_table(what_if: WhatIf) -> Table:
-    """Return each pointing."""
+    """Return each pointing; ``turned``: commanded pan and tilt less those that were commanded."""
     headings = (
-        "operation", "pointing", "range m", "recorded x, y (px)", "would be x, y (px)", "sigma x, y (px)",
-        "commanded otherwise pan, tilt (mrad)",
+        "operation", "pointing", "range m", "recorded (px)", "would be (px)", "sigma (px)", "turned (mrad)",
     )  # fmt: skip
     rows = []
     for one in what_if.pointings:
@@ -97,16 +93,6 @@ def pointing_table(what_if: WhatIf) -> Table:
         turned = 1e3 * np.subtract(one.commanded_rad, one.seen.commanded_rad)
         rows.append([*row, x_y(one.residual_px, 3), x_y(one.sigma_px, 3), x_y(turned, 3)])
     return Table(headings, rows)
-
-
-def short_table(what_if: WhatIf) -> Table:
-    """Return each pointing as it fits a terminal."""
-    rows = []
-    for one in what_if.pointings:
-        would_be = x_y(one.residual_px) or one.error
-        start = one.seen.operation, str(one.seen.pointing), x_y(one.seen.residual_px)
-        rows.append([*start, would_be, x_y(one.sigma_px)])
-    return Table(("operation", "pointing", "recorded (px)", "would be (px)", "sigma (px)"), rows)
 
 
 def handoff_table(what_if: WhatIf) -> Table:
@@ -128,10 +114,13 @@ def write_what_if(what_if: WhatIf, folder: Path) -> Path:
     """Write the page ``what_if.html`` into a folder, which is made if need be; return it. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     name, stored = what_if.recording.first_mast
-    told = what_if.recording.told()
+    summary = what_if.recording.summary()
     hardware = what_if.recording.facts.get("hardware", "unknown")
     facts = [
-        ("recording", f"{what_if.recording.path.name}, {told['seconds']:.0f} s, {told['frames']} pictures"),
+        (
+            "recording",
+            f"{what_if.recording.path.name}, {summary['seconds']:.0f} s, {summary['frames']} images",
+        ),
         ("recorded with", f"{name.name} ({stored.digest[:12]})"),
         ("what if", f"{what_if.mast.path.name} ({what_if.mast.digest[:12]})"),
     ]
@@ -145,7 +134,6 @@ def write_what_if(what_if: WhatIf, folder: Path) -> Path:
         handoffs=handoff_table(what_if),
         plot=_plot(what_if) if what_if.columns() and plots.installed() else None,
         answered=bool(what_if.columns()),
-        pictured=_pictured(what_if),
         others=other_lines(what_if),
     )
     page = folder / "what_if.html"
@@ -173,64 +161,16 @@ def _plot(what_if: WhatIf) -> Figure:
     return plots.plot(figure, "residuals as recorded and as they would have been")
 
 
-def _pictured(what_if: WhatIf) -> list[Figure]:
-    """The picture after each move, its middle enlarged: where the target is, and where the aim would be."""
-    shown: list[Figure] = []
-    for one in what_if.answered:
-        frame = what_if.recording.frames.get(one.seen.frame_id)
-        if frame is not None and len(shown) < PICTURED:
-            figure = _picture(one, frame)
-            shown += [] if figure is None else [figure]
-    return shown
-
-
-def _picture(one: WouldBe, frame: McapFrame) -> Figure | None:
-    try:
-        image = frame.image()
-    except BadFrame:
-        return None
-    seen, residual = one.seen, np.asarray(one.residual_px)
-    middle = (float(seen.aim_px[0]), float(seen.aim_px[1]))
-    drawn = pictures.enlarged(image, middle, CROP_PX, SCALE)
-    centre = np.array([CROP_PX * SCALE, CROP_PX * SCALE], dtype=float)
-    _mark(drawn, centre, pictures.ORANGE_BGR, cv2.MARKER_CROSS, 40)
-    # What the picture shows at the target's pixel would, with the other file, have come to the new residual:
-    # so the aim would have lain where the target is, less that residual.
-    _mark(drawn, centre + SCALE * seen.residual_px, RUST, cv2.MARKER_TILTED_CROSS, 28)
-    _mark(drawn, centre + SCALE * (seen.residual_px - residual), BLUE, cv2.MARKER_SQUARE, 28)
-    was, would = (f"{v[0]:+.2f}, {v[1]:+.2f}" for v in (seen.residual_px, residual))
-    caption = f"operation {seen.operation}, pointing {seen.pointing}: {was} px; would be {would} px"
-    return pictures.photo(drawn, f"the target after pointing {seen.pointing} of {seen.operation}", caption)
-
-
-def _mark(image: Any, place: FloatArray, colour: tuple[int, int, int], kind: int, size: int) -> None:
-    cv2.drawMarker(image, (round(place[0]), round(place[1])), colour, kind, size, 2, cv2.LINE_AA)
-
-
-def _pointing_told(one: WouldBe) -> dict[str, Any]:
-    def listed(values: Any) -> list[float] | None:
-        return None if values is None else [float(value) for value in values]
-
+def _pointing_record(one: WouldBe) -> dict[str, Any]:
     return {
         "operation": one.seen.operation,
         "pointing": one.seen.pointing,
         "frame_id": one.seen.frame_id,
         "range_m": one.range_m,
-        "recorded_px": listed(one.seen.residual_px),
-        "would_be_px": listed(one.residual_px),
-        "sigma_px": listed(one.sigma_px),
-        "commanded_rad": listed(one.commanded_rad),
-        "recorded_commanded_rad": listed(one.seen.commanded_rad),
-        "error": one.error,
-    }
-
-
-def _handoff_told(one: HandedAgain) -> dict[str, Any]:
-    return {
-        "time": one.time,
-        "camera": one.camera,
-        "recorded_px": one.recorded_px.tolist(),
-        "would_be_px": None if one.would_be_px is None else one.would_be_px.tolist(),
-        "sigma_px": one.sigma_px.tolist(),
+        "recorded_px": as_json(one.seen.residual_px),
+        "would_be_px": as_json(one.residual_px),
+        "sigma_px": as_json(one.sigma_px),
+        "commanded_rad": as_json(one.commanded_rad),
+        "recorded_commanded_rad": as_json(one.seen.commanded_rad),
         "error": one.error,
     }

@@ -1,19 +1,18 @@
 """One MCAP file that a killed daemon leaves readable: chunks of a quarter of a second, written and synced.
 
 The library's writer buffers, does not sync, and writes its index at the end. Here the file is unbuffered,
-mast file and configuration stand at its start with their digests, and every chunk is written whole at once
-and then synced by a thread that alone waits for the disk (`drivers.recordings.mcap_file` reads what is left).
+mast file and configuration come first with their digests, and every chunk is written whole at once and then
+synced by a worker that alone waits for the disk (`drivers.recordings.mcap_file` reads what a kill leaves).
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
-import threading
 import time
 from collections.abc import Mapping
+from concurrent import futures
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,90 +20,9 @@ from typing import Any
 from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
-from mastctl.recorder.schemas import described
+from mastctl.recorder.schemas import encodings
 
 FINISH_S = 3.0
-
-
-class Sync:
-    """Has a file's bytes on the disk soon after each `ask`; nobody else waits for the disk.
-
-    Parameters
-    ----------
-    descriptor
-        Of the file; closed by `finish`.
-    folder
-        Where the file was just made: its name is put on the disk first.
-    """
-
-    def __init__(self, descriptor: int, folder: Path) -> None:
-        self._descriptor = descriptor
-        self._folder = folder
-        self._asked = threading.Event()
-        self._last = False
-        self._since_s: float | None = None
-        self._error: OSError | None = None
-        self._thread = threading.Thread(target=self._work, name="recorder sync", daemon=True)
-        self._thread.start()
-
-    @property
-    def waits_s(self) -> float:
-        """How long the disk has not answered, seconds; 0 while nothing is asked of it."""
-        since_s = self._since_s
-        return 0.0 if since_s is None else time.monotonic() - since_s
-
-    def ask(self) -> None:
-        """Have all that was written so far put on the disk. Raises OSError if that failed before."""
-        if self._error is not None:
-            raise self._error
-        self._asked.set()
-
-    def finish(self, *, wait: bool) -> None:
-        """Put the rest on the disk and close the file; wait for it, some seconds at most, or not.
-
-        Raises
-        ------
-        OSError
-            If it failed, and that is known.
-        """
-        self._last = True
-        self._asked.set()
-        if wait:
-            self._thread.join(FINISH_S)
-        if self._error is not None:
-            raise self._error
-
-    def _work(self) -> None:
-        try:
-            self._sync_folder()
-            while not self._last:
-                self._asked.wait()
-                self._asked.clear()
-                self._sync()
-            self._sync()
-        finally:
-            os.close(self._descriptor)
-
-    def _sync(self) -> None:
-        self._since_s = time.monotonic()
-        try:
-            os.fdatasync(self._descriptor)
-        except OSError as error:
-            self._error = error
-        finally:
-            self._since_s = None
-
-    def _sync_folder(self) -> None:
-        try:
-            folder = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
-        except OSError as error:
-            self._error = error
-
-
 PROFILE = "mastctl/record/1"
 CHUNK_BYTES = 4 << 20
 FLUSH_S = 0.25
@@ -129,9 +47,7 @@ class Attached:
 
 @dataclass(frozen=True)
 class Clocks:
-    """What ties the daemon's clock to the calendar: one pair for a file, so that a clock set back does not
-    show in it.
-    """
+    """The daemon's clock and the calendar at one moment: one pair a file, so that it shows no set-back."""
 
     monotonic_s: float
     unix_ns: int
@@ -151,7 +67,7 @@ class RecordFile:
     attached
         Mast file and configuration, written first.
     facts
-        Words about the recording: metadata ``mastctl``.
+        Of the recording: metadata ``mastctl``.
     clocks
         Stamps the messages.
 
@@ -172,7 +88,9 @@ class RecordFile:
         self._schemas: dict[str, int] = {}
         self._counts: dict[int, int] = {}
         self._open_since_s: float | None = None
-        self._sync = Sync(os.dup(self._file.fileno()), path.parent)
+        self._disk = futures.ThreadPoolExecutor(1, "recorder sync")
+        self._synced: futures.Future[None] = self._disk.submit(_sync_folder, path.parent)
+        self._sync_since_s = time.monotonic()
         self._gathered = 0
         self._size = 0
         self._attached: set[str] = set()
@@ -207,20 +125,20 @@ class RecordFile:
 
     @property
     def size_mb(self) -> float:
-        """`size` in 10⁶ bytes; asked from any thread."""
+        """`size` in 10⁶ bytes; read from any thread."""
         return self._size / 1e6
 
     @property
     def in_place(self) -> bool:
-        """Whether it is still what its path names: nobody deleted or moved it. Asks the disk."""
+        """Whether its path still names it: it was not deleted or moved. Reads the disk."""
         try:
             return os.path.samestat(self.path.stat(), os.fstat(self._file.fileno()))
         except (FileNotFoundError, NotADirectoryError):
             return False
 
-    def add_json(self, topic: str, kind: str, told: Mapping[str, Any], time_s: float, now_s: float) -> None:
+    def add_json(self, topic: str, kind: str, record: Mapping[str, Any], time_s: float, now_s: float) -> None:
         """Add one JSON message; ``kind`` names its schema. ``now_s`` is the flush's clock."""
-        data = json.dumps(told, allow_nan=False, separators=(",", ":")).encode()
+        data = json.dumps(record, allow_nan=False, separators=(",", ":")).encode()
         self._add(topic, f"mastctl.{kind}", data, time_s, now_s)
 
     def add_message(self, topic: str, message: Message, time_s: float, now_s: float) -> None:
@@ -228,38 +146,47 @@ class RecordFile:
         self._add(topic, message.DESCRIPTOR.full_name, message.SerializeToString(), time_s, now_s)
 
     def flush_if_due(self, now_s: float) -> bool:
-        """Put the gathered chunk on the disk if it is old enough; return whether it was."""
+        """Write the gathered chunk if it is old enough; return whether it was."""
         if self._open_since_s is None or now_s - self._open_since_s < FLUSH_S:
             return False
         self.flush()
         return True
 
     def flush(self) -> None:
-        """Write what was gathered, and have it put on the disk."""
+        """Write what was gathered, and have the disk keep it."""
         self._open_since_s = None
         self._gathered = 0
         self._writer.flush()  # type: ignore[no-untyped-call]
-        self._sync.ask()
         self._size = self._file.tell()
+        if self._synced.done():
+            self._sync()
 
     @property
     def disk_waits_s(self) -> float:
-        """How long the disk has not answered, seconds; asked from any thread."""
-        return self._sync.waits_s
+        """How long the disk has not answered, seconds; read from any thread."""
+        return 0.0 if self._synced.done() else time.monotonic() - self._sync_since_s
 
     def finish(self, *, wait: bool = True) -> None:
-        """Write the index and close the file; wait until it is on the disk, or not."""
+        """Write the index and close the file; wait until it is on the disk, some seconds at most, or not."""
         try:
             self._writer.finish()  # type: ignore[no-untyped-call]
+            self._sync()
+            if wait and futures.wait([self._synced], FINISH_S).done:
+                self._synced.result()
         finally:
-            self._file.close()
-            self._sync.finish(wait=wait)
+            self.abandon()
 
     def abandon(self) -> None:
         """Close the file as it is; a repair makes it whole."""
-        self._file.close()
-        with contextlib.suppress(OSError):
-            self._sync.finish(wait=False)
+        self._disk.submit(self._file.close)
+        self._disk.shutdown(wait=False)
+
+    def _sync(self) -> None:
+        """Have the disk keep what was written. Raises OSError if it did not keep what was before."""
+        if self._synced.done():
+            self._synced.result()
+        self._sync_since_s = time.monotonic()
+        self._synced = self._disk.submit(os.fdatasync, self._file.fileno())
 
     def _add(self, topic: str, schema: str, data: bytes, time_s: float, now_s: float) -> None:
         channel = self._channels.get((topic, schema))
@@ -275,10 +202,10 @@ class RecordFile:
             self.flush()
 
     def _channel(self, topic: str, schema: str) -> int:
-        known = described(schema)
+        encoding, schema_encoding, data = encodings(schema)
         if schema not in self._schemas:
-            self._schemas[schema] = self._writer.register_schema(schema, known.schema, known.data)
-        channel = self._writer.register_channel(topic, known.message, self._schemas[schema])
+            self._schemas[schema] = self._writer.register_schema(schema, schema_encoding, data)
+        channel = self._writer.register_channel(topic, encoding, self._schemas[schema])
         self._channels[topic, schema] = channel
         return channel
 
@@ -299,4 +226,13 @@ class _Whole:
         return int(self._file.tell())
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Nothing is buffered."""
+
+
+def _sync_folder(path: Path) -> None:
+    """Have the disk keep the name of a file that was just made."""
+    folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

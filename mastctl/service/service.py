@@ -38,6 +38,8 @@ from mastctl.motion.pairs import in_picture
 from mastctl.motion.requests import wrong_camera
 from mastctl.motion.track import ACTIVE, RoverPose, TrackStatus
 from mastctl.motion.tracker import Tracker
+from mastctl.recorder.recorder import AttachedMast, Recorder
+from mastctl.recorder.writer import Attached
 from mastctl.safety import heads, stop_socket
 from mastctl.safety.latch import Latch
 from mastctl.safety.state_folder import StateFolder
@@ -46,12 +48,11 @@ from mastctl.safety.stop_threads import StopThreads
 from mastctl.service.masts import MastInUse, Masts, configured, read_mast
 from mastctl.service.opening import bounded, run_names
 from mastctl.service.places import Places
-from mastctl.service.recording import DaemonRecorder
 from mastctl.service.state import State
 from mastctl.service.steering import Steering
 from mastctl.service.stopping import SocketStops, Stopping, state_faults
 from mastctl.service_manager import ServiceManager
-from mastctl.watch.handoffs import HandoffCheck
+from mastctl.watch.handoffs import HandoffCheck, line_of
 from mastctl.watch.metrics import Metrics
 from mastctl.watch.reference import SENTINEL_FOLDER
 from mastctl.watch.residuals import CalibrationHealth
@@ -66,6 +67,7 @@ RENDERING_S = 20.0  # six simulated cameras share one renderer, on a machine tha
 HARDWARE_CLOSE_S = 3.0
 AUDIT_FILE = "audit.jsonl"
 STRANGERS_FILE = "strangers.jsonl"
+RECORDS_FOLDER = "records"
 KEPT_PICTURES = 8  # of a camera
 
 
@@ -107,8 +109,8 @@ class Service:
         Where each command passes, who steers, and what is recorded of it; of strangers' elsewhere.
     metrics
         What is counted, for Prometheus.
-    recording
-        The recorder, and what it hears.
+    recorder
+        Records what is published; begins and ends runs.
     stop_threads
         Where the web side stops: threads that nothing else can keep busy.
     folder, head_folder
@@ -154,11 +156,12 @@ class Service:
         publisher.publish("track", "track", self.tracker.status)
         self.stop_threads = StopThreads()
         self.handoffs = HandoffCheck(config.tracking.handoff_log, mast.stored.digest, clock)
-        self.recording = DaemonRecorder(
-            config,
-            mast,
+        self.recorder = Recorder(
+            config.record,
+            config.record.folder or self.folder.path / RECORDS_FOLDER,
+            _attached(mast),
+            [Attached(config.path.name, config.data)],
             {"hardware": hardware.kind, "version": self._version},
-            self.folder.path,
             publisher,
             self.devices.frame_by_id,
             clock,
@@ -387,7 +390,7 @@ class Service:
             self.handoffs.close,
             self.health.close,
             self.sentinel.close,
-            self.recording.close,
+            self.recorder.close,
             lambda: bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S),
             *(one.close for one in maybe if one is not None),
         )
@@ -401,7 +404,7 @@ class Service:
         """What is wrong with the daemon's own files; takes no lock."""
         return (
             *self.handoffs.faults(),
-            *self.recording.faults(),
+            *self.recorder.faults(),
             *self.audit.faults(),
             *self.strangers.faults(),
             *state_faults(self.folder, self.latch, self.started_s),
@@ -422,7 +425,7 @@ class Service:
         self.steering.repeat_after_s = config.repeat_after_s
         self.steering.use_rig(configured(self.stored.rig, config.hardware.cameras))
         self.tracker.use_settings(config.limits, config.tracking)
-        self.recording.use_config(config)
+        self.recorder.use_settings(config.record, [Attached(config.path.name, config.data)])
         self.masts.use_config(config)
 
     def _use_mast(self, mast: MastInUse) -> None:
@@ -434,7 +437,7 @@ class Service:
         self.tracker.use_rig(rig, mast.path.name)
         self.handoffs.use_mast(stored.digest)
         self.health.use_mast(stored)
-        self.recording.use_mast(mast)
+        self.recorder.use_mast(_attached(mast))
 
     def _steered(self, control: WhoSteers | None) -> None:
         """Publish who holds the lease."""
@@ -452,7 +455,12 @@ class Service:
     def _handed_over(self, handoff: MatchedHandoff) -> None:
         """Have a hand-off counted and recorded."""
         self.handoffs.add(handoff)
-        self.recording.handed_over(handoff)
+        self.recorder.add_handoff(line_of(handoff))
+
+
+def _attached(mast: MastInUse) -> AttachedMast:
+    """A mast file as a recording has it."""
+    return AttachedMast(mast.stored.rig, Attached(mast.path.name, mast.data))
 
 
 def _tried(close: Callable[[], object]) -> None:

@@ -123,30 +123,30 @@ def add_recordings(app: FastAPI) -> None:
 
     @app.get(f"{PREFIX}/recordings", summary="Every recording, and what is recorded now")
     async def recordings(here: Here) -> Recordings:
-        return await here.waiting.run(here.service.recording.told)
+        return await here.waiting.run(here.service.recorder.listing)
 
     @command(
         app, "POST /recordings/start", RECORD_START, "Record until it is ended, or there is no room left"
     )
     def start(body: RecordBody, here: Here) -> RecorderTold:
-        return here.service.recording.recorder.start_run(body.name)
+        return here.service.recorder.start_run(body.name)
 
     @command(app, "POST /recordings/stop", RECORD_STOP, "End the recording that was begun")
     def stop(here: Here) -> RecordingEnded:
-        return here.service.recording.recorder.stop_run()
+        return here.service.recorder.stop_run()
 
     @app.get(
         f"{PREFIX}/recordings/{{name}}/{{file}}", summary="A recording's file", response_class=FileResponse
     )
     async def read(name: str, file: str, request: Request, here: Here) -> FileResponse:
-        path = await here.waiting.run(lambda: here.service.recording.recorder.file(name, file))
+        path = await here.waiting.run(lambda: here.service.recorder.file(name, file))
         headers = request.scope["headers"]
         request.scope["headers"] = [one for one in headers if one[0] != b"range"]  # it is given whole
         return FileResponse(path, media_type="application/octet-stream", filename=readable(path.name))
 
     @command(app, "DELETE /recordings/{name}", RECORD_DELETE, "Delete a run, or what was kept at a fault")
     def delete(name: str, here: Here) -> RecordingDeleted:
-        return here.service.recording.recorder.delete(name)
+        return here.service.recorder.delete(name)
 
 
 def add_bench(app: FastAPI) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from hil_tests.waiting import NET_S
-from mastctl.recorder import feed, recorder, writer
+from mastctl.recorder import recorder, writer
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -16,7 +16,6 @@ def disks_are_waited_for() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for module, name in (
             (recorder, "SLOW_S"), (recorder, "ANSWER_S"), (recorder, "CLOSE_S"), (writer, "FINISH_S"),
-            (feed, "CLOSE_S"),
         ):  # fmt: skip
             patch.setattr(module, name, NET_S)
         yield

@@ -8,14 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from mcap.reader import make_reader
 
 from calib.files.mast_file import parse_rig
 from drivers.clock import SystemClock
 from drivers.interfaces import Image
 from mastctl.config import load_config
+from mastctl.control.publisher import Publisher
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
+from mastctl.errors import NotKnown
 from mastctl.recorder.recorder import AttachedMast, Recorder
 from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.writer import Attached
@@ -57,11 +60,26 @@ def reading(pan_rad: float, moving: bool = True) -> HeadReading:
     return HeadReading(pan_rad, 0.0, moving, 100.0, true_rad=(pan_rad, 0.0))
 
 
-def recorder(folder: Path, **settings: Any) -> Recorder:
-    wanted = {"ring_s": 600.0, "free_mb": 0.0} | settings
-    return Recorder(
-        RecordSettings(**wanted), folder, mast(), [CONFIG], {"hardware": "simulated"}, SystemClock()
-    )
+class Recording:
+    """A recorder, and the publisher that it reads."""
+
+    def __init__(self, folder: Path, **settings: Any) -> None:
+        self.publisher = Publisher()
+        wanted = {"ring_s": 600.0, "free_mb": 0.0} | settings
+        facts = {"hardware": "simulated"}
+        self.recorder = Recorder(
+            RecordSettings(**wanted), folder, mast(), [CONFIG], facts, self.publisher, _gone, SystemClock()
+        )
+        self.publish, self.summary = self.publisher.publish, self.recorder.summary
+
+    def written(self) -> None:
+        """Wait until what was published so far was handled."""
+        with pytest.raises(NotKnown):
+            self.recorder.delete("none")
+
+
+def _gone(frame_id: str) -> StampedFrame:
+    raise NotKnown("frame_unknown", f"{frame_id} is not kept any more")
 
 
 def files(folder: Path) -> list[Path]:
@@ -74,5 +92,5 @@ def messages(path: Path, topic: str | None = None) -> Iterator[tuple[Any, Any, A
         yield from make_reader(file, validate_crcs=True).iter_messages(topic)
 
 
-def told(path: Path, topic: str) -> list[Any]:
+def records(path: Path, topic: str) -> list[Any]:
     return [json.loads(message.data) for _, _, message in messages(path, topic)]

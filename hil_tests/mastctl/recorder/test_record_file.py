@@ -19,14 +19,14 @@ from mcap.reader import make_reader
 from drivers.recordings.mcap_file import BadRecording, McapContents, McapEntry, read_items
 from hil_tests.mastctl.recorder.recorder_world import (
     CONFIG,
+    Recording,
     files,
     frame,
     mast,
     messages,
     picture,
     reading,
-    recorder,
-    told,
+    records,
 )  # fmt: skip
 from mastctl.recorder.repair import repair
 from mastctl.recorder.writer import Clocks, RecordFile
@@ -35,15 +35,15 @@ from mastctl.recorder.writer import Clocks, RecordFile
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded")
-    one = recorder(folder)
+    one = Recording(folder)
     done, data = cv2.imencode(".jpg", picture(3))
     assert done
-    one.tell("joints", "pan_tilt", reading(0.25))
-    one.tell("frame", "navcam_left", frame(1))
-    one.tell("frame", "navcam_left", frame(2, picture(2, (24, 32, 3))))
-    one.tell("frame", "navcam_right", frame(3, picture(3), bytes(data), "navcam_right"))
-    one.tell("command", "c1", {"what": "point", "who": "somebody"})
-    one.close()
+    one.publish("joints", "pan_tilt", reading(0.25))
+    one.publish("frame", "navcam_left", frame(1))
+    one.publish("frame", "navcam_left", frame(2, picture(2, (24, 32, 3))))
+    one.publish("frame", "navcam_right", frame(3, picture(3), bytes(data), "navcam_right"))
+    one.publish("command", "c1", {"what": "point", "who": "somebody"})
+    one.recorder.close()
     (path,) = files(folder)
     return path
 
@@ -106,7 +106,7 @@ def test_pixels_come_back_to_the_last_bit_and_jpeg_byte_for_byte(recorded: Path)
     jpeg = CompressedImage.FromString(last.data)
     assert jpeg.format == "jpeg"
     assert jpeg.data == bytes(cv2.imencode(".jpg", picture(3))[1])
-    assert [one["frame_id"] for one in told(recorded, "/camera/navcam_right/frame")] == [
+    assert [one["frame_id"] for one in records(recorded, "/camera/navcam_right/frame")] == [
         frame(3, camera="navcam_right").frame_id
     ]
 
@@ -156,7 +156,7 @@ def test_cut_off_at_any_byte_it_keeps_the_chunks_before_for_repair(tmp_path: Pat
         counts.add(len(there))
         out = tmp_path / f"{length}-whole.mcap"
         assert repair([cut], out).messages == len(there)
-        assert [one["number"] for one in told(out, "/command")] == there
+        assert [one["number"] for one in records(out, "/command")] == there
     assert counts == {0, 10, 20, 30}
 
 

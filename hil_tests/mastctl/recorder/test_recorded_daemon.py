@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from drivers.recordings.mcap_file import McapEntry, read_items
-from hil_tests.mastctl.recorder.recorder_world import told
+from hil_tests.mastctl.recorder.recorder_world import records
 from hil_tests.waiting import until
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
@@ -74,13 +74,13 @@ def test_a_run_holds_what_was_asked_seen_and_found(client: Client, daemon: Runni
     assert record["pointings"][0]["frame_id"] in recording.frames
     image = recording.frames[shot.frame_id].image()
     assert (image == shot.image).all()
-    (residual,) = told(path, "/residual")
+    (residual,) = records(path, "/residual")
     assert residual["residual_px"] == record["residual_px"]
-    assert [one["operation"] for one in told(path, "/target")] == [done]
-    commands = [one["command"] for one in told(path, "/command")]
+    assert [one["operation"] for one in records(path, "/target")] == [done]
+    commands = [one["command"] for one in records(path, "/command")]
     assert commands.count("point") >= 2
-    assert len({one["word"] for one in told(path, "/state")}) > 1
-    assert len({one["pan_rad"] for one in told(path, "/joints")}) > 1
+    assert len({one["word"] for one in records(path, "/state")}) > 1
+    assert len({one["pan_rad"] for one in records(path, "/joints")}) > 1
 
 
 def _state_of(path: Path, operation: str) -> str:

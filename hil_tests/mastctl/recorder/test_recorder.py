@@ -15,22 +15,23 @@ import pytest
 from drivers.clock import ManualClock
 from drivers.recordings.mcap_file import McapContents, McapEntry, read_items
 from hil_tests.mastctl.recorder.recorder_world import (
+    Recording,
     files,
     frame,
     mast,
     messages,
     picture,
     reading,
-    recorder,
-    told,
+    records,
 )
 from hil_tests.support.kills import kills
 from hil_tests.waiting import until
+from mastctl.control import publisher
 from mastctl.control.standing import StandingFault
 from mastctl.errors import NotNow, Unable
 from mastctl.recorder import recorder as module
+from mastctl.recorder.folder import RecordFolder
 from mastctl.recorder.recorder import AttachedMast
-from mastctl.recorder.shelf import Shelf
 from mastctl.recorder.writer import Attached, RecordFile
 
 FAULT = StandingFault("pan_tilt", "no_reply", "it does not answer", 1.0, "it answers")
@@ -38,7 +39,7 @@ FAULT = StandingFault("pan_tilt", "no_reply", "it does not answer", 1.0, "it ans
 
 def kinds(folder: Path) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
-    for one in Shelf(folder).all():
+    for one in RecordFolder(folder).all():
         found.setdefault(one.kind, []).append(one.name)
     return found
 
@@ -50,47 +51,47 @@ def test_killed_at_any_moment_it_leaves_all_but_the_end_and_that_is_whole(tmp_pa
 
 
 def test_nothing_is_recorded_without_a_ring_until_a_run_begins(tmp_path: Path) -> None:
-    one = recorder(tmp_path, ring_s=0.0)
-    one.tell("command", "1", {"number": 1})
-    one.tell("state", "machine", {"word": "ready"})
-    assert one.told()["recording"] is False
-    assert one.start_run("my rock")["run"].endswith("-my-rock")
-    one.tell("command", "2", {"number": 2})
+    one = Recording(tmp_path, ring_s=0.0)
+    one.publish("command", "1", {"number": 1})
+    one.publish("state", "machine", {"word": "ready"})
+    assert one.summary()["recording"] is False
+    assert one.recorder.start_run("my rock")["run"].endswith("-my-rock")
+    one.publish("command", "2", {"number": 2})
     with pytest.raises(NotNow, match="is recorded already"):
-        one.start_run("another")
-    ended = one.stop_run()
-    one.tell("command", "3", {"number": 3})
+        one.recorder.start_run("another")
+    ended = one.recorder.stop_run()
+    one.publish("command", "3", {"number": 3})
     with pytest.raises(NotNow, match="no run is recorded"):
-        one.stop_run()
-    one.close()
+        one.recorder.stop_run()
+    one.recorder.close()
     (path,) = files(tmp_path)
     assert str(path) == ended["file"]
-    assert [one["number"] for one in told(path, "/command")] == [2]
-    assert told(path, "/state") == [{"word": "ready"}]  # what was known before the run
+    assert [one["number"] for one in records(path, "/command")] == [2]
+    assert records(path, "/state") == [{"word": "ready"}]  # what was known before the run
 
 
 def test_a_run_takes_the_rings_place_and_gives_it_back(tmp_path: Path) -> None:
-    one = recorder(tmp_path)
-    one.tell("command", "1", {"number": 1})
-    one.start_run("")
-    one.tell("command", "2", {"number": 2})
-    one.stop_run()
-    one.tell("command", "3", {"number": 3})
-    one.close()
-    assert [[n["number"] for n in told(path, "/command")] for path in files(tmp_path)] == [[1], [3], [2]]
+    one = Recording(tmp_path)
+    one.publish("command", "1", {"number": 1})
+    one.recorder.start_run("")
+    one.publish("command", "2", {"number": 2})
+    one.recorder.stop_run()
+    one.publish("command", "3", {"number": 3})
+    one.recorder.close()
+    assert [[n["number"] for n in records(path, "/command")] for path in files(tmp_path)] == [[1], [3], [2]]
 
 
 def test_the_ring_goes_round_within_its_size(tmp_path: Path) -> None:
-    one = recorder(tmp_path, ring_mb=1.0)
+    one = Recording(tmp_path, ring_mb=1.0)
     for number in range(400):
-        one.tell("frame", "navcam_left", frame(number, picture(number, (100, 1000))))
-        until(lambda: not one._queue, "it writes")
+        one.publish("frame", "navcam_left", frame(number, picture(number, (100, 1000))))
+        one.written()
         if files(tmp_path)[-1:] and int(files(tmp_path)[-1].name[:6]) > 12:
             break
-    one.close()
+    one.recorder.close()
     names = [path.name[:6] for path in files(tmp_path)]
     assert int(names[-1]) > 12 and names[0] != "000001"
-    (ring,) = [entry for entry in Shelf(tmp_path).all() if entry.kind == "ring"]
+    (ring,) = [entry for entry in RecordFolder(tmp_path).all() if entry.kind == "ring"]
     assert ring.size_bytes < 2e6  # the bound, and the newest segment
 
 
@@ -98,57 +99,57 @@ def test_a_fault_keeps_the_ring_once_and_what_comes_after_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "AFTER_FAULT_S", 0.3)
-    one = recorder(tmp_path)
-    one.tell("command", "1", {"number": 1})
-    one.tell("fault", "pan_tilt", (FAULT,))
-    one.tell("command", "2", {"number": 2})
+    one = Recording(tmp_path)
+    one.publish("command", "1", {"number": 1})
+    one.publish("fault", "pan_tilt", (FAULT,))
+    one.publish("command", "2", {"number": 2})
     until(lambda: "kept" in kinds(tmp_path), "it is kept")
-    one.tell("fault", "pan_tilt", ())
-    one.tell("fault", "pan_tilt", (FAULT,))  # it comes and goes: the disk does not fill with it
-    one.close()
+    one.publish("fault", "pan_tilt", ())
+    one.publish("fault", "pan_tilt", (FAULT,))  # it comes and goes: the disk does not fill with it
+    one.recorder.close()
     (name,) = kinds(tmp_path)["kept"]
     assert name.endswith("-pan_tilt-no_reply")
     (kept,) = [path for path in files(tmp_path) if name in str(path)]
-    assert [n["number"] for n in told(kept, "/command")] == [1, 2]
-    assert told(kept, "/fault")[0]["faults"][0]["code"] == "no_reply"
+    assert [n["number"] for n in records(kept, "/command")] == [1, 2]
+    assert records(kept, "/fault")[0]["faults"][0]["code"] == "no_reply"
 
 
 def test_what_was_kept_is_bounded_and_the_oldest_goes_first(tmp_path: Path) -> None:
-    shelf = Shelf(tmp_path)
-    shelf.prepare()
+    folder = RecordFolder(tmp_path)
+    folder.prepare()
     for why in "abc":
-        shelf.next_segment().write_bytes(b"x" * 400_000)
-        shelf.keep_ring(why, 1.0)
+        folder.next_segment().write_bytes(b"x" * 400_000)
+        folder.keep_ring(why, 1.0)
     assert [name[-1] for name in kinds(tmp_path)["kept"]] == ["b", "c"]
 
 
 @pytest.mark.parametrize("step_s", [-7200.0, 7200.0])
 def test_the_ring_goes_round_by_recorded_time_not_by_the_calendar(tmp_path: Path, step_s: float) -> None:
     clock = ManualClock()
-    shelf = Shelf(tmp_path, clock.now_s)
-    shelf.prepare()
+    folder = RecordFolder(tmp_path, clock.now_s)
+    folder.prepare()
     for number in range(1, 13):
-        path = shelf.next_segment()
+        path = folder.next_segment()
         path.write_bytes(b"x")
         clock.advance(100.0)
         calendar_s = 1.8e9 + clock.now_s() + (step_s if number > 3 else 0.0)
         os.utime(path, (calendar_s, calendar_s))
-        shelf.trim_ring(300.0, 1.0)
+        folder.trim_ring(300.0, 1.0)
         oldest = max(1, number - 3)  # the last to end no more than 300 s before this one
         assert [int(one.name[:6]) for one in files(tmp_path)] == list(range(oldest, number + 1))
 
 
 def test_a_folder_of_other_files_is_no_recording_and_keeps_them(tmp_path: Path) -> None:
-    shelf = Shelf(tmp_path)
-    shelf.prepare()
+    folder = RecordFolder(tmp_path)
+    folder.prepare()
     (tmp_path / "kept" / "notes").mkdir()
-    assert shelf.all() == []
+    assert folder.all() == []
     recording, other = [tmp_path / "kept" / "notes" / name for name in ("one.mcap", "one.txt")]
     recording.write_bytes(b"x")
     other.write_text("mine")
-    shelf.delete(shelf.all()[0])
+    folder.delete(folder.all()[0])
     assert (recording.exists(), other.read_text()) == (False, "mine")
-    assert shelf.all() == []
+    assert folder.all() == []
 
 
 def test_a_disk_that_hangs_holds_nobody_and_what_was_dropped_is_told(
@@ -164,21 +165,21 @@ def test_a_disk_that_hangs_holds_nobody_and_what_was_dropped_is_told(
 
     monkeypatch.setattr(RecordFile, "flush", slow)
     monkeypatch.setattr(module, "SLOW_S", 0.1)
-    monkeypatch.setattr(module, "QUEUE_BYTES", 5 * picture(0, (100, 100)).nbytes)
-    one = recorder(tmp_path)
-    one.tell("command", "0", {"number": 0})
+    monkeypatch.setattr(publisher, "MOST_UNREAD", 5)
+    one = Recording(tmp_path)
+    one.publish("command", "0", {"number": 0})
     assert hangs.wait(60.0)
     for number in range(20):
-        one.tell("frame", "navcam_left", frame(number, picture(0, (100, 100))))
-    until(lambda: one.faults(), "it says that the disk does not answer")
-    assert one.faults()[0].code == "slow"
-    assert one.told()["dropped"] == {"frame": 15}
+        one.publish("frame", "navcam_left", frame(number, picture(0, (100, 100))))
+    until(lambda: one.recorder.faults(), "it says that the disk does not answer")
+    assert one.recorder.faults()[0].code == "slow"
+    assert one.summary()["dropped"] == {"overtaken": 15}
     free.set()
-    until(lambda: not one.faults(), "the disk answers")
-    one.close()
+    until(lambda: not one.recorder.faults(), "the disk answers")
+    one.recorder.close()
     path = files(tmp_path)[-1]
-    assert told(path, "/recorder")[-1]["dropped"] == {"frame": 15}
-    assert len(told(path, "/camera/navcam_left/frame")) == 5
+    assert records(path, "/recorder")[-1]["dropped"] == {"overtaken": 15}
+    assert len(records(path, "/camera/navcam_left/frame")) == 5
 
 
 def test_a_disk_that_refuses_is_a_fault_and_is_tried_again(
@@ -193,60 +194,60 @@ def test_a_disk_that_refuses_is_a_fault_and_is_tried_again(
         flush(self)
 
     monkeypatch.setattr(RecordFile, "flush", refusing)
-    monkeypatch.setattr(module, "AGAIN_S", 0.0)
-    one = recorder(tmp_path)
-    one.tell("command", "0", {"number": 0})
-    until(lambda: one.faults(), "it says so")
-    (fault,) = one.faults()
+    monkeypatch.setattr(module, "RETRY_S", 0.0)
+    one = Recording(tmp_path)
+    one.publish("command", "0", {"number": 0})
+    until(lambda: one.recorder.faults(), "it says so")
+    (fault,) = one.recorder.faults()
     assert fault.code == "unwritable" and "No space left on device; nothing is recorded" in fault.message
     with pytest.raises(Unable, match="cannot be written"):
-        one.start_run("now")
+        one.recorder.start_run("now")
     full[0] = False
-    one.tell("command", "1", {"number": 1})
-    until(lambda: not one.faults(), "it goes on")
-    one.close()
-    assert [n["number"] for n in told(files(tmp_path)[-1], "/command")] == [1]
+    one.publish("command", "1", {"number": 1})
+    until(lambda: not one.recorder.faults(), "it goes on")
+    one.recorder.close()
+    assert [n["number"] for n in records(files(tmp_path)[-1], "/command")] == [1]
 
 
 def test_the_room_of_others_is_left_free_the_ring_giving_way_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     left_mb = [5000.0]
-    monkeypatch.setattr(Shelf, "free_bytes", lambda self: int(left_mb[0] * 1e6))
-    monkeypatch.setattr(module, "AGAIN_S", 0.0)
-    one = recorder(tmp_path, free_mb=1000.0)
-    one.start_run("long")
-    one.tell("command", "0", {"number": 0})
+    monkeypatch.setattr(RecordFolder, "free_bytes", lambda self: int(left_mb[0] * 1e6))
+    monkeypatch.setattr(module, "RETRY_S", 0.0)
+    one = Recording(tmp_path, free_mb=1000.0)
+    one.recorder.start_run("long")
+    one.publish("command", "0", {"number": 0})
     left_mb[0] = 900.0
-    until(lambda: one.faults(), "it stops before the disk is full")
-    (fault,) = one.faults()
+    until(lambda: one.recorder.faults(), "it stops before the disk is full")
+    (fault,) = one.recorder.faults()
     assert fault.code == "disk_low" and "900 MB free where 1000 MB are left to others" in fault.message
-    assert one.told()["run"] is None
+    assert one.summary()["run"] is None
     with pytest.raises(Unable, match="900 MB free"):
-        one.start_run("more")
+        one.recorder.start_run("more")
     left_mb[0] = 1050.0  # a little more is not enough: it would end again at once
-    one.tell("command", "1", {"number": 1})
-    until(lambda: not one._queue, "it is read")
-    assert one.faults()
+    one.publish("command", "1", {"number": 1})
+    one.written()
+    assert one.recorder.faults()
     left_mb[0] = 2000.0
-    one.tell("command", "2", {"number": 2})
-    until(lambda: not one.faults(), "it goes on")
-    one.close()
+    one.publish("command", "2", {"number": 2})
+    until(lambda: not one.recorder.faults(), "it goes on")
+    one.recorder.close()
     assert all(McapContents is not None and list(read_items(path)) for path in files(tmp_path))
 
 
 def test_a_run_ends_at_its_size_and_says_so(tmp_path: Path) -> None:
-    one = recorder(tmp_path, run_mb=1.0, ring_s=0.0)
-    one.start_run("full")
+    one = Recording(tmp_path, run_mb=1.0, ring_s=0.0)
+    one.recorder.start_run("full")
     number = 0
-    while one.told()["run"]:
+    while one.summary()["run"]:
         number += 1
-        one.tell("frame", "navcam_left", frame(number, picture(number, (300, 1000))))
-        until(lambda: not one._queue, "it writes")
+        one.publish("frame", "navcam_left", frame(number, picture(number, (300, 1000))))
+        one.written()
         assert number < 15
-    until(lambda: one.faults(), "it says so")
-    assert one.faults()[0].code == "run_full"
-    one.close()
+    until(lambda: one.recorder.faults(), "it says so")
+    assert one.recorder.faults()[0].code == "run_full"
+    one.recorder.close()
 
 
 def deleted(path: Path) -> None:
@@ -271,39 +272,40 @@ def with_its_folder(path: Path) -> None:
 def test_a_run_whose_file_goes_is_a_fault_until_the_next_one(
     tmp_path: Path, goes: Callable[[Path], None], ring_s: float
 ) -> None:
-    one = recorder(tmp_path / "recordings", ring_s=ring_s)
-    run = one.start_run("rock")["run"]
+    one = Recording(tmp_path / "recordings", ring_s=ring_s)
+    run = one.recorder.start_run("rock")["run"]
     (path,) = files(tmp_path)
-    one.tell("command", "1", {"number": 1})
-    until(lambda: one.told()["size_mb"] and not one._queue, "it is written")
+    one.publish("command", "1", {"number": 1})
+    one.written()
+    until(lambda: one.summary()["size_mb"], "it is written")
     goes(path)
-    until(lambda: one.faults(), "it says so")
-    one.tell("command", "2", {"number": 2})
-    until(lambda: not one._queue and one.told()["recording"] is (ring_s > 0.0), "the ring goes on")
-    (fault,) = one.faults()
+    until(lambda: one.recorder.faults(), "it says so")
+    one.publish("command", "2", {"number": 2})
+    until(lambda: one.summary()["recording"] is (ring_s > 0.0), "the ring goes on")
+    (fault,) = one.recorder.faults()
     words = f"the run {run} has ended: its file {path} was deleted or moved while it was recorded"
     assert (fault.code, fault.message, fault.until) == ("run_gone", words, "another run begins")
-    assert one.told()["fault"] == words and one.told()["run"] is None
+    assert one.summary()["fault"] == words and one.summary()["run"] is None
     with pytest.raises(NotNow, match="no run is recorded"):
-        one.stop_run()
-    one.start_run("again")
-    assert one.faults() == ()
-    one.stop_run()
-    one.close()
+        one.recorder.stop_run()
+    one.recorder.start_run("again")
+    assert one.recorder.faults() == ()
+    one.recorder.stop_run()
+    one.recorder.close()
     if goes is moved:
-        assert [n["number"] for n in told(tmp_path / "recordings" / "elsewhere.mcap", "/command")] == [1]
+        assert [n["number"] for n in records(tmp_path / "recordings" / "elsewhere.mcap", "/command")] == [1]
 
 
 def test_another_mast_file_is_attached_and_its_cameras_told_when_it_comes(tmp_path: Path) -> None:
-    one = recorder(tmp_path)
-    one.tell("joints", "pan_tilt", reading(0.1))
-    until(lambda: one.told()["recording"] and one._busy_since_s is None, "the file has begun")
+    one = Recording(tmp_path)
+    one.publish("joints", "pan_tilt", reading(0.1))
+    one.written()
     other = Attached("other.yaml", b"another mast file")
-    one.use_mast(AttachedMast(mast().rig, other))
-    one.tell("joints", "pan_tilt", reading(0.2))
-    one.close()
+    one.recorder.use_mast(AttachedMast(mast().rig, other))
+    one.publish("joints", "pan_tilt", reading(0.2))
+    one.recorder.close()
     (path,) = files(tmp_path)
-    digests = [one["mast_digest"] for one in told(path, "/camera/navcam_left/cahvor")]
+    digests = [one["mast_digest"] for one in records(path, "/camera/navcam_left/cahvor")]
     assert digests == [mast().file.digest, other.digest]
     from mcap.reader import make_reader
 
@@ -314,25 +316,25 @@ def test_another_mast_file_is_attached_and_its_cameras_told_when_it_comes(tmp_pa
 def test_an_operations_end_leaves_its_residuals_and_target_once(tmp_path: Path) -> None:
     pointing = {"residual_px": [0.1, 0.2], "residual_sigma_px": [0.05, 0.05], "frame_id": "f"}
     record: dict[str, Any] = {"id": "000001-ab", "state": "running", "result": None, "ended_s": None}
-    one = recorder(tmp_path)
-    one.tell("operation", "000001-ab", record)
+    one = Recording(tmp_path)
+    one.publish("operation", "000001-ab", record)
     done = record | {"state": "done", "ended_s": 2.0}
     done["result"] = {"position_m": [1.0, 2.0, 3.0], "range_m": 4.0, "pointings": [pointing, pointing]}
-    one.tell("operation", "000001-ab", done)
-    one.tell("operation", "000001-ab", done)
-    one.close()
+    one.publish("operation", "000001-ab", done)
+    one.publish("operation", "000001-ab", done)
+    one.recorder.close()
     (path,) = files(tmp_path)
-    assert [row["pointing"] for row in told(path, "/residual")] == [1, 2]
-    assert told(path, "/target") == [
+    assert [row["pointing"] for row in records(path, "/residual")] == [1, 2]
+    assert records(path, "/target") == [
         {"operation": "000001-ab", "position_m": [1.0, 2.0, 3.0], "range_m": 4.0}
     ]
 
 
 def test_a_value_that_cannot_be_told_spoils_nothing_else(tmp_path: Path) -> None:
-    one = recorder(tmp_path)
-    one.tell("frame", "navcam_left", "no frame at all")
-    one.tell("command", "1", {"number": 1})
-    one.close()
+    one = Recording(tmp_path)
+    one.publish("frame", "navcam_left", "no frame at all")
+    one.publish("command", "1", {"number": 1})
+    one.recorder.close()
     (path,) = files(tmp_path)
     assert sum(isinstance(item, McapEntry) for item in read_items(path)) == sum(1 for _ in messages(path))
-    assert told(path, "/command") == [{"number": 1}]
+    assert records(path, "/command") == [{"number": 1}]

@@ -19,6 +19,7 @@ from hil_tests.mastctl.watch.small_rover import small
 from mastctl.cli.main import main
 from mastctl.client import Client
 from mastctl.config import Listen, load_config
+from mastctl.control.publisher import Publisher
 from mastctl.daemon import RunningDaemon
 from mastctl.recorder.recorded import Recording, read_whole
 from mastctl.recorder.recorder import AttachedMast, Recorder
@@ -55,8 +56,10 @@ def recorded(mast_file: Path, true_file: Path, folder: Path) -> Path:
     settings = RecordSettings(ring_s=0.0, free_mb=0.0)
     attached = [replace(CONFIG, data=Path(config.path).read_bytes())]
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
-        clock = daemon.service.clock
-        recorder = Recorder(settings, folder, mast, attached, {"hardware": "simulated"}, clock)
+        publisher, service = Publisher(), daemon.service
+        facts = {"hardware": "simulated"}
+        find = service.devices.frame_by_id
+        recorder = Recorder(settings, folder, mast, attached, facts, publisher, find, service.clock)
         recorder.start_run("")
         for x_px, y_px in CLICKS_PX:
             client.wait(client.point(pan_rad=0.0, tilt_rad=-0.1))
@@ -65,10 +68,9 @@ def recorded(mast_file: Path, true_file: Path, folder: Path) -> Path:
             record = client.wait(done)
             assert record["state"] == "done", record["error"]
             for pointing in record["pointings"]:
-                frame = daemon.service.devices.frame_by_id(pointing["frame_id"])
-                recorder.tell("frame", frame.camera, frame)
-            told = daemon.service.operations.get(done)
-            recorder.tell("operation", done, told)
+                frame = find(pointing["frame_id"])
+                publisher.publish("frame", frame.camera, frame)
+            publisher.publish("operation", done, service.operations.get(done))
         file = Path(recorder.stop_run()["file"])
         recorder.close()
     return file
@@ -134,7 +136,7 @@ def test_the_command_tells_a_table_and_draws_a_page(
     shown = capsys.readouterr().out
     assert "would be rms" in shown and "what_if.html" in shown
     page = (tmp_path / "what_if.html").read_text()
-    assert page.count("data:image/jpeg") == 2 * len(CLICKS_PX) and page.count("data:image/png") == 1
+    assert page.count("data:image/png") == 1
 
 
 def test_what_cannot_be_worked_out_is_named() -> None:
@@ -145,7 +147,7 @@ def test_what_cannot_be_worked_out_is_named() -> None:
     }
     seen, others = seen_in(records, {})
     assert seen == []
-    assert others["1"] == "it had no picture in which anything could be measured"
+    assert others["1"] == "it had no image in which anything could be measured"
     assert others["2"] == "it failed: it was flat"
     assert others["3"].startswith("its record does not hold enough")
 

@@ -79,7 +79,7 @@ def test_a_report_has_one_main_part_and_no_empty_heading() -> None:
     told = {"title": "Run", "badge": pages.Badge("REAL", "real"), "facts": [("mast file", "a.yaml")]}
     text = pages.page(
         "what_if.html", **told, answered=True, summary=table, plot=None, pointings=Table([], []),
-        handoffs=Table([], []), pictured=[], others=[],
+        handoffs=Table([], []), others=[],
     )  # fmt: skip
     assert text.count("<main>") == text.count("</main>") == 1
     assert not re.search(r"<th[^>]*>\s*</th>", text)

@@ -1,11 +1,11 @@
 """The folder of recordings: the ring's segments, what was kept at faults, and runs; each within its bound.
 
-    ring/      000001-20261122T120341Z.mcap ...              goes round
+    ring/      000001-20261122T120341Z.mcap ...              overwritten in turn
     kept/      000001-20261122T120341Z-pan_tilt-no_reply/    segments of the ring, moved here at a fault
     runs/      20261122T120341Z-NAME.mcap                    begun and ended by command
 
-Segments are moved, not copied: keeping them needs no room and no time, on a full disk either. Which of them
-is older is told by their numbers and by the monotonic clock: the calendar may be set back, or ahead.
+Segments are moved, not copied: keeping them needs no space and no time, on a full disk either. Which of them
+is older follows from their numbers and by the monotonic clock: the calendar may be set back, or ahead.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Recorded:
     size_bytes: int
     folder: Path  # of its files; its own for what was kept
 
-    def told(self) -> RecordingListed:
+    def as_json(self) -> RecordingListed:
         """Return it as JSON."""
         return {
             "name": self.name,
@@ -50,7 +50,7 @@ class Recorded:
         }
 
 
-class Shelf:
+class RecordFolder:
     """The files of one daemon's recordings; used by the recorder's writing thread, read by any.
 
     Parameters
@@ -67,7 +67,7 @@ class Shelf:
     """
 
     def __init__(self, folder: Path, clock_s: Callable[[], float] = time.monotonic) -> None:
-        self.folder = folder
+        self.path = folder
         self._clock_s = clock_s
         self._opened_s = clock_s()
         self._begun_s: dict[str, float] = {}
@@ -80,8 +80,8 @@ class Shelf:
 
     def free_bytes(self) -> int:
         """Return what is free on the disk for this user."""
-        room = os.statvfs(self.folder)
-        return room.f_bavail * room.f_frsize
+        disk = os.statvfs(self.path)
+        return disk.f_bavail * disk.f_frsize
 
     def next_segment(self) -> Path:
         """Return the name of the ring's next file."""
@@ -91,7 +91,7 @@ class Shelf:
 
     def next_run(self, name: str) -> Path:
         """Return the file of a run that begins now; its name is not taken."""
-        return _untaken(self._runs, f"{_stamp()}{_worded(name)}", SUFFIX)
+        return _untaken(self._runs, f"{_stamp()}{_suffix(name)}", SUFFIX)
 
     def trim_ring(self, ring_s: float, ring_mb: float) -> None:
         """Let the oldest segments go when the newest one has ended: those that another followed ``ring_s``
@@ -123,7 +123,7 @@ class Shelf:
         if not _files(self._ring):
             return ""
         number = _next_number(self._kept.iterdir())
-        place = self._kept / f"{number:06d}-{_stamp()}{_worded(why)}"
+        place = self._kept / f"{number:06d}-{_stamp()}{_suffix(why)}"
         place.mkdir(mode=0o700)
         for path in _files(self._ring):
             path.rename(place / path.name)
@@ -188,9 +188,9 @@ def _stamp() -> str:
     return datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
 
 
-def _worded(words: str) -> str:
-    """Words as a part of a file's name."""
-    plain = _NOT_IN_NAMES.sub("-", words).strip("-.")[:60]
+def _suffix(text: str) -> str:
+    """A text as the end of a file's name."""
+    plain = _NOT_IN_NAMES.sub("-", text).strip("-.")[:60]
     return f"-{plain}" if plain else ""
 
 
