@@ -16,7 +16,7 @@ from mastctl.recorder.recorded import Recording
 from mastctl.recorder.what_if import HandedAgain, WouldBe, rms
 from mastctl.report import pages, plots
 from mastctl.report.pictures import Figure
-from mastctl.report.tables import Table, number, x_y
+from mastctl.report.tables import Table, x_y
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,19 +80,13 @@ def summary_table(what_if: WhatIf) -> Table:
 
 
 def pointing_table(what_if: WhatIf) -> Table:
-    """Return each pointing; ``turned``: commanded pan and tilt less those that were commanded."""
-    headings = (
-        "operation", "pointing", "range m", "recorded (px)", "would be (px)", "sigma (px)", "turned (mrad)",
-    )  # fmt: skip
+    """Return each pointing."""
     rows = []
     for one in what_if.pointings:
-        row = [one.seen.operation, str(one.seen.pointing), number(one.range_m), x_y(one.seen.residual_px, 3)]
-        if one.residual_px is None or one.commanded_rad is None:
-            rows.append([*row, one.error, "", ""])
-            continue
-        turned = 1e3 * np.subtract(one.commanded_rad, one.seen.commanded_rad)
-        rows.append([*row, x_y(one.residual_px, 3), x_y(one.sigma_px, 3), x_y(turned, 3)])
-    return Table(headings, rows)
+        would_be = x_y(one.residual_px, 3) or one.error
+        start = one.seen.operation, str(one.seen.pointing), x_y(one.seen.residual_px, 3)
+        rows.append([*start, would_be, x_y(one.sigma_px, 3)])
+    return Table(("operation", "pointing", "recorded (px)", "would be (px)", "sigma (px)"), rows)
 
 
 def handoff_table(what_if: WhatIf) -> Table:
