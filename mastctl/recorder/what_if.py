@@ -7,8 +7,8 @@ at those follows from where it was seen, since the way between the two angles is
 file's. What the servos left of the command is taken as it was. With the recording's own mast file the
 recorded residual comes out again.
 
-The reported sigma is that of another run's residual: of the matches, of the range from the pair's matches, and of
-what the servos leave, as scattered over the recording.
+The reported sigma is that of another run's residual: of the matches, of the range from the pair's matches,
+and of what the servos leave, as scattered over the recording.
 """
 
 from __future__ import annotations
