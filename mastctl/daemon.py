@@ -17,12 +17,11 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import uvicorn
 from starlette.types import ASGIApp
@@ -35,17 +34,7 @@ from mastctl.config import Config, Listen
 from mastctl.errors import MastctlError
 from mastctl.guided.guide import WayIn
 from mastctl.http.access import Access
-from mastctl.http.connections import (
-    ACCEPTED_AT_ONCE,
-    WAITING_IN_KERNEL,
-    Connection,
-    counted,
-    most_connections,
-    sweep,
-)
 from mastctl.http.entrance import EntryRules, HostNames
-from mastctl.http.server import Server
-from mastctl.http.sockets import LARGEST_BYTES, PING_S, Socket
 from mastctl.http.tokens import TokenList
 from mastctl.http.waiting import Streams, Waiting
 from mastctl.logs import stall_while
@@ -59,6 +48,14 @@ from mastctl.web.pictures import WatchedCameras
 log = logging.getLogger(__name__)
 
 GRACE_S = 2  # for answers under way, when the daemon ends; what waits for a device is refused at once
+ACCEPTED_AT_ONCE = 4  # connections taken in one turn of the event loop
+WAITING_IN_KERNEL = 128  # connections that the kernel keeps for us meanwhile
+IDLE_S = 10  # how long a connection is kept for its next request
+UNREAD_S = 10.0  # after that the kernel ends a connection whose client takes no bytes
+LARGEST_HEADERS_BYTES = 16384
+LARGEST_MESSAGE_BYTES = 1024  # of a WebSocket's client
+PING_S = 20.0
+REVOKED_S = 0.5  # how late a stream may end after its token
 SWITCH_S = 0.0005  # a stop goes through five threads and may wait so long for each; 5 ms by default
 START_TIMEOUT_S = 600.0  # the first start compiles the simulator's kernels
 END_TIMEOUT_S = 20.0
@@ -265,17 +262,14 @@ async def _serve(
     """
     loop = asyncio.get_running_loop()
     waiting = Waiting(service.clock)
-    most = most_connections()
-    streams = Streams(service.machine.publisher, most // 2)
+    streams = Streams(service.machine.publisher)
     watched = WatchedCameras(service.devices, service.clock)
-    kind = type("Connection", (Connection,), {"most": most, "turns": waiting.turns})
-    settings = _settings(service, create_app(service, waiting, entrance, streams, watched), kind)
-    server = Server(settings)
+    server = uvicorn.Server(_settings(create_app(service, waiting, entrance, streams, watched)))
     ending = asyncio.Event()
 
     def end() -> None:
         if ending.is_set():
-            server.force()  # asked twice: wait for nobody
+            server.force_exit = True  # requested twice: wait for no client
         ending.set()
 
     def end_from_anywhere() -> None:
@@ -290,6 +284,7 @@ async def _serve(
             loop.add_signal_handler(number, end)
         if signal.getsignal(signal.SIGTSTP) is not signal.SIG_IGN:
             loop.add_signal_handler(signal.SIGTSTP, _suspend, service)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     while not server.started and not serving.done():
         await asyncio.sleep(0.005)
@@ -297,19 +292,21 @@ async def _serve(
         await serving
         raise MastctlError("the web server ended before it answered a request")
     listener.listen(WAITING_IN_KERNEL)  # asyncio has one number for this and for how many it takes at once
-    stands = (lambda credential: True) if entrance.access is None else entrance.access.stands
-    sweeping = asyncio.create_task(sweep(server.server_state.connections, stands))
+    beside = [asyncio.create_task(_report_state(service, manager))]
+    if entrance.access is not None:
+        beside.append(asyncio.create_task(_end_revoked(streams, entrance.access)))
     if in_process:
+        for number, handler in handlers.items():  # uvicorn has set its own: the mast is stopped first
+            signal.signal(number, handler)
         # What the start has made stays. Looked through again by each full collection it held every thread for
         # some 80 ms, a stop's too.
         gc.collect()
         gc.freeze()
     on_ready(end_from_anywhere)
     manager.ready()
-    telling = asyncio.create_task(_tell_state(service, manager))
-    asked = asyncio.create_task(ending.wait())
-    await asyncio.wait({serving, asked}, return_when=asyncio.FIRST_COMPLETED)
-    asked.cancel()
+    requested = asyncio.create_task(ending.wait())
+    await asyncio.wait({serving, requested}, return_when=asyncio.FIRST_COMPLETED)
+    requested.cancel()
     manager.stopping()
     try:
         stopped = asyncio.wrap_future(service.stop_threads.submit(service.operations.close))
@@ -318,19 +315,25 @@ async def _serve(
     waiting.end()
     log.info("ending: the mast is stopped first")
     await stopped
-    streams.end()
+    await streams.end()
     watched.close()
-    server.end()
-    loop.call_later(GRACE_S - 0.5, _leave, server.server_state.connections)  # before uvicorn's own impatience
+    server.should_exit = True
     await serving
-    for task in (sweeping, telling):
+    for task in beside:
         task.cancel()
     if in_process:
         await loop.run_in_executor(None, service.close)
 
 
-async def _tell_state(service: Service, manager: ServiceManager) -> None:
-    """Tell who started this process each change of the state, in words."""
+async def _end_revoked(streams: Streams, access: Access) -> None:
+    """End streams with the tokens that opened them, until cancelled."""
+    while True:
+        await asyncio.sleep(REVOKED_S)
+        streams.end_revoked(access.stands)
+
+
+async def _report_state(service: Service, manager: ServiceManager) -> None:
+    """Report each change of the state to the service manager, as text."""
     with service.machine.publisher.subscribe_here("state") as changes:
         while not changes.closed:
             for change in await changes.wait():
@@ -338,14 +341,15 @@ async def _tell_state(service: Service, manager: ServiceManager) -> None:
                 manager.status(f"{now.word}: {now.reason}" if now.reason else now.word)
 
 
-def _settings(service: Service, app: ASGIApp, kind: type[Connection]) -> uvicorn.Config:
-    """How uvicorn serves."""
+def _settings(app: ASGIApp) -> uvicorn.Config:
+    """How uvicorn serves. Its limit of concurrent requests would refuse stops too, and is not set."""
     return uvicorn.Config(
         app,
-        http=kind,
+        http="h11",
+        h11_max_incomplete_event_size=LARGEST_HEADERS_BYTES,
         backlog=ACCEPTED_AT_ONCE,
-        ws=Socket,
-        ws_max_size=LARGEST_BYTES,
+        timeout_keep_alive=IDLE_S,
+        ws_max_size=LARGEST_MESSAGE_BYTES,
         ws_ping_interval=PING_S,
         ws_ping_timeout=PING_S,
         ws_per_message_deflate=False,
@@ -354,6 +358,7 @@ def _settings(service: Service, app: ASGIApp, kind: type[Connection]) -> uvicorn
         server_header=False,
         access_log=False,
         log_config=None,
+        log_level="critical",  # what strangers send is no error; the guard logs defects
         timeout_graceful_shutdown=GRACE_S,
     )
 
@@ -380,12 +385,6 @@ def _entrance(service: Service, url: str) -> Iterator[EntryRules]:
         yield EntryRules(names, access, "token")
     finally:
         access.close()
-
-
-def _leave(connections: Iterable[Any]) -> None:
-    """Leave those who have not read their answers."""
-    for one in counted(list(connections)):
-        one.leave()
 
 
 def _suspend(service: Service) -> None:
@@ -427,6 +426,8 @@ def _tcp_socket(listen: Listen) -> socket.socket:
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        # Inherited by each connection, which a client that stops reading would otherwise keep for ever.
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(1000 * UNREAD_S))
         listener.bind((listen.host, listen.port))
         # Listening at once: SO_REUSEADDR lets two sockets bind as long as neither of them listens.
         listener.listen()

@@ -127,9 +127,9 @@ def process() -> NoReturn:
     if "OMP_NUM_THREADS" not in os.environ:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     code = main()
-    others = [one for one in threading.enumerate() if one is not threading.main_thread()]
-    if others and all(one.daemon for one in others):
-        # The interpreter's own end would end them where they are, and C++ (OpenCV, SciPy) aborts on that.
+    if threading.active_count() > 1:
+        # The interpreter's own end would wait for a thread that a device holds, and end daemon threads where
+        # they are, on which C++ (OpenCV, SciPy) aborts.
         atexit._run_exitfuncs()
         with contextlib.suppress(OSError):
             sys.stderr.flush()

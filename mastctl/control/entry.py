@@ -261,13 +261,10 @@ class CommandEntry:
         """Record a stop that could not even be tried."""
         self._record(command, asked, None, error, begins=False)
 
-    def refused(self, caller: Caller, what: str, code: str, message: str, times: int | None = None) -> None:
-        """Record a request that was refused before it was a command; ``times``, how often that has come to be
-        where not each one is recorded. Nobody is told of it."""
-        told = {"number": next(self._numbers), **self._now(), **_who(what, caller), "request": {}}
+    def refused(self, caller: Caller, command: str, code: str, message: str) -> None:
+        """Record a request that was refused before it was a command. It is not published."""
+        told = {"number": next(self._numbers), **self._now(), **_who(command, caller), "request": {}}
         told |= {"result": code, "message": message}
-        if times is not None:
-            told["times"] = times
         (self.strangers if caller.stranger else self.audit).put(told)
 
     def ended(self, operation: str, state: str, error: Mapping[str, Any] | None) -> None:

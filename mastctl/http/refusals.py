@@ -100,7 +100,7 @@ async def query_of(line: WebSocket, model: type[Query], listed: str) -> AsyncIte
         words = sentence({**first, "loc": ("query", *first["loc"])}, model)
         await line.send_denial_response(error_response(422, "bad_request", words))
     except MastctlError as error:
-        await line.send_denial_response(told(error))
+        await line.send_denial_response(refusal_response(error))
 
 
 def marked(headers: Iterable[tuple[bytes, bytes]]) -> Headers:
@@ -213,7 +213,7 @@ def status_of(error: Exception) -> int:
     return next(STATUS_OF_KIND[kind] for kind in type(error).__mro__ if kind in STATUS_OF_KIND)
 
 
-def told(error: Exception) -> JSONResponse:
+def refusal_response(error: Exception) -> JSONResponse:
     """Return the answer to a request that met an error of these families."""
     if isinstance(error, GuardError):
         return error_response(error.status, error.code, str(error), headers=error.headers)
@@ -230,7 +230,7 @@ def add_errors(app: FastAPI) -> None:
     """Every refusal in the one form."""
 
     async def ours(request: Request, error: Exception) -> JSONResponse:
-        return told(error)
+        return refusal_response(error)
 
     for kind in (MastctlError, DriverError, CalibError, GuardError):
         app.add_exception_handler(kind, ours)

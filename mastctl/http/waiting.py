@@ -1,25 +1,23 @@
-"""Requests that wait: for a thread, a device, a picture, a change; and none for a daemon that ends.
+"""Requests that wait: for a thread, a device, an image, a change; and none for a daemon that ends.
 
-The event loop itself never waits for a lock, a file or a device. What may, runs here in worker threads; a
-request that waits when the daemon ends is refused at once, and what its thread still brings is dropped.
-Pictures have a limit of their own for each camera, so that a dead camera, however often it is asked, takes
-no thread from anything else. What computes for long does it in a few threads of the lowest standing.
-
-What is no stop is taken up in turn, one piece in each turn of the event loop: however many ask at once, what
-a stop still waits for is the work of a few of them, not of all.
+The event loop itself never waits for a lock, a file or a device. Work that may wait runs here in worker
+threads; a request that waits when the daemon ends is refused at once, and its thread's result is dropped.
+Images have a limit of their own for each camera, so that a dead camera, however often it is requested, takes
+no thread from anything else. Long computations run in a few threads of the lowest priority.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import threading
-from collections import deque
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
+
+from anyio import CancelScope, CapacityLimiter, move_on_after
+from anyio.to_thread import run_sync
 
 from drivers.clock import Clock, SystemClock
 from mastctl.control.publisher import LoopSubscription, Publisher, Topic
@@ -27,37 +25,9 @@ from mastctl.errors import Unable
 
 T = TypeVar("T")
 
-
-class Turns:
-    """What waits to be taken up on one event loop; used on that loop only."""
-
-    def __init__(self) -> None:
-        self._waiting: deque[Callable[[], None]] = deque()
-
-    def call(self, function: Callable[[], None]) -> None:
-        """Have a function called when all that came before has had a turn of the event loop."""
-        self._waiting.append(function)
-        if len(self._waiting) == 1:
-            asyncio.get_running_loop().call_soon(self._next)
-
-    async def turn(self) -> None:
-        """Return when all that came before has had its turn."""
-        mine: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self.call(lambda: None if mine.done() else mine.set_result(None))
-        await mine
-
-    def _next(self) -> None:
-        try:
-            self._waiting[0]()
-        finally:
-            self._waiting.popleft()  # now, so that what it has called comes a turn later
-            if self._waiting:
-                asyncio.get_running_loop().call_soon(self._next)
-
-
-AT_ONCE = 40  # worker threads for everything but pictures
-PICTURES_AT_ONCE = 4  # of one camera
-PICTURE_QUEUE_S = 2.0  # how long a request waits for those before it
+WORKERS = 40  # threads for everything but images
+IMAGES_AT_ONCE = 4  # of one camera
+IMAGE_QUEUE_S = 2.0  # how long a request waits for those before it
 ENCODERS = 2
 ENCODERS_NICE = 10  # a stop's threads, and the event loop, go first
 
@@ -70,20 +40,32 @@ class Waiting:
 
     def __init__(self, clock: Clock | None = None) -> None:
         self._clock = clock or SystemClock()
-        self._ending = asyncio.Event()
-        self._asked: dict[tuple[str, bool], asyncio.Semaphore] = {}
-        self._others = asyncio.Semaphore(AT_ONCE)
-        self.turns = Turns()
-        self._encoders = ThreadPoolExecutor(ENCODERS, "encoding", _give_way)
+        self._ended = False
+        self._scopes: set[CancelScope] = set()
+        self._turn = asyncio.Lock()
+        self._workers = CapacityLimiter(WORKERS)
+        self._images: dict[tuple[str, bool], CapacityLimiter] = {}
+        self._encoders = ThreadPoolExecutor(ENCODERS, "encoding", _lower_priority)
 
     def end(self) -> None:
         """Refuse what waits now and what will come."""
-        self._ending.set()
+        self._ended = True
+        for scope in self._scopes:
+            scope.cancel()
         self._encoders.shutdown(wait=False, cancel_futures=True)
 
+    async def turn(self) -> None:
+        """Return one turn of the event loop after the call before: what is no stop begins in turn.
+
+        However many requests come at once, a stop waits for the work of a few of them only.
+        """
+        async with self._turn:
+            await asyncio.sleep(0)
+
     def encode(self, function: Callable[[], T]) -> T:
-        """Return what ``function()`` returns, which computes for long: a few at a time, and everybody else's
-        work first. For a worker thread of `run` or `picture`.
+        """Return what ``function()`` returns, which computes for long: a few at a time, after all other work.
+
+        For a worker thread of `run` or `image`.
 
         Raises
         ------
@@ -91,14 +73,14 @@ class Waiting:
             ``closing`` if the daemon ends.
         """
         try:
-            asked = self._encoders.submit(function)
+            encoded = self._encoders.submit(function)
         except RuntimeError:  # the daemon ends
-            asked = Future[T]()
-            asked.cancel()
+            encoded = Future[T]()
+            encoded.cancel()
         try:
-            return asked.result()
+            return encoded.result()
         except CancelledError:
-            raise Unable("closing", "the daemon ends; the request will not be served") from None
+            raise _closing() from None
 
     async def run(self, function: Callable[[], T]) -> T:
         """Return what ``function()`` returns, run in a worker thread.
@@ -106,13 +88,13 @@ class Waiting:
         Raises
         ------
         Unable
-            ``closing`` if the daemon ends before it returns, ``no_thread`` if the machine has none for it.
+            ``closing`` if the daemon ends before it returns.
         """
-        return await self._unless_ending(self._worked(function))
+        return await self._unless_ending(function, self._workers)
 
-    async def picture(self, camera: str, function: Callable[[], T], kept: bool = False) -> T:
-        """Return what ``function()`` returns, which takes a picture with a (known) camera, or encodes one
-        that is ``kept``: as many of these at once, and none of them waits for the camera.
+    async def image(self, camera: str, function: Callable[[], T], kept: bool = False) -> T:
+        """Return what ``function()`` returns, which takes an image with a (known) camera, or encodes one that
+        is ``kept``: as many of these at once, and none of them waits for the camera.
 
         Raises
         ------
@@ -120,109 +102,82 @@ class Waiting:
             ``too_many`` if so many others wait for this camera that it does not come to this one's turn in
             2 s; else as `run`.
         """
-        return await self._unless_ending(self._in_turn(camera, function, kept))
+        limiter = self._images.setdefault((camera, kept), CapacityLimiter(IMAGES_AT_ONCE))
+        return await self._unless_ending(function, limiter, camera)
 
-    async def _worked(self, function: Callable[[], T]) -> T:
-        async with self._others:
-            return await _in_thread(self._at_work(function))
+    async def _unless_ending(
+        self, function: Callable[[], T], limiter: CapacityLimiter, camera: str = ""
+    ) -> T:
+        with CancelScope() as scope:
+            self._scopes.add(scope)
+            if self._ended:
+                scope.cancel()
+            try:
+                with move_on_after(IMAGE_QUEUE_S if camera else None) as queue:
+                    await limiter.acquire()
+                if queue.cancelled_caught:
+                    raise _too_many(camera)
+                try:
+                    one = CapacityLimiter(1)  # the place is taken already
+                    return await run_sync(self._at_work, function, abandon_on_cancel=True, limiter=one)
+                finally:
+                    limiter.release()
+            finally:
+                self._scopes.discard(scope)
+        raise _closing()
 
-    async def _in_turn(self, camera: str, function: Callable[[], T], kept: bool) -> T:
-        turn = self._asked.setdefault((camera, kept), asyncio.Semaphore(PICTURES_AT_ONCE))
-        try:
-            await asyncio.wait_for(turn.acquire(), PICTURE_QUEUE_S)
-        except TimeoutError:
-            raise Unable(
-                "too_many",
-                f"{PICTURES_AT_ONCE} pictures of {camera} are waited for, and none came in "
-                f"{PICTURE_QUEUE_S:g} s; ask again later",
-                PICTURE_QUEUE_S,
-            ) from None
-        try:
-            return await _in_thread(self._at_work(function))
-        finally:
-            turn.release()
-
-    def _at_work(self, function: Callable[[], T]) -> Callable[[], T]:
-        def work() -> T:
-            with self._clock.at_work():
-                return function()
-
-        return work
-
-    async def _unless_ending(self, work: Awaitable[T]) -> T:
-        call = asyncio.ensure_future(work)
-        ending = asyncio.ensure_future(self._ending.wait())
-        try:
-            await asyncio.wait({call, ending}, return_when=asyncio.FIRST_COMPLETED)
-            if call.done():
-                return call.result()
-            raise Unable("closing", "the daemon ends; the request will not be served")
-        finally:
-            for one in (call, ending):
-                one.cancel()
+    def _at_work(self, function: Callable[[], T]) -> T:
+        with self._clock.at_work():
+            return function()
 
 
-def _give_way() -> None:
-    """Let this thread come after everybody else's; Linux counts niceness by thread."""
+def _closing() -> Unable:
+    return Unable("closing", "the daemon ends; the request will not be served")
+
+
+def _too_many(camera: str) -> Unable:
+    return Unable(
+        "too_many",
+        f"{IMAGES_AT_ONCE} images of {camera} are waited for, and none came in {IMAGE_QUEUE_S:g} s; "
+        "send the request again later",
+        IMAGE_QUEUE_S,
+    )
+
+
+def _lower_priority() -> None:
+    """Let this thread come after all others; Linux counts niceness by thread."""
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), ENCODERS_NICE)
 
 
-async def _in_thread(function: Callable[[], T]) -> T:
-    """Return what a function returns, run in a daemon thread, which does not hold the process's end."""
-    loop = asyncio.get_running_loop()
-    answer: asyncio.Future[T] = loop.create_future()
-
-    def tell(result: T | None, error: Exception | None) -> None:
-        if answer.done():  # nobody waits any more
-            return
-        if error is not None:
-            answer.set_exception(error)
-        else:
-            answer.set_result(result)  # type: ignore[arg-type]
-
-    def run() -> None:
-        result: T | None = None
-        error: Exception | None = None
-        try:
-            result = function()
-        except BaseException as raised:  # it belongs to the request that waits, which nothing else would end
-            error = RuntimeError(f"{type(raised).__name__}: {raised}")
-            if isinstance(raised, Exception) and not isinstance(raised, StopIteration):
-                error = raised
-        with contextlib.suppress(RuntimeError):  # the loop has ended already
-            loop.call_soon_threadsafe(tell, result, error)
-
-    try:
-        threading.Thread(target=run, name="request", daemon=True).start()
-    except RuntimeError as error:
-        raise Unable("no_thread", f"the request was not begun: {error}") from None
-    return await answer
-
-
-MOST = 100
-FULL_S = 1.0
+MOST_STREAMS = 100
+RETRY_S = 1.0
+END_S = 1.5  # for the last events to be sent
 
 
 class Streams:
-    """Who listens to one daemon; used on its event loop only.
+    """The open event streams of one daemon; used on its event loop only.
 
     Parameters
     ----------
     publisher
-        What is listened to.
+        The source of their events.
     most
-        How many may listen at once, so that they leave connections for everybody else.
+        How many there may be at once.
     """
 
-    def __init__(self, publisher: Publisher, most: int = MOST) -> None:
+    def __init__(self, publisher: Publisher, most: int = MOST_STREAMS) -> None:
         self._publisher = publisher
         self._most = most
-        self._open: set[LoopSubscription] = set()
+        self._open: dict[LoopSubscription, str] = {}
         self._ended = False
 
     @contextmanager
-    def listening(self, topics: tuple[Topic, ...], keys: frozenset[str] | None) -> Iterator[LoopSubscription]:
-        """Listen inside the block to topics, all of them if none is named, of some keys or of every one.
+    def listening(
+        self, topics: tuple[Topic, ...], keys: frozenset[str] | None, credential: str
+    ) -> Iterator[LoopSubscription]:
+        """Listen inside the block to topics (empty: all) of some keys (None: all).
+
+        ``credential`` is the digest of the client's token, with which the stream ends; empty for none.
 
         Raises
         ------
@@ -232,17 +187,30 @@ class Streams:
         if self._ended:
             raise Unable("closing", "the daemon ends; no more events follow")
         if len(self._open) >= self._most:
-            words = f"{self._most} listen to events already, and no more may; ask again later"
-            raise Unable("too_many", words, FULL_S)
+            raise Unable("too_many", f"{self._most} event streams are open, the most there may be", RETRY_S)
         with self._publisher.subscribe_here(*topics, keys=keys) as news:
-            self._open.add(news)
+            self._open[news] = credential
             try:
                 yield news
             finally:
-                self._open.discard(news)
+                del self._open[news]
 
-    def end(self) -> None:
-        """Let every stream tell what it has not told yet, and end."""
+    def end_revoked(self, valid: Callable[[str], bool]) -> None:
+        """End each stream whose token is no longer valid."""
+        for news, credential in tuple(self._open.items()):
+            if credential and not valid(credential):
+                news.close()
+
+    @property
+    def ended(self) -> bool:
+        """Whether the daemon ends."""
+        return self._ended
+
+    async def end(self) -> None:
+        """Let every stream send its last events, and end; clients that do not read are not waited for."""
         self._ended = True
         for news in tuple(self._open):
             news.close()
+        with move_on_after(END_S):
+            while self._open:
+                await asyncio.sleep(0.005)

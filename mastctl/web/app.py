@@ -67,7 +67,7 @@ def create_app(
         scope.setdefault("state", {})["parts"] = parts
         await routes(scope, receive, send)
 
-    return Guard(served, entrance, service.entry)
+    return Guard(served, entrance, service.entry, waiting.turn)
 
 
 class _Read(Request):

@@ -1,8 +1,8 @@
 """The event stream: each change, pushed as it comes, as server-sent events or through a WebSocket.
 
 A listener begins with what is known and then gets the newest of each topic and key. One that reads slowly
-loses values in between and is told how many; nobody waits for it. WebSockets only tell: what a client sends
-into one ends it (`mastctl.http.sockets`).
+loses values in between and is sent their number; nothing waits for it. A WebSocket of events ends with the
+first message that its client sends.
 """
 
 from __future__ import annotations
@@ -15,21 +15,23 @@ from weakref import WeakKeyDictionary
 
 from fastapi import FastAPI, Query, WebSocket
 from fastapi.responses import StreamingResponse
+from starlette.requests import HTTPConnection
 from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
 from mastctl.as_json import as_json, writable
+from mastctl.control.caller import Caller
 from mastctl.control.publisher import LoopSubscription, Published, Topic
 from mastctl.http import PREFIX
-from mastctl.http.connections import EVENTS
 from mastctl.http.refusals import query_of
 from mastctl.service.service import Service
 from mastctl.service.state import fault_told, joints_told, standing_told
 from mastctl.web.models import EventsQuery
 from mastctl.web.parts import Here, Parts
 
+EVENTS = f"{PREFIX}/events"
 ALIVE_S = 2.0  # between signs of life where nothing changes
-GOING_AWAY = 1001  # RFC 6455, 7.4.1
+GOING_AWAY, UNSUPPORTED, NOT_ALLOWED = 1001, 1003, 1008  # RFC 6455, 7.4.1
 TOLD_AT_ONCE = 16  # events, in one turn of the event loop
 AGES_HOLD_S = 0.02  # for how long a text that tells an age is told to others too
 AGELESS: frozenset[Topic] = frozenset({"operation", "mast", "command", "bench"})
@@ -62,7 +64,7 @@ def add_events(app: FastAPI) -> None:
     @app.websocket(EVENTS)
     async def socket(line: WebSocket, here: Here) -> None:
         async with query_of(line, EventsQuery, "key") as query:
-            with here.streams.listening(query.names, query.keys) as news:
+            with here.streams.listening(query.names, query.keys, credential_of(line)) as news:
                 await _tell(line, news, here)
 
 
@@ -90,11 +92,11 @@ class _Lines(StreamingResponse):
         self, here: Parts, topics: tuple[Topic, ...], keys: frozenset[str] | None, tell: Telling
     ) -> None:
         super().__init__(self._lines(), media_type="text/event-stream")
-        self._listening = here.streams.listening(topics, keys)
-        self._service, self._tell, self._turns = here.service, tell, here.waiting.turns
+        self._here, self._topics, self._keys, self._tell = here, topics, keys, tell
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        with self._listening as self._news:
+        credential = credential_of(HTTPConnection(scope))
+        with self._here.streams.listening(self._topics, self._keys, credential) as self._news:
             await super().__call__(scope, receive, send)
 
     async def _lines(self) -> AsyncIterator[str]:
@@ -102,10 +104,10 @@ class _Lines(StreamingResponse):
         while True:
             found = await news.wait(ALIVE_S)
             for some in _by_few(found):
-                lines = [(one.sequence, self._tell(self._service, one, news.lost)) for one in some]
+                lines = [(one.sequence, self._tell(self._here.service, one, news.lost)) for one in some]
                 yield "".join(f"id: {number}\ndata: {text}\n\n" for number, text in lines)
                 if some[-1] is not found[-1]:
-                    await self._turns.turn()
+                    await self._here.waiting.turn()
             if not found:
                 if news.closed:
                     return
@@ -118,7 +120,7 @@ def _by_few(found: Sequence[Published]) -> Iterator[Sequence[Published]]:
 
 
 async def _tell(line: WebSocket, news: LoopSubscription, here: Parts) -> None:
-    """Tell through a WebSocket until the daemon or the client ends."""
+    """Send events through a WebSocket until the daemon or the client ends."""
     await line.accept()
     gone = asyncio.ensure_future(line.receive())  # a client's only message is its end
     gone.add_done_callback(lambda _: news.close())
@@ -128,13 +130,29 @@ async def _tell(line: WebSocket, news: LoopSubscription, here: Parts) -> None:
                 for one in some:
                     await line.send_text(_event(here.service, one, news.lost))
                 if some[-1] is not found[-1]:
-                    await here.waiting.turns.turn()
+                    await here.waiting.turn()
         if not gone.done():
-            await line.close(GOING_AWAY)
+            await close_ended(line, here)
+        elif gone.result()["type"] == "websocket.receive":
+            await line.close(UNSUPPORTED, "this WebSocket takes no messages")
     except WebSocketDisconnect:
         pass
     finally:
         gone.cancel()
+
+
+async def close_ended(line: WebSocket, here: Parts) -> None:
+    """Close a WebSocket whose stream has ended: with the daemon, or with its token."""
+    if here.streams.ended:
+        await line.close(GOING_AWAY)
+    else:
+        await line.close(NOT_ALLOWED, "the token that opened this has ended")
+
+
+def credential_of(line: HTTPConnection) -> str:
+    """Return the digest of the token that opened a stream, empty for none."""
+    caller: Caller = line.scope["state"]["caller"]
+    return caller.credential
 
 
 def value_told(service: Service, one: Published) -> Any:

@@ -24,18 +24,17 @@ from mastctl.as_json import as_json
 from mastctl.control.entry import CAMERA_SETTINGS
 from mastctl.frame_facts import headers_of
 from mastctl.http import PREFIX
-from mastctl.http.connections import IMAGES
 from mastctl.http.refusals import query_of
-from mastctl.http.sockets import UNSUPPORTED
 from mastctl.report.pictures import encoded
-from mastctl.service.service import Service
 from mastctl.web.commands import command
-from mastctl.web.events import GOING_AWAY
+from mastctl.web.events import UNSUPPORTED, close_ended, credential_of
 from mastctl.web.models import CameraSettingsBody, ImagesQuery, SnapshotQuery
 from mastctl.web.parts import Here, Parts
-from mastctl.web.pictures import Picture, WatchedCameras, Watcher
+from mastctl.web.pictures import Picture, Watcher
 
-ASKS = "?"
+IMAGES = f"{PREFIX}/images"
+TIME = "?"
+LONGEST_MESSAGE = 100  # a camera's name, and how large its next image may be
 
 
 def add_images(app: FastAPI) -> None:
@@ -60,16 +59,16 @@ def add_images(app: FastAPI) -> None:
             data = waiting.encode(lambda: encoded(frame.image, query.format))
             return Response(data, media_type=f"image/{query.format}", headers=headers_of(frame))
 
-        return await waiting.picture(camera, picture, kept=frame_id is not None)
+        return await waiting.image(camera, picture, kept=frame_id is not None)
 
     @app.websocket(IMAGES)
     async def socket(line: WebSocket, here: Here) -> None:
         async with query_of(line, ImagesQuery, "camera") as query:
             for camera in query.camera:
                 here.service.check_camera(camera)
-            with here.streams.listening((), frozenset()) as ending:  # counted as a listener, and ended as one
+            with here.streams.listening((), frozenset(), credential_of(line)) as ending:
                 await line.accept()
-                await _Line(here.service, here.watched, line, query).run(asyncio.ensure_future(ending.wait()))
+                await _Line(here, line, query).run(asyncio.ensure_future(ending.wait()))
 
 
 def add_cameras(app: FastAPI) -> None:
@@ -126,45 +125,45 @@ def _mode_told(mode: SensorMode) -> SensorModeTold:
 class _Line:
     """One WebSocket of pictures, until the daemon or the client ends."""
 
-    def __init__(
-        self, service: Service, watched: WatchedCameras, line: WebSocket, query: ImagesQuery
-    ) -> None:
-        self._service = service
+    def __init__(self, here: Parts, line: WebSocket, query: ImagesQuery) -> None:
+        self._here = here
         self._line = line
         self._there = asyncio.Event()
         self._loop = asyncio.get_running_loop()
-        self._watcher: Watcher = watched.watch(query.camera, self._wake, not query.on_request, query.every)
+        self._watcher: Watcher = here.watched.watch(
+            query.camera, self._wake, not query.on_request, query.every
+        )
 
     async def run(self, ending: asyncio.Future[Any]) -> None:
         """Send pictures until ``ending`` is done."""
-        jobs = {ending, asyncio.ensure_future(self._hear()), asyncio.ensure_future(self._tell())}
+        jobs = {ending, asyncio.ensure_future(self._receive()), asyncio.ensure_future(self._send())}
         try:
             await asyncio.wait(jobs, return_when=asyncio.FIRST_COMPLETED)
             if ending.done():
                 with contextlib.suppress(WebSocketDisconnect, RuntimeError):
-                    await self._line.close(GOING_AWAY)
+                    await close_ended(self._line, self._here)
         finally:
             for job in jobs:
                 job.cancel()
             await asyncio.gather(*jobs, return_exceptions=True)
             self._watcher.end()
 
-    async def _hear(self) -> None:
-        """Hear which pictures were shown, and who asks what the clock says."""
+    async def _receive(self) -> None:
+        """Take which images were shown, and answer requests for the time."""
         with contextlib.suppress(WebSocketDisconnect):
-            while True:
-                word, _, more = (await self._line.receive_text()).partition(" ")
-                if word == ASKS:
-                    told = {"asked": more, "now_s": self._loop.time()}
-                    await self._line.send_text(json.dumps(told))
-                elif more and not more.isdecimal():
+            while (message := await self._line.receive())["type"] == "websocket.receive":
+                text = message.get("text") or ""
+                name, _, more = text.partition(" ")
+                if name == TIME and len(text) <= LONGEST_MESSAGE:
+                    await self._line.send_text(json.dumps({"asked": more, "now_s": self._loop.time()}))
+                elif not 0 < len(text) <= LONGEST_MESSAGE or (more and not more.isdecimal()):
                     await self._line.close(UNSUPPORTED, "CAMERA, CAMERA MOST_BYTES or ? WORDS are taken here")
                     return
                 else:
-                    self._watcher.shown(word, int(more) if more else None)
+                    self._watcher.shown(name, int(more) if more else None)
 
-    async def _tell(self) -> None:
-        """Send what is there."""
+    async def _send(self) -> None:
+        """Send each image that is ready."""
         with contextlib.suppress(WebSocketDisconnect):
             while True:
                 await self._there.wait()
@@ -175,10 +174,10 @@ class _Line:
     def _message(self, picture: Picture) -> bytes:
         frame = picture.frame
         height, width = frame.image.shape[:2]
-        age_s = max(0.0, self._service.clock.now_s() - frame.mid_exposure_s)
+        age_s = max(0.0, self._here.service.clock.now_s() - frame.mid_exposure_s)
         facts = as_json(frame.facts) | {"size_px": [width, height], "reduced": picture.reduced}
         facts |= {"age_s": age_s, "sent_s": self._loop.time()}
-        facts["track"] = self._service.track_in(frame)
+        facts["track"] = self._here.service.track_in(frame)
         head = json.dumps(facts, allow_nan=False).encode()
         return b"".join((len(head).to_bytes(4, "little"), head, picture.jpeg))
 

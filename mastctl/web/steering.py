@@ -101,7 +101,7 @@ def add_pointing(app: FastAPI) -> None:
         service.check_camera(body.pixel.camera)
         cancelled = threading.Event()
         try:
-            seen: PreviewTold = await here.waiting.picture(
+            seen: PreviewTold = await here.waiting.image(
                 body.pixel.camera, lambda: as_json(service.steering.preview(body.request, cancelled))
             )
         except PointingError as error:

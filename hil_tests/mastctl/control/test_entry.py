@@ -266,14 +266,14 @@ def test_strangers_push_nobody_elses_records_out(tmp_path: Path) -> None:
         world.entry.first(ESTOP, world.asked(who, request={"reason": "x" * 4000}), lambda: {"id": "-"})
         if number % 50 == 0:
             assert world.strangers.flush(NET_S)
-    world.entry.refused(Caller("view", "view", "token", "10.0.0.2"), "POST /point", "role", "may view", 2000)
+    world.entry.refused(Caller("view", "view", "token", "10.0.0.2"), "POST /point", "role", "may view")
     world.entry.refused(who, "GET /status", "wrong_token", "nobody's")
     known = world.lines()
     assert [(line["who"], line["address"], line["result"]) for line in known] == [
         ("operate", "10.0.0.1", "ok"),
         ("view", "10.0.0.2", "role"),
     ]
-    assert known[1]["command"] == "POST /point" and known[1]["times"] == 2000
+    assert known[1]["command"] == "POST /point"
     assert world.strangers.flush(NET_S)
     last = json.loads((tmp_path / "strangers.jsonl").read_text().splitlines()[-1])
     assert (last["address"], last["result"]) == ("10.0.0.9", "wrong_token")
