@@ -17,7 +17,6 @@ CASES = {
     "campaigns.refine --rig /nosuch --click-px 0": "--click-px: '0' where a number above zero is expected",
     "campaigns.handoff --cases 0": "--cases: '0' where a whole number of at least 1 is expected",
     "campaigns.provocations survey --cases 0": "--cases: '0' where a whole number of at least 1 is expected",
-    "campaigns.provocations survey --pairs eye": "has no stereo pair 'eye'",
     "benchmarks.daemon start --rounds 0": "--rounds: '0' where a whole number of at least 1 is expected",
     "campaigns.coverage survey --gross -1": "--gross: '-1' where zero or more is expected",
 }

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from calib.errors import CalibError
 from drivers.errors import DriverError
 from mastctl import signals
-from mastctl.cli.output import CommandError, WrongUse, as_command_error, at_least, one_line, positive_number
+from mastctl.cli.output import CommandError, WrongUse, as_command_error, at_least, one_line
 from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.errors import MastctlError
 
@@ -44,7 +44,6 @@ def options(
     of: str = "",
     *,
     seed: int | None = 1,
-    minutes: float | None = None,
     as_json: bool = False,
     tasks: bool = True,
 ) -> argparse.ArgumentParser:
@@ -58,8 +57,6 @@ def options(
         Default of ``--cases``, and what a case is of; None: it has no such option.
     seed
         Default of ``--seed``; None: nothing is drawn.
-    minutes
-        Default of ``--minutes``; None: it does not go by time.
     as_json
         Whether there is ``--json``.
     tasks
@@ -74,9 +71,6 @@ def options(
     if cases is not None:
         words = f"{of or 'how many'} (default {cases})"
         parser.add_argument("--cases", type=at_least(1), default=cases, metavar="N", help=words)
-    if minutes is not None:
-        words = f"how long (default {minutes:g})"
-        parser.add_argument("--minutes", type=positive_number, default=minutes, metavar="T", help=words)
     if seed is not None:
         words = f"of all that is drawn; cases with seeds of their own begin there (default {seed})"
         parser.add_argument("--seed", type=at_least(0), default=seed, metavar="S", help=words)

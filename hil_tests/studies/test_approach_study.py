@@ -22,23 +22,13 @@ from tools.studies.approach_world import ApproachWorld, WorldErrors
 
 
 def stop(range_m: float, error_m: tuple[float, float, float], state: str = "tracked") -> Stop:
-    return Stop(
-        range_m,
-        "hazcam",
-        state,
-        "",
-        error_m,
-        (0.003,) * 3,
-        0.3,
-        False,
-        (0.1, 0.0, 0.0),
-    )
+    return Stop(range_m, "hazcam", state, error_m, (0.003,) * 3, (0.1, 0.0, 0.0))
 
 
 def test_runs_are_counted_and_averaged_by_hand() -> None:
     runs = [
         ApproachRun(1, (stop(5.0, (0.02, 0.0, 0.0)), stop(1.05, (0.003, 0.0, 0.001)))),
-        ApproachRun(2, (replace(stop(1.05, (-0.004, 0.002, 0.0)), pose_doubt="9 cm"),)),
+        ApproachRun(2, (replace(stop(1.05, (-0.004, 0.002, 0.0)), doubted=True),)),
         ApproachRun(3, (stop(4.0, (0.0, 0.0, 0.0), "lost"),)),
         ApproachRun(4, (), "no view offered a target"),
         ApproachRun(5, (stop(1.05, (0.5, 0.0, 0.0)),)),

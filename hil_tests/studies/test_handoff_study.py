@@ -41,7 +41,7 @@ def handed(
 def record(index: int, *seen: Handed, error: str = "") -> HandoffRecord:
     if error:
         return HandoffRecord(STEP, index, error=error)
-    return HandoffRecord(STEP, index, 2.1, "navcam_left-1", (500.0, 300.0), seen)
+    return HandoffRecord(STEP, index, seen)
 
 
 RECORDS = (

@@ -17,7 +17,6 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -27,13 +26,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
-from hil_tests.support.living_daemon import Asker, simulated, started
+from hil_tests.support.living_daemon import simulated, started
 from mastctl.cli.output import at_least
+from mastctl.client import Client, ClientError
 from mastctl.packaged import default_config
 from mastctl.safety.stop_line import ask
-from tools.command import end, options
+from tools.command import end, heading, line, options
 
 HEADS = ("memory", "dynamixel", "ptu")
 STREAMS = 4
@@ -86,12 +87,15 @@ def start(rounds: int) -> None:
                 subprocess.run([sys.executable, "-c", LIBRARIES], check=True)
             with spending("import mastctl.daemon"):
                 subprocess.run([sys.executable, "-c", "import mastctl.daemon"], check=True)
-            with spending("mastctl run, first answer, end"), started(config) as (_, port):
-                _get(port, "/health/live")
-    print(f"{'seconds, median':44s} processor   passed")
+            with (
+                spending("mastctl run, first answer, end"),
+                started(config) as (_, port),
+                Client(f"http://127.0.0.1:{port}") as client,
+            ):
+                client.status()
+    print(heading(("median, s", "processor", "passed")))
     for what, times in spent.items():
-        processor_s, passed_s = (statistics.median(one) for one in zip(*times, strict=True))
-        print(f"{what:44s} {processor_s:9.3f} {passed_s:8.3f}")
+        print(line(what, *(f"{one:.3f}" for one in np.median(times, axis=0))))
 
 
 LIBRARIES = "import numpy, scipy.optimize, scipy.spatial, cv2, fastapi, uvicorn, httpx, websockets, yaml"
@@ -99,58 +103,53 @@ LIBRARIES = "import numpy, scipy.optimize, scipy.spatial, cv2, fastapi, uvicorn,
 
 def stops_under_way(head: str, stops: int) -> None:
     """Print how soon stops of a moving head are answered, and how soon the operation ends."""
-    print(
-        "head       request           answered ms: median   90 %   99 %  longest   within 20 ms   ended: 99 %"
-    )
-    with tempfile.TemporaryDirectory() as folder, _daemon(Path(folder), head) as (port, path), _streams(port):
-        for name, stop in _requests(port, path).items():
-            rows = [_stop_under_way(port, stop) for _ in range(stops)]
-            answered, ended = (sorted(1e3 * row[number] for row in rows) for number in (0, 1))
-            within = sum(one <= 20.0 for one in answered) / len(answered)
-            print(
-                f"{head:<10} {name:<18} {_part(answered, 0.5):>18.1f} {_part(answered, 0.9):>6.1f}"
-                f" {_part(answered, 0.99):>6.1f} {answered[-1]:>8.1f} {100 * within:>12.1f} %"
-                f" {_part(ended, 0.99):>15.1f}",
-                flush=True,
-            )
+    columns = ("head", "request", "answered, ms: median", "90 %", "99 %", "longest", "within 20 ms, %")
+    print(heading((*columns, "ended: 99 %")))
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        _daemon(Path(folder), head) as (port, path),
+        _streams(port),
+        Client(f"http://127.0.0.1:{port}") as client,
+    ):
+        for name, stop in _requests(client.url, path).items():
+            rows = [_stop_under_way(client, stop) for _ in range(stops)]
+            answered_ms, ended_ms = 1e3 * np.array(rows).T
+            cells = [*np.quantile(answered_ms, (0.5, 0.9, 0.99, 1.0)), 100.0 * np.mean(answered_ms <= 20.0)]
+            print(line(head, name, *(f"{one:.1f}" for one in (*cells, np.quantile(ended_ms, 0.99)))))
 
 
-def _part(ordered: list[float], part: float) -> float:
-    """The value that this part of them does not exceed."""
-    return ordered[min(len(ordered) - 1, int(part * len(ordered)))]
-
-
-def _requests(port: int, path: Path) -> dict[str, Callable[[], object]]:
+def _requests(url: str, path: Path) -> dict[str, Callable[[], Any]]:
     """Return each kind of stop as a function."""
+
+    def once(call: Callable[[Client], Any]) -> Any:
+        with Client(url, name="benchmark") as client:
+            return call(client)
+
     return {
-        "stop, HTTP": lambda: _post(port, "/stop"),
+        "stop, HTTP": lambda: once(lambda client: client.stop()),
         "stop, socket": lambda: ask(path, "stop"),
-        "estop, HTTP": lambda: _kept(_post(port, "/estop", {"name": "benchmark"})),
-        "estop, socket": lambda: _kept(ask(path, "estop benchmark: a measurement")),
+        "estop, HTTP": lambda: once(lambda client: client.estop()),
+        "estop, socket": lambda: ask(path, "estop benchmark: a measurement"),
     }
 
 
-def _kept(answer: dict[str, Any]) -> None:
-    if answer["kept"] is not True:
-        raise RuntimeError(f"the latch is not kept: {answer}")
-
-
-def _stop_under_way(port: int, stop: Callable[[], object]) -> tuple[float, float]:
+def _stop_under_way(client: Client, stop: Callable[[], Any]) -> tuple[float, float]:
     """Send the head off, stop it under way; return how long the answer took, and from it the end."""
-    pan = _get(port, "/status")["joints"]["pan_rad"]
-    _until(port, lambda status: status["state"] not in ("stopping", "moving", "starting"))
-    _post(port, "/point", {"pan_rad": FAR_RAD if pan < 0 else -FAR_RAD, "tilt_rad": -0.2})
-    _until(port, lambda status: status["moving"])
+    status = _until(client, lambda status: status["state"] not in ("stopping", "moving", "starting"))
+    away = -1.0 if status["joints"]["pan_rad"] > 0 else 1.0
+    client.point(pan_rad=away * FAR_RAD, tilt_rad=-0.2)
+    _until(client, lambda status: status["moving"])
     began_s = time.monotonic()
-    stop()
+    answer = stop()
     answered_s = time.monotonic()
-    status = _until(port, lambda status: status["operation"] is None)
+    if answer.get("kept") is False:
+        raise RuntimeError(f"the latch is not kept: {answer}")
+    status = _until(client, lambda status: status["operation"] is None)
     ended_s = time.monotonic()
-    if status["estop"] is not None:
-        with Asker(port, "benchmark") as asker:
-            body = {"reason": "a measurement", "name": "benchmark"}
-            while asker.ask("POST", "/reset", body)[0] != 200:
-                time.sleep(0.01)
+    while status["estop"] is not None:
+        with contextlib.suppress(ClientError):  # while the stop is not over
+            client.reset(reason="a measurement", name="benchmark")
+        status = client.status()
     return answered_s - began_s, ended_s - answered_s
 
 
@@ -181,7 +180,6 @@ def _daemon(folder: Path, head: str) -> Iterator[tuple[int, Path]]:
 @contextlib.contextmanager
 def _streams(port: int) -> Iterator[None]:
     """Clients that stream pictures, and one that asks for many and reads none."""
-    _get(port, "/status")
     streams = [
         subprocess.Popen([sys.executable, "-c", STREAM, str(port), CAMERA], stderr=subprocess.DEVNULL)
         for _ in range(STREAMS)
@@ -200,25 +198,14 @@ def _streams(port: int) -> Iterator[None]:
             stream.wait()
 
 
-def _until(port: int, holds: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+def _until(client: Client, holds: Callable[[Any], bool]) -> Any:
     """The first status of which something holds."""
     until_s = time.monotonic() + NET_S
     while time.monotonic() < until_s:
-        status = _get(port, "/status")
-        if holds(status):
+        if holds(status := client.status()):
             return status
         time.sleep(0.002)
     raise TimeoutError("the awaited state did not come")
-
-
-def _get(port: int, path: str) -> dict[str, Any]:
-    with Asker(port, "benchmark") as asker:
-        return asker.json("GET", path)
-
-
-def _post(port: int, path: str, body: dict[str, Any] | None = None) -> dict[str, Any]:
-    with Asker(port, "benchmark") as asker:
-        return asker.json("POST", path, body)
 
 
 if __name__ == "__main__":

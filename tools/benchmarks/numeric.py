@@ -1,12 +1,9 @@
-"""Time lenses, beside mrcal and OpenCV in the same run.
+"""Time lenses, beside OpenCV in the same run.
 
     .venv/bin/python -m tools.benchmarks.numeric [--points 100000] [--rounds 7] [--json]
 
-Processor time of one thread; all sides take turns, round by round, and the table has
-medians. The results are compared before they are timed. mrcal is used where this interpreter,
-or Debian's /usr/bin/python3, can import it (``apt-get install --no-install-recommends python3-mrcal``). It
-has no oblique H and V, so these cameras have none. Debian's mrcal 2.2 differs by pixels where E is not 0; the
-vectors of JPL's library do not.
+Processor time of one thread; both sides take turns, round by round, and the table has medians. Where OpenCV
+has the lens, the results are compared before they are timed.
 """
 # ruff: noqa: E402  the number of threads is set before numpy is imported
 
@@ -18,18 +15,11 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"
 
 import itertools
-import json
 import math
 import statistics
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import partial
-from pathlib import Path
-from typing import IO, Any
+from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -39,8 +29,6 @@ from mastctl.cli.output import at_least
 from tools.command import end, options, show
 
 TASKS = ("forward", "gradient", "inverse")
-SAME = {"forward": 1e-6, "gradient": 1e-3, "inverse": 1e-7}
-"""Largest difference between two programs' results: pixels, pixels a metre, parts of a unit vector."""
 OPENCV_LENSES: dict[str, list[float]] = {
     "OPENCV5": [-0.31, 0.12, 0.001, -0.0007, 0.02],
     "OPENCV8": [0.5, 0.1, 0.001, -0.0005, 0.01, 0.8, 0.2, 0.03],
@@ -51,34 +39,6 @@ ROUND_S = 0.1
 """Calls are repeated to about this time in each round."""
 EXACT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
-Lens = tuple[CameraModel, str, list[float]]
-"""A camera in its own frame, with mrcal's name and numbers for it (an empty name: mrcal has no such lens)."""
-
-MRCAL = """
-import json, sys, time
-import mrcal, numpy as np
-print("ready", flush=True)
-for line in sys.stdin:
-    ask = json.loads(line)
-    values, numbers, lens = np.load(ask["values"]), np.array(ask["numbers"]), ask["lens"]
-    call = {
-        "forward": lambda: mrcal.project(values, lens, numbers),
-        "gradient": lambda: mrcal.project(values, lens, numbers, get_gradients=True)[1],
-        "inverse": lambda: mrcal.unproject(values, lens, numbers, normalize=True),
-    }[ask["task"]]
-    try:
-        began = time.thread_time()
-        for _ in range(ask["repeats"]):
-            result = call()
-        seconds = (time.thread_time() - began) / ask["repeats"]
-    except Exception as error:
-        print(json.dumps({"refused": str(error)}), flush=True)
-        continue
-    np.save(ask["result"], result)
-    print(json.dumps({"seconds": seconds}), flush=True)
-"""
-"""Runs under an interpreter that has mrcal and needs nothing of this project."""
-
 
 def main() -> int:
     """Measure, and print a table or a document."""
@@ -86,19 +46,18 @@ def main() -> int:
     parser.add_argument("--points", type=at_least(1), default=100_000, help="of each lens (default 100000)")
     parser.add_argument("--rounds", type=at_least(1), default=7, help="how often each is timed (default 7)")
     args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder, mrcal(Path(folder)) as other:
-        show(args, lenses(other, args.points, args.rounds), LENS_COLUMNS)
+    show(args, lenses(args.points, args.rounds), LENS_COLUMNS)
     return 0
 
 
-def navcam(kind: str, e: tuple[float, float, float] = (0, 0, 0)) -> Lens:
+def navcam(kind: str, e: tuple[float, float, float] = (0, 0, 0)) -> CameraModel:
     """Return a Navcam-like CAHVOR or CAHVORE (type 2) camera, O a little off A."""
     curved = kind == "CAHVORE"
     size, focal = ((1280, 960), 600.0) if curved else ((1024, 1024), 1226.0)
     alpha, beta = 0.003, -0.002
     r = (0.0, 0.05, -0.016) if curved else (0.0003, -0.005, 0.0215)
     cx, cy = size[0] / 2 + 5.3, size[1] / 2 - 7.1
-    model = CameraModel(
+    return CameraModel(
         kind,
         size,
         C=[0, 0, 0],
@@ -110,22 +69,14 @@ def navcam(kind: str, e: tuple[float, float, float] = (0, 0, 0)) -> Lens:
         E=e,
         cahvore_type=2 if curved else 0,
     )
-    numbers = [focal, focal, cx, cy, alpha, beta, *r]
-    return (
-        (model, "LENSMODEL_CAHVORE_linearity=0.000", numbers + list(e))
-        if curved
-        else (model, "LENSMODEL_CAHVOR", numbers)
-    )
 
 
-def opencv_lens(kind: str) -> Lens:
-    """Return a camera with one of OpenCV's lenses; mrcal has those of up to 12 coefficients."""
+def opencv_lens(kind: str) -> CameraModel:
+    """Return a camera with one of OpenCV's lenses."""
     lens, size = OPENCV_LENSES[kind], (1280, 960)
     focal = 560.0 if kind == "OPENCV_FISHEYE" else 900.0
     matrix = [[focal, 0.0, 645.3], [0.0, focal + 2.0, 472.9], [0.0, 0.0, 1.0]]
-    model = CameraModel.of_matrix(kind, size, matrix, lens, np.eye(3), np.zeros(3))
-    name = f"LENSMODEL_{kind}" if kind in ("OPENCV5", "OPENCV8") else ""
-    return model, name, [focal, focal + 2.0, 645.3, 472.9, *lens]
+    return CameraModel.of_matrix(kind, size, matrix, lens, np.eye(3), np.zeros(3))
 
 
 def ours(model: CameraModel, task: str, values: np.ndarray) -> np.ndarray:
@@ -148,40 +99,8 @@ def opencvs(model: CameraModel, task: str, values: np.ndarray) -> np.ndarray:
     return undistort(values[:, None], matrix, lens, np.eye(3), np.eye(3), EXACT)
 
 
-Mrcal = Callable[[Lens, str, np.ndarray, int], "tuple[float, np.ndarray] | str"]
-
-
-@contextmanager
-def mrcal(folder: Path) -> Iterator[Mrcal | None]:
-    """Run mrcal in the first interpreter that has it: seconds a call and its result, or its refusal."""
-    for interpreter in (sys.executable, "/usr/bin/python3"):
-        command = [interpreter, "-c", MRCAL]
-        pipe = subprocess.PIPE
-        with subprocess.Popen(
-            command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True
-        ) as process:
-            assert process.stdin is not None and process.stdout is not None
-            if process.stdout.readline() == "ready\n":
-                yield partial(_ask_mrcal, process.stdin, process.stdout, folder)
-                process.stdin.close()
-                return
-    yield None
-
-
-def _ask_mrcal(
-    to: IO[str], back: IO[str], folder: Path, lens: Lens, task: str, values: np.ndarray, repeats: int
-) -> tuple[float, np.ndarray] | str:
-    files = {name: str(folder / f"{name}.npy") for name in ("values", "result")}
-    np.save(files["values"], values)
-    request = {"lens": lens[1], "numbers": lens[2], "task": task, "repeats": repeats, **files}
-    to.write(json.dumps(request) + "\n")
-    to.flush()
-    answer = json.loads(back.readline() or '{"refused": "mrcal ended"}')
-    return answer.get("refused") or (answer["seconds"], np.load(files["result"]))
-
-
-def lenses(other: Mrcal | None, points: int, rounds: int) -> list[dict[str, Any]]:
-    """Return a row for each lens and task: million points a second, and the ratios to the others."""
+def lenses(points: int, rounds: int) -> list[dict[str, Any]]:
+    """Return a row for each lens and task: million points a second, and the ratio to OpenCV's."""
     cameras = {
         "CAHVOR": navcam("CAHVOR"),
         "CAHVORE": navcam("CAHVORE", (-0.0036, 0.013, -0.024)),
@@ -189,8 +108,7 @@ def lenses(other: Mrcal | None, points: int, rounds: int) -> list[dict[str, Any]
         **{kind: opencv_lens(kind) for kind in OPENCV_LENSES},
     }
     rng, rows = np.random.default_rng(1), []
-    for (name, lens), task in itertools.product(cameras.items(), TASKS):
-        model = lens[0]
+    for (name, model), task in itertools.product(cameras.items(), TASKS):
         pixels = rng.uniform(0.0, 1.0, (points, 2)) * (np.array(model.size_px) - 1.0)
         rays = model.ray(pixels)
         values = (
@@ -201,31 +119,16 @@ def lenses(other: Mrcal | None, points: int, rounds: int) -> list[dict[str, Any]
         sides: dict[str, Callable[[int], float]] = {
             "ours": _timed(lambda m=model, t=task, v=values: ours(m, t, v))
         }
-        notes = []
+        row: dict[str, Any] = {"lens": name, "task": task}
         if name in OPENCV_LENSES:
             sides["cv2"] = _timed(lambda m=model, t=task, v=values: opencvs(m, t, v))
-            notes.append(f"cv2 agrees to {_cv2_gap(model, task, values):.0e}")
-        found = (
-            other(lens, task, values, 1)
-            if other and lens[1] and not (task == "inverse" and model.E.any())
-            else ""
-        )
-        if isinstance(found, tuple):
-            assert other is not None
-            sides["mrcal"] = lambda n, f=other, a=lens, t=task, v=values: _seconds(f(a, t, v, n))
-            gap = float(np.abs(found[1] - ours(model, task, values)).max())
-            notes.append(f"mrcal {'agrees to' if gap <= SAME[task] else 'DIFFERS by'} {gap:.0e}")
+            row["agrees_to"] = _cv2_gap(model, task, values)
         times = in_turns(sides, rounds)
-        rows.append(
-            {"lens": name, "task": task, "note": ", ".join(notes)}
-            | {f"{side}_per_us": points / seconds / 1e6 for side, seconds in times.items()}
-            | {f"over_{side}": times[side] / times["ours"] for side in ("cv2", "mrcal") if side in times}
-        )
+        row |= {f"{side}_per_us": points / seconds / 1e6 for side, seconds in times.items()}
+        if "cv2" in times:
+            row["over_cv2"] = times["cv2"] / times["ours"]
+        rows.append(row)
     return rows
-
-
-def _seconds(found: tuple[float, np.ndarray] | str) -> float:
-    return found[0] if isinstance(found, tuple) else math.nan
 
 
 def _cv2_gap(model: CameraModel, task: str, values: np.ndarray) -> float:
@@ -257,8 +160,7 @@ def in_turns(sides: dict[str, Callable[[int], float]], rounds: int) -> dict[str,
 
 LENS_COLUMNS = {
     "lens": "{lens}", "task": "{task}", "million points/s": "{ours_per_us:.1f}", "cv2": "{cv2_per_us:.1f}",
-    "mrcal": "{mrcal_per_us:.1f}", "over cv2": "{over_cv2:.1f}", "over mrcal": "{over_mrcal:.1f}",
-    "note": "{note}",
+    "over cv2": "{over_cv2:.1f}", "agrees to": "{agrees_to:.0e}",
 }  # fmt: skip
 if __name__ == "__main__":
     end(main)

@@ -29,7 +29,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -363,10 +362,8 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("of", choices=("survey", "bench"))
     parser.add_argument("--method", choices=sorted(FITS), default="joint")
     parser.add_argument("--mast", type=int, choices=(6, 8), default=6)
-    parser.add_argument("--joint-sigma-rad", type=not_negative, default=0.0, help="noise of joint readings")
     parser.add_argument("--prism-cad-sigma-m", type=not_negative, default=0.0, help="of the prisms' drawing")
     parser.add_argument("--gross", type=not_negative, default=0.0, help="part of the dots thrown anywhere")
-    parser.add_argument("--rig", type=Path, default=config_folder() / "sim" / "rocky8.yaml")
     parser.add_argument("--head", choices=sorted(HEADS), default="ptu")
     parser.add_argument("--attitudes", type=at_least(4), default=20, help="head positions per placement")
     parser.add_argument("--checks", type=at_least(0), default=0, help="the same that are not fitted")
@@ -374,11 +371,11 @@ def main(words: Sequence[str] | None = None) -> int:
     seeds = range(args.seed, args.seed + args.cases)
     found: list[Score | str]
     if args.of == "survey":
-        true = load_rig(args.rig).rig
+        true = load_rig(config_folder() / "sim" / "rocky8.yaml").rig
         if args.mast == 8:
             skew = replace(true.mast, axis_offset_m=SKEW_M, axis_twist_rad=SKEW_RAD)
             true = replace(true, mast=skew)
-        plan = SurveyPlan(sigma=Sigma(0.001, 0.1, args.joint_sigma_rad, args.prism_cad_sigma_m))
+        plan = SurveyPlan(sigma=Sigma(0.001, 0.1, 0.0, args.prism_cad_sigma_m))
         surveys = [SurveyTask(true, seed, plan, args.method, args.mast, args.gross) for seed in seeds]
         found = run_cases(args, "surveys", survey_score, surveys, "seed {0.seed}".format)
     else:

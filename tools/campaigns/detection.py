@@ -13,8 +13,6 @@ stand those of OpenCV's CharucoDetector on the same images.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -304,7 +302,6 @@ class CornersOutcome:
     in_view: int
     theirs_px: FloatArray
     reason: str
-    seconds: float
 
 
 def hide(rng: np.random.Generator, image: Levels, truth: FloatArray, part: float) -> NDArray[np.bool_]:
@@ -351,24 +348,21 @@ def run_pose(task: PoseTask) -> dict[str, CornersOutcome]:
         seen = hide(rng, image, truth, case.hidden)
         rim = 2.0 * case.blur_px + 1.0
         seen &= ((truth > rim) & (truth < np.array(SIZE_PX) - 1 - rim)).all(axis=1)
-        start_s = time.process_time()
         found = find_corners(one.board, image)
-        seconds = time.process_time() - start_s
         eight = image.astype(np.uint8) if case.bits == 8 else (image / 200.0).astype(np.uint8)
         theirs = opencvs(board, eight, truth)
         if isinstance(found, CornersNotFound):
             errors, sigma_px, reason = np.empty((0, 2)), np.empty(0), found.reason
         else:
             errors, sigma_px, reason = found.pixels_px - truth[found.ids], found.sigma_px, ""
-        outcomes[case.name] = CornersOutcome(errors, sigma_px, int(seen.sum()), theirs, reason, seconds)
+        outcomes[case.name] = CornersOutcome(errors, sigma_px, int(seen.sum()), theirs, reason)
     return outcomes
 
 
 COLUMNS = {
     "board": "{kind}", "scene": "{scene}", "pictures": "{case}", "%": "{percent:.0f}", "rms": "{rms_px:.4f}",
     "worst": "{worst_px:.3f}", "rms/sigma": "{ratio:.2f} ± {unsure:.2f}", "wrong": "{wrong}",
-    "not found": "{lost} of {of}", "ms": "{ms:.0f}",
-    "OpenCV": "{theirs_px:.4f}", "its wrong": "{theirs_wrong}",
+    "not found": "{lost} of {of}", "OpenCV": "{theirs_px:.4f}", "its wrong": "{theirs_wrong}",
 }  # fmt: skip
 
 
@@ -388,7 +382,6 @@ def row_of(kind: str, scene: str, case: str, outcomes: list[CornersOutcome]) -> 
         "wrong": int((np.abs(errors).max(axis=1, initial=0.0) > OUTLIER_PX).sum()),
         "lost": len(lost),
         "of": len(outcomes),
-        "ms": float(np.median([1e3 * o.seconds for o in outcomes])),
         "theirs_px": rms(near) if len(near) else None,
         "theirs_wrong": len(theirs) - len(near),
         "reasons": [f"{lost.count(reason)} not found: {reason}" for reason in sorted(set(lost))],
@@ -415,23 +408,13 @@ def main() -> int:
         for pose in range(args.cases)
     ]
     founds = run_cases(args, "poses", run_pose, tasks, lambda t: f"{t.kind}, {t.scene.name}, {t.pose}")
-    rows = []
-    for (kind, scene), cases in found_by(tasks, founds).items():
-        rows += [row_of(kind, scene, case, outcomes) for case, outcomes in cases.items()]
+    by_case: dict[tuple[str, str, str], list[CornersOutcome]] = {}
+    for task, outcomes in zip(tasks, founds, strict=True):
+        for case, outcome in outcomes.items():
+            by_case.setdefault((task.kind, task.scene.name, case), []).append(outcome)
+    rows = [row_of(*case, outcomes) for case, outcomes in by_case.items()]
     show(args, rows, COLUMNS, "reasons")
     return 1 if any(row["wrong"] for row in rows) else 0
-
-
-def found_by(
-    tasks: Sequence[PoseTask], founds: Sequence[dict[str, CornersOutcome]]
-) -> dict[tuple[str, str], dict[str, list[CornersOutcome]]]:
-    """Return the outcomes of each case, by board and scene."""
-    found: dict[tuple[str, str], dict[str, list[CornersOutcome]]] = {}
-    for task, outcomes in zip(tasks, founds, strict=True):
-        cases = found.setdefault((task.kind, task.scene.name), {})
-        for case, outcome in outcomes.items():
-            cases.setdefault(case, []).append(outcome)
-    return found
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ px; medians of sigma.
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -70,21 +69,11 @@ class ClicksTask:
 
 @dataclass(frozen=True)
 class TrueClick:
-    """One click: how far away, what was refused, or the error and the sigma (x, y) in px.
+    """One click: the code of its refusal, or the error and the sigma (x, y) in px.
 
-    Attributes
-    ----------
-    view_rad
-        Pan and tilt of the view that was clicked in.
-    hidden
-        Whether the other eye cannot see what was clicked.
-    refused
-        Code and sentence; empty for a residual.
+    ``hidden``: whether the other camera cannot see what was clicked; ``refused`` is empty for a residual.
     """
 
-    view_rad: tuple[float, float]
-    pixel_px: tuple[float, float]
-    range_m: float
     hidden: bool
     refused: str
     error_px: tuple[float, float] | None = None
@@ -119,26 +108,20 @@ def click(client: Client, rover: SimulatedRover, group: str, rng: np.random.Gene
     point = hit(rover, seen_by, np.array([pixel]))[0]
     truth = rover.frame_truth(*camera_and_sequence(shot.frame_id))
     other = rover.rig.camera_in_rover(RIGHT, truth.pan_rad, truth.tilt_rad)
-    about: dict[str, Any] = {
-        "view_rad": (shot.pan_rad, shot.tilt_rad),
-        "pixel_px": pixel,
-        "range_m": float(np.linalg.norm(point - seen_by.C)),
-        "hidden": not shown(rover, other, point),
-    }
+    hidden = not shown(rover, other, point)
     record: Any
     try:
         record = client.wait(client.point(pixel=(LEFT, shot.frame_id, *pixel)), timeout_s=WAITED_S)
     except ClientError as error:
-        return TrueClick(**about, refused=f"{error.code}: {error}")
+        return TrueClick(hidden, error.code)
     if record["state"] != "done":
-        told = record["error"] or {"code": record["state"], "message": ""}
-        return TrueClick(**about, refused=f"{told['code']}: {told['message']}")
+        return TrueClick(hidden, record["error"]["code"] if record["error"] else record["state"])
     (row,) = record["pointings"]
     measured = np.array(row["target_px"])
     landed = client.snapshot(LEFT, frame_id=row["frame_id"])
     true, _ = camera_of(rover, landed, float(measured[1])).project(point)
     error_px, sigma_px = measured - true, row["residual_sigma_px"]
-    return TrueClick(**about, refused="", error_px=tuple(error_px.tolist()), sigma_px=tuple(sigma_px))
+    return TrueClick(hidden, "", error_px=tuple(error_px.tolist()), sigma_px=tuple(sigma_px))
 
 
 def camera_of(rover: SimulatedRover, shot: Snapshot, row_px: float) -> CameraModel:
@@ -207,7 +190,7 @@ def shown(rover: SimulatedRover, camera: CameraModel, point_m: FloatArray) -> bo
     return ends_m > (1.0 - HIDDEN) * float((point_m - ray.origins_m) @ ray.directions)
 
 
-def told(day: str, group: str, clicks: Sequence[TrueClick]) -> dict[str, Any]:
+def summary(day: str, group: str, clicks: Sequence[TrueClick]) -> dict[str, Any]:
     """A row of the table."""
     refused = [one for one in clicks if one.refused]
     good = [one for one in clicks if not one.refused]
@@ -217,7 +200,7 @@ def told(day: str, group: str, clicks: Sequence[TrueClick]) -> dict[str, Any]:
         "cases": len(clicks),
         "refused_percent": 100.0 * len(refused) / max(len(clicks), 1),
         "refused_hidden": sum(one.hidden for one in refused),
-        "reasons": [f"{n} {code}" for code, n in Counter(map(_code, refused)).most_common()],
+        "reasons": [f"{n} {code}" for code, n in Counter(one.refused for one in refused).most_common()],
     }
     if not good:
         return row
@@ -235,10 +218,6 @@ def told(day: str, group: str, clicks: Sequence[TrueClick]) -> dict[str, Any]:
     }
 
 
-def _code(one: TrueClick) -> str:
-    return one.refused.split(":")[0]
-
-
 _X_Y = "{{{0}[0]:{1}}}, {{{0}[1]:{1}}}".format
 COLUMNS = {
     "day": "{day}", "on": "{group}", "cases": "{cases}", "refused, %": "{refused_percent:.0f}",
@@ -252,40 +231,26 @@ COLUMNS = {
 def main() -> int:
     """Click, and print a table or a document."""
     parser = options(__doc__, 200, "clicks a group and day", as_json=True)
-    parser.add_argument(
-        "--day",
-        choices=DAYS,
-        nargs="+",
-        default=["kind", "worst"],
-        metavar="DAY",
-        help="(default kind worst)",
-    )
-    parser.add_argument(
-        "--on", choices=GROUPS, nargs="+", default=list(GROUPS), help="what is clicked (default both)"
-    )
+    parser.add_argument("--day", choices=DAYS, nargs="+", default=list(DAYS), help="(default both)")
     args = parser.parse_args()
     tasks = [
         ClicksTask(day, group, args.seed, number, min(A_TASK, args.cases - number * A_TASK))
         for number in range(math.ceil(args.cases / A_TASK))
         for day in args.day
-        for group in args.on
+        for group in GROUPS
     ]
     label = "{0.day} day, {0.group}, scene {0.number}".format
     found = run_cases(args, "scenes", click_all, tasks, label)
-    rows, clicks = [], []
-    for day, group in product(args.day, args.on):
+    rows = []
+    for day, group in product(args.day, GROUPS):
         mine = [
             one
             for task, row in zip(tasks, found, strict=True)
             if (task.day, task.group) == (day, group)
             for one in row
         ]
-        rows.append(told(day, group, mine))
-        clicks += [{"day": day, "group": group, **vars(one)} for one in mine]
-    if args.json:
-        print(json.dumps({"rows": rows, "clicks": clicks}))
-    else:
-        show(args, rows, COLUMNS, "reasons")
+        rows.append(summary(day, group, mine))
+    show(args, rows, COLUMNS, "reasons")
     return 0
 
 

@@ -1,7 +1,6 @@
 """Opportunity Navcam frames: the mast fitted to labels, features carried from one picture to the next.
 
-Part of flight_validation.py. Frames come through the ``replay`` driver, as they would from a live head
-and camera.
+Frames come through the ``replay`` driver, as they would from a live head and camera.
 
 The rule by which features count: at most 400 Shi-Tomasi corners of the first picture (quality 0.02 of
 the best, 25 px apart, 15 px blocks); the corner must lie in the second picture, 25 px from its border,
@@ -72,7 +71,6 @@ class CarriedFeatures:
     pixel_px: FloatArray
     found_px: FloatArray
     across_px: float
-    correlation: float
     position_m: FloatArray
 
 
@@ -85,7 +83,6 @@ class Rehearsal:
     """
 
     carried: CarriedFeatures
-    position_m: FloatArray
     aim_px: FloatArray
     solution: Solution
     off_rad: float
@@ -197,7 +194,7 @@ def carry(first: FlightView, pixel_px: FloatArray, second: FlightView) -> Carrie
     except NoStereoPoint:  # a match so near the vanishing point that the rays diverge: a false one
         return None
     across = across_px(first.camera, pixel_px, second.camera, best.pixel_px)
-    return CarriedFeatures(pixel_px, best.pixel_px, across, best.correlation, position)
+    return CarriedFeatures(pixel_px, best.pixel_px, across, position)
 
 
 def across_px(first: CameraModel, pixel_px: FloatArray, second: CameraModel, found_px: FloatArray) -> float:
@@ -288,4 +285,4 @@ def rehearse(
         rover.mast, head_camera, target, aim, from_pan_rad=first.pan_rad, from_tilt_rad=first.tilt_rad
     )[0]
     off = max(abs(best.pan_rad - second.pan_rad), abs(best.tilt_rad - second.tilt_rad))
-    return Rehearsal(this, target, aim, best, off)
+    return Rehearsal(this, aim, best, off)

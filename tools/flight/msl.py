@@ -1,4 +1,4 @@
-"""MSL Navcam labels: a mast fitted to twelve of them predicts the others. Part of flight_validation.py."""
+"""MSL Navcam labels: a mast fitted to twelve of them predicts the others."""
 
 from __future__ import annotations
 
@@ -89,13 +89,8 @@ def new_pointings(training: Sequence[Label], others: Sequence[Label]) -> list[La
 
 def fit(labels: Sequence[Label], parameters: int = 8) -> PoseFit:
     """Fit a mast to labels."""
-    models, pan, tilt = columns(labels)
-    return fit_poses(models, pan, tilt, parameters=8 if parameters == 8 else 6)
-
-
-def columns(labels: Sequence[Label]) -> tuple[list[CameraModel], list[float], list[float]]:
-    """Return models, pan and tilt angles of labels."""
-    return [x.model for x in labels], [x.pan_rad for x in labels], [x.tilt_rad for x in labels]
+    models, pan_rad, tilt_rad = zip(*((one.model, one.pan_rad, one.tilt_rad) for one in labels), strict=True)
+    return fit_poses(models, pan_rad, tilt_rad, parameters=8 if parameters == 8 else 6)
 
 
 def one_lens(labels: Sequence[Label], lens: CameraModel) -> list[Label]:

@@ -82,7 +82,6 @@ class CarriedTarget:
     pixel_px: FloatArray
     predicted_px: FloatArray
     verdict: str
-    reason: str
     found_px: FloatArray
     across_px: float
     ecc_px: FloatArray
@@ -155,7 +154,7 @@ def carried(
     good = match.verdict == "good"
     across = mer.across_px(first.camera, pixel_px, second.camera, match.pixel_px) if good else np.nan
     return CarriedTarget(
-        pixel_px, np.asarray(predicted), _verdict(look), look.reason, match.pixel_px, across,
+        pixel_px, np.asarray(predicted), _verdict(look), match.pixel_px, across,
         _by_ecc(first, second, pixel_px, plane, seed) if good else np.full(2, np.nan),
     )  # fmt: skip
 

@@ -1,9 +1,8 @@
 """Make all numbers of docs/evidence/validation.md from the flight data in hil_tests/data.
 
-    python -m tools.flight.validation [--data FOLDER] [--write] [--mast-file OUT.yaml]
+    python -m tools.flight.validation [--data FOLDER] [--write]
 
 The tables go to stdout. With --write they also replace the CSV files of these tables in docs/evidence/data.
---mast-file writes the mast file of the replayed rover, for a configuration with the driver ``replay``.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.files.mast_file import save_rig
 from drivers.clock import ManualClock
 from drivers.recordings.pds3 import PdsProduct
 from tools.command import end
@@ -36,13 +34,12 @@ def main() -> int:
     parser.add_argument(
         "--write", action="store_true", help="renew the tables of docs/evidence/validation.md"
     )
-    parser.add_argument("--mast-file", type=Path, help="write the mast file of the replayed rover here")
     arguments = parser.parse_args()
     for name in ("msl_navcam", "mer_navcam"):
         if not (arguments.data / name).is_dir():
             parser.error(f"{arguments.data} has no folder {name}; --data names the folder that holds it")
     blocks = msl_blocks(arguments.data / "msl_navcam")
-    blocks |= mer_blocks(arguments.data / "mer_navcam", arguments.mast_file)
+    blocks |= mer_blocks(arguments.data / "mer_navcam")
     for name, text in blocks.items():
         print(f"## {name}\n\n{text}\n")
     if arguments.write:
@@ -119,13 +116,11 @@ def msl_blocks(folder: Path) -> dict[str, str]:
     }
 
 
-def mer_blocks(folder: Path, mast_file: Path | None) -> dict[str, str]:
+def mer_blocks(folder: Path) -> dict[str, str]:
     """Return the tables about the Opportunity frames."""
     products = mer.labels(folder)
     fitted = mer.fit(products)
     rover = mer.rig(fitted, products)
-    if mast_file is not None:
-        save_rig(rover, mast_file)
     clock = ManualClock()
     recording = mer.replay(folder, clock)
     views = mer.views(recording, clock, rover)

@@ -16,7 +16,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calib.errors import BadFile
 from calib.files.mast_file import load_rig
 from calib.survey.records import Sigma, Survey
 from calib.survey.writer import write_survey
@@ -50,27 +49,23 @@ def main() -> int:
     parser.add_argument("--joint-sigma-rad", type=not_negative, default=0.0)
     parser.add_argument("--prism-cad-sigma-m", type=not_negative, default=0.0)
     options = parser.parse_args()
-    try:
-        rig = load_rig(options.rig).rig
-        sigma = Sigma(
-            options.station_sigma_m, options.dot_sigma_px, options.joint_sigma_rad, options.prism_cad_sigma_m
-        )
-        plan = SurveyPlan(
-            mast_boards=options.mast_boards,
-            check_boards=options.check_boards,
-            prisms=options.prisms,
-            sigma=sigma,
-        )
-        survey, truth = simulate_survey(rig, options.seed, plan)
-        if options.render:
-            images = pictures(survey, truth, options.seed, options.plain)
-            written = write_survey(replace(survey, dots={}), options.out, images)
-        else:
-            nameless = tuple(replace(image, file=Path()) for image in survey.images)
-            written = write_survey(replace(survey, images=nameless), options.out)
-    except BadFile as error:
-        print(error, file=sys.stderr)
-        return 2
+    rig = load_rig(options.rig).rig
+    sigma = Sigma(
+        options.station_sigma_m, options.dot_sigma_px, options.joint_sigma_rad, options.prism_cad_sigma_m
+    )
+    plan = SurveyPlan(
+        mast_boards=options.mast_boards,
+        check_boards=options.check_boards,
+        prisms=options.prisms,
+        sigma=sigma,
+    )
+    survey, truth = simulate_survey(rig, options.seed, plan)
+    if options.render:
+        images = pictures(survey, truth, options.seed, options.plain)
+        written = write_survey(replace(survey, dots={}), options.out, images)
+    else:
+        nameless = tuple(replace(image, file=Path()) for image in survey.images)
+        written = write_survey(replace(survey, images=nameless), options.out)
     boards = len({(image.setup, image.placement) for image in written.images})
     kind = "pictures" if options.render else "images by their dots alone"
     print(f"wrote {options.out}: {boards} boards, {len(written.images)} {kind}, digest {written.digest[:12]}")

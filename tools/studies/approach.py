@@ -1,18 +1,17 @@
 """The paper's approach (Fig. 1, Table I) on the simulated rover: a target picked at 10 m, followed to 1 m.
 
-    .venv/bin/python -m tools.studies.approach --cases 5 --out approaches
+    .venv/bin/python -m tools.studies.approach --cases 5
 
 Each run follows a rock from Pancam to Navcam to Hazcam, a minute a run. It prints the errors of the tracked
-stops beside the paper's Table I; ``--out`` gets stops.csv, a row for each stop.
+stops beside the paper's Table I.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,11 +27,9 @@ from calib.geometry.stereo import target_approach_budget
 from calib.matching.look import seen_by
 from calib.matching.track import Track, moved_track, start_track
 from drivers.sim.scene import SceneSettings, build_scene
-from mastctl.cli import output
 from mastctl.experiment.targets import texture_mask
 from mastctl.motion.pairs import choose_pairs
 from mastctl.packaged import config_folder
-from mastctl.report.pages import write_csv
 from tools.command import end, options, run_cases, show
 from tools.studies.approach_world import ApproachWorld, WorldErrors
 
@@ -69,24 +66,20 @@ AXES = ("along", "right", "below")
 
 @dataclass(frozen=True)
 class Stop:
-    """One stop of an approach, a row of ``--out``; errors are believed less true, along `AXES`.
+    """One stop of an approach; errors are believed less true, along `AXES`.
 
-    ``range_m`` is the true distance from the middle of the pair's cameras; ``state`` tracked or lost, and
-    ``reason`` why; ``pixel_error_px`` of the left camera's match, not-a-number without one; ``untracked_m``
-    the error had the start's position been carried by reported motions alone; ``pose_doubt`` the pictures'
-    objection to the reported motion, which is honest.
+    ``range_m`` is the true distance from the middle of the pair's cameras; ``state`` tracked or lost;
+    ``untracked_m`` the error had the start's position been carried by reported motions alone; ``doubted``
+    whether the pictures object to the reported motion, which is honest.
     """
 
     range_m: float
     pair: str
     state: str
-    reason: str
     error_m: tuple[float, ...]
     sigma_m: tuple[float, ...]
-    pixel_error_px: float
-    renewed: bool
     untracked_m: tuple[float, ...]
-    pose_doubt: str = ""
+    doubted: bool = False
 
     @property
     def silently_wrong(self) -> bool:
@@ -254,33 +247,25 @@ def _look(
     chosen = choose_pairs(rig, track.position_m)[0]
     name, pan, tilt = chosen.pair, chosen.pan_rad or 0.0, chosen.tilt_rad or 0.0
     pair = rig.stereo[name]
-    doubt = ""
+    doubted = False
     for _ in range(LOST_LOOKS):
         eyes = world.look(pair, pan, tilt)
         look = seen_by(track, eyes)
-        doubt = doubt or (look.doubt.sentence if look.doubt else "")
+        doubted |= bool(look.doubt)
         if look.track.state == "tracked":
             break
     track = look.track
     true = world.site_from_rover.inverse.points(target)
     middle = (eyes[pair[0]].camera.C + eyes[pair[1]].camera.C) / 2
     axes = _axes(true - middle)
-    found = look.found.get(pair[0])
-    pixel_error = math.nan
-    if found is not None and found.verdict == "good":
-        exact = world.true_pixel(pair[0], pan, tilt, target)
-        pixel_error = float(np.linalg.norm(found.pixel_px - exact))
     return track, Stop(
         float(np.linalg.norm(true - middle)),
         name,
         track.state,
-        look.reason,
         _tuple(axes @ (track.position_m - true)),
         _tuple(np.sqrt(np.diag(axes @ track.target_covariance_m2 @ axes.T))),
-        pixel_error,
-        look.renewed,
         _tuple(axes @ (carried_m - true)),
-        doubt,
+        doubted,
     )
 
 
@@ -338,7 +323,7 @@ def approach_rows(runs: Sequence[ApproachRun]) -> list[dict[str, Any]]:
         "hand-offs": sum(run.handoffs for run in began),
         "losses": sum(run.losses[0] for run in began),
         "found again": sum(run.losses[1] for run in began),
-        "honest poses doubted": sum(bool(stop.pose_doubt) for run in began for stop in run.stops),
+        "honest poses doubted": sum(stop.doubted for run in began for stop in run.stops),
         "stops": sum(len(run.stops) for run in began),
     }
     rows[-1] |= {"counts": counts, "notes": [", ".join(f"{name} {n}" for name, n in counts.items())]}
@@ -360,29 +345,10 @@ def _row(
     return row | parts | {"position_cm": float(np.linalg.norm(rms))}
 
 
-def write_stops(path: Path, runs: Sequence[ApproachRun]) -> None:
-    """Write a row for each stop, three columns for each error; its folder is made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    vectors = {"error_m", "sigma_m", "untracked_m"}
-    names = [field.name for field in fields(Stop)]
-    columns = [
-        column for name in names
-        for column in ([f"{name[:-2]}_{axis}_m" for axis in AXES] if name in vectors else [name])
-    ]  # fmt: skip
-    rows = []
-    for run in runs:
-        for index, stop in enumerate(run.stops):
-            cells = [v if isinstance(v, tuple) else (v,) for v in astuple(stop)]
-            rows.append([run.seed, index, *(one for cell in cells for one in cell)])
-    write_csv(path, ("seed", "stop", *columns), rows)
-
-
 def main(words: Sequence[str] | None = None) -> int:
     """Run the approaches; 1 if no target at all was kept."""
     parser = options(__doc__, 5, "approaches", as_json=True)
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for stops.csv")
     args = parser.parse_args(words)
-    output.check_folder(args.out, "--out")
     true = load_rig(config_folder() / "sim" / "rocky8.yaml").rig
     believed = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig
     tasks = [ApproachTask(true, believed, args.seed + index) for index in range(args.cases)]
@@ -390,8 +356,6 @@ def main(words: Sequence[str] | None = None) -> int:
         args, "approaches", one_approach, tasks, "seed {0.seed}".format,
         failure=lambda run: run.error,
     )  # fmt: skip
-    if args.out is not None:
-        write_stops(args.out / "stops.csv", runs)
     show(args, approach_rows(runs), COLUMNS, "notes")
     return 0 if any(one.kept for one in runs) else 1
 

@@ -106,8 +106,6 @@ class SurveyOutcome:
         The six (or eight) numbers, estimated, and their standard deviations.
     mast_rms_px
         By pair, (x, y) rms over the images of purpose ``mast``.
-    seconds
-        Of the fit.
     """
 
     variant: Variant
@@ -118,7 +116,6 @@ class SurveyOutcome:
     mast: FloatArray = field(default_factory=lambda: np.full(8, np.nan))
     sigma: FloatArray = field(default_factory=lambda: np.full(8, np.nan))
     mast_rms_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    seconds: float = 0.0
 
 
 def one_survey(task: SurveyTask) -> SurveyOutcome:
@@ -144,7 +141,6 @@ def one_survey(task: SurveyTask) -> SurveyOutcome:
             [*sigma["translation_m"], *sigma["rotation_rad"], sigma["axis_offset_m"], sigma["axis_twist_rad"]]
         ),
         _mast_rms(fit),
-        fit.seconds,
     )
 
 

@@ -2,8 +2,8 @@
 
     .venv/bin/python -m tools.studies.handoff --simulated --targets 20 --out handed
 
-Targets are handed from Pancam to Navcam at 6 m and on to Hazcam at 2 m. ``--out`` gets targets.csv and
-handoffs.jsonl, by which ``mastctl calibrate --refine`` corrects body cameras.
+Targets are handed from Pancam to Navcam at 6 m and on to Hazcam at 2 m. ``--out`` gets handoffs.jsonl, by
+which ``mastctl calibrate --refine`` corrects body cameras.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from mastctl.cli.tasks import refuse_task_options, run_bar
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.experiment.simulated import Rover, SimulationTruth, running_rover
-from mastctl.report.pages import write_csv
 from mastctl.watch.handoffs import HandoffLog
 from tools.command import end, options, run_cases, show
 from tools.studies.handoff_run import STEPS, HandoffRecord, run_handoff_experiment
@@ -43,12 +42,6 @@ COLUMNS = {
     "refined": "{accepted}", "rms": "{refined_rms_px:.2f}", "worst refined": "{refined_worst_px:.2f}",
     "paper worst": "{paper_worst_px:g}",
 }  # fmt: skip
-CSV_COLUMNS = (
-    "handoff", "target", "range_m", "frame_id", "clicked_x_px", "clicked_y_px", "camera",
-    "geometric_x_px", "geometric_y_px", "search_sigma_major_px", "search_sigma_minor_px",
-    "verdict", "refined_x_px", "refined_y_px", "refined_sigma_x_px", "refined_sigma_y_px", "correlation",
-    "true_x_px", "true_y_px", "reason",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -58,7 +51,6 @@ class HandoffTask:
     rover: Rover
     source: str
     index: int
-    click_px: float
 
 
 def one_handoff(task: HandoffTask) -> list[HandoffRecord]:
@@ -68,7 +60,6 @@ def one_handoff(task: HandoffTask) -> list[HandoffRecord]:
             client,
             targets=1,
             seed=task.rover.seed,
-            click_px=task.click_px,
             truth=SimulationTruth(rover),
             first=task.index,
             chosen=(task.source,),
@@ -107,9 +98,8 @@ def handoff_rows(records: Sequence[HandoffRecord]) -> list[dict[str, Any]]:
 
 
 def write_handoffs(folder: Path, records: Sequence[HandoffRecord]) -> None:
-    """Write targets.csv and handoffs.jsonl into ``folder`` (made if need be)."""
+    """Write handoffs.jsonl into ``folder`` (made if need be)."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_csv(folder / "targets.csv", CSV_COLUMNS, [row for record in records for row in _csv_rows(record)])
     log = HandoffLog(folder / "handoffs.jsonl")
     log.path.unlink(missing_ok=True)
     for record in records:
@@ -140,14 +130,7 @@ def main(words: Sequence[str] | None = None) -> int:
         "--targets", type=output.at_least(1), metavar="N",
         default=10, help="targets of each hand-off (default 10)",
     )  # fmt: skip
-    parser.add_argument(
-        "--click-px", type=output.not_negative, default=0.2, metavar="PX",
-        help="sigma of the noise added to the clicks (default 0.2)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR",
-        help="folder for targets.csv and handoffs.jsonl",
-    )  # fmt: skip
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for handoffs.jsonl")
     args = parser.parse_args(words)
     if args.mast_file is not None and not args.simulated:
         raise output.WrongUse("--mast-file belongs to --simulated; a running daemon has its own mast file")
@@ -170,11 +153,7 @@ def _simulated(args: argparse.Namespace) -> list[HandoffRecord]:
         )
     mast_file = None if args.mast_file is None else args.mast_file.read_bytes()
     rover = Rover("ptu_d46_70", args.seed, 0, mast_file)
-    tasks = [
-        HandoffTask(rover, source, index, args.click_px)
-        for source in sources
-        for index in range(args.targets)
-    ]
+    tasks = [HandoffTask(rover, source, index) for source in sources for index in range(args.targets)]
     parts = run_cases(
         args, "hand-off", one_handoff, tasks, "from {0.source}, target {0.index}".format,
         failure=lambda part: next((record.error for record in part if record.error), ""),
@@ -189,9 +168,7 @@ def _on_daemon(args: argparse.Namespace, client: Client) -> list[HandoffRecord]:
         def step_done(record: HandoffRecord) -> None:
             step(record.step, record.error and f"{record.step}, target {record.index}: {record.error}")
 
-        return run_handoff_experiment(
-            client, targets=args.targets, seed=args.seed, click_px=args.click_px, on_target=step_done
-        )
+        return run_handoff_experiment(client, targets=args.targets, seed=args.seed, on_target=step_done)
 
 
 def _report(args: argparse.Namespace, records: Sequence[HandoffRecord]) -> int:
@@ -214,24 +191,6 @@ def _lengths(
     rms, mean = np.sqrt(np.mean(errors**2, axis=0)), errors.mean(axis=0)
     worst = float(np.linalg.norm(errors, axis=1).max())
     return (float(rms[0]), float(rms[1])), (float(mean[0]), float(mean[1])), worst
-
-
-def _csv_rows(record: HandoffRecord) -> list[list[Any]]:
-    start = [record.step, record.index, record.range_m, record.frame_id, *record.clicked_px]
-    if not record.handed:
-        return [[*start, *[""] * 13, record.error]]
-    rows = []
-    for one in record.handed:
-        axes = np.sqrt(np.maximum(np.linalg.eigvalsh(one.geometric.search_px2)[::-1], 0.0))
-        refined = one.refined
-        rows.append(
-            [
-                *start, one.camera, *one.geometric.pixel_px, *axes, refined.verdict, *refined.pixel_px,
-                *np.sqrt(np.diag(refined.covariance_px2)), refined.correlation,
-                *(one.true_px or ("", "")), refined.reason,
-            ]
-        )  # fmt: skip
-    return rows
 
 
 if __name__ == "__main__":

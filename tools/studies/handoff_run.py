@@ -7,7 +7,6 @@ On a simulated rover the error is against the truth; on a real one the refined p
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -68,9 +67,6 @@ class HandoffRecord:
 
     step: str
     index: int
-    range_m: float = math.nan
-    frame_id: str = ""
-    clicked_px: tuple[float, float] = (math.nan, math.nan)
     handed: tuple[Handed, ...] = ()
     error: str = ""
     matched: MatchedHandoff | None = None
@@ -181,10 +177,7 @@ class _HandoffRun:
         matched = matched_handoff(
             target.shot.mast_digest, source, at, clicks, sigma_px, to_joints, done, refined
         )
-        clicked = (float(clicks[0, 0]), float(clicks[0, 1]))
-        return HandoffRecord(
-            self._step, index, target.range_m, target.shot.frame_id, clicked, tuple(handed), matched=matched
-        )
+        return HandoffRecord(self._step, index, tuple(handed), matched=matched)
 
     def _camera(self, shot: Snapshot) -> Eye:
         return Eye(grey(shot.image), self.rig.camera_in_rover(shot.camera, *shot.true_rad))

@@ -130,7 +130,7 @@ def test_no_free_place_of_a_fine_grid_is_nearer_than_the_goal_named() -> None:
         here, goal = ((draw.uniform(-1.0, 1.0), draw.uniform(-0.5, 0.5)) for _ in range(2))
         if allowed(keep_outs, here, goal):
             continue
-        grid = [(0.02 * i, 0.02 * j) for i in range(-50, 51) for j in range(-25, 26)]
+        grid = [(0.04 * i, 0.04 * j) for i in range(-25, 26) for j in range(-12, 13)]
         free = [math.dist(place, goal) for place in grid if allowed(keep_outs, here, place)]
         nearest = keep_outs.nearest_free(Span.around(here), goal, True)
         if nearest is None:
