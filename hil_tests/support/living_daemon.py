@@ -16,18 +16,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import psutil
 import yaml
 
 from mastctl.config import load_config
 from mastctl.packaged import default_config
 
-HEADS = ("memory", "dynamixel", "ptu")
 _WIRES = {"dynamixel": "dynamixel", "ptu": "flir_ptu"}
 _ANSWER_S = 30.0
 _ENDS_S = 30.0
 _KEPT_S = 2.0  # the daemon closes what has been idle for 5 s
-_PAGE = os.sysconf("SC_PAGE_SIZE")
-_TICK = os.sysconf("SC_CLK_TCK")
 
 
 def simulated(
@@ -40,7 +38,7 @@ def simulated(
     folder
         Gets the configuration, a second mast file and the daemon's state.
     head
-        One of ``HEADS``: in memory, or the real driver on simulated bytes.
+        ``memory``, or the real driver on simulated bytes: ``dynamixel`` or ``ptu``.
     cameras
         Those of the packaged rover that are opened.
     more
@@ -140,14 +138,6 @@ class Asker:
             raise OSError(f"{method} {path}: {error!r}") from None
         return answer.status, {name.lower(): value for name, value in answer.getheaders()}, got
 
-    def json(self, method: str, path: str, body: object = None) -> dict[str, Any]:
-        """Return an answer's content. Raises OSError, also for a refusal."""
-        status, _, data = self.ask(method, path, body)
-        if status >= 400:
-            raise OSError(f"{method} {path}: {status} {data.decode()[:300]}")
-        told: dict[str, Any] = json.loads(data)
-        return told
-
     def __enter__(self) -> Asker:
         return self
 
@@ -159,43 +149,21 @@ class Asker:
 
 @dataclass(frozen=True)
 class Vitals:
-    """What the kernel tells of a process.
-
-    Attributes
-    ----------
-    rss_mb
-        Memory in RAM, 10⁶ bytes.
-    threads, descriptors
-        How many.
-    cpu_s
-        Processor time since its start, seconds.
-    open_files
-        How many descriptors of each kind there are.
-    """
+    """Memory of a process in RAM, 10⁶ bytes; its threads, and its descriptors in all and of each kind."""
 
     rss_mb: float
     threads: int
     descriptors: int
-    cpu_s: float
     open_files: Mapping[str, int]
 
 
 def vitals(pid: int) -> Vitals:
-    """Return the vitals of a process now. Raises OSError if it is gone."""
-    home = Path(f"/proc/{pid}")
-    after_name = (home / "stat").read_text().rpartition(")")[2].split()
-    user, system = int(after_name[11]), int(after_name[12])  # proc(5): fields 14 and 15
-    kinds = Counter[str]()
-    for link in (home / "fd").iterdir():
+    """Return the vitals of a process now. Raises psutil.NoSuchProcess if it is gone."""
+    process, kinds = psutil.Process(pid), Counter[str]()
+    for link in Path(f"/proc/{pid}/fd").iterdir():
         with contextlib.suppress(FileNotFoundError):
             kinds[_kind(str(link.readlink()))] += 1
-    return Vitals(
-        rss_mb=int((home / "statm").read_text().split()[1]) * _PAGE / 1e6,
-        threads=int(after_name[17]),
-        descriptors=sum(kinds.values()),
-        cpu_s=(user + system) / _TICK,
-        open_files=kinds,
-    )
+    return Vitals(process.memory_info().rss / 1e6, process.num_threads(), sum(kinds.values()), kinds)
 
 
 def _kind(target: str) -> str:

@@ -3,7 +3,7 @@
 The daemon is a process of its own on a simulated rover, recorder on. Two clients look at pictures. One
 steers: it points at angles, pixels and places, tracks while the rover drives, jogs under a lease, stops and
 latches, changes mast files. One tries to steer beside it. Faults come at random by their words; clients
-stall, are killed (SIGKILL) and send rubbish. Now and then all of them rest, faults are taken back, and the
+stall and are killed (SIGKILL). Now and then all of them rest, faults are taken back, and the
 daemon is weighed. The warm-up ends when each thing that the clients do was done once, and the recorder's ring
 has gone round. The daemon gives freed memory back at once, so that what is weighed is what it holds. Wanted,
 after the first rest:

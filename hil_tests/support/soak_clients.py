@@ -34,19 +34,6 @@ while True:
         there.close()
 """
 
-RUBBISH = (
-    b"\x00\xff\x16\x03\x01 hello\r\n\r\n",
-    b"GET /api/v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Long: " + b"a" * 40_000 + b"\r\n\r\n",
-    b"POST /api/v1/point HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n"
-    b'Content-Length: 9\r\n\r\n{"pan_ra"',
-    b"POST /api/v1/point HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n"
-    b"Content-Length: 100000\r\n\r\n" + b"[" * 100_000,
-    b"POST /api/v1/stop HTTP/1.1\r\nHost: evil.example\r\n\r\n",
-    b"GET /api/v1/track/stream HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
-    b"POST /api/v1/jog HTTP/1.1\r\nHost: 127.0.0.1\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n",
-    b"GET /api/v1/snapshot/navcam_left HTTP/1.1\r\nHost: 127.0.0.1\r\n",
-)
-
 
 class Crowd:
     """All clients of one daemon. A context manager; they begin at rest."""
@@ -59,7 +46,7 @@ class Crowd:
         self._idle: dict[str, threading.Event] = {}
         clients: dict[str, Callable[[SoakClient], None]] = {
             "looker 1": _look, "looker 2": _look, "watcher": _watch, NAME: _steer, "rival": _rival,
-            "faults": _set_fault, "staller": _stall, "vanisher": _vanish, "rubbish": _rubbish,
+            "faults": _set_fault, "staller": _stall, "vanisher": _vanish,
         }  # fmt: skip
         self._threads = [
             threading.Thread(
@@ -183,10 +170,9 @@ class SoakClient:
         self.ledger.check(False, f"{what}: has not ended {ENDS_S:g} s after its {deadline_s:g} s")
         return {}
 
-    def point(self, what: str, body: dict[str, Any], key: str | None = None) -> dict[str, Any]:
+    def point(self, what: str, body: dict[str, Any]) -> dict[str, Any]:
         """Point somewhere and wait; the record, or the refusal."""
-        headers = {} if key is None else {"Idempotency-Key": key}
-        told = self.ask("POST", "/point", {**body, "deadline_s": DEADLINE_S}, headers)
+        told = self.ask("POST", "/point", {**body, "deadline_s": DEADLINE_S})
         self.ledger.act(what)
         return self.wait(what, told["id"]) if told["http"] == 202 else told
 
@@ -239,7 +225,7 @@ def _steer(client: SoakClient) -> None:
     acts = {
         _angles: (4, "angles done"), _pixel: (3, "pixel done"), _place: (2, "place done"),
         _track: (2, "look done"), _jog: (2, "jog done"), _stop: (2, "stop"), _estop: (1, "estop"),
-        _mast: (1, "mast"), _outside: (1, "outside"), _twice: (1, "twice"), _record: (1, "recording"),
+        _mast: (1, "mast"), _record: (1, "recording"),
     }  # fmt: skip
     lacking = client.ledger.lacking()
     first = [act for act, (_, what) in acts.items() if what in lacking]
@@ -248,13 +234,6 @@ def _steer(client: SoakClient) -> None:
 
 def _angles(client: SoakClient) -> None:
     client.point("angles", client.angles())
-
-
-def _outside(client: SoakClient) -> None:
-    told = client.ask("POST", "/point", {"pan_rad": 2.9, "tilt_rad": 0.0})
-    client.ledger.act("outside")
-    if told["http"] == 202:
-        client.ledger.check(False, "an angle outside the limits was taken")
 
 
 def _pixel(client: SoakClient) -> None:
@@ -378,18 +357,6 @@ def _mast(client: SoakClient) -> None:
         client.ask("POST", "/mast", {"file": "mast.yaml"})
 
 
-def _twice(client: SoakClient) -> None:
-    """Ask for one pointing twice under one key; it must be one operation."""
-    key = f"{client.draw.getrandbits(64):x}"
-    body, headers = {**client.angles(), "deadline_s": DEADLINE_S}, {"Idempotency-Key": key}
-    first, second = (client.ask("POST", "/point", body, headers) for _ in range(2))
-    client.ledger.act("twice")
-    if first["http"] == 202:
-        good = second.get("id") == first["id"]
-        client.ledger.check(good, f"one key, two answers: {first} and {second}")
-        client.wait("angles", first["id"])
-
-
 def _record(client: SoakClient) -> None:
     """Record a pointing into a file of its own."""
     began = client.ask("POST", "/recordings/start", {})
@@ -453,15 +420,3 @@ def _vanish(client: SoakClient) -> None:
         one.kill()
     client.ledger.act("killed")
     time.sleep(client.draw.uniform(1.0, 6.0))
-
-
-def _rubbish(client: SoakClient) -> None:
-    """Send what is no request, or a stop from nowhere, and go."""
-    since_s = time.monotonic()
-    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", client.port), 2.0) as there:
-        there.sendall(client.draw.choice(RUBBISH))
-        first = there.recv(4096).partition(b"\r\n")[0].decode("latin-1")
-        good = not first.startswith("HTTP/1.1 5") or client.ledger.explained(since_s, time.monotonic())
-        client.ledger.check(good, f"rubbish was answered by {first}")
-    client.ledger.act("rubbish")
-    time.sleep(client.draw.uniform(0.2, 3.0))

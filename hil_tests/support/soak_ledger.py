@@ -34,8 +34,8 @@ OF_THE_DISK = {"latch_not_kept"}
 
 EVERYTHING = frozenset({
     "angles done", "pixel done", "place done", "look done", "jog done", "rival", "stop", "estop", "mast",
-    "outside", "twice", "recording", "stalled", "killed", "rubbish", "fault of the head",
-    "fault of a camera", *(f"looked by {camera}" for camera in SEES),
+    "recording", "stalled", "killed", "fault of the head", "fault of a camera",
+    *(f"looked by {camera}" for camera in SEES),
 })  # fmt: skip
 """What the first time takes memory that stays; a daemon is warm when it has done all of it."""
 
