@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import select
 import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -30,6 +31,7 @@ LARGEST_IMAGE_PX = 65536
 BLIND_GRID = (38, 31)
 #: A lens with no ray in more than this part of its image is refused; a fisheye's corners often have none.
 MOST_BLIND = 0.5
+SILENT_S = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +66,20 @@ class CameraFile:
 
 
 def read_bytes(path: str | Path, limit_bytes: int) -> bytes:
-    """Return the whole file, or raise BadFile if it cannot be read, is empty, or is larger than the limit."""
+    """Return the whole file, or raise BadFile if it cannot be read, is empty, or is larger than the limit.
+
+    A pipe without a writer is empty; one whose writer says nothing is waited for `SILENT_S` seconds.
+    """
+    data = b""
     try:
-        with open(path, "rb", opener=_opened_at_once) as file:
-            os.set_blocking(file.fileno(), True)
-            data = file.read(limit_bytes + 1)
+        with open(path, "rb", buffering=0, opener=_opened_at_once) as file:
+            more = select.poll()
+            more.register(file, select.POLLIN)
+            while len(data) <= limit_bytes and (part := file.read(limit_bytes + 1 - len(data))) != b"":
+                data += part or b""
+                if part is None and not more.poll(1000.0 * SILENT_S):
+                    silent = f"is a pipe or a device that has sent nothing for {SILENT_S:g} s"
+                    raise BadFile(path, "", f"{silent}; a plain file is expected")
     except OSError as error:
         raise BadFile(path, "", f"cannot be read: {error.strerror or error}") from None
     except ValueError as error:  # a path with a NUL
@@ -81,7 +92,7 @@ def read_bytes(path: str | Path, limit_bytes: int) -> bytes:
 
 
 def _opened_at_once(path: str, flags: int) -> int:
-    """Open a file; a pipe that nothing writes to does not wait for a writer, and is empty."""
+    """Open a file, a pipe too, without waiting for anything."""
     return os.open(path, flags | os.O_NONBLOCK)
 
 

@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from calib.errors import BadFile
+from calib.files import read_bytes
 from mastctl import signals
 from mastctl.cli import output
 from mastctl.cli.output import WrongUse, at_least, finite_number, positive_number
@@ -184,9 +186,9 @@ def _options(text: str | None) -> dict[str, Any]:
     try:
         if not text.lstrip().startswith("{"):
             words = f"--options {text}"
-            text = Path(text).read_text(encoding="utf-8")
+            text = read_bytes(text, 1 << 20).decode()
         options = json.loads(text)
-    except (OSError, ValueError) as error:
+    except (BadFile, ValueError) as error:
         raise WrongUse(f"{words}: a JSON object, or a file that holds one, is expected: {error}") from None
     if not isinstance(options, dict):
         raise WrongUse(f"{words}: a JSON object is expected")
