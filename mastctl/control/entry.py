@@ -257,9 +257,9 @@ class CommandEntry:
         self._record(command, asked, answer, None, begins=False)
         return answer
 
-    def not_begun(self, command: Command, asked: CommandRequest, error: Exception) -> None:
-        """Record a stop that could not even be tried."""
-        self._record(command, asked, None, error, begins=False)
+    def note(self, command: Command, asked: CommandRequest, error: Exception | None = None) -> None:
+        """Record a stop that could not even be tried, or the reason that came after its stop."""
+        self._record(command, asked, {}, error, begins=False)
 
     def refused(self, caller: Caller, command: str, code: str, message: str) -> None:
         """Record a request that was refused before it was a command. It is not published."""

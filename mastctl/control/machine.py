@@ -153,14 +153,16 @@ class StateMachine:
         """Take that a stop is over: the head has confirmed it, or its fault was told before."""
         self._turns.bring(lambda now: ("stop_ended", replace(now, stops=max(0, now.stops - 1))))
 
-    def estop_asked(self, latch: Latched) -> None:
+    def estop_asked(self, latch: Latched, instead_of: Latched | None = None) -> None:
         """Note an emergency stop, between `stop_asked` and `stop_ended` of its stop.
 
-        From then on nothing may begin. One that is latched already stays; the first one stays in front.
+        From then on nothing may begin. One that is latched already stays, but for the one whose place it
+        takes; the first one stays in front.
         """
 
         def news(now: Standing) -> tuple[Event, Standing]:
-            entries = now.latched if latch in now.latched else (*now.latched, latch)
+            entries = tuple(latch if one == instead_of else one for one in now.latched)
+            entries = entries if latch in entries else (*entries, latch)
             return "estop_asked", replace(now, latch=entries[0], more_latched=entries[1:], held=AFTER_A_STOP)
 
         self._turns.leave(news)

@@ -34,6 +34,7 @@ log = logging.getLogger(__name__)
 
 KEPT_OPERATIONS = 200
 END_TIMEOUT_S = 5.0  # for a cancelled operation to notice, when the service closes
+REASON_S = 2.0  # what the record of an operation waits for the reason of a stop that came without it
 ENDS_SOON_S = 0.25  # a stopped operation ends within 20 ms or so; who comes next waits for that
 
 STOP_ASKED = "a stop was asked for"
@@ -93,6 +94,8 @@ class OperationRunner:
             0  # under way, for operations beyond their deadline; whoever waits, waits by `_ended`
         )
         self._cancelled_because: MastctlError = Stopped(STOP_ASKED)
+        self._reason_is_known = threading.Event()
+        self._reason_is_known.set()
 
     @property
     def running(self) -> str | None:
@@ -142,11 +145,11 @@ class OperationRunner:
             self._mover.allow_moves(hold)
             self._machine.stop_ended()
 
-    def stop(self, reason: str = STOP_ASKED) -> str | None:
+    def stop(self, reason: str = STOP_ASKED, reason_follows: bool = False) -> str | None:
         """Stop the mast, then the running operation, if any; return its id.
 
         The head comes first: nothing is asked, written or locked before it was told. ``reason`` is what the
-        operation's record says.
+        operation's record says; if a better ``reason_follows``, the record waits for it (`explain`).
 
         Raises
         ------
@@ -156,6 +159,8 @@ class OperationRunner:
         with self.held():
             running = self._current
             if running is not None:  # what ends from here on, ends by the stop
+                if reason_follows:
+                    self._reason_is_known.clear()
                 self._cancelled_because = Stopped(reason)
                 running[1].set()
             try:
@@ -167,6 +172,12 @@ class OperationRunner:
             name = running[0]
         log.info("stop%s", f": operation {name}" if name else "")
         return name
+
+    def explain(self, reason: str | None) -> None:
+        """Say why the last stop came, which was asked for without its reason; None for no better one."""
+        if reason is not None:
+            self._cancelled_because = Stopped(reason)
+        self._reason_is_known.set()
 
     def refusal(self, need: Need) -> MastctlError | None:
         """Return why a command may not be carried out now, as `mastctl.control.machine.StateMachine.refusal`.
@@ -375,6 +386,7 @@ class OperationRunner:
         self._stop_unasked(f"after operation {name}")
         partial = getattr(error, "result", None)
         if cancelled.is_set():
+            self._reason_is_known.wait(REASON_S)
             error = self._cancelled_because
         body = error_body(error)
         if isinstance(error, Stopped) and cancelled.is_set():

@@ -33,6 +33,7 @@ FILE = "latch.json"
 USED_SCHEMA = "mastctl/latch-used/1"
 USED = "latch.used.json"
 """Says where a latch file was: where it is gone, nobody knows what it said."""
+NOBODY, NO_REASON = "anonymous", "no reason given"
 MOST = 5
 OTHERS = "others"  # stops of more people than entries are kept of
 HEAD_FIRST_S = 0.1  # how long the disk waits for the head to be told, at most
@@ -118,7 +119,7 @@ class Latch:
         """
         with self._changed:
             self._asked += 1
-            entry = Latched(_told(name, "anonymous"), _told(reason, "no reason given"), _now())
+            entry = Latched(_told(name, NOBODY), _told(reason, NO_REASON), _now())
             for one in self.entries:
                 if one.name == entry.name:
                     return one
@@ -132,6 +133,22 @@ class Latch:
                 self._due_s = now_s + HEAD_FIRST_S
                 self._changed.notify_all()
             return next(one for one in self.entries if one.name == entry.name)
+
+    def explain(self, reason: str | None, name: str | None) -> tuple[Latched, Latched] | None:
+        """Give the cause without name and reason those that came after its stop; return it before and after.
+
+        None if there is no such cause, or another one of that name, which stays as it is.
+        """
+        with self._changed:
+            bare = next((one for one in self.entries if (one.name, one.reason) == (NOBODY, NO_REASON)), None)
+            name = _told(name, NOBODY)
+            if bare is None or name in [one.name for one in self.entries if one is not bare]:
+                return None
+            self._asked += 1  # a reset that is under way has not released this
+            cause = replace(bare, name=name, reason=_told(reason, NO_REASON))
+            self.entries = tuple(cause if one is bare else one for one in self.entries)
+            self._changed.notify_all()
+            return bare, cause
 
     def head_told(self) -> None:
         """Let the disk be written to: the head comes first."""

@@ -56,14 +56,14 @@ class Stopping:
         for entry in latch.entries:
             devices.block_moves(entry, Estopped(entry.sentence))
 
-    def stop(self, reason: str = STOP_ASKED) -> str | None:
+    def stop(self, reason: str = STOP_ASKED, reason_follows: bool = False) -> str | None:
         """Stop the mast, then what runs and the track; return the stopped operation's id.
 
         Raises DriverError.
         """
         with self._operations.held():  # until the track has ended too, which would look again
             try:
-                stopped = self._operations.stop(reason)
+                stopped = self._operations.stop(reason, reason_follows)
             finally:
                 self._tracker.stop(reason)
         return stopped
@@ -81,10 +81,13 @@ class Stopping:
         if running is not None and self._operations.running == running:
             self._operations.stop()
 
-    def estop(self, reason: str | None = None, name: str | None = None) -> EstopTold:
+    def estop(
+        self, reason: str | None = None, name: str | None = None, reason_follows: bool = False
+    ) -> EstopTold:
         """Stop the mast, and let nothing move it before `reset`, across restarts too.
 
         The head first; then what runs and the track end; then it is told whether the disk holds the stop.
+        If its ``reason_follows``, `explain_estop` comes next, with a reason or without.
 
         Returns
         -------
@@ -101,7 +104,7 @@ class Stopping:
         with self._operations.held():
             held = self.latch_estop(reason, name)
             try:
-                stopped = self.stop(f"an emergency stop: {held.reason} ({held.name})")
+                stopped = self.stop(f"an emergency stop: {held.reason} ({held.name})", reason_follows)
             except (DriverError, MastctlError) as error:
                 unconfirmed = error
         self._latch.head_told()
@@ -132,6 +135,21 @@ class Stopping:
             self._devices.block_moves(held, Estopped(held.sentence))
         finally:
             self._machine.stop_ended()
+        return held
+
+    def explain_estop(self, reason: str | None, name: str | None) -> Latched | None:
+        """Add the name and the reason that came after their stop; return its cause if that has changed."""
+        explained = self._latch.explain(reason, name) if reason or name else None
+        if explained is None:
+            self._operations.explain(None)
+            return None
+        bare, held = explained
+        self._machine.stop_asked()
+        self._machine.estop_asked(held, instead_of=bare)
+        self._devices.block_moves(held, Estopped(held.sentence))
+        self._devices.allow_moves(bare)
+        self._machine.stop_ended()
+        self._operations.explain(f"an emergency stop: {held.reason} ({held.name})")
         return held
 
     def reset(self, reason: str, name: str) -> ResetTold:

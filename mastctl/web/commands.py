@@ -149,7 +149,7 @@ async def stop_first(
     try:
         return await stopped(here.service, lambda: entry.first(kind, asked, act))
     except StopsHang as error:
-        entry.not_begun(kind, asked, error)
+        entry.note(kind, asked, error)
         raise
 
 

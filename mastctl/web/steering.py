@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 import json
 import threading
+from functools import partial
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -55,7 +56,7 @@ from mastctl.safety.latch import LONGEST
 from mastctl.safety.stop_threads import StopsHang
 from mastctl.service.service import Service
 from mastctl.service.steering import usual_s
-from mastctl.web.commands import Asks, carried_out, command, stop_first
+from mastctl.web.commands import Asks, caller_of, carried_out, command, stop_first
 from mastctl.web.models import (
     EstopBody,
     JogBody,
@@ -71,7 +72,7 @@ from mastctl.web.models import (
 )
 from mastctl.web.parts import Here, Parts
 
-BODY_S = 0.05  # a body comes with its request; who sends it later is stopped without its words
+BODY_S = 1.0  # what a stop that has been carried out waits for its reason
 LARGEST_BODY_BYTES = 4096
 ANY_BODY = {"anyOf": [EstopBody.model_json_schema(), {}]}  # a stop is refused for no body
 
@@ -145,37 +146,49 @@ def add_estop(app: FastAPI) -> None:
         openapi_extra={"requestBody": {"content": {"application/json": {"schema": ANY_BODY}}}},
     )
     async def estop(request: Request, here: Here) -> EstopTold:
-        told = await _words(request)
-        words = told.get("reason"), told.get("name")
-        stopping, asked = here.service.stopping, {"reason": words[0], "name": words[1]}
+        stopping, entry = here.service.stopping, here.service.entry
+        reading = asyncio.ensure_future(_reason_and_name(request))
+        await asyncio.wait([reading], timeout=0)  # one turn of the loop: what came with the request is read
+        late = not reading.done()
+        given = {"reason": None, "name": None} if late else reading.result()
+        stop = partial(stopping.estop, **given, reason_follows=late)
         try:
-            return await stop_first(here, ESTOP, request, lambda: stopping.estop(*words), asked)
+            answer = await stop_first(here, ESTOP, request, stop, given)
         except StopsHang as error:
-            await here.waiting.run(lambda: stopping.latch_estop(*words))
+            await here.waiting.run(lambda: stopping.latch_estop(**given))
             raise Unable("stop_unconfirmed", f"the emergency stop is latched, but {error}") from None
+        finally:
+            if late:
+                given = await reading
+                cause = stopping.explain_estop(**given)
+                if any(given.values()):
+                    entry.note(ESTOP, CommandRequest(caller_of(request), request=given))
+        if late and cause is not None:
+            answer |= {"reason": cause.reason, "name": cause.name}
+        return answer
 
     @command(app, "POST /reset", RESET, "Release an emergency stop; nothing moves before the next command")
     def reset(body: ResetBody, here: Here) -> ResetTold:
         return here.service.stopping.reset(body.reason, body.name)
 
 
-async def _words(request: Request) -> dict[str, str]:
-    """What words the body has, if it comes at once and has any."""
+async def _reason_and_name(request: Request) -> dict[str, str | None]:
+    """The reason and the name in a body, None where it has none, or does not come in time."""
+    given: dict[str, str | None] = {"reason": None, "name": None}
     data = b""
     try:
         async with asyncio.timeout(BODY_S):
             async for part in request.stream():
                 data += part
                 if len(data) > LARGEST_BODY_BYTES:
-                    return {}
+                    return given
         found = json.loads(data)
-    except Exception:  # late, broken off, no JSON: a stop is not refused for its words
-        return {}
-    return (
-        {key: one_line(value, LONGEST) for key, value in found.items() if isinstance(value, str)}
-        if isinstance(found, dict)
-        else {}
-    )
+    except Exception:  # late, broken off, no JSON: a stop is not refused for its body
+        return given
+    for key in given if isinstance(found, dict) else ():
+        if isinstance(found.get(key), str):
+            given[key] = one_line(found[key], LONGEST)
+    return given
 
 
 def add_tracking(app: FastAPI) -> None:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import random
+import socket
 import threading
+from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import httpx
 import pytest
@@ -14,12 +18,12 @@ import pytest
 from calib.errors import BadFile
 from drivers.errors import DriverError
 from hil_tests.mastctl.outside_daemon import daemon_process, line, write_config
-from hil_tests.mastctl.service_fakes import CONFIG, Hang, fake_daemon
+from hil_tests.mastctl.service_fakes import CONFIG, Hang, ScriptedLoop, fake_daemon
 from hil_tests.waiting import NET_S, present, until
 from mastctl.client import Client, ClientError
 from mastctl.control import machine as machine_module
 from mastctl.control.standing import Latched
-from mastctl.errors import NotNow, Unable
+from mastctl.errors import NotNow, Stopped, Unable
 from mastctl.safety import latch as latch_module
 from mastctl.safety.latch import FILE, Estopped, Latch
 from mastctl.safety.state_file import StateFile
@@ -272,6 +276,44 @@ def test_an_emergency_stop_is_never_refused_for_its_words(
         status = httpx.get(f"{daemon.url}/api/v1/status", timeout=NET_S)
         assert present(status.json()["estop"])["reason"] == reason
         assert ("stop",) in hardware.head.calls
+
+
+def until_stopped(request: Any, record: Any, cancelled: threading.Event, devices: Any) -> None:
+    """An operation that nothing but a stop ends."""
+    cancelled.wait(NET_S)
+    raise Stopped("it was stopped")
+
+
+def test_an_emergency_stop_acts_before_its_reason_has_come(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    body = b'{"reason": "a hand", "name": "Ana"}'
+    with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, hardware), Client(daemon.url) as client:
+        with monkeypatch.context() as patch:
+            patch.setattr(ScriptedLoop, "script", staticmethod(until_stopped))
+            operation = client.point(pan_rad=0.1, tilt_rad=0.1)
+            until(lambda: client.operation(operation)["state"] == "running", "the operation")
+        address = urlsplit(daemon.url)
+        with socket.create_connection((address.hostname, address.port), timeout=NET_S) as line:
+            head = f"POST /api/v1/estop HTTP/1.1\r\nHost: {address.netloc}\r\nConnection: close\r\n"
+            line.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n".encode())
+            until(lambda: client.status()["estop"] is not None, "the stop is latched")
+            until(lambda: ("stop",) in hardware.head.calls, "the head is stopped")
+            line.sendall(body)
+            answer = b"".join(iter(partial(line.recv, 65536), b""))
+        told = json.loads(answer.partition(b"\r\n\r\n")[2])
+        assert (told["reason"], told["name"]) == ("a hand", "Ana")
+        (cause,) = client.status()["estops"]
+        assert (cause["reason"], cause["name"]) == ("a hand", "Ana")
+        assert present(client.wait(operation)["error"])["message"] == "an emergency stop: a hand (Ana)"
+        until(lambda: b"a hand" in (tmp_path / "state" / FILE).read_bytes(), "the disk has it")
+        assert daemon.service.audit.flush(NET_S)
+        recorded = (tmp_path / "state" / "audit.jsonl").read_text().splitlines()
+        assert [one["request"].get("reason") for one in map(json.loads, recorded[1:3])] == [None, "a hand"]
+        with pytest.raises(Estopped, match="a hand"):
+            daemon.service.devices.move(0.1, 0.1)
+        client.reset(reason="the hand is away", name="Ana")
+        client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
 
 
 @pytest.mark.parametrize(
