@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.files.pictures import decode_picture
 from drivers.errors import BadFrame
 from drivers.interfaces import Image
 
@@ -284,9 +285,10 @@ def _upper(layout: Layout, groups: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def _decoded(format: PictureFormat, raw: NDArray[np.uint8], flags: int) -> Image:
     """A JPEG's picture, of the size that the driver promised."""
-    image = cv2.imdecode(raw, flags | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise BadFrame(f"{len(raw)} bytes that are no JPEG")
+    try:
+        image = decode_picture(raw.tobytes(), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    except ValueError as error:
+        raise BadFrame(f"a JPEG of {len(raw)} bytes: {error}") from None
     if image.shape[1::-1] != format.size_px:
         raise BadFrame(f"a JPEG of {image.shape[1]}x{image.shape[0]} px where {format.size_px} px were set")
     return _image(image)

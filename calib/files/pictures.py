@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from typing import Any
 
@@ -27,14 +28,37 @@ def decode_picture(data: bytes, flags: int = AS_STORED) -> NDArray[Any]:
     """
     if (spoiled := spoiled_png(data)) is not None:
         raise ValueError(spoiled)
+    is_jpeg = data.startswith(b"\xff\xd8\xff")
+    if is_jpeg:
+        data = _without_end(data)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     except cv2.error:
         image = None
     if image is None:
-        is_jpeg = data.startswith(b"\xff\xd8\xff")
         raise ValueError("it is cut short or damaged" if is_jpeg else "a PNG or JPEG file is expected")
     return np.asarray(image)
+
+
+def _without_end(data: bytes) -> bytes:
+    """Return a JPEG of one scan without its end marker; empty if it has none, or a part of the scan is lost.
+
+    At that marker libjpeg fills what is missing of a picture with grey, and says so on stderr only; without
+    it, it gives up. It looks some bytes ahead. One of several scans is returned as it is.
+    """
+    at, components = 2, 0
+    while (code := data[at + 1 : at + 2]) != b"\xda":
+        if data[at : at + 1] != b"\xff" or len(data) < at + 10:
+            return data
+        if code in (b"\xc0", b"\xc1"):
+            components = data[at + 9]
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    if data[at + 4 : at + 5] != bytes((components,)):
+        return data
+    scan = data[at : max(at, data.rfind(b"\xff\xd9"))]
+    restarts = re.findall(rb"\xff([\xd0-\xd7])", scan)
+    in_order = all(one[0] == 0xD0 + number % 8 for number, one in enumerate(restarts))
+    return data[:at] + scan + bytes(16) if scan and in_order else b""
 
 
 def spoiled_png(data: bytes) -> str | None:

@@ -206,25 +206,15 @@ def _pixels(path: Path) -> NDArray[np.generic]:
     """The pixels of a PDS3 product or an ordinary image file."""
     try:
         data = read_bytes(path, MAX_IMAGE_BYTES)
-        if looks_like_pds3(data):
-            image: NDArray[np.generic] | None = read_product(path).image
-        else:
-            image = _decoded(data)
+        image = read_product(path).image if looks_like_pds3(data) else decode_picture(data, HOW)
+        if image is None:
+            raise ValueError("its label names none")
     except CalibError as error:
         raise BadOptions(str(error), device="replay") from None
-    if image is None or image.size == 0:
-        raise BadOptions(
-            f"{path}: holds no image that can be read (PNG, JPEG, TIFF or PDS3)", device="replay"
-        )
+    except ValueError as error:
+        words = f"{path}: holds no image (PNG, JPEG, TIFF or PDS3) that can be read: {error}"
+        raise BadOptions(words, device="replay") from None
     return image
-
-
-def _decoded(data: bytes) -> NDArray[np.generic] | None:
-    """Decode an image file; grey stays grey, colour is BGR, 16 bits stay 16. None if it is no image."""
-    try:
-        return decode_picture(data, HOW)
-    except ValueError:
-        return None
 
 
 def _rows(path: Path) -> list[tuple[str, str, float, float, Path]]:

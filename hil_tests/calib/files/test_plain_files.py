@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import select
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,7 @@ from calib.survey.find_dots import find_in_file
 from calib.targets.board_file import load_board
 from calib.targets.boards import Board
 from drivers.recordings.mcap_file import is_mcap, read_items
-from hil_tests.waiting import NET_S
+from hil_tests.waiting import NET_S, until
 from mastctl.config import load_config
 
 
@@ -66,10 +67,11 @@ def test_a_pipe_in_the_place_of_a_file_is_refused(
 
 def test_what_a_program_writes_into_a_pipe_is_read_whole() -> None:
     reads, writes = os.pipe()
-    with os.fdopen(writes, "wb") as stream:
-        writer = threading.Thread(target=lambda: (stream.write(b"a" * 200_000), stream.close()))
-        writer.start()
-        assert files.read_bytes(f"/dev/fd/{reads}", 1 << 20) == b"a" * 200_000
+    writer = threading.Thread(target=lambda: Path(f"/dev/fd/{writes}").write_bytes(b"a" * 200_000))
+    writer.start()
+    until(lambda: select.select([reads], [], [], 0)[0], "the first bytes")
+    os.close(writes)  # of which the writer has its own
+    assert files.read_bytes(f"/dev/fd/{reads}", 1 << 20) == b"a" * 200_000
     writer.join()
     os.close(reads)
 

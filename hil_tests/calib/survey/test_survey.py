@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from calib.errors import BadFile
-from calib.files.pictures import spoiled_png
+from calib.files.pictures import decode_picture, spoiled_png
 from calib.survey.reader import read_survey
 from calib.survey.records import Survey
 from calib.survey.writer import write_survey
@@ -339,6 +339,18 @@ def test_files_of_a_survey_are_on_disk_before_the_folder_is_named(
     write_survey(survey, target, [("pictures/x.png", b"x")])
     written = {path.name for path in target.rglob("*") if path.is_file()}
     assert {"survey.yaml", "station.csv", "images.csv", "x.png"} <= written <= early
+
+
+@pytest.mark.parametrize("interval", [0, 4], ids=["one piece", "restart markers"])
+def test_a_jpeg_whose_data_end_before_its_picture_is_refused(interval: int) -> None:
+    grey = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 256, (96, 96), np.uint8), (0, 0), 1.0)
+    for picture in (grey, np.full_like(grey, 128)):  # the grey of a part that is missing
+        whole = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_RST_INTERVAL, interval])[1].tobytes()
+        np.testing.assert_array_equal(decode_picture(whole), cv2.imdecode(np.frombuffer(whole, np.uint8), 0))
+    whole = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_RST_INTERVAL, interval])[1].tobytes()
+    for at in range(len(whole) // 2, len(whole) - 60, 97):
+        with pytest.raises(ValueError, match="cut short or damaged"):
+            decode_picture(whole[:at] + b"\xff\xd9")
 
 
 def test_a_png_is_whole_to_its_last_byte_or_said_to_be_cut_short() -> None:

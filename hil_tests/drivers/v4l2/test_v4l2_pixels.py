@@ -178,5 +178,9 @@ def test_a_cut_off_jpeg_is_found() -> None:
     for padding in (300, 50000):  # filled up by the camera, to its packets or to its buffer
         assert pixels.wrong_length(form, memoryview(data + bytes(padding))) == ""
     assert "cut off" in pixels.wrong_length(form, memoryview(data[: len(data) // 2]))
+    lost = data[: len(data) // 2] + data[-2:]
+    assert pixels.wrong_length(form, memoryview(lost)) == ""
+    with pytest.raises(BadFrame, match="cut short or damaged"):
+        pixels.grey(form, np.frombuffer(lost, np.uint8))
     assert "no JPEG" in pixels.wrong_length(form, memoryview(data[10:]))
     assert "no JPEG" in pixels.wrong_length(form, memoryview(b""))
