@@ -11,7 +11,7 @@ import hashlib
 import os
 import select
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -32,6 +32,8 @@ BLIND_GRID = (38, 31)
 #: A lens with no ray in more than this part of its image is refused; a fisheye's corners often have none.
 MOST_BLIND = 0.5
 SILENT_S = 10.0
+JPEG_SCAN = 0xDA
+JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +74,9 @@ def read_bytes(path: str | Path, limit_bytes: int) -> bytes:
     """
     data = b""
     try:
-        with open(path, "rb", buffering=0, opener=_opened_at_once) as file:
+        with open(
+            path, "rb", buffering=0, opener=lambda name, how: os.open(name, how | os.O_NONBLOCK)
+        ) as file:
             more = select.poll()
             more.register(file, select.POLLIN)
             while len(data) <= limit_bytes and (part := file.read(limit_bytes + 1 - len(data))) != b"":
@@ -91,11 +95,6 @@ def read_bytes(path: str | Path, limit_bytes: int) -> bytes:
     return data
 
 
-def _opened_at_once(path: str, flags: int) -> int:
-    """Open a file, a pipe too, without waiting for anything."""
-    return os.open(path, flags | os.O_NONBLOCK)
-
-
 def open_plain(path: str | Path) -> BinaryIO:
     """Open a file to be read; waits for nothing. Raises OSError, also for a pipe, a socket or a device."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -106,6 +105,31 @@ def open_plain(path: str | Path) -> BinaryIO:
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         raise OSError(errno.EINVAL, "it is a pipe or a device; a plain file is expected")
     return os.fdopen(descriptor, "rb")
+
+
+def jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
+    """Yield the marker of each segment of a JPEG up to its first scan, and where what it holds begins.
+
+    ISO 10918-1, B.1.1.
+    """
+    at = 2
+    while at + 10 <= len(data) and data[at] == 0xFF:
+        if data[at + 1] == 0xFF:  # fills up
+            at += 1
+            continue
+        yield data[at + 1], at + 4
+        if data[at + 1] == JPEG_SCAN:
+            return
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+
+
+def text_of(data: bytes, path: str | Path) -> str:
+    """Return the text of a file's bytes, UTF-8 with or without a byte-order mark. Raises BadFile."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise BadFile(path, f"line {line}", f"byte 0x{data[error.start]:02x} is not UTF-8 text") from None
 
 
 def is_plain_file(path: Path) -> bool:

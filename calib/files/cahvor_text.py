@@ -23,7 +23,7 @@ from typing import Any, cast
 import numpy as np
 
 from calib.errors import BadFile
-from calib.files import CameraFile, build_model, digest_of, read_bytes
+from calib.files import CameraFile, build_model, digest_of, text_of
 from calib.files.atomic import save_bytes
 from calib.files.yaml_text import plain
 from calib.geometry.cahvor import CameraModel, Kind
@@ -45,24 +45,12 @@ def looks_like_cahvor(data: bytes) -> bool:
     return re.search(rb"^[ \t]*(?:Model|Dimensions|C)[ \t]*=", data[:MAX_BYTES], re.MULTILINE) is not None
 
 
-def load_cahvor(path: str | Path) -> CameraFile:
-    """Read a .cahvor file; its frame is ``unknown``, a covariance that is not zero goes into ``fit``.
-
-    Raises
-    ------
-    BadFile
-        If it cannot be read or is no camera: which line, what it holds, what is expected.
-    """
-    return parse_cahvor(read_bytes(path, MAX_BYTES), path)
-
-
 def parse_cahvor(data: bytes, path: str | Path) -> CameraFile:
-    """Read a .cahvor file's bytes; ``path`` is for messages only. Raises BadFile as ``load_cahvor``."""
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise BadFile(path, f"line {line}", f"byte 0x{data[error.start]:02x} is not UTF-8 text") from None
+    """Read a .cahvor file's bytes; ``path`` is for messages only. Raises BadFile.
+
+    Its frame is ``unknown``; a covariance that is not zero goes into ``fit``.
+    """
+    text = text_of(data, path)
     values, matrices, unread = _lines(text, path)
     kind, cahvore_type, linearity = _kind(values, path)
     for letter in kind:

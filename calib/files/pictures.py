@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.files import JPEG_SCAN, jpeg_segments
+
 PNG_BEGINS = b"\x89PNG\r\n\x1a\n"
 AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 """Grey, all bits of a sample, and not turned as a camera's tag may ask."""
@@ -46,14 +48,9 @@ def _without_end(data: bytes) -> bytes:
     At that marker libjpeg fills what is missing of a picture with grey, and says so on stderr only; without
     it, it gives up. It looks some bytes ahead. One of several scans is returned as it is.
     """
-    at, components = 2, 0
-    while (code := data[at + 1 : at + 2]) != b"\xda":
-        if data[at : at + 1] != b"\xff" or len(data) < at + 10:
-            return data
-        if code in (b"\xc0", b"\xc1"):
-            components = data[at + 9]
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    if data[at + 4 : at + 5] != bytes((components,)):
+    segments = dict(jpeg_segments(data))
+    at, frame = segments.get(JPEG_SCAN), segments.get(0xC0, segments.get(0xC1))
+    if at is None or frame is None or data[at] != data[frame + 5]:
         return data
     scan = data[at : max(at, data.rfind(b"\xff\xd9"))]
     restarts = re.findall(rb"\xff([\xd0-\xd7])", scan)

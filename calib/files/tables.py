@@ -18,7 +18,7 @@ from typing import TextIO
 import numpy as np
 
 from calib.errors import BadFile
-from calib.files import read_bytes
+from calib.files import read_bytes, text_of
 from calib.geometry.rigid import FloatArray
 
 MAX_BYTES = 1 << 29
@@ -50,11 +50,7 @@ def read_table(path: str | Path, columns: Sequence[str]) -> FloatArray:
 
 def parse_table(data: bytes, path: str | Path, columns: Sequence[str]) -> FloatArray:
     """Return the numbers of a table's bytes; ``path`` is for messages. Raises BadFile as ``read_table``."""
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise BadFile(path, f"line {line}", f"byte 0x{data[error.start]:02x} is not UTF-8 text") from None
+    text = text_of(data, path)
     lines = csv.reader(io.StringIO(text, newline=""), strict=True)
     # Python's float reads 1_000 and digits of other scripts too; without them it knows just our numbers.
     float_is_strict = text.isascii() and text.count("_") == sum(name.count("_") for name in columns)

@@ -19,6 +19,7 @@ import numpy as np
 import yaml
 
 from calib.errors import BadFile
+from calib.files import text_of
 from calib.geometry.rigid import FloatArray
 
 MAX_BYTES = 4_000_000
@@ -55,11 +56,7 @@ def parse_mapping(data: bytes, path: str | Path) -> dict[str, Any]:
     """
     if len(data) > MAX_BYTES:
         raise BadFile(path, "", f"is larger than {MAX_BYTES} bytes, the most that is read")
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise BadFile(path, f"line {line}", f"byte 0x{data[error.start]:02x} is not UTF-8 text") from None
+    text = text_of(data, path)
     try:
         document = _Builder(yaml.parse(text, Loader=_PARSER), path).document()
     except yaml.YAMLError as error:

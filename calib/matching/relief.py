@@ -65,26 +65,13 @@ FIT_STEPS = 4
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What a patch's pixels were seen to be.
+    """How far off the plane a patch's pixels were seen, along the other camera's epipolar line, pixels."""
 
-    Attributes
-    ----------
-    off_px, counts
-        (n, n) how far off the plane, pixels of the other camera along the epipolar line; and which belong to
-        it.
-    px_m
-        Pixels there for each 1/m of inverse range.
-    sigma_px
-        One sigma of ``off_px`` in the middle.
-    middle
-        Whether the middle was seen.
-    """
-
-    off_px: Grey
-    counts: Grey
-    px_m: float
-    sigma_px: float
-    middle: bool
+    off_px: Grey  # (n, n)
+    counts: Grey  # (n, n) which of them belong to the patch
+    px_m: float  # pixels there for each 1/m of inverse range
+    sigma_px: float  # one sigma of off_px in the middle
+    middle: bool  # whether it was seen
 
 
 def surface_seen(

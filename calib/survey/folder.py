@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import math
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from calib.errors import BadFile
-from calib.files import digest_of, open_plain, read_bytes
+from calib.files import JPEG_FRAMES, digest_of, jpeg_segments, open_plain, read_bytes, text_of
 from calib.files.tables import NUMBER, check_header
 from calib.files.yaml_text import MAX_BYTES, nearest, parse_mapping
 from calib.survey.records import SurveyCamera
@@ -19,9 +20,6 @@ CSV_MAX_BYTES = 200_000_000
 
 EDGE_PX = 1.0
 """How far outside its image a dot or corner may have been found: noise at the border."""
-
-_NO_FRAME = {0xC4, 0xC8, 0xCC}
-"""JPEG markers between the frame headers that are none."""
 
 
 def _picture_size_px(data: bytes) -> tuple[int, int] | None:
@@ -34,27 +32,16 @@ def _picture_size_px(data: bytes) -> tuple[int, int] | None:
     if data.startswith(PNG_BEGINS) and data[12:16] == b"IHDR" and len(data) >= 24:
         return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
     if data.startswith(b"\xff\xd8"):
-        return _jpeg_size_px(data)
+        for marker, at in jpeg_segments(data):
+            if marker in JPEG_FRAMES:  # ISO 10918-1, B.2.2: precision, height, width
+                height, width = struct.unpack_from(">HH", data, at + 1)
+                return width, height
+        return None
     try:
         height, width = decode_picture(data).shape[:2]
     except ValueError:
         return None
     return width, height
-
-
-def _jpeg_size_px(data: bytes) -> tuple[int, int] | None:
-    """Walk the segments to the frame header (ISO 10918-1, B.2.2: SOF, length, precision, height, width)."""
-    at = 2
-    while at + 9 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
-        if marker == 0xFF:
-            at += 1
-        elif 0xC0 <= marker <= 0xCF and marker not in _NO_FRAME:
-            height, width = (int.from_bytes(data[i : i + 2], "big") for i in (at + 5, at + 7))
-            return width, height
-        else:
-            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return None
 
 
 class Row:
@@ -165,13 +152,7 @@ class SurveyFolder:
         path = self.path / name
         if not required and not path.exists():
             return
-        data = self._bytes_of(name, CSV_MAX_BYTES)
-        try:
-            text = data.decode("utf-8-sig")
-        except UnicodeDecodeError as error:
-            line = data.count(b"\n", 0, error.start) + 1
-            byte = f"byte 0x{data[error.start]:02x} is not UTF-8 text"
-            raise BadFile(path, f"line {line}", byte) from None
+        text = text_of(self._bytes_of(name, CSV_MAX_BYTES), path)
         lines = csv.reader(io.StringIO(text, newline=""), strict=True)
         blank_line = count = 0
         try:

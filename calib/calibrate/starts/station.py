@@ -68,11 +68,6 @@ class AdjustedPrisms:
     rejected: tuple[tuple[str | None, str], ...] = ()
     doubt: str = ""
 
-    @property
-    def places_in_rover_m(self) -> FloatArray:
-        """(n, 3) the places of the prisms."""
-        return np.array(list(self.state.prisms_in_rover_m.values()))
-
 
 def adjust_prisms(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> AdjustedPrisms:
     """Fit the places of the prisms to all set-ups of a survey and to the drawing.
