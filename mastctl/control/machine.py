@@ -4,18 +4,17 @@ Operations, devices and the tracker keep no state word of their own. What they t
 `mastctl.control.table`; each change of `StateMachine.standing` is published once, in order, as
 ``("state", "machine", Standing)``.
 
-Nothing that a stop does on its way to the head waits here: `StateMachine.stop_asked`, `.estop_asked` and
-`.closing` only leave a note, which whoever reads or tells something next takes. Reading takes no lock.
+The lock is held for one change and its publication, which wait for nothing. Reading takes no lock.
 """
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from drivers.clock import Clock
-from mastctl.control.in_turn import InTurn
 from mastctl.control.publisher import Publisher
 from mastctl.control.refusals import Need, refusal_of
 from mastctl.control.standing import Latched, Residual, Standing, StandingFault, same_faults, why
@@ -55,21 +54,16 @@ class StateMachine:
     ) -> None:
         self.publisher = publisher or Publisher()
         self._clock = clock
-        self._turns = InTurn[_News](self._take)
+        self._lock = threading.RLock()
         now = Standing(since_s=clock.now_s())
         if latch is not None:
             now = replace(now, word="stopped", latch=latch, more_latched=more_latched)
         self._standing = replace(now, reason=why(now))
         self.publisher.publish("state", "machine", self._standing)
 
-    def go_on(self) -> None:
-        """Take what was noted, so that whoever listens hears it."""
-        self._turns.go_on()
-
     @property
     def standing(self) -> Standing:
         """What it is doing now."""
-        self._turns.go_on()
         return self._standing
 
     def something_runs(self) -> bool:
@@ -88,14 +82,12 @@ class StateMachine:
 
     def operation_began(self, operation: str, target: Mapping[str, Any]) -> None:
         """Let an operation begin. Raises what `refusal` returns for ``motion``; then nothing has changed."""
-        told = dict(target)
-        with self._turns.alone():
+        facts: dict[str, Any] = {"operation": operation, "target": dict(target), "held": ""}
+        with self._lock:
             refused = refusal_of(self._standing, "motion")
             if refused is not None:
                 raise refused
-            self._take(
-                lambda now: ("operation_began", replace(now, operation=operation, target=told, held=""))
-            )
+            self._take(lambda now: ("operation_began", replace(now, **facts)))
 
     def operation_ended(self, operation: str, residual: Residual | None = None) -> None:
         """Take that an operation ended, and what it measured last; not twice of one."""
@@ -105,29 +97,25 @@ class StateMachine:
                 return None
             return "operation_ended", replace(now, operation=None, residual=residual or now.residual)
 
-        self._turns.bring(news)
+        self._take(news)
 
     def track_began(self, track: str) -> None:
         """Take that a track began, of which the operation of this id looks first.
 
         Nothing is refused: its operation was begun, and a stop in between ends the track too.
         """
-        self._turns.bring(lambda now: ("track_began", replace(now, track=track, held="")))
+        self._take(lambda now: ("track_began", replace(now, track=track, held="")))
 
     def track_ended(self, track: str) -> None:
         """Take that a track ended."""
-        self._turns.bring(
-            lambda now: ("track_ended", replace(now, track=None)) if now.track == track else None
-        )
+        self._take(lambda now: ("track_ended", replace(now, track=None)) if now.track == track else None)
 
     def head_read(self, moving: bool) -> None:
         """Take what a reading of the head says; nothing is done if the one before said the same."""
         now = self._standing
         if now.head_moves != moving or now.word == "starting":
             event: Event = "head_moves" if moving else "head_rests"
-            self._turns.bring(lambda now: (event, replace(now, head_moves=moving)))
-        else:
-            self._turns.go_on()
+            self._take(lambda now: (event, replace(now, head_moves=moving)))
 
     def head_faults(self, faults: tuple[StandingFault, ...]) -> None:
         """Take all that is wrong with the head now; nothing is done if it is the same as before."""
@@ -143,18 +131,18 @@ class StateMachine:
             return "fault_cleared", replace(now, faults=(), held=held)
 
         if not same_faults(self._standing.faults, faults):
-            self._turns.bring(news)
+            self._take(news)
 
     def stop_asked(self) -> None:
-        """Note that a stop was asked for; told once more when it is over (`stop_ended`)."""
-        self._turns.leave(lambda now: ("stop_asked", replace(now, stops=now.stops + 1, held=AFTER_A_STOP)))
+        """Take that a stop was requested; `stop_ended` follows when it is over."""
+        self._take(lambda now: ("stop_asked", replace(now, stops=now.stops + 1, held=AFTER_A_STOP)))
 
     def stop_ended(self) -> None:
         """Take that a stop is over: the head has confirmed it, or its fault was told before."""
-        self._turns.bring(lambda now: ("stop_ended", replace(now, stops=max(0, now.stops - 1))))
+        self._take(lambda now: ("stop_ended", replace(now, stops=max(0, now.stops - 1))))
 
     def estop_asked(self, latch: Latched, instead_of: Latched | None = None) -> None:
-        """Note an emergency stop, between `stop_asked` and `stop_ended` of its stop.
+        """Take an emergency stop, between `stop_asked` and `stop_ended` of its stop.
 
         From then on nothing may begin. One that is latched already stays, but for the one whose place it
         takes; the first one stays in front.
@@ -165,7 +153,7 @@ class StateMachine:
             entries = entries if latch in entries else (*entries, latch)
             return "estop_asked", replace(now, latch=entries[0], more_latched=entries[1:], held=AFTER_A_STOP)
 
-        self._turns.leave(news)
+        self._take(news)
 
     def reset(self, name: str, reason: str, latched: Callable[[], Sequence[Latched]] = tuple) -> None:
         """Take that a latch was released, of a service that asked `refusal` of ``latch`` before.
@@ -181,19 +169,20 @@ class StateMachine:
             first, *more = latched() or (None,)
             return "reset", replace(now, latch=first, more_latched=tuple(more), held=held)
 
-        self._turns.bring(news)
+        self._take(news)
 
     def closing(self) -> None:
-        """Note that the service is closing: nothing begins any more."""
-        self._turns.leave(lambda now: ("closing", now))
+        """Take that the service is closing: nothing begins any more."""
+        self._take(lambda now: ("closing", now))
 
     def _take(self, news: _News) -> None:
-        """Take one event: its facts, the word that the table has for it, and tell who listens."""
-        before = self._standing
-        told = news(before)
-        if told is None:
-            return
-        event, now = told
+        """Take one event: its facts and the state that the table has for it; publish a change."""
+        with self._lock:
+            before = self._standing
+            if (changed := news(before)) is not None:
+                self._change(before, *changed)
+
+    def _change(self, before: Standing, event: Event, now: Standing) -> None:
         to = TABLE[before.word].get(event, before.word)
         if to.startswith("refused: "):  # asked before, and true by now all the same
             to = before.word

@@ -286,7 +286,6 @@ class OperationRunner:
         self._machine.closing()
         self._mover.block_moves(self, CLOSING)
         self._stop_unasked("as the service closes")
-        self._machine.go_on()
         with self._lock:
             current = self._current
             self._cancel(CLOSING)

@@ -2,7 +2,7 @@
 
 A subscriber has at most one value of each topic and key waiting for it. One that is slow loses values in
 between, never the newest, and is told how many it lost: `Publisher.publish` neither waits nor queues. A
-listener that counts may ask for every value, up to a bound beyond which it loses the oldest.
+listener that counts may request every value, up to a bound beyond which it loses the oldest.
 
     topic       key                 value
     state       "machine"           `mastctl.control.standing.Standing`
@@ -24,14 +24,10 @@ import contextlib
 import itertools
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, ClassVar, Literal, Self, TypeVar, get_args
-from weakref import WeakKeyDictionary, ref
-
-from mastctl.control.in_turn import InTurn
+from typing import Any, Literal, Self, TypeVar, get_args
 
 Topic = Literal[
     "state", "joints", "operation", "track", "fault", "frame", "mast", "command", "lease", "bench"
@@ -41,7 +37,7 @@ TOPICS: frozenset[Topic] = frozenset(get_args(Topic))
 _Subscription = TypeVar("_Subscription", bound="Subscription")
 
 MOST_UNREAD = 10_000
-"""Values that wait for a listener that hears every one."""
+"""Values that wait for one listener."""
 
 GONE: Any = object()
 
@@ -62,46 +58,6 @@ class Published:
     value: Any
 
 
-class _NewestOfEach:
-    """What a listener has not read: a newer value takes the place of one of the same topic and key."""
-
-    def __init__(self) -> None:
-        self._kept: dict[tuple[Topic, str], Published] = {}
-
-    def put(self, one: Published) -> int:
-        """Keep a value, or forget the one before; return how many are lost by that."""
-        lost = self._kept.pop((one.topic, one.key), None) is not None
-        if one.value is not GONE:
-            self._kept[one.topic, one.key] = one
-        return int(lost)
-
-    def take(self) -> Iterable[Published]:
-        """Hand over all."""
-        kept, self._kept = self._kept, {}
-        return kept.values()
-
-
-class _EveryValue:
-    """What a listener has not read of all values; the oldest gives way beyond ``MOST_UNREAD``."""
-
-    def __init__(self) -> None:
-        self._most = MOST_UNREAD
-        self._kept = deque[Published](maxlen=self._most)
-
-    def put(self, one: Published) -> int:
-        """Keep a value, unless it is none; return how many are lost by that."""
-        if one.value is GONE:
-            return 0
-        lost = len(self._kept) == self._most
-        self._kept.append(one)
-        return int(lost)
-
-    def take(self) -> Iterable[Published]:
-        """Hand over all."""
-        kept, self._kept = self._kept, deque[Published](maxlen=self._most)
-        return kept
-
-
 class Subscription:
     """What one listener has not read yet. A context manager; one thread, or one coroutine, reads it.
 
@@ -109,34 +65,31 @@ class Subscription:
     ----------
     lost
         How many values were replaced by newer ones before they were read, or found no room.
+    closed
+        Whether no more will come: it was closed, or its publisher was.
     """
 
     def __init__(
         self,
         topics: frozenset[Topic],
         keys: frozenset[str] | None,
-        unread: _NewestOfEach | _EveryValue,
-        wake: Callable[[], None],
         end: Callable[[Subscription], None],
+        every: bool = False,
     ) -> None:
         self.lost = 0
+        self.closed = False
         self._topics = topics
         self._keys = keys
-        self._wake = wake
         self._end = end
+        self._every = every
+        self._most = MOST_UNREAD
         self._lock = threading.Lock()  # held while a value is put in or all are handed over, never for longer
-        self._unread = unread
-        self._closed = False
-
-    @property
-    def closed(self) -> bool:
-        """Whether no more will come: it was closed, or its publisher was."""
-        return self._closed
+        self._unread: dict[int | tuple[Topic, str], Published] = {}
 
     def close(self) -> None:
-        """Hear no more; who waits is woken."""
+        """Receive no more; a reader that waits is woken."""
         self._end(self)
-        self._ended()
+        self.finish()
 
     def __enter__(self) -> Self:
         return self
@@ -146,22 +99,35 @@ class Subscription:
     ) -> None:
         self.close()
 
-    def _take_unread(self) -> list[Published]:
-        with self._lock:
-            unread = self._unread.take()
-        return sorted(unread, key=lambda one: one.sequence)
+    # For the publisher
 
-    def _put(self, one: Published) -> None:
+    def put(self, one: Published) -> None:
+        """Keep a value for the reader, in place of an older one of the same topic and key."""
         if one.topic not in self._topics or (self._keys is not None and one.key not in self._keys):
             return
+        place = one.sequence if self._every else (one.topic, one.key)
         with self._lock:
-            self.lost += self._unread.put(one)
+            self.lost += self._unread.pop(place, None) is not None
+            if one.value is not GONE:
+                self._unread[place] = one
+            if len(self._unread) > self._most:
+                del self._unread[next(iter(self._unread))]
+                self.lost += 1
         if one.value is not GONE:
             self._wake()
 
-    def _ended(self) -> None:
-        self._closed = True
+    def finish(self) -> None:
+        """State that no more will come."""
+        self.closed = True
         self._wake()
+
+    def _wake(self) -> None:
+        raise NotImplementedError
+
+    def _take_unread(self) -> list[Published]:
+        with self._lock:
+            unread, self._unread = self._unread, {}
+        return sorted(unread.values(), key=lambda one: one.sequence)
 
 
 class ThreadSubscription(Subscription):
@@ -171,8 +137,7 @@ class ThreadSubscription(Subscription):
         self, topics: frozenset[Topic], end: Callable[[Subscription], None], every: bool = False
     ) -> None:
         self._something = threading.Event()
-        unread = _EveryValue() if every else _NewestOfEach()
-        super().__init__(topics, None, unread, self._something.set, end)
+        super().__init__(topics, None, end, every)
 
     def wait(self, timeout_s: float | None = None) -> list[Published]:
         """Return what is new since the last call, oldest first; wait for it for ``timeout_s`` real seconds.
@@ -184,9 +149,12 @@ class ThreadSubscription(Subscription):
             self._something.clear()
             unread = self._take_unread()
             left_s = None if until_s is None else until_s - time.monotonic()
-            if unread or self._closed or (left_s is not None and left_s <= 0):
+            if unread or self.closed or (left_s is not None and left_s <= 0):
                 return unread
             self._something.wait(left_s)
+
+    def _wake(self) -> None:
+        self._something.set()
 
 
 class LoopSubscription(Subscription):
@@ -196,10 +164,9 @@ class LoopSubscription(Subscription):
         self, topics: frozenset[Topic], keys: frozenset[str] | None, end: Callable[[Subscription], None]
     ) -> None:
         self._loop = asyncio.get_running_loop()
-        self._wakes = _Wakes.of(self._loop)
         self._something = asyncio.Event()
         self._woken = False
-        super().__init__(topics, keys, _NewestOfEach(), self._wake_loop, end)
+        super().__init__(topics, keys, end)
 
     async def wait(self, timeout_s: float | None = None) -> list[Published]:
         """Return what is new since the last call, oldest first; wait for it for ``timeout_s`` seconds.
@@ -212,81 +179,45 @@ class LoopSubscription(Subscription):
             self._woken = False
             unread = self._take_unread()
             left_s = None if until_s is None else until_s - self._loop.time()
-            if unread or self._closed or (left_s is not None and left_s <= 0):
+            if unread or self.closed or (left_s is not None and left_s <= 0):
                 return unread
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(left_s):
                     await self._something.wait()
 
-    def _wake_loop(self) -> None:
+    def _wake(self) -> None:
         if not self._woken:
             self._woken = True
-            self._wakes.wake(self._something)
-
-
-class _Wakes:
-    """Wakes those who wait on one event loop, one in each of its turns.
-
-    However many listen, who publishes calls the loop once, and what else the loop has to do, a stop above
-    all, comes between them.
-    """
-
-    _known: ClassVar[WeakKeyDictionary[asyncio.AbstractEventLoop, _Wakes]] = WeakKeyDictionary()
-
-    @classmethod
-    def of(cls, loop: asyncio.AbstractEventLoop) -> _Wakes:
-        """Return the one of a loop; to be called on it."""
-        if loop not in cls._known:
-            cls._known[loop] = cls(loop)
-        return cls._known[loop]
-
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._call = ref(loop)
-        self._due: deque[asyncio.Event] = deque()
-        self._called = False
-
-    def wake(self, waiting: asyncio.Event) -> None:
-        """Have an event set; from any thread."""
-        self._due.append(waiting)
-        if not self._called:
-            self._called = True
-            self._again()
-
-    def _again(self) -> None:
-        loop = self._call()
-        with contextlib.suppress(RuntimeError):  # the loop has ended, and with it who would read
-            if loop is not None:
-                loop.call_soon_threadsafe(self._next)
-
-    def _next(self) -> None:
-        self._called = False  # first: what comes from now on calls again
-        if self._due:
-            self._due.popleft().set()
-        if self._due and not self._called:
-            self._called = True
-            self._again()
+            with contextlib.suppress(RuntimeError):  # the loop has ended, and with it the reader
+                self._loop.call_soon_threadsafe(self._something.set)
 
 
 class Publisher:
-    """Hands each value to everyone who listens; safe to use from any thread, never blocks."""
+    """Hands each value to every listener; safe to use from any thread. Its lock is held for no listener."""
 
     def __init__(self) -> None:
         self._numbers = itertools.count(1)
         self._newest: dict[tuple[Topic, str], Published] = {}
         self._subscriptions: tuple[Subscription, ...] = ()
         self._closed = False
-        self._turns = InTurn[Callable[[], None]](lambda act: act())
+        self._lock = threading.RLock()
 
     def publish(self, topic: Topic, key: str, value: Any) -> None:
-        """Tell everyone who listens to a topic the newest value of a key.
+        """Hand every listener of a topic the newest value of a key.
 
         Values reach each listener in the order in which they were published.
         """
-        self._turns.bring(lambda: self._hand_out(topic, key, value))
+        with self._lock:
+            one = self._newest[topic, key] = Published(next(self._numbers), topic, key, value)
+            for subscription in self._subscriptions:
+                subscription.put(one)
 
     def forget(self, topic: Topic, key: str) -> None:
-        """Hold a key's value no longer, for nobody: it is one of many, and old."""
-        self._turns.bring(lambda: self._hand_out(topic, key, GONE))
+        """Drop a key's value, for later listeners too: it is one of many, and old."""
+        with self._lock:
+            self._newest.pop((topic, key), None)
+            for subscription in self._subscriptions:
+                subscription.put(Published(0, topic, key, GONE))
 
     def newest(self, topic: Topic, key: str) -> Any:
         """Return the newest value of a key, None before the first; takes no lock."""
@@ -318,45 +249,29 @@ class Publisher:
     def close(self) -> None:
         """End every subscription, and each that is asked for later; publishing goes nowhere from then on."""
 
-        def end() -> None:
+        with self._lock:
             self._closed = True
             subscriptions, self._subscriptions = self._subscriptions, ()
-            for one in subscriptions:
-                one._ended()
-
-        self._turns.bring(end)
+        for one in subscriptions:
+            one.finish()
 
     def _added(self, subscription: _Subscription, known: bool) -> _Subscription:
-        def add() -> None:
+        with self._lock:
             if self._closed:
-                subscription._ended()
-                return
+                subscription.finish()
+                return subscription
             self._subscriptions = (*self._subscriptions, subscription)
-            if known:
-                for one in self._newest.values():
-                    subscription._put(one)
-
-        self._turns.bring(add)
+            for one in self._newest.values() if known else ():
+                subscription.put(one)
         return subscription
 
     def _leave(self, subscription: Subscription) -> None:
-        def remove() -> None:
+        with self._lock:
             self._subscriptions = tuple(one for one in self._subscriptions if one is not subscription)
-
-        self._turns.bring(remove)
-
-    def _hand_out(self, topic: Topic, key: str, value: Any) -> None:
-        one = Published(next(self._numbers), topic, key, value)
-        if value is GONE:
-            self._newest.pop((topic, key), None)
-        else:
-            self._newest[topic, key] = one
-        for subscription in self._subscriptions:
-            subscription._put(one)
 
 
 def _checked(topics: Iterable[Topic]) -> frozenset[Topic]:
-    asked = frozenset(topics)
-    if not asked <= TOPICS:
-        raise ValueError(f"{', '.join(sorted(asked - TOPICS))}: there is no such topic")
-    return asked or TOPICS
+    chosen = frozenset(topics)
+    if not chosen <= TOPICS:
+        raise ValueError(f"{', '.join(sorted(chosen - TOPICS))}: there is no such topic")
+    return chosen or TOPICS

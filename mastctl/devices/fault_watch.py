@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from drivers.clock import Clock
-from mastctl.control.in_turn import InTurn
 from mastctl.control.machine import StateMachine
 from mastctl.control.standing import StandingFault, same_faults
 
@@ -54,7 +54,7 @@ class FaultWatch:
         self._head = head
         self._machine = machine
         self._told: dict[str, tuple[StandingFault, ...]] = {}
-        self._turns = InTurn[None](self._compare)
+        self._lock = threading.Lock()
         self._changed = clock.signal()
         self._begun = self._closed = False
         self._thread = clock.thread(self._work, "faults")
@@ -74,9 +74,12 @@ class FaultWatch:
         self._thread.start()
 
     def look(self) -> None:
-        """Tell what has changed; waits for nobody."""
-        if self._begun:
-            self._turns.bring(None)
+        """Publish what has changed; a look that is under way is not waited for."""
+        if self._begun and self._lock.acquire(blocking=False):
+            try:
+                self._compare()
+            finally:
+                self._lock.release()
 
     def close(self) -> None:
         """Look once more, and end the thread."""
@@ -95,7 +98,7 @@ class FaultWatch:
                     return
             self.look()
 
-    def _compare(self, _: None) -> None:
+    def _compare(self) -> None:
         by_device: dict[str, list[StandingFault]] = {}
         for fault in (one for faults in self._sources for one in faults()):
             by_device.setdefault(fault.device, []).append(fault)

@@ -104,10 +104,9 @@ class _Lines(StreamingResponse):
         while True:
             found = await news.wait(ALIVE_S)
             for some in _by_few(found):
+                await self._here.waiting.turn()
                 lines = [(one.sequence, self._tell(self._here.service, one, news.lost)) for one in some]
                 yield "".join(f"id: {number}\ndata: {text}\n\n" for number, text in lines)
-                if some[-1] is not found[-1]:
-                    await self._here.waiting.turn()
             if not found:
                 if news.closed:
                     return
@@ -127,10 +126,9 @@ async def _tell(line: WebSocket, news: LoopSubscription, here: Parts) -> None:
     try:
         while found := await news.wait():
             for some in _by_few(found):
+                await here.waiting.turn()
                 for one in some:
                     await line.send_text(_event(here.service, one, news.lost))
-                if some[-1] is not found[-1]:
-                    await here.waiting.turn()
         if not gone.done():
             await close_ended(line, here)
         elif gone.result()["type"] == "websocket.receive":

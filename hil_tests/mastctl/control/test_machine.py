@@ -272,13 +272,3 @@ def test_a_mast_file_is_not_changed_under_a_head_that_moves() -> None:
     refusal = machine.refusal("rest")
     assert refusal is not None and refusal.code == "moving"
     assert machine.refusal("motion") is None
-
-
-def test_noting_a_stop_waits_for_nothing_and_reading_shows_it() -> None:
-    machine, heard, _ = machine_in("ready")
-    count = len(heard.standings)
-    with machine._turns._lock, machine.publisher._turns._lock:
-        machine.stop_asked()
-        assert machine.standing.word == "ready", "somebody else has the turn"
-    assert len(heard.standings) == count
-    assert machine.standing.word == "stopping"
