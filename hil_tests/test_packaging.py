@@ -6,7 +6,6 @@ import email
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 import tempfile
@@ -19,7 +18,6 @@ from typing import Any
 import pytest
 from markdown_it import MarkdownIt
 
-from hil_tests.waiting import until
 from tools import dist
 from tools.page_tables import page_text
 
@@ -319,13 +317,6 @@ def check(mast_client, fault, device, words, ends_with):
         assert record["error"]["code"] in ends_with.split(", ")
 """
 
-STAYS = """
-
-def test_stays(mast_daemon):
-    print(mast_daemon, flush=True)
-    time.sleep(600)
-"""
-
 
 @pytest.fixture
 def project(repository: Path, tmp_path: Path) -> Path:
@@ -357,30 +348,3 @@ def test_an_outside_project_is_tested_in_parallel_and_nothing_is_left(
         )  # fmt: skip
     assert re.search(r"\b\d\d passed in", done.stdout), done.stdout
     assert installed.processes() == []
-
-
-@WHOLE
-@pytest.mark.parametrize("workers", ["0", "1"])
-def test_nothing_is_left_when_pytest_is_killed(installed: Installed, tmp_path: Path, workers: str) -> None:
-    (tmp_path / "test_stays.py").write_text(STAYS)
-    log = tmp_path / "log.txt"
-    with log.open("w") as out:
-        pytest_process = subprocess.Popen(
-            [installed.program("pytest"), "-s", "-n", workers, "--basetemp", tmp_path / "base"],
-            stdout=out, stderr=out, env=installed.environ, cwd=tmp_path,
-        )  # fmt: skip
-    with pytest_process:
-        try:
-            until(
-                lambda: pytest_process.poll() is not None or serving(installed),
-                "the daemon serves",
-                TIMEOUT_S,
-            )
-            assert pytest_process.poll() is None, log.read_text()
-        finally:
-            pytest_process.send_signal(signal.SIGKILL)
-    until(lambda: not installed.processes(), "nothing runs any more")
-
-
-def serving(installed: Installed) -> bool:
-    return any("mastctl.testing.serve" in line for line in installed.processes())

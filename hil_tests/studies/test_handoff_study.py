@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,11 +12,10 @@ import pytest
 from calib.geometry.handoff import Joints, PredictedPixel
 from calib.matching.handed_over import Landed, MatchedHandoff
 from calib.matching.handoff import RefinedPixel, RefinedVerdict
-from mastctl.client import Client, ClientError
 from mastctl.watch.handoffs import read_log
 from tools.studies import handoff as study
 from tools.studies.handoff import handoff_rows, write_handoffs
-from tools.studies.handoff_run import Handed, HandoffRecord, run_handoff_experiment
+from tools.studies.handoff_run import Handed, HandoffRecord
 
 STEP = "navcam to hazcam"
 
@@ -69,53 +67,6 @@ def test_without_the_truth_the_refined_pixel_stands_in() -> None:
     assert handed((1.0, 1.0), (0.0, 0.0), None, "flat").geometric_error_px is None
     (failed,) = handoff_rows(RECORDS[2:])
     assert failed["geometric_rms_px"] is None and failed["refined_rms_px"] is None
-
-
-class StuckDaemon:
-    """What of a client the experiment uses; the first view takes too long, the others are refused."""
-
-    url = "http://127.0.0.1:1"
-
-    def __init__(self, mast: bytes) -> None:
-        self.mast, self.calls = mast, list[str]()
-
-    def simulation_time(self) -> dict[str, Any]:
-        raise ClientError("not_simulated", "clocks are for a simulated rover only")
-
-    def status(self) -> dict[str, Any]:
-        cameras = [f"{pair}_{eye}" for pair in ("pancam", "navcam") for eye in ("left", "right")]
-        limits = {"pan_rad": [-2.0, 2.0], "tilt_rad": [-1.0, 1.0]}
-        return {"hardware": "simulated", "cameras": dict.fromkeys(cameras), "limits": limits, "now_s": 1.0}
-
-    def mast_file(self) -> bytes:
-        return self.mast
-
-    def point(self, **request: Any) -> str:
-        self.calls.append("point")
-        if len(self.calls) > 1:
-            raise ClientError("busy", "operation 7 is running; wait for it or stop it")
-        return "000001"
-
-    def wait(self, operation: str, timeout_s: float) -> dict[str, Any]:
-        raise ClientError("timeout", f"operation {operation} has not ended after {timeout_s:g} s")
-
-    def stop_operation(self, operation: str) -> dict[str, Any]:
-        self.calls.append("stop")
-        return {"stopped": True, "operation": operation}
-
-
-@pytest.mark.parametrize(("targets", "calls"), [(2, ["point", "stop", "point"]), (1, ["point", "stop"])])
-def test_a_view_that_fails_is_a_failed_target(repository: Path, targets: int, calls: list[str]) -> None:
-    daemon = StuckDaemon((repository / "configs/sim/rocky8.yaml").read_bytes())
-    run = run_handoff_experiment(cast(Client, daemon), targets=targets)
-    assert daemon.calls == calls
-    reasons = [
-        "timeout: operation 000001 has not ended after 60 s",
-        "busy: operation 7 is running; wait for it or stop it",
-    ]
-    assert [record.error for record in run] == reasons[:targets]
-    (row,) = handoff_rows(run)
-    assert (row["targets"], row["failed"]) == (targets, targets)
 
 
 def test_the_record_of_hand_offs_and_a_constant_offset(tmp_path: Path) -> None:

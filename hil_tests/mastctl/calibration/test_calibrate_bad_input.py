@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.adjust.result import Calibration
 from calib.survey.reader import read_survey
 from calib.survey.records import Survey
 from hil_tests.mastctl.calibration.survey_world import navcam_survey, write_folder
@@ -23,7 +22,7 @@ from hil_tests.support.sim_survey.blunders import (
     with_wrong_prism,
 )
 from mastctl.calibration.detection import with_dots
-from mastctl.calibration.run import FITS, Method, checked_survey
+from mastctl.calibration.run import FITS, checked_survey
 from mastctl.calibration.verdict import judge_calibration
 from mastctl.cli.main import main
 
@@ -154,19 +153,13 @@ class Judged(NamedTuple):
     left_out: list[str]
 
 
-def judged(survey: Survey, method: Method = "joint") -> Judged:
-    """What the command does with a survey before it writes anything."""
-    fit = FITS[method](survey, 6)
-    verdict = judge_calibration(survey, fit, checked_survey(survey, method))
+def judged(survey: Survey) -> Judged:
+    """What the command does with a survey before it writes anything; the fit must be as good as the noise."""
+    fit = FITS["joint"](survey, 6)
+    verdict = judge_calibration(survey, fit, checked_survey(survey, "joint"))
+    assert all(0.08 < value < 0.12 for pair in fit.rms_px.values() for value in pair), fit.rms_px
     reasons = " | ".join(reason.sentence for reason in verdict.reasons)
-    return Judged(verdict.grade, reasons, outliers_of(fit))
-
-
-def outliers_of(fit: Calibration) -> list[str]:
-    """Names of what was left out; the fit without it must be as good as the noise."""
-    if fit.method == "joint":
-        assert all(0.08 < value < 0.12 for pair in fit.rms_px.values() for value in pair), fit.rms_px
-    return [outlier.name for outlier in fit.outliers]
+    return Judged(verdict.grade, reasons, [outlier.name for outlier in fit.outliers])
 
 
 def test_a_prism_that_is_off_is_left_out_and_named(
@@ -191,25 +184,21 @@ def test_two_boards_mixed_up_are_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("image", "own", "other", "method"),
-    [
-        (IMAGE, "mast-3", "mast-4", "joint"),
-        (CHECK, "check-1", "mast-8", "joint"),
-    ],
+    ("image", "own", "other"), [(IMAGE, "mast-3", "mast-4"), (CHECK, "check-1", "mast-8")]
 )
-def test_an_image_with_the_placement_of_another_is_told_whose_it_is(
-    folder: Path, capsys: pytest.CaptureFixture[str], image: str, own: str, other: str, method: Method
+def test_an_image_with_the_placement_of_another_is_named_with_its_own(
+    folder: Path, capsys: pytest.CaptureFixture[str], image: str, own: str, other: str
 ) -> None:
     rows(folder / IMAGES, lambda c, _: c | {"placement": other} if c["image"] == image else c)
     # Drawing a report takes longer than all the rest; an image without any pixels is the hard one to draw.
-    if (image, method) == (CHECK, "joint"):
+    if image == CHECK:
         code, told = calibrate(capsys, folder, "--report", str(folder.parent / "r"))
         assert code == 0, told
         verdict = told["verdict"]
         reasons = " | ".join(reason["sentence"] for reason in verdict["reasons"])
         found = Judged(verdict["grade"], reasons, [outlier["name"] for outlier in told["outliers"]])
     else:
-        found = judged(read_survey(folder), method)
+        found = judged(read_survey(folder))
     assert f"image {image} cannot show placement {other} but would show {own} (set-up level)" in found.reasons
     assert found.grade == ("bad" if image == CHECK else "care")
     assert found.left_out == ([] if image == CHECK else [f"image {image}"])

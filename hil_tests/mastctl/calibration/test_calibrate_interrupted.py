@@ -37,18 +37,6 @@ plots.installed = lambda: False
 """
 """The command in a process of its own, with a fit that is there already and a report of words alone."""
 
-KILLED_AT = """
-import os, signal
-fsync, calls = os.fsync, []
-def deadly(file):
-    calls.append(file)
-    if len(calls) == int(sys.argv[2]):
-        os.kill(os.getpid(), signal.SIGKILL)
-    fsync(file)
-os.fsync = deadly
-sys.exit(main(sys.argv[3:]))
-"""
-
 FILE_LIMIT_BYTES = 20_000
 """Less than a mast file with its covariance."""
 
@@ -90,23 +78,6 @@ def run(code: str, *argv: str, **options: Any) -> subprocess.CompletedProcess[st
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
-
-
-@pytest.mark.parametrize("at", [1, 2, 3])
-def test_a_kill_while_writing_leaves_whole_files(survey: Path, kept: Path, tmp_path: Path, at: int) -> None:
-    """The first two syncs are of the mast file and its folder, the third is of the report."""
-    out = tmp_path / "m.yaml"
-    save_rig(navcam_rig(), out)
-    old = out.read_bytes()
-    report = words(survey, out, "--report", str(tmp_path / "r"))
-    done = run(FITTED + KILLED_AT, str(kept), str(at), *report)
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    load_rig(out)
-    assert (out.read_bytes() == old) == (at == 1)
-    assert old in contents(tmp_path).values()
-    assert not (tmp_path / "r" / "calibration.html").exists()
-    assert main(words(survey, out)) == 0
-    load_rig(out)
 
 
 def test_a_full_disk_leaves_everything_as_it_was(survey: Path, kept: Path, tmp_path: Path) -> None:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping
-from concurrent.futures import Executor
+from collections.abc import Iterator
 from contextlib import nullcontext
-from dataclasses import is_dataclass
-from typing import Any
+from functools import partial
 
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ from mastctl.experiment.tasks import Work, open_executor
 from tools.campaigns import refine
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def address() -> Iterator[str]:
     """The scheduler of a cluster of this machine: two workers in processes of their own."""
     import dask  # slow to load, and every worker loads this file
@@ -36,43 +34,13 @@ def address() -> Iterator[str]:
         yield str(cluster.scheduler_address)
 
 
-@pytest.fixture(scope="module")
-def places(address: str) -> Iterator[tuple[Executor, Executor]]:
-    """Two processes of this machine, and the cluster."""
-    with open_executor("local", 2) as here, open_executor(f"dask:{address}") as there:
-        yield here, there
-
-
-def values(result: Any) -> Any:
-    """Nested lists of numbers, words and arrays; without times, which differ."""
-    if is_dataclass(result):
-        return [values(one) for name, one in vars(result).items() if name not in ("seconds", "fit_seconds")]
-    if isinstance(result, Mapping):
-        return [[str(key), values(one)] for key, one in result.items()]
-    return [values(one) for one in result] if isinstance(result, (list, tuple)) else result
-
-
-def same(places: tuple[Executor, Executor], works: list[Work[Any, Any]], of: Any = values) -> list[list[Any]]:
-    """What works come to here, after it was found to be the same there."""
-    here, there = (
-        [[of(one) for one in work.run(lambda place=place: nullcontext(place))] for work in works]  # type: ignore[misc]
-        for place in places
-    )
-    np.testing.assert_equal(there, here)
-    return here
-
-
-def works_of(tasks: Mapping[Any, list[Any]]) -> list[Work[Any, Any]]:
-    return [Work(function, pair, lambda _: "small") for function, pair in tasks.items()]
-
-
-def test_campaigns_of_numbers(places: tuple[Executor, Executor]) -> None:
+def test_a_campaign_on_a_cluster_comes_to_the_same_bits(address: str) -> None:
     rig = load_rig(RIG_FILE).rig
-    works = works_of(
-        {
-            refine.run_block: [
-                refine.RefineBlock(rig, (2.0, 2.0), 1.0, n, 1, 9, 0.2, 0.4, 1) for n in (0, 10)
-            ],
-        }
-    )
-    same(places, works)
+    blocks = [refine.RefineBlock(rig, (2.0, 2.0), 1.0, n, 1, 9, 0.2, 0.4, 1) for n in (0, 10)]
+    work = Work(refine.run_block, blocks, lambda _: "small")
+    with open_executor("local", 2) as local, open_executor(f"dask:{address}") as cluster:
+        ours, theirs = (
+            [[vars(case) for case in block] for block in work.run(partial(nullcontext, place))]
+            for place in (local, cluster)
+        )
+    np.testing.assert_equal(theirs, ours)

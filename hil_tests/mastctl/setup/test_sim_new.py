@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,6 @@ from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.rigid import tangents
 from mastctl.cli.main import main
 from mastctl.config import load_config
-from mastctl.daemon import RunningDaemon
-from mastctl.experiment.simulated import own_config
 from mastctl.setup.true_twin import true_twin
 
 FILES = ("config.yaml", "mast.yaml", "true_rig.yaml")
@@ -122,25 +119,3 @@ def test_a_file_without_covariance_gets_stated_sigmas_and_they_are_told(
             turns.append(tangents(one.A) @ (other.A - one.A))
     for values, sigma in ((focal, 1e-4), (places, 2e-4), (turns, 5e-5)):
         assert np.std(np.array(values)) == pytest.approx(sigma, rel=0.12)
-
-
-def test_a_new_rig_points_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    made(tmp_path, "--size", "320x240", "--view-deg", "45", "--speed", "max")
-    config = own_config(load_config(tmp_path / "config.yaml"), head=None, wire=None)
-    capsys.readouterr()
-    with RunningDaemon(config) as daemon:
-        words = [
-            "experiment",
-            "pointing",
-            "--url",
-            daemon.url,
-            "--targets",
-            "1",
-            "--distances",
-            "4",
-            "--json",
-        ]
-        assert main(words) == 0
-    (distance,) = json.loads(capsys.readouterr().out)["distances"]
-    assert distance["targets"] == 1
-    assert max(distance["second_rms_px"]) < 0.5

@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from calib.geometry.rig import Rig
-from hil_tests.mastctl.watch.small_rover import RESTS, bumped, slipped, small_rover, truly
+from hil_tests.mastctl.watch.small_rover import RESTS, bumped, small_rover, truly
 from hil_tests.waiting import until
 from mastctl.cli.main import main
 from mastctl.client import Client
@@ -22,8 +21,6 @@ from mastctl.watch.looks import watch
 from mastctl.watch.reference import LOOKS, read_looks, read_reference
 
 Run = Callable[..., tuple[int, str, str]]
-THERE = (0.4, -0.2)
-"""Where a person sends the head."""
 
 
 @pytest.fixture(scope="module")
@@ -75,21 +72,14 @@ def undated(sentence: str) -> str:
     return sentence.partition(", since ")[0]
 
 
-@pytest.mark.parametrize(
-    ("change", "what"),
-    [
-        (lambda rig: bumped(rig, "navcam_left", (0.0, 1.8e-3, 0.0)), "navcam_left turned 1."),
-        (lambda rig: slipped(rig, 0.0, 4e-3), "tilt slipped by +"),
-    ],
-    ids=["bumped", "tilt horn"],
-)
-def test_a_change_of_the_truth_is_named_by_two_looks_and_told_everywhere(
-    change: Callable[[Rig], Rig], what: str, daemon: RunningDaemon, run: Run, client: Client
+def test_a_bumped_camera_is_named_by_two_looks_and_reported_everywhere(
+    daemon: RunningDaemon, run: Run, client: Client
 ) -> None:
+    what = "navcam_left turned 1."
     rover = daemon.service.hardware.simulation
     assert rover is not None
     before = stands(client)
-    with truly(daemon, change(rover.rig)):
+    with truly(daemon, bumped(rover.rig, "navcam_left", (0.0, 1.8e-3, 0.0))):
         code, said, _ = run("look")
         assert (code, said.startswith(what)) == (0, True), said
         assert "seen once" in said
@@ -128,21 +118,18 @@ def spoilt(folder: Path, to: Path, change: Callable[[dict[str, Any]], object]) -
 
 
 @pytest.mark.parametrize(
-    ("change", "code", "phrase"),
+    ("change", "phrase"),
     [
-        (lambda told: told.update(mast_digest="0" * 64), 1, "another mast file is in use than when"),
+        (lambda told: told.update(mast_digest="0" * 64), "another mast file is in use than when"),
         (
             lambda told: [one.update(camera="pancam_left") for one in told["pictures"]],
-            1,
             "the reference is of pancam_left, the daemon has navcam_left, navcam_right; take a new one",
         ),
-        (lambda told: told["pictures"][0].update(sha256="0"), 2, "is not the picture that was taken"),
     ],
-    ids=["mast file", "cameras", "spoiled"],
+    ids=["mast file", "cameras"],
 )
 def test_a_reference_that_cannot_be_compared_moves_nothing(
     change: Callable[[dict[str, Any]], object],
-    code: int,
     phrase: str,
     folder: Path,
     tmp_path: Path,
@@ -152,7 +139,7 @@ def test_a_reference_that_cannot_be_compared_moves_nothing(
     where = spoilt(folder, tmp_path / "other", change)
     before = [one["id"] for one in client.operations()]
     got, _, log = run("look", where=where)
-    assert got == code
+    assert got == 1
     assert phrase in log and len(log.splitlines()) == 1
     assert [one["id"] for one in client.operations()] == before
 
@@ -207,18 +194,6 @@ def test_a_watch_looks_where_nobody_needs_the_head_and_lets_go_of_it(
     assert watched(daemon, folder, lambda: None) == ["looked: 6"]
     assert client.control() is None
     assert len(read_looks(folder, read_reference(folder))) == 1
-
-
-def test_a_watch_gives_way_to_a_person_who_points_in_the_middle(
-    daemon: RunningDaemon, folder: Path, client: Client
-) -> None:
-    def point() -> None:
-        assert client.wait(client.point(pan_rad=THERE[0], tilt_rad=THERE[1]))["state"] == "done"
-
-    told = watched(daemon, folder, point)
-    assert told == ["no look now: ana wants to steer, and sentinel gives way; nothing was kept"]
-    assert stands(client) == pytest.approx(THERE, abs=1e-3)
-    assert read_looks(folder, read_reference(folder)) == []
 
 
 def test_a_watch_gives_way_to_a_lease_and_starts_none_while_it_holds(
