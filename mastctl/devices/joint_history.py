@@ -25,7 +25,8 @@ from mastctl.errors import one_line
 KEPT_READINGS = 3000  # one minute at 50 Hz
 OLDEST_READING_S = 1.0  # a reading stamped further back is not a present measurement
 CLOCK_TOLERANCE_S = 0.005  # what a stamp may lie in the future by rounding
-LARGEST_GAP_S = 1.0  # between the readings around an exposure; beyond it the angles are a guess
+LARGEST_GAP_S = 1.0  # between the readings around an exposure of a head that moves: its angles are a guess
+LARGEST_GAP_AT_REST_S = 10.0  # of one that rests before and after: a late reading is not a fault
 MOST_FAULTS, LONGEST_FAULT = 20, 200  # words that a head may say of itself at once, and their signs
 STILL_RAD = 3e-3  # between neighbours; two counts of a 12-bit servo
 USUAL_PLAY_RAD = 6e-3  # of hobby servos' gears; by it the side is told where the mast file states no backlash
@@ -196,7 +197,8 @@ class JointHistory:
         Raises
         ------
         BadReply
-            If the readings do not reach around the exposure, or leave a gap of more than 1 s in it.
+            If the readings do not reach around the exposure, or leave a gap of more than 1 s in it, 10 s at
+            rest.
         """
         with self._lock:
             times_s = [reading.time_s for reading in self._readings]
@@ -210,10 +212,6 @@ class JointHistory:
             side = "before" if first < 0 else "after"
             raise BadReply(f"there is no joint reading {side} the frame's exposure", device=device)
         stamps_s = [reading.time_s for reading in around]
-        gap_s = max(np.diff(stamps_s), default=0.0)
-        if gap_s > LARGEST_GAP_S:
-            words = f"the joint readings around the exposure are {gap_s:.2f} s apart"
-            raise BadReply(f"{words}, at most {LARGEST_GAP_S} s is taken", device=device)
         pans = [reading.pan_rad for reading in around]
         tilts = [reading.tilt_rad for reading in around]
         seems = (
@@ -222,6 +220,13 @@ class JointHistory:
             or max(tilts) - min(tilts) > STILL_RAD
         )
         moving = (seems and not rests) or any(stamps_s[0] <= sent_s <= stamps_s[-1] for sent_s in moves_s)
+        gap_s, most_s = (
+            max(np.diff(stamps_s), default=0.0),
+            LARGEST_GAP_S if moving else LARGEST_GAP_AT_REST_S,
+        )
+        if gap_s > most_s:
+            words = f"the joint readings around the exposure are {gap_s:.2f} s apart"
+            raise BadReply(f"{words}, at most {most_s:g} s is taken", device=device)
         read = float(np.interp(mid_s, stamps_s, pans)), float(np.interp(mid_s, stamps_s, tilts))
         pan_load, tilt_load = (float(np.interp(mid_s, stamps_s, load)) for load in zip(*loads, strict=True))
         with self._lock:

@@ -178,6 +178,8 @@ class SteeredHead:
             If the head does not answer.
         """
         reading, before = self._head.read(), self._last
+        if self._clock.now_s() - reading.time_s > self._settings.reading_age_s:
+            reading = self._head.read()  # a process that got no processor meanwhile is no fault of the head
         now_s = self._clock.now_s()
         if not all(map(math.isfinite, (reading.pan_rad, reading.tilt_rad, reading.time_s))):
             words = f"the head reads pan {reading.pan_rad}, tilt {reading.tilt_rad}"

@@ -580,18 +580,24 @@ def test_any_motion_from_before_to_after_the_exposure_counts(
 
 
 @pytest.mark.parametrize(
-    ("times_s", "words"),
+    ("times_s", "moves", "words"),
     [
-        ((5.1, 5.2), "no joint reading before"),
-        ((4.8, 4.9), "no joint reading after"),
-        ((4.2, 5.5), "1.30 s apart"),
+        ((5.1, 5.2), False, "no joint reading before"),
+        ((4.8, 4.9), False, "no joint reading after"),
+        ((4.2, 5.5), True, "1.30 s apart, at most 1 s"),
+        ((4.2, 14.5), False, "10.30 s apart, at most 10 s"),
     ],
 )
 def test_readings_that_do_not_reach_around_the_exposure_are_refused(
-    times_s: tuple[float, float], words: str
+    times_s: tuple[float, float], moves: bool, words: str
 ) -> None:
     with pytest.raises(BadReply, match=words):
-        history(*((t, 0.0, 0.0, False) for t in times_s)).at_exposure(5.0, 5.01, 5.02, "head")
+        history(*((t, 0.0, 0.0, moves) for t in times_s)).at_exposure(5.0, 5.01, 5.02, "head")
+
+
+def test_a_late_reading_of_a_head_at_rest_is_no_fault() -> None:
+    joints = history((4.2, 0.1, 0.0, False), (5.5, 0.1, 0.0, False)).at_exposure(5.0, 5.01, 5.02, "head")
+    assert (joints.pan_rad, joints.moving) == (0.1, False)
 
 
 def test_a_move_sent_between_the_readings_counts_even_if_they_are_alike() -> None:

@@ -182,6 +182,13 @@ def test_a_head_may_be_anywhere_on_its_way_at_once_but_not_beyond_its_goal() -> 
         head.read()
 
 
+def test_a_reading_that_came_late_once_is_read_again() -> None:
+    turning = standing()
+    delays_s = [1.2, 0.0]
+    turning.stamp = lambda reading: replace(reading, time_s=reading.time_s - delays_s.pop(0))
+    assert request(turning).read().time_s == 100.0
+
+
 def test_the_nearest_solution_that_no_keep_out_bars_is_taken() -> None:
     near, far = Solution(0.2, 0.1, 3.0), Solution(-0.9, 0.3, 3.0)
     barred: set[float] = set()
