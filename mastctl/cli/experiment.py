@@ -133,8 +133,8 @@ def become_study(name: str, options: Sequence[str]) -> NoReturn:
     root = Path(mastctl.__file__).parents[1]
     if not (root / "tools" / "studies" / f"{name}.py").is_file():
         raise output.WrongUse(
-            f"'experiment {name}' is a program of the checkout, and mastctl was installed without one in "
-            f"{root}; run it in a checkout after tools/setup"
+            f"'experiment {name}' is a program of mastctl's source code, which is not in {root}; in a clone "
+            f"of it, run tools/setup and then '.venv/bin/mastctl experiment {name}'"
         )
     path = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
     command = [sys.executable, "-P", "-m", f"tools.studies.{name}", *options]

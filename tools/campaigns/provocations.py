@@ -381,8 +381,18 @@ def provoked(case: BenchCase) -> Iterator[None]:
         Client.snapshot, Client.put_board = snapshot, put_board  # type: ignore[method-assign]
 
 
+def bench_row(name: str) -> tuple[str, int, int, str]:
+    """Name, exit code, pictures kept, and the sentence: a refusal, else the verdict and what is not well."""
+    case = next(one for one in CASES if one.name == name)
+    config = load_config(config_folder() / "bench.yaml")
+    simulation = {**config.hardware.simulation, "speed": "max", "samples": 1}
+    config = replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))
+    with RunningDaemon(config) as daemon, tempfile.TemporaryDirectory() as folder:
+        return name, *bench_answer(case, daemon.url, Path(folder))
+
+
 def bench_answer(case: BenchCase, url: str, folder: Path) -> tuple[int, int, str]:
-    """Exit code, pictures kept, and the sentence: a refusal, else the verdict and what is not well."""
+    """Exit code, pictures kept, and the sentence of a bench."""
     board, out = folder / "board.yaml", folder / "mast.yaml"
     save_board(board, PRINTED)
     command = ["calibrate", "bench", "--url", url, "--board", board, "--out", out, "--json"]
@@ -398,15 +408,6 @@ def bench_answer(case: BenchCase, url: str, folder: Path) -> tuple[int, int, str
         return code, kept, document["error"]["message"].replace(str(folder), "FOLDER")
     bad = [one["sentence"] for one in document["verdict"]["reasons"] if one["grade"] != "good"]
     return code, kept, f"{document['verdict']['words']}: " + ("; ".join(bad) or "all is well")
-
-
-def put_right(url: str) -> None:
-    """Put everything in order again."""
-    with Client(url) as client:
-        client.clear_faults()
-        client.stand(0.0, 0.0, 0.0)
-        for name in client.boards():
-            client.take_board(name)
 
 
 def rig_of_pairs(file: Path, pairs: Sequence[str]) -> Rig:
@@ -441,17 +442,11 @@ def surveys(args: argparse.Namespace) -> int:
 
 def benches(args: argparse.Namespace) -> int:
     """Print the table of benches."""
-    config = load_config(config_folder() / "bench.yaml")
-    simulation = {**config.hardware.simulation, "speed": "max", "samples": 1}
-    config = replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))
-    print(heading(("provoked", "exit", "pictures kept", "message")), flush=True)
-    with RunningDaemon(config) as daemon:
-        for case in CASES:
-            if args.only and not any(part in case.name for part in args.only):
-                continue
-            with tempfile.TemporaryDirectory() as folder:
-                print(line(case.name, *bench_answer(case, daemon.url, Path(folder))), flush=True)
-            put_right(daemon.url)
+    names = [case.name for case in CASES if not args.only or any(part in case.name for part in args.only)]
+    rows = run_cases(args, "benches", bench_row, names)
+    print(heading(("provoked", "exit", "pictures kept", "message")))
+    for row in rows:
+        print(line(*row))
     return 0
 
 

@@ -13,7 +13,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+import mastctl
 from calib.files.mast_file import load_rig
+from mastctl.cli.experiment import become_study
+from mastctl.cli.output import WrongUse
 from mastctl.client import Client, ClientError
 from mastctl.devices.frames import camera_and_sequence
 from mastctl.experiment.pointing import (
@@ -168,3 +171,11 @@ def test_a_study_of_the_paper_runs_from_a_checkout(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mastctl", "experiment", "handoff", "--json", "--seed", "x"]
     refused = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (refused.returncode, json.loads(refused.stdout)["error"]["code"]) == (2, "wrong_use")
+
+
+def test_without_a_checkout_its_experiments_say_how_to_get_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(mastctl, "__file__", str(tmp_path / "mastctl" / "__init__.py"))
+    with pytest.raises(WrongUse, match=r"not in .*; in a clone of it, run tools/setup and then '\.venv/bin/"):
+        become_study("handoff", ())
