@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-from hil_tests.left_behind import Homes, OwnFolder, end_all_of
+from hil_tests.left_behind import OwnFolder, end_all_of, left_at_home, places_at_home
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 VM_CONFTEST = REPOSITORY / "hil_tests" / "vm" / "conftest.py"
@@ -54,9 +54,8 @@ tempfile.tempdir = None  # asks the environment again
 os.environ["XDG_STATE_HOME"] = str(OWN.keep("state"))
 os.environ["MASTCTL_HEADS"] = str(OWN.keep("heads"))
 os.environ.pop("STATE_DIRECTORY", None)
-HOMES = Homes()
+AT_HOME = places_at_home()
 LEFT = pytest.StashKey[list[str]]()
-SEEN = pytest.StashKey[list[dict[str, str]]]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -76,7 +75,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Declare the marker of the long run."""
     config.stash[LEFT] = []
-    config.stash[SEEN] = [HOMES.first_seen]
     config.addinivalue_line(
         "markers",
         "long(part, why): left out of the quick run; belongs to one of the four parts of the long run that "
@@ -120,7 +118,6 @@ def pytest_runtest_protocol(
     What is left then is what modules and the session keep; the next collection does not look at it again.
     """
     ran = yield
-    HOMES.look(item.nodeid)
     if nextitem is None or nextitem.path != item.path:
         gc.collect()
         gc.freeze()
@@ -144,9 +141,9 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     elif session.exitstatus == pytest.ExitCode.INTERRUPTED:  # its workers are gone by now
         end_all_of(workers.nodemanager.testrunuid, Path(os.environ["PYTEST_DEBUG_TEMPROOT"]))
     if hasattr(config, "workeroutput"):
-        config.workeroutput |= {"left": config.stash[LEFT], "seen": HOMES.first_seen}
+        config.workeroutput["left"] = config.stash[LEFT]
         return
-    config.stash[LEFT] += HOMES.left(config.stash[SEEN])
+    config.stash[LEFT] += left_at_home(AT_HOME)
     if config.stash[LEFT] and session.exitstatus == pytest.ExitCode.OK:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
@@ -154,9 +151,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node: Any) -> None:
     """Take what a worker of xdist left."""
-    told = getattr(node, "workeroutput", {})
-    node.config.stash[LEFT] += told.get("left", [])
-    node.config.stash[SEEN].append(told.get("seen", {}))
+    node.config.stash[LEFT] += getattr(node, "workeroutput", {}).get("left", [])
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)

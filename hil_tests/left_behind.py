@@ -2,7 +2,7 @@
 
 Each process that runs tests has a folder of its own as ``TMPDIR``, which all that it starts inherits. So what
 it left can be told from what others do on the same machine at the same time. Where daemons keep the state of
-their heads is one place for all: there, what is new since the run began counts unless somebody else holds it.
+their heads is one place for all: what is new there since the run began counts unless another process uses it.
 """
 
 from __future__ import annotations
@@ -55,42 +55,20 @@ def held() -> set[object]:
     return found
 
 
-class Homes:
-    """Where daemons of this user keep state that outlives them, whatever the environment of a test says.
+def places_at_home() -> set[Path]:
+    """State folders of daemons and places of heads, which outlive them whatever a test's environment says."""
+    homes = {Path.home()}
+    with suppress(KeyError):  # a user whom the password database does not know
+        homes.add(Path(pwd.getpwuid(os.getuid()).pw_dir))
+    folders = [Path("/var/lib/mastctl"), *(home / ".local/state/mastctl" for home in homes)]
+    found = {place for folder in folders for kind in ("*", "heads/*") for place in folder.glob(kind)}
+    return {place for place in found if place.name != "heads"}
 
-    Several processes run tests and none can see whose a place is: each remembers after which test of its own
-    it was there first. That of the process that made it is among these, whoever is slow to tell.
-    """
 
-    def __init__(self) -> None:
-        homes = {Path.home()}
-        with suppress(KeyError):  # a user whom the password database does not know
-            homes.add(Path(pwd.getpwuid(os.getuid()).pw_dir))
-        self._folders = [Path("/var/lib/mastctl"), *(home / ".local/state/mastctl" for home in homes)]
-        self._before = self._places()
-        self.first_seen: dict[str, str] = {}
-
-    def look(self, test: str) -> None:
-        """Remember after which test of this process something new was there first."""
-        for place in self._places() - self._before:
-            self.first_seen.setdefault(str(place), test)
-
-    def left(self, seen: list[dict[str, str]]) -> list[str]:
-        """Return what is new and still there, a line each, with what each process saw first."""
-        held = _held_by_others()
-        return [
-            f"{place} (first seen after {' or '.join(tests) or 'the last test'})"
-            for place in sorted(self._places() - self._before)
-            if place.stat().st_ino not in held
-            for tests in [sorted({one[str(place)] for one in seen if str(place) in one})]
-        ]
-
-    def _places(self) -> set[Path]:
-        """State folders of daemons, and places of heads."""
-        found = {
-            place for folder in self._folders for kind in ("*", "heads/*") for place in folder.glob(kind)
-        }
-        return {place for place in found if place.name != "heads"}
+def left_at_home(before: set[Path]) -> list[str]:
+    """Return what is new there, and no other process uses."""
+    used = _held_by_others()
+    return [str(place) for place in sorted(places_at_home() - before) if place.stat().st_ino not in used]
 
 
 def _held_by_others() -> set[int]:

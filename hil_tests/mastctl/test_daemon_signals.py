@@ -22,7 +22,7 @@ from mastctl.cli.main import main
 from mastctl.client import Client
 
 
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGHUP", "SIGUSR1"])
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_signal_that_ends_stops_the_mast_first(tmp_path: Path, name: str) -> None:
     with daemon_process(tmp_path, write_config(tmp_path)) as daemon:
         with Client(line(daemon)) as client:

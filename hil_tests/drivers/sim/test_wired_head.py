@@ -20,16 +20,11 @@ from hil_tests.waiting import until
 pytestmark = pytest.mark.usefixtures("one_scene")
 
 
-WIRES = {"dynamixel_x": "dynamixel", "ptu_d46_70": "flir_ptu"}
-
-
 @contextmanager
-def wired(
-    rig: Path, head: str, speed: int | str = "max", **options: object
-) -> Iterator[tuple[SimulatedRover, Clock]]:
-    section = {"rover": rig.name, "seed": 5, "head": {"preset": head, **options}, "wire": WIRES[head]}
+def wired(rig: Path) -> Iterator[tuple[SimulatedRover, Clock]]:
+    section = {"rover": rig.name, "seed": 5, "head": "dynamixel_x", "wire": "dynamixel", "speed": "max"}
     sim = DeviceSettings("sim")
-    settings = HardwareSettings(sim, {"navcam_left": sim}, {**section, "speed": speed}, rig.parent)
+    settings = HardwareSettings(sim, {"navcam_left": sim}, section, rig.parent)
     clock = clock_for(settings)
     with open_hardware(settings, clock) as hardware:
         rover = hardware.simulation
@@ -52,9 +47,8 @@ def fails(device: SimulatedRover) -> bool:
     return False
 
 
-@pytest.mark.parametrize("head", ["dynamixel_x", "ptu_d46_70"])
-def test_faults_of_the_rover_reach_line_and_axes(small_rig: Path, head: str) -> None:
-    with wired(small_rig, head) as (device, clock):
+def test_faults_of_the_rover_reach_line_and_axes(small_rig: Path) -> None:
+    with wired(small_rig) as (device, clock):
         settled(device, clock, 0.1, 0.0)
         for word in ("off", "hang_up"):
             device.faults.set(PAN_TILT, word)
@@ -70,7 +64,7 @@ def test_faults_of_the_rover_reach_line_and_axes(small_rig: Path, head: str) -> 
 
 def test_the_same_moves_give_the_same_readings_to_the_last_bit(small_rig: Path) -> None:
     def readings_of_a_run() -> list[Reading]:
-        with wired(small_rig, "dynamixel_x") as (device, clock):
+        with wired(small_rig) as (device, clock):
             device.pan_tilt.move(0.3, -0.2)
             readings = [device.pan_tilt.read() for _ in range(20)]
             return [*readings, settled(device, clock, -0.1, 0.1)]

@@ -14,7 +14,7 @@ from mastctl.control.standing import StandingFault
 FULL = StandingFault("a file", "full", "the disk is full", 1.0, "it is not")
 
 
-@pytest.mark.parametrize("part", ["handoffs", "recording", "audit"])
+@pytest.mark.parametrize("part", ["handoffs", "recorder", "audit"])
 def test_each_own_fault_is_published_and_in_the_status(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, part: str
 ) -> None:

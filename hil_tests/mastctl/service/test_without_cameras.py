@@ -25,38 +25,31 @@ cameras: {}
 CONFIG = """
 schema: mastctl/config/1
 mast_file: little.yaml
-listen: {{port: 0}}
-pan_tilt: {{driver: fake}}
-{cameras}
-limits: {{pan_rad: [-2.0, 2.0], tilt_rad: [-1.0, 1.0], speed_rad_per_s: 0.5}}
+listen: {port: 0}
+pan_tilt: {driver: fake}
+limits: {pan_rad: [-2.0, 2.0], tilt_rad: [-1.0, 1.0], speed_rad_per_s: 0.5}
 """
 
 ANGLES: dict[str, object] = {"pan_rad": 0.3, "tilt_rad": -0.2}
 
 
-def started(
-    monkeypatch: pytest.MonkeyPatch, folder: Path, cameras: str, mounted: tuple[str, ...], mast: str = ""
-) -> RunningDaemon:
-    """A daemon on fakes whose configuration has these lines about cameras."""
-    hardware = FakeHardware(mounted)
+def started(monkeypatch: pytest.MonkeyPatch, folder: Path, mast: str) -> RunningDaemon:
+    """A daemon on fakes whose configuration has no cameras."""
+    hardware = FakeHardware(())
     if mast:
         (folder / "little.yaml").write_text(mast)
     else:
         save_rig(rig(), folder / "little.yaml")
-    (folder / "daemon.yaml").write_text(CONFIG.format(cameras=cameras))
+    (folder / "daemon.yaml").write_text(CONFIG)
     monkeypatch.setattr("mastctl.devices.opening.open_hardware", lambda settings, clock: hardware)
     return RunningDaemon(load_config(folder / "daemon.yaml"))
 
 
-@pytest.fixture(scope="module", params=["", "cameras: {}", "bare"])
+@pytest.fixture(scope="module", params=["", "bare"])
 def bare(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Iterator[RunningDaemon]:
-    """A head alone: no key, an empty one, and a mast file that has no cameras either."""
-    mast = BARE_MAST if request.param == "bare" else ""
-    cameras = "" if request.param == "bare" else request.param
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        started(patch, tmp_path_factory.mktemp("bare"), cameras, (), mast) as daemon,
-    ):
+    """A head alone: none is configured, or the mast file has no cameras either."""
+    folder, mast = tmp_path_factory.mktemp("bare"), BARE_MAST if request.param == "bare" else ""
+    with pytest.MonkeyPatch.context() as patch, started(patch, folder, mast) as daemon:
         yield daemon
 
 
