@@ -7,6 +7,7 @@ import logging
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -53,6 +54,13 @@ def clock_for(settings: HardwareSettings) -> Clock:
             if not driver_of(kind, device.driver, name).any_clock:
                 raise BadOptions(f"{words} driver {device.driver!r} runs in real time", device=name)
     return SimulationClock(speed)
+
+
+def is_hardware(hardware: HardwareKind, kind: Kind, driver: str) -> bool:
+    """Return whether the devices of a driver are ``real``, ``simulated`` or ``replayed``."""
+    with suppress(BadOptions):  # there is none of this name: the same sentence comes when it is opened
+        return driver_of(kind, driver, driver).hardware == hardware
+    return False
 
 
 def head_name(settings: HardwareSettings) -> str | None:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import threading
 import time
+from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
-from drivers.errors import BadFrame
-from drivers.interfaces import Frame, Image
+from drivers.errors import BadFrame, NoCamera, NoFreshFrame
+from drivers.interfaces import Camera, CameraSetting, Frame, FrameTime, Image
 
 RECENT_FRAMES = 30  # a second's: from their times the offset between two cameras is learned
 ROUNDING_S = 1e-9  # a frame told by its middle and length is not newer than itself
@@ -109,11 +110,6 @@ class Newest(Generic[Arrived]):
         """The counts so far."""
         with self._changed:
             return replace(self._counters)
-
-    @property
-    def damaged(self) -> int:
-        """How many frames were refused so far."""
-        return self._counters.damaged
 
     @property
     def lost(self) -> str:
@@ -242,3 +238,58 @@ class Newest(Generic[Arrived]):
     def _forget(self) -> None:
         self._frame = self._make = self._picture = None
         self._recent.clear()
+
+
+class CapturedCamera(Camera):
+    """A camera whose ``capture`` has a thread of its own and a `Newest`; safe from any thread."""
+
+    capture: Any
+    name: str
+    _last: TimedFrame | None = None
+
+    @abstractmethod
+    def _timed(self, arrived: Any, image: Image, jpeg: bytes) -> TimedFrame:
+        """Return a frame that arrived, with its picture."""
+
+    @property
+    def counters(self) -> Counters:
+        """The counts of good, damaged and missing frames so far."""
+        counters: Counters = self.capture.newest.counters
+        return counters
+
+    def next_frame(self, exposed_after_s: float, timeout_s: float) -> TimedFrame:
+        """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.
+
+        Its stamp is at most a period and 5 ms old, or it came during the call. Raises NoFreshFrame if none
+        came within ``timeout_s`` seconds; the message says what came instead; NoCamera (at once, if the
+        camera is gone).
+        """
+        newest: Newest[Any] = self.capture.newest
+        damaged = newest.counters.damaged
+        taken = self.capture.take(exposed_after_s, timeout_s)
+        if taken is None:
+            if lost := newest.lost:
+                raise NoCamera(lost)
+            words = newest.instead(exposed_after_s, timeout_s, damaged, self.now_s())
+            raise NoFreshFrame(words, device=self.name)
+        if self._last is None or self._last.image is not taken[1]:
+            self._last = self._timed(*taken)
+        return self._last
+
+    def now_s(self) -> float:
+        """Return the time by the clock of its stamps."""
+        return time.monotonic()
+
+    def recent_times(self) -> list[FrameTime]:
+        """Return the times of the last good frames of this stream, oldest first."""
+        return [FrameTime(frame.sequence, frame.window.begin_s) for frame in self.capture.newest.recent()]
+
+    def settings(self) -> Sequence[CameraSetting]:
+        """Return exposure, gain, white balance and focus, as far as it has them. Raises DriverError."""
+        settings: Sequence[CameraSetting] = self.capture.settings()
+        return settings
+
+    def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
+        """Change some of them, as `drivers.interfaces.Camera.adjust`."""
+        notes: Sequence[str] = self.capture.adjust(wanted)
+        return notes

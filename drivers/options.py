@@ -123,6 +123,15 @@ class OptionReader:
             raise self.bad(key, between.join(str(one) for one in allowed))
         return allowed[allowed.index(value)]  # 1 for 1.0
 
+    def check_in_frame(self, key: str, exposure_s: float | None, rate_hz: float | None) -> None:
+        """Refuse an exposure time for which a camera would have to stretch its frames. Raises BadOptions."""
+        if exposure_s is not None and rate_hz is not None and exposure_s > 1 / rate_hz:
+            raise self.refused(
+                key,
+                f" is {exposure_s:g} s, longer than a frame at rate_hz {rate_hz:g} ({1 / rate_hz:.4g} s); "
+                "a shorter one, or a lower rate, is expected",
+            )
+
     def pair(self, key: str, expected: str) -> tuple[float, float]:
         """Return two numbers."""
         value = self.values[key]

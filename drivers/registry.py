@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from inspect import getattr_static
@@ -79,6 +80,14 @@ class Driver:
     halt
         ``halt(options)`` stops a head that no daemon drives any more, and returns the actions on each axis in
         plain words. Raises DriverError if the head did not confirm.
+    probe
+        Of a head: ``probe(port, path)`` returns the `drivers.probes.ProbedHead` on a line, or None, and a
+        reason that may be empty; DriverError: no other head is to be tried. Of cameras: ``probe()`` returns
+        each `ProbedCamera`, a sentence for each of no use, and what this machine lacks. Nothing moves.
+    probe_order
+        Heads of a lower number probe a line first.
+    bench
+        What a person does with a device on the bench (`drivers.probes`).
     """
 
     open: Callable[[Mapping[str, Any], Context], Any]
@@ -86,6 +95,9 @@ class Driver:
     any_clock: bool = False
     read_options: Callable[[Mapping[str, Any]], Any] | None = None
     halt: Callable[[Mapping[str, Any]], Sequence[str]] | None = None
+    probe: Callable[..., tuple[Any, ...]] | None = None
+    probe_order: int = 0
+    bench: Any = None
 
 
 @dataclass(frozen=True)
@@ -143,6 +155,16 @@ def _installed(folders: tuple[tuple[str, int], ...]) -> Sequence[InstalledDriver
 def kinds_of(driver: str) -> set[Kind]:
     """Return which devices a driver of that name drives; nothing for one that no package offers."""
     return {one.kind for one in installed_drivers() if one.name == driver}
+
+
+def drivers_of(kind: Kind) -> Mapping[str, Driver]:
+    """Return every installed driver of a kind that can be imported, by name, in the order of probing."""
+    found: dict[str, Driver] = {}
+    for one in installed_drivers():
+        if one.kind == kind:
+            with suppress(BadOptions):
+                found[one.name] = driver_of(kind, one.name, one.name)
+    return dict(sorted(found.items(), key=lambda item: (item[1].probe_order, item[0])))
 
 
 def driver_of(kind: Kind, driver: str, device: str) -> Driver:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
 from typing import Any
 
 from drivers import pixels
-from drivers.aravis.capture import GenicamCapture
+from drivers.aravis import find
+from drivers.aravis.capture import ArrivedGenicam, GenicamCapture
 from drivers.aravis.options import AravisOptions, parse_options
 from drivers.clock import Clock
-from drivers.errors import NoCamera, NoFreshFrame
-from drivers.interfaces import Camera, CameraInfo, CameraSetting, FrameTime
-from drivers.newest import Counters, TimedFrame
+from drivers.interfaces import CameraInfo, Image
+from drivers.newest import CapturedCamera, TimedFrame
+from drivers.probes import CameraBench
 from drivers.registry import Driver
 
 
@@ -27,19 +28,15 @@ def open_camera(options: Mapping[str, Any], clock: Clock | None = None, name: st
     return AravisCamera(parse_options(options, name), name)
 
 
-class AravisCamera(Camera):
+class AravisCamera(CapturedCamera):
     """One camera; safe from any thread."""
+
+    capture: GenicamCapture
 
     def __init__(self, options: AravisOptions, name: str) -> None:
         self.name = name
         self._options = options
         self.capture = GenicamCapture(options, name, pixels.colour if options.colour else pixels.grey)
-        self._last: TimedFrame | None = None
-
-    @property
-    def counters(self) -> Counters:
-        """The counts of good, damaged and missing frames so far."""
-        return self.capture.newest.counters
 
     @property
     def info(self) -> CameraInfo:
@@ -62,18 +59,6 @@ class AravisCamera(Camera):
         span_s = times[-1].exposure_began_s - times[0].exposure_began_s
         return max(1e-3, span_s / max(1, times[-1].sequence - times[0].sequence))
 
-    def recent_times(self) -> list[FrameTime]:
-        """Return the times of the last good frames of this stream, oldest first."""
-        return [FrameTime(frame.sequence, frame.window.begin_s) for frame in self.capture.newest.recent()]
-
-    def settings(self) -> list[CameraSetting]:
-        """Return exposure, gain, white balance and focus, as far as it has them. Raises DriverError."""
-        return self.capture.settings()
-
-    def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
-        """Change some of them, as `drivers.interfaces.Camera.adjust`."""
-        return self.capture.adjust(wanted)
-
     @contextmanager
     def exposure_held(self) -> Iterator[None]:
         """Wait until a change that was made before shows, for a second at most: a measurement compares
@@ -82,26 +67,9 @@ class AravisCamera(Camera):
         self.capture.await_settled()
         yield
 
-    def next_frame(self, exposed_after_s: float, timeout_s: float) -> TimedFrame:
-        """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.
-
-        Raises NoFreshFrame if none came within ``timeout_s`` seconds; the message says what came instead;
-        NoCamera (at once, if the camera is gone).
-        """
-        newest = self.capture.newest
-        damaged = newest.damaged
-        taken = self.capture.take(exposed_after_s, timeout_s)
-        if taken is None:
-            if lost := newest.lost:
-                raise NoCamera(lost)
-            words = self.capture.newest.instead(exposed_after_s, timeout_s, damaged, time.monotonic())
-            raise NoFreshFrame(words, device=self.name)
-        arrived, image, _ = taken
-        last = self._last
-        if last is not None and last.image is image:
-            return last
+    def _timed(self, arrived: ArrivedGenicam, image: Image, jpeg: bytes) -> TimedFrame:
         window, exposure_s = arrived.window, arrived.settings.get("exposure_s")
-        self._last = TimedFrame(
+        return TimedFrame(
             image=image,
             settings=arrived.settings,
             sequence=arrived.sequence,
@@ -114,11 +82,16 @@ class AravisCamera(Camera):
             driver_sequence=arrived.filled.number,
             stream=arrived.stream,
         )
-        return self._last
 
     def close(self) -> None:
         """Let go of the camera; a waiting call ends with NoFreshFrame."""
         self.capture.close()
 
 
-DRIVER = Driver(lambda options, context: open_camera(options, context.clock, context.name))
+DRIVER = Driver(
+    lambda options, context: open_camera(options, context.clock, context.name),
+    probe=find.probe, probe_order=1, bench=CameraBench(
+        "genicam", "cameras of GigE Vision and USB3 Vision (driver aravis)",
+        lambda: ([asdict(one) for one in find.list_cameras()], []), find.present,
+    ),
+)  # fmt: skip

@@ -112,24 +112,16 @@ class CameraClock:
                 self.low_s = above_s - self.least_delay_s
         self._check()
 
-    def window(
-        self, stamp_s: float, stamped: Stamped, longest_s: float, triggered_s: float, arrived_s: float
-    ) -> GenicamWindow:
+    def window(self, stamp_s: float, stamped: Stamped, longest_s: float, arrived_s: float) -> GenicamWindow:
         """Return in which stretch of our time a frame was exposed.
 
         Parameters
         ----------
-        triggered_s
-            Before which moment of ours it cannot have begun: its trigger's; -inf where none is known.
         arrived_s
             When its first packet came: the exposure was over.
         """
         begin_s = stamp_s + self.low_s - (0.0 if stamped == "start" else longest_s)
         end_s = stamp_s + self.high_s + (0.0 if stamped == "end" else longest_s)
-        if not self.readings and triggered_s > -math.inf:
-            begin_s = triggered_s
-        elif triggered_s <= stamp_s + self.high_s:  # else it was stamped before, and answers another trigger
-            begin_s = max(begin_s, triggered_s)
         return GenicamWindow(begin_s, max(begin_s, min(end_s, arrived_s)))
 
     def _widen(self, now_s: float) -> None:

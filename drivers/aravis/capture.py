@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.aravis.camera_clock import CameraClock, ClockStepped, GenicamWindow
 from drivers.aravis.device import Device, Filled
-from drivers.aravis.options import SOFTWARE, AravisOptions
+from drivers.aravis.options import AravisOptions
 from drivers.aravis.settings import EXPOSURE
 from drivers.errors import DriverError, NoCamera, StreamFailed
 from drivers.interfaces import CameraSetting, Image
@@ -74,10 +74,6 @@ class GenicamCapture:
         self._options, self._name, self._convert = options, name, convert
         self.newest: Newest[ArrivedGenicam] = Newest()
         self._over = threading.Event()
-        self._triggering = threading.Lock()
-        self._asked: list[float] = []  # moments of triggers that no frame answered yet; under the lock below
-        self._past = 0  # of those, oldest first: so many that none answers any more
-        self._asking = threading.Condition()
         self._opening = threading.Lock()  # guards what is adjusted, and which values are in force
         self._adjusted: dict[str, float] = {}
         self._longest_s: float  # of an exposure that is not known
@@ -98,67 +94,8 @@ class GenicamCapture:
         self._thread.start()
 
     def take(self, exposed_after_s: float, timeout_s: float) -> tuple[ArrivedGenicam, Image, bytes] | None:
-        """Return the newest frame exposed after that moment, as `drivers.newest.Newest.take`.
-
-        A camera with the trigger ``Software`` exposes it now, and again after one that came damaged or not.
-        """
-        if self._options.trigger_source != SOFTWARE:
-            return self.newest.take(exposed_after_s, timeout_s, self._is_young)
-        until_s = time.monotonic() + timeout_s
-        if not self._triggering.acquire(timeout=timeout_s):
-            return None
-        try:
-            if found := self.newest.take(exposed_after_s, 0.0, lambda frame: True):
-                return found
-            while self._fire(until_s):
-                while True:
-                    now_s = time.monotonic()
-                    next_s = min(until_s, now_s + SETTLE_S)
-                    found = self.newest.take(exposed_after_s, next_s - now_s, lambda frame: True)
-                    if (
-                        found or next_s == until_s or time.monotonic() < next_s
-                    ):  # the camera is lost or closed
-                        return found
-                    if not self._unanswered():
-                        break
-            return None
-        finally:
-            self._triggering.release()
-
-    def _fire(self, until_s: float) -> bool:
-        """Send the software trigger, and note when; False if there is no camera.
-
-        After a trigger that no frame answered, the next frame may be that one's, late, and counts as such. So
-        a camera whose clock cannot be read is triggered again only when no late frame is believed any more.
-        By a clock that is read a frame shows its age: its trigger waits for as long as that is uncertain.
-        """
-        with self._asking:
-            if self._unanswered():
-                if self._clock.readings:
-                    self._asking.wait_for(lambda: False, min(self._unsure_s(), until_s - time.monotonic()))
-                elif not self._asking.wait_for(
-                    lambda: not self._unanswered(), max(0.0, until_s - time.monotonic())
-                ):
-                    return False
-            device = self._device
-            if device is None:
-                return False
-            self._asked.append(time.monotonic())
-            try:
-                device.trigger()
-            except StreamFailed:
-                self._asked.pop()
-                raise
-        return True
-
-    def _unanswered(self) -> bool:
-        """Whether a frame may come that answers a former trigger."""
-        return len(self._asked) > self._past
-
-    def _unsure_s(self) -> float:
-        """How much earlier than it did a frame's exposure may seem to begin, by the camera's clock."""
-        before_stamp_s = 0.0 if self._options.stamp == "start" else self._longest_s
-        return self._clock.high_s - self._clock.low_s + before_stamp_s
+        """Return the newest frame exposed after that moment, as `drivers.newest.Newest.take`."""
+        return self.newest.take(exposed_after_s, timeout_s, self._is_young)
 
     def _is_young(self, frame: ArrivedGenicam) -> bool:
         """Whether no newer one should be here: a triggered camera's stays young."""
@@ -241,11 +178,7 @@ class GenicamCapture:
 
     def _let_go(self, device: Device) -> None:
         """Close a stream before it is opened again; wait only a second for a camera that is gone."""
-        with self._asking:
-            self._device = None
-            self._asked.clear()
-            self._past = 0
-            self._asking.notify_all()
+        self._device = None
         self.newest.forget()
         self._held = None
         closing = threading.Thread(target=device.close, name=f"closing {self._name}", daemon=True)
@@ -261,9 +194,8 @@ class GenicamCapture:
                 log.exception("%s: opening again failed", self._name)
             self.newest.lose(str(error) or type(error).__name__)
             return None
-        with self._asking:
-            self._device = device
-        self.newest.come_back()  # from here on it is asked
+        self._device = device
+        self.newest.come_back()
         log.warning("%s is back", self._name)
         return device
 
@@ -287,7 +219,6 @@ class GenicamCapture:
         silent_s = max(SILENT_S, SILENT_PERIODS * (device.period_s or 0.0))
         read_next_s = self._read_clock(device, heard_s)
         while not self._over.is_set():
-            waits_s = time.monotonic()
             filled = device.wait(WAIT_S)
             now_s = time.monotonic()
             if device.lost.is_set():
@@ -299,8 +230,6 @@ class GenicamCapture:
                 if now_s >= read_next_s:
                     read_next_s = self._read_clock(device, now_s)
                 continue
-            # Exposed at once, it would come so late after its stamp that `_wrong_delay` refuses it.
-            self._give_up(waits_s - DELAYED_S - 2 * self._longest_s - self._options.margin_s)
             if self._options.free_running and now_s - heard_s > silent_s:
                 raise StreamFailed(
                     f"it gave no frame for {now_s - heard_s:.1f} s (its cable, its power?)",
@@ -319,8 +248,8 @@ class GenicamCapture:
 
     def _take(self, device: Device, filled: Filled, received_s: float) -> None:
         """Check one buffer; publish it if it is good, and give the last one back, else itself."""
-        missing = self._count(filled)
-        triggered_s, wrong, dropped = self._triggered_s(missing), filled.wrong, missing or 0
+        dropped = self._count(filled)
+        wrong = filled.wrong
         if not wrong:
             try:
                 self._clock.arrived(filled.stamp_s, filled.arrived_s)
@@ -328,20 +257,20 @@ class GenicamCapture:
                 raise StreamFailed(str(error), device=self._name) from None
             wrong = self._wrong_delay(filled)
         self._learned += not wrong
-        learning = not self._clock.readings and self._learned <= LEARNING_FRAMES and triggered_s == -math.inf
+        learning = not self._clock.readings and self._learned <= LEARNING_FRAMES
         if wrong or learning:
             self.newest.refuse(dropped, wrong)
             device.queue(filled.handle)
             return
-        window = self._window(filled, self._longest_s, triggered_s)
+        window = self._window(filled, self._longest_s)
         settings: dict[str, float | None] = {}
         for name, values in self._in_force.items():
             settings[name], highest = values.of(self._last_sequence, window.end_s, window.begin_s)
             if name == EXPOSURE.name and highest is not None:
-                window = self._window(filled, highest, triggered_s)
+                window = self._window(filled, highest)
         settings |= filled.sent
         if sent_s := filled.sent.get(EXPOSURE.name):
-            window = self._window(filled, sent_s, triggered_s)
+            window = self._window(filled, sent_s)
         frame = ArrivedGenicam(filled, window, settings, self._last_sequence, self._streams, received_s)
         self.newest.publish(frame, partial(self._made, device, filled.handle), dropped=dropped, late=False)
         held, self._held = self._held, filled.handle
@@ -349,52 +278,27 @@ class GenicamCapture:
             device.queue(held)
         self._pause_s = FIRST_PAUSE_S
 
-    def _window(self, filled: Filled, longest_s: float, triggered_s: float) -> GenicamWindow:
+    def _window(self, filled: Filled, longest_s: float) -> GenicamWindow:
         """In which stretch of our time a frame was exposed, for so long at most."""
-        return self._clock.window(
-            filled.stamp_s, self._options.stamp, longest_s, triggered_s, filled.arrived_s
-        )
+        return self._clock.window(filled.stamp_s, self._options.stamp, longest_s, filled.arrived_s)
 
     def _made(self, device: Device, handle: int) -> tuple[Image, bytes]:
         """The picture of a buffer."""
         data, format = device.bytes_of(handle)
         return self._convert(format, data), b""
 
-    def _triggered_s(self, missing: int | None) -> float:
-        """When the trigger was sent that this frame answers, or an earlier one; -inf where that is not known.
-
-        Frames come in the order of their triggers, and those that are missing answered the oldest ones.
-        """
-        if self._options.trigger_source != SOFTWARE or missing is None:
-            return -math.inf
-        with self._asking:
-            at = max(missing, self._past)
-            triggered_s = self._asked[at] if at < len(self._asked) else -math.inf
-            del self._asked[: at + 1]
-            self._past = 0
-            self._asking.notify_all()
-        return triggered_s
-
-    def _give_up(self, before_s: float) -> None:
-        """Take in that no frame answers a trigger sent before that moment: none is there, and later than that
-        none is believed.
-        """
-        with self._asking:
-            self._past = sum(asked_s < before_s for asked_s in self._asked)
-            self._asking.notify_all()
-
-    def _count(self, filled: Filled) -> int | None:
-        """Count a frame; return how many are missing before it, None if its number does not say."""
-        step, known = 1, True
+    def _count(self, filled: Filled) -> int:
+        """Count a frame; return how many are missing before it, as far as its number says."""
+        step = 1
         if self._last_number is not None:
             step = filled.number - self._last_number
             if step <= 0 and self._last_number < 2**16:
                 step += 2**16 - 1  # the count of 16 bits leaves out 0
             if not 0 < step < 2**15:  # it began again: nothing says how many that cost
-                step, known = 1, False
+                step = 1
         self._last_number = filled.number
         self._last_sequence += step
-        return step - 1 if known else None
+        return step - 1
 
     def _wrong_delay(self, filled: Filled) -> str:
         """Why a frame comes too late to be believed; empty if it does not. Raises StreamFailed for many."""

@@ -18,7 +18,7 @@ from calib.geometry.mode import SensorMode
 from drivers.aravis import find
 from drivers.aravis.camera_clock import WallClock
 from drivers.aravis.library import CONTROL_LOST, GenicamError, library
-from drivers.aravis.options import SOFTWARE, AravisOptions
+from drivers.aravis.options import AravisOptions
 from drivers.aravis.settings import CHUNKS, EXPOSURE, ROUNDING, Control, Meaning, change, set_up, settings_of
 from drivers.errors import CameraBusy, DriverError, NoCamera, StreamFailed, UnsupportedFormat
 from drivers.interfaces import CameraSetting
@@ -300,16 +300,6 @@ class Device:
         except GenicamError as error:
             raise StreamFailed(f"its clock cannot be read: {error}", device=self._name) from None
         return before_s, ticks / self._ticks_hz, after_s
-
-    def trigger(self) -> None:
-        """Have one frame exposed. Raises StreamFailed if the camera does not answer."""
-        try:
-            with self._asking:
-                self._arv("camera_software_trigger", self._camera)
-        except GenicamError as error:
-            raise StreamFailed(
-                f"it did not take the {SOFTWARE.lower()} trigger: {error}", device=self._name
-            ) from None
 
     def settings(self) -> list[CameraSetting]:
         """Return what may be changed, as the camera has it now. Raises DriverError."""

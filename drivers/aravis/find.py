@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import ctypes
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.aravis.library import GenicamError, Library, installed, library
-from drivers.aravis.options import AravisOptions
-from drivers.errors import BadOptions, CameraBusy, NoCamera, StreamFailed, UnsupportedFormat
+from drivers.aravis.library import INSTALL, GenicamError, Library, installed, library
+from drivers.aravis.options import AravisOptions, parse_options
+from drivers.errors import BadOptions, CameraBusy, DriverError, NoCamera, StreamFailed, UnsupportedFormat
 from drivers.pixels import GENICAM
+from drivers.probes import ProbedCamera
 
 _LISTING = threading.Lock()
 """Aravis has one list of devices, which each search makes anew."""
@@ -102,10 +104,7 @@ def open_camera(options: AravisOptions, name: str) -> int:
         found = _listed(arv)
         named = [one for one in found if is_meant(options, one)]
         if len(named) > 1:
-            raise BadOptions(
-                f"several cameras have {options.words}: {', '.join(one.id for one in named)}; give 'id'",
-                device=name,
-            )
+            raise BadOptions(_several(options, named), device=name)
         if not named:
             raise _absent(options, name, found)
         key = named[0].id
@@ -125,3 +124,46 @@ def _absent(options: AravisOptions, name: str, found: list[FoundGenicam], why: s
     connected = "; ".join(one.words for one in found) or "none"
     said = f" ({why})" if why else ""
     return NoCamera(f"no camera with {options.words} answers{said}; there are: {connected}", device=name)
+
+
+USUAL_HZ = 30.0
+NOT_INSTALLED = f"GigE Vision and USB3 Vision cameras are found only with the library Aravis: {INSTALL}"
+
+
+def probe() -> tuple[list[ProbedCamera], list[str], str]:
+    """Return cameras as `drivers.registry.Driver.probe`."""
+    cameras: list[ProbedCamera] = []
+    others: list[str] = []
+    found = sorted(list_cameras(), key=lambda one: (one.serial, one.id))
+    serials = [one.serial for one in found]
+    for one in found:
+        try:
+            options = options_for(one, bool(one.serial) and serials.count(one.serial) == 1, USUAL_HZ)
+        except DriverError as error:
+            others.append(str(error))
+            continue
+        name = f"{one.vendor} {one.model} {one.serial}"
+        cameras.append(ProbedCamera(name, one.address or one.protocol, None, options, "aravis"))
+    return cameras, others, "" if installed() else NOT_INSTALLED
+
+
+def present(options: Mapping[str, Any], name: str) -> str:
+    """Return which camera a configuration names, as `drivers.probes.CameraBench`; it is not opened.
+
+    Raises BadOptions, NoCamera.
+    """
+    wanted = parse_options(options, name)
+    library(name)
+    connected = list_cameras()
+    found = [one for one in connected if is_meant(wanted, one)]
+    if not found and wanted.address:
+        return f"no camera with {wanted.words} answers to a search; mastctl camera check says more"
+    if not found:
+        raise _absent(wanted, name, connected)
+    if len(found) > 1:
+        raise BadOptions(_several(wanted, found), device=name)
+    return found[0].words
+
+
+def _several(options: AravisOptions, found: list[FoundGenicam]) -> str:
+    return f"several cameras have {options.words}: {', '.join(one.id for one in found)}; give 'id'"

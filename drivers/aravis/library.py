@@ -61,7 +61,6 @@ _FUNCTIONS = {
     "arv_camera_get_gain_bounds": "ppp>v!",
     "arv_camera_set_trigger": "ps>v!",
     "arv_camera_clear_triggers": "p>v!",
-    "arv_camera_software_trigger": "p>v!",
     "arv_camera_set_acquisition_mode": "pi>v!",
     "arv_camera_gv_get_packet_size": "p>u!",
     "arv_camera_gv_set_stream_options": "pi>v",

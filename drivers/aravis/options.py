@@ -8,14 +8,13 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from drivers.faults import nearest
-from drivers.options import OptionReader, is_number, is_whole
+from drivers.options import OptionReader, is_number
 from drivers.pixels import GENICAM
 
 OPTIONS = (
     "serial", "address", "id", "format", "size_px", "offset_px", "rate_hz", "colour", "features",
     "exposure_s", "gain", "trigger_source", "trigger", "stamp", "margin_s", "buffers",
 )  # fmt: skip
-SOFTWARE = "Software"
 Stamped = Literal["start", "end", "either"]
 
 
@@ -37,8 +36,7 @@ class AravisOptions:
         Fixed exposure time, and gain in the camera's own unit, each with its automatic turned off; None
         leaves it alone.
     trigger_source
-        Empty: free-running. ``Software``: a frame is exposed when one is asked for. Else the input line whose
-        rising edge exposes one, by its GenICam name.
+        Empty: free-running. Else the input line whose rising edge exposes a frame, by its GenICam name.
     trigger
         The name of the hardware trigger that exposes it, the same for all cameras on it; empty: none.
     stamp
@@ -96,6 +94,8 @@ def parse_options(options: Mapping[str, Any], name: str) -> AravisOptions:
         raise read.refused("format", f" is {code!r}, which this driver does not read{nearest(code, GENICAM)}")
     rate_hz = None
     source = read.text("trigger_source", "a text", usual.trigger_source)
+    if source == "Software":
+        raise read.bad("trigger_source", "an input line, such as Line1: a request exposes no frame")
     if options.get("rate_hz", 0) is not None and not source:
         rate_hz = read.number("rate_hz", usual.rate_hz, 0.1, 1000.0)
     elif source and options.get("rate_hz") is not None:
@@ -103,20 +103,15 @@ def parse_options(options: Mapping[str, Any], name: str) -> AravisOptions:
             "rate_hz", " stands beside trigger_source; a triggered camera has no rate of its own"
         )
     exposure_s = read.number("exposure_s", None, 1e-6, 10.0)
-    if exposure_s is not None and rate_hz is not None and exposure_s > 1 / rate_hz:
-        raise read.refused(
-            "exposure_s",
-            f" is {exposure_s:g} s, longer than a frame at rate_hz {rate_hz:g} ({1 / rate_hz:.4g} s); "
-            "a shorter one, or a lower rate, is expected",
-        )
+    read.check_in_frame("exposure_s", exposure_s, rate_hz)
     stamp: Stamped = read.one_of("stamp", usual.stamp, ("start", "end", "either"))
     return AravisOptions(
         serial=serial,
         address=address,
         id=identity,
         format=code,
-        size_px=_pixels(read, "size_px", usual.size_px, 1),
-        offset_px=_pixels(read, "offset_px", usual.offset_px, 0),
+        size_px=read.wholes("size_px", 2, 1, 32768) or usual.size_px,
+        offset_px=read.wholes("offset_px", 2, 0, 32768) or usual.offset_px,
         rate_hz=rate_hz,
         colour=read.flag("colour", usual.colour),
         features=_features(read),
@@ -136,17 +131,6 @@ def _check_address(read: OptionReader, address: str) -> None:
         ipaddress.IPv4Address(address)
     except ValueError:
         raise read.bad("address", "an IPv4 address, such as 192.168.0.20") from None
-
-
-def _pixels(read: OptionReader, key: str, usual: tuple[int, int], low: int) -> tuple[int, int]:
-    """Two whole numbers of pixels."""
-    if key not in read.values:
-        return usual
-    value = read.values[key]
-    whole = isinstance(value, list | tuple) and all(is_whole(one) and low <= one <= 32768 for one in value)
-    if not whole or len(value) != 2:
-        raise read.bad(key, f"two whole numbers of pixels from {low} to 32768")
-    return int(value[0]), int(value[1])
 
 
 def _features(read: OptionReader) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from drivers.dynamixel.models import WATCHDOG_TRIPPED
 from drivers.dynamixel.pair import Axis, Pair, make_ready, open_pair
 from drivers.dynamixel.servo import Reboots, hardware_fault_words
 from drivers.dynamixel.settings import DynamixelSettings, dynamixel_settings
+from drivers.dynamixel.workshop import BENCH
 from drivers.errors import BadReply, HardwareFault, Refused
 from drivers.registry import Driver
 from drivers.serial_line import OpenLine, SerialLine
@@ -225,5 +226,6 @@ def halt(
 
 
 DRIVER = Driver(
-    lambda options, context: open_head(options, context.clock), read_options=dynamixel_settings, halt=halt
-)
+    lambda options, context: open_head(options, context.clock),
+    read_options=dynamixel_settings, halt=halt, probe=BENCH.probe, probe_order=1, bench=BENCH,
+)  # fmt: skip

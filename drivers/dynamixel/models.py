@@ -16,6 +16,7 @@ from types import MappingProxyType
 from drivers.dynamixel.registers import Register, vendor_names, vendor_table
 from drivers.errors import BadOptions
 from drivers.faults import nearest
+from drivers.servo_bus.settings import CountedModel
 
 RPM_RAD_PER_S = math.tau / 60
 REV_PER_MIN2_RAD_PER_S2 = math.tau / 3600
@@ -66,56 +67,57 @@ OPERATING_MODES = MappingProxyType(
 Words = Callable[["ServoModel", int], str]
 
 
-@dataclass(frozen=True)
-class ServoModel:
-    """One kind of servo.
+@dataclass(frozen=True, kw_only=True)
+class ServoModel(CountedModel):
+    """One kind of servo, as of `CountedModel`.
 
     Attributes
     ----------
-    velocity_unit_rad_per_s, acceleration_unit_rad_per_s2
-        Of one count of velocity and profile acceleration.
-    current_unit_A, most_current_counts
-        One count of current, and the most that its current limit may be; None and 0 for a servo that measures
-        its load only.
-    backlash_rad
-        As the maker states it; None where nothing is stated.
+    most_current_counts
+        The most that its current limit may be; 0 for a servo that measures its load only.
+    watchdog_firmware
+        The first firmware that has a bus watchdog.
     """
 
-    name: str
     number: int
     registers: Mapping[str, Register]
-    low_count: int
-    high_count: int
-    centre_count: int
-    counts_per_turn: int
-    velocity_unit_rad_per_s: float
-    acceleration_unit_rad_per_s2: float
-    current_unit_A: float | None
     most_current_counts: int
-    backlash_rad: float | None
     watchdog_firmware: int
-
-    @property
-    def count_rad(self) -> float:
-        """One count, radians."""
-        return math.tau / self.counts_per_turn
 
 
 def _x(
     name: str, number: int, current_unit_A: float | None, most_current_counts: int, backlash_deg: float | None
 ) -> ServoModel:
     """A servo of the X or MX series: 12-bit encoder on the output shaft."""
-    table = vendor_table(number, first_ram_address=64)
-    backlash = None if backlash_deg is None else math.radians(backlash_deg)
-    units = 0.229 * RPM_RAD_PER_S, 214.577 * REV_PER_MIN2_RAD_PER_S2
-    return ServoModel(name, number, *table, 4096, *units, current_unit_A, most_current_counts, backlash, 38)
+    return ServoModel(
+        name=name,
+        number=number,
+        **vendor_table(number)._asdict(),
+        count_rad=math.tau / 4096,
+        velocity_unit_rad_per_s=0.229 * RPM_RAD_PER_S,
+        acceleration_unit_rad_per_s2=214.577 * REV_PER_MIN2_RAD_PER_S2,
+        current_unit_A=current_unit_A,
+        backlash_rad=None if backlash_deg is None else math.radians(backlash_deg),
+        most_current_counts=most_current_counts,
+        watchdog_firmware=38,
+    )
 
 
 def _p(name: str, number: int, most_current_counts: int) -> ServoModel:
     """A servo of the P series: counts on the motor's side of the gear."""
-    table = vendor_table(number, first_ram_address=512)
-    turn, units = table.high_count - table.low_count, (0.01 * RPM_RAD_PER_S, 1.0 * REV_PER_MIN2_RAD_PER_S2)
-    return ServoModel(name, number, *table, turn, *units, 0.001, most_current_counts, math.radians(0.1), 0)
+    table = vendor_table(number)
+    return ServoModel(
+        name=name,
+        number=number,
+        **table._asdict(),
+        count_rad=math.tau / (table.high_count - table.low_count),
+        velocity_unit_rad_per_s=0.01 * RPM_RAD_PER_S,
+        acceleration_unit_rad_per_s2=REV_PER_MIN2_RAD_PER_S2,
+        current_unit_A=0.001,
+        backlash_rad=math.radians(0.1),
+        most_current_counts=most_current_counts,
+        watchdog_firmware=0,
+    )
 
 
 # Current units and limits, backlash: e-manual, and the makers' data sheets where they state backlash

@@ -1,8 +1,8 @@
 """Registers of servos: where they stand, by the tables that ROBOTIS ships with dynamixel-sdk.
 
 ``dynamixel_easy_sdk/control_table`` holds a file a model, with the address and size of each register, and the
-middle and the ends of the turn in position mode. Which registers are permanent, and the signs of most, are
-from the ROBOTIS e-manual (emanual.robotis.com, one page per model).
+middle and the ends of the turn in position mode. The signs of most are from the ROBOTIS e-manual
+(emanual.robotis.com, one page per model).
 """
 
 from __future__ import annotations
@@ -61,9 +61,8 @@ _WINDOWS = {
 
 @dataclass(frozen=True)
 class Register:
-    """One entry of a control table: its address, its size in bytes, whether it is signed or permanent.
+    """One entry of a control table: its address, its size in bytes, whether it is signed.
 
-    ``permanent`` registers (EEPROM) can be written only while torque is off and wear with each write.
     ``window`` is the address and the length of what is read to know the register: see `_WINDOWS`.
     """
 
@@ -71,7 +70,6 @@ class Register:
     address: int
     size: int
     signed: bool = False
-    permanent: bool = False
     window: tuple[int, int] = (0, 0)
 
     def decode(self, data: bytes) -> int:
@@ -97,12 +95,12 @@ class VendorTable(NamedTuple):
     centre_count: int
 
 
-def vendor_table(number: int, first_ram_address: int) -> VendorTable:
+def vendor_table(number: int) -> VendorTable:
     """Return what the SDK says of the model that answers a ping with a number."""
     found = _sections(_files()[number])
     turn = {name: round(float(value)) for name, value in found["type info"]}
     ends = (turn[f"value_of_{end}_radian_position"] for end in ("min", "max", "zero"))
-    return VendorTable(_registers(found["control table"], first_ram_address), *ends)
+    return VendorTable(_registers(found["control table"]), *ends)
 
 
 def vendor_names() -> Mapping[int, str]:
@@ -113,7 +111,7 @@ def vendor_names() -> Mapping[int, str]:
 def vendor_registers(number: int) -> list[Register]:
     """Return every register that the SDK's table of a model holds, by address; indirect ones are left out.
 
-    Which are permanent is not known here; signed are those that the table says to be, and positions.
+    Signed are those that the table says to be, and positions.
     """
     found = _sections(_files()[number])
     signed = {row[0] for row in found.get("unit info", []) if row[-1] == "signed"} | _SIGNED_POSITIONS
@@ -149,7 +147,7 @@ def _sections(file: Path) -> dict[str, list[list[str]]]:
     return {section: rows[1:] for section, rows in found.items()}
 
 
-def _registers(rows: Sequence[Sequence[str]], first_ram_address: int) -> Mapping[str, Register]:
+def _registers(rows: Sequence[Sequence[str]]) -> Mapping[str, Register]:
     """The registers of one model, those that the driver knows, by name."""
     places: dict[str, tuple[int, int]] = {}
     for address, length, theirs in rows:
@@ -165,7 +163,7 @@ def _registers(rows: Sequence[Sequence[str]], first_ram_address: int) -> Mapping
         first, end = min(at, tick), max(at + size, tick + 2)
         fitting = (w for w in windows if w[0] <= at and at + size <= sum(w))
         window = next(fitting, (first, end - first))
-        registers[name] = Register(name, at, size, word != name, at < first_ram_address, window)
+        registers[name] = Register(name, at, size, word != name, window)
     return MappingProxyType(registers)
 
 

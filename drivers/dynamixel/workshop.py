@@ -13,6 +13,7 @@ from drivers.clock import Clock
 from drivers.dynamixel.link import Link, Pinged
 from drivers.dynamixel.models import (
     BAUD_RATES,
+    MODELS,
     MODELS_BY_NUMBER,
     ServoModel,
     hardware_error_words,
@@ -21,11 +22,13 @@ from drivers.dynamixel.models import (
 )
 from drivers.dynamixel.registers import vendor_names, vendor_registers
 from drivers.dynamixel.servo_table import ServoTable, identified
+from drivers.dynamixel.settings import POLL_BYTES
 from drivers.errors import NoReply, Refused, WrongDevice
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.bench import (
     FoundServo,
     Scan,
+    ServoBench,
     ServoFacts,
     changing,
     check_change,
@@ -170,3 +173,11 @@ def _confirm(link: Link, servo_id: int, model: ServoModel, otherwise: str) -> No
         raise WrongDevice(otherwise) from None
     if found.model_number != model.number:
         raise WrongDevice(f"{otherwise}: model number {found.model_number} answers")
+
+
+BENCH = ServoBench(
+    "dynamixel", Link, scan, facts, set_id,
+    (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000, 6_000_000, 10_500_000, 9600),
+    (1_000_000, 57_600, 115_200, 2_000_000, 3_000_000, 4_000_000),
+    MODELS, "XL330-M288-T", POLL_BYTES,
+)  # fmt: skip

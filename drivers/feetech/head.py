@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from drivers.clock import Clock
@@ -21,6 +21,7 @@ from drivers.errors import BadOptions, BadReply, DriverError, HardwareFault, NoR
 from drivers.feetech.servos import (
     BAUD_RATES,
     LOCKED,
+    MODELS,
     MODELS_BY_NUMBER,
     POLL_BYTES,
     POSITION_MODE,
@@ -28,13 +29,17 @@ from drivers.feetech.servos import (
     FeetechLink,
     FeetechModel,
     Questions,
+    facts,
     model_named,
     open_link,
+    scan,
+    set_id,
     status_words,
 )
 from drivers.options import OptionReader
 from drivers.registry import Driver
 from drivers.serial_line import OpenLine, SerialLine
+from drivers.servo_bus.bench import ServoBench
 from drivers.servo_bus.course import ServoSample, Truth
 from drivers.servo_bus.exchange import ATTEMPTS, again
 from drivers.servo_bus.head import BusHead
@@ -127,7 +132,7 @@ def _axis(options: OptionReader, name: str) -> FeetechAxisSettings:
     if percent is not None and values["model"].is_scs:
         raise read.refused("torque_percent", f": a {values['model'].name} has no torque limit")
     axis = FeetechAxisSettings(
-        **{**values, "model": replace(values["model"], speed_unit_counts=unit)},
+        **{**values, "model": values["model"].with_speed_unit(unit)},
         torque_percent=percent,
     )
     check_axis(read, axis)
@@ -635,6 +640,12 @@ def halt(
         return halt_axes(pair)
 
 
+BENCH = ServoBench(
+    "feetech", open_link, scan, facts, set_id,
+    (1_000_000, 115_200, 500_000, 250_000, 128_000, 76_800, 57_600, 38_400), (1_000_000, 115_200, 500_000),
+    MODELS, "STS3215", POLL_BYTES,
+)  # fmt: skip
 DRIVER = Driver(
-    lambda options, context: open_head(options, context.clock), read_options=feetech_settings, halt=halt
-)
+    lambda options, context: open_head(options, context.clock),
+    read_options=feetech_settings, halt=halt, probe=BENCH.probe, probe_order=2, bench=BENCH,
+)  # fmt: skip

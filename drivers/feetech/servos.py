@@ -27,7 +27,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
 from typing import Literal
@@ -40,6 +40,7 @@ from drivers.servo_bus.bench import FoundServo, Scan, ServoFacts, changing, chec
 from drivers.servo_bus.course import ServoSample
 from drivers.servo_bus.exchange import ATTEMPTS, REPLY_TIMEOUT_S, BusLink, again
 from drivers.servo_bus.port import QUIET_S, PacketFormat, StatusPacket
+from drivers.servo_bus.settings import CountedModel
 
 BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
 """By their code: the maker's SMS_STS.h (2021, 2025), SCSCL.h (2018, 2020) and memory tables, address 6.
@@ -59,7 +60,6 @@ STATUS_WORDS = MappingProxyType(
 )
 POSITION_MODE = 0
 UNLOCKED, LOCKED = 0, 1
-FIRST_RAM_ADDRESS = 40
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,6 @@ class Register:
     address: int
     size: int = 1
     sign_bit: int | None = None
-
-    @property
-    def permanent(self) -> bool:
-        """Whether it lies in the EEPROM, which wears."""
-        return self.address < FIRST_RAM_ADDRESS
 
     def decode(self, data: bytes, order: Literal["little", "big"]) -> int:
         """Return the value of the register's bytes."""
@@ -123,64 +118,46 @@ STS = _table(
 SCS = _table(Register("protective_torque", 37), Register("protective_time", 38), Register("lock", 48))
 
 
-@dataclass(frozen=True)
-class FeetechModel:
-    """One kind of servo; attributes as of `drivers.servo_bus.settings.CountedModel`.
+@dataclass(frozen=True, kw_only=True)
+class FeetechModel(CountedModel):
+    """One kind of servo, as of `CountedModel`; the acceleration of an SCS, which has none, is assumed.
 
     Attributes
     ----------
-    number
-        What stands in its memory; None for a whole series, of which it is not compared.
+    speed_unit_counts
+        Counts a second of one unit of its speed: 1, or 50 in some firmware.
     """
 
-    name: str
-    number: int | None
     registers: Mapping[str, Register]
     order: Literal["little", "big"]
-    turn_rad: float
-    counts_per_turn: int
     speed_unit_counts: int = 1
-    current_unit_A: float | None = None
-    low_count: int = 0
-    backlash_rad: float | None = None
-
-    @property
-    def high_count(self) -> int:
-        """The highest position limit."""
-        return self.counts_per_turn - 1
-
-    @property
-    def centre_count(self) -> int:
-        """The middle of its range."""
-        return self.counts_per_turn // 2
-
-    @property
-    def count_rad(self) -> float:
-        """One count."""
-        return self.turn_rad / self.counts_per_turn
-
-    @property
-    def velocity_unit_rad_per_s(self) -> float:
-        """One count of speed."""
-        return self.speed_unit_counts * self.count_rad
-
-    @property
-    def acceleration_unit_rad_per_s2(self) -> float:
-        """One count of acceleration, 100 counts a second squared; of an SCS what is taken for it."""
-        return 100 * self.count_rad
 
     @property
     def is_scs(self) -> bool:
         """Whether it is of the SCS series: no torque limit, no acceleration, no read of several servos."""
         return self.order == "big"
 
+    def with_speed_unit(self, counts: int) -> FeetechModel:
+        """Return it with another unit of speed."""
+        return replace(self, speed_unit_counts=counts, velocity_unit_rad_per_s=counts * self.count_rad)
 
-def _sts(name: str, number: int | None) -> FeetechModel:
-    return FeetechModel(name, number, STS, "little", math.tau, 4096, current_unit_A=0.0065)
 
-
-def _scs(name: str, number: int | None) -> FeetechModel:
-    return FeetechModel(name, number, SCS, "big", math.radians(300), 1024)
+def _model(name: str, number: int | None) -> FeetechModel:
+    scs = name.startswith("SCS")
+    counts, turn_rad = (1024, math.radians(300)) if scs else (4096, math.tau)
+    return FeetechModel(
+        name=name,
+        number=number,
+        registers=SCS if scs else STS,
+        low_count=0,
+        high_count=counts - 1,
+        centre_count=counts // 2,
+        count_rad=turn_rad / counts,
+        velocity_unit_rad_per_s=turn_rad / counts,
+        acceleration_unit_rad_per_s2=100 * turn_rad / counts,
+        current_unit_A=None if scs else 0.0065,
+        order="big" if scs else "little",
+    )
 
 
 # Model numbers: lerobot's MODEL_NUMBER_TABLE; the maker publishes none.
@@ -188,8 +165,8 @@ MODELS: Mapping[str, FeetechModel] = MappingProxyType(
     {
         model.name: model
         for model in (
-            _sts("STS3215", 777), _sts("STS3250", 2825), _sts("SM8512BL", 11272), _scs("SCS0009", 1284),
-            _sts("STS", None), _sts("SMS", None), _scs("SCS", None),
+            _model("STS3215", 777), _model("STS3250", 2825), _model("SM8512BL", 11272),
+            _model("SCS0009", 1284), _model("STS", None), _model("SMS", None), _model("SCS", None),
         )
     }
 )  # fmt: skip

@@ -28,6 +28,7 @@ from drivers.flir_ptu.axis import StepAxis, StepCount
 from drivers.flir_ptu.conversation import Conversation, StopCameFirst
 from drivers.flir_ptu.options import DEVICE, Options, options_from
 from drivers.flir_ptu.unit import SupplyWatch, checked_version, measure, ready_axes
+from drivers.flir_ptu.workshop import BENCH, probe
 from drivers.interfaces import AxisMotion, HeadInfo, PanTilt, Reading
 from drivers.registry import Driver
 from drivers.serial_line import OpenLine, SerialLine
@@ -400,5 +401,6 @@ def halt(
 
 
 DRIVER = Driver(
-    lambda options, context: open_head(options, context.clock), read_options=options_from, halt=halt
-)
+    lambda options, context: open_head(options, context.clock),
+    read_options=options_from, halt=halt, probe=probe, bench=BENCH,
+)  # fmt: skip

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from typing import Any
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, Refused
 from drivers.flir_ptu import protocol as ask
 from drivers.flir_ptu.conversation import Conversation
-from drivers.flir_ptu.options import DEVICE
+from drivers.flir_ptu.options import BAUDS, DEVICE
+from drivers.probes import Ends, ProbedHead, UnitBench
 from drivers.serial_line import ByteLine, OpenLine, SerialLine
 
+ARCSEC_RAD = math.radians(1 / 3600)
+SIGNS = {"pan": -1, "tilt": 1}
+"""A unit counts pan to the left and tilt upwards, the mast to the right and upwards."""
+PROBED_BAUDS = (9600, 38_400)
+"""As units come from the factory, and as docs/how-to/hardware.md has them set up."""
 HOMING_S = 60.0
 """How long a reset may take; up to 30 s, the manual says."""
 
@@ -113,3 +121,48 @@ def _told(talk: Conversation, command: str) -> str:
     except DriverError:
         talk.in_step()
         return ""
+
+
+class UnitOnLine(ProbedHead):
+    """A unit that answered on a line."""
+
+    driver = DEVICE
+
+    def __init__(self, port: str, unit: Facts, baud: int) -> None:
+        self.port = port
+        self._unit, self._baud = unit, baud
+
+    @property
+    def summary(self) -> str:
+        """The unit's own name."""
+        return f"{self.port}: a FLIR PTU, {self._unit.version}"
+
+    def configured(self, ends: Ends, ids: Mapping[str, int]) -> tuple[dict[str, Any], Ends]:
+        """Return options whose limits the unit has too, where it reports them."""
+        ends = {axis: self._within(axis, ends[axis]) for axis in ends}
+        axes = {axis: {"sign": SIGNS[axis], "limits_rad": list(ends[axis])} for axis in ends}
+        return {"baud": self._baud, **axes}, ends
+
+    def _within(self, name: str, ends: tuple[float, float]) -> tuple[float, float]:
+        axis: AxisFacts = getattr(self._unit, name)
+        count_rad = SIGNS[name] * axis.resolution_arcsec * ARCSEC_RAD
+        reach = sorted(count_rad * end for end in (axis.lowest, axis.highest) if end is not None)
+        if len(reach) < 2:
+            return ends
+        return max(ends[0], math.ceil(1e3 * reach[0]) / 1e3), min(ends[1], math.floor(1e3 * reach[1]) / 1e3)
+
+
+def probe(
+    port: str, path: str, clock: Clock | None = None, open_line: OpenLine = SerialLine
+) -> tuple[UnitOnLine | None, str]:
+    """Return the unit of a line, as `drivers.registry.Driver.probe`.
+
+    One that answers in short form is set to its usual one, which it forgets at power-off.
+    """
+    for baud in PROBED_BAUDS:
+        with suppress(DriverError):  # no unit
+            return UnitOnLine(port, facts(path, baud, clock, open_line), baud), ""
+    return None, ""
+
+
+BENCH = UnitBench((9600, *(baud for baud in BAUDS if baud != 9600)), facts, home)

@@ -1,17 +1,24 @@
-"""Servos of any family on the bench: a scan, another id, and the records of these."""
+"""Servos of any family on the bench: a scan, a probe, another id, and the records of these."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from shlex import quote
-from typing import TypeVar
+from typing import Any, TypeVar
 
+from drivers.clock import Clock
 from drivers.errors import BadOptions, DriverError, WrongDevice
-from drivers.servo_bus.exchange import BusLink
+from drivers.probes import Ends, ProbedHead
+from drivers.serial_line import OpenLine, SerialLine
+from drivers.servo_bus.exchange import REPLY_TIMEOUT_S, BusLink
+from drivers.servo_bus.settings import CountedModel
 
 HIGHEST_ID = 252
+APPROACH_RAD = 0.02
+FASTEST_POLL_HZ, USUAL_BAUD = 50.0, 1_000_000
 L = TypeVar("L", bound=BusLink)
 
 
@@ -116,8 +123,9 @@ class Change:
 @contextmanager
 def changing(link: BusLink, family: str, old: int, new_baud: int | None) -> Iterator[Change]:
     """Say, if a change is broken off within, what the servo is left with. Raises what broke it off."""
-    line = quote(link.name) + ("" if family == "dynamixel" else f" --family {family}")
-    change = Change(line, [old], [link.baud], None if new_baud == link.baud else new_baud)
+    change = Change(
+        line_words(link.name, family), [old], [link.baud], None if new_baud == link.baud else new_baud
+    )
     try:
         yield change
     except BaseException as error:
@@ -127,3 +135,127 @@ def changing(link: BusLink, family: str, old: int, new_baud: int | None) -> Iter
         if isinstance(error, DriverError):
             raise type(error)(words, detail=error.detail) from error
         raise WrongDevice(words) from error
+
+
+def line_words(port: str, family: str) -> str:
+    """Return a line as commands name it, with the family of its servos."""
+    return f"{quote(port)} --family {family}"
+
+
+@dataclass(frozen=True)
+class ServoBench:
+    """What is done with servos of one family on the bench.
+
+    Attributes
+    ----------
+    family
+        The driver's name.
+    open
+        Called with port and rate; returns the open line.
+    scan, facts, set_id
+        As of the family's module.
+    bauds, likely_bauds
+        Rates of a scan and of a probe, that of the factory or the likeliest first.
+    models, usual_model
+        Those that the driver turns, and one for a configuration before any is plugged in.
+    poll_bytes
+        Of one reading of both servos on the wire.
+    """
+
+    family: str
+    open: Callable[[str, int], BusLink]
+    scan: Callable[..., Scan]
+    facts: Callable[[Any, int], ServoFacts]
+    set_id: Callable[..., None]
+    bauds: tuple[int, ...]
+    likely_bauds: tuple[int, ...]
+    models: Mapping[str, CountedModel]
+    usual_model: str
+    poll_bytes: int
+
+    def numbering(self, port: str, baud: int) -> str:
+        """Return the command that gives a new servo, alone on a line, the second id."""
+        return f"mastctl servo set-id {line_words(port, self.family)} 1 2 --baud {baud}"
+
+    def one_id(self, port: str, baud: int) -> str:
+        """Return what to do where one id is all that answers."""
+        return (
+            f"new servos all have the id 1; connect one at a time, and give the second another id: "
+            f"{self.numbering(port, baud)}; then connect both"
+        )
+
+    def probe(
+        self, port: str, path: str, clock: Clock | None = None, open_line: OpenLine = SerialLine
+    ) -> tuple[ServosOnLine | None, str]:
+        """Return the servos of a line, as `drivers.registry.Driver.probe`; two servos end the search."""
+        found: list[FoundServo] = []
+        garbled: list[int] = []
+        for baud in self.likely_bauds:
+            try:
+                result = self.scan(path, (baud,), REPLY_TIMEOUT_S, clock, open_line)
+            except BadOptions:
+                continue  # a rate that the adapter does not have
+            found += result.found
+            garbled += result.garbled
+            if len(found) > 1:
+                break
+        if found:
+            return ServosOnLine(self, port, tuple(found)), ""
+        if garbled:
+            return None, f"at {garbled[0]} baud something answers: {self.one_id(port, garbled[0])}"
+        return None, ""
+
+
+class ServosOnLine(ProbedHead):
+    """Servos that answered on a line, or are still to be plugged in.
+
+    Attributes
+    ----------
+    driven
+        Those that the driver turns, by id.
+    """
+
+    speed_rad_per_s = 0.8
+
+    def __init__(self, bench: ServoBench, port: str, found: Sequence[FoundServo] = ()) -> None:
+        self.bench, self.driver, self.port = bench, bench.family, port
+        self._found = found
+        self.driven = {one.servo_id: one for one in found if one.model in bench.models}
+        self.usable = bool(self.driven)
+
+    @property
+    def bauds(self) -> list[int]:
+        """The rates of those that the driver turns, the lowest first."""
+        return sorted({one.baud for one in self.driven.values()})
+
+    @property
+    def summary(self) -> str:
+        """The servos, in one sentence."""
+        names = [
+            f"{one.model} (id {one.servo_id}, {one.baud} baud)"
+            if one.model in self.bench.models
+            else f"{one.model}, which mastctl does not drive"
+            for one in sorted(self._found, key=lambda one: one.model not in self.bench.models)
+        ]
+        return f"{self.port}: {', '.join(names)}"
+
+    def configured(self, ends: Ends, ids: Mapping[str, int]) -> tuple[dict[str, Any], Ends]:
+        """Return options for servos of these ids, as found or as usual."""
+        bench = self.bench
+        baud = max(self.bauds, default=USUAL_BAUD)
+        poll_hz = min(FASTEST_POLL_HZ, math.floor(baud / (10 * bench.poll_bytes)))
+        axes = {}
+        for axis, number in ids.items():
+            like = self.driven.get(number) or next(iter(self.driven.values()), None)
+            model = bench.models[bench.usual_model if like is None else like.model]
+            axes[axis] = {
+                "id": number,
+                "model": model.name,
+                "limits_rad": list(ends[axis]),
+                "approach": "positive" if axis == "pan" else "gravity",
+                "approach_rad": max(
+                    APPROACH_RAD, 0.0 if like is None else round(1.5 * (model.backlash_rad or 0.0), 3)
+                ),
+            }
+        slow = {} if poll_hz == FASTEST_POLL_HZ else {"poll_hz": float(poll_hz)}
+        return {"baud": baud, **slow, **axes}, ends

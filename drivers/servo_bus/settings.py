@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 from drivers.approach import APPROACHES, ApproachedAxis
 from drivers.errors import BadOptions, WrongDevice
@@ -18,53 +18,35 @@ RESTING_POLL_S = 0.1  # of servos that stand: an idle computer stays idle
 LEAST_SLACK_COUNTS = 3
 
 
-class CountedModel(Protocol):
-    """A kind of servo, by its counts."""
+@dataclass(frozen=True, kw_only=True)
+class CountedModel:
+    """A kind of servo, by its counts.
 
-    @property
-    def name(self) -> str:
-        """As its maker calls it."""
-        ...
+    Attributes
+    ----------
+    name, number
+        As its maker calls it, and as its memory does; None for a whole series, of which it is not compared.
+    registers
+        Of its table, by name.
+    low_count, high_count, centre_count
+        The position limits at most, and where its own angle is zero.
+    count_rad, velocity_unit_rad_per_s, acceleration_unit_rad_per_s2, current_unit_A
+        One count of position, velocity, acceleration and current; no current where it measures none.
+    backlash_rad
+        As the maker states it; None where nothing is stated.
+    """
 
-    @property
-    def low_count(self) -> int:
-        """The lowest position limit."""
-        ...
-
-    @property
-    def high_count(self) -> int:
-        """The highest position limit."""
-        ...
-
-    @property
-    def centre_count(self) -> int:
-        """Where its own angle is zero."""
-        ...
-
-    @property
-    def count_rad(self) -> float:
-        """One count."""
-        ...
-
-    @property
-    def velocity_unit_rad_per_s(self) -> float:
-        """One count of velocity."""
-        ...
-
-    @property
-    def acceleration_unit_rad_per_s2(self) -> float:
-        """One count of acceleration."""
-        ...
-
-    @property
-    def current_unit_A(self) -> float | None:
-        """One count of current; None where it measures none."""
-        ...
-
-    @property
-    def backlash_rad(self) -> float | None:
-        """As the maker states it; None where nothing is stated."""
-        ...
+    name: str
+    number: int | None
+    registers: Mapping[str, Any]
+    low_count: int
+    high_count: int
+    centre_count: int
+    count_rad: float
+    velocity_unit_rad_per_s: float
+    acceleration_unit_rad_per_s2: float
+    current_unit_A: float | None = None
+    backlash_rad: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 from drivers import pixels
 from drivers.clock import Clock, SystemClock
-from drivers.errors import NoCamera, NoFreshFrame, StreamFailed
-from drivers.interfaces import Camera, CameraInfo, CameraSetting, FrameTime
-from drivers.newest import Counters, TimedFrame
+from drivers.errors import StreamFailed, UnsupportedFormat
+from drivers.interfaces import CameraInfo, Image
+from drivers.newest import CapturedCamera, TimedFrame
+from drivers.probes import CameraBench
 from drivers.registry import Driver
 from drivers.v4l2 import find
 from drivers.v4l2.capture import Bytes, Capture
@@ -35,8 +36,10 @@ def open_camera(options: Mapping[str, Any], clock: Clock | None = None, name: st
     return V4l2Camera(parse_options(options, name), name, clock or SystemClock())
 
 
-class V4l2Camera(Camera):
+class V4l2Camera(CapturedCamera):
     """One camera; safe from any thread."""
+
+    capture: Capture
 
     def __init__(self, options: CameraOptions, name: str, clock: Clock) -> None:
         self.name = name
@@ -63,12 +66,6 @@ class V4l2Camera(Camera):
         except BaseException:
             self._leave_group()
             raise
-        self._last: TimedFrame | None = None
-
-    @property
-    def counters(self) -> Counters:
-        """What happened to the frames so far."""
-        return self.capture.newest.counters
 
     @property
     def info(self) -> CameraInfo:
@@ -81,26 +78,9 @@ class V4l2Camera(Camera):
             trigger=self._options.trigger,
         )
 
-    def next_frame(self, exposed_after_s: float, timeout_s: float) -> TimedFrame:
-        """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.
-
-        Its stamp is at most a period and 5 ms old, or it came during the call. Raises NoFreshFrame if none
-        came within ``timeout_s`` seconds; the message says what came instead; NoCamera (at once, if the
-        camera is gone).
-        """
-        damaged = self.capture.newest.damaged
-        taken = self.capture.take(exposed_after_s, timeout_s)
-        if taken is None:
-            if lost := self.capture.lost:
-                raise NoCamera(lost)
-            words = self.capture.newest.instead(exposed_after_s, timeout_s, damaged, self._clock.now_s())
-            raise NoFreshFrame(words, device=self.name)
-        arrived, image, jpeg = taken
-        last = self._last
-        if last is not None and last.image is image:
-            return last
+    def _timed(self, arrived: Arrived, image: Image, jpeg: bytes) -> TimedFrame:
         buffer, window, exposure_s = arrived.buffer, arrived.window, arrived.timing.exposure_s
-        self._last = TimedFrame(
+        return TimedFrame(
             image=image,
             jpeg=jpeg,
             settings=arrived.settings,
@@ -114,11 +94,10 @@ class V4l2Camera(Camera):
             driver_sequence=buffer.sequence,
             stream=arrived.stream,
         )
-        return self._last
 
-    def recent_times(self) -> list[FrameTime]:
-        """Return the times of the last good frames of this stream, oldest first."""
-        return [FrameTime(frame.sequence, frame.window.begin_s) for frame in self.capture.newest.recent()]
+    def now_s(self) -> float:
+        """Return the time by the clock that its stamps are judged by."""
+        return self._clock.now_s()
 
     def abilities(self) -> dict[str, Any]:
         """Return what the camera offers, as JSON: ``formats`` and ``controls`` with their values now."""
@@ -137,14 +116,6 @@ class V4l2Camera(Camera):
                     for c in controls
                 ],
             }  # fmt: skip
-
-    def settings(self) -> list[CameraSetting]:
-        """Return exposure, gain, white balance and focus, as far as it has them. Raises DriverError."""
-        return self.capture.settings()
-
-    def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
-        """Change some of them, as `drivers.interfaces.Camera.adjust`."""
-        return self.capture.adjust(wanted)
 
     @contextmanager
     def exposure_held(self) -> Iterator[None]:
@@ -242,4 +213,20 @@ class V4l2Camera(Camera):
                 self._changing, self._asked_s = False, stream.asked_exposure_s
 
 
-DRIVER = Driver(lambda options, context: open_camera(options, context.clock, context.name))
+def present(options: Mapping[str, Any], name: str) -> str:
+    """Return which camera a configuration names, as `drivers.probes.CameraBench`. Raises DriverError."""
+    wanted = parse_options(options, name)
+    with find.open_node(wanted.address, name) as node:
+        offered, place = node.formats(), f"{node.identity.card} at {node.identity.bus}"
+    if wanted.format not in offered:
+        words = (
+            f"{place} offers {', '.join(offered)} where {wanted.format} is configured; configure one of these"
+        )
+        raise UnsupportedFormat(words, device=name)
+    return f"{place}, {wanted.format}"
+
+
+DRIVER = Driver(
+    lambda options, context: open_camera(options, context.clock, context.name),
+    probe=find.probe, bench=CameraBench("cameras", "cameras", find.table, present, find.options_for),
+)  # fmt: skip

@@ -15,6 +15,9 @@ import numpy as np
 from drivers.errors import BadOptions
 from drivers.interfaces import Image
 
+PERCENTILE, TARGET, TOLERANCE = 95.0, 180.0, 25.0
+"""The percentile of the grey levels is brought to the target, and left alone within the tolerance of it (the
+hysteresis: without it, noise alone would change the exposure again and again)."""
 SATURATED = 250
 PATIENCE = 6  # so many looks of one camera without one of the others: that one gives no pictures now
 MOST_STEP = 4.0  # no change by more than this factor at once: levels far from the target tell little
@@ -28,17 +31,11 @@ class AutoExposureSettings:
     ----------
     group
         Cameras of one name share their exposure; empty for a camera by itself.
-    percentile, target, tolerance
-        The percentile of the grey levels is brought to ``target``, and left alone within ``tolerance`` of it
-        (the hysteresis: without it, noise alone would change the exposure again and again).
     shortest_s, longest_s
         Bounds of the exposure time, seconds.
     """
 
     group: str = ""
-    percentile: float = 95.0
-    target: float = 180.0
-    tolerance: float = 25.0
     shortest_s: float = 1e-4
     longest_s: float = 0.03
 
@@ -106,7 +103,7 @@ class ExposureControl:
         Pictures taken with another exposure than the present one are not judged.
         """
         s = self._settings
-        seen = level(image, s.percentile)
+        seen = level(image, PERCENTILE)
         with self._lock:
             if self._holds or abs(exposure_s - self._exposure_s) > 1e-9:
                 return self._exposure_s
@@ -115,9 +112,9 @@ class ExposureControl:
             if self._members - set(self._levels) and self._looks[camera] < PATIENCE:
                 return self._exposure_s
             brightest = max(self._levels.values())
-            if abs(brightest - s.target) <= s.tolerance:
+            if abs(brightest - TARGET) <= TOLERANCE:
                 return self._exposure_s
-            factor = 1 / MOST_STEP if brightest >= SATURATED else s.target / max(brightest, 1.0)
+            factor = 1 / MOST_STEP if brightest >= SATURATED else TARGET / max(brightest, 1.0)
             factor = min(max(factor, 1 / MOST_STEP), MOST_STEP)
             wanted_s = min(max(self._exposure_s * factor, s.shortest_s), s.longest_s)
             if wanted_s != self._exposure_s:

@@ -13,6 +13,7 @@ from typing import Any
 
 from drivers.errors import BadOptions, DriverError, NoCamera, NoPermission, UnsupportedFormat
 from drivers.pixels import FORMATS
+from drivers.probes import ProbedCamera
 from drivers.v4l2.controls import Value
 from drivers.v4l2.node import Node, capture_nodes
 
@@ -213,3 +214,54 @@ def _node_path(word: str) -> Path:
         busses = ", ".join(c.bus for c in matches)
         raise DriverError(f"several cameras have this name; give a bus instead: {busses}", device=word)
     raise NoCamera(f"no camera of this card or bus is connected; connected are {connected}", device=word)
+
+
+LEAST_PX, USUAL_HZ = (640, 480), 30.0
+
+
+def probe() -> tuple[list[ProbedCamera], list[str], str]:
+    """Return cameras as `drivers.registry.Driver.probe`."""
+    cameras: list[ProbedCamera] = []
+    others = list(refused_nodes(capture_nodes()))
+    found = list_cameras()
+    for one in found:
+        try:
+            cameras.append(ProbedCamera(one.card, one.bus, one.node, _usual(one, found), "v4l2"))
+        except DriverError as error:
+            others.append(f"{one.card} at {one.bus}: {error}")
+    return cameras, others, ""
+
+
+def _usual(camera: FoundCamera, found: list[FoundCamera]) -> dict[str, Any]:
+    """A camera's options: its stable link, or card and bus; its format, size and rate, of now or usual.
+
+    Cameras with one serial number have one link by-id together, which can tell none of them.
+    """
+    alike = [one for one in found if one.card == camera.card]
+    by_id = len({link.name for one in alike for link in one.links if link.parent.name == "by-id"}) >= len(
+        alike
+    )
+    now = options_for(str(camera.node), None, None, None, {})
+    code, size_px = now["format"], tuple(now["size_px"])
+    with Node(camera.node) as node:
+        small = any(side < least for side, least in zip(size_px, LEAST_PX, strict=True))
+        if small and LEAST_PX in node.sizes(code)[0]:
+            size_px = LEAST_PX
+        rates_hz = node.rates_hz(code, size_px)
+    slow_hz = [rate for rate in rates_hz if rate <= USUAL_HZ + 1e-3]
+    rate = {"rate_hz": round(max(slow_hz or rates_hz), 3)} if rates_hz else {}
+    links = [link for link in camera.links if by_id or link.parent.name != "by-id"]
+    address = {"device": str(links[0])} if links else {"card": camera.card, "bus": camera.bus}
+    return {**address, "format": code, "size_px": list(size_px), **rate}
+
+
+def table() -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the connected cameras, as `drivers.probes.CameraBench`."""
+    rows = [
+        {
+            "card": c.card, "bus": c.bus, "driver": c.driver, "node": str(c.node),
+            "links": [str(link) for link in c.links],
+        }
+        for c in list_cameras()
+    ]  # fmt: skip
+    return rows, list(refused_nodes(capture_nodes()))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.faults import nearest
-from drivers.options import OptionReader, is_whole
+from drivers.options import OptionReader
 from drivers.pixels import FORMATS
 from drivers.v4l2.controls import Value
 from drivers.v4l2.exposure import AutoExposureSettings
@@ -18,7 +18,7 @@ OPTIONS = (
     "device", "card", "bus", "format", "size_px", "rate_hz", "colour", "controls", "exposure_s", "gain",
     "white_balance_k", "focus", "auto_exposure", "margin_s", "trigger", "buffers",
 )  # fmt: skip
-AUTO_EXPOSURE_OPTIONS = ("group", "percentile", "target", "tolerance", "shortest_s", "longest_s")
+AUTO_EXPOSURE_OPTIONS = ("group", "shortest_s", "longest_s")
 
 
 @dataclass(frozen=True)
@@ -81,14 +81,14 @@ def parse_options(options: Mapping[str, Any], name: str) -> CameraOptions:
     if options.get("rate_hz", 0) is not None:
         rate_hz = read.number("rate_hz", default.rate_hz, 0.1, 1000.0)
     exposure_s = read.number("exposure_s", None, 1e-5, 10.0)
-    _check_in_frame(read, "exposure_s", exposure_s, rate_hz)
+    read.check_in_frame("exposure_s", exposure_s, rate_hz)
     auto = _auto_exposure(read, rate_hz)
     if auto is not None and exposure_s is None:
         raise read.refused("auto_exposure", " needs exposure_s: the exposure time to begin with")
     return CameraOptions(
         address=address,
         format=code,
-        size_px=_size(read),
+        size_px=read.wholes("size_px", 2, 1, 16384) or default.size_px,
         rate_hz=rate_hz,
         colour=read.flag("colour", default.colour),
         controls=_controls(read),
@@ -101,16 +101,6 @@ def parse_options(options: Mapping[str, Any], name: str) -> CameraOptions:
         trigger=read.text("trigger", "a text", default.trigger),
         buffers=read.whole("buffers", default.buffers, 3, 32),
     )
-
-
-def _check_in_frame(read: OptionReader, key: str, exposure_s: float | None, rate_hz: float | None) -> None:
-    """Refuse an exposure time for which a camera would have to stretch its frames. Raises BadOptions."""
-    if exposure_s is not None and rate_hz is not None and exposure_s > 1 / rate_hz:
-        raise read.refused(
-            key,
-            f" is {exposure_s:g} s, longer than a frame at rate_hz {rate_hz:g} ({1 / rate_hz:.4g} s); "
-            "a shorter one, or a lower rate, is expected",
-        )
 
 
 def _auto_exposure(options: OptionReader, rate_hz: float | None) -> AutoExposureSettings | None:
@@ -126,28 +116,14 @@ def _auto_exposure(options: OptionReader, rate_hz: float | None) -> AutoExposure
     read = options.section("auto_exposure", "true, false or its settings", AUTO_EXPOSURE_OPTIONS)
     settings = AutoExposureSettings(
         group=read.text("group", "a text", default.group),
-        percentile=read.number("percentile", default.percentile, 1.0, 99.9),
-        target=read.number("target", default.target, 10.0, 245.0),
-        tolerance=read.number("tolerance", default.tolerance, 1.0, 100.0),
         shortest_s=read.number("shortest_s", default.shortest_s, 1e-5, 10.0),
         longest_s=read.number("longest_s", default.longest_s, 1e-5, 10.0),
     )
-    _check_in_frame(read, "longest_s", settings.longest_s, rate_hz)
+    read.check_in_frame("longest_s", settings.longest_s, rate_hz)
     if settings.shortest_s >= settings.longest_s:
         words = f" is {settings.shortest_s:g} s, expected less than longest_s ({settings.longest_s:g} s)"
         raise read.refused("shortest_s", words)
     return settings
-
-
-def _size(read: OptionReader) -> tuple[int, int]:
-    """The option ``size_px``."""
-    if "size_px" not in read.values:
-        return CameraOptions.size_px
-    value = read.values["size_px"]
-    whole = isinstance(value, list | tuple) and all(is_whole(v) and 0 < v <= 16384 for v in value)
-    if not whole or len(value) != 2:
-        raise read.bad("size_px", "[width, height] in pixels")
-    return int(value[0]), int(value[1])
 
 
 def _controls(read: OptionReader) -> dict[str, Value]:

@@ -16,7 +16,7 @@ from mastctl.cli.output import positive_number
 if TYPE_CHECKING:
     from calib.geometry.rig import Rig
     from drivers.hardware import HardwareSettings
-    from drivers.v4l2.camera import V4l2Camera
+    from drivers.registry import Driver
     from mastctl.config import Config
     from mastctl.setup.sync_sweep import Sweep
 
@@ -208,23 +208,31 @@ def add_camera_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-@contextmanager
-def opened_camera(args: argparse.Namespace) -> Iterator[V4l2Camera]:
-    """Open the camera of the arguments, by itself or by its name in a configuration, and close it."""
-    from drivers.v4l2.camera import open_camera
-    from drivers.v4l2.find import options_for
+def camera_driver() -> tuple[str, Driver]:
+    """Return the driver of cameras that a person names at the command line, with its name."""
+    from drivers.registry import drivers_of
 
+    found = drivers_of("camera").items()
+    return next(one for one in found if one[1].bench is not None and one[1].bench.options_for is not None)
+
+
+@contextmanager
+def opened_camera(args: argparse.Namespace) -> Iterator[Any]:
+    """Open the camera of the arguments, by itself or by its name in a configuration, and close it."""
+    from drivers.registry import Context
+
+    driver = camera_driver()[1]
     if args.config is not None:
         options = _configured_options(args)
     else:
-        options = options_for(
+        options = driver.bench.options_for(
             args.camera,
             args.format,
             None if args.size is None else tuple(args.size),
             args.rate,
             _settings(args.set),
         )
-    camera = open_camera(options, name=args.camera)
+    camera = driver.open(options, Context(args.camera))
     try:
         yield camera
     finally:
@@ -259,11 +267,12 @@ def with_cameras(config: Config, names: Iterable[str]) -> HardwareSettings:
 
 
 def _configured_options(args: argparse.Namespace) -> dict[str, Any]:
-    """A v4l2 camera's options in a configuration."""
+    """A camera's options in a configuration."""
     config = config_of(args)
     device = config.hardware.cameras[args.camera]
-    if device.driver != "v4l2":
-        raise output.WrongUse(f"{args.camera} in {config.path} is of driver {device.driver!r}, not 'v4l2'")
+    if device.driver != (wanted := camera_driver()[0]):
+        words = f"{args.camera} in {config.path} is of driver {device.driver!r}, not {wanted!r}"
+        raise output.WrongUse(words)
     return dict(device.options)
 
 

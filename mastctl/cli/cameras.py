@@ -12,6 +12,7 @@ from mastctl.cli import camera_mode, camera_sync, output
 from mastctl.cli.camera_sync import (
     FRAME_TIMEOUT_S,
     add_camera_options,
+    camera_driver,
     config_of,
     opened_camera,
     with_cameras,
@@ -20,7 +21,6 @@ from mastctl.cli.output import finite_number, positive_number
 from mastctl.cli.service import add_daemon_options, client_of
 
 if TYPE_CHECKING:
-    from drivers.v4l2.camera import V4l2Camera
     from mastctl.config import Config
     from mastctl.devices.frames import StampedFrame
 
@@ -104,36 +104,27 @@ def camera_settings(args: argparse.Namespace) -> int:
 
 def camera_list(args: argparse.Namespace) -> int:
     """Show the connected cameras."""
-    from dataclasses import asdict
+    from drivers.registry import drivers_of
 
-    from drivers.aravis.find import list_cameras as list_genicam
-    from drivers.v4l2 import find
-    from drivers.v4l2.node import capture_nodes
-
-    found, genicam = find.list_cameras(), list_genicam()
-    told: list[dict[str, Any]] = [
-        {
-            "node": str(c.node), "driver": c.driver, "card": c.card, "bus": c.bus,
-            "links": [str(link) for link in c.links],
-        }
-        for c in found
-    ]  # fmt: skip
-    refused = list(find.refused_nodes(capture_nodes()))
+    benches = [driver.bench for driver in drivers_of("camera").values() if driver.bench is not None]
+    tables = [(bench, *bench.table()) for bench in benches]
+    refused = [sentence for _, _, sentences in tables for sentence in sentences]
     if args.json:
-        output.print_json({"cameras": told, "genicam": [asdict(one) for one in genicam], "refused": refused})
+        output.print_json({**{bench.key: rows for bench, rows, _ in tables}, "refused": refused})
         return 0
-    if not found and not genicam:
+    if not any(rows for _, rows, _ in tables):
         sys.stdout.write("no camera is connected\n")
-    if found:
-        rows = [(c["card"], c["bus"], c["driver"], c["node"], "\n".join(c["links"]) or "-") for c in told]
-        output.print_table("cameras", ("card", "bus", "driver", "node now", "stable links"), rows)
-    if genicam:
-        titles = ("id", "serial", "address", "vendor", "model", "protocol")
-        rows = [tuple(getattr(one, title) for title in titles) for one in genicam]
-        output.print_table("cameras of GigE Vision and USB3 Vision (driver aravis)", titles, rows)
+    for bench, rows, _ in tables:
+        if rows:
+            cells = [tuple(_cell(value) for value in row.values()) for row in rows]
+            output.print_table(bench.title, tuple(rows[0]), cells)
     for line in refused:
         output.tell(line)
     return 0
+
+
+def _cell(value: Any) -> str:
+    return ("\n".join(value) or "-") if isinstance(value, list) else str(value)
 
 
 def camera_grab(args: argparse.Namespace) -> int:
@@ -251,10 +242,14 @@ def camera_check(args: argparse.Namespace) -> int:
     from calib.files.mast_file import sensor_mode_keys
     from mastctl.setup.camera_check import quality_of
 
-    if args.config is not None and (config := config_of(args)).hardware.cameras[args.camera].driver != "v4l2":
-        return _check_any(args, config)
+    if args.config is not None:
+        config = config_of(args)
+        if config.hardware.cameras[args.camera].driver != camera_driver()[0]:
+            return _check_any(args, config)
     if args.with_head:
-        raise output.WrongUse("--with-head goes with --config and a camera of another driver than v4l2")
+        raise output.WrongUse(
+            f"--with-head goes with --config and a camera of another driver than {camera_driver()[0]}"
+        )
     with opened_camera(args) as camera:
         measured = _measured(camera, args.seconds)
         frame = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
@@ -309,7 +304,7 @@ def _check_any(args: argparse.Namespace, config: Config) -> int:
     return 0 if found["frames"] else 1
 
 
-def _measured(camera: V4l2Camera, seconds: float) -> dict[str, Any]:
+def _measured(camera: Any, seconds: float) -> dict[str, Any]:
     """Rate, losses and delays over some seconds."""
     before = camera.counters
     frame = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)

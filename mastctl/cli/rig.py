@@ -11,8 +11,9 @@ from mastctl.cli.output import CommandError, WrongUse, at_least, check_folder, f
 from mastctl.cli.sim_new import folder_name
 
 if TYPE_CHECKING:
+    from drivers.probes import ProbedHead
     from mastctl.rig.drawing import RigAnswers
-    from mastctl.rig.plugged import Plugged, PluggedHead
+    from mastctl.rig.plugged import Plugged
     from mastctl.rig.questions import Prompts
 
 
@@ -66,6 +67,7 @@ def _port(text: str) -> str:
 
 def _new(args: argparse.Namespace) -> int:
     """Look, ask, write, and say what is next."""
+    from drivers.servo_bus.bench import ServosOnLine
     from mastctl.rig.folder import check_free, write_rig, write_simulated
     from mastctl.rig.plugged import look
     from mastctl.rig.questions import Prompts
@@ -83,7 +85,7 @@ def _new(args: argparse.Namespace) -> int:
     head = _head(found, questions)
     if args.port and head is None:
         raise CommandError("no_head", f"no head: {'; '.join(found.unused)}; nothing is written")
-    rates = sorted({one.baud for one in head.servos}) if head is not None else []
+    rates = head.bauds if isinstance(head, ServosOnLine) else []
     if len(rates) > 1:
         told = " and ".join(map(str, rates))
         change = "`mastctl servo set-id` with --new-baud changes a servo's"
@@ -104,8 +106,8 @@ def _new(args: argparse.Namespace) -> int:
     if args.json:
         output.print_json(
             {
-                "heads": [one.words for one in found.heads],
-                "cameras": [one.words for one in found.cameras],
+                "heads": [one.summary for one in found.heads],
+                "cameras": [one.summary for one in found.cameras],
                 "unused": list(found.unused),
                 "notes": list(made.notes),
                 "simulated": made.simulated,
@@ -121,7 +123,7 @@ def _new(args: argparse.Namespace) -> int:
     return 0
 
 
-def _head(found: Plugged, questions: Prompts) -> PluggedHead | None:
+def _head(found: Plugged, questions: Prompts) -> ProbedHead | None:
     """The head of the rig, of those that can be one."""
     heads = found.heads
     if len(heads) < 2:
@@ -132,13 +134,14 @@ def _head(found: Plugged, questions: Prompts) -> PluggedHead | None:
 
 
 def _answers(
-    args: argparse.Namespace, found: Plugged, head: PluggedHead | None, questions: Prompts
+    args: argparse.Namespace, found: Plugged, head: ProbedHead | None, questions: Prompts
 ) -> RigAnswers:
     """What the options say, else the person at the terminal, else what is usual."""
+    from drivers.servo_bus.bench import ServosOnLine
     from mastctl.rig.drawing import RigAnswers
 
     usual = RigAnswers()
-    ids = list(dict.fromkeys(one.servo_id for one in head.servos)) if head is not None else []
+    ids = list(head.driven) if isinstance(head, ServosOnLine) else []
     pan_id, tilt_id = _axes(args, ids, questions)
     ask = questions.number
 

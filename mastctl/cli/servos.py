@@ -1,4 +1,4 @@
-"""Real heads on their lines: ``mastctl servo`` (two families) and ``mastctl ptu``."""
+"""Real heads on their lines: ``mastctl servo`` (each family) and ``mastctl ptu``."""
 
 from __future__ import annotations
 
@@ -13,21 +13,8 @@ from mastctl.cli.output import CommandError, WrongUse
 REPLY_TIMEOUT_S = 0.05
 
 if TYPE_CHECKING:
-    from drivers.dynamixel.link import Link
-    from drivers.feetech.servos import FeetechLink
-    from drivers.flir_ptu.workshop import Facts
-
-
-FAMILIES = {
-    "dynamixel": (
-        57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000, 6_000_000, 10_500_000, 9600,
-    ),
-    "feetech": (1_000_000, 115_200, 500_000, 250_000, 128_000, 76_800, 57_600, 38_400),
-}  # fmt: skip
-"""The baud rates that a scan tries: every rate that ``set-id`` can give, first that of the factory."""
-
-NO_SERVOS = {"flir_ptu": "mastctl ptu info PORT"}
-"""Heads without servos, and the command that asks one."""
+    from drivers.probes import UnitBench
+    from drivers.servo_bus.bench import ServoBench
 
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
@@ -38,9 +25,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def _add_servo(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add servo with its three commands."""
-    servo = subparsers.add_parser(
-        "servo", help="find, read and number Dynamixel or Feetech servos on the bench"
-    )
+    servo = subparsers.add_parser("servo", help="find, read and number servos on the bench")
     commands = servo.add_subparsers(dest="servo_command", metavar="WHAT", required=True)
 
     scan = commands.add_parser("scan", help="ask at every baud rate which servos are there; moves nothing")
@@ -71,35 +56,44 @@ def _add_servo(subparsers: argparse._SubParsersAction[Any]) -> None:
 def _add_port(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("port", metavar="PORT", help="serial device, or a URL such as socket://host:port")
     parser.add_argument(
-        "--family", type=_family, choices=FAMILIES, default="dynamixel",
-        help="of the servos on it (default dynamixel)",
-    )  # fmt: skip
-
-
-def _family(text: str) -> str:
-    """Read a family; a head without servos is told which commands are for it (argparse ``type``)."""
-    if text in NO_SERVOS:
-        raise argparse.ArgumentTypeError(
-            f"a {text} head has no servos: '{NO_SERVOS[text]}' asks it, 'mastctl conform --config FILE "
-            "--head' tries it"
-        )
-    return text
+        "--family", metavar="DRIVER", help="of the servos on it (default: the first of the drivers)"
+    )
 
 
 def _add_baud(parser: argparse.ArgumentParser) -> None:
-    told = ", ".join(f"{family} {bauds[0]}" for family, bauds in FAMILIES.items())
     parser.add_argument(
         "--baud", type=_whole, metavar="B",
-        help=f"bits per second (default as servos come from the factory: {told})",
+        help="bits per second (default as the family's servos come from the factory)",
     )  # fmt: skip
 
 
-def _workshop(args: argparse.Namespace) -> Any:
-    """The workshop of a family of servos."""
-    from drivers.dynamixel import workshop as dynamixel
-    from drivers.feetech import servos as feetech
+def _bench(args: argparse.Namespace) -> ServoBench:
+    """The bench of a family of servos. Raises WrongUse, with the commands for a head that has none."""
+    from drivers.probes import UnitBench
+    from drivers.registry import drivers_of
+    from drivers.servo_bus.bench import ServoBench
 
-    return feetech if args.family == "feetech" else dynamixel
+    benches = {name: driver.bench for name, driver in drivers_of("head").items()}
+    families = {name: bench for name, bench in benches.items() if isinstance(bench, ServoBench)}
+    if args.family is None:
+        return next(iter(families.values()))
+    if isinstance(benches.get(args.family), UnitBench):
+        raise WrongUse(
+            f"--family: a {args.family} head has no servos: 'mastctl ptu info PORT' queries it, "
+            "'mastctl conform --config FILE --head' tries it"
+        )
+    if args.family not in families:
+        raise WrongUse(f"--family is '{args.family}', expected one of {', '.join(families)}")
+    return families[args.family]
+
+
+def _unit_bench() -> UnitBench:
+    """The bench of pan/tilt units."""
+    from drivers.probes import UnitBench
+    from drivers.registry import drivers_of
+
+    benches = (driver.bench for driver in drivers_of("head").values())
+    return next(bench for bench in benches if isinstance(bench, UnitBench))
 
 
 def _whole(text: str) -> int:
@@ -110,18 +104,9 @@ def _whole(text: str) -> int:
 
 
 @contextmanager
-def _line(args: argparse.Namespace) -> Iterator[Any]:
+def _line(args: argparse.Namespace, bench: ServoBench) -> Iterator[Any]:
     """The open line of a command."""
-    baud = FAMILIES[args.family][0] if args.baud is None else args.baud
-    link: Link | FeetechLink
-    if args.family == "feetech":
-        from drivers.feetech.servos import open_link
-
-        link = open_link(args.port, baud)
-    else:
-        from drivers.dynamixel.link import Link
-
-        link = Link(args.port, baud)
+    link = bench.open(args.port, bench.bauds[0] if args.baud is None else args.baud)
     try:
         yield link
     finally:
@@ -130,7 +115,8 @@ def _line(args: argparse.Namespace) -> Iterator[Any]:
 
 def _scan(args: argparse.Namespace) -> int:
     """List the servos of a line."""
-    result = _workshop(args).scan(args.port, args.baud or FAMILIES[args.family], REPLY_TIMEOUT_S)
+    bench = _bench(args)
+    result = bench.scan(args.port, args.baud or bench.bauds, REPLY_TIMEOUT_S)
     bauds = ", ".join(str(baud) for baud in result.bauds)
     garbled = [
         f"at {baud} baud something answered that cannot be understood: two servos of one id, or a bad line"
@@ -140,7 +126,7 @@ def _scan(args: argparse.Namespace) -> int:
         raise CommandError(
             "no_servo",
             f"no servo answered on {args.port} at {bauds} baud; "
-            + ("; ".join(garbled) or f"is its power on, is it a {args.family} servo?"),
+            + ("; ".join(garbled) or f"is its power on, is it a {bench.family} servo?"),
         )
     if args.json:
         rows = [
@@ -170,8 +156,9 @@ def _scan(args: argparse.Namespace) -> int:
 
 def _info(args: argparse.Namespace) -> int:
     """Show a servo's registers."""
-    with _line(args) as link:
-        found = _workshop(args).facts(link, args.id)
+    bench = _bench(args)
+    with _line(args, bench) as link:
+        found = bench.facts(link, args.id)
     if args.json:
         output.print_json(
             {
@@ -195,8 +182,9 @@ def _set_id(args: argparse.Namespace) -> int:
     """Change a servo's id and baud rate."""
     from mastctl.devices.opening import line_held
 
-    with line_held(args.port), _line(args) as link:
-        _workshop(args).set_id(link, args.id, args.new_id, args.new_baud, torque_off=args.torque_off)
+    bench = _bench(args)
+    with line_held(args.port), _line(args, bench) as link:
+        bench.set_id(link, args.id, args.new_id, args.new_baud, torque_off=args.torque_off)
         baud = link.baud
     if args.json:
         output.print_json({"id": args.new_id, "old_id": args.id, "baud": baud})
@@ -205,12 +193,9 @@ def _set_id(args: argparse.Namespace) -> int:
     return 0
 
 
-DEFAULT_BAUD = 9600
-
-
 def _add_ptu(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add ptu with its two commands."""
-    ptu = subparsers.add_parser("ptu", help="read and home a FLIR pan/tilt unit on the bench")
+    ptu = subparsers.add_parser("ptu", help="read and home a pan/tilt unit on the bench")
     commands = ptu.add_subparsers(dest="ptu_command", metavar="WHAT", required=True)
 
     info = commands.add_parser("info", help="show what a unit says about itself; moves nothing")
@@ -234,34 +219,27 @@ def _add_line(parser: argparse.ArgumentParser) -> None:
         "port", metavar="PORT", help="serial device, socket://HOST:4000 or rfc2217://HOST:PORT"
     )
     parser.add_argument(
-        "--baud",
-        type=_baud,
-        default=DEFAULT_BAUD,
-        metavar="B",
-        help=f"bits a second (default {DEFAULT_BAUD})",
+        "--baud", type=_baud, metavar="B", help="bits a second (default: as units come from the factory)"
     )
 
 
 def _baud(text: str) -> int:
     """Read a baud rate (argparse ``type``)."""
-    from drivers.flir_ptu.options import BAUDS
-
-    if not text.isascii() or not text.isdigit() or int(text) not in BAUDS:
-        raise argparse.ArgumentTypeError(f"'{text}' where one of {', '.join(map(str, BAUDS))} is expected")
+    bauds = sorted(_unit_bench().bauds)
+    if not text.isascii() or not text.isdigit() or int(text) not in bauds:
+        raise argparse.ArgumentTypeError(f"'{text}' where one of {', '.join(map(str, bauds))} is expected")
     return int(text)
 
 
 def _ptu_info(args: argparse.Namespace) -> int:
     """Show a unit."""
-    from drivers.flir_ptu.workshop import facts
-
-    _show(args, facts(args.port, args.baud))
+    bench = _unit_bench()
+    _show(args, bench.facts(args.port, args.baud or bench.bauds[0]))
     return 0
 
 
 def _home(args: argparse.Namespace) -> int:
     """Reset a unit, if it is really meant."""
-    from drivers.flir_ptu.workshop import home
     from mastctl.devices.opening import line_held
 
     if not args.sweep_full_range:
@@ -269,14 +247,15 @@ def _home(args: argparse.Namespace) -> int:
             "homing sweeps both axes over their full range, whatever limits are set; "
             "clear the mast, then give --sweep-full-range"
         )
+    bench = _unit_bench()
     output.tell("homing: both axes sweep their full range, up to half a minute")
     with line_held(args.port):
-        found = home(args.port, args.baud)
+        found = bench.home(args.port, args.baud or bench.bauds[0])
     _show(args, found)
     return 0
 
 
-def _show(args: argparse.Namespace, found: Facts) -> None:
+def _show(args: argparse.Namespace, found: Any) -> None:
     """Print a unit as a table or as JSON."""
     axes = {"pan": vars(found.pan), "tilt": vars(found.tilt)}
     if args.json:

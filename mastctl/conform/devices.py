@@ -12,7 +12,7 @@ from typing import Any
 
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
-from drivers.hardware import DeviceSettings, HardwareSettings
+from drivers.hardware import DeviceSettings, HardwareSettings, is_hardware
 from drivers.interfaces import Camera
 from drivers.registry import kinds_of
 from mastctl.conform.camera_checks import CAMERAS, CameraTrial
@@ -97,11 +97,12 @@ def head_under_test(
         head = opened()
         counts_rad = head.door.counts_rad.values()
         count_rad = max(counts_rad) if len(counts_rad) == 2 else None
+        again = not is_hardware("simulated", "head", settings.pan_tilt.driver)
         trial = HeadTrial(
             head, ((0.0, 0.0), (0.0, 0.0)), min(speed_rad_per_s, bounds.limits.speed_rad_per_s),
             limits_rad=ends if own_limits_rad is not None or (known and math.isinf(reach_rad)) else None,
             own_limits=own_limits_rad is not None,
-            count_rad=count_rad, open_again=None if settings.pan_tilt.driver == "sim" else opened,
+            count_rad=count_rad, open_again=opened if again else None,
         )  # fmt: skip
         if count_rad is not None:
             trial.settle_rad = head.info.settles_within_counts * count_rad
@@ -143,7 +144,7 @@ def camera_under_test(
         def opened() -> Camera:
             return stack.enter_context(open_one_camera(settings, name))
 
-        again = None if settings.cameras[name].driver in ("sim", "replay") else opened
+        again = None if not is_hardware("real", "camera", settings.cameras[name].driver) else opened
         yield CameraTrial(name, opened(), size_px, seconds, again)
 
 

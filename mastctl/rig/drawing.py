@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
 from calib.files.mast_file import MAST_SCHEMA
-from drivers.flir_ptu.workshop import AxisFacts
+from drivers.probes import ProbedCamera, ProbedHead
+from drivers.registry import drivers_of
+from drivers.servo_bus.bench import ServoBench, ServosOnLine
 from mastctl.config import CONFIG_SCHEMA
-from mastctl.rig.plugged import FAMILIES, PluggedCamera, PluggedHead
 
-ARCSEC_RAD = math.radians(1 / 3600)
 FORWARD_M, DOWN_M = 0.04, 0.02
 """Of the cameras from the meeting point of the axes."""
 MARGIN_RAD = 0.1
 """Between the limits that a head's driver holds and the soft ones."""
-APPROACH_RAD = 0.02
-PTU_SIGNS = {"pan": -1, "tilt": 1}
-"""A unit counts pan to the left and tilt upwards, the mast to the right and upwards."""
-FASTEST_POLL_HZ, USUAL_BAUD, USUAL_MODEL = 50.0, 1_000_000, "XL330-M288-T"
 
 
 @dataclass(frozen=True)
@@ -59,33 +54,35 @@ def camera_names(count: int) -> list[str]:
     return ["cam_left", "cam_right"] if count > 1 else ["cam"][:count]
 
 
+def head_to_come() -> ProbedHead:
+    """Return a head of two usual servos before it is plugged in."""
+    benches = (driver.bench for driver in drivers_of("head").values())
+    return ServosOnLine(next(bench for bench in benches if isinstance(bench, ServoBench)), "")
+
+
 def configuration(
-    head: PluggedHead | None, cameras: list[PluggedCamera], answers: RigAnswers, port: str
+    head: ProbedHead | None, cameras: list[ProbedCamera], answers: RigAnswers, port: str
 ) -> dict[str, Any]:
-    """Return the configuration; without a head, that of two XL330 which are still to be plugged in.
+    """Return the configuration; without a head, that of two usual servos which are still to be plugged in.
 
     ``port`` is what the head's line is called.
     """
     ends = {"pan": _radians(answers.pan_deg), "tilt": _radians(answers.tilt_deg)}
-    if head is not None and head.unit is not None:
-        ends = {axis: _within(ends[axis], getattr(head.unit, axis), PTU_SIGNS[axis]) for axis in ends}
-        driver, options, speed = "flir_ptu", _ptu(head.unit_baud, ends), 0.5
-    else:
-        driver = FAMILIES[0].driver if head is None or head.family is None else head.family.driver
-        options, speed = _servos(head, answers, ends), 0.8
+    head = head or head_to_come()
+    options, reached = head.configured(ends, {"pan": answers.pan_id, "tilt": answers.tilt_id})
     names = camera_names(len(cameras))
     return {
         "schema": CONFIG_SCHEMA,
         "mast_file": "mast.yaml",
         "listen": {"host": "127.0.0.1", "port": 8420},
-        "pan_tilt": {"driver": driver, "options": {"port": port, **options}},
+        "pan_tilt": {"driver": head.driver, "options": {"port": port, **options}},
         "cameras": {
             name: {"driver": camera.driver, "options": dict(camera.options)}
             for name, camera in zip(names, cameras, strict=False)
         },
         "limits": {
-            **{f"{axis}_rad": _soft(of_axis) for axis, of_axis in ends.items()},
-            "speed_rad_per_s": speed,
+            **{f"{axis}_rad": _soft(of_axis) for axis, of_axis in reached.items()},
+            "speed_rad_per_s": head.speed_rad_per_s,
         },
     }
 
@@ -104,44 +101,7 @@ def soft_limits(answers: RigAnswers) -> tuple[list[float], list[float]]:
     return _soft(_radians(answers.pan_deg)), _soft(_radians(answers.tilt_deg))
 
 
-def _within(ends: tuple[float, float], axis: AxisFacts, sign: int) -> tuple[float, float]:
-    """Limits that a unit has too, where it tells them."""
-    count_rad = sign * axis.resolution_arcsec * ARCSEC_RAD
-    reach = sorted(count_rad * end for end in (axis.lowest, axis.highest) if end is not None)
-    if len(reach) < 2:
-        return ends
-    return max(ends[0], math.ceil(1e3 * reach[0]) / 1e3), min(ends[1], math.floor(1e3 * reach[1]) / 1e3)
-
-
-def _ptu(baud: int, ends: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
-    axes = {axis: {"sign": PTU_SIGNS[axis], "limits_rad": list(ends[axis])} for axis in ends}
-    return {"baud": baud, **axes}
-
-
-def _servos(
-    head: PluggedHead | None, answers: RigAnswers, ends: Mapping[str, tuple[float, float]]
-) -> dict[str, Any]:
-    family = head.family if head is not None and head.family is not None else FAMILIES[0]
-    servos = {one.servo_id: one for one in head.servos} if head is not None else {}
-    baud = max((one.baud for one in servos.values()), default=USUAL_BAUD)
-    poll_hz = min(FASTEST_POLL_HZ, math.floor(baud / (10 * family.poll_bytes)))
-    axes = {}
-    for axis, number in (("pan", answers.pan_id), ("tilt", answers.tilt_id)):
-        like = servos.get(number) or next(iter(servos.values()), None)
-        name = USUAL_MODEL if like is None else like.model
-        backlash_rad = None if like is None else family.models[name].backlash_rad
-        axes[axis] = {
-            "id": number,
-            "model": name,
-            "limits_rad": list(ends[axis]),
-            "approach": "positive" if axis == "pan" else "gravity",
-            "approach_rad": max(APPROACH_RAD, round(1.5 * (backlash_rad or 0.0), 3)),
-        }
-    slow = {} if poll_hz == FASTEST_POLL_HZ else {"poll_hz": float(poll_hz)}
-    return {"baud": baud, **slow, **axes}
-
-
-def drawing(name: str, cameras: list[PluggedCamera], answers: RigAnswers) -> dict[str, Any]:
+def drawing(name: str, cameras: list[ProbedCamera], answers: RigAnswers) -> dict[str, Any]:
     """Return the mast file: axes that meet over the rover's origin, and cameras that look ahead."""
     names = camera_names(len(cameras))
     half_m = answers.baseline_m / 2

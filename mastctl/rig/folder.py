@@ -19,18 +19,19 @@ from calib.files.atomic import save_bytes
 from calib.files.mast_file import load_rig
 from calib.files.yaml_text import dump_mapping
 from drivers.faults import PAN_TILT
+from drivers.probes import ProbedCamera, ProbedHead
 from drivers.registry import driver_of
+from drivers.servo_bus.bench import USUAL_BAUD, ServosOnLine, line_words
 from mastctl.config import check_cameras, load_config
 from mastctl.packaged import SCHEMAS, config_folder, name_schema
 from mastctl.rig.drawing import (
-    USUAL_BAUD,
     RigAnswers,
     camera_names,
     configuration,
     drawing,
     soft_limits,
 )
-from mastctl.rig.plugged import Plugged, PluggedCamera, PluggedHead, set_id, usb_of
+from mastctl.rig.plugged import Plugged, lone_servo, usb_of
 from mastctl.setup.machine import ExaminedMachine
 from mastctl.setup.new_rig import RigNumbers, built_rig, focal_of
 from mastctl.setup.rig_folder import CONFIG, MAST, TRUE_RIG, InTheWay, write_built
@@ -83,7 +84,7 @@ def check_free(folder: Path) -> None:
 
 
 def write_rig(
-    folder: Path, plugged: Plugged, head: PluggedHead | None, answers: RigAnswers, machine: ExaminedMachine
+    folder: Path, plugged: Plugged, head: ProbedHead | None, answers: RigAnswers, machine: ExaminedMachine
 ) -> NewRigFolder:
     """Write the files of a rig with a head, cameras or both, and read them as the daemon does.
 
@@ -98,7 +99,7 @@ def write_rig(
     cameras = list(plugged.cameras)
     port = LINE if head is None or _NUMBERED.fullmatch(head.port) else head.port
     name = re.sub(r"\W+", "_", folder.resolve().name) or "rig"
-    servos = head is None or head.family is not None
+    servos = head is None or isinstance(head, ServosOnLine)
     words = f"{_CONFIG_WORDS}{_SERVO_WORDS if servos else _HEAD_WORDS}"
     files = {
         CONFIG: words.encode() + dump_mapping(configuration(head, cameras, answers, port)),
@@ -205,7 +206,7 @@ _MAST_WORDS = """\
 
 
 def _usb_of(
-    camera: PluggedCamera, machine: ExaminedMachine, by_socket: bool = False
+    camera: ProbedCamera, machine: ExaminedMachine, by_socket: bool = False
 ) -> Iterator[tuple[str, str]]:
     """What singles out a camera's node for udev; nothing for a camera without one."""
     if camera.node is None:
@@ -214,7 +215,7 @@ def _usb_of(
 
 
 def rules(
-    head: PluggedHead | None, plugged: Plugged, machine: ExaminedMachine, alike: Sequence[str] = ()
+    head: ProbedHead | None, plugged: Plugged, machine: ExaminedMachine, alike: Sequence[str] = ()
 ) -> str:
     """Return the packaged udev rules, and a stable name for each device of this rig.
 
@@ -240,7 +241,7 @@ def _rule(about: str, matches: Sequence[tuple[str, str]], name: str) -> list[str
     return [f'{about}{told}, SYMLINK+="{name}"']
 
 
-def _steps(folder: Path, head: PluggedHead | None, cameras: int) -> tuple[str, ...]:
+def _steps(folder: Path, head: ProbedHead | None, cameras: int) -> tuple[str, ...]:
     """The next three commands."""
     config = f"--config {quote(str(folder / CONFIG))}"
     rules = f"sudo cp {quote(str(folder / RULES))} /etc/udev/rules.d/ && sudo udevadm control --reload"
@@ -250,8 +251,9 @@ def _steps(folder: Path, head: PluggedHead | None, cameras: int) -> tuple[str, .
     point = f"mastctl point {config} --angles 0.2 0.0"
     by_rule = _USB.fullmatch(head.port) or cameras
     steps = (f"{rules} && sudo udevadm trigger", doctor, run) if by_rule else (doctor, run, point)
-    if head.family is not None and head.lacks and head.servos[0].servo_id == 1:
-        return set_id(head.port, head.family, head.servos[0].baud), *steps[:2]
+    lone = lone_servo(head)
+    if lone is not None and lone[1].servo_id == 1:
+        return lone[0].numbering(head.port, lone[1].baud), *steps[:2]
     return steps
 
 
@@ -287,17 +289,15 @@ def _readme(plugged: Plugged, steps: Sequence[str], notes: Sequence[str] = ()) -
 def _slow(plugged: Plugged) -> list[str]:
     """How to raise the rate of servos as they come from the factory."""
     for head in plugged.heads:
-        slow = [one for one in head.servos if one.baud < USUAL_BAUD and not head.lacks]
-        if slow and head.family is not None and head.family.driver == "dynamixel":
-            number, baud = slow[0].servo_id, slow[0].baud
-            set_id = (
-                f"mastctl servo set-id {head.port} {number} {number} --baud {baud} --new-baud {USUAL_BAUD}"
-            )
+        if isinstance(head, ServosOnLine) and len(head.driven) > 1 and head.bauds[0] < USUAL_BAUD:
+            servo = min(head.driven.values(), key=lambda one: one.baud)
+            number, line = servo.servo_id, line_words(head.port, head.driver)
+            command = f"mastctl servo set-id {line} {number} {number}"
             return [
                 "",
-                f"The servos speak {baud} baud, which delays every reading. This raises one servo's rate:",
+                f"The servos speak {servo.baud} baud, which delays every reading. This raises one's rate:",
                 "",
-                f"`{set_id}`",
+                f"`{command} --baud {servo.baud} --new-baud {USUAL_BAUD}`",
                 "",
                 f"Do so for each, then write `baud: {USUAL_BAUD}` and take `poll_hz` out of {CONFIG}.",
                 "",

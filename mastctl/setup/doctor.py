@@ -10,15 +10,12 @@ from typing import Any
 
 from calib.errors import BadFile
 from calib.files.mast_file import load_rig
-from drivers.aravis import find as genicam
-from drivers.aravis import library as genicam_library
-from drivers.aravis import options as genicam_options
 from drivers.errors import BadOptions, CameraBusy, DriverError, NoCamera, NoPermission
 from drivers.faults import PAN_TILT
-from drivers.hardware import DeviceSettings, clock_for
-from drivers.registry import driver_of, installed_drivers
-from drivers.v4l2 import find
-from drivers.v4l2.options import parse_options
+from drivers.hardware import DeviceSettings, clock_for, is_hardware
+from drivers.probes import UnitBench
+from drivers.registry import Driver, driver_of, installed_drivers
+from drivers.servo_bus.bench import ServoBench, line_words
 from mastctl.config import Config, check_cameras, load_config
 from mastctl.safety.state_folder import usual_folder
 from mastctl.setup.machine import (
@@ -70,10 +67,7 @@ def examine(
     yield from _head_line(config, machine)
     yield from examine_drivers(installed_drivers())
     for name, camera in config.hardware.cameras.items():
-        if camera.driver == "aravis":
-            yield examine_genicam(name, camera.options, in_use=status is not None)
-        elif camera.driver == "v4l2":
-            yield examine_camera(name, camera.options, in_use=status is not None)
+        yield from examine_camera(name, camera, in_use=status is not None)
     yield from _simulation(config)
     yield from examine_folder(
         "state folder", config.state_folder or usual_folder(config.path, config.listen.url)
@@ -149,46 +143,43 @@ def _head_line(config: Config, machine: ExaminedMachine) -> Iterator[DoctorFindi
     if driver.hardware != "real":
         return
     if driver.read_options is None:
-        yield DoctorFinding("head", "unsure", f"{head.driver} is from outside; it is not looked at", "")
+        yield DoctorFinding("head", "unsure", f"{head.driver} is from outside; it is not examined", "")
     elif isinstance(port, str):
         yield from examine_port(port, machine)
-        yield _head_options(head, driver.read_options)
-        yield from _servos(head.driver, head.options, port)
+        yield from _head_options(head, driver, port)
     else:
         words = f"driver {head.driver} has no 'port' in its options"
         yield DoctorFinding("port", "bad", words, "name the serial device; docs/reference/configuration.md")
 
 
-def _head_options(head: DeviceSettings, read_options: Callable[[Mapping[str, Any]], Any]) -> DoctorFinding:
-    """Whether the driver takes the head's options, and what asks such a head; it is not asked here."""
+def _head_options(head: DeviceSettings, driver: Driver, port: str) -> Iterator[DoctorFinding]:
+    """Whether the driver takes the head's options, and what queries such a head; it is not queried here."""
+    assert driver.read_options is not None
     try:
-        read = read_options(head.options)
+        read = driver.read_options(head.options)
     except BadOptions as error:
         advice = "correct the configuration; docs/how-to/hardware.md has every option"
-        return DoctorFinding("head", "bad", str(error), advice)
-    words = f"driver {head.driver}, {read.baud} baud"
-    if head.driver == "flir_ptu":
-        words += f"; 'mastctl ptu info {quote(read.port)} --baud {read.baud}' asks it"
-    return DoctorFinding("head", "good", words)
-
-
-def _servos(driver: str, options: Mapping[str, Any], port: str) -> Iterator[DoctorFinding]:
-    """Which servo is which axis, and how a new one gets its id: no servo is asked here."""
-    axes = (options.get("pan"), options.get("tilt"))
-    ids = [axis["id"] for axis in axes if isinstance(axis, Mapping) and isinstance(axis.get("id"), int)]
-    if len(ids) != 2:
+        yield DoctorFinding("head", "bad", str(error), advice)
         return
-    at = quote(port) + ("" if driver == "dynamixel" else f" --family {driver}")
-    words = f"pan is servo {ids[0]} and tilt servo {ids[1]}; 'mastctl servo scan {at}' asks which answer"
+    words = f"driver {head.driver}, {read.baud} baud"
+    if isinstance(driver.bench, UnitBench):
+        words += f"; 'mastctl ptu info {quote(read.port)} --baud {read.baud}' queries it"
+    yield DoctorFinding("head", "good", words)
+    if not isinstance(driver.bench, ServoBench):
+        return
+    ids, line = (read.pan.servo_id, read.tilt.servo_id), line_words(port, head.driver)
+    words = f"pan is servo {ids[0]} and tilt servo {ids[1]}; 'mastctl servo scan {line}' shows which answer"
     new = next((number for number in ids if number != 1), 2)
-    advice = f"a new servo has the id 1: connect it alone, then mastctl servo set-id {at} 1 {new}"
+    advice = f"a new servo has the id 1: connect it alone, then mastctl servo set-id {line} 1 {new}"
     yield DoctorFinding("servos", "good", words, advice)
 
 
 def _simulation(config: Config) -> Iterator[DoctorFinding]:
     """Whether what simulates can be had."""
-    drivers = [config.hardware.pan_tilt.driver, *(one.driver for one in config.hardware.cameras.values())]
-    if "sim" not in drivers:
+    cameras = config.hardware.cameras.values()
+    if not is_hardware("simulated", "head", config.hardware.pan_tilt.driver) and not any(
+        is_hardware("simulated", "camera", camera.driver) for camera in cameras
+    ):
         return
     try:
         clock_for(config.hardware)
@@ -202,64 +193,29 @@ def _simulation(config: Config) -> Iterator[DoctorFinding]:
         yield DoctorFinding("simulation", "good", f"a simulated rover, rendered by numba {numba.__version__}")
 
 
-def examine_camera(name: str, options: Mapping[str, Any], *, in_use: bool) -> DoctorFinding:
-    """Look at one V4L2 camera; no stream is begun.
-
-    Parameters
-    ----------
-    name
-        As the configuration calls it.
-    options
-        Of the driver ``v4l2``.
-    in_use
-        Whether a daemon that runs may have it.
-    """
+def examine_camera(name: str, camera: DeviceSettings, *, in_use: bool) -> Iterator[DoctorFinding]:
+    """Examine one camera; no stream is begun. ``in_use``: whether a daemon that runs may have it."""
     what = f"camera {name}"
     try:
-        asked = parse_options(options, name)
-        with find.open_node(asked.address, name) as node:
-            offered = node.formats()
-            who = node.identity
+        bench = driver_of("camera", camera.driver, name).bench
+        if bench is not None:
+            yield DoctorFinding(what, "good", bench.present(camera.options, name))
     except BadOptions as error:
-        return DoctorFinding(what, "bad", str(error), "correct the configuration")
-    except NoCamera as error:
-        return DoctorFinding(
-            what, "bad", str(error), "plug it in; mastctl camera list shows what is connected"
-        )
+        yield DoctorFinding(what, "bad", str(error), "correct the configuration")
     except NoPermission as error:
-        return DoctorFinding(what, "bad", str(error))  # it names the group, and how to join it
-    except CameraBusy as error:
-        if in_use:
-            return DoctorFinding(what, "good", str(error))
-        return DoctorFinding(what, "bad", str(error), "end the program that has it")
+        yield DoctorFinding(what, "bad", str(error))  # it names the group, and how to join it
+    except (NoCamera, CameraBusy) as error:
+        busy = isinstance(error, CameraBusy)
+        remedy = (
+            "end the program that has it"
+            if busy
+            else "plug it in; mastctl camera list shows what is connected"
+        )
+        yield DoctorFinding(
+            what, "good" if busy and in_use else "bad", str(error), "" if busy and in_use else remedy
+        )
     except DriverError as error:
-        return DoctorFinding(what, "bad", str(error), "mastctl camera check says more")
-    if asked.format not in offered:
-        words = f"{who.card} at {who.bus} offers {', '.join(offered)} where {asked.format} is configured"
-        return DoctorFinding(what, "bad", words, "configure one of these")
-    return DoctorFinding(what, "good", f"{who.card} at {who.bus}, {asked.format}")
-
-
-def examine_genicam(name: str, options: Mapping[str, Any], *, in_use: bool) -> DoctorFinding:
-    """Look whether a GigE Vision or USB3 Vision camera answers; it is not opened. As `examine_camera`."""
-    what = f"camera {name}"
-    try:
-        asked = genicam_options.parse_options(options, name)
-        genicam_library.library(name)
-    except BadOptions as error:
-        needs = not genicam_library.installed()
-        advice = genicam_library.INSTALL if needs else "correct the configuration"
-        return DoctorFinding(what, "bad", str(error), advice)
-    found = [one for one in genicam.list_cameras() if genicam.is_meant(asked, one)]
-    if len(found) == 1:
-        return DoctorFinding(what, "good", found[0].words)
-    if found:
-        words = f"several cameras have {asked.words}: {', '.join(one.id for one in found)}"
-        return DoctorFinding(what, "bad", words, "give its id")
-    words = f"no camera with {asked.words} answers"
-    if in_use or asked.address:  # one beyond a router does not answer to a search
-        return DoctorFinding(what, "unsure", f"{words} to a search", "mastctl camera check says more")
-    return DoctorFinding(what, "bad", words, "plug it in; mastctl camera list shows what is connected")
+        yield DoctorFinding(what, "bad", str(error), "mastctl camera check says more")
 
 
 OLD_DAYS = 180

@@ -24,7 +24,7 @@ Level = Literal["good", "unsure", "bad"]
 
 @dataclass(frozen=True)
 class DoctorFinding:
-    """One thing that was looked at.
+    """One thing that was examined.
 
     Attributes
     ----------

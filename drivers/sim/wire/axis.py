@@ -22,9 +22,6 @@ WARM_C = 35.0
 HOTTEST_C = 125.0
 """Where a temperature ramp ends."""
 
-FALL_RAD_PER_S, FALL_RAD_PER_S2 = 1.0, 2.0
-"""How fast a limp axis falls, gears and friction holding it back (assumed)."""
-
 _FAR_RAD = 1e4
 _FASTEST_RAD_PER_S = 100.0
 _STEEPEST_RAD_PER_S2 = 1e4
@@ -44,8 +41,6 @@ class WireAxis:
         The panel that is asked for faults of ``pan_tilt``; none when left out.
     number
         0 for pan, 1 for tilt: which faults concern it.
-    falls_to_rad
-        Where a limp axis falls to; None: friction holds it.
     resumes
         Whether it goes on to where it was sent when a fault that held it is over.
     """
@@ -56,7 +51,6 @@ class WireAxis:
         faults: FaultPanel | None = None,
         *,
         number: Literal[0, 1] = 0,
-        falls_to_rad: float | None = None,
         start_rad: float = 0.0,
         time_s: float = 0.0,
         resumes: bool = True,
@@ -64,7 +58,6 @@ class WireAxis:
         self.settings = settings
         self._faults = faults
         self._number = number
-        self._falls_to_rad = falls_to_rad
         self._resumes = resumes
         self._lock = threading.RLock()
         self._axis = Axis.resting(settings, time_s, start_rad)
@@ -123,11 +116,8 @@ class WireAxis:
                 self._continue(self._axis.motion.stopped(time_s, acceleration), time_s)
 
     def limp(self, time_s: float) -> None:
-        """Let the motor go: friction brakes it, or it falls."""
-        if self._falls_to_rad is None:
-            self.halt(time_s)
-        else:
-            self.goal(time_s, self._falls_to_rad, FALL_RAD_PER_S, FALL_RAD_PER_S2)
+        """Let the motor go: friction brakes and holds it."""
+        self.halt(time_s)
 
     def angle_rad(self, time_s: float) -> float:
         """Return where the motor is as its encoder has it, with the encoder's faults."""

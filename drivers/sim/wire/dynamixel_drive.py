@@ -27,30 +27,18 @@ _HOMING_LIMIT = 1024  # beyond it position control ignores the homing offset
 
 
 class Drive:
-    """The moving half of one servo.
-
-    Parameters
-    ----------
-    zero_counts
-        Raw count at axis angle 0.
-    sign
-        1 or -1: whether counts grow with the axis angle.
-    """
+    """The moving half of one servo; its raw count grows with the axis angle."""
 
     def __init__(
         self,
         model: SimulatedModel,
         table: ControlTable,
         axis: WireAxis,
-        zero_counts: int,
-        sign: int,
         time_s: float,
     ) -> None:
         self.axis = axis
         self._model = model
         self._table = table
-        self._zero = zero_counts
-        self._sign = sign
         self._shift = 0
         self._motion = Motion.at_rest(time_s, self._place_rad(time_s))
         self._profile = 0
@@ -68,7 +56,7 @@ class Drive:
 
     def _turned(self, angle_rad: float) -> float:
         """Raw counts at an axis angle, in the servo's direction."""
-        raw = self._zero + self._sign * angle_rad / self._model.count_rad
+        raw = self._model.zero_counts + angle_rad / self._model.count_rad
         return self._direction() * raw
 
     def _counts(self, angle_rad: float) -> int:
@@ -76,7 +64,7 @@ class Drive:
 
     def _angle_rad(self, counts: int) -> float:
         raw = self._direction() * (counts - self._homing() + self._shift)
-        return self._sign * (raw - self._zero) * self._model.count_rad
+        return (raw - self._model.zero_counts) * self._model.count_rad
 
     def _place_rad(self, time_s: float) -> float:
         """The encoder's angle; where a fault makes it absurd, the load's, so that no turn is lost."""
@@ -95,7 +83,7 @@ class Drive:
 
     def velocity(self, time_s: float) -> int:
         """Return Present Velocity."""
-        speed = self._sign * self._direction() * self.axis.velocity_rad_per_s(time_s)
+        speed = self._direction() * self.axis.velocity_rad_per_s(time_s)
         return round(speed / self._model.velocity_unit_rad_per_s)
 
     # Orders
@@ -173,7 +161,7 @@ class Drive:
 
     def _turn(self, time_s: float, speed_rad_per_s: float) -> None:
         """Turn for ever, in the direction that the servo calls positive."""
-        speed = self._sign * self._direction() * speed_rad_per_s
+        speed = self._direction() * speed_rad_per_s
         acceleration = self._acceleration_rad_per_s2()
         if self._timed() and self._table["profile_acceleration"] > 0:
             change = abs(speed - self.axis.velocity_rad_per_s(time_s))
@@ -223,7 +211,7 @@ class Drive:
 
     def trajectory_velocity(self, time_s: float) -> int:
         """Return Velocity Trajectory."""
-        speed = self._sign * self._direction() * self._trajectory(time_s)[1]
+        speed = self._direction() * self._trajectory(time_s)[1]
         return round(speed / self._model.velocity_unit_rad_per_s)
 
     def pushes(self, time_s: float) -> bool:
@@ -241,5 +229,5 @@ class Drive:
         if not self._on():
             return 0.0
         friction = math.tanh(self.axis.velocity_rad_per_s(time_s) / 0.05) * 0.08
-        push = self._sign * self._direction() * (friction + 12.0 * self.error_rad(time_s))
+        push = self._direction() * (friction + 12.0 * self.error_rad(time_s))
         return max(-1.0, min(1.0, push))

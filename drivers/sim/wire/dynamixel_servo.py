@@ -45,10 +45,6 @@ class SimulatedServo:
     ----------
     model
         Its name, in any spelling that `dynamixel_models.model_named` takes.
-    zero_counts
-        Count at axis angle 0 (with homing offset 0 and normal direction); left out, the middle of the range.
-    sign
-        1 or -1: whether counts grow with the axis angle.
     settings
         Initial values of registers, by name; those of the EEPROM outlast a reboot.
 
@@ -64,8 +60,6 @@ class SimulatedServo:
         servo_id: int,
         axis: WireAxis,
         *,
-        zero_counts: int | None = None,
-        sign: int = 1,
         settings: Mapping[str, int] | None = None,
         time_s: float = 0.0,
     ) -> None:
@@ -83,8 +77,7 @@ class SimulatedServo:
                 )
         self.table.values.update({"model_number": self.model.number, "firmware_version": self.model.firmware})
         self.table.values.update({"id": servo_id, **(settings or {})})
-        zero = self.model.zero_counts if zero_counts is None else zero_counts
-        self.drive = Drive(self.model, self.table, axis, zero, sign, time_s)
+        self.drive = Drive(self.model, self.table, axis, time_s)
         self._axis = axis
         self._backup: dict[str, int] = {}
         self._backup_pointers: list[int] = []

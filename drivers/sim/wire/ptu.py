@@ -171,9 +171,6 @@ class SimulatedPtu:
         A name of ``drivers.sim.wire.ptu_axis.MODELS``.
     step_mode
         F, H, Q, E or A; as delivered when left out.
-    signs
-        Whether positions of pan and tilt grow (1) or fall (-1) with the axis angle. By default pan falls:
-        the unit counts to the left, the mast to the right.
     """
 
     def __init__(
@@ -183,7 +180,6 @@ class SimulatedPtu:
         tilt: WireAxis,
         *,
         step_mode: str | None = None,
-        signs: tuple[int, int] = (-1, 1),
         baud: int = 9600,
     ) -> None:
         if model not in MODELS:
@@ -194,7 +190,7 @@ class SimulatedPtu:
         if baud not in BAUD_RATES:
             rates = ", ".join(str(rate) for rate in BAUD_RATES)
             raise BadOptions(f"a pan/tilt unit has no baud rate {baud}; there is {rates}")
-        self._unit = PtuUnit(MODELS[model], pan, tilt, mode, signs, baud)
+        self._unit = PtuUnit(MODELS[model], pan, tilt, mode, baud)
         self._received = bytearray()
 
     @property

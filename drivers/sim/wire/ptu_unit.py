@@ -29,7 +29,7 @@ class PtuUnit:
 
     Parameters
     ----------
-    model, pan, tilt, step_mode, signs, baud
+    model, pan, tilt, step_mode, baud
         As ``drivers.sim.wire.ptu.SimulatedPtu``.
 
     Attributes
@@ -51,13 +51,12 @@ class PtuUnit:
         pan: WireAxis,
         tilt: WireAxis,
         step_mode: str,
-        signs: tuple[int, int],
         baud: int,
     ) -> None:
         self.model = model
         known = model.unsure_arcsec is None
-        self.pan = PtuAxis("Pan", model, pan, signs[0], step_mode, known)
-        self.tilt = PtuAxis("Tilt", model, tilt, signs[1], step_mode, known)
+        self.pan = PtuAxis("Pan", model, pan, -1, step_mode, known)  # the unit counts to the left
+        self.tilt = PtuAxis("Tilt", model, tilt, 1, step_mode, known)
         self.axes: Mapping[str, PtuAxis] = {"P": self.pan, "T": self.tilt}
         self.echo = not model.e_series
         self.verbose = True

@@ -141,8 +141,6 @@ class GigeCamera:
         Registers that it refuses to have written.
     sends_us
         The exposure time of the chunk data where it is to be another than the true one.
-    ignores, triggers
-        So many software triggers it takes next without exposing anything, and how many it took.
     delay_s
         From the middle of a frame's exposure to its first packet, beside half the exposure.
     """
@@ -157,7 +155,6 @@ class GigeCamera:
         self.gains: list[float] = []  # of every frame
         self.behind = 0
         self.sends_us: float | None = None
-        self.ignores = self.triggers = 0
         self.refuses: set[int] = set()
         self._chunks_on: dict[int, int] = {}
         self._written_settings: list[tuple[float, float]] = []  # exposure time and gain, not yet in force
@@ -270,12 +267,6 @@ class GigeCamera:
     def _written(self, at: int) -> None:
         if at == LATCH:
             struct.pack_into(">Q", self._memory, LATCHED, self._ticks(time.monotonic()))
-        if at == SOFTWARE and self._get(RUNS) and self._get(TRIGGERED) and self._get(SOURCE) == 0:
-            self.triggers += 1
-            self.ignores -= 1
-            if self.ignores < 0:
-                self.ignores = 0
-                threading.Thread(target=self._expose, daemon=True).start()
         if at == CHUNK_ON:
             self._chunks_on[self._get(CHUNK_SELECTOR)] = self._get(CHUNK_ON)
         if at == EXPOSURE:

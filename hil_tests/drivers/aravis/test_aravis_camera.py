@@ -111,65 +111,6 @@ def test_frames_that_never_came_are_counted_by_their_numbers(device: GigeCamera)
     camera.close()
 
 
-def test_the_software_trigger_exposes_when_a_frame_is_asked_for(device: GigeCamera) -> None:
-    camera = opened(rate_hz=None, trigger_source="Software")
-    with pytest.raises(NoFreshFrame):
-        camera.next_frame(time.monotonic() + 3600.0, 0.05)  # a triggered frame is no proof of the future
-    until(lambda: device.frames == 1, "the frame of that request")
-    before = device.frames
-    for count in range(1, 6):
-        asked_s = time.monotonic()
-        frame = camera.next_frame(asked_s, NET_S)
-        assert device.frames == before + count
-        assert device.exposed_s[frame.driver_sequence - 1][0] >= asked_s
-        assert truly_inside(frame, device)
-    camera.close()
-
-
-@pytest.fixture(params=[False, True], ids=["clock not readable", "clock readable"])
-def either_clock(request: pytest.FixtureRequest) -> Iterator[GigeCamera]:
-    camera = GigeCamera(ADDRESS, clock_readable=request.param, clock_ahead_s=-55.0)
-    yield camera
-    while OPENED:
-        OPENED.pop().close()
-    camera.unplug()
-
-
-def fresh(camera: AravisCamera, device: GigeCamera) -> TimedFrame:
-    """The frame of a request, which was truly exposed after it."""
-    asked_s = time.monotonic()
-    frame = camera.next_frame(asked_s, NET_S)
-    assert device.exposed_s[frame.driver_sequence - 1][0] >= asked_s
-    assert truly_inside(frame, device)
-    return frame
-
-
-@pytest.mark.parametrize("how", ["ignored", "lost", "late"])
-def test_after_a_trigger_without_a_frame_the_next_request_has_its_own(
-    either_clock: GigeCamera, how: str
-) -> None:
-    device = either_clock
-    camera = opened(rate_hz=None, trigger_source="Software")
-    for _ in range(2):
-        gone = fresh(camera, device).driver_sequence + 1
-        device.ignores = int(how == "ignored")
-        device.delay_s = 0.3 if how == "late" else 0.001
-        device.lose = lambda frame, packet, gone=gone: how == "lost" and frame == gone  # type: ignore[misc]
-        with pytest.raises(NoFreshFrame):
-            camera.next_frame(time.monotonic(), 0.05)
-        device.delay_s = 0.001
-        fresh(camera, device)
-    assert fresh(camera, device).driver_sequence == device.frames
-
-
-def test_a_request_triggers_again_after_a_damaged_frame(either_clock: GigeCamera) -> None:
-    device = either_clock
-    camera = opened(rate_hz=None, trigger_source="Software")
-    gone = fresh(camera, device).driver_sequence + 1
-    device.lose = lambda frame, packet: frame == gone
-    assert fresh(camera, device).driver_sequence > gone
-
-
 @pytest.mark.parametrize("sends_us", [-4000.0, float("nan")])
 def test_an_impossible_exposure_time_is_left_out_and_logged_once(
     device: GigeCamera, sends_us: float, caplog: pytest.LogCaptureFixture

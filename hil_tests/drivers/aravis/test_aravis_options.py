@@ -19,6 +19,7 @@ from drivers.errors import BadOptions
         ({"serial": "1", "format": "mono8"}, "format is 'mono8', which this driver does not read"),
         ({"serial": "1", "exposure_s": 0.05}, "longer than a frame at rate_hz 30"),
         ({"serial": "1", "trigger_source": "Line1", "rate_hz": 10}, "rate_hz stands beside trigger_source"),
+        ({"serial": "1", "trigger_source": "Software"}, "'Software', expected an input line"),
         ({"serial": "1", "features": {"Gain Auto": "Off"}}, "features is"),
     ],
 )

@@ -102,6 +102,6 @@ def test_both_count_as_the_maker_does(
     name: str, counts_per_turn: int, rpm: float, rev_per_min2: float
 ) -> None:
     for model in (driver.MODELS[name], dynamixel_models.model_named(name)):
-        assert model.counts_per_turn == counts_per_turn
+        assert round(math.tau / model.count_rad) == counts_per_turn
         assert model.velocity_unit_rad_per_s == pytest.approx(rpm * math.tau / 60)
         assert model.acceleration_unit_rad_per_s2 == pytest.approx(rev_per_min2 * math.tau / 3600)

@@ -373,7 +373,7 @@ def test_a_given_frame_does_not_change_with_its_buffer(bench: Bench, camera: V4l
         ({"card": "a", "format": "H264"}, "options.format is 'H264', which this driver does not read"),
         (
             {"card": "a", "size_px": [640]},
-            r"options.size_px is \[640\], expected \[width, height\] in pixels",
+            r"options.size_px is \[640\], expected 2 whole numbers from 1 to 16384",
         ),
         ({"card": "a", "rate_hz": float("nan")}, "options.rate_hz is nan"),
         ({"card": "a", "buffers": 1}, "options.buffers is 1, expected a whole number from 3 to 32"),

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.v4l2.exposure import GROUPS, AutoExposureSettings, ExposureControl
+from drivers.v4l2.exposure import GROUPS, TARGET, TOLERANCE, AutoExposureSettings, ExposureControl
 
-SETTINGS = AutoExposureSettings(percentile=95, target=180, tolerance=25, shortest_s=1e-4, longest_s=0.03)
+SETTINGS = AutoExposureSettings(shortest_s=1e-4, longest_s=0.03)
 
 
 def picture(light: float, exposure_s: float) -> np.ndarray:
@@ -25,7 +25,7 @@ def test_the_percentile_comes_to_the_target_and_stays(light: float) -> None:
     control = ExposureControl(SETTINGS, 0.005)
     exposures_s = settle(control, light)
     level = np.percentile(picture(light, control.exposure_s), 95)
-    assert abs(level - SETTINGS.target) <= SETTINGS.tolerance
+    assert abs(level - TARGET) <= TOLERANCE
     assert exposures_s[-6:] == [exposures_s[-1]] * 6
 
 
@@ -54,7 +54,7 @@ def test_cameras_of_a_group_have_one_exposure_by_the_brightest() -> None:
             left.see("left", picture(3e4, left.exposure_s), left.exposure_s)
             right.see("right", picture(6e4, right.exposure_s), right.exposure_s)
         level = np.percentile(picture(6e4, right.exposure_s), 95)
-        assert abs(level - settings.target) <= settings.tolerance
+        assert abs(level - TARGET) <= TOLERANCE
     finally:
         GROUPS.leave("left", settings)
         GROUPS.leave("right", settings)

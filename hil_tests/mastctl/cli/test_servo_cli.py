@@ -135,7 +135,7 @@ def test_set_id_drops_torque_only_when_told_to(bench: Bench, capsys: pytest.Capt
     ("words", "error"),
     [
         (("info", "foo://x", "1"), "protocol 'foo' not known"),
-        (("info", "PORT", "1", "--family", "flir_ptu"), "no servos: 'mastctl ptu info PORT' asks it"),
+        (("info", "PORT", "1", "--family", "flir_ptu"), "no servos: 'mastctl ptu info PORT' queries it"),
     ],
 )
 def test_wrong_use_is_one_line_and_exit_2(

@@ -7,10 +7,8 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import jsonschema_rs
@@ -21,10 +19,11 @@ from calib.files.atomic import save_bytes
 from calib.files.mast_file import load_rig
 from calib.files.yaml_text import parse_mapping
 from drivers.dynamixel.settings import dynamixel_settings
-from drivers.dynamixel.workshop import FoundServo
+from drivers.dynamixel.workshop import BENCH, FoundServo
 from drivers.feetech.head import feetech_settings
 from drivers.flir_ptu.options import options_from
-from drivers.flir_ptu.workshop import facts as ptu_facts
+from drivers.probes import ProbedCamera
+from drivers.servo_bus.bench import ServosOnLine
 from drivers.sim.heads import PRESETS, HeadSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
@@ -43,12 +42,13 @@ from mastctl.rig import folder as folder_module
 from mastctl.rig import plugged
 from mastctl.rig.drawing import RigAnswers
 from mastctl.rig.folder import CONFIG, MAST, README, RULES, write_rig
-from mastctl.rig.plugged import FAMILIES, Plugged, PluggedCamera, PluggedHead
+from mastctl.rig.plugged import Plugged, head_probes
 from mastctl.rig.questions import Prompts
 from mastctl.setup import doctor
 from mastctl.setup.machine import ExaminedMachine
 
 X = PRESETS["dynamixel_x"]
+HEAD_PROBES = head_probes()
 
 
 class Bench:
@@ -76,9 +76,8 @@ class Bench:
         """The line's name, while the device is on it."""
         line = MemoryLine(device, self.clock)
         asked = {"clock": self.clock, "open_line": lambda port, *rest: line.open(line.path, *rest)}
-        families = tuple(replace(one, scan=partial(one.scan, **asked)) for one in FAMILIES)
-        self._patch.setattr(plugged, "FAMILIES", families)
-        self._patch.setattr(plugged, "flir_ptu", SimpleNamespace(facts=partial(ptu_facts, **asked)))
+        probes = [partial(probe, **asked) for probe in HEAD_PROBES]
+        self._patch.setattr(plugged, "head_probes", lambda: probes)
         self._patch.setattr(plugged, "examine_port", lambda port, machine: ())
         with self.clock.at_work(), line:
             yield "/dev/ttyMemory"
@@ -214,11 +213,12 @@ def test_a_named_line_without_an_answer_fails_and_writes_nothing(
 
 
 CAMERAS = tuple(
-    PluggedCamera(
+    ProbedCamera(
         card="C270",
         bus=f"usb-{n}",
         node=Path(f"/dev/video{n}"),
         options={"device": f"/dev/v4l/by-id/c{n}", "format": "YUYV", "size_px": [640, 480]},
+        driver="v4l2",
     )
     for n in (0, 2)
 )
@@ -249,7 +249,7 @@ def test_an_adapter_without_a_stable_name_gets_one_by_a_rule(
 ) -> None:
     machine = machine_with(tmp_path / "machine", serial)
     folder = tmp_path / "rig"
-    head = PluggedHead("/dev/ttyUSB0", FAMILIES[0], SERVOS)
+    head = ServosOnLine(BENCH, "/dev/ttyUSB0", SERVOS)
     made = write_rig(folder, Plugged((head,), CAMERAS), head, RigAnswers(), machine)
     lines = (folder / RULES).read_text().splitlines()
     line = next(one for one in lines if one.endswith('SYMLINK+="mast"') and not one.startswith("#"))
@@ -263,7 +263,7 @@ def test_an_adapter_without_a_stable_name_gets_one_by_a_rule(
 
 
 def test_a_pair_of_cameras_is_drawn_with_options_of_its_driver(tmp_path: Path) -> None:
-    head = PluggedHead("/dev/serial/by-id/usb-FTDI", FAMILIES[0], SERVOS)
+    head = ServosOnLine(BENCH, "/dev/serial/by-id/usb-FTDI", SERVOS)
     answers = RigAnswers(baseline_m=0.16, view_deg=90.0)
     write_rig(tmp_path / "rig", Plugged((head,), CAMERAS), head, answers, ExaminedMachine(tmp_path))
     good_by_schema(tmp_path / "rig")
