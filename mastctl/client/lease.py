@@ -77,11 +77,11 @@ class LeaseCalls:
         name: str | None = None,
         for_s: float = 30.0,
         take_over: str | None = None,
-        preemptible: bool = False,
         ends_with_stop: bool = False,
-        stops_when_silent: bool = False,
     ) -> Iterator[HeldLease]:
         """Steer alone inside the block: a thread renews the lease, and this client's commands carry it.
+
+        A motion that still runs when the lease ends, by the block's end too, is stopped: wait for it.
 
         Parameters
         ----------
@@ -91,15 +91,9 @@ class LeaseCalls:
             How long it outlives a holder that falls silent, 1 to 3600 s.
         take_over
             The reason for taking it from the client that steers; None neither waits nor takes it away.
-        preemptible
-            Whether it ends as soon as another client wants to steer, or stops the head: for what is done when
-            no other client needs the head.
         ends_with_stop
-            Whether it ends as soon as anybody stops the head: for a program that would go on with its next
-            move otherwise.
-        stops_when_silent
-            Whether the daemon stops a running operation when the lease is no longer renewed: this process has
-            died, or cannot reach the daemon.
+            Whether it ends with the next stop of the head: for a program that would go on with its next move
+            otherwise.
 
         Yields
         ------
@@ -111,8 +105,7 @@ class LeaseCalls:
         ClientError
             ``leased`` if another client steers.
         """
-        ends = preemptible, ends_with_stop, stops_when_silent
-        granted = self.acquire_lease(name, for_s, take_over, *ends)
+        granted = self.acquire_lease(name, for_s, take_over, ends_with_stop)
         before, held = self.daemon.lease_id, HeldLease(self.daemon, granted, for_s)
         self.daemon.lease_id = held.id
         try:
@@ -130,20 +123,15 @@ class LeaseCalls:
         name: str | None = None,
         for_s: float = 30.0,
         take_over: str | None = None,
-        preemptible: bool = False,
         ends_with_stop: bool = False,
-        stops_when_silent: bool = False,
     ) -> LeaseGranted:
         """Acquire or take over a lease that is not renewed; arguments as for `lease`.
 
         Returns ``lease_id``, ``holder``, ``for_s`` and ``until``; `use_lease` has commands carry it.
         """
-        ends = {
-            "preemptible": preemptible,
-            "ends_with_stop": ends_with_stop,
-            "stops_when_silent": stops_when_silent,
-        }
-        body: dict[str, Any] = {"for_s": float(for_s)} | {key: True for key, wanted in ends.items() if wanted}
+        body: dict[str, Any] = {"for_s": float(for_s)}
+        if ends_with_stop:
+            body["ends_with_stop"] = True
         if name is not None:
             body["name"] = name
         if take_over is None:

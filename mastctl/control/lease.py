@@ -1,15 +1,14 @@
-"""Who steers: one lease at a time, or without one, whoever started what runs.
+"""The client that steers: the holder of the one lease, or without one the client that started what runs.
 
 A lease runs on the machine's clock, however fast a simulated rover's goes: it bounds how long a client may
-be silent, and clients live in real time. It holds while the time is before its end, not at its end. Its id
-is what proves it, so no answer but the holder's own tells it.
+be silent, and clients live in real time. It runs until just before its end. Its id proves it, so only its
+holder's answers have it. A motion that was begun under a lease is stopped when the lease ends, however that is.
 
 Reading from here (`LeaseTable.control`) takes no lock.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hmac
 import logging
 import math
@@ -29,10 +28,9 @@ from mastctl.errors import BadRequest, NotNow
 log = logging.getLogger(__name__)
 
 SHORTEST_S, USUAL_S, LONGEST_S = 1.0, 30.0, 3600.0
-NOT_RENEWED = "the lease was not renewed for"
-SILENT_S = 0.2  # how soon after its time what runs under a lease that stops it is stopped, at most
+WATCH_S = 0.2  # how late what runs is stopped after its lease has run out
 AGAIN_S = 1.0  # between such stops while the head does not confirm one
-REMEMBERED = 64  # ended leases whose end is still told to who comes with them
+REMEMBERED = 64  # ended leases for which a refusal still states how they ended
 
 
 class Leased(NotNow):
@@ -62,10 +60,8 @@ class StopCame:
 class Lease:
     """The right to steer until ``until_s``, seconds of the lease's clock.
 
-    A ``preemptible`` one ends as soon as another client wants to steer, or stops the head.
     ``last_stop`` is that of `LeaseTable.last_stop` after which the next one ends it; None: no stop does.
-    ``credential`` is what its caller showed, without which it ends; empty: nothing. One that
-    ``stops_when_silent`` takes what runs with it when its time runs out.
+    ``credential`` is the digest of its caller's token, with which it ends; empty: none.
     """
 
     id: str
@@ -73,23 +69,21 @@ class Lease:
     since_s: float
     for_s: float
     until_s: float
-    preemptible: bool = False
     last_stop: StopCame | None = None
     credential: str = field(default="", repr=False)
-    stops_when_silent: bool = False
     caller: str = ""
 
 
 @dataclass(frozen=True)
 class WhoSteers:
-    """Who steers.
+    """The client that steers.
 
     Attributes
     ----------
     holder
         Its name.
     kind
-        ``lease``, or ``operation``: by what runs, until that has ended.
+        ``lease``, or ``operation``: it steers until what it started has ended.
     until_s
         When a lease ends, seconds of its clock; None for an operation.
     """
@@ -112,24 +106,23 @@ class WhoSteers:
 
 
 class LeaseTable:
-    """The lease of one daemon, and who steers without one; safe to use from any thread.
+    """The lease of one daemon, or the client that steers without one; safe to use from any thread.
 
     Parameters
     ----------
     clock
-        What leases run on.
+        The clock of the leases.
     running
         Whether an operation or a track runs; called with the lock held, so it must take none.
     on_change
-        Told who steers after each change, and that a lease has ended by time when somebody asks next.
-    give_way
-        Stops what runs under a lease that gives way, before who came for it goes on; gets why. Called
-        without the lock.
+        Gets the client that steers after each change.
+    stop
+        Stops what runs; gets the reason. Called without the lock.
 
     Attributes
     ----------
     stands
-        Whether a credential still lets in; called with the lock held, from any thread.
+        Whether a token is still valid, by its digest; called with the lock held, from any thread.
     """
 
     def __init__(
@@ -137,12 +130,12 @@ class LeaseTable:
         clock: Clock,
         running: Callable[[], bool],
         on_change: Callable[[WhoSteers | None], None] = lambda control: None,
-        give_way: Callable[[str], object] = lambda why: None,
+        stop: Callable[[str], object] = lambda why: None,
     ) -> None:
         self._clock = clock
         self._running = running
         self._on_change = on_change
-        self._give_way = give_way
+        self._stop = stop
         self.stands: Callable[[str], bool] = lambda credential: True
         self._last_stop = StopCame()
         self._lock = threading.Lock()
@@ -150,10 +143,11 @@ class LeaseTable:
         self._over: dict[str, str] = {}  # id of an ended lease: how it ended
         self._under_way: dict[object, str] = {}  # commands that are being carried out: their party
         self._party: str | None = None  # who started what runs
-        self._closed = False
+        self._left = ""  # why what runs is to be stopped: its lease has ended
+        self._closing = threading.Event()
 
     def control(self) -> WhoSteers | None:
-        """Return who steers now, None for nobody."""
+        """Return the client that steers now, None without one."""
         lease = self._lease
         if lease is not None and not self._over_by(lease):
             return WhoSteers(lease.holder, "lease", lease.until_s)
@@ -162,12 +156,12 @@ class LeaseTable:
         return None if party is None else WhoSteers(party, "operation")
 
     def told(self) -> ControlTold | None:
-        """Return who steers as ``GET /status`` tells it."""
+        """Return the client that steers as ``GET /status`` has it."""
         control = self.control()
         return None if control is None else control.told(self._clock.now_s())
 
     def told_of(self, lease: Lease) -> LeaseRuns:
-        """Return a lease as its holder is told of it, whoever steers meanwhile."""
+        """Return a lease as its holder gets it, whichever client steers meanwhile."""
         left_s = max(0.0, lease.until_s - self._clock.now_s())
         return {"holder": lease.holder, "for_s": left_s, "until": _by_the_wall(left_s)}
 
@@ -177,7 +171,7 @@ class LeaseTable:
         return self._last_stop
 
     def stop_came(self, how: str = "the head was stopped") -> None:
-        """End a lease that ends with a stop: somebody stops the head. Takes no lock, waits for nothing."""
+        """End a lease that ends with a stop: the head is being stopped. Takes no lock, waits for nothing."""
         self._last_stop = StopCame(how)
 
     def was_stopped(self, lease: Lease) -> bool:
@@ -185,101 +179,59 @@ class LeaseTable:
         return lease.last_stop is not None and lease.last_stop is not self._last_stop
 
     def acquire(
-        self,
-        caller: Caller,
-        name: str | None = None,
-        for_s: float = USUAL_S,
-        preemptible: bool = False,
-        ends_with_stop: bool = False,
-        stops_when_silent: bool = False,
+        self, caller: Caller, name: str | None = None, for_s: float = USUAL_S, ends_with_stop: bool = False
     ) -> Lease:
-        """Return a new lease if nobody else steers, or who does gives way.
+        """Return a new lease if no other client steers.
 
         Parameters
         ----------
         caller
-            Who asks. What its name has running does not stand against it.
+            The client. What its name has running is no obstacle.
         name
             The holder's name, the caller's by default.
         for_s
             How long, seconds.
-        preemptible
-            Whether it ends as soon as anybody else wants to steer, or stops the head.
         ends_with_stop
-            Whether it ends as soon as anybody stops the head, and for that alone.
-        stops_when_silent
-            Whether what runs is stopped when its time runs out: its holder has died, or is out of reach.
+            Whether it ends with the next stop of the head.
 
         Raises
         ------
         Leased
-            If somebody steers.
+            If another client steers.
         BadRequest
             If ``for_s`` is out of bounds.
-        DriverError
-            If what runs under a lease that gives way could not be stopped; there is no new lease then.
         """
         _check_time(for_s)
         with self._changing():
-            why = self._check_free(caller)
-            last_stop = self._last_stop if preemptible or ends_with_stop else None
-            lease = self._grant(caller, name, for_s, preemptible, last_stop, stops_when_silent)
-        return self._begun(lease, why)
+            self._check_free(caller)
+            return self._grant(caller, name, for_s, self._last_stop if ends_with_stop else None)
 
-    def _begun(self, lease: Lease, why: str) -> Lease:
-        """Return a new lease when what gives way to it was stopped.
+    def watch(self) -> None:
+        """Stop what runs whenever its lease has run out or lost its token, until `close`."""
+        pause_s = WATCH_S
+        while not self._closing.wait(pause_s):
+            pause_s = WATCH_S
+            try:
+                self.stop_left_running()
+            except Exception as error:
+                log.error("%s: %s; the stop is sent again", self._left, error)
+                pause_s = AGAIN_S
 
-        If that fails the lease ends: its id is told to no client.
+    def stop_left_running(self) -> None:
+        """Stop what runs without its lease, if anything; again at the next call until the head confirms it.
+
+        A command that was carried out meanwhile takes over. Raises what the stop raises.
         """
-        try:
-            if lease.stops_when_silent:
-                threading.Thread(target=self._watch, args=(lease,), name="silent holder", daemon=True).start()
-            if why:
-                self._give_way(why)
-        except BaseException:
-            with self._changing():
-                if self._lease is not None and self._lease.id == lease.id:
-                    self._end("it could not be granted")
-            raise
-        return lease
-
-    def _watch(self, lease: Lease) -> None:
-        """Stop what a lease's holder has left running, again and again until the head confirms it, unless
-        another client steers by then."""
-        try:
-            while not self.stopped_silent(lease):
-                self._clock.sleep(SILENT_S)
-            return
-        except Exception as error:
-            log.error("what %s has left running: %s; the stop is sent again", lease.holder, error)
-        why = self._silence(lease)
-        names = lease.holder, lease.caller
-        while not self._closed and ((now := self.control()) is None or now.holder in names):
-            self._clock.sleep(AGAIN_S)
-            with contextlib.suppress(Exception):
-                self._give_way(why)
-                log.warning("the head has confirmed the stop: %s", why)
-                return
-
-    def stopped_silent(self, lease: Lease) -> bool:
-        """Return whether a lease has ended; what its holder began is stopped if its time ran out."""
         with self._changing():
-            if self._lease is not None and self._lease.id == lease.id:
-                return False
-            its_own = self._lease is None and self._party in (lease.holder, lease.caller)
-            why = self._silence(lease)
-        if why and its_own and self._running():
-            self._give_way(why)
-        return True
-
-    def _silence(self, lease: Lease) -> str:
-        """Why what runs under a lease is stopped; empty unless its time ran out."""
-        how = self._over.get(lease.id, "")
-        return f"{lease.holder} began it and has fallen silent: {how}" if how.startswith(NOT_RENEWED) else ""
+            why = self._left
+        if why:
+            self._stop(why)
+            with self._lock:
+                self._left = "" if self._left == why else self._left
 
     def close(self) -> None:
-        """Send no stop for a silent holder any more: the service has stopped the head, and ends."""
-        self._closed = True
+        """Stop nothing any more: the service has stopped the head, and ends."""
+        self._closing.set()
 
     def holds(self, lease_id: str) -> bool:
         """Return whether a lease runs now; takes no lock."""
@@ -310,10 +262,11 @@ class LeaseTable:
             return self._lease
 
     def release(self, lease_id: str) -> None:
-        """End a lease. Raises NotNow as `renew`."""
+        """End a lease and stop what runs under it. Raises NotNow as `renew`; DriverError."""
         with self._changing():
             self._held_by(lease_id)
             self._end("it was released")
+        self.stop_left_running()
 
     def take(
         self,
@@ -322,65 +275,67 @@ class LeaseTable:
         name: str | None = None,
         for_s: float = USUAL_S,
         last_stop: StopCame | None = None,
-        preemptible: bool = False,
         ends_with_stop: bool = False,
-        stops_when_silent: bool = False,
     ) -> Lease:
-        """Return a new lease, whoever steers; the former holder is told by whom it was taken, and why.
+        """Return a new lease, whichever client steers; the former holder gets the new one's name and reason.
 
-        What runs goes on, but for what runs under a lease that gives way. With ``last_stop`` it ends with the
-        first stop after that one. Other parameters and exceptions as of `acquire`.
+        What runs under a lease is stopped. With ``last_stop`` the new one ends with the first stop after that
+        one. Other parameters and exceptions as of `acquire`.
+
+        Raises
+        ------
+        DriverError
+            If the head did not confirm the stop; there is no lease then.
         """
         _check_time(for_s)
         with self._changing():
-            gave_way = self._lease is not None and self._lease.preemptible and self._running()
-            how = f"{name or caller.name} took over: {reason}"
-            self._end(how)
-            if last_stop is None and (preemptible or ends_with_stop):
+            self._end(f"{name or caller.name} took over: {reason}")
+        self.stop_left_running()
+        with self._changing():
+            self._end(f"{name or caller.name} took over: {reason}")  # another client's since then
+            if last_stop is None and ends_with_stop:
                 last_stop = self._last_stop
-            lease = self._grant(caller, name, for_s, preemptible, last_stop, stops_when_silent)
-        return self._begun(lease, how if gave_way else "")
+            return self._grant(caller, name, for_s, last_stop)
 
     @contextmanager
     def steering(self, caller: Caller, lease_id: str | None) -> Iterator[None]:
-        """Let a command that steers be carried out inside the block; waits for nobody.
+        """Let a command that steers be carried out inside the block; waits for nothing.
 
-        Until it has ended, and what it started too, nobody else gets a lease or steers, unless by `take`.
+        Until it has ended, and what it started too, no other client gets a lease or steers, unless by `take`.
 
         Raises
         ------
         Leased
-            If somebody else steers.
+            If another client steers.
         NotNow
             ``lease_over``, ``lease_unknown``, for the lease that came with it.
-        DriverError
-            If what runs under a lease that gives way could not be stopped.
         """
-        ticket, why = object(), ""
+        ticket = object()
+        lease: Lease | None = None
         with self._changing():
             if lease_id is not None:
-                party = self._held_by(lease_id).holder
+                lease = self._held_by(lease_id)
             else:
-                why = self._check_free(caller)
-                party = caller.name
+                self._check_free(caller)
+            party = caller.name if lease is None else lease.holder
             self._under_way[ticket] = party
             anothers = self._running()
         try:
-            if why:
-                self._give_way(why)
             yield
             anothers = False  # it was carried out: what runs from now on is its
         finally:
             with self._changing():
-                if not anothers:
-                    self._party = party
                 del self._under_way[ticket]
+                if not anothers:
+                    self._party, self._left = party, ""
+                    if lease is not None and (how := self._over.get(lease.id)):  # meanwhile
+                        self._leave_running(lease, how)
 
     # With the lock held
 
     @contextmanager
     def _changing(self) -> Iterator[None]:
-        """Hold the lock, with a lease that has run out ended; tell a change after it."""
+        """Hold the lock, with a lease that has run out ended; report a change after it."""
         changed = False
         try:
             with self._lock:
@@ -397,29 +352,20 @@ class LeaseTable:
                 self._on_change(self.control())
 
     def _over_by(self, lease: Lease) -> str:
-        """What has ended a lease that nobody released or took, '' if nothing has; takes no lock."""
+        """What has ended a lease that was not released or taken, '' if nothing has; takes no lock."""
         if self._clock.now_s() >= lease.until_s:
-            return f"{NOT_RENEWED} {lease.for_s:g} s"
+            return f"the lease was not renewed for {lease.for_s:g} s"
         if self.was_stopped(lease):
             return self._last_stop.how
         if lease.credential and not self.stands(lease.credential):
-            return "the token or the session that it was granted to has ended"
+            return "the token that it was granted to has ended"
         return ""
 
-    def _check_free(self, caller: Caller) -> str:
-        """Pass unless a lease runs, or somebody of another name steers. Raises Leased.
-
-        A lease that gives way is ended; returns why what runs under it is to be stopped, '' if nothing does.
-        """
-        lease = self._lease
-        if lease is not None and lease.preemptible:
-            why = f"{caller.name} wants to steer, and {lease.holder} gives way"
-            self._end(why)
-            return why if self._running() else ""
+    def _check_free(self, caller: Caller) -> None:
+        """Pass unless a lease runs, or a client of another name steers. Raises Leased."""
         control = self.control()
         if control is not None and (control.kind == "lease" or control.holder != caller.name):
             raise Leased(control, self._clock.now_s())
-        return ""
 
     def _held_by(self, lease_id: str) -> Lease:
         """Return the lease that runs, if it is this one."""
@@ -431,37 +377,28 @@ class LeaseTable:
             raise NotNow("lease_unknown", "the lease is not known, or ended long ago; acquire one")
         raise LeaseOver(how)
 
-    def _grant(
-        self,
-        caller: Caller,
-        name: str | None,
-        for_s: float,
-        preemptible: bool = False,
-        last_stop: StopCame | None = None,
-        stops_when_silent: bool = False,
-    ) -> Lease:
-        now_s, holder = self._clock.now_s(), name or caller.name
+    def _grant(self, caller: Caller, name: str | None, for_s: float, last_stop: StopCame | None) -> Lease:
+        now_s, key = self._clock.now_s(), secrets.token_hex(16)
         times_s = now_s, for_s, now_s + for_s
-        lease = Lease(
-            secrets.token_hex(16),
-            holder,
-            *times_s,
-            preemptible,
-            last_stop,
-            caller.credential,
-            stops_when_silent,
-            caller.name,
-        )
+        lease = Lease(key, name or caller.name, *times_s, last_stop, caller.credential, caller.name)
         self._lease = lease
         return lease
 
     def _end(self, how: str) -> None:
-        if self._lease is None:
+        lease = self._lease
+        if lease is None:
             return
-        self._over[self._lease.id] = how
+        self._over[lease.id] = how
         while len(self._over) > REMEMBERED:
             del self._over[next(iter(self._over))]
         self._lease = None
+        if self._party in (lease.holder, lease.caller) and not self.was_stopped(lease):
+            self._leave_running(lease, how)
+
+    def _leave_running(self, lease: Lease, how: str) -> None:
+        """Note what runs under a lease that has ended, for `stop_left_running`."""
+        if self._running():
+            self._left = f"{lease.holder} began it, and its lease has ended: {how}"
 
 
 def _by_the_wall(left_s: float) -> str:

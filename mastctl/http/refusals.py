@@ -46,7 +46,7 @@ PAGE = (
 )
 """The Content-Security-Policy of a page: its own files only, no script inside it, in nobody's frame."""
 
-RENAMED = {"gives_way": "preemptible", "goes_on": "resume"}
+RENAMED = {"goes_on": "resume"}
 """Keys of bodies by their names before version 0.1."""
 
 Headers = list[tuple[bytes, bytes]]

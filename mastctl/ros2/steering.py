@@ -152,7 +152,7 @@ class RosSteering:
         try:
             with self._connect() as client:
                 asked = wish.request(client)
-                with client.lease(for_s=LEASE_S, ends_with_stop=True, stops_when_silent=True):
+                with client.lease(for_s=LEASE_S, ends_with_stop=True):
                     return self._carried_out(client, wish, asked)
         except ValueError as error:
             return GoalOutcome("refused", "bad_request", str(error))

@@ -168,6 +168,7 @@ class Service:
         )
         people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
         self.leases = LeaseTable(people_s, self.machine.something_runs, self._steered, self.stopping.stop)
+        threading.Thread(target=self.leases.watch, name="leases", daemon=True).start()
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
         strangers = self.folder.path / STRANGERS_FILE
         self.strangers = AuditLog(strangers, clock, files=STRANGERS_FILES, device=STRANGERS)

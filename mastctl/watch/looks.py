@@ -243,14 +243,14 @@ def is_due(reference: Reference, last_look: str | None, every_s: float, now: dat
 
 
 def look_idle(client: Client, reference: Reference) -> SceneDrift:
-    """Look under a lease that gives way to everybody.
+    """Look under a lease, which ends with a stop of the head.
 
     Raises
     ------
     LookEnded
-        If somebody wanted to steer or stopped the head; as `look_again` else.
+        If another client took over or stopped the head; as `look_again` else.
     """
-    with client.lease(NAME, for_s=LEASE_S, preemptible=True):
+    with client.lease(NAME, for_s=LEASE_S, ends_with_stop=True):
         try:
             return look_again(client, reference)
         except ClientError as error:

@@ -72,15 +72,12 @@ class ResetBody(_Strict):
 class LeaseBody(_Strict):
     """``POST /lease``: how long, and whose it is, if not the caller's.
 
-    ``preemptible``: it ends as soon as another client wants to steer, or stops the head; ``ends_with_stop``:
-    with a stop only. ``stops_when_silent``: a running operation is stopped when its time runs out.
+    ``ends_with_stop``: it ends with the next stop of the head.
     """
 
     name: Name | None = None
     for_s: LeaseS = USUAL_S
-    preemptible: bool = False
     ends_with_stop: bool = False
-    stops_when_silent: bool = False
 
 
 class RenewBody(_Strict):

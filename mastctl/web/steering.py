@@ -312,7 +312,7 @@ def add_lease(app: FastAPI) -> None:
         return {"control": leases.told()}
 
     @command(
-        app, "POST /lease/take", LEASE_TAKE, "Take the lease from its holder; a running operation goes on"
+        app, "POST /lease/take", LEASE_TAKE, "Take the lease from its holder; what runs under it is stopped"
     )
     def take(body: TakeBody, here: Here, asked: Asks) -> LeaseGranted:
         leases = here.service.leases

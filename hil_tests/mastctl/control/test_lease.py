@@ -26,15 +26,12 @@ class World:
         self.clock = ManualClock(100.0)
         self.runs = False
         self.changes: list[WhoSteers | None] = []
-        self.gave_way: list[str] = []
-        self.leases = self.leases_of(self.give_way)
+        self.stops: list[str] = []
+        self.leases = LeaseTable(self.clock, lambda: self.runs, self.changes.append, self.stop)
 
-    def leases_of(self, give_way: Callable[[str], object]) -> LeaseTable:
-        return LeaseTable(self.clock, lambda: self.runs, self.changes.append, give_way)
-
-    def give_way(self, why: str) -> None:
+    def stop(self, why: str) -> None:
         self.runs = False
-        self.gave_way.append(why)
+        self.stops.append(why)
 
     def steer(self, caller: Caller, lease: Lease | None = None, starts: bool = False) -> None:
         with self.leases.steering(caller, None if lease is None else lease.id):
@@ -153,14 +150,15 @@ def test_all_who_tell_no_name_are_one_party(world: World) -> None:
     refused("leased", lambda: world.steer(BENCH))
 
 
-def test_what_a_holder_started_stays_its_own_after_its_lease(world: World) -> None:
+def test_what_a_holder_started_is_its_own_until_it_is_stopped(world: World) -> None:
     lease = world.leases.acquire(BENCH, for_s=5.0)
     world.steer(BENCH, lease, starts=True)
     world.clock.advance(6.0)
     assert world.leases.control() == WhoSteers("bench", "operation")
     refused("leased", lambda: world.leases.acquire(ROVER))
-    taken = world.leases.take(ROVER, "it hangs")
-    world.steer(ROVER, taken)
+    world.leases.stop_left_running()
+    assert world.leases.control() is None
+    world.steer(ROVER, world.leases.acquire(ROVER))
 
 
 def test_a_command_that_fails_leaves_nobody_steering(world: World) -> None:
@@ -191,35 +189,10 @@ def test_each_change_is_told_once_an_end_by_time_when_somebody_asks(world: World
     assert told == [("bench", 110.0), ("bench", 120.0), None, ("rover", 101.0), None]
 
 
-@pytest.mark.parametrize("by", ["command", "lease", "take"])
-def test_a_preemptible_lease_ends_for_the_next_client_after_a_stop(world: World, by: str) -> None:
-    lease = world.leases.acquire(BENCH, for_s=60.0, preemptible=True)
-    world.steer(BENCH, lease, starts=True)
-    if by == "command":
-        with world.leases.steering(ROVER, None):
-            assert not world.runs, "what ran is stopped before the command is carried out"
-    elif by == "lease":
-        assert world.leases.acquire(ROVER).holder == "rover"
-    else:
-        assert world.leases.take(ROVER, "why not").holder == "rover"
-    assert len(world.gave_way) == 1
-    assert "rover" in world.gave_way[0]
-    assert "rover" in refused("lease_over", lambda: world.steer(BENCH, lease))
-
-
-def test_a_stop_ends_a_lease_that_gives_way_and_no_other(world: World) -> None:
+def test_a_stop_ends_no_other_lease(world: World) -> None:
     lease = world.leases.acquire(BENCH)
     world.leases.stop_came()
     world.steer(BENCH, lease)
-    world.leases.release(lease.id)
-    lease = world.leases.acquire(BENCH, preemptible=True)
-    world.steer(BENCH, lease)
-    with world.leases._lock:  # whoever holds it, the stop waits for nobody
-        world.leases.stop_came()
-        assert world.leases.control() is None
-    assert "the head was stopped" in refused("lease_over", lambda: world.steer(BENCH, lease))
-    assert "the head was stopped" in refused("lease_over", lambda: world.leases.renew(lease.id))
-    world.steer(BENCH, world.leases.acquire(BENCH, preemptible=True))
 
 
 def test_a_lease_that_ends_with_a_stop_ends_with_nothing_else(world: World) -> None:
@@ -232,10 +205,11 @@ def test_a_lease_that_ends_with_a_stop_ends_with_nothing_else(world: World) -> N
         world.leases.stop_came()
         assert world.leases.was_stopped(lease) and world.leases.control() is None
     assert "the head was stopped" in refused("lease_over", lambda: world.steer(BENCH, lease))
-    assert world.gave_way == []
+    world.leases.stop_left_running()
+    assert world.stops == [], "the stop has come already"
 
 
-def test_a_lease_ends_with_the_token_or_the_session_that_it_was_granted_to(world: World) -> None:
+def test_a_lease_ends_with_the_token_that_it_was_granted_to(world: World) -> None:
     shown = {"of a token"}
     world.leases.stands = shown.__contains__
     inside = world.leases.acquire(BENCH)
@@ -248,43 +222,63 @@ def test_a_lease_ends_with_the_token_or_the_session_that_it_was_granted_to(world
         shown.clear()
         assert world.leases.control() is None
         assert not world.leases.holds(lease.id)
-        with pytest.raises(NotNow, match="token or the session"):
+        with pytest.raises(NotNow, match="token"):
             world.leases.renew(lease.id)
         world.leases.release(world.leases.acquire(ROVER).id)
 
 
-def test_what_a_silent_holder_began_is_stopped_when_its_lease_runs_out(world: World) -> None:
+def test_what_runs_is_stopped_when_its_lease_runs_out(world: World) -> None:
     lease = world.leases.acquire(ROVER, for_s=2.0)
     world.steer(ROVER, lease, starts=True)
     world.clock.advance(1.9)
-    lease = world.leases.renew(lease.id)
+    world.leases.renew(lease.id)
     world.clock.advance(1.9)
-    assert not world.leases.stopped_silent(lease)
+    world.leases.stop_left_running()
     assert world.runs
     world.clock.advance(0.2)
-    assert world.leases.stopped_silent(lease)
-    assert world.gave_way == ["rover began it and has fallen silent: the lease was not renewed for 2 s"]
+    world.leases.stop_left_running()
+    world.leases.stop_left_running()
+    assert world.stops == ["rover began it, and its lease has ended: the lease was not renewed for 2 s"]
 
 
-@pytest.mark.parametrize("how", ["released", "taken over"])
-def test_a_lease_that_did_not_run_out_leaves_what_runs_alone(world: World, how: str) -> None:
+def test_a_token_that_ends_stops_what_runs_under_its_lease(world: World) -> None:
+    caller = Caller("rover", credential="of a token")
+    world.steer(caller, world.leases.acquire(caller), starts=True)
+    world.leases.stands = lambda credential: False
+    world.leases.stop_left_running()
+    assert len(world.stops) == 1 and "token" in world.stops[0]
+
+
+@pytest.mark.parametrize("how", ["it was released", "bench took over: it is my turn"])
+def test_a_released_or_taken_lease_stops_what_runs_under_it(world: World, how: str) -> None:
     lease = world.leases.acquire(ROVER, for_s=2.0)
     world.steer(ROVER, lease, starts=True)
-    if how == "released":
+    if how == "it was released":
         world.leases.release(lease.id)
     else:
-        world.leases.take(BENCH, "it is my turn")
-    world.clock.advance(5.0)
-    assert world.leases.stopped_silent(lease)
-    assert world.runs and not world.gave_way
+        assert world.leases.take(BENCH, "it is my turn").holder == "bench"
+    assert not world.runs
+    assert world.stops == [f"rover began it, and its lease has ended: {how}"]
 
 
-@pytest.mark.parametrize("how", ["acquired", "taken over"])
-def test_the_stop_for_a_silent_holder_is_sent_until_the_head_confirms(
-    monkeypatch: pytest.MonkeyPatch, how: str
-) -> None:
+def test_a_command_under_way_when_its_lease_ends_is_stopped_too(world: World) -> None:
+    lease = world.leases.acquire(ROVER)
+    with world.leases.steering(ROVER, lease.id):
+        world.leases.release(lease.id)
+        world.runs = True
+    world.leases.stop_left_running()
+    assert world.stops == ["rover began it, and its lease has ended: it was released"]
+
+
+def test_what_runs_without_a_lease_is_taken_over_and_goes_on(world: World) -> None:
+    world.steer(BENCH, starts=True)
+    world.leases.take(ROVER, "it is my turn")
+    assert world.runs and world.stops == []
+
+
+def test_the_stop_at_a_leases_end_is_sent_until_the_head_confirms(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lease_module, "AGAIN_S", 0.01)
-    runs, sent = [True], list[str]()
+    runs, sent = list[bool](), list[str]()
 
     def unconfirmed_twice(why: str) -> None:
         runs.clear()  # the operation ends in any case
@@ -292,26 +286,29 @@ def test_the_stop_for_a_silent_holder_is_sent_until_the_head_confirms(
         if len(sent) < 3:
             raise NoReply("the head did not answer", device="pan_tilt")
 
-    leases = LeaseTable(SystemClock(), lambda: bool(runs), give_way=unconfirmed_twice)
-    if how == "acquired":
-        runs.clear()
-        lease = leases.acquire(ROVER, for_s=SHORTEST_S, stops_when_silent=True)
-    else:
-        lease = leases.take(ROVER, "it is my turn", for_s=SHORTEST_S, stops_when_silent=True)
+    leases = LeaseTable(SystemClock(), lambda: bool(runs), stop=unconfirmed_twice)
+    watching = threading.Thread(target=leases.watch)
+    watching.start()
+    lease = leases.acquire(ROVER, for_s=SHORTEST_S)
     with leases.steering(ROVER, lease.id):
         runs[:] = [True]
     until(lambda: len(sent) == 3, "the stop that the head confirms")
-    assert set(sent) == {"rover began it and has fallen silent: the lease was not renewed for 1 s"}
+    assert set(sent) == {"rover began it, and its lease has ended: the lease was not renewed for 1 s"}
     leases.close()
+    joined(watching)
 
 
-def test_what_another_began_meanwhile_is_not_stopped_for_a_silent_holder(world: World) -> None:
-    lease = world.leases.acquire(ROVER, for_s=2.0)
-    world.steer(ROVER, lease, starts=True)
-    world.clock.advance(3.0)
-    world.leases.take(BENCH, "it hangs")
-    assert world.leases.stopped_silent(lease)
-    assert world.runs and not world.gave_way
+def test_a_lease_that_is_taken_is_none_if_the_head_did_not_stop(world: World) -> None:
+    def unconfirmed(why: str) -> None:
+        raise NoReply("the head did not answer", device="pan_tilt")
+
+    leases = LeaseTable(world.clock, lambda: True, stop=unconfirmed)
+    lease = leases.take(ROVER, "a test")
+    with leases.steering(ROVER, lease.id):
+        pass
+    with pytest.raises(NoReply):
+        leases.take(BENCH, "it hangs")
+    assert leases.control() == WhoSteers("rover", "operation")
 
 
 def test_a_refused_command_does_not_make_its_client_the_owner_of_what_runs(world: World) -> None:

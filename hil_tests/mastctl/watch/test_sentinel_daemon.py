@@ -196,12 +196,12 @@ def test_a_watch_looks_where_nobody_needs_the_head_and_lets_go_of_it(
     assert len(read_looks(folder, read_reference(folder))) == 1
 
 
-def test_a_watch_gives_way_to_a_lease_and_starts_none_while_it_holds(
+def test_a_watch_ends_where_another_takes_over_and_starts_no_look_meanwhile(
     daemon: RunningDaemon, folder: Path, client: Client
 ) -> None:
     lease = []
-    told = watched(daemon, folder, lambda: lease.append(client.acquire_lease(for_s=60.0)))
-    assert told == ["no look now: ana wants to steer, and sentinel gives way; nothing was kept"]
+    told = watched(daemon, folder, lambda: lease.append(client.acquire_lease(for_s=60.0, take_over="mine")))
+    assert told == ["no look now: ana took over: mine; nothing was kept"]
     last = [one["id"] for one in client.operations()]
     assert watched(daemon, folder, lambda: None) == ["no look now: ana steers"]
     assert [one["id"] for one in client.operations()] == last
