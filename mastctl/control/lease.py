@@ -2,7 +2,7 @@
 
 A lease runs on the machine's clock, however fast a simulated rover's goes: it bounds how long a client may
 be silent, and clients live in real time. It runs until just before its end. Its id proves it, so only its
-holder's answers have it. A motion that was begun under a lease is stopped when the lease ends, however that is.
+holder's answers have it. Whatever ends a lease stops the motion that was begun under it.
 
 Reading from here (`LeaseTable.control`) takes no lock.
 """
