@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,9 +50,11 @@ from calib.adjust.unknowns import (
 from calib.geometry.covariance import camera_rates
 from calib.geometry.parameters import (
     camera_numbers,
+    focus_and_turn_rates,
     parameter_names,
     parameter_part,
     stepped,
+    twist_rates,
 )
 from calib.geometry.rig import (
     JOINTS_NAMES,
@@ -73,6 +76,22 @@ NO_BOW = np.zeros(2)
 
 USUAL_BOW_M = 0.005
 """How far a board's edges are usually from flat, one sigma, metres."""
+
+
+PAN_TILT = [len(MAST_NAMES) + len(JOINTS_NAMES), len(MAST_NAMES) + len(JOINTS_NAMES) + 1]
+"""Places of the readings among the numbers that move the head."""
+
+
+class Motions(NamedTuple):
+    """An image's residuals as the fit weighs them, and how these (m,) follow small motions.
+
+    ``head`` (m, 20) is by the mast's eight numbers, the joints' ten and the readings of pan and tilt, (m, 0)
+    of a body camera; ``camera`` (m, 4) by a part of the focal length, and by a turn about C, radians.
+    """
+
+    block: ResidualBlock
+    head: FloatArray
+    camera: FloatArray
 
 
 class Adjustment:
@@ -445,16 +464,40 @@ class Adjustment:
         boards = [state.rover_from_board[t.board] for t in stack.terms]
         parts = [np.zeros((len(boards), 0, 6))]
         if head is not None:
-            joints = joint_twists(head, state.as_joints, *self.readings(state, stack.terms))
-            parts += [-head.twists[:, self.mast_free], -joints[:, self.joint_errors]]
-            if self._own_reading(stack.terms[0]):
-                parts.append(-joints[:, 10:])
+            own = PAN_TILT if self._own_reading(stack.terms[0]) else []
+            free = np.array([*self.mast_free, *(len(MAST_NAMES) + self.joint_errors), *own], dtype=int)
+            parts.append(-self._head_twists(state, stack.terms, head)[:, free])
         if stack.terms[0].board not in self.held:
             parts.append(rigid_twists(np.array([board.translation_m for board in boards])))
         if stack.terms[0].board[0] in self.bowed:
             parts.append(np.array([[[0.0, 0.0, 0.0, *board.rotation[:, 2]]] for board in boards]))
         twists = np.concatenate(parts, axis=1)
         return twists if head is None else head.in_head(twists)
+
+    def _head_twists(self, state: Estimate, images: Sequence[ImageTerm], head: Gimbal) -> FloatArray:
+        """Twists (images, 20, 6) by which the mast's eight numbers, the joints' ten and the readings of pan
+        and tilt move the head."""
+        joints = joint_twists(head, state.as_joints, *self.readings(state, images))
+        return np.concatenate([head.twists[:, : len(MAST_NAMES)], joints], axis=1)
+
+    def motions(self, state: Estimate, images: Sequence[ImageTerm]) -> list[Motions]:
+        """Return how the residuals of images that count follow small motions of the head and the camera,
+        whether these are unknowns or not."""
+        found = []
+        for image, block in zip(images, self.image_blocks(state, images), strict=True):
+            model = state.cameras[image.camera]
+            weight = np.sqrt(bounded_weights(block.residual, 2, self.huber))
+            block = replace(
+                block, residual=weight * block.residual, jacobian=weight[:, None] * block.jacobian
+            )
+            rates = block.rates(("camera", image.camera))
+            by_head = np.zeros((len(rates), 0))
+            if image.attitude is not None:
+                head = self.head(state, [image])
+                twists = head.in_head(self._head_twists(state, [image], head))[0]
+                by_head = rates @ twist_rates(model) @ twists.T
+            found.append(Motions(block, by_head, rates @ focus_and_turn_rates(model)))
+        return found
 
     def _places(self, state: Estimate, stack: StationStack) -> tuple[FloatArray, FloatArray]:
         """Where points of the station were measured and are expected (n, 3), metres in the rover frame."""

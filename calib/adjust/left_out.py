@@ -24,9 +24,10 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from calib.adjust.adjustment import Adjustment, bounded_weights
+from calib.adjust.goodness import goodness
 from calib.adjust.scatter import Scatter, scattering
 from calib.adjust.significance import chance
-from calib.adjust.solver import Minimum
+from calib.adjust.solver import Minimum, covariance_of
 from calib.adjust.terms import ImageTerm, StationTerm
 from calib.adjust.unknowns import MAST, Estimate, Known, ResidualBlock
 from calib.geometry.rigid import FloatArray
@@ -269,3 +270,56 @@ def _dots(
 
 def _rms(parts: list[FloatArray]) -> float:
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+
+
+@dataclass(frozen=True)
+class OtherPlacements:
+    """A placement held against the others: chi-square of what its pictures and theirs say of ``freedom``
+    numbers that they share, and its chance if all is right, all placements counted."""
+
+    board: tuple[str, str]
+    chi2: float
+    freedom: int
+    chance: float
+
+    @property
+    def sentence(self) -> str:
+        """The contradiction to the others, and the remedy."""
+        return (
+            f"placement {self.board[1]} of board {self.board[0]} contradicts the others: its pictures say "
+            f"something else of cameras, axes and joints (chi-square {self.chi2:.0f} for {self.freedom} "
+            "numbers). Check that it is the same board and that nothing changed in between, and put it up "
+            "there once more"
+        )
+
+
+def by_other_placements(problem: Adjustment, state: Estimate) -> tuple[OtherPlacements, ...]:
+    """Return each placement held against the others, the least likely first; none if there is but one.
+
+    Parameters
+    ----------
+    problem, state
+        A fit at its minimum.
+    """
+    chi2, matrix, _ = problem.normal(state)
+    covariance = covariance_of(matrix, problem.weak)
+    _, freedom = goodness(problem, state, covariance)
+    images = [image for image in problem.images if image.keep.any()]
+    boards = list(dict.fromkeys(image.board for image in images))
+    found = []
+    for board in boards if len(boards) > 1 else ():
+        blocks = problem.image_blocks(state, [image for image in images if image.board == board])
+        columns = np.unique(np.concatenate([block.columns for block in blocks]))
+        residual = np.concatenate([block.residual for block in blocks])
+        jacobian = np.zeros((len(residual), len(columns)))
+        first = 0
+        for block in blocks:
+            last = first + len(block.residual)
+            jacobian[first:last, np.searchsorted(columns, block.columns)] = block.jacobian
+            first = last
+        every = ResidualBlock(residual, jacobian, columns, 2)
+        keep = np.ones(len(jacobian) // 2, dtype=bool)
+        pull, numbers = left_out(every, covariance[np.ix_(columns, columns)], keep, problem.huber).pull()
+        likely = chance(pull, numbers, chi2 / max(freedom, 1.0), max(freedom, 1.0))
+        found.append(OtherPlacements(board, pull, numbers, min(1.0, len(boards) * likely)))
+    return tuple(sorted(found, key=lambda one: one.chance))

@@ -8,14 +8,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from calib.adjust.drifts import BenchDrift, OtherPlacements
 from calib.adjust.goodness import Component
-from calib.adjust.left_out import LeftOutBoard
+from calib.adjust.hypotheses import Finding
+from calib.adjust.left_out import LeftOutBoard, OtherPlacements
 from calib.adjust.model_terms import ModelTerm
 from calib.adjust.outliers import Outlier
 from calib.adjust.significance import THREE_SIGMAS
 from calib.adjust.unknowns import Estimate
-from calib.adjust.wider import WiderModel
 from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.survey.records import Click, Survey
@@ -166,7 +165,7 @@ class Calibration(FittedRig):
     station: tuple[StationResidual, ...]
     rover_from_station: Mapping[str, Rigid]
     prisms_in_rover_m: Mapping[str, FloatArray]
-    wider: tuple[WiderModel, ...] = ()
+    wider: tuple[Finding, ...] = ()
     left_out_boards: tuple[LeftOutBoard, ...] = ()
     unseen_clicks: tuple[Click, ...] = ()
 
@@ -262,7 +261,7 @@ class BenchCalibration(FittedRig):
     checks: Mapping[str, CheckExpected]
     gauges: tuple[str, ...]
     placements: tuple[OtherPlacements, ...]
-    drifts: tuple[BenchDrift, ...]
+    drifts: tuple[Finding, ...]
     joint_rad: float
     inexact_m: float
     bows_m: Mapping[str, FloatArray]

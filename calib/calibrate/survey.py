@@ -13,8 +13,8 @@ import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from calib.adjust.adjustment import HUBER, Adjustment
-from calib.adjust.changes import BenchChange, find_change
 from calib.adjust.goodness import goodness
+from calib.adjust.hypotheses import Finding, explaining, find_change, survey_findings
 from calib.adjust.left_out import left_out_boards
 from calib.adjust.outliers import name_outliers
 from calib.adjust.result import Calibration, rig_of
@@ -32,7 +32,6 @@ from calib.adjust.uncertainty import (
     unseen_clicks,
 )
 from calib.adjust.unknowns import Estimate
-from calib.adjust.wider import WiderModel, explaining, wider_models
 from calib.calibrate.refusals import refuse_far, refuse_unsettled
 from calib.calibrate.starts.survey import Start, start_values
 from calib.geometry.rig import MAST_FREE
@@ -95,7 +94,7 @@ def joint_problem(survey: Survey, start: Start, mast_parameters: int) -> Adjustm
     return problem.with_terms(with_kept(problem.images, unseen), problem.station)
 
 
-def _what_changed(cleaned: Cleaned) -> BenchChange | None:
+def _what_changed(cleaned: Cleaned) -> Finding | None:
     """A joint that slipped or a camera that was refocused or knocked, where images were left out for that.
 
     Images and tapes were left out because they contradict others; whether they do since something changed is
@@ -110,9 +109,9 @@ def _what_changed(cleaned: Cleaned) -> BenchChange | None:
     every = every.with_terms(whole, every.station).with_huber(SCAN_HUBER)
     fit = minimise(every, cleaned.fit.state, weak=every.weak, gain=1e-6)
     change = find_change(every, fit.state) if np.isfinite(fit.normal.cost) else None
-    if change is None or not change.sure or change.board is not None:
+    if change is None or not change.sure or change.subject[0] == "board":
         return None
-    return None if _skew_axes_explain(every, fit, change.chi2) else change
+    return None if _skew_axes_explain(every, fit, change.gain) else change
 
 
 def _skew_axes_explain(every: Adjustment, fit: Minimum[Estimate], chi2: float) -> bool:
@@ -127,18 +126,16 @@ def _skew_axes_explain(every: Adjustment, fit: Minimum[Estimate], chi2: float) -
     return fit.normal.cost - wider.normal.cost > chi2  # the cost is half a sum of squares
 
 
-def _as_wider(change: BenchChange | None) -> tuple[WiderModel, ...]:
-    """A change as the wider model that it is; how far it moves dots is not bounded by those that are left."""
+def _left_out_for(change: Finding | None) -> tuple[Finding, ...]:
+    """A change that images were left out for; how far it moves dots is not bounded by those that are left."""
     if change is None:
         return ()
-    name = f"images left out for a change of {change.camera or change.what}"
-    return (
-        WiderModel(name, change.sentence, len(change.step), change.chi2, change.chance, True, float("inf")),
-    )
+    name = f"images left out for a change of {change.subject[1]}"
+    return (replace(change, name=name, significant=True, size_px=float("inf")),)
 
 
 def _refuse_wrong_minimum(
-    problem: Adjustment, state: Estimate, dot_px: float, change: BenchChange | None
+    problem: Adjustment, state: Estimate, dot_px: float, change: Finding | None
 ) -> None:
     """Raise if a camera's typical dot is far above its noise, or if the station contradicts the rest."""
     tapes = [p for p in problem.station if p.board is not None]
@@ -172,7 +169,7 @@ def _calibration(
     start: Start,
     cleaned: Cleaned,
     weighed: Weighed,
-    change: BenchChange | None,
+    change: Finding | None,
     began: float,
 ) -> Calibration:
     """Put together what the fit says, with the stated sigmas and with those that were found."""
@@ -225,7 +222,7 @@ def _calibration(
         images=images,
         station=station_residuals(problem, state),
         components=weighed.components,
-        wider=(*_as_wider(change), *_wider(cleaned, weighed)),
+        wider=(*_left_out_for(change), *_wider(cleaned, weighed)),
         left_out_boards=left_out_boards(problem, weighed.fit, covariance),
         rover_from_station=state.rover_from_station,
         rover_from_board=state.rover_from_board,
@@ -234,16 +231,14 @@ def _calibration(
     )
 
 
-def _wider(cleaned: Cleaned, weighed: Weighed) -> tuple[WiderModel, ...]:
-    """Wider models beside the fit, those first that explain why sigmas had to be widened beyond scatter."""
-    found = wider_models(weighed.problem, weighed.fit.state, weighed.covariance, weighed.fit.normal.gradient)
+def _wider(cleaned: Cleaned, weighed: Weighed) -> tuple[Finding, ...]:
+    """What hypotheses would gain, those first that explain why sigmas had to be widened beyond scatter."""
+    found = survey_findings(weighed.problem, weighed.fit.state)
     if not any(component.wrong for component in weighed.components):
         return found
-    problem, fit = cleaned.problem, cleaned.fit
-    covariance = covariance_of(fit.normal.matrix, problem.weak)
-    causes = explaining(wider_models(problem, fit.state, covariance, fit.normal.gradient), weighed.excess)
-    named = {model.name for model in causes}
-    return (*causes, *(model for model in found if model.name not in named))
+    causes = explaining(survey_findings(cleaned.problem, cleaned.fit.state), weighed.excess)
+    named = {finding.name for finding in causes}
+    return (*causes, *(finding for finding in found if finding.name not in named))
 
 
 def _prism_notes(problem: Adjustment, state: Estimate, mast_parameters: int) -> list[str]:

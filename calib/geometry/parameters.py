@@ -21,7 +21,7 @@ import numpy as np
 
 from calib.geometry.cahvor import COEFFICIENTS, FREE, CameraModel, letters_of
 from calib.geometry.lenses import opencv
-from calib.geometry.rigid import FloatArray, crossed, crossed_rows, tangents
+from calib.geometry.rigid import FloatArray, crossed, crossed_rows, rigid_twists, tangents
 
 _LETTERS = {
     "C": ("C.x", "C.y", "C.z"),
@@ -111,6 +111,16 @@ def twist_rates(model: CameraModel) -> FloatArray:
             )
     rates[parameter_part(model.kind, "C"), 3:] = np.eye(3)
     return rates
+
+
+def focus_and_turn_rates(model: CameraModel) -> FloatArray:
+    """Return how a camera's step (p,) follows a focal length longer by a part of itself, and a small turn
+    about its C: (p, 4)."""
+    zoom = np.zeros((len(parameter_names(model.kind)), 1))
+    for letter in "HV":
+        vector: FloatArray = getattr(model, letter)
+        zoom[parameter_part(model.kind, letter), 0] = vector - (vector @ model.A) * model.A
+    return np.hstack([zoom, twist_rates(model) @ rigid_twists(model.C)[:3].T])
 
 
 def carried_errors(model: CameraModel, moved: CameraModel, rotation: FloatArray) -> FloatArray:

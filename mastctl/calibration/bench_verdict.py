@@ -125,7 +125,7 @@ def _drifts(calibration: BenchCalibration) -> Iterator[Reason]:
     """Whether joints and cameras stayed what they were."""
     for drift in calibration.drifts:
         if drift.chance < RARELY:
-            yield Reason("bad" if drift.moves_px > POINTING_GOOD_PX else "care", drift.sentence)
+            yield Reason("bad" if drift.size_px > POINTING_GOOD_PX else "care", drift.sentence)
 
 
 def _checks(calibration: BenchCalibration) -> Iterator[Reason]:

@@ -3,7 +3,7 @@ alone.
 
 The estimator is that of surveys (``calib.adjust.adjustment``), with boards of unknown pose and no station.
 Start (``calib.calibrate.starts.bench``), pulls bounded, what changed half-way told apart
-(``calib.adjust.changes``), blunders left out by the tests of ``calib.adjust.outliers``, terms chosen
+(``calib.adjust.hypotheses``), blunders left out by the tests of ``calib.adjust.outliers``, terms chosen
 (``calib.adjust.model_terms``), least squares.
 """
 
@@ -17,8 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.adjust.adjustment import HUBER, Adjustment
-from calib.adjust.changes import BenchChange, find_change
-from calib.adjust.drifts import find_drifts
+from calib.adjust.hypotheses import Finding, find_change, find_drifts
 from calib.adjust.model_terms import Tested
 from calib.adjust.result import BenchCalibration
 from calib.adjust.robust import SurveyNotFitted, judged_again, weigh, without_blunders
@@ -120,7 +119,7 @@ def _look_for_changes(
         If a joint slipped, or a camera changed: nothing says which of its two states is the one to come.
     """
     wrong = {n: s for view in bench.views.values() for n, s in view.wrong.items()}
-    tried: tuple[BenchChange, BenchProblem, Adjustment, Minimum[Estimate]] | None = None
+    tried: tuple[Finding, BenchProblem, Adjustment, Minimum[Estimate]] | None = None
     for left in range(CHANGES, -1, -1):
         problem = bench.seen(chosen, bench.start)
         problem = problem.with_terms([replace(t, keep=t.keep & ~wrong[t.name]) for t in problem.images], ())
@@ -135,7 +134,7 @@ def _look_for_changes(
             if not fit.normal.cost < MENDS * tried[3].normal.cost:
                 _, bench, problem, fit = tried
                 break
-            if tried[0].board is None:
+            if tried[0].subject[0] != "board":
                 raise SomethingChanged(tried[0].sentence)
             tried = None
         if not np.isfinite(fit.normal.cost) or not left:
@@ -144,18 +143,19 @@ def _look_for_changes(
         _refuse_slip(bench, fit.state)
         if change is None:
             break
+        kind, *which = change.subject
         if change.sure:
-            if any(drift.tells_more(change) for drift in find_drifts(problem, fit.state)):
+            if any(drift.likelier(change) for drift in find_drifts(problem, fit.state)):
                 break  # the verdict names it, with its size
-            if change.board is None:
+            if kind != "board":
                 raise SomethingChanged(change.sentence)
         else:
             tried, bench = (change, bench, problem, fit), bench.copied()
-        if change.board is None:
-            bench.read_otherwise(change.what, change.after, float(change.step[0]))
+        if kind != "board":
+            bench.read_otherwise(which[0], change.after, float(change.values[0]))
         else:
             bench.notes.append(f"{change.sentence}; from there on it counts as another placement")
-            bench.split_placement(change.board, change.after)
+            bench.split_placement((which[0], which[1]), change.after)
         bench.begin()
     return bench, problem.with_huber(HUBER), fit.state
 

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtrc
 
-from calib.adjust.adjustment import Adjustment
-from calib.adjust.changes import reading_rates
-from calib.adjust.drifts import by_other_placements, find_drifts
+from calib.adjust.adjustment import PAN_TILT, Adjustment
 from calib.adjust.goodness import goodness
+from calib.adjust.hypotheses import find_drifts
+from calib.adjust.left_out import by_other_placements
 from calib.adjust.model_terms import TERM_KINDS, Tested, candidate_terms, choose_terms, moves_px, term_motions
 from calib.adjust.outliers import name_outliers
 from calib.adjust.result import BenchCalibration, CheckExpected, ImageResiduals, TermGain, rig_of
@@ -136,19 +136,17 @@ def check_weights(weighed: Weighed, terms: Sequence[ImageTerm]) -> FloatArray:
     """
     problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
     scatter = {c.kind: c.weighed for c in weighed.components}
-    exact = problem.at_rest()
+    exact = problem.with_huber(None).at_rest()
     standstills = list(dict.fromkeys((t.pan_rad, t.tilt_rad, t.approach) for t in terms))
     by_all, by_readings, own_px = [], [], []
-    blocks = exact.image_blocks(state, terms)
-    by_reading = reading_rates(exact, state, terms, [block.residual for block in blocks])
-    for term, block, read in zip(terms, blocks, by_reading, strict=True):
+    for term, motions in zip(terms, exact.motions(state, terms), strict=True):
         sigma_px = np.repeat(term.sigma_px[term.keep], 2)[:, None]
         rates = np.zeros((len(sigma_px), len(covariance)))
-        rates[:, block.columns] = sigma_px * block.jacobian
+        rates[:, motions.block.columns] = sigma_px * motions.block.jacobian
         readings = np.zeros((len(sigma_px), len(standstills), 2))
         if term.attitude is not None and problem.joint_rad > 0:
             at = standstills.index((term.pan_rad, term.tilt_rad, term.approach))
-            readings[:, at] = sigma_px * problem.joint_rad * read
+            readings[:, at] = sigma_px * problem.joint_rad * motions.head[:, PAN_TILT]
         by_all.append(rates)
         by_readings.append(readings.reshape(len(rates), -1))
         own_px.append(scatter.get(term.kind, 1.0) * sigma_px)

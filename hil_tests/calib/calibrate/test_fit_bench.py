@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -10,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.adjust import changes as bench_changes
-from calib.adjust.drifts import BenchDrift, find_drifts
+from calib.adjust import hypotheses
+from calib.adjust.adjustment import PAN_TILT, Motions
+from calib.adjust.hypotheses import Finding, find_drifts
 from calib.adjust.model_terms import candidate_terms, entering_together
 from calib.adjust.result import BenchCalibration
 from calib.adjust.significance import chance
@@ -118,17 +118,17 @@ def test_harmonics_backlash_and_bow_enter_and_say_what_they_gain() -> None:
 def test_joint_readings_count_as_measurements_where_changes_are_looked_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    asked: list[float] = []
+    freedoms: list[float] = []
 
-    def chance(chi2: float, numbers: int, scale: float, freedom: float) -> float:
-        asked.append(freedom)
+    def chance(chi2: float, numbers: int, scale: float = 1.0, freedom: float = np.inf) -> float:
+        freedoms.append(freedom)
         return 1.0
 
-    monkeypatch.setattr(bench_changes, "chance", chance)
+    monkeypatch.setattr(hypotheses, "chance", chance)
     fit = fit_bench(simulate_bench(1, BenchPlan(attitudes=10, **SERVO)))
     terms = sum(len(t.parameters) for t in fit.terms)
     # all terms are fitted then; readings without a number of their own would be some 70 fewer
-    assert asked == [pytest.approx(fit.degrees_of_freedom, abs=terms)]
+    assert freedoms[0] == pytest.approx(fit.degrees_of_freedom, abs=terms)
 
 
 @pytest.mark.long(3, "two whole fits of a bench; names of terms are tested quickly beside it")
@@ -259,9 +259,9 @@ def test_what_drifts_is_named_with_its_size_and_is_no_slip() -> None:
             wider = centre_px + (1 + 0.0005 * part) * (seen.pixels_px - centre_px)
             corners[image.name] = replace(seen, pixels_px=wider)
     fit = fit_bench(replace(survey, images=tuple(images), corners=corners))
-    drifts = {drift.what: drift for drift in fit.drifts}
-    assert drifts["pan"].step[0] == pytest.approx(0.0005, rel=0.15)
-    assert drifts["navcam_right"].step[0] == pytest.approx(0.0005, rel=0.3)
+    drifts = {drift.subject[1]: drift for drift in fit.drifts}
+    assert drifts["pan"].values[0] == pytest.approx(0.0005, rel=0.15)
+    assert drifts["navcam_right"].values[0] == pytest.approx(0.0005, rel=0.3)
     assert max(drifts["pan"].chance, drifts["navcam_right"].chance) < 1e-6 < drifts["tilt"].chance
     assert "pan drifts off its reading, by +0." in drifts["pan"].sentence
     # what the second placement says of the camera is not what the first one says
@@ -269,18 +269,14 @@ def test_what_drifts_is_named_with_its_size_and_is_no_slip() -> None:
 
 
 def test_a_drift_of_many_numbers_has_to_explain_more_than_a_change_of_few() -> None:
-    def drift(chi2: float) -> BenchDrift:
-        return BenchDrift("navcam_left", np.zeros(4), chi2, chance(chi2, 4), 0.01)
+    def found(gain: float, numbers: int) -> Finding:
+        values = np.full(numbers, 1e-4)
+        return Finding("", (), "", values, values, numbers, gain, chance(gain, numbers), 0.01)
 
-    def refocused(chi2: float) -> bench_changes.BenchChange:
-        return bench_changes.BenchChange(
-            "focus", None, "navcam_left", "p1-003", "p1-004", np.array([1e-4]), chi2, chance=chance(chi2, 1)
-        )
-
-    assert not drift(50.0).tells_more(refocused(45.0))
-    assert drift(60.0).tells_more(refocused(45.0))
-    assert drift(3100.0).tells_more(refocused(3000.0))  # no float is as small as these chances
-    assert not drift(3000.0).tells_more(refocused(3100.0))
+    assert not found(50.0, 4).likelier(found(45.0, 1))
+    assert found(60.0, 4).likelier(found(45.0, 1))
+    assert found(3100.0, 4).likelier(found(3000.0, 1))  # no float is as small as these chances
+    assert not found(3000.0, 4).likelier(found(3100.0, 1))
 
 
 def test_a_camera_without_a_picture_left_is_asked_for_no_drift() -> None:
@@ -289,7 +285,7 @@ def test_a_camera_without_a_picture_left_is_asked_for_no_drift() -> None:
     problem = bench.seen((), bench.start)
     left = [replace(t, keep=t.keep & (t.camera == "navcam_left")) for t in problem.images]
     drifts = find_drifts(problem.with_terms(left, ()), bench.start)
-    assert {drift.what for drift in drifts} == {"pan", "tilt", "navcam_left"}
+    assert {drift.subject[1] for drift in drifts} == {"pan", "tilt", "navcam_left"}
 
 
 ANOTHER_MOVE = pytest.mark.long(
@@ -332,14 +328,12 @@ def test_check_images_of_a_camera_share_the_error_of_its_calibration() -> None:
     ]  # fmt: skip
     block = ResidualBlock(np.zeros(4), np.full((4, 1), 10.0), np.arange(1), 2)  # in sigmas
 
-    def residuals(state: None, images: Sequence[ImageTerm]) -> list[np.ndarray]:
-        return [
-            np.full(4, 1e4 * (image.pan_rad - term.pan_rad))
-            for image, term in zip(images, terms, strict=True)
-        ]
-
-    exact = SimpleNamespace(image_blocks=lambda state, terms: [block] * len(terms), image_residuals=residuals)
-    problem = SimpleNamespace(at_rest=lambda: exact, joint_rad=0.002)
+    by_pan = np.full((4, 20), 1e4) * (np.arange(20) == PAN_TILT[0])
+    reads = Motions(block, by_pan, np.zeros((4, 4)))
+    exact = SimpleNamespace(motions=lambda state, terms: [reads] * len(terms))
+    problem = SimpleNamespace(
+        with_huber=lambda huber: SimpleNamespace(at_rest=lambda: exact), joint_rad=0.002
+    )
     weighed: Any = SimpleNamespace(
         problem=problem, fit=SimpleNamespace(state=None), covariance=np.array([[0.25]]), components=()
     )

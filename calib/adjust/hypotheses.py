@@ -1,0 +1,673 @@
+"""What a fit's residuals would gain by: one table of hypotheses, for surveys and for benches.
+
+Each hypothesis has numbers beside the fitted ones, all 0 in the fit: of the mast's axes, of a joint's errors
+around the turn, of a joint that slips or is read wrong once, of a lens, of a camera that changes between two
+pictures, of joints and cameras that drift from the first picture to the last, of a board's shape, of a board
+that moved. Near the fit the problem is linear, so that the gain in chi-square follows from sums over pictures
+(`calib.adjust.score`), and no further fit is made. Surveys and benches differ only in what is tested. Where
+one defect shows in several hypotheses, the one that gains most for its numbers is the likeliest. A pan that
+slips between two placements of a bench's board is seen by nothing and does no harm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from scipy.linalg import null_space
+
+from calib.adjust.adjustment import PAN_TILT, Adjustment, Motions
+from calib.adjust.goodness import goodness
+from calib.adjust.score import MADE_UP, Gain, Score
+from calib.adjust.significance import chance
+from calib.adjust.solver import covariance_of
+from calib.adjust.terms import DRAWING, ImageTerm
+from calib.adjust.unknowns import Estimate, ResidualBlock
+from calib.geometry.rig import AXIS_NAMES, MAST_NAMES
+from calib.geometry.rigid import FloatArray, rigid_rates
+
+FALSE_ALARMS = 0.0003
+"""The chance that a survey that is as modelled asks for any hypothesis."""
+
+DRAWING_ALARMS = 0.01
+"""The same of the prisms' drawing alone: few prisms check one another, and the rover frame hangs on them."""
+
+UNLIKELY = 1e-7
+"""A change is reported if so large a gain, were it none, had less than this chance over all tries."""
+
+EXPLAINS = 0.5
+"""A hypothesis explains an excess of chi-square if it would take away this part of it."""
+
+FEWEST = 4
+"""Of a survey's images or standstills, for a change among them to be looked for."""
+
+BEND_DEGREE = 4
+"""Of the polynomials of the place in the picture by which a lens may be bent otherwise than modelled."""
+
+AS_GOOD = 0.98
+"""A change with fewer numbers is preferred if it gains this part of the best one's."""
+
+LEAST_PART = 0.01
+"""A board or camera that moved explains at least this part of the weighted sum of squares: less is the
+model's."""
+
+STILL_FAR = 9.0
+"""Chi-square over its degrees of freedom that a cause leaves at most, or it explains half of it at least."""
+
+UNSEEN = 1e-3
+"""A direction is not tested if the other unknowns take up all but this part of it, unless a station ties
+boards to the rover: tapes show a slip that sharp images alone leave to their boards."""
+
+LARGEST = 0.5
+"""Radians, or part of the focal length: what is larger is no slip, knock or other focus."""
+
+FURTHER_MAST = {4: (3, 4), 6: (6, 7)}
+"""Which numbers of the mast a fit of so many parameters leaves out that the next wider one has."""
+
+Course = Literal["always", "once", "each", "from", "drift"]
+Rates = Callable[[ImageTerm, Motions], FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A measurement that a hypothesis concerns: of a picture, or of the station.
+
+    ``name`` is the picture's or placement's, ``group`` what changes only as a whole: a standstill, a
+    placement. ``block`` are its residuals (m,), ``rates`` (m, k) how they follow the numbers, ``moves_px``
+    (n, k) how its dots do, and ``elapsed`` which part of the pictures had been taken before, 0 to 1.
+    """
+
+    name: str
+    group: Hashable
+    block: ResidualBlock
+    rates: FloatArray
+    moves_px: FloatArray
+    elapsed: float = 0.0
+
+    def part(self, numbers: Sequence[int]) -> Row:
+        """Return the same for some of its numbers."""
+        return replace(self, rates=self.rates[:, numbers], moves_px=self.moves_px[:, numbers])
+
+    def weight(self, course: Course) -> float:
+        """What part of its numbers a course has reached."""
+        return self.elapsed if course == "drift" else 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """Something that may be otherwise than a fit has it.
+
+    Attributes
+    ----------
+    name
+        ``mast``, ``harmonics of pan``, ``slip of tilt``, ``drift of tilt``, ``attitude``,
+        ``joint readings``, ``lens of CAMERA``, ``change of CAMERA``, ``focus of CAMERA``,
+        ``knock of CAMERA``, ``drift of CAMERA``, ``bow of the board``, ``spacing of the board``,
+        ``board moved`` or ``drawing`` (of the prisms).
+    subject
+        ``("joint", NAME)``, ``("camera", NAME)`` or ``("board", NAME, PLACEMENT)``, where it is one's.
+    rows
+        The measurements that it concerns, in the order in which they were taken.
+    sentence
+        What a finding of it says.
+    course
+        When it is so: ``always``, in one of the groups (``once``), in each by numbers of its own, from some
+        group on, or more with every picture (``drift``).
+    side
+        Groups at least on either side of a change.
+    """
+
+    name: str
+    subject: tuple[str, ...]
+    rows: Sequence[Row]
+    sentence: Callable[[Finding], str] | str
+    course: Course = "always"
+    side: int = 1
+
+    @cached_property
+    def groups(self) -> list[list[Row]]:
+        """The rows that change only together, in the order of their first."""
+        found: dict[Hashable, list[Row]] = {}
+        for row in self.rows:
+            found.setdefault(row.group, []).append(row)
+        return list(found.values())
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """What a hypothesis would gain, at that of its pictures at which it gains most.
+
+    Attributes
+    ----------
+    name, subject, sentence
+        Of the hypothesis; what the finding says, and what to do.
+    values, sigma
+        (k,) of its numbers: radians (1) of a joint; a part of the focal length and a turn (1, 3 or 4) of a
+        camera; turn and shift (6) of a board.
+    numbers, gain
+        How many numbers count, and by how much the sum of squares would fall.
+    chance
+        Of such a gain without any such effect, all tries counted.
+    size_px
+        By how much the numbers move the dots that depend on them, rms, pixels; not-a-number for what moves
+        points of the station.
+    before, after
+        Names of the pictures between which it changed; ``after`` alone where it is one's.
+    significant
+        Whether chance does not explain it, all hypotheses counted.
+    sure
+        Whether little would be left then; else only another fit shows it, for far from it nothing is linear.
+    """
+
+    name: str
+    subject: tuple[str, ...]
+    sentence: str
+    values: FloatArray
+    sigma: FloatArray
+    numbers: int
+    gain: float
+    chance: float
+    size_px: float
+    before: str = ""
+    after: str = ""
+    significant: bool = False
+    sure: bool = True
+
+    def likelier(self, other: Finding) -> bool:
+        """Whether chance explains this finding less than another one.
+
+        It may have more numbers to explain with. Where no float is as small as both chances, chi-squares of
+        hundreds are compared, beside which few numbers more count nothing.
+        """
+        return (self.chance, -self.gain) < (other.chance, -other.gain)
+
+
+def survey_findings(problem: Adjustment, state: Estimate) -> tuple[Finding, ...]:
+    """Return what every hypothesis that can be tested on a survey would gain, the likeliest first.
+
+    ``problem`` and ``state`` are a fit at its minimum, with the sigmas that count.
+    """
+    fit = ScoredFit(problem, state)
+    found = fit.findings(_of_surveys(fit)) if fit.images else []
+    limit = FALSE_ALARMS / max(len(found), 1)
+    found = [
+        replace(f, significant=f.chance < (DRAWING_ALARMS if f.name == DRAWING else limit)) for f in found
+    ]
+    return tuple(sorted(found, key=lambda f: (not f.significant, 2 * f.numbers - f.gain)))
+
+
+def explaining(findings: Sequence[Finding], excess: float) -> tuple[Finding, ...]:
+    """Return the findings that make up for most of an excess of chi-square: not the sigmas were wrong then.
+
+    ``findings`` are those of a fit with the stated sigmas, ``excess`` by how much its sum of squares is
+    larger than they allow. A fit with sigmas widened for that excess no longer asks for them.
+    """
+    return tuple(f for f in findings if f.significant and f.gain - f.numbers > EXPLAINS * excess)
+
+
+def find_drifts(problem: Adjustment, state: Estimate) -> tuple[Finding, ...]:
+    """Return how far each joint and each camera drifts, the least likely by chance first."""
+    fit = ScoredFit(problem, state)
+    found = fit.findings([*_joint_drifts(fit), *_camera_drifts(fit)])
+    found = [replace(f, chance=min(1.0, len(found) * f.chance)) for f in found]
+    return tuple(sorted(found, key=lambda f: f.chance))
+
+
+def find_change(problem: Adjustment, state: Estimate) -> Finding | None:
+    """Return the change between two pictures that explains most, or None if none is significant.
+
+    ``problem`` and ``state`` are a fit with pulls bounded. For every picture from which on a board may have
+    stood elsewhere, a joint read otherwise, or a camera had another focal length or another direction, the
+    gain is found. Of changes that explain the same, that with the fewest numbers is reported.
+    """
+    fit = ScoredFit(problem, state)
+    tried = [(what, at, gain) for what in _changes(fit) for at, gain in fit.gains(what)]
+    possible = [one for one in tried if one[2].chi2 < fit.chi2]
+    if not possible:
+        return None
+    most = max(gain.chi2 for _, _, gain in possible)
+    as_good = [one for one in possible if one[2].chi2 >= AS_GOOD * most]
+    what, at, gain = min(as_good, key=lambda one: (len(one[2].values), -one[2].chi2))
+    sure = fit.left(gain) <= STILL_FAR or gain.chi2 >= 0.5 * fit.chi2
+    if not sure and what.subject[0] == "camera":  # it is the model that is wrong
+        return None
+    found = fit.finding(what, at, gain, len(tried))
+    if found.chance > UNLIKELY or (len(gain.values) > 1 and gain.chi2 < LEAST_PART * fit.chi2):
+        return None
+    return replace(found, sure=sure)
+
+
+class ScoredFit:
+    """A fit at its minimum, and what every hypothesis of it is tested by."""
+
+    def __init__(self, problem: Adjustment, state: Estimate) -> None:
+        self.problem, self.state = problem, state
+        # Of this very state: what is left of a change that others nearly take up is a small difference.
+        self.chi2, matrix, self.gradient = problem.normal(state)
+        self.covariance = covariance_of(matrix, problem.weak)
+        self.freedom = max(goodness(problem, state, self.covariance)[1], 1.0)
+        self.images = [image for image in problem.images if image.keep.any()]
+        self.motions = problem.motions(state, self.images)
+        self.least = MADE_UP if problem.station else UNSEEN
+        last = max(len(self.images) - 1, 1)
+        self.elapsed = {image.name: k / last for k, image in enumerate(self.images)}
+
+    def rows(self, rates: Rates, only: Callable[[ImageTerm], bool] | None = None) -> list[Row]:
+        """The images, or some, by the rates (m, k) of their residuals."""
+        found = []
+        for image, motions in zip(self.images, self.motions, strict=True):
+            if only is None or only(image):
+                mine = rates(image, motions)
+                found.append(self._row(image, motions.block, mine, mine))
+        return found
+
+    def of_camera(self, name: str, rates: Rates | None = None) -> list[Row]:
+        """The images of one camera, by its focal length and turn where no rates are given."""
+        return self.rows(rates or (lambda _, motions: motions.camera), lambda image: image.camera == name)
+
+    def of_board(self, board: tuple[str, str]) -> list[Row]:
+        """The images of one board, by its pose."""
+        key = ("board", board)
+        return self.rows(lambda _, motions: motions.block.rates(key), lambda image: image.board == board)
+
+    def _row(self, image: ImageTerm, block: ResidualBlock, rates: FloatArray, moves: FloatArray) -> Row:
+        sigma_px = np.repeat(image.sigma_px[image.keep], 2)[:, None]
+        group = image.name if image.attitude is None else image.attitude
+        return Row(image.name, group, block, rates, sigma_px * moves, self.elapsed[image.name])
+
+    @cached_property
+    def readings(self) -> list[Row]:
+        """The head's images by what pan and tilt read.
+
+        Where readings have a sigma it is that measurement which changes, and images only show where the head
+        was: sharp ones leave of a reading's rates in pixels next to nothing that no other unknown takes up.
+        The first image of a standstill has the reading then, and the others have no residuals.
+        """
+        known = {what.key: block for what, block in self.problem.known(self.state)}
+        found = []
+        for image, motions in zip(self.images, self.motions, strict=True):
+            if image.attitude is None:
+                continue
+            block, rates = motions.block, motions.head[:, PAN_TILT]
+            moves = rates
+            if self.problem.joint_rad > 0.0:
+                key = ("attitude", image.attitude)
+                nothing = ResidualBlock(np.zeros(0), np.zeros((0, 2)), self.problem.at(key), 1)
+                block = known.pop(key, nothing)
+                rates = -block.jacobian
+            found.append(self._row(image, block, rates, moves))
+        return found
+
+    def gains(self, what: Hypothesis) -> list[tuple[int, Gain]]:
+        """What a hypothesis gains, by the group at which it is so, or from which on."""
+        weights = [row.elapsed if what.course == "drift" else 1.0 for row in what.rows]
+        fitted = len(self.gradient)
+        if what.course in ("always", "drift"):
+            measured = [
+                (row.block, weight * row.rates) for row, weight in zip(what.rows, weights, strict=True)
+            ]
+            return [(0, self._gain(Score.of(measured, fitted)))] if measured else []
+        scores = [Score.of(((row.block, row.rates) for row in group), fitted) for group in what.groups]
+        if what.course == "once":
+            return [(at, self._gain(score)) for at, score in enumerate(scores)]
+        if what.course == "each":
+            return [(0, self._gain(Score.side_by_side(scores)))]
+        found, total = [], None
+        for at in range(len(scores) - 1, what.side - 1, -1):
+            total = scores[at] if total is None else scores[at] + total
+            if len(scores) - at >= what.side:
+                gain = self._gain(total)
+                if what.subject[:1] == ("board",) or np.linalg.norm(gain.values) <= LARGEST:
+                    found.append((at, gain))
+        return found
+
+    def _gain(self, score: Score) -> Gain:
+        return score.gain(self.covariance, self.gradient, self.least)
+
+    def left(self, gain: Gain) -> float:
+        """Chi-square over its degrees of freedom that a gain leaves."""
+        return (self.chi2 - gain.chi2) / self.freedom
+
+    def findings(self, hypotheses: Sequence[Hypothesis] | Iterator[Hypothesis]) -> list[Finding]:
+        """What hypotheses gain, each where its gain is the least likely."""
+        found = []
+        for what in hypotheses:
+            gains = self.gains(what)
+            if gains:
+                at, best = min(gains, key=lambda one: (chance(one[1].chi2, one[1].freedom), -one[1].chi2))
+                found.append(self.finding(what, at, best, len(gains)))
+        return found
+
+    def finding(self, what: Hypothesis, at: int, gain: Gain, tries: int) -> Finding:
+        """What a hypothesis says with its gain at some of its groups, the best of so many tries."""
+        scale = self.left(gain)
+        if what.subject[:1] == ("joint",) and what.course in ("from", "drift"):
+            scale = max(scale, self._scatter(what.rows, gain.chi2))
+        likely = chance(gain.chi2, gain.freedom, scale, self.freedom)
+        before = what.groups[at - 1][-1].name if what.course == "from" else ""
+        after = what.groups[at][0].name if what.course in ("once", "from") else ""
+        found = Finding(
+            what.name, what.subject, "", gain.values, gain.sigma, gain.freedom, gain.chi2,
+            min(1.0, tries * likely), _size_px(what, at, gain.values), before, after,
+        )  # fmt: skip
+        said = what.sentence
+        return replace(found, sentence=said if isinstance(said, str) else said(found))
+
+    def _scatter(self, readings: Sequence[Row], gain: float) -> float:
+        """How much larger the squares of a joint's readings are than their sigma allows, less a gain.
+
+        A joint whose readings scatter more than stated, by an unknown play, has not slipped.
+        """
+        squares = redundancy = 0.0
+        for row in readings:
+            size, one = float(np.sum(row.rates**2)), row.block
+            if size:
+                mine = self.covariance[np.ix_(one.columns, one.columns)]
+                squares += float((row.rates.T @ one.residual)[0] ** 2) / size
+                along = row.rates.T @ one.jacobian
+                redundancy += 1.0 - float((along @ mine @ along.T)[0, 0]) / size
+        return (squares - gain) / max(redundancy - 1.0, 1.0)
+
+
+def _size_px(what: Hypothesis, at: int, values: FloatArray) -> float:
+    """By how much numbers move the dots concerned, rms, pixels."""
+    groups = what.groups
+    if what.course == "each":
+        own = np.split(values, len(groups))
+        moved = [row.moves_px @ v for group, v in zip(groups, own, strict=True) for row in group]
+    else:
+        some = {"once": groups[at : at + 1], "from": groups[at:]}.get(what.course, groups)
+        moved = [row.weight(what.course) * (row.moves_px @ values) for group in some for row in group]
+    every = np.concatenate(moved)
+    return float(np.sqrt(np.mean(every**2))) if len(every) else float("nan")
+
+
+def _of_surveys(fit: ScoredFit) -> Iterator[Hypothesis]:
+    """The hypotheses that a survey is tested for."""
+    yield from _axes(fit)
+    if fit.readings:
+        yield from _harmonics(fit)
+        if len({row.group for row in fit.readings}) >= FEWEST:
+            yield from _readings(fit)
+            yield from _slips(fit)
+            yield from _joint_drifts(fit)
+    yield from _lenses(fit)
+    enough = {name for name in _cameras(fit) if sum(i.camera == name for i in fit.images) >= FEWEST}
+    yield from (one for one in (*_camera_changes(fit), *_camera_drifts(fit)) if one.subject[1] in enough)
+    yield from _board_shape(fit)
+    yield from _moved_before_tapes(fit)
+    yield from _drawing(fit)
+
+
+def _changes(fit: ScoredFit) -> Iterator[Hypothesis]:
+    """The changes between two pictures that are looked for where a fit fails; one picture is a blunder."""
+    for board in dict.fromkeys(image.board for image in fit.images):
+        if board not in fit.problem.held:
+            mine = fit.of_board(board)
+            yield Hypothesis("board moved", ("board", *board), mine, _board_sentence, "from", side=2)
+    yield from _slips(fit, side=2)
+    for name in _cameras(fit):
+        rows = fit.of_camera(name)
+        for what, part, sentence in (("focus", [0], _focus_sentence), ("knock", [1, 2, 3], _knock_sentence)):
+            some = [row.part(part) for row in rows]
+            yield Hypothesis(f"{what} of {name}", ("camera", name), some, sentence, "from", side=2)
+
+
+def _axes(fit: ScoredFit) -> Iterator[Hypothesis]:
+    """The axes of the mast."""
+    fitted = len(fit.problem.mast_free)
+    further = FURTHER_MAST.get(fitted)
+    if further is None or not fit.readings:
+        return
+
+    def sentence(found: Finding) -> str:
+        named = []
+        for index, value, sigma in zip(further, found.values, found.sigma, strict=True):
+            name, unit = MAST_NAMES[index], "mm" if MAST_NAMES[index].endswith("_m") else "mrad"
+            name = name.replace("_rad", "").replace("_m", "").replace("_", " ").replace(".", " ")
+            named.append(f"{name} {1e3 * value:+.2f} ± {1e3 * sigma:.2f} {unit}")
+        return f"{' and '.join(named)}: fit with --mast {fitted + 2}"
+
+    yield Hypothesis("mast", (), _on_head(fit, further), sentence)
+
+
+def _on_head(fit: ScoredFit, numbers: Sequence[int]) -> list[Row]:
+    """The head's images by some of the numbers that move it."""
+    rows = fit.rows(
+        lambda image, motions: motions.head[:, numbers] if image.attitude is not None else motions.head
+    )
+    return [row for row, image in zip(rows, fit.images, strict=True) if image.attitude is not None]
+
+
+def _harmonics(fit: ScoredFit) -> Iterator[Hypothesis]:
+    """Readings that are off around the turn."""
+    for joint, name in enumerate(("pan", "tilt")):
+        first = len(MAST_NAMES) + joint * len(AXIS_NAMES)
+        text = (
+            f"{name} is read wrong around the turn (a magnet off centre, an arm that sags): its mast file "
+            "needs joint terms"
+        )
+        rows = _on_head(fit, range(first, first + 4))
+        yield Hypothesis(f"harmonics of {name}", (), rows, text)
+
+
+def _readings(fit: ScoredFit) -> Iterator[Hypothesis]:
+    """Readings that are off all, or once."""
+
+    def every(found: Finding) -> str:
+        rms = 1e3 * float(np.sqrt(np.mean(found.values**2)))
+        return f"joint readings scatter by some {rms:.2g} mrad more than joint_rad in survey.yaml says"
+
+    def one(found: Finding) -> str:
+        pan, tilt = 1e3 * found.values
+        return (
+            f"at image {found.after} the head was elsewhere than read, by {pan:+.2f} mrad in pan and "
+            f"{tilt:+.2f} in tilt"
+        )
+
+    yield Hypothesis("joint readings", (), fit.readings, every, "each")
+    yield Hypothesis("attitude", (), fit.readings, one, "once")
+
+
+def _slips(fit: ScoredFit, side: int = 1) -> Iterator[Hypothesis]:
+    """Joints that read otherwise from one picture on."""
+    for joint, name in enumerate(("pan", "tilt")):
+        rows = [row.part([joint]) for row in fit.readings]
+        yield Hypothesis(f"slip of {name}", ("joint", name), rows, _slip_sentence, "from", side)
+
+
+def _joint_drifts(fit: ScoredFit) -> Iterator[Hypothesis]:
+    """Joints that read more and more otherwise."""
+    for joint, name in enumerate(("pan", "tilt")):
+        rows = [row.part([joint]) for row in fit.readings]
+        yield Hypothesis(f"drift of {name}", ("joint", name), rows, _joint_drift_sentence, "drift")
+
+
+def _cameras(fit: ScoredFit) -> list[str]:
+    """The cameras that have an image left, in the order of their first."""
+    return list(dict.fromkeys(image.camera for image in fit.images))
+
+
+def _lenses(fit: ScoredFit) -> Iterator[Hypothesis]:
+    """Lenses that bend otherwise than their models."""
+    powers = [(i, j) for i in range(BEND_DEGREE + 1) for j in range(BEND_DEGREE + 1 - i)]
+
+    def bends(image: ImageTerm, motions: Motions) -> FloatArray:
+        middle = (np.array(fit.state.cameras[image.camera].size_px) - 1) / 2
+        sigma = image.sigma_px[image.keep, None]
+        # Where the fit sees them: places as measured hold the very noise that is left over.
+        seen_px = image.pixels_px[image.keep] + motions.block.residual.reshape(-1, 2) * sigma
+        u, v = ((seen_px - middle) / middle[0]).T
+        terms = np.stack([u**i * v**j for i, j in powers], axis=1) / sigma
+        return np.asarray(np.einsum("nk,ij->nijk", terms, np.eye(2)).reshape(2 * len(u), -1))
+
+    for name in _cameras(fit):
+        text = (
+            f"the rest over {name}'s image is not noise: its lens is bent otherwise than "
+            f"{fit.state.cameras[name].kind} can be, or its dots are off in a pattern"
+        )
+        yield Hypothesis(f"lens of {name}", (), fit.of_camera(name, bends), text)
+
+
+def _camera_changes(fit: ScoredFit) -> Iterator[Hypothesis]:
+    """Cameras that are others from one picture on: refocused, or moved on their mount."""
+    for name in _cameras(fit):
+        rows = fit.of_camera(name)
+        yield Hypothesis(f"change of {name}", ("camera", name), rows, _change_sentence, "from")
+
+
+def _camera_drifts(fit: ScoredFit) -> Iterator[Hypothesis]:
+    """Cameras that change more and more."""
+    for name in _cameras(fit):
+        rows = fit.of_camera(name)
+        yield Hypothesis(f"drift of {name}", ("camera", name), rows, _camera_drift_sentence, "drift")
+
+
+def _board_shape(fit: ScoredFit) -> Iterator[Hypothesis]:
+    """The board's shape."""
+    half_m = float(max(np.abs(image.in_board_m[image.keep]).max() for image in fit.images))
+
+    def moved(moves_m: Callable[[FloatArray, FloatArray], FloatArray]) -> list[Row]:
+        """Images by how numbers move the board's points (3, k, n), metres in the board."""
+
+        def rates(image: ImageTerm, motions: Motions) -> FloatArray:
+            turn = fit.state.rover_from_board[image.board].rotation
+            per_point = motions.block.rates(("board", image.board))[:, 3:].reshape(-1, 2, 3) @ turn
+            x, y, _ = image.in_board_m[image.keep].T
+            found = np.einsum("nij,jkn->nik", per_point, moves_m(x, y))
+            return np.asarray(found.reshape(-1, found.shape[2]))
+
+        return fit.rows(rates)
+
+    def bent(found: Finding) -> str:
+        bend_mm = 1e3 * float(np.abs(found.values).max())
+        return f"the board is not flat: bent by some {bend_mm:.2g} mm at its edges"
+
+    def spaced(found: Finding) -> str:
+        wide, high, aslant = 1e3 * found.values
+        return (
+            f"the board's dots are not spaced as stated: {wide:+.2f} per mille along rows, {high:+.2f} along "
+            f"columns, {aslant:+.2f} aslant"
+        )
+
+    def bow(x: FloatArray, y: FloatArray) -> FloatArray:
+        nothing = np.zeros((3, len(x)))
+        return np.stack([nothing, nothing, np.stack([x * x, x * y, y * y]) / half_m**2])
+
+    def spacing(x: FloatArray, y: FloatArray) -> FloatArray:
+        no = np.zeros(len(x))
+        return np.stack([np.stack([x, no, y]), np.stack([no, y, no]), np.zeros((3, len(x)))])
+
+    yield Hypothesis("bow of the board", (), moved(bow), bent)
+    yield Hypothesis("spacing of the board", (), moved(spacing), spaced)
+
+
+def _moved_before_tapes(fit: ScoredFit) -> Iterator[Hypothesis]:
+    """Boards that moved between their tapes and their pictures."""
+    shown = {image.board for image in fit.images}
+    rows, eye = [], np.eye(3)[None]
+    for board, pose in fit.state.rover_from_board.items():
+        mine = [p for p in fit.problem.station if p.board == board and p.keep]
+        if len(mine) < 2 or board not in shown:
+            continue
+        for point, block in zip(mine, fit.problem.station_blocks(fit.state, mine), strict=True):
+            rates = rigid_rates(eye, pose.points(point.in_board_m)[None], pose.translation_m)[0]
+            name = f"placement {board[1]} (set-up {board[0]})"
+            rows.append(Row(name, board, block, -rates / point.sigma_m, np.zeros((0, 6))))
+
+    def sentence(found: Finding) -> str:
+        turn, shift = (1e3 * float(np.linalg.norm(part)) for part in np.split(found.values, 2))
+        return (
+            f"the tapes of {found.after} stand {shift:.1f} mm and {turn:.1f} mrad from where its pictures "
+            "show the board: it moved between them"
+        )
+
+    yield Hypothesis("board moved", (), rows, sentence, "once")
+
+
+def _drawing(fit: ScoredFit) -> Iterator[Hypothesis]:
+    """Prisms that stand elsewhere on the rover than drawn, the same in every set-up."""
+    mine = [p for p in fit.problem.station if p.board is None and p.keep]
+    if fit.problem.prism_cad_m > 0 or not mine:
+        return
+    names = list(dict.fromkeys(point.point for point in mine))
+    # All prisms moved as one body are another rover frame, which no survey determines.
+    places = np.array([fit.state.prisms_in_rover_m[name] for name in names])
+    as_one = rigid_rates(np.eye(3)[None], places, places.mean(axis=0)).reshape(-1, 6)
+    apart = null_space(as_one.T).reshape(len(names), 3, -1)
+    rows = [
+        Row(p.point, p.setup, block, -apart[names.index(p.point)] / p.sigma_m, np.zeros((0, apart.shape[2])))
+        for p, block in zip(mine, fit.problem.station_blocks(fit.state, mine), strict=True)
+    ]
+
+    def sentence(found: Finding) -> str:
+        off_mm = 1e3 * float(np.sqrt(np.sum(found.values**2) / len(names)))
+        return (
+            f"the prisms stand elsewhere than drawn, by some {off_mm:.1f} mm: measure them on the rover "
+            "again, or state prism_cad_m and measure them from several set-ups"
+        )
+
+    yield Hypothesis(DRAWING, (), rows, sentence)
+
+
+def _milli(size: FloatArray) -> str:
+    """The length of something in thousandths, with two digits at least."""
+    length = 1e3 * float(np.linalg.norm(size))
+    return f"{length:.1f}" if length >= 1.0 else f"{length:.2g}"
+
+
+def _board_sentence(found: Finding) -> str:
+    _, board, placement = found.subject
+    return (
+        f"board {board} moved during placement {placement}, between pictures {found.before} and "
+        f"{found.after}, by about {_milli(found.values[3:])} mm and {_milli(found.values[:3])} mrad"
+    )
+
+
+def _slip_sentence(found: Finding) -> str:
+    return (
+        f"{found.subject[1]} slipped by about {_milli(found.values)} mrad between pictures "
+        f"{found.before} and {found.after}: the head no longer points where it read before; tighten what "
+        "holds it on its axis and take the pictures again"
+    )
+
+
+def _joint_drift_sentence(found: Finding) -> str:
+    return (
+        f"{found.subject[1]} drifts off its reading, by {1e3 * found.values[0]:+.2f} mrad from the first "
+        "picture to the last: a mount or an encoder creeps; fasten it and take the pictures again"
+    )
+
+
+def _focus_sentence(found: Finding) -> str:
+    return (
+        f"camera {found.subject[1]} was refocused between pictures {found.before} and {found.after}: its "
+        f"focal length changed by about {100 * abs(found.values[0]):.2f} %; fix the lens and take the "
+        "pictures again"
+    )
+
+
+def _knock_sentence(found: Finding) -> str:
+    return (
+        f"camera {found.subject[1]} was knocked between pictures {found.before} and {found.after}: it turned "
+        f"by about {_milli(found.values)} mrad in its mount; fasten it and take the pictures again"
+    )
+
+
+def _change_sentence(found: Finding) -> str:
+    return (
+        f"from picture {found.after} on {found.subject[1]} is another camera (focal length "
+        f"{100 * found.values[0]:+.2f} %, turned by {_milli(found.values[1:])} mrad): it was refocused or "
+        "knocked there; fasten it and take the pictures again"
+    )
+
+
+def _camera_drift_sentence(found: Finding) -> str:
+    return (
+        f"camera {found.subject[1]} drifts from the first picture to the last. Its focal length changes by "
+        f"{100 * found.values[0]:+.3f} %, and it turns by {_milli(found.values[1:])} mrad; let it warm up, "
+        "fasten it, and take the pictures again"
+    )
