@@ -18,18 +18,18 @@ than their sigma says contradict nothing: the chance is by what they scatter (`c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from calib.adjust.adjustment import Adjustment, bounded_weights
-from calib.adjust.goodness import goodness
 from calib.adjust.scatter import Scatter, scattering
 from calib.adjust.significance import chance
-from calib.adjust.solver import Minimum, covariance_of
+from calib.adjust.solver import Minimum
 from calib.adjust.terms import ImageTerm, StationTerm
-from calib.adjust.unknowns import MAST, Estimate, Known, ResidualBlock
+from calib.adjust.unknowns import Estimate, Known, ResidualBlock
 from calib.geometry.rigid import FloatArray
 
 REDUNDANT = 0.02
@@ -38,7 +38,7 @@ REDUNDANT = 0.02
 SOLE = 1e-6
 """Part of what is known of an unknown that the others are taken to contribute at least: it is inverted."""
 
-TOLD = 1e-3
+DETERMINES = 1e-3
 """A direction of whose variance some measurements take away less than this part is not determined by them."""
 
 REPEATS = 3
@@ -61,19 +61,11 @@ class LeftOut:
         """
         rows = np.repeat(good, 2)
         rates, residual = self.rates[rows], self.residual[rows]
-        told, along = np.linalg.eigh(rates.T @ rates)
-        told = np.maximum(told, 0.0)
-        free = REDUNDANT * (1.0 + told) > 1.0
-        taken = (along.T @ (rates.T @ residual)) ** 2 / np.where(free, told, 1.0 + told)
+        values, along = np.linalg.eigh(rates.T @ rates)
+        values = np.maximum(values, 0.0)
+        free = REDUNDANT * (1.0 + values) > 1.0
+        taken = (along.T @ (rates.T @ residual)) ** 2 / np.where(free, values, 1.0 + values)
         return float(residual @ residual - taken.sum()), int(rows.sum() - free.sum())
-
-    def pull(self) -> tuple[float, int]:
-        """Return chi-square of what these dots say of the unknowns against what the others say, and of how
-        many numbers; those that either hardly determines are not compared."""
-        told, along = np.linalg.eigh(self.rates.T @ self.rates)
-        compared = (told > TOLD) & (REDUNDANT * (1.0 + told) <= 1.0)
-        told, gradient = told[compared], along[:, compared].T @ (self.rates.T @ self.residual)
-        return float(np.sum(gradient**2 / (told * (1.0 + told)))), int(compared.sum())
 
     def agreeing(self, good: np.ndarray, limit: float) -> np.ndarray:
         """Return which of the good dots (n,) stay so beside one another: of those the others' error cannot be
@@ -144,7 +136,7 @@ class LeftOutBoard:
     Attributes
     ----------
     board
-        Set-up and placement.
+        Set-up, or a bench's board, and placement.
     dots
         How many were fitted.
     fitted_px, predicted_px
@@ -152,52 +144,73 @@ class LeftOutBoard:
         without dots, or where the others leave something open that its images need.
     chi2, freedom, chance
         Its part of the sum of squares, of how many numbers, and the chance of more if all is right.
-    mast_sigmas, mast_chance
-        How far the mast would be elsewhere without it, the length of the step in sigmas of the fit's mast;
-        and the chance of such a step, which has the covariance of the fit without it less that with it.
+    pull_sigmas
+        How far the compared numbers would be elsewhere without it, the length of the step in the fit's
+        sigmas.
+    pull, pull_freedom, pull_chance
+        Chi-square of that step, in directions that both the board and the others determine, of how many
+        numbers; and the chance of more. It has the covariance of the fit without the board less that with it.
     """
 
     board: tuple[str, str]
     dots: int
-    fitted_px: float
-    predicted_px: float
-    chi2: float
-    freedom: int
-    chance: float
-    mast_sigmas: float
-    mast_chance: float
+    fitted_px: float = float("nan")
+    predicted_px: float = float("nan")
+    chi2: float = float("nan")
+    freedom: int = 0
+    chance: float = 1.0
+    pull_sigmas: float = float("nan")
+    pull: float = 0.0
+    pull_freedom: int = 0
+    pull_chance: float = 1.0
 
     @property
     def least_chance(self) -> float:
-        """The chance that neither its residuals nor its pull on the mast would be larger."""
-        return min(1.0, 2 * min(self.chance, self.mast_chance))
+        """The chance that neither its residuals nor its pull on the numbers would be larger."""
+        return min(1.0, 2 * min(self.chance, self.pull_chance))
+
+    @property
+    def sentence(self) -> str:
+        """The contradiction to the others, and the remedy."""
+        return (
+            f"placement {self.board[1]} of board {self.board[0]} contradicts the others: its pictures say "
+            f"something else of cameras, axes and joints (chi-square {self.pull:.0f} for {self.pull_freedom} "
+            "numbers). Check that it is the same board and that nothing changed in between, and put it up "
+            "there once more"
+        )
 
 
 def left_out_boards(
-    problem: Adjustment, fit: Minimum[Estimate], covariance: FloatArray
+    problem: Adjustment, fit: Minimum[Estimate], covariance: FloatArray, kinds: Sequence[str]
 ) -> tuple[LeftOutBoard, ...]:
-    """Return what the rest says of each board, the least likely first.
+    """Return what the rest says of each board, the least likely first; nothing of a board alone.
 
     Parameters
     ----------
     problem, fit, covariance
         A fit at its minimum, and the covariance (p, p) of its unknowns.
+    kinds
+        The kinds of unknowns (`calib.adjust.unknowns`) that a board's pull is on.
     """
     groups: dict[tuple[str, str], list[tuple[ImageTerm | StationTerm, ResidualBlock]]] = {}
     for what, block in problem.blocks(fit.state):
         if not isinstance(what, Known) and what.board is not None:
             groups.setdefault(what.board, []).append((what, block))
-    mast = problem.at(MAST)
-    of_mast = covariance[np.ix_(mast, mast)]
+    if len(groups) < 2:
+        return ()
+    compared = problem.unknowns.of_kinds(*kinds)
     whole = fit.normal.matrix + np.diag(problem.weak)
-    noise = scattering(problem, fit.state, [t for t in problem.images if t.keep.any()]).values()
-    found = [
-        _left_out(
-            board, group, whole, problem.at(("board", board)), of_mast, mast,
-            [one for image, one in noise if image.board == board],
-        )
-        for board, group in groups.items()
-    ]  # fmt: skip
+    images = [image for image in problem.images if image.keep.any()]
+    noise: dict[tuple[str, str], list[Scatter]] = {}
+    for image, one in scattering(problem, fit.state, images).values():
+        noise.setdefault(image.board, []).append(one)
+    found = []
+    for board, group in groups.items():
+        touched = np.unique(np.concatenate([block.columns for _, block in group]))
+        numbers = np.intersect1d(compared, touched)
+        own = problem.at(("board", board)) if board not in problem.held else np.zeros(0, dtype=int)
+        spread = covariance[np.ix_(numbers, numbers)]
+        found.append(_left_out(board, group, whole, own, numbers, spread, noise.get(board, [])))
     return tuple(sorted(found, key=lambda one: one.least_chance))
 
 
@@ -206,11 +219,12 @@ def _left_out(
     group: list[tuple[ImageTerm | StationTerm, ResidualBlock]],
     whole: FloatArray,
     own: np.ndarray,
-    of_mast: FloatArray,
-    mast: np.ndarray,
+    compared: np.ndarray,
+    spread: FloatArray,
     noise: list[Scatter],
 ) -> LeftOutBoard:
-    """One board by the others; its images scatter by ``noise``."""
+    """One board by the others; the covariance of what is compared is ``spread``, its images scatter by
+    ``noise``."""
     rest, pull, squares, count = whole.copy(), np.zeros(len(whole)), 0.0, 0
     for _, block in group:
         rest[np.ix_(block.columns, block.columns)] -= block.jacobian.T @ block.jacobian
@@ -223,31 +237,30 @@ def _left_out(
     step = np.zeros(len(whole))
     try:
         factor = cho_factor(rest[np.ix_(others, others)] * np.outer(size, size), check_finite=False)
-        step[others] = size * cho_solve(factor, size * pull[others], check_finite=False)
-        to_mast = np.zeros((len(others), len(mast)))
-        to_mast[np.searchsorted(others, mast), np.arange(len(mast))] = 1.0
-        without = size[:, None] * cho_solve(factor, size[:, None] * to_mast, check_finite=False)
-    except np.linalg.LinAlgError:  # the others leave open what this board alone tells
-        nan = float("nan")
-        return LeftOutBoard(board, dots, nan, nan, nan, 0, 1.0, nan, 1.0)
+    except np.linalg.LinAlgError:  # the others leave open what this board alone determines
+        return LeftOutBoard(board, dots)
+    step[others] = size * cho_solve(factor, size * pull[others], check_finite=False)
+    picked = np.zeros((len(others), len(compared)))
+    picked[np.searchsorted(others, compared), np.arange(len(compared))] = 1.0
+    without = picked.T @ (size[:, None] * cho_solve(factor, size[:, None] * picked, check_finite=False))
     chi2, freedom = squares + float(pull @ step), max(count - len(own), 1)
-    fitted, predicted = _dots(board, group, step)
-    moved, by_luck = _pull(step[mast], without.T @ to_mast, of_mast)
     scale = float(np.average([n.square for n in noise], weights=[n.freedom for n in noise])) if noise else 1.0
-    likely = chance(chi2, freedom, scale)
-    return LeftOutBoard(board, dots, fitted, predicted, chi2, freedom, likely, moved, by_luck)
+    found = LeftOutBoard(board, dots, *_dots(board, group, step), chi2, freedom, chance(chi2, freedom, scale))
+    return _pulled(found, step[compared], without, spread)
 
 
-def _pull(step: FloatArray, without: FloatArray, of_mast: FloatArray) -> tuple[float, float]:
-    """How far a board moves the mast, in sigmas, and the chance of it; covariances without and with it."""
+def _pulled(board: LeftOutBoard, step: FloatArray, without: FloatArray, spread: FloatArray) -> LeftOutBoard:
+    """The board with how far it moves numbers; covariances are those without and with it."""
     if not len(step):
-        return 0.0, 1.0
-    root = np.linalg.inv(np.linalg.cholesky(of_mast))
+        return replace(board, pull_sigmas=0.0)
+    scale = np.sqrt(np.diag(spread))
+    root = np.linalg.inv(np.linalg.cholesky(spread / np.outer(scale, scale))) / scale
     values, vectors = np.linalg.eigh(root @ without @ root.T - np.eye(len(step)))
     along = vectors.T @ root @ step
-    told = values > TOLD
-    chi2 = float(np.sum(along[told] ** 2 / values[told]))
-    return float(np.linalg.norm(along)), chance(chi2, int(told.sum()))
+    compared = (values > DETERMINES) & (REDUNDANT * (1.0 + values) <= 1.0)
+    pull, freedom = float(np.sum(along[compared] ** 2 / values[compared])), int(compared.sum())
+    length, likely = float(np.linalg.norm(along)), chance(pull, freedom)
+    return replace(board, pull_sigmas=length, pull=pull, pull_freedom=freedom, pull_chance=likely)
 
 
 def _dots(
@@ -255,7 +268,12 @@ def _dots(
 ) -> tuple[float, float]:
     """Rms of a board's dots as fitted, and by the others with its pose fitted again, pixels."""
     ahead = [block.residual + block.jacobian @ step[block.columns] for _, block in group]
-    poses = [block.rates(("board", board)) for _, block in group]
+    poses = [
+        block.rates(("board", board))
+        if ("board", board) in block.parts
+        else np.zeros((len(block.residual), 0))
+        for _, block in group
+    ]
     pose = np.linalg.lstsq(np.concatenate(poses), -np.concatenate(ahead), rcond=None)[0]
     fitted, predicted = [], []
     for (what, block), residual, rates in zip(group, ahead, poses, strict=True):
@@ -263,63 +281,8 @@ def _dots(
             sigma = np.repeat(what.sigma_px[what.keep], 2)
             fitted.append(block.residual * sigma)
             predicted.append((residual + rates @ pose) * sigma)
-    if not fitted:
-        return float("nan"), float("nan")
     return _rms(fitted), _rms(predicted)
 
 
 def _rms(parts: list[FloatArray]) -> float:
-    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
-
-
-@dataclass(frozen=True)
-class OtherPlacements:
-    """A placement held against the others: chi-square of what its pictures and theirs say of ``freedom``
-    numbers that they share, and its chance if all is right, all placements counted."""
-
-    board: tuple[str, str]
-    chi2: float
-    freedom: int
-    chance: float
-
-    @property
-    def sentence(self) -> str:
-        """The contradiction to the others, and the remedy."""
-        return (
-            f"placement {self.board[1]} of board {self.board[0]} contradicts the others: its pictures say "
-            f"something else of cameras, axes and joints (chi-square {self.chi2:.0f} for {self.freedom} "
-            "numbers). Check that it is the same board and that nothing changed in between, and put it up "
-            "there once more"
-        )
-
-
-def by_other_placements(problem: Adjustment, state: Estimate) -> tuple[OtherPlacements, ...]:
-    """Return each placement held against the others, the least likely first; none if there is but one.
-
-    Parameters
-    ----------
-    problem, state
-        A fit at its minimum.
-    """
-    chi2, matrix, _ = problem.normal(state)
-    covariance = covariance_of(matrix, problem.weak)
-    _, freedom = goodness(problem, state, covariance)
-    images = [image for image in problem.images if image.keep.any()]
-    boards = list(dict.fromkeys(image.board for image in images))
-    found = []
-    for board in boards if len(boards) > 1 else ():
-        blocks = problem.image_blocks(state, [image for image in images if image.board == board])
-        columns = np.unique(np.concatenate([block.columns for block in blocks]))
-        residual = np.concatenate([block.residual for block in blocks])
-        jacobian = np.zeros((len(residual), len(columns)))
-        first = 0
-        for block in blocks:
-            last = first + len(block.residual)
-            jacobian[first:last, np.searchsorted(columns, block.columns)] = block.jacobian
-            first = last
-        every = ResidualBlock(residual, jacobian, columns, 2)
-        keep = np.ones(len(jacobian) // 2, dtype=bool)
-        pull, numbers = left_out(every, covariance[np.ix_(columns, columns)], keep, problem.huber).pull()
-        likely = chance(pull, numbers, chi2 / max(freedom, 1.0), max(freedom, 1.0))
-        found.append(OtherPlacements(board, pull, numbers, min(1.0, len(boards) * likely)))
-    return tuple(sorted(found, key=lambda one: one.chance))
+    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) if parts else float("nan")

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.adjust.goodness import Component
 from calib.adjust.hypotheses import Finding
-from calib.adjust.left_out import LeftOutBoard, OtherPlacements
+from calib.adjust.left_out import LeftOutBoard
 from calib.adjust.model_terms import ModelTerm
 from calib.adjust.outliers import Outlier
 from calib.adjust.significance import THREE_SIGMAS
@@ -260,7 +260,7 @@ class BenchCalibration(FittedRig):
     terms: tuple[TermGain, ...]
     checks: Mapping[str, CheckExpected]
     gauges: tuple[str, ...]
-    placements: tuple[OtherPlacements, ...]
+    placements: tuple[LeftOutBoard, ...]
     drifts: tuple[Finding, ...]
     joint_rad: float
     inexact_m: float

@@ -223,7 +223,7 @@ def _calibration(
         station=station_residuals(problem, state),
         components=weighed.components,
         wider=(*_left_out_for(change), *_wider(cleaned, weighed)),
-        left_out_boards=left_out_boards(problem, weighed.fit, covariance),
+        left_out_boards=left_out_boards(problem, weighed.fit, covariance, ["mast"]),
         rover_from_station=state.rover_from_station,
         rover_from_board=state.rover_from_board,
         prisms_in_rover_m=state.prisms_in_rover_m,

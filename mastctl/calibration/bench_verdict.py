@@ -107,17 +107,17 @@ def _placements(calibration: BenchCalibration) -> Iterator[Reason]:
 
 def _others(calibration: BenchCalibration) -> Iterator[Reason]:
     """Whether placements agree with one another."""
-    odd = [one for one in calibration.placements if one.chance < RARELY]
-    if len(calibration.placements) == 2:  # either contradicts the other
+    placements = sorted(calibration.placements, key=lambda one: one.pull_chance)
+    odd = [one for one in placements if len(placements) * one.pull_chance < RARELY]
+    if len(placements) == 2:  # either contradicts the other
         odd = odd[:1]
     yield from (Reason("care", one.sentence) for one in odd)
-    if calibration.placements and not odd:
-        worst = calibration.placements[0]
+    if placements and not odd:
         yield Reason(
             "good",
-            f"each of {len(calibration.placements)} placements says what the others say of cameras, axes and "
-            f"joints; {worst.board[1]} of board {worst.board[0]} differs most, chi-square {worst.chi2:.0f} "
-            f"for {worst.freedom} numbers",
+            f"each of {len(placements)} placements says what the others say of cameras, axes and joints; "
+            f"{placements[0].board[1]} of board {placements[0].board[0]} differs most, chi-square "
+            f"{placements[0].pull:.0f} for {placements[0].pull_freedom} numbers",
         )
 
 

@@ -134,7 +134,7 @@ def board_table(calibration: Calibration, most: int | None = None) -> Table | No
             f"{one.dots}",
             f"{one.fitted_px:.3f}",
             f"{one.predicted_px:.3f}",
-            f"{one.mast_sigmas:.2f}",
+            f"{one.pull_sigmas:.2f}",
             f"{one.least_chance:.2g}",
         ]
         for one in calibration.left_out_boards[:most]
@@ -182,7 +182,7 @@ def cross_validation_told(calibration: Calibration) -> dict[str, Any] | None:
                 "predicted_px": finite(one.predicted_px),
                 "chi2": finite(one.chi2),
                 "degrees_of_freedom": one.freedom,
-                "mast_sigmas": finite(one.mast_sigmas),
+                "mast_sigmas": finite(one.pull_sigmas),
                 "chance": one.least_chance,
             }
             for one in calibration.left_out_boards

@@ -255,7 +255,7 @@ def _by_the_others(calibration: Calibration) -> list[Reason]:
         words = (
             f"placement {one.board[1]} (set-up {one.board[0]}) contradicts the others: without it the mast "
         )
-        words += f"would be elsewhere by {one.mast_sigmas:.1f} of its sigmas"
+        words += f"would be elsewhere by {one.pull_sigmas:.1f} of its sigmas"
         if np.isfinite(one.predicted_px):
             words += f", and its dots are {one.predicted_px:.2f} px rms off what they say"
         reasons.append(Reason("care", words))

@@ -12,7 +12,7 @@ from scipy.special import chdtrc
 from calib.adjust.adjustment import PAN_TILT, Adjustment
 from calib.adjust.goodness import goodness
 from calib.adjust.hypotheses import find_drifts
-from calib.adjust.left_out import by_other_placements
+from calib.adjust.left_out import left_out_boards
 from calib.adjust.model_terms import TERM_KINDS, Tested, candidate_terms, choose_terms, moves_px, term_motions
 from calib.adjust.outliers import name_outliers
 from calib.adjust.result import BenchCalibration, CheckExpected, ImageResiduals, TermGain, rig_of
@@ -98,7 +98,7 @@ def bench_calibration(
         chi2=total,
         degrees_of_freedom=freedom,
         chi2_probability=float(chdtrc(freedom, total)) if freedom > 0 else float("nan"),
-        placements=by_other_placements(problem, state),
+        placements=left_out_boards(problem, weighed.fit, covariance, ["mast", "joints", "camera"]),
         drifts=find_drifts(problem, state),
         components=weighed.components,
         joint_rad=problem.joint_rad,

@@ -173,7 +173,7 @@ def test_a_board_by_the_others_is_what_a_fit_without_it_says(made: Made, good: C
         assert good.chi2 - without.chi2 == pytest.approx(one.chi2, rel=0.01)
         moved = without.estimate[:6] - good.estimate[:6]
         length = np.sqrt(moved @ np.linalg.solve(good.covariance[:6, :6], moved))
-        assert one.mast_sigmas == pytest.approx(length, rel=0.1, abs=0.02)
+        assert one.pull_sigmas == pytest.approx(length, rel=0.1, abs=0.02)
     assert all(one.predicted_px >= one.fitted_px for one in good.left_out_boards if one.dots)
     assert min(one.least_chance for one in good.left_out_boards) > 1e-4
 

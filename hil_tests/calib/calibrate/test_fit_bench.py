@@ -66,7 +66,8 @@ def test_a_head_without_errors_is_found_from_rough_focal_lengths_alone() -> None
     fit = fit_bench(simulate_bench(3, plan))
     assert not [t.name for t in fit.terms if t.entered]
     assert fit.chi2_probability > 1e-3
-    assert all(1e-3 < one.chance <= 1.0 for one in (*fit.drifts, *fit.placements))
+    assert all(1e-3 < drift.chance <= 1.0 for drift in fit.drifts)
+    assert all(1e-3 < board.pull_chance <= 1.0 for board in fit.placements)
     for name, truth in plan.cameras.items():
         assert np.abs(errors_in_sigmas(plan, fit, name)).max() < IN_SIGMAS
         assert fit.rms_px[name] == pytest.approx((0.1, 0.1), rel=0.1)
@@ -265,7 +266,7 @@ def test_what_drifts_is_named_with_its_size_and_is_no_slip() -> None:
     assert max(drifts["pan"].chance, drifts["navcam_right"].chance) < 1e-6 < drifts["tilt"].chance
     assert "pan drifts off its reading, by +0." in drifts["pan"].sentence
     # what the second placement says of the camera is not what the first one says
-    assert fit.placements[0].chance < 1e-6
+    assert fit.placements[0].pull_chance < 1e-6
 
 
 def test_a_drift_of_many_numbers_has_to_explain_more_than_a_change_of_few() -> None:
