@@ -22,22 +22,16 @@ from calib.adjust.adjustment import Adjustment
 from calib.adjust.terms import PRISMS, TAPES, ImageTerm, StationTerm
 from calib.adjust.unknowns import Estimate, Known, ResidualBlock
 from calib.geometry.rigid import FloatArray
+from calib.geometry.significance import Level
 
 FEWEST = 3.0
 """With less redundancy than this, nothing is said of a kind of measurement."""
-
-RARELY = 0.001
-"""A stated sigma is wrong if chance makes residuals so large, or so small, in fewer than so many surveys, all
-kinds together."""
 
 LEAST = 0.1
 """A sigma is narrowed to this part of the stated one at most: what is smaller still is no noise."""
 
 STAYS = 20.0
 """A kind that was called wrong stays so up to a chance so many times larger."""
-
-APART = 0.001
-"""Tapes and prisms are one instrument's, unless chance makes them differ so seldom."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +135,7 @@ def found_sigmas(components: Sequence[Component], *, narrows: bool = True) -> di
     """
     told = [c for c in components if np.isfinite(c.factor)]
     found = {c.kind: c.factor for c in told}
-    limit = {c.kind: (STAYS if c.weighed != 1.0 else 1.0) * RARELY / len(told) for c in told}
+    limit = {c.kind: (STAYS if c.weighed != 1.0 else 1.0) * Level.STATED / len(told) for c in told}
     odd = {c.kind: 2 * min(c.chance, c.small_chance) if narrows else c.chance for c in told}
     wrong = {kind for kind, chance in odd.items() if chance < limit[kind]}
     station = {c.kind: c for c in told if c.kind in (TAPES, PRISMS)}
@@ -157,7 +151,7 @@ def as_one(one: Component, other: Component) -> bool:
     """Return whether two kinds may have one sigma."""
     ratio = (one.factor / other.factor) ** 2
     above = float(fdtrc(one.redundancy, other.redundancy, ratio))
-    return 2 * min(above, 1 - above) > APART
+    return 2 * min(above, 1 - above) > Level.STATED
 
 
 def goodness(problem: Adjustment, state: Estimate, covariance: FloatArray) -> tuple[float, float]:

@@ -22,21 +22,12 @@ from scipy.linalg import null_space
 from calib.adjust.adjustment import PAN_TILT, Adjustment, Motions
 from calib.adjust.goodness import goodness
 from calib.adjust.score import MADE_UP, Gain, Score
-from calib.adjust.significance import chance
 from calib.adjust.solver import covariance_of
 from calib.adjust.terms import DRAWING, ImageTerm
 from calib.adjust.unknowns import Estimate, ResidualBlock
 from calib.geometry.rig import AXIS_NAMES, MAST_NAMES
 from calib.geometry.rigid import FloatArray, rigid_rates
-
-FALSE_ALARMS = 0.0003
-"""The chance that a survey that is as modelled asks for any hypothesis."""
-
-DRAWING_ALARMS = 0.01
-"""The same of the prisms' drawing alone: few prisms check one another, and the rover frame hangs on them."""
-
-UNLIKELY = 1e-7
-"""A change is reported if so large a gain, were it none, had less than this chance over all tries."""
+from calib.geometry.significance import Level, chance
 
 EXPLAINS = 0.5
 """A hypothesis explains an excess of chi-square if it would take away this part of it."""
@@ -192,10 +183,9 @@ def survey_findings(problem: Adjustment, state: Estimate) -> tuple[Finding, ...]
     """
     fit = ScoredFit(problem, state)
     found = fit.findings(_of_surveys(fit)) if fit.images else []
-    limit = FALSE_ALARMS / max(len(found), 1)
-    found = [
-        replace(f, significant=f.chance < (DRAWING_ALARMS if f.name == DRAWING else limit)) for f in found
-    ]
+    # Few prisms check one another, and the rover frame hangs on their drawing.
+    limits, each = {DRAWING: float(Level.MEASUREMENT)}, Level.HYPOTHESIS / max(len(found), 1)
+    found = [replace(f, significant=f.chance < limits.get(f.name, each)) for f in found]
     return tuple(sorted(found, key=lambda f: (not f.significant, 2 * f.numbers - f.gain)))
 
 
@@ -235,7 +225,7 @@ def find_change(problem: Adjustment, state: Estimate) -> Finding | None:
     if not sure and what.subject[0] == "camera":  # it is the model that is wrong
         return None
     found = fit.finding(what, at, gain, len(tried))
-    if found.chance > UNLIKELY or (len(gain.values) > 1 and gain.chi2 < LEAST_PART * fit.chi2):
+    if found.chance > Level.CHANGED or (len(gain.values) > 1 and gain.chi2 < LEAST_PART * fit.chi2):
         return None
     return replace(found, sure=sure)
 

@@ -26,11 +26,11 @@ from scipy.linalg import cho_factor, cho_solve
 
 from calib.adjust.adjustment import Adjustment, bounded_weights
 from calib.adjust.scatter import Scatter, scattering
-from calib.adjust.significance import chance
 from calib.adjust.solver import Minimum
 from calib.adjust.terms import ImageTerm, StationTerm
 from calib.adjust.unknowns import Estimate, Known, ResidualBlock
 from calib.geometry.rigid import FloatArray
+from calib.geometry.significance import chance
 
 REDUNDANT = 0.02
 """Directions of a residual with less than this part of the noise left in them cannot be tested."""

@@ -21,11 +21,11 @@ from typing import Literal
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
-from calib.adjust.significance import THREE_SIGMAS, chance
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rig import AXIS_NAMES, JOINTS_NAMES, MAST_NAMES
 from calib.geometry.rigid import FloatArray
+from calib.geometry.significance import Level, chance
 
 Kind = Literal["harmonic 1", "harmonic 2", "backlash", "offset", "twist", "bow"]
 
@@ -122,7 +122,7 @@ def choose_terms(
     scale: float,
     freedom: float,
     motions: Mapping[tuple[str, ...], FloatArray],
-    enters: float = THREE_SIGMAS,
+    enters: float = Level.THREE_SIGMAS,
 ) -> tuple[tuple[str, ...], dict[str, Tested]]:
     """Return the terms that are needed, and how each one does beside these.
 

@@ -32,10 +32,10 @@ from scipy.special import chdtri
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.left_out import REDUNDANT, LeftOut, dot_statistics, left_out
 from calib.adjust.scatter import MOST, scatter
-from calib.adjust.significance import typical_scale
 from calib.adjust.terms import ImageTerm, StationTerm
 from calib.adjust.unknowns import Estimate, ResidualBlock
 from calib.geometry.rigid import FloatArray, moved_rigid
+from calib.geometry.significance import Level, typical_scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +72,6 @@ class Outlier:
         off = f"{self.size:.2f} px" if self.kind in ("dot", "image") else f"{1000 * self.size:.1f} mm"
         return f"{self.name} is off by {off} and was not used"
 
-
-FALSE_ALARMS = 0.01
-"""Chance that a survey without blunders loses any dot; and any tape or prism."""
-
-FALSE_IMAGES = 1e-4
-"""The same for whole images, whose dots have to be off together: their noise is not quite normal. Of 18
-corners in a rendered picture, all found well, chi-square was 74 for 36."""
 
 BAD_IMAGE = 0.25
 """With more than this part of its dots beyond their limit an image is judged as a whole."""
@@ -228,14 +221,14 @@ class _Limits:
     point_scale: float
 
     def dot(self, camera: str) -> float:
-        return float(chdtri(2, FALSE_ALARMS / max(self.dots, 1))) * self.dot_scales[camera]
+        return float(chdtri(2, Level.MEASUREMENT / max(self.dots, 1))) * self.dot_scales[camera]
 
     def image(self, camera: str, freedom: int, own: float) -> float:
-        limit = float(chdtri(max(freedom, 1), FALSE_IMAGES / max(self.images, 1)))
+        limit = float(chdtri(max(freedom, 1), Level.WHOLE_IMAGE / max(self.images, 1)))
         return limit * max(self.dot_scales[camera], own)
 
     def point(self, freedom: int) -> float:
-        return float(chdtri(freedom, FALSE_ALARMS / max(self.points, 1))) * self.point_scale
+        return float(chdtri(freedom, Level.MEASUREMENT / max(self.points, 1))) * self.point_scale
 
 
 def _tested(
@@ -319,7 +312,7 @@ def _board_misfit(
     """
     tapes = [p for p in problem.station if p.board == board and p.keep]
     shown = [problem.images[i] for i in images]
-    allowed = float(chdtri(3, FALSE_ALARMS / max(len(problem.station), 1)))
+    allowed = float(chdtri(3, Level.MEASUREMENT / max(len(problem.station), 1)))
     without = ([p for p in tapes if p is not one] for one in tapes)
     return min(
         _misfit(problem, state, board, shown, tapes),

@@ -13,10 +13,10 @@ from calib.adjust.hypotheses import Finding
 from calib.adjust.left_out import LeftOutBoard
 from calib.adjust.model_terms import ModelTerm
 from calib.adjust.outliers import Outlier
-from calib.adjust.significance import THREE_SIGMAS
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import FloatArray, Rigid
+from calib.geometry.significance import Level
 from calib.survey.records import Click, Survey
 
 HELD_FIXED = (
@@ -219,7 +219,7 @@ class TermGain:
         told = f"{self.name}: {1e3 * size:.2f} ± {1e3 * spread:.2f} {milli}"
         if not self.entered:
             return f"{told}, not significant (chi-square {self.chi2:.1f}): left out"
-        if self.chance > THREE_SIGMAS and self.term.kind != "harmonic 2":
+        if self.chance > Level.THREE_SIGMAS and self.term.kind != "harmonic 2":
             return f"{told}, chi-square {self.chi2:.1f}: not significant, but the pictures cannot exclude it"
         return f"{told}, moves pixels by {self.moves_px:.2f} px rms, lowers chi-square by {self.chi2:.0f}"
 

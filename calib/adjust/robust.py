@@ -17,12 +17,12 @@ from calib.adjust.adjustment import HUBER, Adjustment
 from calib.adjust.goodness import Component, found_sigmas, variance_components
 from calib.adjust.outliers import judge
 from calib.adjust.scatter import with_scales
-from calib.adjust.significance import typical_scale
 from calib.adjust.solver import Minimum, Normal, covariance_of, minimise
 from calib.adjust.terms import ImageTerm, StationTerm, scattered_images, widened_images
 from calib.adjust.unknowns import Estimate
 from calib.errors import CalibError
 from calib.geometry.rigid import FloatArray
+from calib.geometry.significance import typical_scale
 
 
 class SurveyNotFitted(CalibError):

@@ -21,10 +21,10 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from calib.adjust.adjustment import Adjustment
-from calib.adjust.significance import typical_scale
 from calib.adjust.terms import ImageTerm, scattered_images, widened_images
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rigid import FloatArray
+from calib.geometry.significance import Level, typical_scale
 
 MOST = 6.0
 """Noise is at most so many times what is stated: five times is what a careless focus makes of it."""
@@ -32,9 +32,6 @@ MOST = 6.0
 ORDER = 2.0
 """Or until a dot's sigma is so many times what the survey states of all dots: dots come with sigmas of their
 own that may be much less, and a near board shows its print's errors most."""
-
-ODD = 0.001
-"""An image has a scale of its own, and a camera another than stated, if chance makes that less often."""
 
 DEGREES = ((60, 3), (24, 2), (10, 1))
 """Fewest dots for a polynomial of that degree; an image with fewer has its camera's scale."""
@@ -104,7 +101,7 @@ def scales(found: Mapping[str, tuple[ImageTerm, Scatter]], order_px: float) -> S
         if like.any():
             typical = float(np.sum((squares * freedom)[like]) / freedom[like].sum())
         together = float(freedom[like].sum())
-        if not (typical > 1.0 and chdtrc(together, typical * together) < ODD):
+        if not (typical > 1.0 and chdtrc(together, typical * together) < Level.STATED):
             typical = 1.0
         most = [_most(found[name][0], order_px) for name in mine]
         cameras[kind] = min(float(np.sqrt(typical)), *most)
@@ -194,7 +191,7 @@ def print_error_m(problem: Adjustment, state: Estimate) -> float:
             sums[key] = matrix + rates.T @ rates, pull + rates.T @ residual
     known = [(matrix, pull) for matrix, pull in sums.values() if np.linalg.det(matrix) > 0.0]
     agree = sum(float(pull @ np.linalg.solve(matrix, pull)) for matrix, pull in known)
-    if not known or chdtrc(2 * len(known), agree) >= ODD:
+    if not known or chdtrc(2 * len(known), agree) >= Level.STATED:
         return 0.0
     return float(np.sqrt((agree - 2 * len(known)) / sum(float(np.trace(matrix)) for matrix, _ in known)))
 
@@ -260,7 +257,7 @@ def _odd(one: Scatter, typical: float, freedom: float) -> bool:
         above = float(chdtrc(one.freedom, one.freedom * ratio))
     else:
         above = float(fdtrc(one.freedom, freedom, ratio))
-    return 2 * min(above, 1.0 - above) < ODD
+    return 2 * min(above, 1.0 - above) < Level.STATED
 
 
 def _median(values: FloatArray, weights: FloatArray) -> float:

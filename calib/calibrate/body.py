@@ -20,13 +20,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
-from calib.adjust.significance import THREE_SIGMAS, chance, sigmas
 from calib.calibrate.body_sights import BodySights, Equations, body_sights
 from calib.errors import NoCorrection
 from calib.geometry.covariance import MOST_SIGMAS, RigCovariance, click_rates, pixel_rates
 from calib.geometry.parameters import carried_errors, parameter_names, twist_rates
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid, rigid_twists
+from calib.geometry.significance import Level, chance, sigmas
 from calib.matching.handed_over import MatchedHandoff
 
 PRIOR_SHIFT_M, PRIOR_TURN_RAD = 0.005, 0.005
@@ -45,9 +45,6 @@ FEWEST = 8
 
 SPREAD = 0.2
 """Of the picture's width, that found pixels must span at least."""
-
-FALSE_ALARMS = 0.01
-"""Chance that a record without blunders loses a hand-off."""
 
 MOST_OUTLIERS = 1 / 3
 
@@ -143,7 +140,7 @@ class BodyPose:
     @property
     def significant(self) -> bool:
         """Whether chance alone does so less often than three sigma."""
-        return self.chance < THREE_SIGMAS
+        return self.chance < Level.THREE_SIGMAS
 
 
 def fit_body_pose(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHandoff]) -> BodyPose:
@@ -286,7 +283,7 @@ def _keep(sights: BodySights) -> tuple[np.ndarray, FloatArray, FloatArray]:
     """Which hand-offs agree; the worst goes first and the fit is done again, and what passes comes back."""
     count = len(sights.handoffs)
     numbers = 2 * sights.seen.sum(axis=1)
-    limits = chdtri(numbers, FALSE_ALARMS / count)
+    limits = chdtri(numbers, Level.MEASUREMENT / count)
     robust = _fit(sights, robust=True)
     statistics = _normal(robust.after, np.ones(count))[2] / robust.scale
     keep = statistics <= limits

@@ -18,11 +18,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from calib.adjust.significance import MEDIAN_OF_TWO, chance, sigmas
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
+from calib.geometry.significance import MEDIAN_OF_TWO, chance, sigmas
 from calib.matching.patch import match_patch
 from calib.matching.verdict import MatchSettings
 from calib.matching.warp import Grey, facing_plane

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.adjust.significance import MEDIAN_OF_TWO
 from calib.adjust.terms import ImageTerm
 from calib.calibrate.starts.agreeing import thinned
 from calib.calibrate.starts.views import ViewsTooFew, poses_of, view_poses
 from calib.geometry.cahvor import CameraModel, Kind
 from calib.geometry.parameters import parameter_names
+from calib.geometry.significance import MEDIAN_OF_TWO
 
 FAMILIES: tuple[Kind, ...] = ("CAHV", "OPENCV4", "CAHVOR", "OPENCV5", "OPENCV8", "OPENCV_FISHEYE", "CAHVORE")
 FOLDS = 5

@@ -35,6 +35,7 @@ from calib.adjust.unknowns import Estimate
 from calib.calibrate.refusals import refuse_far, refuse_unsettled
 from calib.calibrate.starts.survey import Start, start_values
 from calib.geometry.rig import MAST_FREE
+from calib.geometry.significance import Level
 from calib.survey.records import Survey
 
 FEW_LEFT_OUT = 3
@@ -179,7 +180,7 @@ def _calibration(
     order = problem.unknowns.of_kinds("mast", "camera")
     mine = covariance[np.ix_(order, order)]
     chi_square, freedom = goodness(problem, state, covariance)
-    if freedom > 0 and chdtrc(freedom, chi_square) < 0.001:
+    if freedom > 0 and chdtrc(freedom, chi_square) < Level.STATED:
         notes.append(
             f"the residuals are {np.sqrt(chi_square / freedom):.2f} times what their sigmas allow "
             f"(chi-square {chi_square:.0f} for {freedom:.0f}); uncertainties are scaled up by as much"
@@ -247,7 +248,7 @@ def _prism_notes(problem: Adjustment, state: Estimate, mast_parameters: int) -> 
     for setup in state.rover_from_station:
         prisms = [p for p in problem.station if p.setup == setup and p.board is None and p.keep]
         residuals = np.array([problem.station_residual(state, p) for p in prisms])
-        if float(np.sum(residuals**2)) > chdtri(3 * len(prisms), 0.001):
+        if float(np.sum(residuals**2)) > chdtri(3 * len(prisms), float(Level.STATED)):
             worst = 1000 * float(np.linalg.norm(residuals, axis=1).max()) * prisms[0].sigma_m
             why = "an upright mast" if mast_parameters == 4 else "their CAD positions"
             notes.append(

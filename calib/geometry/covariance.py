@@ -273,11 +273,8 @@ def click_covariance(
     return np.asarray(total + sigma_rad * sigma_rad * (turned @ turned.T))
 
 
-FALSE_ALARMS = 0.001
-"""Chance that two clicks of one point are refused, if all stated sigmas are right."""
-
 MOST_SIGMAS = 3.2905
-"""Beyond it a normal error is, either side, in that part of cases."""
+"""Two clicks are of no point beyond it: a normal error is, either side, with the chance `Level.STATED`."""
 
 RIG_PX = 1.0
 """One sigma, each pixel coordinate, of what a camera is taken to be wrong by whose errors its rig does not

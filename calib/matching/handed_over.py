@@ -19,9 +19,9 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.adjust.significance import THREE_SIGMAS, chance, sigmas
 from calib.geometry.handoff import Handoff, Joints
 from calib.geometry.rigid import FloatArray
+from calib.geometry.significance import Level, chance, sigmas
 from calib.matching.handoff import RefinedPixel, RefinedVerdict, RefineSettings
 
 MODEL_PX = RefineSettings().model_px
@@ -131,10 +131,6 @@ def matched_handoff(
     return MatchedHandoff(when, mast_digest, pair, joints, clicks, sigma_px, to_joints, landed)
 
 
-FALSE_ALARMS = 0.01
-"""Chance that a camera's offsets without a blunder lose one."""
-
-
 @dataclass(frozen=True, eq=False)
 class HandoffBias:
     """The mean offset of one camera.
@@ -163,7 +159,7 @@ class HandoffBias:
     @property
     def significant(self) -> bool:
         """Whether chance alone does so less often than three sigma."""
-        return self.chance < THREE_SIGMAS
+        return self.chance < Level.THREE_SIGMAS
 
     @property
     def sentence(self) -> str:
@@ -213,7 +209,7 @@ def _mean(source: str, camera: str, off_px: FloatArray, covariance_px2: FloatArr
     statistics = np.einsum("ni,nij,nj->n", apart, weights, apart)
     # Chi-square of two degrees of freedom is beyond -2 ln p with the chance p.
     typical = max(1.0, float(np.median(statistics)) / (-2.0 * math.log(0.5)))
-    keep = statistics <= typical * (-2.0 * math.log(FALSE_ALARMS / len(off_px)))
+    keep = statistics <= typical * (-2.0 * math.log(Level.MEASUREMENT / len(off_px)))
     information = weights[keep].sum(axis=0)
     mean = np.linalg.solve(information, np.einsum("nij,nj->i", weights[keep], off_px[keep]))
     rest = off_px[keep] - mean

@@ -24,10 +24,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.adjust.significance import chance, sigmas
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import MOST_SIGMAS
 from calib.geometry.rigid import FloatArray, Rigid, moved_rigid
+from calib.geometry.significance import Level, chance, sigmas
 from calib.matching.handoff import Eye
 from calib.matching.partner import find_partner
 from calib.matching.patch import match_patch
@@ -112,10 +112,6 @@ def one_point(
     return None
 
 
-FALSE_ALARMS = 0.001
-"""Chance that a look after an honest motion doubts it."""
-
-
 @dataclass(frozen=True, eq=False)
 class PoseDoubt:
     """The evidence of pictures against a motion.
@@ -166,7 +162,7 @@ def pose_doubt(
     off = seen.position_m - believed_m
     statistic = float(off @ np.linalg.solve(covariance_m2 + seen.covariance_m2, off))
     probability = chance(statistic, 3)
-    return PoseDoubt(off, sigmas(probability), sure) if probability < FALSE_ALARMS else None
+    return PoseDoubt(off, sigmas(probability), sure) if probability < Level.STATED else None
 
 
 UNKNOWN_M = 100.0

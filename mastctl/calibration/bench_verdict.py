@@ -9,9 +9,9 @@ import numpy as np
 from calib.adjust.result import BenchCalibration
 from calib.errors import CalibError
 from calib.geometry.covariance import RigCovariance
+from calib.geometry.significance import Level
 from calib.plan.knowledge import Knowledge, Workspace, pointing
 from calib.survey.records import Survey
-from mastctl.calibration.checks import RARELY
 from mastctl.calibration.verdict import (
     MANY_LEFT_OUT,
     POINTING_BAD_PX,
@@ -108,7 +108,7 @@ def _placements(calibration: BenchCalibration) -> Iterator[Reason]:
 def _others(calibration: BenchCalibration) -> Iterator[Reason]:
     """Whether placements agree with one another."""
     placements = sorted(calibration.placements, key=lambda one: one.pull_chance)
-    odd = [one for one in placements if len(placements) * one.pull_chance < RARELY]
+    odd = [one for one in placements if len(placements) * one.pull_chance < Level.STATED]
     if len(placements) == 2:  # either contradicts the other
         odd = odd[:1]
     yield from (Reason("care", one.sentence) for one in odd)
@@ -124,7 +124,7 @@ def _others(calibration: BenchCalibration) -> Iterator[Reason]:
 def _drifts(calibration: BenchCalibration) -> Iterator[Reason]:
     """Whether joints and cameras stayed what they were."""
     for drift in calibration.drifts:
-        if drift.chance < RARELY:
+        if drift.chance < Level.STATED:
             yield Reason("bad" if drift.size_px > POINTING_GOOD_PX else "care", drift.sentence)
 
 

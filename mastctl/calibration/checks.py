@@ -14,10 +14,9 @@ from calib.adjust.result import Calibration, ImageResiduals
 from calib.adjust.terms import DOTS_OF, JOINTS, PRISMS, TAPES
 from calib.adjust.uncertainty import pixel_covariance
 from calib.geometry.rigid import FloatArray, rigid_rates
+from calib.geometry.significance import Level
 from calib.survey.alignment import Alignment, NotAligned, rover_from_station, station_from_board
 from calib.survey.records import Survey
-
-RARELY = 0.001
 
 
 class CheckSize(NamedTuple):
@@ -58,7 +57,7 @@ def check_sizes(survey: Survey, calibration: Calibration) -> dict[str, CheckSize
         seen, expected = np.sqrt(np.mean(pairs, axis=0))
         each = np.array([part for _, part in pairs])
         freedom = 2 * each.sum() ** 2 / np.sum(each**2)
-        limit = expected * np.sqrt(chdtri(freedom, RARELY) / freedom)
+        limit = expected * np.sqrt(chdtri(freedom, float(Level.STATED)) / freedom)
         rarer = float(chdtrc(freedom, freedom * (seen / expected) ** 2))
         sizes[camera] = CheckSize(float(seen), float(expected), float(limit), rarer)
     return sizes

@@ -15,8 +15,9 @@ from calib.adjust.result import BenchCalibration, Calibration, ImageResiduals
 from calib.adjust.terms import PRISMS, TAPES
 from calib.adjust.uncertainty import pointing_covariance
 from calib.errors import CalibError
+from calib.geometry.significance import Level
 from calib.survey.records import Survey, SurveyFinding
-from mastctl.calibration.checks import RARELY, check_sizes, exchanged_boards
+from mastctl.calibration.checks import check_sizes, exchanged_boards
 from mastctl.calibration.tested import allowed, cross_validation_px, wrong_sentence
 
 Grade = Literal["good", "care", "bad"]
@@ -160,7 +161,7 @@ def _noise(survey: Survey, calibration: Calibration) -> list[Reason]:
 def chi_square_grade(calibration: Calibration | BenchCalibration, factor: float) -> Grade:
     """Return how bad residuals are that are ``factor`` times what stated sigmas make them: no reason by
     themselves where single kinds of measurements, or images, explain it; these have reasons of their own."""
-    if calibration.chi2_probability >= RARELY:
+    if calibration.chi2_probability >= Level.STATED:
         return "good"
     if any(c.wrong for c in calibration.components) or any(i.scatter > 1.0 for i in calibration.images):
         return "good"
@@ -249,7 +250,7 @@ def _by_the_others(calibration: Calibration) -> list[Reason]:
     boards = calibration.left_out_boards
     if not boards:
         return []
-    odd = [one for one in boards if one.least_chance * len(boards) < RARELY]
+    odd = [one for one in boards if one.least_chance * len(boards) < Level.STATED]
     reasons = []
     for one in odd:
         words = (

@@ -41,7 +41,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from calib.adjust.result import Calibration
-from calib.adjust.significance import THREE_SIGMAS
 from calib.adjust.uncertainty import pixel_covariance, pointing_covariance
 from calib.calibrate.survey import fit_joint
 from calib.errors import CalibError
@@ -49,6 +48,7 @@ from calib.files.mast_file import load_rig
 from calib.geometry.pointing import solve
 from calib.geometry.rig import MAST_NAMES, Rig, numbers_of
 from calib.geometry.rigid import FloatArray
+from calib.geometry.significance import Level
 from calib.geometry.stereo import triangulate
 from calib.survey.reader import read_survey
 from calib.survey.records import Sigma
@@ -159,7 +159,7 @@ def errors_in_sigmas(made: Provoked, fit: Calibration) -> dict[str, float]:
         covariance = fit.covariance[np.ix_(fitted, fitted)]
         distance = float(off @ np.linalg.solve(covariance, off))
         # The distance at which chance is that of three sigma of one number counts as three.
-        found["mast"] = SIGMAS * float(np.sqrt(distance / chi2.isf(THREE_SIGMAS, len(off))))
+        found["mast"] = SIGMAS * float(np.sqrt(distance / chi2.isf(Level.THREE_SIGMAS, len(off))))
     return found
 
 

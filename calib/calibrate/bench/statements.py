@@ -18,7 +18,6 @@ from calib.adjust.outliers import name_outliers
 from calib.adjust.result import BenchCalibration, CheckExpected, ImageResiduals, TermGain, rig_of
 from calib.adjust.robust import Weighed
 from calib.adjust.scatter import own_scales, print_error_m
-from calib.adjust.significance import chance_of_sum, rare_sum
 from calib.adjust.solver import Minimum, covariance_of
 from calib.adjust.terms import ImageTerm, lens_notes, scattered_images
 from calib.adjust.uncertainty import image_residuals, open_directions, rms_by_camera, sigma_by_key
@@ -27,9 +26,7 @@ from calib.calibrate.bench.problem import BenchProblem
 from calib.calibrate.starts.wrong_dots import wrong_points
 from calib.geometry.covariance import RigCovariance
 from calib.geometry.rigid import FloatArray
-
-UNPREDICTED = 3e-5
-"""Check images of a camera were not predicted if chance makes them so far off in fewer benches than this."""
+from calib.geometry.significance import Level, chance_of_sum, rare_sum
 
 
 def choose(
@@ -123,7 +120,7 @@ def _expected(
         square = sum(float(np.sum(i.residuals_px[i.used] ** 2)) for i in checked if i.name in names)
         expected[camera] = CheckExpected(
             float(np.sqrt(weights.mean())),
-            float(np.sqrt(rare_sum(UNPREDICTED, weights) / len(weights))),
+            float(np.sqrt(rare_sum(Level.PREDICTED, weights) / len(weights))),
             chance_of_sum(square, weights),
         )
     return expected

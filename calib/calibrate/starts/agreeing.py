@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
-from calib.adjust.significance import MEDIAN_OF_TWO
 from calib.adjust.solver import Minimum, minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rigid import FloatArray
+from calib.geometry.significance import MEDIAN_OF_TWO
 
 GROSS = 6.0
 """An image is left out if its typical residual is this many times the typical image's and the expected."""

@@ -24,6 +24,7 @@ from calib.adjust.terms import StationTerm, station_terms
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rig import MAST_NAMES
 from calib.geometry.rigid import FloatArray, Rigid
+from calib.geometry.significance import Level
 from calib.survey.alignment import (
     FALSE_ALARM,
     Alignment,
@@ -168,11 +169,6 @@ def _fit(survey: Survey, drawing: Mapping[str, FloatArray], station: Sequence[St
     return AdjustedPrisms(fit.state, covariance, fit.normal.cost, freedom, fit.settled)
 
 
-GROSS = 1e-9
-"""Tapes or prisms whose shape chance alone makes so seldom are not trusted for a start: only gross errors,
-since the stated sigmas may be too small. The finer ones are the fit's to judge."""
-
-
 @dataclass(frozen=True, eq=False)
 class StationPoses:
     """Poses of set-ups and boards from prisms and tapes alone.
@@ -208,7 +204,7 @@ def station_poses(survey: Survey) -> StationPoses:
     else:
         setups, prisms = _as_drawn(survey, blunders, notes)
     boards, bent = {}, set()
-    for (setup, placement), pose in station_from_board(survey, false_alarm=GROSS).items():
+    for (setup, placement), pose in station_from_board(survey, false_alarm=Level.GROSS).items():
         where = f"of placement {placement} (set-up {setup})"
         boards[setup, placement] = setups[setup] @ pose.b_from_a
         blunders += _left_out("tape", pose, survey.sigma.station_m, where)
@@ -223,7 +219,7 @@ def _as_drawn(
 ) -> tuple[dict[str, Rigid], dict[str, FloatArray]]:
     """Set-ups by prisms that are where the drawing says, and these."""
     found = {}
-    for setup, pose in rover_from_station(survey, false_alarm=GROSS).items():
+    for setup, pose in rover_from_station(survey, false_alarm=Level.GROSS).items():
         found[setup] = pose.b_from_a
         blunders += _left_out("prism", pose, survey.sigma.station_m, f"of set-up {setup}")
         if pose.doubt:
@@ -235,7 +231,7 @@ def _refined(
     survey: Survey, blunders: list[Outlier], notes: list[str]
 ) -> tuple[dict[str, Rigid], dict[str, FloatArray]]:
     """Set-ups and prisms by all set-ups and the drawing together."""
-    refined = adjust_prisms(survey, false_alarm=GROSS)
+    refined = adjust_prisms(survey, false_alarm=Level.GROSS)
     setups, prisms = dict(refined.state.rover_from_station), dict(refined.state.prisms_in_rover_m)
     measured = {(p.setup, p.point): p.position_m for p in survey.station if p.kind == "prism"}
     for setup, name in refined.rejected:
@@ -261,4 +257,6 @@ def _outlier(
     kind: Literal["prism", "tape"], name: str, where: str, off_m: FloatArray, sigma_m: float
 ) -> Outlier:
     off = float(np.linalg.norm(off_m))
-    return Outlier(kind, f"{kind} {name} {where}", (off / sigma_m) ** 2, float(chdtri(3, GROSS)), off)
+    return Outlier(
+        kind, f"{kind} {name} {where}", (off / sigma_m) ** 2, float(chdtri(3, float(Level.GROSS))), off
+    )

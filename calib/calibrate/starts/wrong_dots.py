@@ -14,13 +14,10 @@ from scipy.special import chdtri
 
 from calib.adjust.outliers import Outlier
 from calib.adjust.scatter import off_smooth
-from calib.adjust.significance import typical_scale
 from calib.geometry.rigid import FloatArray
+from calib.geometry.significance import Level, typical_scale
 from calib.survey.records import Survey
 from calib.targets.boards import Dots
-
-FALSE_ALARMS = 0.01
-"""Chance that a survey without blunders loses any dot."""
 
 DEGREES = ((60, 4), (30, 3))
 """Fewest dots for a polynomial of that degree."""
@@ -55,7 +52,7 @@ def wrong_dots(survey: Survey) -> tuple[dict[str, np.ndarray], tuple[Outlier, ..
     fine = 0.0
     if every:
         scale = _typical(np.concatenate(every))
-        fine = float(chdtri(2, FALSE_ALARMS / sum(map(len, every)))) * scale
+        fine = float(chdtri(2, Level.MEASUREMENT / sum(map(len, every)))) * scale
     wrong, outliers = dict[str, np.ndarray](), list[Outlier]()
     for name, (statistic, off_px) in tested.items():
         limit = fine if len(statistic) >= DEGREES[-1][0] else GROSS * _typical(statistic)

@@ -8,12 +8,13 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from calib.adjust.goodness import RARELY, Component, found_sigmas, variance_components
+from calib.adjust.goodness import Component, found_sigmas, variance_components
 from calib.adjust.result import Calibration
 from calib.adjust.terms import StationTerm
 from calib.adjust.unknowns import ResidualBlock
 from calib.calibrate.survey import fit_joint
 from calib.geometry.rig import Rig
+from calib.geometry.significance import Level
 from calib.survey.records import Sigma
 from hil_tests.calib.adjust.small_surveys import survey_of
 from mastctl.calibration.verdict import judge_calibration
@@ -114,8 +115,8 @@ def test_right_sigmas_are_called_wrong_as_seldom_as_stated_all_kinds_together(ki
         ]
         return kinds * float(np.mean([one["dots of c0"] != 1.0 for one in found]))
 
-    assert alarms() == pytest.approx(RARELY, rel=0.11)
-    assert alarms(narrows=False) == pytest.approx(RARELY, rel=0.11), "one side alone has it all"
+    assert alarms() == pytest.approx(Level.STATED, rel=0.11)
+    assert alarms(narrows=False) == pytest.approx(Level.STATED, rel=0.11), "one side alone has it all"
 
 
 def heights(sigma_m: float, count: int, rng: np.random.Generator) -> list[tuple[StationTerm, ResidualBlock]]:

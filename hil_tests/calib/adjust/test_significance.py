@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import chdtrc
 
-from calib.adjust.significance import chance_of_sum, rare_sum
+from calib.geometry.significance import chance_of_sum, rare_sum
 
 
 @pytest.mark.parametrize("total", [2.0, 12.0, 30.0, 60.0, 90.0])

@@ -14,7 +14,6 @@ from calib.adjust.adjustment import PAN_TILT, Motions
 from calib.adjust.hypotheses import Finding, find_drifts
 from calib.adjust.model_terms import candidate_terms, entering_together
 from calib.adjust.result import BenchCalibration
-from calib.adjust.significance import chance
 from calib.adjust.terms import ImageTerm
 from calib.adjust.uncertainty import pixel_covariance
 from calib.adjust.unknowns import ResidualBlock
@@ -24,6 +23,7 @@ from calib.calibrate.bench.statements import check_weights
 from calib.calibrate.starts.bench import BenchNotFitted
 from calib.geometry.rig import Mast
 from calib.geometry.rigid import Rigid
+from calib.geometry.significance import chance
 from hil_tests.support.sim_survey.bench import (
     NAVCAMS,
     BenchCamera,

@@ -13,7 +13,6 @@ import pytest
 from calib.errors import CalibError, NoHandoff, NoStereoPoint
 from calib.files.mast_file import load_rig
 from calib.geometry.covariance import (
-    FALSE_ALARMS,
     MOST_SIGMAS,
     RigCovariance,
     click_covariance,
@@ -24,6 +23,7 @@ from calib.geometry.covariance import (
 from calib.geometry.handoff import Joints, hand_off
 from calib.geometry.parameters import parameter_names
 from calib.geometry.rig import Rig
+from calib.geometry.significance import Level
 from calib.geometry.stereo import triangulate
 
 AT = Joints(0.1, -0.55)
@@ -317,7 +317,7 @@ def test_one_good_pair_of_clicks_in_a_thousand_is_refused(
             eyes = [believed.camera_in_rover(name, *at) for name in PAIR]
         clicked = exact + rng.normal(0.0, 0.2, (2, 2))
         sigmas.append(ray_gap(triangulate(*eyes, *clicked), allowed).sigmas)
-    assert FALSE_ALARMS == 0.001 and pytest.approx(norm.isf(0.0005), abs=1e-4) == MOST_SIGMAS
+    assert pytest.approx(norm.isf(Level.STATED / 2), abs=1e-4) == MOST_SIGMAS
     # Of 10 (3) expected, 1 in 10^4 repetitions is outside; the mean square is 1 to 1.4 % (2.6 %).
     refused = int(np.sum(np.array(sigmas) > MOST_SIGMAS))
     assert (1 <= refused <= 24) if draws == 10_000 else refused <= 11

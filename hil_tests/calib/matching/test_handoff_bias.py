@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.adjust.significance import chance, sigmas
 from calib.geometry.handoff import Joints
+from calib.geometry.significance import chance, sigmas
 from calib.matching.handed_over import Landed, MatchedHandoff, handoff_bias
 
 

@@ -1,8 +1,9 @@
-"""How large misfits are, and how unlikely by chance: as a probability and in sigmas."""
+"""How large misfits are, and how unlikely by chance; and the levels at which all tests decide."""
 
 from __future__ import annotations
 
 import math
+from enum import Enum
 
 import numpy as np
 
@@ -11,8 +12,30 @@ from calib.geometry.rigid import FloatArray
 MOST_SIGMAS = 37.0
 """Beyond this the probability is no number that a computer holds."""
 
-THREE_SIGMAS = 0.0027
-"""The chance that a normal error is beyond three sigma, either side."""
+
+class Level(float, Enum):
+    """Chances by which tests decide; ``meaning`` says how often a test of that level errs.
+
+    A test of several measurements, hypotheses or boards shares its level among them.
+    """
+
+    meaning: str
+
+    def __new__(cls, chance: float, meaning: str) -> Level:
+        level = float.__new__(cls, chance)
+        level._value_ = chance
+        level.meaning = meaning
+        return level
+
+    MEASUREMENT = 0.01, "of a hundred records without a blunder, one loses a measurement or doubts a drawing"
+    THREE_SIGMAS = 0.0027, "of 370 single numbers that are nothing, one is beyond three sigma"
+    STATED = 0.001, "of a thousand right statements, as of a sigma or of one pose, one is called wrong"
+    HYPOTHESIS = 0.0003, "of 3000 surveys that are as modelled, one asks for another hypothesis"
+    WHOLE_IMAGE = 1e-4, "of 10,000 surveys, one loses a right image: noise is not quite normal"
+    PREDICTED = 3e-5, "of 30,000 right cameras, one is said not to predict its check images"
+    CHANGED = 1e-7, "of ten million right fits, one is said to have changed half-way"
+    GROSS = 1e-9, "no right measurement fails this, though its stated sigma be twice too small"
+
 
 MEDIAN_OF_TWO = 2 * np.log(2.0)
 """Median of chi-square with two degrees of freedom."""
