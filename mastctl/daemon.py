@@ -19,7 +19,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
@@ -411,7 +410,7 @@ def _listening(listen: Listen) -> Iterator[tuple[socket.socket, str]]:
         url = listen.url
     else:
         listener = _tcp_socket(listen)
-        url = replace(listen, port=listener.getsockname()[1]).url
+        url = listen.model_copy(update={"port": listener.getsockname()[1]}).url
     try:
         yield listener, url
     finally:

@@ -46,12 +46,14 @@ def looks_like_cahvor(data: bytes) -> bool:
 
 
 def parse_cahvor(data: bytes, path: str | Path) -> CameraFile:
-    """Read a .cahvor file's bytes; ``path`` is for messages only. Raises BadFile.
+    """Read a .cahvor file's bytes; its frame is ``unknown``, a covariance that is not zero goes into ``fit``.
 
-    Its frame is ``unknown``; a covariance that is not zero goes into ``fit``.
+    Raises
+    ------
+    BadFile
+        If it is no camera: which line, what it holds, what is expected.
     """
-    text = text_of(data, path)
-    values, matrices, unread = _lines(text, path)
+    values, matrices, unread = _lines(text_of(data, path), path)
     kind, cahvore_type, linearity = _kind(values, path)
     for letter in kind:
         if letter not in values:

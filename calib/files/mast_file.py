@@ -8,7 +8,7 @@ Contract section 2. A and O are normalised on load; a note says so when that mov
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -27,8 +27,8 @@ from calib.files import (
     read_bytes,
 )
 from calib.files.atomic import save_bytes
-from calib.files.records import Free, Number, Record, Text, Vector, problem, read_record
-from calib.files.yaml_text import MAX_BYTES, Section, dump_mapping, kind_of, parse_mapping
+from calib.files.records import ABSENT, Free, Number, Pair, Record, Text, Vector, parse_record, problem, when
+from calib.files.yaml_text import MAX_BYTES, dump_mapping, kind_of
 from calib.geometry.cahvor import COEFFICIENTS, FREE, KINDS, CameraModel, Kind
 from calib.geometry.mode import FLIPS, FlipName, SensorMode, flip_name
 from calib.geometry.rig import MOST_HARMONICS, AxisJoint, JointErrors, Mast, Rig, RigCamera
@@ -40,19 +40,17 @@ CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """``<pair>_left`` and ``<pair>_right`` for the cameras of a pair; a single camera has no side."""
 CAMERA_NAME_WORDS = "a camera's name is letters, digits, '_' and '-'"
 _ROUNDED, _NO_ROTATION = 1e-15, 1e-3
-_ABSENT: Any = None
-"""The value of a key that a file may leave out; the key itself takes no null."""
 
 _Size = Annotated[int, Field(ge=1, le=LARGEST_IMAGE_PX)]
+SizePx = Annotated[list[_Size], Field(min_length=2, max_length=2)]
+"""Width and height of an image."""
 _Offset = Annotated[int, Field(ge=0, le=LARGEST_IMAGE_PX)]
-_Row = Annotated[list[Number], Field(min_length=3, max_length=3)]
 _Turn = Annotated[float, Field(ge=-1.001, le=1.001)]
 _TurnRow = Annotated[list[_Turn], Field(min_length=3, max_length=3)]
 _Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
-_Harmonic = Annotated[list[Number], Field(min_length=2, max_length=2)]
 
 
-def _name_of(what: str) -> Callable[[str], str]:
+def name_of(what: str) -> Callable[[str], str]:
     def check(name: str) -> str:
         if not CAMERA_NAME.fullmatch(name):
             raise problem("", f"a {what}'s name is letters, digits, '_' and '-'")
@@ -71,8 +69,8 @@ def _pair(names: object) -> object:
 
 
 _NAMED = WithJsonSchema({"type": "string", "pattern": f"^{CAMERA_NAME.pattern}$"})
-_CameraName = Annotated[str, AfterValidator(_name_of("camera")), _NAMED]
-_PairName = Annotated[str, AfterValidator(_name_of("pair")), _NAMED]
+CameraName = Annotated[str, AfterValidator(name_of("camera")), _NAMED]
+_PairName = Annotated[str, AfterValidator(name_of("pair")), _NAMED]
 _SIDES = [{"type": "string", "pattern": "_left$"}, {"type": "string", "pattern": "_right$"}]
 _Pair = Annotated[
     Any,
@@ -85,11 +83,9 @@ class SensorModeRecord(Record):
     """``sensor_mode`` of a camera."""
 
     flip: FlipName = Field(description="how the camera turns its pictures")
-    sensor_px: Annotated[list[_Size], Field(min_length=2, max_length=2)] = Field(
-        default=_ABSENT, description="all that the sensor can give"
-    )
+    sensor_px: SizePx = Field(default=ABSENT, description="all that the sensor can give")
     crop_px: Annotated[list[_Offset], Field(min_length=4, max_length=4)] = Field(
-        default=_ABSENT, description="the part that makes a picture"
+        default=ABSENT, description="the part that makes a picture"
     )
 
 
@@ -116,40 +112,36 @@ def _schema_by_kind(schema: dict[str, Any]) -> None:
         keys |= dict.fromkeys(refused, False)
         if kind in COEFFICIENTS:
             keys["distortion"] = {"minItems": COEFFICIENTS[kind], "maxItems": COEFFICIENTS[kind]}
-        cases.append(_case("model", kind, {"properties": keys, "required": list(needed)}))
-    schema["allOf"] = [*cases, _case("type", 3, {"required": ["linearity"]})]
-
-
-def _case(key: str, value: object, then: dict[str, Any]) -> dict[str, Any]:
-    return {"if": {"required": [key], "properties": {key: {"const": value}}}, "then": then}
+        cases.append(when("model", kind, {"properties": keys, "required": list(needed)}))
+    schema["allOf"] = [*cases, when("type", 3, {"required": ["linearity"]})]
 
 
 class CameraRecord(Record, json_schema_extra=_schema_by_kind):
     """The keys of one camera model."""
 
-    size_px: Annotated[list[_Size], Field(min_length=2, max_length=2)]
+    size_px: SizePx
     model: Kind = Field(description="the family of its lens")
     C: Vector = Field(description="projection center")
-    A: Vector = Field(default=_ABSENT, description="unit vector along the optical axis")
-    H: Vector = Field(default=_ABSENT, description="image columns and rows")
-    V: Vector = Field(default=_ABSENT, description="image columns and rows")
-    O: Vector = Field(default=_ABSENT, description="unit vector, axis of the distortion")  # noqa: E741
-    R: Vector = Field(default=_ABSENT, description="radial distortion")
-    E: Vector = Field(default=_ABSENT, description="moving entrance pupil")
+    A: Vector = Field(default=ABSENT, description="unit vector along the optical axis")
+    H: Vector = Field(default=ABSENT, description="image columns and rows")
+    V: Vector = Field(default=ABSENT, description="image columns and rows")
+    O: Vector = Field(default=ABSENT, description="unit vector, axis of the distortion")  # noqa: E741
+    R: Vector = Field(default=ABSENT, description="radial distortion")
+    E: Vector = Field(default=ABSENT, description="moving entrance pupil")
     type: Annotated[int, Field(ge=1, le=3)] = Field(
-        default=_ABSENT, description="perspective, fisheye, general"
+        default=ABSENT, description="perspective, fisheye, general"
     )
-    linearity: Annotated[float, Field(ge=-100.0, le=100.0)] = Field(default=_ABSENT)
-    camera_matrix: Annotated[list[_Row], Field(min_length=3, max_length=3)] = Field(
-        default=_ABSENT, description="[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"
+    linearity: Annotated[float, Field(ge=-100.0, le=100.0)] = Field(default=ABSENT)
+    camera_matrix: Annotated[list[Vector], Field(min_length=3, max_length=3)] = Field(
+        default=ABSENT, description="[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"
     )
     distortion: list[_Coefficient] = Field(
-        default=_ABSENT,
+        default=ABSENT,
         description="k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 τx τy, as many as the model's name says; "
         "OPENCV_FISHEYE: k1 k2 k3 k4 of cv2.fisheye",
     )
     rotation: Annotated[list[_TurnRow], Field(min_length=3, max_length=3)] = Field(
-        default=_ABSENT,
+        default=ABSENT,
         description="OpenCV's R: rows are the camera's x right, y down and z ahead in the frame of on",
     )
 
@@ -185,7 +177,7 @@ class RigCameraRecord(CameraRecord, json_schema_extra=_schema_by_kind):
 
     on: Literal["head", "rover"] = Field(description="the frame of its vectors")
     sensor_mode: SensorModeRecord = Field(
-        default=_ABSENT,
+        default=ABSENT,
         description="which pixels of the sensor the calibrated pictures show: the daemon compares it",
     )
 
@@ -211,7 +203,7 @@ class MastRecord(Record):
 class AxisRecord(Record):
     """Errors of one joint's readings."""
 
-    harmonics_rad: Annotated[list[_Harmonic], Field(max_length=MOST_HARMONICS)] = Field(
+    harmonics_rad: Annotated[list[Pair], Field(max_length=MOST_HARMONICS)] = Field(
         default=[], description="true = read + Σ (c_i cos(i read) + s_i sin(i read))"
     )
     backlash_rad: Annotated[float, Field(ge=0.0, le=1e9)] = Field(
@@ -243,9 +235,23 @@ class JointsRecord(Record):
 
 
 class StereoRecord(Record):
-    """The key ``stereo`` of a file."""
+    """The key ``stereo`` of a file, which names cameras of the key ``cameras`` of a class that adds it."""
 
     stereo: dict[_PairName, _Pair] = Field(default={}, description="the cameras of each pair")
+
+    @property
+    def pairs(self) -> dict[str, tuple[str, str]]:
+        """The left and right cameras of each pair."""
+        return {pair: (left, right) for pair, (left, right) in self.stereo.items()}
+
+    @model_validator(mode="after")
+    def _has_the_cameras_of_its_pairs(self) -> StereoRecord:
+        cameras: dict[str, Any] = getattr(self, "cameras", {})
+        for pair, name in ((pair, name) for pair, names in self.stereo.items() for name in names):
+            if name not in cameras:
+                known = ", ".join(cameras) or "none"
+                raise problem(f"stereo.{pair}", f"'{name}' is no camera of this file; there are {known}")
+        return self
 
 
 class MastFileRecord(StereoRecord):
@@ -254,7 +260,7 @@ class MastFileRecord(StereoRecord):
     schema_: Literal["mastctl/mast/1"] = Field(alias="schema")
     name: Text
     mast: MastRecord
-    cameras: dict[_CameraName, RigCameraRecord] = Field(
+    cameras: dict[CameraName, RigCameraRecord] = Field(
         description="cameras by name: <pair>_left and <pair>_right; one alone has a name without a side"
     )
     joints: JointsRecord = Field(
@@ -262,12 +268,6 @@ class MastFileRecord(StereoRecord):
     )
     fit: Free = Field(default={}, description="residuals, covariance with its parameter order")
     provenance: Free = Field(default={}, description="origin of the file")
-
-    @model_validator(mode="after")
-    def _has_the_cameras_of_its_pairs(self) -> MastFileRecord:
-        for key, reason in _without_camera(self.stereo, self.cameras):
-            raise problem(key, reason)
-        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,14 +293,14 @@ def load_rig(path: str | Path) -> StoredRig:
 
 def parse_rig(data: bytes, path: str | Path) -> StoredRig:
     """Read a mast file's bytes; ``path`` is for messages only. Raises BadFile as ``load_rig``."""
-    record = read_record(MastFileRecord, _of_schema(data, path, MAST_SCHEMA), path)
+    record = parse_record(MastFileRecord, data, path, MAST_SCHEMA)
     cameras: dict[str, RigCamera] = {}
     notes: tuple[str, ...] = ()
     for name, camera in record.cameras.items():
         place = f"cameras.{name}"
         model, camera_notes = _model(camera, path, place)
         mode = camera.sensor_mode
-        sensor_mode = _sensor_mode(mode, model.size_px, path, place) if mode else None
+        sensor_mode = sensor_mode_of(mode, model.size_px, path, place)
         cameras[name] = RigCamera(camera.on, model, sensor_mode)
         notes += camera_notes
     mast = record.mast
@@ -313,7 +313,7 @@ def parse_rig(data: bytes, path: str | Path) -> StoredRig:
             mast.axis_twist_rad,
         ),
         cameras=cameras,
-        stereo={pair: (left, right) for pair, (left, right) in record.stereo.items()},
+        stereo=record.pairs,
         fit=record.fit,
         provenance=record.provenance,
         joints=JointErrors(record.joints.pan.joint, record.joints.tilt.joint),
@@ -356,7 +356,7 @@ def save_rig(rig: Rig, path: str | Path) -> StoredRig:
 
 def parse_camera(data: bytes, path: str | Path) -> CameraFile:
     """Read a camera file's bytes; ``path`` is for messages only. Raises BadFile as ``load_rig``."""
-    record = read_record(CameraFileRecord, _of_schema(data, path, CAMERA_SCHEMA), path)
+    record = parse_record(CameraFileRecord, data, path, CAMERA_SCHEMA)
     model, notes = _model(record, path, "")
     return CameraFile(model, record.frame, record.fit, record.provenance, notes, Path(path), digest_of(data))
 
@@ -371,16 +371,6 @@ def save_camera(camera: CameraFile, path: str | Path) -> CameraFile:
     stored = parse_camera(data, path)
     save_bytes(path, data)
     return stored
-
-
-def _of_schema(data: bytes, path: str | Path, expected: str) -> dict[str, Any]:
-    """The keys of a file, one of another schema refused before any of them is read."""
-    document = parse_mapping(data, path)
-    if "schema" not in document:
-        raise BadFile(path, "schema", f"the key is missing; 'schema: {expected}' is expected")
-    if document["schema"] != expected:
-        raise BadFile(path, "schema", f"{kind_of(document['schema'])} where '{expected}' is expected")
-    return document
 
 
 def _model(record: CameraRecord, path: str | Path, place: str) -> tuple[CameraModel, tuple[str, ...]]:
@@ -431,25 +421,12 @@ def _model_keys(model: CameraModel) -> dict[str, Any]:
     return keys
 
 
-def read_sensor_mode(camera: Section, size_px: tuple[int, int]) -> SensorMode | None:
-    """Return the ``sensor_mode`` of a camera whose pictures are (width, height); None where it has none.
-
-    Raises
-    ------
-    BadFile
-        If a key is missing or the crop is not inside the sensor.
-    """
-    if "sensor_mode" not in camera:
+def sensor_mode_of(
+    record: SensorModeRecord | None, size_px: tuple[int, int], path: str | Path, place: str
+) -> SensorMode | None:
+    """Return a camera's sensor mode; None without. Raises BadFile if the crop is not inside the sensor."""
+    if record is None:
         return None
-    record = read_record(
-        SensorModeRecord, camera.values["sensor_mode"], camera.path, camera.at("sensor_mode")
-    )
-    return _sensor_mode(record, size_px, camera.path, camera.place)
-
-
-def _sensor_mode(
-    record: SensorModeRecord, size_px: tuple[int, int], path: str | Path, place: str
-) -> SensorMode:
     crop: Any = tuple(record.crop_px) if record.crop_px else None
     sensor: Any = tuple(record.sensor_px) if record.sensor_px else None
     try:
@@ -477,29 +454,6 @@ def joint_keys(joints: JointErrors) -> dict[str, Any]:
         }
         for name, axis in (("pan", joints.pan), ("tilt", joints.tilt))
     }
-
-
-def read_stereo(top: Section, cameras: Mapping[str, object]) -> dict[str, tuple[str, str]]:
-    """Return the stereo pairs under ``stereo``: (left, right) names of cameras that are there.
-
-    Raises
-    ------
-    BadFile
-        For a pair that is not two known cameras, left and right.
-    """
-    stereo = read_record(StereoRecord, {"stereo": top.mapping("stereo")}, top.path).stereo
-    for key, reason in _without_camera(stereo, cameras):
-        raise top.bad(key, reason)
-    return {pair: (left, right) for pair, (left, right) in stereo.items()}
-
-
-def _without_camera(stereo: Mapping[str, Any], cameras: Mapping[str, object]) -> Iterator[tuple[str, str]]:
-    """Yield the key of each pair that names a camera which is not there, and the reason."""
-    for pair, names in stereo.items():
-        for name in names:
-            if name not in cameras:
-                there = ", ".join(cameras) or "none"
-                yield f"stereo.{pair}", f"'{name}' is no camera of this file; there are {there}"
 
 
 def _dump(document: dict[str, Any], path: str | Path) -> bytes:

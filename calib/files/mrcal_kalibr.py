@@ -22,15 +22,18 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from calib.errors import BadFile
-from calib.files import LARGEST_IMAGE_PX, CameraFile, build_model, digest_of
+from calib.files import CameraFile, build_model, digest_of
+from calib.files.mast_file import SizePx
 from calib.files.opencv_ros import (
     LENSES,
-    Loose,
+    ForeignMapping,
     Reading,
     as_camera_file,
     coefficients,
@@ -42,6 +45,7 @@ from calib.files.opencv_ros import (
     read_document,
     row,
 )
+from calib.files.records import Number, Text
 from calib.files.twin import FISHEYE
 from calib.files.yaml_text import kind_of, parse_mapping
 from calib.geometry.cahvor import FREE, CameraModel, Kind
@@ -79,18 +83,17 @@ def parse_mrcal(data: bytes, path: str | Path) -> CameraFile:
     bare = _INPUTS.sub(b"", data)
     notes: tuple[str, ...] = ("optimization_inputs: not read",) if bare != data else ()
     # A mapping of numbers, words and lists in Python's form is one in YAML's too.
-    top = Loose(path, "", parse_mapping(bare, path))
+    top = ForeignMapping(path, "", parse_mapping(bare, path))
     lens_key, pose_key = top.need(*_MRCAL_LENS), top.need(*_MRCAL_POSE)
     for key in ("intrinsics", "imagersize"):
         top.need(key)
-    top.values["lensmodel"] = top.text(lens_key).replace("DISTORTION", "LENSMODEL", 1)
-    name = top.text("lensmodel")
-    width, height = top.integers("imagersize", 2, 1, LARGEST_IMAGE_PX)
-    pose = top.vector(pose_key, count=6)
+    name = str(top.read(Text, lens_key)).replace("DISTORTION", "LENSMODEL", 1)
+    width, height = top.read(SizePx, "imagersize")
+    pose = top.numbers(pose_key, 6)
     frame_from_camera = Rigid(Rotation.from_rotvec(pose[:3]).as_matrix(), pose[3:]).inverse
     notes += top.unread(_MRCAL_READ)
     if name in _OPENCV:
-        numbers = top.vector("intrinsics", count=4 + _OPENCV[name])
+        numbers = top.numbers("intrinsics", 4 + _OPENCV[name])
         camera = lens_camera(
             top, "pinhole", (width, height), matrix_of(numbers[:4]), numbers[4:], frame_from_camera
         )
@@ -100,7 +103,7 @@ def parse_mrcal(data: bytes, path: str | Path) -> CameraFile:
 
 
 def _cahvor(
-    top: Loose, name: str, size_px: tuple[int, int], frame_from_camera: Rigid
+    top: ForeignMapping, name: str, size_px: tuple[int, int], frame_from_camera: Rigid
 ) -> tuple[CameraModel, tuple[str, ...]]:
     """The camera of LENSMODEL_CAHVOR or LENSMODEL_CAHVORE, with notes."""
     match = _CAHVORE.fullmatch(name)
@@ -109,7 +112,7 @@ def _cahvor(
             "PINHOLE, OPENCV4, 5, 8 or 12, CAHVOR or CAHVORE (mrcal-convert-lensmodel makes one of others)"
         )
         raise top.bad("lensmodel", f"{kind_of(name)} where LENSMODEL_{expected} is expected")
-    numbers = top.vector("intrinsics", count=12 if match else 9)
+    numbers = top.numbers("intrinsics", 12 if match else 9)
     fx, fy, cx, cy, alpha, beta = numbers[:6].tolist()
     if fx * fy < 0.0:
         raise top.bad(
@@ -185,7 +188,10 @@ def refuse_mirrored(model: CameraModel, path: str | Path) -> None:
 
 
 _CAMERA = re.compile(r"cam(0|[1-9][0-9]?)")
-_LENSES = ("radtan", "equidistant", "none")
+_Lens = Literal["radtan", "equidistant", "none"]
+_Pose = Annotated[
+    list[Annotated[list[Number], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
+]
 _KALIBR_READ = (
     "camera_model",
     "intrinsics",
@@ -211,7 +217,7 @@ def parse_kalibr(data: bytes, path: str | Path) -> dict[str, Reading]:
         If it is no camchain: which key, what it holds, what is expected.
     """
     document, notes_before = read_document(data, path)
-    top = Loose(path, "", document)
+    top = ForeignMapping(path, "", document)
     names = [name for name in top.values if _CAMERA.fullmatch(name)]
     if names != [f"cam{at}" for at in range(len(names))] or not names:
         raise BadFile(
@@ -225,7 +231,7 @@ def parse_kalibr(data: bytes, path: str | Path) -> dict[str, Reading]:
     lost: BadFile | None = None
     for name in names:
         try:
-            section = Loose(path, name, top.values[name])
+            section = ForeignMapping(path, name, top.values[name])
             if lost is None:
                 try:
                     camera_from_frame = _step(section) @ camera_from_frame
@@ -241,25 +247,17 @@ def parse_kalibr(data: bytes, path: str | Path) -> dict[str, Reading]:
     return readings
 
 
-def _step(section: Loose) -> Rigid:
+def _step(section: ForeignMapping) -> Rigid:
     """The transform from the camera before."""
     if "T_cn_cnm1" in section:
-        return _pose(section)
+        return pose_of(section, "T_cn_cnm1", np.array(section.read(_Pose, "T_cn_cnm1")))
     if section.place != "cam0":
         raise section.bad("T_cn_cnm1", "the key is missing; it places the camera against the one before")
     return Rigid.identity()
 
 
-def _pose(section: Loose) -> Rigid:
-    rows = section.values["T_cn_cnm1"]
-    if not isinstance(rows, list) or len(rows) != 4:
-        raise section.bad("T_cn_cnm1", f"{kind_of(rows)} where four lists of four numbers are expected")
-    inner = Loose(section.path, section.place, {f"T_cn_cnm1[{at}]": one for at, one in enumerate(rows)})
-    return pose_of(section, "T_cn_cnm1", np.array([inner.vector(key, count=4) for key in inner.values]))
-
-
 def _kalibr_camera(
-    section: Loose, frame_from_camera: Rigid, frame: str, digest: str, notes_before: Sequence[str]
+    section: ForeignMapping, frame_from_camera: Rigid, frame: str, digest: str, notes_before: Sequence[str]
 ) -> CameraFile:
     for key in ("camera_model", "intrinsics", "distortion_model", "resolution"):
         section.need(key)
@@ -267,7 +265,7 @@ def _kalibr_camera(
         raise section.bad(
             "camera_model", f"{kind_of(section.values['camera_model'])}; only 'pinhole' is read"
         )
-    lens = section.choice("distortion_model", _LENSES)
+    lens = section.read(_Lens, "distortion_model")
     notes = list(notes_before)
     numbers = section.numbers("distortion_coeffs") if "distortion_coeffs" in section else np.zeros(0)
     if not len(numbers) and lens != "none":
@@ -275,8 +273,8 @@ def _kalibr_camera(
         raise section.bad("distortion_coeffs", f"an empty list where 4 numbers are expected for '{lens}'")
     distortion = coefficients(section, "distortion_coeffs", lens, numbers, notes)
     notes += section.unread((*_KALIBR_READ, "cam_overlaps", "rostopic"))
-    width, height = section.integers("resolution", 2, 1, LARGEST_IMAGE_PX)
-    matrix = matrix_of(section.vector("intrinsics", count=4))
+    width, height = section.read(SizePx, "resolution")
+    matrix = matrix_of(section.numbers("intrinsics", 4))
     camera = lens_camera(section, LENSES[lens][0], (width, height), matrix, distortion, frame_from_camera)
     return as_camera_file(camera, section, frame, digest, notes)
 

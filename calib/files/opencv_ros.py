@@ -21,15 +21,18 @@ import re
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BeforeValidator, Field
 
 from calib.errors import BadFile
-from calib.files import LARGEST_COMPONENT, LARGEST_IMAGE_PX, CameraFile, blind_notes, digest_of
+from calib.files import LARGEST_IMAGE_PX, CameraFile, blind_notes, digest_of
 from calib.files.file_storage import looks_like_storage, parse_storage
+from calib.files.mast_file import SizePx
+from calib.files.records import Number, Text, read_value
 from calib.files.twin import FISHEYE, ODD, LensFamily, kind_of_lens
-from calib.files.yaml_text import Section, dump_mapping, kind_of, parse_mapping
+from calib.files.yaml_text import dump_mapping, kind_of, parse_mapping
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.lenses import opencv
 from calib.geometry.rigid import FloatArray, Rigid
@@ -38,6 +41,15 @@ CAMERA_FRAME = "camera"
 """The frame of a file that holds no pose: the camera's own, x right, y down, z ahead."""
 
 LARGEST_COEFFICIENT = 1e6
+
+_Flag = Annotated[int, Field(ge=0, le=1)]
+_Binning = Annotated[int, Field(ge=0, le=64)]
+_Offset = Annotated[int, Field(ge=0, le=65536)]
+_Pixels = Annotated[
+    int,
+    Field(ge=1, le=LARGEST_IMAGE_PX),
+    BeforeValidator(lambda size: int(size) if isinstance(size, float) and size.is_integer() else size),
+]
 
 _LENS_KEY = re.compile(
     r"fish_?eye|omni|distor|dist_?coef|lens|model|(?:^|_)(?:xi|skew|alpha|mirror\w*)$", re.I
@@ -49,33 +61,45 @@ _NEAR = 0.8
 """How alike (difflib's ratio) a key that is not read and a known one must be for a misspelling."""
 
 
-class Loose(Section):
+class ForeignMapping:
     """A mapping of another program, whose unknown keys are noted unless they may change the camera."""
 
     def __init__(self, path: str | Path, place: str, value: Any) -> None:
         if not isinstance(value, dict):
             raise BadFile(path, place, f"{kind_of(value)} where a mapping is expected")
-        super().__init__(path, place, value, (), tuple(value))
+        self.path, self.place, self.values = path, place, value
 
-    def need(self, *names: str) -> str:
+    def __contains__(self, key: str) -> bool:
+        return key in self.values
+
+    def at(self, key: str) -> str:
+        """Return the key path of a key."""
+        return f"{self.place}.{key}" if self.place and key else self.place or key
+
+    def bad(self, key: str, reason: str) -> BadFile:
+        """Return the refusal of a key's value."""
+        return BadFile(self.path, self.at(key), reason)
+
+    def read(self, kind: Any, key: str) -> Any:
+        """Return the value of a key, of an annotated type. Raises BadFile."""
+        return read_value(kind, self.values[key], self.path, self.at(key))
+
+    def numbers(self, key: str, count: int | None = None) -> FloatArray:
+        """Return a list of numbers (n,), of as many as are expected."""
+        kind = Annotated[list[Number], Field(min_length=count, max_length=count)]
+        return np.array(self.read(kind, key), dtype=np.float64)
+
+    def need(self, *names: str, remedy: str = "") -> str:
         """Return the first of the names that is a key; they are other programs' names of one thing."""
         present = [name for name in names if name in self.values]
         if not present:
             near = [key for name in names for key in get_close_matches(name, self.values, n=1, cutoff=_NEAR)]
             hint = f"; rename '{near[0]}', if that is it" if near else ""
-            raise self.bad(names[0], f"the key is missing{hint}")
+            raise self.bad(names[0], f"the key is missing{hint}{remedy}")
         for other in present[1:]:
             if self.values[other] != self.values[present[0]]:
                 raise self.bad(other, f"has other values than '{present[0]}'; keep the one that is right")
         return present[0]
-
-    def numbers(self, key: str, counts: Sequence[int] = (), limit: float = LARGEST_COMPONENT) -> FloatArray:
-        """Return a list of numbers (n,), n one of ``counts`` if given."""
-        value = self.values[key]
-        if not isinstance(value, list) or (counts and len(value) not in counts):
-            expected = " or ".join(map(str, counts)) + " " if counts else ""
-            raise self.bad(key, f"{kind_of(value)} where a list of {expected}numbers is expected")
-        return self.vector(key, limit, len(value))
 
     def matrix(self, key: str, notes: list[str]) -> FloatArray:
         """Return the numbers (n,) of ``{rows, cols, data}``, of a list of rows, or of a list.
@@ -84,10 +108,9 @@ class Loose(Section):
         """
         value = self.values[key]
         if isinstance(value, dict):
-            inner = Loose(self.path, self.at(key), value)
-            data = value[inner.need("data")]
-            inner.values = {"data": [data] if isinstance(data, (int, float)) else data or []}
-            found = inner.numbers("data")
+            data = value[ForeignMapping(self.path, self.at(key), value).need("data")]
+            data = [data] if isinstance(data, (int, float)) else data or []
+            found = ForeignMapping(self.path, self.at(key), {"data": data}).numbers("data")
             rows, columns = value.get("rows"), value.get("cols")
             if isinstance(rows, int) and isinstance(columns, int) and rows * columns != len(found):
                 notes.append(
@@ -102,15 +125,8 @@ class Loose(Section):
         rows_of = [row if isinstance(row, list) else [row] for row in value]
         if len({len(row) for row in rows_of}) > 1:
             raise self.bad(key, "rows of several lengths where a matrix is expected")
-        flat = Loose(self.path, self.place, {key: [number for row in rows_of for number in row]})
+        flat = ForeignMapping(self.path, self.place, {key: [number for row in rows_of for number in row]})
         return flat.numbers(key)
-
-    def size(self, width: str, height: str) -> tuple[int, int]:
-        """Return the image's size from two keys."""
-        for key in (width, height):
-            if isinstance(self.values[key], float) and self.values[key].is_integer():
-                self.values[key] = int(self.values[key])
-        return self.integer(width, 1, LARGEST_IMAGE_PX), self.integer(height, 1, LARGEST_IMAGE_PX)
 
     def unread(self, known: Sequence[str]) -> tuple[str, ...]:
         """Return a note that names the keys that were not read.
@@ -139,7 +155,7 @@ class Loose(Section):
 _LENS_KEYS = "distortion_model (plumb_bob, rational_polynomial or equidistant) and distortion_coefficients"
 
 
-def camera_matrix(section: Section, key: str, matrix: FloatArray) -> FloatArray:
+def camera_matrix(section: ForeignMapping, key: str, matrix: FloatArray) -> FloatArray:
     """Return a matrix K (3, 3), which has no skew: cv2 and those who build on it leave a skew out."""
     if matrix[0, 1] or matrix[1, 0] or matrix[2].tolist() != [0.0, 0.0, 1.0]:
         raise section.bad(key, f"{matrix.tolist()} where [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] is expected")
@@ -152,7 +168,7 @@ def matrix_of(numbers: FloatArray) -> FloatArray:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def pose_of(section: Section, key: str, matrix: FloatArray) -> Rigid:
+def pose_of(section: ForeignMapping, key: str, matrix: FloatArray) -> Rigid:
     """Return a (4, 4) matrix as a rigid transform; a rotation of few digits is made one."""
     turn, _, other = np.linalg.svd(matrix[:3, :3])
     rotation = turn @ other
@@ -163,7 +179,7 @@ def pose_of(section: Section, key: str, matrix: FloatArray) -> Rigid:
 
 
 def lens_camera(
-    section: Section,
+    section: ForeignMapping,
     family: LensFamily,
     size_px: tuple[int, int],
     matrix: FloatArray,
@@ -193,7 +209,7 @@ def lens_camera(
 
 
 def as_camera_file(
-    camera: CameraModel, section: Section, frame: str, digest: str, notes: Sequence[str] = ()
+    camera: CameraModel, section: ForeignMapping, frame: str, digest: str, notes: Sequence[str] = ()
 ) -> CameraFile:
     """Return the camera, with a note of the part of its image that has no ray.
 
@@ -321,13 +337,13 @@ def parse_calibration(data: bytes, path: str | Path) -> dict[str, Reading]:
         If it is no camera: which key, what it holds, what is expected.
     """
     document, notes = read_document(data, path)
-    top = Loose(path, "", document)
+    top = ForeignMapping(path, "", document)
     if not any(key in top for matrix, _ in _PAIR.values() for key in matrix):
         return {"camera": _calibration(top, _MATRIX, _COEFFICIENTS, digest_of(data), notes)}
     names = [key for matrix, coefficients in _PAIR.values() for key in (*matrix, *coefficients)]
     found: dict[str, Reading] = {}
     for side, (matrix, coefficients) in _PAIR.items():
-        one = Loose(
+        one = ForeignMapping(
             path,
             "",
             {key: value for key, value in top.values.items() if key not in names}
@@ -341,7 +357,7 @@ def parse_calibration(data: bytes, path: str | Path) -> dict[str, Reading]:
 
 
 def _calibration(
-    top: Loose,
+    top: ForeignMapping,
     matrix_names: Sequence[str],
     coefficient_names: Sequence[str],
     digest: str,
@@ -357,7 +373,7 @@ def _calibration(
     size = _size(top)
     family, distortion = _lens(top, distortion_key, top.matrix(distortion_key, notes), notes)
     for name in _BINNING:
-        if name in top and top.integer(name, 0, 64) > 1:
+        if name in top and top.read(_Binning, name) > 1:
             raise top.bad(name, "the picture is binned; the camera of the whole picture is expected (0 or 1)")
     frame, pose = CAMERA_FRAME, None
     known = [*matrix_names, *coefficient_names, *_WIDTH, *_HEIGHT, _RESOLUTION, *_LENS_NAMES, "fisheye_model"]
@@ -367,36 +383,33 @@ def _calibration(
         if len(numbers) != 16:
             raise top.bad("camera_from_frame", f"{len(numbers)} numbers where 4 x 4 are expected")
         pose = pose_of(top, "camera_from_frame", numbers.reshape(4, 4)).inverse
-        frame = top.text(top.need("frame"))
+        frame = top.read(Text, top.need("frame"))
         known += ["frame", "camera_from_frame"]
     notes += top.unread(known)
     if "roi" in top:
-        roi = Loose(top.path, "roi", top.values["roi"])
-        if any(name in roi and roi.integer(name, 0, 65536) for name in ("x_offset", "y_offset")):
+        roi = ForeignMapping(top.path, "roi", top.values["roi"])
+        if any(name in roi and roi.read(_Offset, name) for name in ("x_offset", "y_offset")):
             notes.append("roi: not read; the camera is that of the whole picture")
     if _is_rectified(top, notes):
         notes.append("R or P turn or scale the picture for rectification; they are not read")
     return as_camera_file(lens_camera(top, family, size, matrix, distortion, pose), top, frame, digest, notes)
 
 
-def _size(top: Loose) -> tuple[int, int]:
+def _size(top: ForeignMapping) -> tuple[int, int]:
     """The image's size in pixels: two keys, or OpenCV's ``cameraResolution``."""
     if _RESOLUTION in top and not any(name in top for name in (*_WIDTH, *_HEIGHT)):
-        width, height = top.integers(_RESOLUTION, 2, 1, LARGEST_IMAGE_PX)
+        width, height = top.read(SizePx, _RESOLUTION)
         return width, height
-    try:
-        return top.size(top.need(*_WIDTH), top.need(*_HEIGHT))
-    except BadFile as refusal:
-        if not refusal.reason.startswith("the key is missing"):
-            raise
-        raise BadFile(
-            top.path,
-            refusal.place,
-            f"{refusal.reason}; add the image's size in pixels, as '{refusal.place}: 640'",
-        ) from None
+    width, height = (
+        top.need(*names, remedy=f"; add the image's size in pixels, as '{names[0]}: 640'")
+        for names in (_WIDTH, _HEIGHT)
+    )
+    return top.read(_Pixels, width), top.read(_Pixels, height)
 
 
-def _lens(top: Loose, key: str, numbers: FloatArray, notes: list[str]) -> tuple[LensFamily, FloatArray]:
+def _lens(
+    top: ForeignMapping, key: str, numbers: FloatArray, notes: list[str]
+) -> tuple[LensFamily, FloatArray]:
     """The family that the file names and the coefficients that it holds; of a name alone cv2 decides."""
     names = {at: top.values[at] for at in _LENS_NAMES if at in top}
     for at, name in names.items():
@@ -407,7 +420,7 @@ def _lens(top: Loose, key: str, numbers: FloatArray, notes: list[str]) -> tuple[
         del names["camera_model"]  # the projection; the other key names the lens
     families: dict[str, LensFamily] = {at: LENSES[name.lower()][0] for at, name in names.items()}
     if "fisheye_model" in top:
-        families["fisheye_model"] = "equidistant" if top.integer("fisheye_model", 0, 1) else "pinhole"
+        families["fisheye_model"] = "equidistant" if top.read(_Flag, "fisheye_model") else "pinhole"
     if len(set(families.values())) > 1:
         raise top.bad(
             "", f"{' and '.join(families)} name two lenses; keep the one that belongs to the coefficients"
@@ -417,7 +430,9 @@ def _lens(top: Loose, key: str, numbers: FloatArray, notes: list[str]) -> tuple[
     return family, coefficients(top, key, name, numbers, notes)
 
 
-def coefficients(section: Section, key: str, name: str, numbers: FloatArray, notes: list[str]) -> FloatArray:
+def coefficients(
+    section: ForeignMapping, key: str, name: str, numbers: FloatArray, notes: list[str]
+) -> FloatArray:
     """Return the coefficients (n,) that cv2 takes of the numbers under a lens's name; a note if these differ.
 
     Raises
@@ -447,7 +462,7 @@ def coefficients(section: Section, key: str, name: str, numbers: FloatArray, not
     return found
 
 
-def _is_rectified(top: Loose, notes: list[str]) -> bool:
+def _is_rectified(top: ForeignMapping, notes: list[str]) -> bool:
     """Whether R is another rotation than none."""
     for key in _RECTIFIED:
         if key in top:

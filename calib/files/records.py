@@ -9,15 +9,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+    WithJsonSchema,
+)
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import PydanticCustomError
 
 from calib.errors import BadFile
-from calib.files.yaml_text import kind_of, nearest
+from calib.files.yaml_text import kind_of, nearest, parse_mapping
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -28,7 +39,7 @@ class Record(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, populate_by_name=True)
 
 
-Kind = TypeVar("Kind", bound=Record)
+Kind = TypeVar("Kind", bound=BaseModel)
 
 
 def problem(key: str, reason: str) -> PydanticCustomError:
@@ -40,6 +51,14 @@ def _printable(text: str) -> str:
     if not text.isprintable():
         raise problem("", f"{text[:40]!r} where text on one line is expected")
     return text
+
+
+def _moment(time: str) -> str:
+    try:
+        datetime.fromisoformat(time).astimezone(UTC)
+    except (ValueError, OverflowError):
+        raise problem("", f"{time!r} where a moment of ISO 8601 is expected") from None
+    return time
 
 
 def _finite(content: dict[str, Any]) -> dict[str, Any]:
@@ -59,16 +78,33 @@ def _finite(content: dict[str, Any]) -> dict[str, Any]:
     return content
 
 
+ABSENT: Any = None
+"""The value of a key that a file may leave out; the key itself takes no null."""
 Text = Annotated[str, Field(pattern=r"\S"), AfterValidator(_printable)]
 """Text on one line, not empty."""
+Moment = Annotated[Text, AfterValidator(_moment)]
 Number = Annotated[float, Field(ge=-1e9, le=1e9)]
+Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
+
+
+def _beside(value: Any, info: ValidationInfo) -> Any:
+    """The path that a file names, from its own folder; a path that a program gives stays."""
+    if info.context is None:
+        return value
+    if not isinstance(value, str) or not value.strip():
+        raise problem("", f"{kind_of(value)} where text is expected")
+    return info.context / _printable(value)
+
+
+PathInFile = Annotated[Path, BeforeValidator(_beside), WithJsonSchema({"type": "string", "pattern": r"\S"})]
+"""A path; a relative one in a file starts at that file's folder."""
 Free = Annotated[dict[str, Any], AfterValidator(_finite)]
 """A mapping of any content in which every number is finite."""
 
 
 class _Schema(GenerateJsonSchema):
-    """Without titles and defaults that nobody wrote."""
+    """Without titles that nobody wrote, and with plain defaults alone."""
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False
@@ -81,10 +117,27 @@ class _Schema(GenerateJsonSchema):
         return found
 
     def default_schema(self, schema: Any) -> JsonSchemaValue:
-        return self.generate_inner(schema["schema"])
+        found, default = self.generate_inner(schema["schema"]), schema.get("default")
+        return found | {"default": default} if isinstance(default, (int, float, str)) else found
+
+    def tagged_union_schema(self, schema: Any) -> JsonSchemaValue:
+        """One key's value names the other keys: an editor then speaks of these alone."""
+        key, choices = schema["discriminator"], schema["choices"]
+        cases = [when(key, tag, self.generate_inner(choice)) for tag, choice in choices.items()]
+        return {
+            "type": "object",
+            "required": [key],
+            "properties": {key: {"enum": [*choices]}},
+            "allOf": cases,
+        }
 
 
-def schema_of(kind: type[Record], title: str) -> dict[str, Any]:
+def when(key: str, value: object, then: dict[str, Any]) -> dict[str, Any]:
+    """Return the part of a JSON Schema that holds where a key has a value."""
+    return {"if": {"required": [key], "properties": {key: {"const": value}}}, "then": then}
+
+
+def schema_of(kind: type[BaseModel], title: str) -> dict[str, Any]:
     """Return the JSON Schema of a file of these records, without references."""
     found: dict[str, Any] = kind.model_json_schema(schema_generator=_Schema)
     whole: dict[str, Any] = _inlined(found, found.get("$defs", {}))
@@ -105,33 +158,70 @@ def _inlined(node: Any, definitions: Mapping[str, Any]) -> Any:
     return {key: _inlined(one, definitions) for key, one in node.items() if key not in dropped}
 
 
+def parse_record(kind: type[Kind], data: bytes, path: str | Path, schema: str) -> Kind:
+    """Return the record of a YAML file, of another ``schema`` refused before any key. Raises BadFile."""
+    document = parse_mapping(data, path)
+    if "schema" not in document:
+        raise BadFile(path, "schema", f"the key is missing; 'schema: {schema}' is expected")
+    if document["schema"] != schema:
+        raise BadFile(path, "schema", f"{kind_of(document['schema'])} where '{schema}' is expected")
+    return read_record(kind, document, path)
+
+
 def read_record(kind: type[Kind], document: object, path: str | Path, place: str = "") -> Kind:
     """Return the record that plain data hold; ``path`` and ``place`` are for messages.
 
     Raises
     ------
     BadFile
-        With the place of the first mistake, its value and what would be right; unknown keys come first.
+        With the place of the first mistake, its value and what would be right; see `_order`.
     """
     try:
-        return kind.model_validate(document)
+        return kind.model_validate(document, context=Path(path).resolve().parent)
     except ValidationError as error:
-        mistakes = error.errors(include_url=False)
-    mistake = min(mistakes, key=lambda one: one["type"] != "extra_forbidden")
+        raise _refusal(error, schema_of(kind, ""), path, place) from None
+
+
+def read_value(kind: Any, value: object, path: str | Path, place: str) -> Any:
+    """Return one value of a file, of an annotated type that is no record. Raises BadFile as `read_record`."""
+    adapter: TypeAdapter[Any] = TypeAdapter(kind, config=ConfigDict(strict=True))
+    try:
+        return adapter.validate_python(value)
+    except ValidationError as error:
+        raise _refusal(error, adapter.json_schema(schema_generator=_Schema), path, place) from None
+
+
+def _refusal(error: ValidationError, schema: dict[str, Any], path: str | Path, place: str) -> BadFile:
+    """The first mistake as a sentence; ``schema`` says what would be right."""
+    mistake = min(error.errors(include_url=False), key=_order)
     steps: list[int | str] = [step for step in mistake["loc"] if step != "[key]"]
-    inner, reason = "", ""
-    around = _part(schema_of(kind, ""), steps[:-1])
+    value = mistake["input"]
+    if mistake["type"].startswith("union_tag"):
+        key = mistake["ctx"]["discriminator"].strip("'")
+        steps.append(key)
+        value = value.get(key)
+    expected, place_steps = _part(schema, steps)
     match mistake["type"]:
         case "problem":
-            inner, reason = mistake["ctx"]["key"], mistake["ctx"]["reason"]
+            place_steps += [mistake["ctx"]["key"]] if mistake["ctx"]["key"] else []
+            reason = mistake["ctx"]["reason"]
         case "missing":
             reason = "the key is missing"
+        case "union_tag_not_found":
+            reason = f"the key is missing; {', '.join(expected['enum'])} are known"
         case "extra_forbidden":
-            reason = f"unknown key; {nearest(str(steps[-1]), tuple(around.get('properties', {})))}"
+            known = tuple(_part(schema, steps[:-1])[0].get("properties", {}))
+            reason = f"unknown key; {nearest(str(steps[-1]), known)}"
         case _:
-            expected = _expected(_part(schema_of(kind, ""), steps), mistake["input"])
-            reason = f"{kind_of(mistake['input'])} where {expected} is expected"
-    raise BadFile(path, _joined([place, *steps, *([inner] if inner else [])]), reason)
+            reason = f"{kind_of(value)} where {_expected(expected, value)} is expected"
+    return BadFile(path, _joined([place, *place_steps]), reason)
+
+
+def _order(mistake: Any) -> tuple[int, bool, bool]:
+    """The outermost mistakes come first; of those unknown keys, then missing ones."""
+    depth = sum(step != "[key]" for step in mistake["loc"])
+    kind = mistake["type"]
+    return depth, kind not in ("extra_forbidden", "missing"), kind != "extra_forbidden"
 
 
 def _joined(steps: Sequence[int | str]) -> str:
@@ -142,15 +232,29 @@ def _joined(steps: Sequence[int | str]) -> str:
     return path
 
 
-def _part(schema: dict[str, Any], steps: Sequence[int | str]) -> dict[str, Any]:
-    """The schema of a value inside."""
-    for step in steps:
+def _part(schema: dict[str, Any], steps: Sequence[int | str]) -> tuple[dict[str, Any], list[int | str]]:
+    """The schema of a value inside, and the steps to it in the file: without the name of a kind of record."""
+    place: list[int | str] = []
+    for step in (*steps, None):
+        schema = next((one for one in schema.get("anyOf", ()) if one.get("type") != "null"), schema)
+        if step is None:
+            break
+        kinds = [one["then"] for one in schema.get("allOf", ()) if _value_of(one) == step]
+        if kinds and step not in schema["properties"]:
+            schema = kinds[0]
+            continue
+        place.append(step)
         if isinstance(step, int):
             inner = schema.get("prefixItems", [])
             schema = inner[step] if step < len(inner) else schema.get("items", {})
         else:
             schema = schema.get("properties", {}).get(step) or schema.get("additionalProperties") or {}
-    return schema
+    return schema, place
+
+
+def _value_of(case: dict[str, Any]) -> object:
+    """The value that a case of `when` is for."""
+    return next(iter(case["if"]["properties"].values()))["const"]
 
 
 def _expected(schema: dict[str, Any], value: object) -> str:
@@ -159,27 +263,37 @@ def _expected(schema: dict[str, Any], value: object) -> str:
         return f"'{schema['const']}'"
     if "enum" in schema:
         return f"one of {', '.join(map(str, schema['enum']))}"
-    low, high = schema.get("minimum"), schema.get("maximum")
     match schema.get("type"):
         case "integer":
-            return f"an integer from {low} to {high}"
+            return f"an integer from {schema['minimum']} to {schema['maximum']}"
+        case "boolean":
+            return "true or false"
         case "number":
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
-                return "a number"
-            if low is not None and low == -(high or 0.0):
-                return f"a finite number up to {high:g}"
-            return f"a number from {low:g} to {high:g}"
+            return _number_expected(schema, value)
         case "array":
             return _list_expected(schema)
         case "object":
+            if "minProperties" in schema and value == {}:
+                return "at least one entry"
             keys = ", ".join(schema.get("properties", ()))
             return f"a mapping with {keys}" if keys else "a mapping"
     return "text on one line" if isinstance(value, str) else "text"
 
 
+def _number_expected(schema: dict[str, Any], value: object) -> str:
+    low, high = schema.get("minimum"), schema["maximum"]
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return "a number"
+    if "exclusiveMinimum" in schema and value <= schema["exclusiveMinimum"]:
+        return f"a number above {schema['exclusiveMinimum']:g}"
+    if low is None or (low == -high and (high > 1e4 or not math.isfinite(value))):
+        return f"a finite number up to {high:g}"
+    return f"a number from {low:g} to {high:g}"
+
+
 def _list_expected(schema: dict[str, Any]) -> str:
     inner, least, most = schema.get("items", {}), schema.get("minItems"), schema.get("maxItems")
-    kinds = {"integer": "integers", "number": "numbers", "array": "lists", "string": "texts"}
+    kinds = {"integer": "integers", "number": "numbers", "array": "lists", "string": "names"}
     what = kinds.get(inner.get("type"), "values")
     if inner.get("type") == "array":
         size = inner.get("maxItems")

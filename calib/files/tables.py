@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -51,30 +51,39 @@ def read_table(path: str | Path, columns: Sequence[str]) -> FloatArray:
 def parse_table(data: bytes, path: str | Path, columns: Sequence[str]) -> FloatArray:
     """Return the numbers of a table's bytes; ``path`` is for messages. Raises BadFile as ``read_table``."""
     text = text_of(data, path)
-    lines = csv.reader(io.StringIO(text, newline=""), strict=True)
     # Python's float reads 1_000 and digits of other scripts too; without them it knows just our numbers.
     float_is_strict = text.isascii() and text.count("_") == sum(name.count("_") for name in columns)
     values: list[list[float]] = []
+    rows = csv_rows(text, path)
+    check_header(next(rows, (1, []))[1], path, columns)
+    for line, cells in rows:
+        if float_is_strict and len(cells) == len(columns):
+            try:
+                values.append([float(cell) for cell in cells])
+                continue
+            except ValueError:
+                pass
+        values.append(_row(cells, path, f"row {len(values) + 1} (line {line})", columns))
+    return np.array(values, dtype=np.float64).reshape(len(values), len(columns))
+
+
+def csv_rows(text: str, path: str | Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the line and the cells of each row, the header first; blank lines may follow the last alone.
+
+    Raises BadFile as `read_table`.
+    """
+    lines = csv.reader(io.StringIO(text, newline=""), strict=True)
     blank_line = 0
     try:
-        check_header(next(lines, []), path, columns)
         for cells in lines:
-            if not cells:
+            if not cells and lines.line_num > 1:
                 blank_line = blank_line or lines.line_num
                 continue
             if blank_line:
                 raise BadFile(path, f"line {blank_line}", "is blank; a row is expected on every line")
-            if float_is_strict and len(cells) == len(columns):
-                try:
-                    values.append([float(cell) for cell in cells])
-                    continue
-                except ValueError:
-                    pass
-            place = f"row {len(values) + 1} (line {lines.line_num})"
-            values.append(_row(cells, path, place, columns))
+            yield lines.line_num, cells
     except csv.Error as error:
         raise BadFile(path, f"line {lines.line_num}", f"is not CSV: {error}") from None
-    return np.array(values, dtype=np.float64).reshape(len(values), len(columns))
 
 
 def write_table(stream: TextIO, columns: Sequence[str], values: FloatArray) -> None:

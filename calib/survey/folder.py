@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,8 +9,8 @@ from pathlib import Path
 
 from calib.errors import BadFile
 from calib.files import JPEG_FRAMES, digest_of, jpeg_segments, open_plain, read_bytes, text_of
-from calib.files.tables import NUMBER, check_header
-from calib.files.yaml_text import MAX_BYTES, nearest, parse_mapping
+from calib.files.tables import NUMBER, check_header, csv_rows
+from calib.files.yaml_text import MAX_BYTES, nearest
 from calib.survey.records import SurveyCamera
 
 MAX_ROWS = 2_000_000
@@ -123,11 +121,11 @@ class SurveyFolder:
         self.path = path
         self._digests: dict[str, str] = {}
 
-    def document(self) -> dict[str, object]:
-        """Return what survey.yaml holds."""
+    def document(self) -> bytes:
+        """Return the bytes of survey.yaml."""
         if not self.path.is_dir():
             raise BadFile(self.path, "", "is no folder; a survey is a folder with survey.yaml in it")
-        return parse_mapping(self._bytes_of("survey.yaml", MAX_BYTES), self.path / "survey.yaml")
+        return self._bytes_of("survey.yaml", MAX_BYTES)
 
     def _bytes_of(self, name: str, limit_bytes: int) -> bytes:
         path = self.path / name
@@ -152,31 +150,18 @@ class SurveyFolder:
         path = self.path / name
         if not required and not path.exists():
             return
-        text = text_of(self._bytes_of(name, CSV_MAX_BYTES), path)
-        lines = csv.reader(io.StringIO(text, newline=""), strict=True)
-        blank_line = count = 0
-        try:
-            header = [cell.strip() for cell in next(lines, [])]
-            if may_be_there is None:
-                check_header(header, path, columns)
-            else:
-                _check_names(header, path, columns, may_be_there)
-            for cells in lines:
-                line = lines.line_num
-                if not cells:
-                    blank_line = blank_line or line
-                    continue
-                if blank_line:
-                    raise BadFile(path, f"line {blank_line}", "is blank; a row is expected on every line")
-                if len(cells) != len(header):
-                    wanted = f"where {len(header)} are expected"
-                    raise BadFile(path, f"line {line}", f"{len(cells)} cells {wanted}")
-                count += 1
-                if count > MAX_ROWS:
-                    raise BadFile(path, "", f"has more than {MAX_ROWS} rows, the most that is read")
-                yield Row(path, line, dict(zip(header, map(str.strip, cells), strict=True)))
-        except csv.Error as error:
-            raise BadFile(path, f"line {lines.line_num}", f"is not CSV: {error}") from None
+        rows = csv_rows(text_of(self._bytes_of(name, CSV_MAX_BYTES), path), path)
+        header = [cell.strip() for cell in next(rows, (1, []))[1]]
+        if may_be_there is None:
+            check_header(header, path, columns)
+        else:
+            _check_names(header, path, columns, may_be_there)
+        for count, (line, cells) in enumerate(rows):
+            if count == MAX_ROWS:
+                raise BadFile(path, "", f"has more than {MAX_ROWS} rows, the most that is read")
+            if len(cells) != len(header):
+                raise BadFile(path, f"line {line}", f"{len(cells)} cells where {len(header)} are expected")
+            yield Row(path, line, dict(zip(header, map(str.strip, cells), strict=True)))
 
     def check_picture(self, row: Row, file: str, camera: SurveyCamera) -> None:
         """Refuse a picture of another size, and note its content; one that is missing is for the check."""

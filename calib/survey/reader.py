@@ -9,15 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
+from pydantic import AfterValidator, Field, RootModel, model_validator
 
 from calib.errors import BadFile
-from calib.files import LARGEST_IMAGE_PX
-from calib.files.mast_file import CAMERA_NAME, CAMERA_NAME_WORDS, read_sensor_mode, read_stereo
-from calib.files.yaml_text import Section, kind_of, nearest
-from calib.geometry.cahvor import KINDS, Kind
+from calib.files.mast_file import CameraName, SensorModeRecord, SizePx, StereoRecord, sensor_mode_of
+from calib.files.records import ABSENT, Record, Text, Vector, parse_record, problem
+from calib.files.yaml_text import nearest, parse_mapping
+from calib.geometry.cahvor import Kind
 from calib.geometry.rigid import FloatArray, frozen_array
 from calib.survey.folder import Once, Row, SurveyFolder
 from calib.survey.records import (
@@ -31,7 +32,7 @@ from calib.survey.records import (
     SurveyCamera,
     SurveyImage,
 )
-from calib.targets.board_file import board_of
+from calib.targets.board_file import BoardRecord, refuse_larger
 from calib.targets.boards import NO_BOARD, AnyBoard, Board, Corners, Dots
 
 SCHEMA = "mastctl/survey/1"
@@ -47,6 +48,128 @@ SIGMA_COLUMN = "sigma_px"
 
 FURTHEST_M, LARGEST_ANGLE_RAD, WORST_SIGMA_PX = 1e5, 1e4, 100.0
 """Beyond these a number is not a measurement; the check of the survey judges unlikely ones."""
+
+
+_Metres = Annotated[float, Field(ge=-FURTHEST_M, le=FURTHEST_M)]
+_Place = Annotated[list[_Metres], Field(min_length=3, max_length=3)]
+_Length = Annotated[float, Field(gt=0.0, le=FURTHEST_M)]
+_Uncertainty = Annotated[float, Field(ge=0.0, le=10.0)]
+_Dots = Annotated[int, Field(ge=2, le=200)]
+_Three = Field(json_schema_extra={"minProperties": 3})
+
+
+def _points(what: str) -> AfterValidator:
+    """At least three points that are not on one line."""
+
+    def check(places: dict[str, list[float]]) -> dict[str, list[float]]:
+        if len(places) < 3:
+            raise problem("", f"{len(places)} {what}s where at least three are expected")
+        table = np.array(list(places.values()))
+        across = np.linalg.svd(table - table.mean(axis=0), compute_uv=False)
+        if across[1] < 1e-3 * max(across[0], 1e-3):
+            raise problem("", f"the {what}s stand on one line; no pose follows from them")
+        return places
+
+    return AfterValidator(check)
+
+
+def _frozen(places: Mapping[str, list[float]]) -> dict[str, FloatArray]:
+    return {name: frozen_array(place, (3,)) for name, place in places.items()}
+
+
+class DotGridRecord(Record):
+    """The board of a survey with a station."""
+
+    rows: _Dots
+    columns: _Dots
+    spacing_m: _Length
+    dot_diameter_m: _Length
+    tapes_in_board_m: Annotated[dict[Text, _Place], _points("tape"), _Three]
+
+    @model_validator(mode="after")
+    def _has_room_between_dots(self) -> DotGridRecord:
+        refuse_larger(self, "dot_diameter_m", "spacing_m")
+        return self
+
+
+class StationSigmaRecord(Record):
+    """Standard deviations, one axis each, of a survey with a station."""
+
+    station_m: _Length
+    dot_px: _Length
+    joint_rad: _Uncertainty = 0.0
+    prism_cad_m: _Uncertainty = 0.0
+
+
+class BenchSigmaRecord(Record):
+    """Standard deviations, one axis each, of a bench."""
+
+    corner_px: _Length
+    joint_rad: _Uncertainty = 0.0
+
+
+class RoughRecord(Record):
+    """A rough pose, in the rover frame at the angles of a camera's first image."""
+
+    C: _Place
+    A: Vector
+
+    @model_validator(mode="after")
+    def _has_a_direction(self) -> RoughRecord:
+        if np.linalg.norm(self.A) < 1e-6:
+            raise problem("A", "is zero where a direction is expected")
+        return self
+
+
+class SurveyCameraRecord(Record):
+    """The prior knowledge of a camera."""
+
+    on: Literal["head", "rover"]
+    size_px: SizePx
+    model: Kind
+    focal_px: _Length
+    rough: RoughRecord = Field(default=ABSENT)
+    sensor_mode: SensorModeRecord = Field(default=ABSENT)
+
+    def camera(self, name: str, path: Path) -> SurveyCamera:
+        """Return the camera of this name; the path is for messages. Raises BadFile."""
+        size_px = self.size_px[0], self.size_px[1]
+        return SurveyCamera(
+            name=name,
+            on=self.on,
+            size_px=size_px,
+            kind=self.model,
+            focal_px=self.focal_px,
+            rough_C_m=frozen_array(self.rough.C, (3,)) if self.rough else None,
+            rough_A=np.array(self.rough.A) / np.linalg.norm(self.rough.A) if self.rough else None,
+            sensor_mode=sensor_mode_of(self.sensor_mode, size_px, path, f"cameras.{name}"),
+        )
+
+
+class _SurveyRecord(StereoRecord):
+    """The keys of every survey.yaml."""
+
+    schema_: Literal["mastctl/survey/1"] = Field(alias="schema")
+    cameras: Annotated[dict[CameraName, SurveyCameraRecord], Field(min_length=1)]
+
+
+class StationRecord(_SurveyRecord):
+    """The survey.yaml of a survey with a station."""
+
+    board: DotGridRecord
+    prisms_in_rover_m: Annotated[dict[Text, _Place], _points("prism"), _Three]
+    sigma: StationSigmaRecord
+
+
+class BenchRecord(_SurveyRecord):
+    """The survey.yaml of a bench."""
+
+    boards: Annotated[dict[Text, BoardRecord], Field(min_length=1)]
+    sigma: BenchSigmaRecord
+
+
+class SurveyRecord(RootModel[StationRecord | BenchRecord]):
+    """A survey.yaml."""
 
 
 def read_survey(folder: str | Path) -> Survey:
@@ -68,17 +191,24 @@ def read_survey(folder: str | Path) -> Survey:
         double row, an image of another size. The message has the file, the place, and what would be right.
     """
     read = SurveyFolder(Path(folder))
-    document = read.document()
-    of_bench = ("schema", "boards", "sigma", "cameras")
-    of_station = ("schema", "board", "prisms_in_rover_m", "sigma", "cameras")
-    bench = "boards" in document
-    top = Section(read.path / "survey.yaml", "", document, of_bench if bench else of_station, ("stereo",))
-    if top.values["schema"] != SCHEMA:
-        raise top.bad("schema", f"{kind_of(top.values['schema'])} where '{SCHEMA}' is expected")
-    boards = _boards(read, top) if bench else {}
-    board = NO_BOARD if bench else _dot_board(top)
-    prisms = {} if bench else _places(top, "prisms_in_rover_m", "prism")
-    cameras, sigma = _cameras(top), _sigma(top, bench)
+    file, data = read.path / "survey.yaml", read.document()
+    bench = "boards" in parse_mapping(data, file)
+    board, boards, prisms = NO_BOARD, dict[str, AnyBoard](), dict[str, FloatArray]()
+    record: BenchRecord | StationRecord
+    if bench:
+        record = parse_record(BenchRecord, data, file, SCHEMA)
+        boards = {name: one.root.board for name, one in record.boards.items()}
+        for name in ("station.csv", "dots.csv", "clicks.csv"):
+            if (read.path / name).exists():
+                reason = "goes with a station, and survey.yaml has boards without one"
+                raise BadFile(read.path / name, "", reason)
+    else:
+        record = parse_record(StationRecord, data, file, SCHEMA)
+        prisms, grid = _frozen(record.prisms_in_rover_m), record.board
+        tapes = _frozen(grid.tapes_in_board_m)
+        board = Board(grid.rows, grid.columns, grid.spacing_m, grid.dot_diameter_m, tapes)
+    cameras = {name: camera.camera(name, file) for name, camera in record.cameras.items()}
+    sigma = Sigma(**record.sigma.model_dump())
     station = () if bench else _station(read, board, prisms)
     images = _images(read, cameras, boards, sorted({point.setup for point in station}))
     by_name = {image.name: image for image in images}
@@ -88,7 +218,7 @@ def read_survey(folder: str | Path) -> Survey:
         prisms_in_rover_m=prisms,
         sigma=sigma,
         cameras=cameras,
-        stereo=read_stereo(top, cameras),
+        stereo=record.pairs,
         station=station,
         images=images,
         dots={} if bench else _dots(read, board, cameras, by_name),
@@ -97,88 +227,6 @@ def read_survey(folder: str | Path) -> Survey:
         corners=_corners(read, boards, cameras, by_name, sigma.corner_px) if bench else {},
         digest=read.digest(),
     )
-
-
-def _boards(read: SurveyFolder, top: Section) -> dict[str, AnyBoard]:
-    for name in ("station.csv", "dots.csv", "clicks.csv"):
-        if (read.path / name).exists():
-            raise BadFile(read.path / name, "", "goes with a station, and survey.yaml has boards without one")
-    boards: dict[str, AnyBoard] = {}
-    for name, value in top.mapping("boards").items():
-        if not name.strip() or not name.isprintable():
-            raise top.bad("boards", f"{name[:40]!r} where the name of a board is expected")
-        boards[name] = board_of(top.path, f"boards.{name}", value)
-    if not boards:
-        raise top.bad("boards", "holds no board; at least one is expected")
-    return boards
-
-
-def _dot_board(top: Section) -> Board:
-    section = top.section("board", ("rows", "columns", "spacing_m", "dot_diameter_m", "tapes_in_board_m"))
-    spacing_m = section.positive("spacing_m", FURTHEST_M)
-    dot_m = section.positive("dot_diameter_m", FURTHEST_M)
-    if dot_m >= spacing_m:
-        raise section.bad("dot_diameter_m", f"{dot_m:g} where less than spacing_m {spacing_m:g} is expected")
-    rows, columns = section.integer("rows", 2, 200), section.integer("columns", 2, 200)
-    return Board(rows, columns, spacing_m, dot_m, _places(section, "tapes_in_board_m", "tape"))
-
-
-def _places(section: Section, key: str, what: str) -> dict[str, FloatArray]:
-    """Read at least three named points that are not on one line."""
-    names = section.mapping(key)
-    for name in names:
-        if not name.strip() or not name.isprintable():
-            raise section.bad(key, f"{name[:40]!r} where the name of a {what} is expected")
-    if len(names) < 3:
-        raise section.bad(key, f"{len(names)} {what}s where at least three are expected")
-    inner = section.section(key, tuple(names))
-    places = {name: frozen_array(inner.vector(name, FURTHEST_M), (3,)) for name in names}
-    table = np.array(list(places.values()))
-    across = np.linalg.svd(table - table.mean(axis=0), compute_uv=False)
-    if across[1] < 1e-3 * max(across[0], 1e-3):
-        raise section.bad(key, f"the {what}s stand on one line; no pose follows from them")
-    return places
-
-
-def _sigma(top: Section, bench: bool) -> Sigma:
-    required = ("corner_px",) if bench else ("station_m", "dot_px")
-    optional = ("joint_rad",) if bench else ("joint_rad", "prism_cad_m")
-    section = top.section("sigma", required, optional)
-    return Sigma(
-        **{key: section.positive(key, FURTHEST_M) for key in required},
-        **{key: section.between(key, 0.0, 10.0, 0.0) for key in optional},
-    )
-
-
-def _cameras(top: Section) -> dict[str, SurveyCamera]:
-    cameras: dict[str, SurveyCamera] = {}
-    for name, value in top.mapping("cameras").items():
-        place = f"cameras.{name}"
-        if not CAMERA_NAME.fullmatch(name):
-            raise top.bad(place, CAMERA_NAME_WORDS)
-        required = ("on", "size_px", "model", "focal_px")
-        section = Section(top.path, place, value, required, ("rough", "sensor_mode"))
-        width, height = section.integers("size_px", 2, 1, LARGEST_IMAGE_PX)
-        rough: dict[str, Any] = {}
-        if "rough" in section:
-            inner = section.section("rough", ("C", "A"))
-            rough["rough_C_m"], axis = inner.vector("C", FURTHEST_M), inner.vector("A")
-            length = float(np.linalg.norm(axis))
-            if length < 1e-6:
-                raise inner.bad("A", "is zero where a direction is expected")
-            rough["rough_A"] = axis / length
-        cameras[name] = SurveyCamera(
-            name=name,
-            on=cast(Literal["head", "rover"], section.choice("on", ("head", "rover"))),
-            size_px=(width, height),
-            kind=cast(Kind, section.choice("model", KINDS)),
-            focal_px=section.positive("focal_px", FURTHEST_M),
-            sensor_mode=read_sensor_mode(section, (width, height)),
-            **rough,
-        )
-    if not cameras:
-        raise top.bad("cameras", "holds no camera; at least one is expected")
-    return cameras
 
 
 def _station(read: SurveyFolder, board: Board, prisms: Mapping[str, FloatArray]) -> tuple[StationPoint, ...]:

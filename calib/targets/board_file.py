@@ -15,34 +15,25 @@ The board that is read has the sizes of the print: each times measured over draw
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal
 
-from calib.errors import BadFile
+from pydantic import AfterValidator, ConfigDict, Field, RootModel, model_validator
+
 from calib.files import read_bytes
 from calib.files.atomic import save_bytes
-from calib.files.yaml_text import MAX_BYTES, Section, dump_mapping, kind_of, parse_mapping
+from calib.files.records import ABSENT, Record, Text, parse_record, problem, read_record
+from calib.files.yaml_text import MAX_BYTES, dump_mapping, kind_of, parse_mapping
 from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, DotBoard
 
 SCHEMA = "mastctl/board/1"
 
-KINDS = ("charuco", "aprilgrid", "dots", "checkerboard")
-
-LARGEST_M, MOST_CELLS = 10.0, 100
-
 WORST_SCALE, WORST_ASPECT = 0.3, 0.03
 """A bar that differs more than this from the drawn one is another bar, or has other units."""
 
-KEYS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "charuco": (("square_m", "marker_m", "dictionary"), ("first_id", "legacy")),
-    "aprilgrid": (("tag_m", "gap_m"), ("family", "first_id", "border")),
-    "dots": (("spacing_m", "dot_diameter_m"), ()),
-    "checkerboard": (("square_m",), ()),
-}
-_GRID_KEYS = ("kind", "columns", "rows")
-_PRINT_KEYS = ("bar_m", "measured", "aspect")
+_Cells = Annotated[int, Field(ge=2, le=100)]
+_Metres = Annotated[float, Field(gt=0.0, le=10.0)]
 
 FAMILIES = {
     "tag36h11": "DICT_APRILTAG_36h11",
@@ -50,6 +41,185 @@ FAMILIES = {
     "tag16h5": "DICT_APRILTAG_16h5",
 }
 """AprilTag's families to OpenCV's dictionaries of them."""
+
+
+def dictionary_size(name: str) -> int:
+    """Return how many markers a dictionary has, by OpenCV's name."""
+    import cv2  # a survey with a station is read without it
+
+    return len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
+
+
+def dictionaries() -> tuple[str, ...]:
+    """Return OpenCV's names of marker dictionaries."""
+    import cv2
+
+    return tuple(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
+
+
+def _dictionary(name: str) -> str:
+    if name not in dictionaries():
+        raise problem("", f"{kind_of(name)} where one of {', '.join(dictionaries())} is expected")
+    return name
+
+
+class _DictionaryNames:
+    """Names them in a JSON Schema, for which alone OpenCV is loaded."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: Any, handler: Any) -> dict[str, Any]:
+        return {"enum": list(dictionaries())}
+
+
+class BarsRecord(Record):
+    """Lengths of the bars as drawn."""
+
+    across: _Metres
+    down: _Metres
+
+
+class MeasuredRecord(Record):
+    """Lengths of the bars as a ruler finds them on the print."""
+
+    across_m: _Metres
+    down_m: _Metres = Field(default=ABSENT)
+
+
+class _BoardRecord(Record, json_schema_extra={"dependentRequired": {"measured": ["bar_m"]}}):
+    """The keys that every kind of board has."""
+
+    schema_: Literal["mastctl/board/1"] = Field(default=ABSENT, alias="schema")
+    name: Text = Field(default=ABSENT)
+    columns: _Cells
+    rows: _Cells
+    aspect: Annotated[float, Field(ge=1.0 - WORST_ASPECT, le=1.0 + WORST_ASPECT)] = 1.0
+    bar_m: BarsRecord = Field(default=ABSENT)
+    measured: MeasuredRecord = Field(default=ABSENT)
+
+    drawn: ClassVar[type[AnyBoard]]
+    """The board that the keys are of."""
+
+    @property
+    def board(self) -> AnyBoard:
+        """The board with the sizes that the measured bars give it."""
+        board = self.drawn(**{key.name: getattr(self, key.name) for key in fields(self.drawn)})
+        if self.measured is None:
+            return board
+        if self.bar_m is None:
+            reason = "there is no bar_m; a measured length says nothing without the one drawn"
+            raise problem("measured", reason)
+        aspect, scale = (
+            board.aspect,
+            _scale("across_m", self.measured.across_m, self.bar_m.across, WORST_SCALE),
+        )
+        if self.measured.down_m is not None:
+            aspect *= _scale("down_m", self.measured.down_m, self.bar_m.down * scale, WORST_ASPECT)
+        return scaled(board, scale, aspect)
+
+    @model_validator(mode="after")
+    def _can_be_drawn(self) -> _BoardRecord:
+        cells = self.columns * self.rows
+        match self:
+            case CharucoRecord() | CheckerboardRecord() if min(self.columns, self.rows) < 3:
+                size = f"{self.columns} x {self.rows}"
+                raise problem("columns", f"{size} squares where 3 x 3 at least are expected")
+            case CharucoRecord():
+                refuse_larger(self, "marker_m", "square_m")
+                _refuse_markers(self.first_id, cells // 2, "markers", self.dictionary)
+            case AprilGridRecord():
+                if self.gap_m > self.tag_m:
+                    raise problem("gap_m", f"{self.gap_m:g} where at most tag_m {self.tag_m:g} is expected")
+                _refuse_markers(self.first_id, cells, "tags", FAMILIES[self.family])
+            case DotBoardRecord():
+                refuse_larger(self, "dot_diameter_m", "spacing_m")
+        _ = self.board
+        return self
+
+
+def refuse_larger(record: Record, key: str, other: str) -> None:
+    """Refuse a length of a record that is not less than another. Raises `problem`."""
+    length, limit = getattr(record, key), getattr(record, other)
+    if length >= limit:
+        raise problem(key, f"{length:g} where less than {other} {limit:g} is expected")
+
+
+def _refuse_markers(first_id: int, needed: int, what: str, dictionary: str) -> None:
+    """Refuse markers that are not in the dictionary."""
+    size = dictionary_size(dictionary)
+    if needed > size:
+        reason = f"the board needs {needed} {what}, and {dictionary} has {size}; fewer are expected"
+        raise problem("columns", reason)
+    if first_id > size - needed:
+        raise problem("first_id", f"{first_id} where an integer from 0 to {size - needed} is expected")
+
+
+class CharucoRecord(_BoardRecord):
+    """A ChArUco board."""
+
+    kind: Literal["charuco"]
+    square_m: _Metres
+    marker_m: _Metres
+    dictionary: Annotated[str, AfterValidator(_dictionary), _DictionaryNames]
+    first_id: Annotated[int, Field(ge=0, le=1023)] = 0
+    legacy: bool = False
+
+    drawn = Charuco
+
+
+class AprilGridRecord(_BoardRecord):
+    """Kalibr's AprilGrid."""
+
+    kind: Literal["aprilgrid"]
+    tag_m: _Metres
+    gap_m: _Metres
+    family: Literal["tag36h11", "tag25h9", "tag16h5"] = "tag36h11"
+    first_id: Annotated[int, Field(ge=0, le=1023)] = 0
+    border: Annotated[int, Field(ge=1, le=4)] = 2
+
+    drawn = AprilGrid
+
+
+class DotBoardRecord(_BoardRecord):
+    """Dots in rows and columns."""
+
+    kind: Literal["dots"]
+    spacing_m: _Metres
+    dot_diameter_m: _Metres
+
+    drawn = DotBoard
+
+
+class CheckerboardRecord(_BoardRecord):
+    """A plain chessboard."""
+
+    kind: Literal["checkerboard"]
+    square_m: _Metres
+
+    drawn = Checkerboard
+
+
+_AnyRecord = Annotated[
+    CharucoRecord | AprilGridRecord | DotBoardRecord | CheckerboardRecord, Field(discriminator="kind")
+]
+
+
+class BoardRecord(RootModel[_AnyRecord]):
+    """A board inside a file: `kind` names its other keys."""
+
+
+class BoardFileRecord(BoardRecord):
+    """A BOARD.yaml."""
+
+    model_config = ConfigDict(json_schema_extra={"required": ["schema", "kind"]})
+
+
+def _scale(key: str, value: float, wanted: float, part: float) -> float:
+    """A measured length over the one expected, if it is within a part of that."""
+    low, high = wanted * (1 - part), wanted * (1 + part)
+    if not low <= value <= high:
+        reason = f"{value:g} where {low:.4g} to {high:.4g} is expected, {wanted:.4g} as drawn"
+        raise problem(f"measured.{key}", reason)
+    return value / wanted
 
 
 def load_board(path: str | Path) -> AnyBoard:
@@ -65,11 +235,7 @@ def load_board(path: str | Path) -> AnyBoard:
 
 def parse_board(data: bytes, path: str | Path) -> AnyBoard:
     """Return the board that a BOARD.yaml's bytes hold; ``path`` is for messages. Raises BadFile."""
-    document = parse_mapping(data, path)
-    schema = document.pop("schema", None)
-    if schema != SCHEMA:
-        raise BadFile(path, "schema", f"{kind_of(schema)} where '{SCHEMA}' is expected")
-    return board_of(path, "", document)
+    return parse_record(BoardFileRecord, data, path, SCHEMA).root.board
 
 
 def save_board(
@@ -109,18 +275,17 @@ def measure(path: str | Path, across_m: float, down_m: float | None = None) -> t
 
     The version before stays beside it. Raises BadFile: it is no board, has no bar, or none so long.
     """
-    document = parse_mapping(read_bytes(path, MAX_BYTES), path)
-    load_board(path)
-    document["measured"] = _measured(across_m, down_m)
+    data = read_bytes(path, MAX_BYTES)
+    parse_board(data, path)
+    document = parse_mapping(data, path) | {"measured": _measured(across_m, down_m)}
     _save(path, document)
     return document["bar_m"]["across"], document["bar_m"]["down"]
 
 
 def bars_of(path: str | Path) -> tuple[float, float] | None:
     """Return the lengths of a BOARD.yaml's bars as drawn, across and down, metres; None if it has none."""
-    load_board(path)
-    bars = parse_mapping(read_bytes(path, MAX_BYTES), path).get("bar_m")
-    return None if bars is None else (bars["across"], bars["down"])
+    bars = parse_record(BoardFileRecord, read_bytes(path, MAX_BYTES), path, SCHEMA).root.bar_m
+    return (bars.across, bars.down) if bars else None
 
 
 def _measured(across_m: float, down_m: float | None) -> dict[str, float]:
@@ -128,145 +293,22 @@ def _measured(across_m: float, down_m: float | None) -> dict[str, float]:
 
 
 def _save(path: str | Path, document: dict[str, Any]) -> None:
-    board_of(path, "", {key: value for key, value in document.items() if key != "schema"})
+    read_record(BoardFileRecord, document, path)
     save_bytes(path, dump_mapping(document))
 
 
 def document_of(board: AnyBoard) -> dict[str, Any]:
     """Return what a file holds of a board, as plain data."""
-    required, optional = KEYS[board.kind]
-    document: dict[str, Any] = {"kind": board.kind, "columns": board.columns, "rows": board.rows}
-    document |= {key: getattr(board, key) for key in (*required, *optional)}
-    if board.aspect != 1.0:
-        document["aspect"] = board.aspect
-    return document
+    keys = [key.name for key in fields(board) if key.name != "aspect" or board.aspect != 1.0]
+    return {"kind": board.kind, **{key: getattr(board, key) for key in keys}}
 
 
 def board_of(path: str | Path, place: str, value: Any) -> AnyBoard:
-    """Return the board that a mapping of a file holds.
-
-    Raises
-    ------
-    BadFile
-        With the file, the key, what it holds, and what is expected.
-    """
-    if not isinstance(value, dict):
-        raise BadFile(path, place, f"{kind_of(value)} where a board with its kind is expected")
-    if "kind" not in value:
-        raise BadFile(
-            path, f"{place}.kind" if place else "kind", f"the key is missing; {', '.join(KINDS)} are kinds"
-        )
-    # the kind first: it says which other keys there may be
-    kind = Section(path, place, {"kind": value["kind"]}, ("kind",)).choice("kind", KINDS)
-    required, optional = KEYS[kind]
-    section = Section(path, place, value, (*_GRID_KEYS, *required), (*optional, *_PRINT_KEYS, "name"))
-    if "name" in section:
-        section.text("name")
-    board = _drawn(kind, section)
-    if "aspect" in section:
-        board = replace(board, aspect=_near(section, "aspect", section.number("aspect"), 1.0, WORST_ASPECT))
-    return _as_printed(board, section)
-
-
-def _drawn(kind: str, section: Section) -> AnyBoard:
-    columns, rows = section.integer("columns", 2, MOST_CELLS), section.integer("rows", 2, MOST_CELLS)
-    if kind in ("charuco", "checkerboard") and min(columns, rows) < 3:
-        raise section.bad("columns", f"{columns} x {rows} squares where 3 x 3 at least are expected")
-    if kind == "charuco":
-        return _charuco(section, columns, rows)
-    if kind == "aprilgrid":
-        return _aprilgrid(section, columns, rows)
-    if kind == "checkerboard":
-        return Checkerboard(columns, rows, section.positive("square_m", LARGEST_M))
-    spacing_m, dot_m = section.positive("spacing_m", LARGEST_M), section.positive("dot_diameter_m", LARGEST_M)
-    if dot_m >= spacing_m:
-        raise section.bad("dot_diameter_m", f"{dot_m:g} where less than spacing_m {spacing_m:g} is expected")
-    return DotBoard(columns, rows, spacing_m, dot_m)
-
-
-def _charuco(section: Section, columns: int, rows: int) -> Charuco:
-    square_m, marker_m = section.positive("square_m", LARGEST_M), section.positive("marker_m", LARGEST_M)
-    if marker_m >= square_m:
-        raise section.bad("marker_m", f"{marker_m:g} where less than square_m {square_m:g} is expected")
-    dictionary = section.choice("dictionary", dictionaries())
-    first_id = _first_id(section, dictionary, columns * rows // 2, "markers")
-    legacy = False
-    if "legacy" in section:
-        legacy = section.values["legacy"]
-        if not isinstance(legacy, bool):
-            raise section.bad("legacy", f"{kind_of(legacy)} where true or false is expected")
-    return Charuco(columns, rows, square_m, marker_m, dictionary, first_id, legacy)
-
-
-def _aprilgrid(section: Section, columns: int, rows: int) -> AprilGrid:
-    tag_m, gap_m = section.positive("tag_m", LARGEST_M), section.positive("gap_m", LARGEST_M)
-    if gap_m > tag_m:
-        raise section.bad("gap_m", f"{gap_m:g} where at most tag_m {tag_m:g} is expected")
-    family = section.choice("family", tuple(FAMILIES)) if "family" in section else "tag36h11"
-    first_id = _first_id(section, FAMILIES[family], columns * rows, "tags")
-    border = section.integer("border", 1, 4) if "border" in section else 2
-    return AprilGrid(columns, rows, tag_m, gap_m, family, first_id, border)
-
-
-def _first_id(section: Section, dictionary: str, needed: int, what: str) -> int:
-    """The first marker's number, all markers being in the dictionary."""
-    holds = dictionary_size(dictionary)
-    if needed > holds:
-        raise section.bad(
-            "columns", f"the board needs {needed} {what}, and {dictionary} has {holds}; fewer are expected"
-        )
-    return section.integer("first_id", 0, holds - needed) if "first_id" in section else 0
-
-
-def _as_printed(board: AnyBoard, section: Section) -> AnyBoard:
-    """The board with the sizes that the measured bars give it."""
-    if "measured" not in section:
-        if "bar_m" in section:
-            _bars(section)
-        return board
-    if "bar_m" not in section:
-        raise section.bad(
-            "measured", "there is no bar_m; a measured length says nothing without the one drawn"
-        )
-    drawn_across_m, drawn_down_m = _bars(section)
-    measured = section.section("measured", ("across_m",), ("down_m",))
-    across = _near(measured, "across_m", measured.number("across_m"), drawn_across_m, WORST_SCALE)
-    scale = across / drawn_across_m
-    aspect = board.aspect
-    if "down_m" in measured:
-        down = measured.number("down_m")
-        aspect *= _near(measured, "down_m", down, drawn_down_m * scale, WORST_ASPECT) / (drawn_down_m * scale)
-    return scaled(board, scale, aspect)
+    """Return the board that a mapping of a file holds. Raises BadFile as `load_board`."""
+    return read_record(BoardRecord, value, path, place).root.board
 
 
 def scaled(board: AnyBoard, scale: float, aspect: float) -> AnyBoard:
     """Return the board with every length times ``scale``, and another aspect."""
-    lengths = [key for key in (*KEYS[board.kind][0],) if key.endswith("_m")]
+    lengths = [key.name for key in fields(board) if key.name.endswith("_m")]
     return replace(board, **{key: scale * getattr(board, key) for key in lengths}, aspect=aspect)
-
-
-def _bars(section: Section) -> tuple[float, float]:
-    bars = section.section("bar_m", ("across", "down"))
-    return bars.positive("across", LARGEST_M), bars.positive("down", LARGEST_M)
-
-
-def _near(section: Section, key: str, value: float, wanted: float, part: float) -> float:
-    """A number that is within a part of the one expected."""
-    low, high = wanted * (1 - part), wanted * (1 + part)
-    if not low <= value <= high:
-        raise section.bad(key, f"{value:g} where {low:.4g} to {high:.4g} is expected, {wanted:.4g} as drawn")
-    return value
-
-
-def dictionary_size(name: str) -> int:
-    """Return how many markers a dictionary has, by OpenCV's name."""
-    import cv2  # a survey with a station is read without it
-
-    return len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
-
-
-def dictionaries() -> tuple[str, ...]:
-    """Return OpenCV's names of marker dictionaries."""
-    import cv2
-
-    return tuple(name for name in dir(cv2.aruco) if name.startswith("DICT_"))

@@ -10,10 +10,13 @@ from typing import Any
 
 import jsonschema_rs
 import pytest
+from pydantic import BaseModel
 
 from calib.files.mast_file import CameraFileRecord, MastFileRecord
-from calib.files.records import Record, schema_of
+from calib.files.records import schema_of
 from calib.files.yaml_text import parse_mapping
+from calib.survey.reader import SurveyRecord
+from calib.targets.board_file import BoardFileRecord
 from drivers.aravis import options as aravis
 from drivers.dynamixel.settings import dynamixel_settings
 from drivers.errors import BadOptions
@@ -26,7 +29,9 @@ from hil_tests.calib.survey import test_survey
 from hil_tests.calib.survey.survey_case import FILES as FILES_OF_A_SURVEY
 from hil_tests.calib.targets import test_board_file
 from hil_tests.mastctl import test_config
+from mastctl.bench.simulated import PlacementsRecord
 from mastctl.cli.main import main
+from mastctl.config import ConfigRecord
 from mastctl.packaged import config_folder, schema_files
 
 FILES = ("board", "camera", "config", "faults", "mast", "placements", "survey")
@@ -76,9 +81,13 @@ def schemas() -> dict[str, Any]:
     }
 
 
-OF_RECORDS: dict[str, tuple[type[Record], str]] = {
+OF_RECORDS: dict[str, tuple[type[BaseModel], str]] = {
     "mast": (MastFileRecord, "A mast file"),
     "camera": (CameraFileRecord, "A camera file"),
+    "board": (BoardFileRecord, "A board"),
+    "survey": (SurveyRecord, "A survey's survey.yaml, of a station or of a bench"),
+    "placements": (PlacementsRecord, "Where the board of a simulated bench stands in turn"),
+    "config": (ConfigRecord, "A daemon's configuration, with the options of our own drivers"),
 }
 """Schemas that are those of the records by which their files are read."""
 
@@ -86,8 +95,14 @@ OF_RECORDS: dict[str, tuple[type[Record], str]] = {
 @pytest.mark.parametrize("name", OF_RECORDS)
 def test_a_schema_is_that_of_the_record_that_reads_the_file(name: str) -> None:
     record, title = OF_RECORDS[name]
-    stated = json.dumps(schema_of(record, title), indent=1, ensure_ascii=False) + "\n"
-    assert schema_files()[name].read_text(encoding="utf-8") == stated, "write it into the file"
+    stated, found = schema_of(record, title), json.loads(schema_files()[name].read_bytes())
+    if name == "config":  # drivers' options have no records
+        head, cameras = (found["properties"][key] for key in ("pan_tilt", "cameras"))
+        del head["allOf"], cameras["additionalProperties"]["allOf"]
+        for simulation in (found["properties"]["simulation"], stated["properties"]["simulation"]):
+            for key in {"additionalProperties", "properties", "required"} & set(simulation):
+                del simulation[key]
+    assert found == stated, "write it into the file"
 
 
 AXIS = {"id": 1, "limits_rad": [-0.1, 0.1], "approach": "positive", "approach_rad": 0.1}

@@ -61,7 +61,7 @@ def record_until_killed(folder: Path, mast: AttachedMast, seed: int) -> None:
     pixels = np.random.default_rng(seed)
     clock = SystemClock()
     recorder_module.SEGMENTS = SEGMENTS
-    settings = RecordSettings(ring_s=600.0, free_mb=0.0)
+    settings = RecordSettings.model_construct(ring_s=600.0, free_mb=0.0)
     publisher = Publisher()
     Recorder(settings, folder, mast, [], {"hardware": "simulated"}, publisher, _not_kept, clock)
     number, next_s = 0, time.monotonic()

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from calib.errors import BadFile
 from calib.files import read_bytes
-from calib.files.yaml_text import MAX_BYTES, Section, parse_mapping
+from calib.files.records import Record, parse_record
+from calib.files.yaml_text import MAX_BYTES
 from calib.geometry.rig import Rig
 from calib.plan.placements import Placement
 from calib.targets.board_file import document_of
@@ -25,11 +24,29 @@ BOARD = "bench"
 """What the board is called in the simulation."""
 
 SCHEMA = "mastctl/placements/1"
-_BOUNDS: Mapping[str, tuple[float, float]] = {
-    "range_m": (0.2, 20.0),
-    "bearing_deg": (-180.0, 180.0),
-    "height_deg": (-80.0, 80.0),
-}
+_Turn = Annotated[float, Field(ge=-80.0, le=80.0)]
+
+
+class PlacementRecord(Record):
+    """A place of the board; it is turned to the right and upwards."""
+
+    range_m: Annotated[float, Field(ge=0.2, le=20.0)]
+    bearing_deg: Annotated[float, Field(ge=-180.0, le=180.0)] = 0.0
+    height_deg: _Turn = 0.0
+    turned_deg: Annotated[list[_Turn], Field(min_length=2, max_length=2)] = Field(default=[0.0, 0.0])
+
+    @property
+    def placement(self) -> Placement:
+        """The place."""
+        turned_deg = self.turned_deg[0], self.turned_deg[1]
+        return Placement(self.range_m, self.bearing_deg, self.height_deg, turned_deg)
+
+
+class PlacementsRecord(Record):
+    """A file of places."""
+
+    schema_: Literal["mastctl/placements/1"] = Field(alias="schema")
+    placements: Annotated[list[PlacementRecord], Field(min_length=1)]
 
 
 class SimulatedPerson:
@@ -131,29 +148,5 @@ def read_placements(file: Path) -> tuple[Placement, ...]:
     BadFile
         With the place, what it holds and what is expected.
     """
-    top = Section(file, "", parse_mapping(read_bytes(file, MAX_BYTES), file), ("schema", "placements"), ())
-    if top.values["schema"] != SCHEMA:
-        raise top.bad("schema", f"'{SCHEMA}' is expected")
-    rows = top.values["placements"]
-    if not isinstance(rows, list) or not rows:
-        raise top.bad("placements", "a list of places is expected")
-    return tuple(_placement(file, f"placements[{k}]", row) for k, row in enumerate(rows))
-
-
-def _placement(file: Path, place: str, row: Any) -> Placement:
-    if not isinstance(row, dict):
-        raise BadFile(file, place, "keys and values are expected, as {range_m: 1.2, bearing_deg: -30}")
-    section = Section(file, place, row, ("range_m",), ("bearing_deg", "height_deg", "turned_deg"))
-    numbers = {key: section.between(key, low, high, 0.0) for key, (low, high) in _BOUNDS.items()}
-    turned: Sequence[float] = (0.0, 0.0)
-    if "turned_deg" in section:
-        turned = section.values["turned_deg"]
-        if not isinstance(turned, list) or len(turned) != 2 or not all(_angle(one) for one in turned):
-            raise section.bad(
-                "turned_deg", "two angles within 80 degrees are expected, to the right and upwards"
-            )
-    return Placement(**numbers, turned_deg=(float(turned[0]), float(turned[1])))
-
-
-def _angle(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.fabs(value) <= 80.0
+    record = parse_record(PlacementsRecord, read_bytes(file, MAX_BYTES), file, SCHEMA)
+    return tuple(one.placement for one in record.placements)

@@ -150,7 +150,7 @@ def _serve(args: argparse.Namespace) -> None:
     config = load_config(args.config)
     if args.listen is not None:
         address = args.listen
-        listen = replace(config.listen, host=address.host, port=address.port, socket=address.socket)
+        listen = address.model_copy(update={"hosts": config.listen.hosts})
         config = replace(config, listen=listen)
     serve_config(config, args)
 

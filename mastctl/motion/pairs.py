@@ -24,7 +24,7 @@ from calib.matching.verdict import PatchMatch
 from mastctl.devices.keep_out import KeptOut
 from mastctl.devices.limits import Limits
 from mastctl.motion.looking import CameraView
-from mastctl.motion.settings import HandoffRules, PairBounds
+from mastctl.motion.settings import HandoffRules
 
 Chosen = Callable[[Sequence[Solution]], Solution]
 
@@ -138,7 +138,7 @@ def _looked_at(
     focal_px = left.focal_px[0]
     baseline_m = float(np.linalg.norm(right.C - left.C))
     error_m = stereo_range_error_m(range_m, focal_px, baseline_m, rules.disparity_error_px)
-    bounds = rules.pairs.get(name, PairBounds())
+    bounds = rules.bounds(name)
     outside = []
     if range_m < bounds.nearest_m:
         outside.append(f"{range_m:.2f} m away, nearer than {bounds.nearest_m:g} m")

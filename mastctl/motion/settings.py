@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
+from typing import Annotated
 
+from pydantic import Field
+
+from calib.files.records import ABSENT, PathInFile, Record
 from calib.matching.shown_view import ViewLimits
 from calib.matching.verdict import MatchSettings
 from mastctl.devices.joint_history import DITHER_RAD
@@ -104,69 +106,52 @@ class PointingSettings:
     )
 
 
-@dataclass(frozen=True)
-class PairBounds:
-    """Where a pair looks.
+class PairBounds(Record):
+    """Where a pair looks; its range is that from the middle between its cameras."""
 
-    Attributes
-    ----------
-    nearest_m
-        Least range of the target from the middle between the pair's cameras.
-    steepest_rad
-        How far below the rover's horizontal it looks at most.
-    """
-
-    nearest_m: float = 0.0
-    steepest_rad: float = math.pi / 2
-
-
-@dataclass(frozen=True)
-class HandoffRules:
-    """What decides between the pairs.
-
-    Attributes
-    ----------
-    pairs
-        Bounds of each pair by its name; a pair that is not here has none. The ranges are the paper's.
-    margin_px
-        The target lies at least so far inside both pictures.
-    disparity_error_px
-        3-sigma disparity error of eq. (1).
-    range_error
-        Largest range error by eqs. (1) and (2), 3 sigma, as a part of the range. At 0.2 a 640x480 Hazcam
-        serves up to some 6 m.
-    """
-
-    pairs: Mapping[str, PairBounds] = field(
-        default_factory=lambda: {"pancam": PairBounds(6.0), "navcam": PairBounds(2.0)}
+    nearest_m: Annotated[float, Field(ge=0.0, le=1000.0)] = Field(
+        default=0.0, description="least range of the target"
     )
-    margin_px: float = 30.0
-    disparity_error_px: float = 1.0
-    range_error: float = 0.2
+    steepest_rad: Annotated[float, Field(ge=0.0, le=math.pi / 2)] = Field(
+        default=math.pi / 2, description="how far below the horizontal it looks at most"
+    )
 
 
-@dataclass(frozen=True)
-class TrackingSettings:
+USUAL_BOUNDS = {"pancam": PairBounds(nearest_m=6.0), "navcam": PairBounds(nearest_m=2.0)}
+"""The paper's ranges, of pairs that no configuration names."""
+
+
+class HandoffRules(Record):
+    """What decides between the pairs; at a range error of 0.2 a 640x480 Hazcam serves up to some 6 m."""
+
+    pairs: dict[str, PairBounds] = Field(default={}, description="the pair for each range (Tracking)")
+    margin_px: Annotated[float, Field(ge=0.0, le=1000.0)] = Field(
+        default=30.0, description="the target lies so far inside both pictures"
+    )
+    disparity_error_px: Annotated[float, Field(ge=0.001, le=100.0)] = Field(
+        default=1.0, description="of the paper's eq. (1)"
+    )
+    range_error: Annotated[float, Field(ge=0.001, le=10.0)] = Field(
+        default=0.2, description="largest range error that a pair may have"
+    )
+
+    def bounds(self, pair: str) -> PairBounds:
+        """Return where a pair looks."""
+        return self.pairs.get(pair) or USUAL_BOUNDS.get(pair, PairBounds())
+
+
+class TrackingSettings(Record):
     """What may be set about tracking.
 
-    Attributes
-    ----------
-    handoff
-        Which pair looks.
-    most_step
-        Longest way between two poses that a track is carried over, as a part of the target's range. A tenth
-        is a usual step; with three tenths the target is seen so differently that a longer way is taken for a
-        pose that jumped.
-    start_error
-        How far from an asked position the target of a track may turn out to be, as a part of its range.
-    named_pairs
-        Pairs whose bounds were set; the mast file must have them.
-    handoff_log
-        Where hand-offs are written down; None: they are forgotten at the daemon's end.
+    A tenth of the range is a usual step between two poses; with three tenths the target is seen so
+    differently that a longer step is treated as a pose that jumped.
     """
 
-    handoff: HandoffRules = field(default_factory=HandoffRules)
-    most_step: float = 0.3
-    start_error: float = 0.1
-    named_pairs: tuple[str, ...] = ()
-    handoff_log: Path | None = None
+    handoff: HandoffRules = HandoffRules()
+    most_step: Annotated[float, Field(ge=0.01, le=1.0)] = Field(
+        default=0.3, description="longest way between two poses"
+    )
+    start_error: Annotated[float, Field(ge=0.001, le=1.0)] = Field(
+        default=0.1, description="greatest distance of the target from a given position"
+    )
+    handoff_log: PathInFile = Field(default=ABSENT, description="record of hand-offs")

@@ -16,17 +16,18 @@ import logging
 import threading
 from collections import deque
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, cast, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import AfterValidator, Field, model_validator
 
 from calib.errors import BadFile
 from calib.files import digest_of, read_bytes
-from calib.files.mast_file import CAMERA_NAME, CAMERA_NAME_WORDS
-from calib.files.yaml_text import Section, kind_of
+from calib.files.mast_file import CameraName
+from calib.files.records import Moment, Number, Pair, Record, Text, problem, read_record
+from calib.files.yaml_text import plain
 from calib.geometry.handoff import Joints
 from calib.matching.handed_over import HandoffBias, Landed, MatchedHandoff, handoff_bias
 from calib.matching.handoff import RefinedVerdict
@@ -45,13 +46,62 @@ TOPIC = "/handoff"
 MAX_BYTES = 1 << 28
 _BEGIN = f'{{"schema": "{SCHEMA}"'.encode()
 LARGEST_PX = 1e6
-_KEYS = (
-    "schema", "time", "mast_digest", "source", "pan_rad", "tilt_rad", "joint_sigma_rad", "left_px",
-    "right_px", "sigma_px", "to_pan_rad", "to_tilt_rad", "destinations",
-)  # fmt: skip
-_LANDED_KEYS = (
-    "geometric_px", "geometric_covariance_px2", "verdict", "reason", "found_px", "found_covariance_px2",
-)  # fmt: skip
+
+
+def _covariance(rows: list[list[float]]) -> list[list[float]]:
+    if not np.allclose(rows, np.transpose(rows)) or np.linalg.eigvalsh(rows)[0] < 0.0:
+        raise problem("", "no covariance: it must be symmetric, with no variance below zero")
+    return rows
+
+
+_Pixel = Annotated[
+    list[Annotated[float, Field(ge=-LARGEST_PX, le=LARGEST_PX)]], Field(min_length=2, max_length=2)
+]
+Covariance = Annotated[list[Pair], Field(min_length=2, max_length=2), AfterValidator(_covariance)]
+
+
+class LandedRecord(Record):
+    """Where a hand-off landed in a camera; what was found where it was accepted."""
+
+    geometric_px: _Pixel
+    geometric_covariance_px2: Covariance
+    verdict: RefinedVerdict
+    reason: str
+    found_px: _Pixel | None
+    found_covariance_px2: Covariance | None
+
+    @model_validator(mode="after")
+    def _was_found_where_accepted(self) -> LandedRecord:
+        for key in ("found_px", "found_covariance_px2"):
+            if self.verdict == "accepted" and getattr(self, key) is None:
+                raise problem(key, "nothing where an accepted hand-off has 2 numbers a row")
+        return self
+
+    @property
+    def landed(self) -> Landed:
+        """The landing in arrays."""
+        good = self.verdict == "accepted"
+        found = (np.array(self.found_px), np.array(self.found_covariance_px2)) if good else (None, None)
+        geometric = np.array(self.geometric_px), np.array(self.geometric_covariance_px2)
+        return Landed(*geometric, self.verdict, self.reason, *found)
+
+
+class HandoffRecord(Record):
+    """A line of a record of hand-offs."""
+
+    schema_: Literal["mastctl/handoff/1"] = Field(alias="schema")
+    time: Moment
+    mast_digest: Text
+    source: Annotated[list[CameraName], Field(min_length=2, max_length=2)]
+    pan_rad: Number
+    tilt_rad: Number
+    joint_sigma_rad: Annotated[float, Field(ge=0.0, le=1e9)]
+    left_px: _Pixel
+    right_px: _Pixel
+    sigma_px: Annotated[float, Field(gt=0.0, le=1e9)]
+    to_pan_rad: Number
+    to_tilt_rad: Number
+    destinations: dict[CameraName, LandedRecord]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,33 +150,23 @@ class HandoffLog:
 
 def line_of(handoff: MatchedHandoff) -> dict[str, Any]:
     """Return the keys of a hand-off's line."""
-    return {
+    joints, to_joints = handoff.joints, handoff.to_joints
+    document = {
         "schema": SCHEMA,
         "time": handoff.time,
         "mast_digest": handoff.mast_digest,
-        "source": list(handoff.pair),
-        "pan_rad": handoff.joints.pan_rad,
-        "tilt_rad": handoff.joints.tilt_rad,
-        "joint_sigma_rad": handoff.joints.sigma_rad,
-        "left_px": handoff.clicks_px[0].tolist(),
-        "right_px": handoff.clicks_px[1].tolist(),
+        "source": handoff.pair,
+        "pan_rad": joints.pan_rad,
+        "tilt_rad": joints.tilt_rad,
+        "joint_sigma_rad": joints.sigma_rad,
+        "left_px": handoff.clicks_px[0],
+        "right_px": handoff.clicks_px[1],
         "sigma_px": handoff.sigma_px,
-        "to_pan_rad": handoff.to_joints.pan_rad,
-        "to_tilt_rad": handoff.to_joints.tilt_rad,
-        "destinations": {
-            name: {
-                "geometric_px": one.geometric_px.tolist(),
-                "geometric_covariance_px2": one.geometric_covariance_px2.tolist(),
-                "verdict": one.verdict,
-                "reason": one.reason,
-                "found_px": None if one.found_px is None else one.found_px.tolist(),
-                "found_covariance_px2": (
-                    None if one.found_covariance_px2 is None else one.found_covariance_px2.tolist()
-                ),
-            }
-            for name, one in handoff.landed.items()
-        },
+        "to_pan_rad": to_joints.pan_rad,
+        "to_tilt_rad": to_joints.tilt_rad,
+        "destinations": {name: vars(one) for name, one in handoff.landed.items()},
     }
+    return dict(plain(document))
 
 
 def bias_told(bias: HandoffBias) -> dict[str, Any]:
@@ -172,58 +212,19 @@ def _lines_recorded(path: Path) -> bytes:
 
 
 def handoff_of(path: str | Path, number: int, value: Any) -> MatchedHandoff:
-    """Return the hand-off that one line tells. Raises BadFile."""
-    line = Section(path, f"line {number}", value, _KEYS)
-    line.choice("schema", (SCHEMA,))
-    time = line.text("time")
-    try:
-        datetime.fromisoformat(time)
-    except ValueError:
-        raise line.bad("time", f"'{time}' where an ISO 8601 time is expected") from None
-    source = value["source"]
-    if not isinstance(source, list) or len(source) != 2 or not all(isinstance(n, str) for n in source):
-        raise line.bad("source", f"{kind_of(source)} where [left camera, right camera] is expected")
-    if not all(CAMERA_NAME.fullmatch(name) for name in source):
-        raise line.bad("source", CAMERA_NAME_WORDS)
-    sigma_px, sigma_rad = line.number("sigma_px"), line.number("joint_sigma_rad")
-    if sigma_px <= 0.0:
-        raise line.bad("sigma_px", f"{sigma_px:g} where a number above zero is expected")
-    if sigma_rad < 0.0:
-        raise line.bad("joint_sigma_rad", f"{sigma_rad:g} where zero or more is expected")
+    """Return the hand-off of one line. Raises BadFile."""
+    line = read_record(HandoffRecord, value, path, f"line {number}")
     return MatchedHandoff(
-        time=time,
-        mast_digest=line.text("mast_digest"),
-        pair=(source[0], source[1]),
-        joints=Joints(line.number("pan_rad"), line.number("tilt_rad"), sigma_rad),
-        clicks_px=np.array([line.vector(key, LARGEST_PX, 2) for key in ("left_px", "right_px")]),
-        sigma_px=sigma_px,
-        to_joints=Joints(line.number("to_pan_rad"), line.number("to_tilt_rad"), sigma_rad),
-        landed=_landed(line),
-        name=f"hand-off of {time} ({Path(path).name} line {number})",
+        time=line.time,
+        mast_digest=line.mast_digest,
+        pair=(line.source[0], line.source[1]),
+        joints=Joints(line.pan_rad, line.tilt_rad, line.joint_sigma_rad),
+        clicks_px=np.array([line.left_px, line.right_px]),
+        sigma_px=line.sigma_px,
+        to_joints=Joints(line.to_pan_rad, line.to_tilt_rad, line.joint_sigma_rad),
+        landed={name: one.landed for name, one in line.destinations.items()},
+        name=f"hand-off of {line.time} ({Path(path).name} line {number})",
     )
-
-
-def _landed(line: Section) -> dict[str, Landed]:
-    """Read a line's destinations."""
-    landed = {}
-    for name, value in line.mapping("destinations").items():
-        key = f"destinations.{name}"
-        if not CAMERA_NAME.fullmatch(name):
-            raise line.bad(key, CAMERA_NAME_WORDS)
-        one = Section(line.path, line.at(key), value, _LANDED_KEYS)
-        verdict = cast(RefinedVerdict, one.choice("verdict", get_args(RefinedVerdict)))
-        if not isinstance(value["reason"], str):
-            raise one.bad("reason", f"{kind_of(value['reason'])} where text is expected")
-        good = verdict == "accepted"
-        landed[name] = Landed(
-            one.vector("geometric_px", LARGEST_PX, 2),
-            one.covariance("geometric_covariance_px2", 2),
-            verdict,
-            value["reason"],
-            one.vector("found_px", LARGEST_PX, 2) if good else None,
-            one.covariance("found_covariance_px2", 2) if good else None,
-        )
-    return landed
 
 
 NAME = "handoff_log"

@@ -6,20 +6,21 @@ import hashlib
 import json
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
+from pydantic import Field, model_validator
 
 from calib.calibrate.drift import SceneDrift
 from calib.errors import BadFile
 from calib.files import read_bytes
 from calib.files.atomic import replace_bytes
-from calib.files.yaml_text import Section
+from calib.files.records import Moment, Record, Text, problem, read_record
 from calib.matching.warp import Grey, grey
 from mastctl.json_lines import append_line, read_lines
 
@@ -29,9 +30,41 @@ SENTINEL_FOLDER = "sentinel"
 
 REFERENCE, LOOKS = "reference.json", "looks.jsonl"
 MOST_BYTES, MOST_PICTURE_BYTES = 4_000_000, 1 << 28
-PICTURE_KEYS = ("camera", "pose", "pan_rad", "tilt_rad", "file", "sha256")
 MOST_LOOKS_BYTES = 16_000_000
 """Of the looks' file; what is older than that is not read."""
+
+
+_Angle = Annotated[float, Field(ge=-100.0, le=100.0)]
+
+
+class PictureRecord(Record):
+    """A picture of `reference.json`."""
+
+    camera: Text
+    pose: Annotated[int, Field(ge=0, le=1_000_000)]
+    pan_rad: _Angle
+    tilt_rad: _Angle
+    file: Text
+    sha256: Text
+
+
+class ReferenceRecord(Record):
+    """A `reference.json`."""
+
+    schema_: Literal["mastctl/sentinel/1"] = Field(alias="schema")
+    time: Moment
+    mast_digest: Text
+    rests: list[Annotated[list[_Angle], Field(min_length=2, max_length=2)]]
+    pictures: list[PictureRecord]
+
+    @model_validator(mode="after")
+    def _has_a_rest_for_each_picture(self) -> ReferenceRecord:
+        most = len(self.rests) - 1
+        for at, one in enumerate(self.pictures):
+            if one.pose > most:
+                reason = f"{one.pose} where an integer from 0 to {most} is expected"
+                raise problem(f"pictures[{at}].pose", reason)
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,31 +86,31 @@ class Reference:
     time: str
     mast_digest: str
     rests: tuple[tuple[float, float], ...]
-    pictures: tuple[Mapping[str, Any], ...]
+    pictures: tuple[PictureRecord, ...]
     folder: Path
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras that it has pictures of."""
-        return tuple(dict.fromkeys(str(one["camera"]) for one in self.pictures))
+        return tuple(dict.fromkeys(one.camera for one in self.pictures))
 
     def check(self) -> None:
         """Pass if all pictures can be read. Raises BadFile."""
         for one in self.pictures:
-            self.picture(one["camera"], one["pose"])
+            self.picture(one.camera, one.pose)
 
     def picture(self, camera: str, pose: int) -> ReferencePicture | None:
         """Return a picture, None if the reference has none of this camera there. Raises BadFile."""
-        for told in self.pictures:
-            if told["camera"] == camera and told["pose"] == pose:
-                path = self.folder / told["file"]
+        for one in self.pictures:
+            if (one.camera, one.pose) == (camera, pose):
+                path = self.folder / one.file
                 data = read_bytes(path, MOST_PICTURE_BYTES)
-                whole = hashlib.sha256(data).hexdigest() == told["sha256"]
+                whole = hashlib.sha256(data).hexdigest() == one.sha256
                 image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if whole else None
                 if image is None:
                     raise BadFile(path, "", "is not the picture that was taken; take the reference again")
                 return ReferencePicture(
-                    camera, pose, told["pan_rad"], told["tilt_rad"], self.mast_digest, grey(image)
+                    camera, pose, one.pan_rad, one.tilt_rad, self.mast_digest, grey(image)
                 )
         return None
 
@@ -143,33 +176,9 @@ def read_reference(folder: Path) -> Reference:
         document = json.loads(read_bytes(path, MOST_BYTES))
     except (ValueError, RecursionError):
         raise BadFile(path, "", "is no JSON; take the reference again") from None
-    top = Section(path, "", document, ("schema", "time", "mast_digest", "rests", "pictures"))
-    top.choice("schema", (SCHEMA,))
-    rests, pictures = [], []
-    for key, kind in (("rests", list), ("pictures", list)):
-        if not isinstance(top.values[key], kind):
-            raise top.bad(key, "a list is expected; take the reference again")
-    for at, rest in enumerate(top.values["rests"]):
-        pair = Section(path, "", {f"rests[{at}]": rest}, (f"rests[{at}]",)).vector(f"rests[{at}]", 100.0, 2)
-        rests.append((float(pair[0]), float(pair[1])))
-    for at, one in enumerate(top.values["pictures"]):
-        told = Section(path, f"pictures[{at}]", one, PICTURE_KEYS)
-        pictures.append(
-            {
-                "camera": told.text("camera"),
-                "pose": told.integer("pose", 0, len(rests) - 1),
-                "pan_rad": told.number("pan_rad", 100.0),
-                "tilt_rad": told.number("tilt_rad", 100.0),
-                "file": told.text("file"),
-                "sha256": told.text("sha256"),
-            }
-        )
-    time = top.text("time")
-    try:
-        datetime.fromisoformat(time).astimezone(UTC)
-    except (ValueError, OverflowError):
-        raise top.bad("time", f"{time!r} where a moment of ISO 8601 is expected") from None
-    return Reference(time, top.text("mast_digest"), tuple(rests), tuple(pictures), folder)
+    record = read_record(ReferenceRecord, document, path)
+    rests = tuple((pan_rad, tilt_rad) for pan_rad, tilt_rad in record.rests)
+    return Reference(record.time, record.mast_digest, rests, tuple(record.pictures), folder)
 
 
 def add_look(folder: Path, reference: Reference, time: str, drift: SceneDrift) -> dict[str, Any]:

@@ -22,7 +22,6 @@ from calib.files.cahvor_text import (
     save_cahvor,
 )
 from calib.files.tables import parse_table, read_table, write_table
-from calib.files.yaml_text import Section
 from calib.geometry.cahvor import CameraModel
 from hil_tests.calib.files.test_store import CAMERA_TEXT, MAST_TEXT
 
@@ -294,16 +293,6 @@ def test_a_covariance_that_is_none_is_refused() -> None:
     with pytest.raises(BadFile, match="18 rows of 18"):
         parse_cahvor(_jpl_text(np.eye(17)).encode(), "x")
     assert len(parameter_order("CAHVORE")) == 21
-
-
-@pytest.mark.parametrize(
-    "rows", [[[-1.0, 0.0], [0.0, 1.0]], [[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.1], [0.0, 1.0]]]
-)
-def test_a_covariance_that_is_negative_or_asymmetric_is_refused(rows: list[list[float]]) -> None:
-    """The second matrix has the eigenvalues 3 and -1."""
-    with pytest.raises(BadFile, match="no covariance: it must be symmetric, with no variance below zero"):
-        Section("x.yaml", "", {"found": rows}, ("found",), ()).covariance("found", 2)
-    assert Section("x", "", {"c": [[1.0, 0.5], [0.5, 1.0]]}, ("c",), ()).covariance("c", 2)[0, 1] == 0.5
 
 
 def test_derived_values_that_contradict_the_vectors_are_told() -> None:

@@ -87,14 +87,6 @@ REFUSALS: dict[str, Refusal] = {
         "prisms_in_rover_m.p3[1]",
         "finite",
     ),
-    "zero sigma": ("survey", "station_m: 0.001", "station_m: 0", "sigma.station_m", "above 0"),
-    "negative sigma": (
-        "survey",
-        "dot_px: 0.1}",
-        "dot_px: 0.1, joint_rad: -1}",
-        "sigma.joint_rad",
-        "from 0 to 10",
-    ),
     "camera name": ("survey", "  hazcam_left:", "  haz cam:", "cameras.haz cam", "letters, digits"),
     "no such model": ("survey", "model: CAHVORE", "model: CAHVAR", "cameras.hazcam_left.model", "CAHVORE"),
     "no such pair": (

@@ -49,20 +49,23 @@ def test_the_target_comes_midway_between_the_middles_of_both_pictures(rig: Rig, 
         assert np.abs(off[0] + off[1]).max() < 1.0
 
 
+UNBOUNDED = {"pancam": PairBounds(), "navcam": PairBounds()}
+
+
 def test_the_budget_decides_between_pairs_that_keep_their_bounds(rig: Rig) -> None:
-    found = choose_pairs(rig, ahead(4.0), HandoffRules(pairs={}))
+    found = choose_pairs(rig, ahead(4.0), HandoffRules(pairs=UNBOUNDED))
     assert [choice.pair for choice in found] == ["pancam", "navcam", "hazcam"]
     errors = [choice.range_error_m for choice in found]
     # Eqs. (1) and (2) with 1 px: 4.1 m away and 1.48 m up, 3409 px by 0.3 m and 1288 px by 0.203 m.
     away_m = math.hypot(4.1, 1.48, 0.3)
     assert errors[:2] == pytest.approx([away_m**2 / (3409 * 0.2998), away_m**2 / (1288 * 0.2031)], rel=0.02)
-    near = choose_pairs(rig, ahead(4.0), HandoffRules(pairs={}, range_error=0.01))
+    near = choose_pairs(rig, ahead(4.0), HandoffRules(pairs=UNBOUNDED, range_error=0.01))
     assert [choice.pair for choice in near if not choice.outside] == ["pancam"]
     assert "more than 0.01 of the range" in near[-1].outside
 
 
 def test_a_pair_that_looks_down_too_steeply_hands_over(rig: Rig) -> None:
-    rules = HandoffRules(pairs={"pancam": PairBounds(6.0), "navcam": PairBounds(0.0, 0.6)})
+    rules = HandoffRules(pairs={"pancam": PairBounds(nearest_m=6.0), "navcam": PairBounds(steepest_rad=0.6)})
     assert choose_pairs(rig, ahead(2.2), rules)[0].pair == "navcam"
     found = choose_pairs(rig, ahead(1.5), rules)
     assert found[0].pair == "hazcam"

@@ -65,11 +65,9 @@ class Recording:
 
     def __init__(self, folder: Path, **settings: Any) -> None:
         self.publisher = Publisher()
-        wanted = {"ring_s": 600.0, "free_mb": 0.0} | settings
-        facts = {"hardware": "simulated"}
-        self.recorder = Recorder(
-            RecordSettings(**wanted), folder, mast(), [CONFIG], facts, self.publisher, _gone, SystemClock()
-        )
+        wanted = RecordSettings.model_construct(**{"ring_s": 600.0, "free_mb": 0.0} | settings)
+        facts, clock = {"hardware": "simulated"}, SystemClock()
+        self.recorder = Recorder(wanted, folder, mast(), [CONFIG], facts, self.publisher, _gone, clock)
         self.publish, self.summary = self.publisher.publish, self.recorder.summary
 
     def written(self) -> None:

@@ -27,7 +27,7 @@ def config_with(folder: Path, ring_s: float | None) -> Config:
         config,
         listen=Listen(port=0),
         hardware=replace(config.hardware, simulation={**config.hardware.simulation, "speed": "max"}),
-        record=RecordSettings(ring_s=ring_s, free_mb=0.0, folder=folder),
+        record=RecordSettings.model_construct(ring_s=ring_s, free_mb=0.0, folder=folder),
     )
 
 

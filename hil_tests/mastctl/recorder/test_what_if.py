@@ -53,7 +53,7 @@ def recorded(mast_file: Path, true_file: Path, folder: Path) -> Path:
     )
     stored = load_rig(mast_file)
     mast = AttachedMast(stored.rig, Attached(mast_file.name, mast_file.read_bytes()))
-    settings = RecordSettings(ring_s=0.0, free_mb=0.0)
+    settings = RecordSettings.model_construct(ring_s=0.0, free_mb=0.0)
     attached = [replace(CONFIG, data=Path(config.path).read_bytes())]
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
         publisher, service = Publisher(), daemon.service

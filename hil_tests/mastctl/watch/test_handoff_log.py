@@ -87,15 +87,19 @@ LEFT = "destinations/hazcam_left"
     [
         (changed("schema", "mastctl/handoff/2"), "line 2.schema", "mastctl/handoff/1"),
         (changed("time", "yesterday"), "line 2.time", "ISO 8601"),
-        (changed("source", ["the left", "right"]), "line 2.source", "letters, digits"),
-        (changed("sigma_px", 0), "line 2.sigma_px", "above zero"),
-        (changed("joint_sigma_rad", -1.0), "line 2.joint_sigma_rad", "zero or more"),
+        (changed("source", ["the left", "right"]), "line 2.source[0]", "letters, digits"),
+        (changed("sigma_px", 0), "line 2.sigma_px", "above 0"),
+        (changed("joint_sigma_rad", -1.0), "line 2.joint_sigma_rad", "from 0 to"),
         (changed("left_px", ["1", "2"]), "line 2.left_px[0]", "a number"),
         (changed(f"{LEFT}/verdict", "good"), "line 2.destinations.hazcam_left.verdict", "accepted"),
         (changed(f"{LEFT}/found_px", None), "line 2.destinations.hazcam_left.found_px", "2 numbers"),
         (
-            changed(f"{LEFT}/found_covariance_px2", [[1, 2], [2, 1]]),
-            "line 2.destinations.hazcam_left.found_covariance_px2", "covariance",
+            changed(f"{LEFT}/found_covariance_px2", [[1, 2], [2, 1]]),  # its eigenvalues are 3 and -1
+            "line 2.destinations.hazcam_left.found_covariance_px2", "with no variance below zero",
+        ),
+        (
+            changed(f"{LEFT}/geometric_covariance_px2", [[1, 0.1], [0, 1]]),
+            "line 2.destinations.hazcam_left.geometric_covariance_px2", "it must be symmetric",
         ),
     ],
 )  # fmt: skip
