@@ -209,7 +209,7 @@ def test_the_installed_command_points_a_small_rover_and_checks_it(
             pointed = json.loads(
                 run(mastctl, "experiment", "pointing", *words, timeout_s=TIMEOUT_S, **how).stdout
             )
-            words = ("conform", url, "--junit", "report.xml", "--json")
+            words = ("conform", url, "--json")
             told = json.loads(run(mastctl, *words, timeout_s=TIMEOUT_S, **how).stdout)
         finally:
             daemon.terminate()
@@ -218,7 +218,6 @@ def test_the_installed_command_points_a_small_rover_and_checks_it(
     ]
     assert_report(tmp_path / "pointed" / "report.html")
     assert told["conforms"] and told["passed"] > 10 and told["failed"] == 0
-    assert (tmp_path / "report.xml").stat().st_size > 1000
 
 
 def assert_report(path: Path) -> None:

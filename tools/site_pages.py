@@ -19,10 +19,10 @@ from drivers import faults
 from drivers.errors import DriverError
 from mastctl.answers import Word
 from mastctl.cli.main import build_parser
-from mastctl.conform.devices import ALL
 from mastctl.conform.rig_checks import RIG
 from mastctl.control.table import CHOICES, EVENTS, HAPPENS, MEANINGS, TABLE, WORDS, Event
 from mastctl.errors import MastctlError
+from mastctl.testing.drivers import test_camera, test_head
 from mastctl.web.app import api
 from mastctl.web.described import description
 from tools import notebooks
@@ -306,12 +306,14 @@ def fault_words_page() -> str:
 
 
 def checks_page() -> str:
-    """Return the checks of ``mastctl conform`` with their promises."""
-    explained = "[Accept a rig or a driver](../../how-to/conform.md) explains them."
-    lines = ["# Checks of `mastctl conform`", "", f"Written from the code; {explained}", ""]
-    for kind, checks in {"rig": RIG.checks, **ALL}.items():
-        rows = [(f"`{one.name}`", "moves" if one.moves else "", one.promise) for one in checks]
-        lines += [f"## Of a {kind}", "", *_table("check", rows, "head", "promise")]
+    """Return the checks of a rig and the acceptance tests of drivers with their promises."""
+    lines = ["# Checks of rigs and drivers", "", "Written from the code.", ""]
+    rows = [(f"`{one.name}`", "moves" if one.moves else "", one.promise) for one in RIG]
+    lines += ["## Of `mastctl conform URL`", "", *_table("check", rows, "head", "promise")]
+    for module in (test_head, test_camera):
+        tests = [one for name, one in vars(module).items() if name.startswith("test_")]
+        rows = [(f"`{one.__name__}`", "moves" * hasattr(one, "pytestmark"), one.__doc__) for one in tests]
+        lines += [f"## Of `{module.__name__}`", "", *_table("test", rows, "head", "promise")]
     return "\n".join(lines)
 
 

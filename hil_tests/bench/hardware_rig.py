@@ -16,9 +16,9 @@ from drivers.feetech.head import feetech_settings
 from drivers.feetech.servos import open_link
 from drivers.hardware import DeviceSettings
 from mastctl.config import load_config
-from mastctl.conform.devices import head_under_test
-from mastctl.conform.head_trial import HeadTrial
 from mastctl.service.masts import bounds_of
+from mastctl.testing.drivers.head_trial import HeadTrial
+from mastctl.testing.drivers.plugin import head_under_test
 
 READERS: dict[str, Any] = {"dynamixel": dynamixel_settings, "feetech": feetech_settings}
 CHOSEN: str | None = None

@@ -1,8 +1,8 @@
-"""The checks of heads on a real one: ``pytest hil_tests/bench --hardware FILE``.
+"""The acceptance of heads on a real one: ``pytest hil_tests/bench --hardware FILE``.
 
 FILE is a configuration with narrow limits and a low speed; the head moves over all of them
-(docs/how-to/hardware.md). Each test ends with a look at the device's own error registers. The checks are
-those of `mastctl conform`.
+(docs/how-to/hardware.md). Each test ends with a look at the device's own error registers. The tests are
+those of `mastctl.testing.drivers`.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import pytest
 
 from hil_tests.bench.hardware_rig import CHOSEN, error_registers, hardware_trial
 from mastctl.config import load_config
-from mastctl.conform.checks import Check, NotTried
-from mastctl.conform.head_checks import HEADS
-from mastctl.conform.head_trial import HeadTrial
+from mastctl.conform.checks import NotTried
+from mastctl.testing.drivers import test_head as suite
+from mastctl.testing.drivers.head_trial import HeadTrial
 
 if CHOSEN is None:
     pytest.skip("moves a real head; name its configuration with --hardware FILE", allow_module_level=True)
@@ -34,9 +34,9 @@ def trial() -> Iterator[HeadTrial]:
     assert error_registers(settings) == {}, "the device has noted a hardware error"
 
 
-@pytest.mark.parametrize("check", HEADS.checks, ids=lambda check: str(check.name))
-def test_a_head_keeps_its_promise(trial: HeadTrial, check: Check[HeadTrial]) -> None:
+@pytest.mark.parametrize("promise", [name for name in vars(suite) if name.startswith("test_")])
+def test_a_head_keeps_its_promise(trial: HeadTrial, promise: str) -> None:
     try:
-        check.ask(trial)
+        getattr(suite, promise)(trial)
     except NotTried as reason:
         pytest.skip(str(reason))

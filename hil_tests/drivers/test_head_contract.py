@@ -22,12 +22,11 @@ from hil_tests.support.servo_rigs import LIMITS_RAD, RIGS, TURNED, HeadRig
 from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.config import load_config
-from mastctl.conform.checks import Check
-from mastctl.conform.head_checks import HEADS, fastest_seen
-from mastctl.conform.head_trial import HeadTrial
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.pointing import run_pointing_experiment
 from mastctl.experiment.simulated import SimulationTruth, demo_config
+from mastctl.testing.drivers import test_head as suite
+from mastctl.testing.drivers.head_trial import HeadTrial
 
 REAL = [name for name in RIGS if name != "in_memory"]
 WIRES = ["dynamixel", "feetech", "ptu"]
@@ -52,7 +51,7 @@ def wired(request: pytest.FixtureRequest) -> Iterator[HeadRig]:
 
 
 def trial_of(rig: HeadRig) -> HeadTrial:
-    """The rig as the checks of heads take one."""
+    """The rig as the acceptance of heads takes one."""
     return HeadTrial(
         rig.head, LIMITS_RAD, 1.0, limits_rad=LIMITS_RAD, own_limits=True,
         count_rad=rig.count_rad, settle_rad=rig.settle_rad,
@@ -130,9 +129,9 @@ def true_reading(rig: HeadRig) -> Reading:
     return reading
 
 
-@pytest.mark.parametrize("check", HEADS.checks, ids=lambda check: str(check.name))
-def test_every_head_keeps_every_promise(rig: HeadRig, check: Check[HeadTrial]) -> None:
-    check.ask(trial_of(rig))
+@pytest.mark.parametrize("promise", [name for name in vars(suite) if name.startswith("test_")])
+def test_every_head_keeps_every_promise(rig: HeadRig, promise: str) -> None:
+    getattr(suite, promise)(trial_of(rig))
 
 
 @pytest.mark.parametrize("name", REAL)
@@ -153,7 +152,7 @@ def test_over_a_real_line_it_moves_and_comes_back_after_a_pulled_plug(name: str)
 def test_no_axis_goes_faster_than_asked_or_than_its_own_bound(rig: HeadRig, asked: float) -> None:
     assert rig.fastest_rad_per_s is not None
     bound = min(asked, rig.fastest_rad_per_s)
-    fastest, unsure = fastest_seen(trial_of(rig), asked)
+    fastest, unsure = suite.fastest_seen(trial_of(rig), asked)
     assert fastest <= bound * 1.02 + unsure
     assert fastest >= min(bound, 1.0) * 0.3, "nor much slower"
 

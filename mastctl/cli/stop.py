@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mastctl.client import Client
 
 WITHOUT_DAEMON = (
-    "if the head moves, end the program that moves it ('camera sync', 'conform') with Ctrl-C, "
+    "if the head moves, end the program that moves it ('camera sync', 'pytest') with Ctrl-C, "
     "or stop it with 'mastctl halt --config FILE'"
 )
 

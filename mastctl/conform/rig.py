@@ -1,4 +1,4 @@
-"""A rig under test, through its running daemon: what checks ask of it, and where its head may be moved."""
+"""A rig under test through its running daemon: requests of its checks, and where its head may be moved."""
 
 from __future__ import annotations
 
@@ -22,13 +22,14 @@ from mastctl.conform.checks import (
     expect,
     run_checks,
 )
-from mastctl.conform.head_trial import Angles, box
 from mastctl.errors import NotNow
 
 log = logging.getLogger(__name__)
 
+Angles = tuple[float, float]
+
 ENDED = ("done", "failed", "stopped")
-ARRIVED_RAD = 0.006  # what the service takes for arrived
+ARRIVED_RAD = 0.006  # where the service lets a move end
 POLL_S = 0.02
 OPERATION_S = 60.0
 TIMEOUT_S = 20.0
@@ -43,7 +44,7 @@ class RigTrial:
     client
         A connection to its daemon.
     reach_rad
-        How far from where it stands the head may be moved, radians.
+        How far from its present pose the head may be moved, radians.
     """
 
     def __init__(self, client: Client, reach_rad: float) -> None:
@@ -63,7 +64,7 @@ class RigTrial:
 
     @cached_property
     def limits(self) -> tuple[Angles, Angles, float]:
-        """Pan's and tilt's limits, radians, and the fastest speed, rad/s, as the daemon tells them."""
+        """Pan's and tilt's limits, radians, and the fastest speed, rad/s, as the daemon reports them."""
         limits = field(self.began, "limits")
         ends = []
         for key in ("pan_rad", "tilt_rad"):
@@ -78,7 +79,7 @@ class RigTrial:
 
     @cached_property
     def box_rad(self) -> tuple[Angles, Angles]:
-        """Where the head may be moved: about where it stands at the beginning, inside its limits."""
+        """Where the head may be moved: about its pose at the beginning, inside its limits."""
         boxes = []
         for at_rad, (low, high) in zip(self.joints(self.began), self.limits[:2], strict=True):
             margin = min(0.02, 0.1 * (high - low))
@@ -99,8 +100,8 @@ class RigTrial:
     def mast_cameras(self) -> Mapping[str, Any]:
         """The cameras of the mast file, by name."""
         try:
-            told = yaml.safe_load(self.mast)["cameras"]
-            return told if isinstance(told, dict) else {}
+            cameras = yaml.safe_load(self.mast)["cameras"]
+            return cameras if isinstance(cameras, dict) else {}
         except (yaml.YAMLError, LookupError, TypeError) as error:
             raise PromiseBroken(f"GET /mast is no mast file: {' '.join(str(error).split())[:200]}") from None
 
@@ -144,7 +145,7 @@ class RigTrial:
 
     @cached_property
     def _time_waits(self) -> bool:
-        """Whether a simulated rover's time passes only when it is told to."""
+        """Whether a simulated rover's time passes only on request."""
         simulated = self.began.get("hardware") == "simulated"
         return simulated and self.client.simulation_time()["speed"] == "max"
 
@@ -171,9 +172,9 @@ def rig_under_test(url: str, reach_rad: float) -> Iterator[RigTrial]:
     Raises
     ------
     NotNow
-        ``busy``, if it is at work: a check would get into somebody's way.
+        ``busy``, if it is at work: a check would disturb that.
     ClientError
-        If nobody answers there, or no mastctl daemon.
+        If no mastctl daemon answers at the address.
     """
     with Client(url, TIMEOUT_S, "mastctl conform") as client:
         trial = RigTrial(client, reach_rad)
@@ -185,29 +186,28 @@ def rig_under_test(url: str, reach_rad: float) -> Iterator[RigTrial]:
 
 def check_rig(
     trial: RigTrial,
-    checks: Sequence[Check[RigTrial]],
+    checks: Sequence[Check],
     motion: bool,
-    tell: Callable[[CheckOutcome], object] = lambda outcome: None,
+    report: Callable[[CheckOutcome], object] = lambda outcome: None,
 ) -> ConformReport:
     """Run checks on a rig. However they end, by Ctrl-C too, a head that was moved is stopped.
 
     Parameters
     ----------
     trial, checks
-        Of what to ask what.
+        The rig, and its checks.
     motion
         Whether the head may be moved.
-    tell
+    report
         Called with each outcome as it comes.
     """
-    began_s = time.time()
     left = ""
     try:
-        outcomes = run_checks(checks, trial, motion=motion, tell=tell)
+        outcomes = run_checks(checks, trial, motion=motion, report=report)
     finally:
         if motion and any(check.moves for check in checks):
             left = _stopped_at_the_end(trial.client.url)
-    return ConformReport("daemon", trial.client.url, began_s, outcomes, left)
+    return ConformReport(trial.client.url, outcomes, left)
 
 
 def _stopped_at_the_end(url: str) -> str:
@@ -222,8 +222,7 @@ def _stopped_at_the_end(url: str) -> str:
                 reasons.clear()
                 return
             except ClientError as error:
-                words = f"the stop at the end was not confirmed, the head may still move: {error}"
-                reasons[:] = [words]
+                reasons[:] = [f"the stop at the end was not confirmed, the head may still move: {error}"]
             time.sleep(0.2)
         log.error("%s", reasons[0])
 
@@ -234,7 +233,7 @@ def _stopped_at_the_end(url: str) -> str:
 
 
 def _at_work(status: Mapping[str, Any]) -> str:
-    """What the daemon is doing, in words; empty at rest."""
+    """What the daemon is doing; empty at rest."""
     if status.get("operation") is not None:
         return f"operation {status['operation']}"
     if status.get("moving"):
@@ -248,13 +247,13 @@ def _at_work(status: Mapping[str, Any]) -> str:
 
 
 def field(document: Any, *path: str) -> Any:
-    """Return what stands at a path of keys. Raises PromiseBroken."""
-    here = document
+    """Return the value at a path of keys. Raises PromiseBroken."""
+    value = document
     for index, key in enumerate(path):
-        if not isinstance(here, Mapping) or key not in here:
+        if not isinstance(value, Mapping) or key not in value:
             raise PromiseBroken(f"the key {'.'.join(path[: index + 1])} is missing")
-        here = here[key]
-    return here
+        value = value[key]
+    return value
 
 
 def number(document: Any, *path: str) -> float:
@@ -263,3 +262,11 @@ def number(document: Any, *path: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise PromiseBroken(f"{'.'.join(path)} is {value!r} where a number is expected")
     return float(value)
+
+
+def box(at_rad: float, ends_rad: Angles, reach_rad: float) -> Angles:
+    """Return where an axis may be moved: as far as the reach about its present angle, inside its ends."""
+    low, high = ends_rad
+    width = min(2 * reach_rad, high - low)
+    start = min(max(at_rad - width / 2, low), high - width)
+    return start, start + width

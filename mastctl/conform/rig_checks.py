@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import math
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -14,12 +15,14 @@ import numpy as np
 
 from drivers.interfaces import CameraSetting
 from mastctl.client import ClientError, Snapshot
-from mastctl.conform.checks import NotTried, PromiseBroken, Suite, expect
-from mastctl.conform.head_trial import Angles
-from mastctl.conform.rig import ARRIVED_RAD, POLL_S, RigTrial, field, number
+from mastctl.conform.checks import Check, NotTried, PromiseBroken, expect
+from mastctl.conform.rig import ARRIVED_RAD, POLL_S, Angles, RigTrial, field, number
 from mastctl.conform.settings_trial import settings_tried
 
-RIG: Suite[RigTrial] = Suite()
+RIG: list[Check] = []
+"""The checks in the order in which they run."""
+
+Test = Callable[[RigTrial], str | None]
 
 READ_EVERY_S = 1.0  # the head at rest is read 20 times a second; a reading this old is none
 BEYOND_RAD = 0.015  # an approach may pass a limit by its own length, and a reading has its noise
@@ -36,7 +39,17 @@ OF_THE_SCENE = {
 """Why a click may come to nothing with a rig that does all it should."""
 
 
-@RIG.check("status.joints", "measured joint angles are finite, within a turn, and fresh")
+def _check(name: str, promise: str, *, moves: bool = False) -> Callable[[Test], Test]:
+    """Add a function to the checks."""
+
+    def add(test: Test) -> Test:
+        RIG.append(Check(name, promise, moves, test))
+        return test
+
+    return add
+
+
+@_check("status.joints", "measured joint angles are finite, within a turn, and fresh")
 def _joints(trial: RigTrial) -> str:
     status = trial.status()
     pan, tilt = trial.joints(status)
@@ -49,7 +62,7 @@ def _joints(trial: RigTrial) -> str:
     return f"pan {pan:.4f} rad, tilt {tilt:.4f} rad, {age_s:.3f} s old"
 
 
-@RIG.check("pictures.facts", "every camera gives a PNG of the mast file's size with its facts in headers")
+@_check("pictures.facts", "every camera gives a PNG of the mast file's size with its facts in headers")
 def _facts(trial: RigTrial) -> str:
     digest = hashlib.sha256(trial.mast).hexdigest()
     for camera in trial.cameras:
@@ -69,7 +82,7 @@ def _facts(trial: RigTrial) -> str:
     return f"{len(trial.cameras)} cameras"
 
 
-@RIG.check("pictures.fresh", "with fresh=true the exposure begins and ends within the request")
+@_check("pictures.fresh", "with fresh=true the exposure begins and ends within the request")
 def _fresh(trial: RigTrial) -> str:
     longest_s = 0.0
     for camera in trial.cameras:
@@ -85,7 +98,7 @@ def _fresh(trial: RigTrial) -> str:
     return f"at most {longest_s:.2f} s a picture"
 
 
-@RIG.check("pictures.ids", "ids are unique; counts and mid-exposures grow together")
+@_check("pictures.ids", "ids are unique; counts and mid-exposures grow together")
 def _ids(trial: RigTrial) -> str:
     seen: set[str] = set()
     for camera in trial.cameras:
@@ -105,7 +118,7 @@ def _ids(trial: RigTrial) -> str:
     return f"{len(seen)} pictures"
 
 
-@RIG.check("pictures.joints", "at rest a picture bears the measured angles, and says that nothing moved")
+@_check("pictures.joints", "at rest a picture bears the measured angles, and says that nothing moved")
 def _angles(trial: RigTrial) -> None:
     at = trial.joints(trial.rest())
     camera = trial.cameras[0]
@@ -115,7 +128,7 @@ def _angles(trial: RigTrial) -> None:
     expect(off_rad <= ARRIVED_RAD, f"{camera}: its angles are {off_rad:.4f} rad from the measured ones")
 
 
-@RIG.check(
+@_check(
     "pictures.settings", "a setting that is changed by a little is read back, on new pictures, and put back"
 )
 def _settings(trial: RigTrial) -> str:
@@ -149,9 +162,7 @@ def _settings_of(trial: RigTrial, camera: str) -> str:
     )
 
 
-@RIG.check(
-    "motion.pointing", "a pointing to joint angles ends there, inside the limits all the way", moves=True
-)
+@_check("motion.pointing", "a pointing to joint angles ends there, inside the limits all the way", moves=True)
 def _pointing(trial: RigTrial) -> str:
     worst_rad, seen = 0.0, 0
 
@@ -183,7 +194,7 @@ def _pointing(trial: RigTrial) -> str:
     return f"within {worst_rad:.1e} rad, seen {seen} times on the way"
 
 
-@RIG.check("motion.speed", "the head is never measured to go faster than its limit", moves=True)
+@_check("motion.speed", "the head is never measured to go faster than its limit", moves=True)
 def _speed(trial: RigTrial) -> str:
     limit = trial.limits[2]
     bound = limit * (1 + FASTER_PART) + FASTER_RAD_PER_S
@@ -206,7 +217,7 @@ def _speed(trial: RigTrial) -> str:
     return f"{fastest:.3f} rad/s, limit {limit:g} rad/s"
 
 
-@RIG.check("motion.stop", "a stop ends motion and operation short of the goal, from anybody", moves=True)
+@_check("motion.stop", "a stop ends motion and operation short of the goal, from anybody", moves=True)
 def _stop(trial: RigTrial) -> str:
     for attempt in range(STOP_TRIES):
         way = 1 if attempt % 2 == 0 else -1
@@ -251,7 +262,7 @@ def _stopped_on_the_way(trial: RigTrial, goal: Angles) -> str:
     return f"{rests_rad:.3f} rad short of the goal, answered in {1e3 * (answered_s - sent_s):.0f} ms"
 
 
-@RIG.check("motion.stop_at_rest", "a stop at rest is taken too, again and again, and moves nothing")
+@_check("motion.stop_at_rest", "a stop at rest is taken too, again and again, and moves nothing")
 def _stop_at_rest(trial: RigTrial) -> None:
     before = trial.joints()
     for _ in range(3):
@@ -260,15 +271,13 @@ def _stop_at_rest(trial: RigTrial) -> None:
     expect(moved_rad <= ARRIVED_RAD, f"a stop at rest moved the head by {moved_rad:.4f} rad")
 
 
-@RIG.check("motion.after_stop", "after a stop the next pointing goes out", moves=True)
+@_check("motion.after_stop", "after a stop the next pointing goes out", moves=True)
 def _after_stop(trial: RigTrial) -> None:
     trial.client.stop()
     trial.point(trial.goal(0.0, 0.0))
 
 
-@RIG.check(
-    "motion.estop", "an emergency stop refuses moves until a reset, and that moves nothing", moves=True
-)
+@_check("motion.estop", "an emergency stop refuses moves until a reset, and that moves nothing", moves=True)
 def _estop(trial: RigTrial) -> str:
     reason, name = "a check of this rig's promises", "mastctl conform"
     before = trial.joints()
@@ -290,9 +299,7 @@ def _estop(trial: RigTrial) -> str:
     return "kept across a restart" if told.get("kept") else "not kept across a restart"
 
 
-@RIG.check(
-    "clicks.pointed", "a click on a frame ends with a residual measured in a newer picture", moves=True
-)
+@_check("clicks.pointed", "a click on a frame ends with a residual measured in a newer picture", moves=True)
 def _clicked(trial: RigTrial) -> str:
     camera = _clicked_camera(trial)
     reasons = []
@@ -351,7 +358,7 @@ def _residual(trial: RigTrial, shot: Snapshot, record: dict[str, Any]) -> str:
     return f"residual {residual[0]:.2f}, {residual[1]:.2f} px, sigma {sigma[0]:.2f}, {sigma[1]:.2f} px"
 
 
-@RIG.check("motion.home", "the head goes back to where it stood before the checks", moves=True)
+@_check("motion.home", "the head goes back to where it stood before the checks", moves=True)
 def _home(trial: RigTrial) -> None:
     pan, tilt = (
         min(max(angle, low), high)

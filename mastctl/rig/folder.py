@@ -196,7 +196,7 @@ _SERVO_WORDS = """\
 """
 _HEAD_WORDS = """\
 # Check before the first move: the sign of each axis (pan positive to the right, tilt up), zero_rad, and the
-# limits. `mastctl conform --config FILE --head --reach 0.1` turns the head a little.
+# limits. `pytest --pyargs mastctl.testing.drivers --rig FILE --motion --reach 0.1` turns the head a little.
 """
 _MAST_WORDS = """\
 # Drawn, not calibrated: `mastctl calibrate bench` replaces it. Lengths to 2 cm are enough (meters, z down).

@@ -68,7 +68,7 @@ class CameraCheck:
 
         Promises are ``frames`` (each can be true), ``fresh`` (none is from before the asked moment),
         ``order`` (count and time grow together), ``refusal`` (what cannot come is refused in time) and
-        ``told`` (what the camera says of itself).
+        ``stated`` (what the camera states of itself).
         """
         return [words for about, words in self._problems if promise in (None, about)]
 
@@ -139,11 +139,11 @@ class CameraCheck:
             height, width = self._frames[-1].image.shape[:2]
             if tuple(info.size_px) != (width, height):
                 words = f"info.size_px is {tuple(info.size_px)}, its pictures have ({width}, {height})"
-                self._problem("told", words)
+                self._problem("stated", words)
         rate_hz, period_s = self._rate_hz(), info.period_s
         if period_s is not None and rate_hz and abs(period_s * rate_hz - 1) > PACE_TOLERANCE:
             words = f"info.period_s is {period_s:.4g} s, frames come every {1 / rate_hz:.4g} s"
-            self._problem("told", words)
+            self._problem("stated", words)
 
     def _rate_hz(self) -> float | None:
         if len(self._frames) < 2:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from mastctl.testing.rover import SetFault, SimulatedRover
 
 MARKER = "mastctl"
+DRIVERS = "mastctl.testing.drivers"
 USUAL_WIDTH_PX = 640
 AS_CONFIGURED = "as_configured"
 
@@ -43,8 +44,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         parser.addini(name, meaning, type="string", default="")
 
 
+def pytest_load_initial_conftests(early_config: pytest.Config, args: list[str]) -> None:
+    """Load the options of the acceptance of drivers where that is on the command line."""
+    if any(DRIVERS in one or DRIVERS.replace(".", os.sep) in one for one in args):
+        early_config.pluginmanager.import_plugin(f"{DRIVERS}.plugin")
+
+
 def pytest_configure(config: pytest.Config) -> None:
-    """Say what the marker is."""
+    """Declare the markers."""
+    config.addinivalue_line("markers", "moves_head: an acceptance test of a driver that moves the head")
     config.addinivalue_line(
         "markers",
         f"{MARKER}(config=None, picture_width_px=None, **simulation): the test's simulated rover; further "

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import http.client
+import os
 import re
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -24,9 +27,11 @@ from drivers.sim.axis import AxisSettings
 from drivers.sim.heads import HeadSettings
 from drivers.sim.pan_tilt import SimulatedPanTilt
 from hil_tests.mastctl.service_fakes import CONFIG, SIZE_PX, rig
+from hil_tests.waiting import NET_S
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 
+REPOSITORY = Path(__file__).resolve().parents[3]
 HERE = "hil_tests.mastctl.conform.conform_world"
 PERIOD_S = 0.02
 KEPT_S = 30.0
@@ -96,6 +101,14 @@ def configuration(folder: Path, speed_rad_per_s: float = SPEED_RAD_PER_S) -> Pat
     text = re.sub(r"(speed_rad_per_s: )[\d.]+", rf"\g<1>{speed_rad_per_s}", text)
     (folder / "daemon.yaml").write_text(text.replace("{driver: fake}", f"{{driver: '{HERE}:NoiseCamera'}}"))
     return folder / "daemon.yaml"
+
+
+def accepted(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run the acceptance of drivers as a program of its own, in a folder."""
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-rs", "--pyargs"]
+    path = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), str(folder)])}
+    whole = [*command, "mastctl.testing.drivers", *words]
+    return subprocess.run(whole, cwd=folder, env=path, capture_output=True, text=True, timeout=NET_S)
 
 
 @contextmanager

@@ -1,25 +1,25 @@
-"""Every check of a camera passes a right one, and finds the driver that breaks its promise."""
+"""Every test of a camera passes a right one, and finds the driver that breaks its promise."""
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from drivers.errors import DriverError, NoFreshFrame, NoReply
 from drivers.interfaces import CameraInfo, Frame
-from hil_tests.mastctl.conform.conform_world import HERE, NoiseCamera
+from hil_tests.mastctl.conform.conform_world import HERE, NoiseCamera, accepted
 from hil_tests.mastctl.service_fakes import SIZE_PX
-from mastctl.cli.main import main
-from mastctl.conform.camera_checks import CAMERAS, CameraTrial
-from mastctl.conform.checks import run_checks
+from mastctl.testing.drivers import test_camera as suite
+from mastctl.testing.drivers.test_camera import CameraTrial
 
-NAMES = [check.name for check in CAMERAS.checks]
+Test = Callable[[CameraTrial], None]
+TESTS = [one for name, one in vars(suite).items() if name.startswith("test_")]
 
 
 def frames(edit: Callable[[Frame, float], Any]) -> type[NoiseCamera]:
@@ -90,56 +90,49 @@ class ClosesOnce(NoiseCamera):
         super().close()
 
 
-BROKEN: list[tuple[str, str, type[NoiseCamera]]] = [
-    ("nothing", "camera.frames", frames(lambda frame, asked_s: None)),
-    ("floats", "camera.frames", frames(lambda frame, asked_s: replace(frame, image=frame.image / 255.0))),
-    ("another size", "camera.frames", frames(lambda frame, asked_s: replace(frame, image=frame.image[::2]))),
-    ("dark", "camera.frames", frames(lambda frame, asked_s: replace(frame, image=frame.image // 64))),
-    ("the future", "camera.frames",
+BROKEN: list[tuple[str, Test, type[NoiseCamera]]] = [
+    ("nothing", suite.test_frames, frames(lambda frame, asked_s: None)),
+    ("floats", suite.test_frames, frames(lambda frame, asked_s: replace(frame, image=frame.image / 255.0))),
+    ("another size", suite.test_frames,
+     frames(lambda frame, asked_s: replace(frame, image=frame.image[::2]))),
+    ("dark", suite.test_frames, frames(lambda frame, asked_s: replace(frame, image=frame.image // 64))),
+    ("the future", suite.test_frames,
      frames(lambda frame, asked_s: replace(frame, mid_exposure_s=frame.mid_exposure_s + 0.5))),
-    ("old frames", "camera.fresh", Old),
-    ("one count for all", "camera.order", frames(lambda frame, asked_s: replace(frame, sequence=7))),
-    ("no deadline", "camera.refusal", Never),
-    ("another pace than told", "camera.told", OtherPace),
-    ("another size than told", "camera.told", OtherSize),
-    ("one call at a time", "camera.threads", OneAtATime),
-    ("a value that is not taken", "camera.settings", Forgets),
-    ("frames of the value before", "camera.settings",
+    ("old frames", suite.test_fresh, Old),
+    ("one count for all", suite.test_order, frames(lambda frame, asked_s: replace(frame, sequence=7))),
+    ("no deadline", suite.test_refusal, Never),
+    ("another pace than told", suite.test_stated, OtherPace),
+    ("another size than told", suite.test_stated, OtherSize),
+    ("one call at a time", suite.test_threads, OneAtATime),
+    ("a value that is not taken", suite.test_settings, Forgets),
+    ("frames of the value before", suite.test_settings,
      frames(lambda frame, asked_s: replace(frame, settings={"gain": 8.0}))),
-    ("frames of no known value", "camera.settings",
+    ("frames of no known value", suite.test_settings,
      frames(lambda frame, asked_s: replace(frame, settings={"gain": None}))),
-    ("close once only", "camera.close", ClosesOnce),
+    ("close once only", suite.test_close, ClosesOnce),
 ]  # fmt: skip
 
 
-def states(camera: Any, *names: str, **known: Any) -> dict[str, tuple[str, str]]:
-    trial = CameraTrial("eye", camera, SIZE_PX, 0.3, **known)
-    checks = [check for check in CAMERAS.checks if check.name in names]
-    return {
-        outcome.name: (outcome.state, outcome.message) for outcome in run_checks(checks, trial, motion=False)
-    }
-
-
-@pytest.mark.parametrize(("name", "kind"), [one[1:] for one in BROKEN], ids=[one[0] for one in BROKEN])
-def test_a_broken_camera_is_found_by_the_check_meant_for_it(name: str, kind: type[NoiseCamera]) -> None:
-    state, message = states(kind(), name)[name]
-    assert state == "failed" and "\n" not in message, message
+@pytest.mark.parametrize(("test", "kind"), [one[1:] for one in BROKEN], ids=[one[0] for one in BROKEN])
+def test_a_broken_camera_is_found_by_the_test_meant_for_it(test: Test, kind: type[NoiseCamera]) -> None:
+    with pytest.raises((AssertionError, DriverError)) as failed:
+        test(CameraTrial("camera", kind(), SIZE_PX, 0.3))
+    assert "\n" not in str(failed.value)
 
 
 def test_a_right_camera_keeps_every_promise() -> None:
-    found = states(NoiseCamera(), *NAMES, open_again=NoiseCamera)
-    assert {name: told for name, told in found.items() if told[0] != "passed"} == {}
+    camera = CameraTrial("camera", NoiseCamera(), SIZE_PX, 0.3, NoiseCamera)
+    for test in TESTS:
+        test(camera)
 
 
-def test_there_is_a_broken_camera_for_every_check() -> None:
-    assert {name for _, name, _ in BROKEN} == set(NAMES)
+def test_there_is_a_broken_camera_for_every_test() -> None:
+    assert {test for _, test, _ in BROKEN} == set(TESTS)
 
 
-def test_the_command_checks_a_camera_by_its_driver(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["conform", "--driver", f"{HERE}:NoiseCamera", "--camera", "--seconds", "0.3", "--json"]
-    assert main([*words, "--size", "64", "48"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["kind"] == "camera" and [check["name"] for check in told["checks"]] == NAMES
-    assert main([*words, "--size", "640", "480", "--only", "camera.frames"]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert "64x48 px" in told["checks"][0]["message"]
+def test_the_suite_takes_a_camera_by_its_driver(tmp_path: Path) -> None:
+    words = ("--camera", f"{HERE}:NoiseCamera", "--seconds", "0.3")
+    done = accepted(tmp_path, *words, "--size", "64", "48")
+    assert done.returncode == 0 and f"{len(TESTS)} passed" in done.stdout, done.stdout
+    done = accepted(tmp_path, *words, "--size", "640", "480", "-k", "frames")
+    assert done.returncode == 1 and "64x48 px" in done.stdout, done.stdout

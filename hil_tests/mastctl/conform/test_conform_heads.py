@@ -1,8 +1,7 @@
-"""Every check of a head finds the driver that breaks its promise."""
+"""Every test of a head finds the driver that breaks its promise."""
 
 from __future__ import annotations
 
-import json
 import math
 import threading
 import time
@@ -15,16 +14,15 @@ import pytest
 
 from drivers.errors import DriverError, NoReply
 from drivers.interfaces import Reading
-from hil_tests.mastctl.conform.conform_world import HERE, open_head
-from mastctl.cli.main import main
-from mastctl.conform.checks import run_checks
-from mastctl.conform.devices import check_head
-from mastctl.conform.head_checks import HEADS
-from mastctl.conform.head_trial import HeadTrial
+from hil_tests.mastctl.conform.conform_world import HERE, accepted, open_head
+from mastctl.conform.checks import SubjectLost
+from mastctl.testing.drivers import test_head as suite
+from mastctl.testing.drivers.head_trial import HeadTrial
 
 LIMITS = ((-2.0, 2.0), (-2.0, 2.0))
 BOX = ((-0.4, 0.4), (-0.3, 0.3))
-NAMES = [check.name for check in HEADS.checks]
+Test = Callable[[HeadTrial], None]
+TESTS = {one for name, one in vars(suite).items() if name.startswith("test_")}
 
 
 class Right:
@@ -177,31 +175,31 @@ class StaysOpen(Right):
         self.right.stop()
 
 
-BROKEN: list[tuple[str, str, type[Right]]] = [
-    ("degrees", "head.reading", reads(lambda head, r: replace(r, tilt_rad=r.tilt_rad + 90.0))),
-    ("an old stamp", "head.reading", reads(lambda head, r: replace(r, time_s=r.time_s - 0.5))),
-    ("another clock", "head.reading", reads(lambda head, r: replace(r, time_s=time.time()))),
-    ("one fault as a text", "head.reading", reads(lambda head, r: replace(r, faults="hot"))),
-    ("a fault", "head.reading", reads(lambda head, r: replace(r, faults=["pan is hot"]))),
-    ("no reading", "head.reading", reads(lambda head, r: None)),
-    ("a move that waits", "head.move", moves(waits)),
-    ("beside the goal", "head.move", moves(lambda head, p, t, s: (p + 0.02, t, s))),
-    ("the commanded angle", "head.under_way",
+BROKEN: list[tuple[str, Test, type[Right]]] = [
+    ("degrees", suite.test_reading, reads(lambda head, r: replace(r, tilt_rad=r.tilt_rad + 90.0))),
+    ("an old stamp", suite.test_reading, reads(lambda head, r: replace(r, time_s=r.time_s - 0.5))),
+    ("another clock", suite.test_reading, reads(lambda head, r: replace(r, time_s=time.time()))),
+    ("one fault as a text", suite.test_reading, reads(lambda head, r: replace(r, faults="hot"))),
+    ("a fault", suite.test_reading, reads(lambda head, r: replace(r, faults=["pan is hot"]))),
+    ("no reading", suite.test_reading, reads(lambda head, r: None)),
+    ("a move that waits", suite.test_move, moves(waits)),
+    ("beside the goal", suite.test_move, moves(lambda head, p, t, s: (p + 0.02, t, s))),
+    ("the commanded angle", suite.test_under_way,
      reads(lambda head, r: replace(r, pan_rad=head.goal[0], tilt_rad=head.goal[1], moving=False))),
-    ("never moving", "head.under_way", reads(lambda head, r: replace(r, moving=False))),
-    ("one stamp for many", "head.under_way",
+    ("never moving", suite.test_under_way, reads(lambda head, r: replace(r, moving=False))),
+    ("one stamp for many", suite.test_under_way,
      reads(lambda head, r: replace(r, time_s=math.floor(r.time_s / 0.004) * 0.004))),
-    ("goals in a queue", "head.new_goal", Queues),
-    ("a stop that does nothing", "head.stop", RunsOn),
-    ("a creep after the stop", "head.stop", Creeps),
-    ("a stop that waits for a move", "head.stop_beside", StopWaits),
-    ("one call at a time", "head.threads", OneAtATime),
-    ("full speed", "head.speed", moves(lambda head, p, t, s: (p, t, 1.5))),
-    ("goals bent to the limits", "head.limits", moves(clipped)),
-    ("goals of no number taken", "head.not_a_number", moves(numbers_only)),
-    ("slow answers", "head.deadlines", Slow),
-    ("close once only", "head.close", ClosesOnce),
-    ("open for ever", "head.close", StaysOpen),
+    ("goals in a queue", suite.test_new_goal, Queues),
+    ("a stop that does nothing", suite.test_stop, RunsOn),
+    ("a creep after the stop", suite.test_stop, Creeps),
+    ("a stop that waits for a move", suite.test_stop_beside, StopWaits),
+    ("one call at a time", suite.test_threads, OneAtATime),
+    ("full speed", suite.test_speed, moves(lambda head, p, t, s: (p, t, 1.5))),
+    ("goals bent to the limits", suite.test_limits, moves(clipped)),
+    ("goals of no number taken", suite.test_not_a_number, moves(numbers_only)),
+    ("slow answers", suite.test_deadlines, Slow),
+    ("close once only", suite.test_close, ClosesOnce),
+    ("open for ever", suite.test_close, StaysOpen),
 ]  # fmt: skip
 
 
@@ -209,106 +207,75 @@ def trial(head: Any, **known: Any) -> HeadTrial:
     return HeadTrial(head, BOX, 0.8, limits_rad=LIMITS, own_limits=True, **known)
 
 
-@pytest.mark.parametrize(("name", "kind"), [one[1:] for one in BROKEN], ids=[one[0] for one in BROKEN])
-def test_a_broken_head_is_found_by_the_check_meant_for_it(name: str, kind: type[Right]) -> None:
-    checks = [check for check in HEADS.checks if check.name == name]
-    (outcome,) = run_checks(checks, trial(kind()), motion=True)
-    assert outcome.state == "failed" and "\n" not in outcome.message, outcome
+@pytest.mark.parametrize(("test", "kind"), [one[1:] for one in BROKEN], ids=[one[0] for one in BROKEN])
+def test_a_broken_head_is_found_by_the_test_meant_for_it(test: Test, kind: type[Right]) -> None:
+    with pytest.raises((AssertionError, DriverError)) as failed:
+        test(trial(kind()))
+    assert "\n" not in str(failed.value)
 
 
 def test_a_move_that_a_busy_machine_delays_is_no_fault_of_the_driver() -> None:
     delayed = iter([False, False, False, True, False])  # the first three ways are too short to tell
     kind = moves(lambda head, p, t, s: waits(head, p, t, s) if next(delayed) else (p, t, s))
-    (outcome,) = run_checks(
-        [check for check in HEADS.checks if check.name == "head.move"], trial(kind()), motion=True
-    )
-    assert outcome.state == "passed", outcome
+    suite.test_move(trial(kind()))
 
 
 def test_a_right_head_is_closed_and_opened_again() -> None:
-    """The other checks are passed by every head of test_head_contract."""
-    checks = [check for check in HEADS.checks if check.name == "head.close"]
-    (outcome,) = run_checks(checks, trial(Right(), open_again=Right), motion=True)
-    assert outcome.state == "passed", outcome
+    """The other tests are passed by every head of test_head_contract."""
+    suite.test_close(trial(Right(), open_again=Right))
 
 
-def test_there_is_a_broken_head_for_every_check() -> None:
-    assert {name for _, name, _ in BROKEN} == set(NAMES)
+def test_there_is_a_broken_head_for_every_test() -> None:
+    assert {test for _, test, _ in BROKEN} == TESTS
 
 
-def test_a_head_that_hangs_ends_the_checks_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_head_that_hangs_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     go = threading.Event()
-    monkeypatch.setattr("mastctl.conform.worker.PATIENCE_S", 0.2)
-    monkeypatch.setattr("mastctl.conform.worker.Worker.call.__defaults__", (0.2,))
+    monkeypatch.setattr("mastctl.testing.drivers.calls.Worker.call.__defaults__", (0.2,))
 
     class Hangs(Right):
         def read(self) -> Reading:
             go.wait(30)
             return super().read()
 
-    outcomes = run_checks(HEADS.checks, trial(Hangs()), motion=True)
+    with pytest.raises(SubjectLost, match="has not come back"):
+        suite.test_reading(trial(Hangs()))
     go.set()
-    assert "has not come back" in outcomes[0].message
-    assert [outcome.state for outcome in outcomes] == ["failed"] + ["skipped"] * (len(NAMES) - 1)
 
 
-@pytest.mark.parametrize("answer", [RuntimeError("no"), NoReply("no"), None])
-def test_a_head_that_reads_nothing_true_at_the_start_is_never_moved(
-    answer: Exception | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    sent: list[Any] = []
-
-    class Tells(Right):
-        def read(self) -> Any:
-            if answer is not None:
-                raise answer
-            return answer
-
-        def move(self, *goal: Any) -> None:
-            sent.append(goal)
-
-    monkeypatch.setattr("hil_tests.mastctl.conform.conform_world.open_head", lambda: Tells())
-    assert main(["conform", "--driver", f"{HERE}:open_head", "--head", "--motion", "--json"]) == 1
-    told = {check["name"]: check for check in json.loads(capsys.readouterr().out)["checks"]}
-    assert told["head.reading"]["state"] == "failed"
-    assert {check["state"] for check in told.values()} == {"failed", "skipped"}
-    assert "not known from where" in told["head.move"]["message"]
-    assert sent == []
+UNREADABLE = """
+class Head:
+    def read(self):
+        raise RuntimeError("no")
+    def move(self, *goal):
+        open("moved", "w").close()
+    def stop(self): ...
+    def close(self): ...
+"""
 
 
-def test_control_c_stops_the_head() -> None:
-    head = Right()
-
-    def interrupt(*ignored: object) -> None:
-        head.right.move(1.5, 0.0, 0.5)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        check_head(trial(head), "right", HEADS.checks[:2], True, interrupt)
-    assert not head.right.read().moving or head.right.read().pan_rad < 0.5
+def test_a_head_that_reads_nothing_true_at_the_start_is_never_moved(tmp_path: Path) -> None:
+    (tmp_path / "unreadable.py").write_text(UNREADABLE)
+    done = accepted(tmp_path, "--head", "unreadable:Head", "--motion")
+    assert done.returncode == 2 and "RuntimeError (no) where a DriverError is expected" in done.stdout
+    assert "its present pose is not known" in done.stdout and " passed" not in done.stdout
+    assert not (tmp_path / "moved").exists()
 
 
-def test_the_command_checks_a_driver_by_its_name(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_the_suite_takes_a_driver_by_its_name_and_refuses_wrong_use(tmp_path: Path) -> None:
     options = tmp_path / "options.json"
     options.write_text('{"low_rad": -1.0, "high_rad": 1.0}')
-    words = [
-        "conform",
-        "--driver",
-        f"{HERE}:open_head",
-        "--options",
-        str(options),
-        "--head",
-        "--motion",
-        "--json",
-    ]
-    assert main([*words, "--limits", "-1", "1", "-1", "1", "--only", "head.limits", "--speed", "2"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["kind"] == "head" and told["passed"] == 1 and told["conforms"]
-    for wrong, code in (
-        ([*words, "--limits", "1", "-1", "-1", "1"], "wrong_use"),
-        ([word for word in words if word != "--head"], "wrong_use"),
-        (["conform", "--driver", "no.such:thing", "--head", "--motion", "--json"], "bad_options"),
-        (["conform", "--driver", f"{HERE}:open_head", "--options", "[1]", "--head", "--json"], "wrong_use"),
+    words = ("--head", f"{HERE}:open_head", "--options", str(options))
+    ends = ("--limits", "-1", "1", "-1", "1", "-k", "limits", "--speed", "2")
+    done = accepted(tmp_path, *words, "--motion", *ends)
+    assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout
+    done = accepted(tmp_path, *words, *ends)
+    assert "1 skipped" in done.stdout and "moved only with --motion" in done.stdout
+    for wrong, message, code in (
+        ((*words, "--limits", "1", "-1", "-1", "1"), "the lower angle first is expected", 4),
+        (("--motion",), "--head DRIVER, --camera DRIVER or --rig FILE is expected", 4),
+        (("--head", "no.such:thing", "--motion"), "no.such", 1),
+        (("--head", f"{HERE}:open_head", "--options", "[1]"), "a JSON object is expected", 4),
     ):
-        assert main(wrong) == 2
-        assert json.loads(capsys.readouterr().out)["error"]["code"] == code
+        done = accepted(tmp_path, *wrong)
+        assert done.returncode == code and message in done.stdout + done.stderr, done.stdout + done.stderr

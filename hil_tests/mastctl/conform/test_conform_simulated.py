@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
+from pathlib import Path
 
-import pytest
-
-from mastctl.cli.main import main
+from hil_tests.mastctl.conform.conform_world import accepted
 from mastctl.config import load_config
 from mastctl.conform.rig import check_rig, rig_under_test
 from mastctl.conform.rig_checks import RIG
@@ -28,14 +26,13 @@ def test_the_simulated_rover_conforms_and_a_click_lands() -> None:
         RunningDaemon(replace(config, hardware=hardware, listen=listen)) as daemon,
         rig_under_test(daemon.url, 0.3) as under_test,
     ):
-        outcomes = check_rig(under_test, RIG.checks, True).outcomes
+        outcomes = check_rig(under_test, RIG, True).outcomes
     assert [outcome for outcome in outcomes if outcome.state == "failed"] == []
     assert {outcome.name for outcome in outcomes if outcome.state == "skipped"} <= TOO_QUICK
 
 
-def test_a_simulated_camera_keeps_its_promises(capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["conform", "--driver", "sim", "--options", '{"samples": 1}', "--camera", "--seconds", "1"]
-    code = main([*command, "--json"])
-    report = json.loads(capsys.readouterr().out)
-    assert code == 0, [check for check in report["checks"] if check["state"] == "failed"]
-    assert report["passed"] >= 7 and report["may_move"] == ""
+def test_a_simulated_head_and_camera_keep_their_promises(tmp_path: Path) -> None:
+    simulation = ("--options", '{"samples": 1}')
+    for device, passed in (("--camera", 8), ("--head", 11)):
+        done = accepted(tmp_path, device, "sim", *simulation, "--seconds", "1")
+        assert done.returncode == 0 and f"{passed} passed" in done.stdout, done.stdout

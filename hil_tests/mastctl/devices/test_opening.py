@@ -13,6 +13,7 @@ import pytest
 
 from calib.files.mast_file import save_rig
 from drivers.hardware import DeviceSettings, HardwareSettings, head_name
+from hil_tests.mastctl.conform.conform_world import accepted
 from hil_tests.mastctl.outside_daemon import daemon_process, line
 from hil_tests.mastctl.safety.test_deaths import Bench, made
 from hil_tests.mastctl.service_fakes import rig
@@ -124,12 +125,11 @@ OPENING = {
     "ptu home": ["PORT", "--sweep-full-range"],
     "camera check": [CAMERA, "--with-head", "--seconds", "0.3", "--config", "CONFIG"],
     "camera sync": ["--seconds", "3", "--config", "CONFIG"],
-    "conform": ["--head", "--motion", "--reach", "0.2", "--config", "CONFIG"],
     "sentinel reference": ["--folder", "sentinel", "--config", "CONFIG"],
 }
 """Commands that open a head beside a daemon; import-linter keeps them few. Those that only read have tests
 of their own that nothing moves."""
-MOVING = {"camera sync", "conform", "servo set-id", "ptu home"}
+MOVING = {"camera sync", "servo set-id", "ptu home"}
 
 
 @BOTH
@@ -148,6 +148,9 @@ def test_no_command_moves_a_latched_head(
         assert "--help')" not in errors, f"{name} was not begun"
         assert watched.swept_rad < STILL_RAD, name
         assert name not in MOVING or "an emergency stop is latched (Ana: sparks)" in errors, (name, errors)
+    done = accepted(tmp_path, "--rig", watched.config, "--motion", "--reach", "0.2", "-k", "head")
+    assert done.returncode == 1 and "an emergency stop is latched (Ana: sparks)" in done.stdout
+    assert watched.swept_rad < STILL_RAD
 
 
 @pytest.mark.parametrize("place", ["can be made", "cannot be made"])
@@ -162,12 +165,8 @@ def test_a_latch_in_the_state_folder_alone_holds_too(
     if place == "cannot be made":
         monkeypatch.setenv(heads.VARIABLE, "/proc/nowhere")
     watched.latch(tmp_path / "state")
-    for words in (
-        ["camera", "sync", "--seconds", "1"],
-        ["conform", "--head", "--motion", "--only", "head.move"],
-    ):
-        assert main([*words, "--config", watched.config]) == 1
-        assert "an emergency stop is latched (Ana: sparks)" in capsys.readouterr().err
+    assert main(["camera", "sync", "--seconds", "1", "--config", watched.config]) == 1
+    assert "an emergency stop is latched (Ana: sparks)" in capsys.readouterr().err
     assert watched.swept_rad < STILL_RAD
 
 
@@ -186,17 +185,13 @@ def test_a_sweep_across_a_keep_out_moves_nothing(
     assert not inside.any()
 
 
-def test_the_checks_of_a_driver_keep_its_head_from_the_sun(
-    watched: Watched, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_acceptance_of_a_driver_keeps_its_head_from_the_sun(watched: Watched, tmp_path: Path) -> None:
     watched.configure(limits=LIMITS | {"sun": SUN})
-    words = ["conform", "--config", watched.config, "--head", "--motion", "--reach", "0.3", "--json"]
-    asked = ["head.move", "head.new_goal", "head.threads", "head.not_a_number", "head.close"]
-    code = main([*words, *(word for name in asked for word in ("--only", name))])
-    told = json.loads(capsys.readouterr().out)
-    said = {one["name"]: one["message"] for one in told["checks"]}
-    assert (code, told["passed"], told["skipped"]) == (0, len(asked) - 1, 1), said
-    assert "keep-out" in said["head.not_a_number"]  # a driver that takes infinity could go to the limit
+    chosen = "test_move or new_goal or threads or not_a_number or test_close"
+    words = ("--rig", watched.config, "--motion", "--reach", "0.3", "-k", f"test_head and ({chosen})")
+    done = accepted(tmp_path, *words)
+    assert done.returncode == 0 and "4 passed, 1 skipped" in done.stdout, done.stdout
+    assert "keep-out" in done.stdout  # a driver that takes infinity could go to the limit
     assert watched.swept_rad > 0.2
     towards = np.array([np.cos(SUN["azimuth_rad"]), np.sin(SUN["azimuth_rad"]), 0.0])
     sight = np.array([rig().camera_in_rover(CAMERA, pan, tilt).A for pan, tilt in watched.path()])
@@ -211,10 +206,10 @@ def test_what_may_move_a_head_is_refused_beside_its_daemon(
         home = ["ptu", "home", watched.port, "--sweep-full-range"]
         for words in (
             ["camera", "sync", "--config", watched.config],
-            ["conform", "--config", watched.config, "--head", "--motion"],
-            ["conform", "--config", watched.config, "--head", "--no-motion"],
             home if watched.bench.driver == "flir_ptu" else ["servo", "info", watched.port, "1"],
         ):
             assert main(words) == 1
             assert "by another program" in capsys.readouterr().err
+        done = accepted(watched.bench.folder, "--rig", watched.config, "--motion", "-k", "test_head")
+        assert done.returncode == 1 and "by another program" in done.stdout
     assert watched.swept_rad < STILL_RAD

@@ -1,4 +1,4 @@
-"""A head under test: what every check asks of it, and where it may be moved."""
+"""A head under test: the calls of every test, and where it may be moved."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from drivers.clock import Clock, SystemClock
 from drivers.interfaces import PanTilt, Reading
 from drivers.options import is_number
 from mastctl.conform.checks import NotTried, SubjectLost, expect
-from mastctl.conform.worker import Worker
+from mastctl.conform.rig import Angles
 from mastctl.devices.frames import CLOCK_TOLERANCE_S
 from mastctl.devices.opening import GuardedHead
+from mastctl.testing.drivers.calls import Worker
 
-Angles = tuple[float, float]
 LONGER = "a larger --reach or a lower --speed"
 SETTLES_WITHIN_S = 30.0
 READ_EVERY_S = 0.002  # on the way
 OUTSIDE_COUNT_RAD = 1e-3
-"""Taken for the count of a head that nobody knows; a 12-bit servo has 1.5e-3."""
+"""Assumed for a count that is not known; a 12-bit servo has 1.5e-3."""
 
 
 @dataclass
 class HeadTrial:
-    """A head under test, and what is known of it besides.
+    """A head under test, and what is known of it.
 
     Attributes
     ----------
@@ -45,15 +45,15 @@ class HeadTrial:
     settle_rad
         How far from its goal a settled head may stand, beyond the rounding to counts.
     true_rad
-        Where the axes truly are at a moment of the last minute; None where nobody knows.
+        Where the axes truly are at a moment of the last minute; None where that is not known.
     open_again
         Opens the same head once more after it was closed; None where that is not to be tried.
     closed
         Whether it was closed for good.
     unplaced
-        Why nobody knows where it may be moved; empty where that is known.
+        Why it is not known where it may be moved; empty where it is.
     clock
-        What the head stamps its readings by, and what the checks wait on.
+        What the head stamps its readings by, and what the tests wait on.
     """
 
     head: PanTilt
@@ -83,7 +83,7 @@ class HeadTrial:
         return a + (pan_part + 1) / 2 * (b - a), c + (tilt_part + 1) / 2 * (d - c)
 
     def read(self) -> Reading:
-        """Read in the head's own thread; the answer is one that can be true."""
+        """Read in the head's own thread; the reading is one that can be true."""
         began_s = self.clock.now_s()
         reading = self.worker.call("read()", self.head.read)
         self.check_reading(reading, began_s, self.clock.now_s())
@@ -95,9 +95,9 @@ class HeadTrial:
         self.worker.call("move()", lambda: self.head.move(goal[0], goal[1], speed))
 
     def try_refusal(self, goal: Angles, speed_rad_per_s: float) -> None:
-        """Send what the driver has to refuse."""
-        ask = self.head.try_refusal if isinstance(self.head, GuardedHead) else self.head.move
-        self.worker.call("move()", lambda: ask(goal[0], goal[1], speed_rad_per_s))
+        """Send a goal or speed that the driver has to refuse."""
+        move = self.head.try_refusal if isinstance(self.head, GuardedHead) else self.head.move
+        self.worker.call("move()", lambda: move(goal[0], goal[1], speed_rad_per_s))
 
     def stop(self) -> None:
         """Stop, in the head's own thread."""
@@ -182,11 +182,3 @@ def away(reading: Reading, goal: Angles) -> float:
 def at(reading: Reading) -> Angles:
     """The angles of a reading."""
     return reading.pan_rad, reading.tilt_rad
-
-
-def box(at_rad: float, ends_rad: Angles, reach_rad: float) -> Angles:
-    """Return where an axis may be moved: as far as the reach about where it stands, inside its ends."""
-    low, high = ends_rad
-    width = min(2 * reach_rad, high - low)
-    start = min(max(at_rad - width / 2, low), high - width)
-    return start, start + width

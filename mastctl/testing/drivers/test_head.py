@@ -1,37 +1,40 @@
-"""What a pan/tilt driver promises (docs/drivers.md), asked of any head."""
+"""What a pan/tilt driver promises (docs/drivers.md), tested on any head."""
 
 from __future__ import annotations
 
+import logging
 import math
 from contextlib import suppress
 from functools import partial
 from itertools import pairwise
 
 import numpy as np
+import pytest
 
 from drivers.errors import BadReply, DriverError, NoReply
-from mastctl.conform.checks import NotTried, PromiseBroken, Suite, expect
-from mastctl.conform.head_trial import (
+from mastctl.conform.checks import NotTried, PromiseBroken, expect
+from mastctl.conform.rig import Angles
+from mastctl.devices.devices import MOVE_TIMEOUT_S, READ_TIMEOUT_S, STOP_TIMEOUT_S
+from mastctl.testing.drivers.calls import PATIENCE_S, beside, ended
+from mastctl.testing.drivers.head_trial import (
     LONGER,
     OUTSIDE_COUNT_RAD,
     READ_EVERY_S,
     SETTLES_WITHIN_S,
-    Angles,
     HeadTrial,
     at,
     away,
 )
-from mastctl.conform.worker import PATIENCE_S, beside, ended
-from mastctl.devices.devices import MOVE_TIMEOUT_S, READ_TIMEOUT_S, STOP_TIMEOUT_S
 
-HEADS: Suite[HeadTrial] = Suite()
+log = logging.getLogger(__name__)
+moves_head = pytest.mark.moves_head
 
 HOLDS_S = 0.3
 
 
-@HEADS.check("head.reading", "a reading is finite, stamped within its call, and without faults")
-def _reading(trial: HeadTrial) -> str:
-    readings = [trial.read() for _ in range(5)]
+def test_reading(head: HeadTrial) -> None:
+    """A reading is finite, stamped within its call, and without faults."""
+    readings = [head.read() for _ in range(5)]
     for before, after in pairwise(readings):
         expect(after.time_s >= before.time_s, f"the stamps went back by {before.time_s - after.time_s:.4f} s")
     faults = readings[-1].faults
@@ -40,49 +43,47 @@ def _reading(trial: HeadTrial) -> str:
         f"faults is {faults!r} where a sequence of sentences is expected",
     )
     expect(len(faults) == 0, f"the head is not healthy: {'; '.join(faults)}")
-    return f"pan {readings[-1].pan_rad:.4f} rad, tilt {readings[-1].tilt_rad:.4f} rad"
+    log.info(f"pan {readings[-1].pan_rad:.4f} rad, tilt {readings[-1].tilt_rad:.4f} rad")
 
 
-@HEADS.check("head.move", "a move returns at once and ends at its goal, at the nearest count", moves=True)
-def _move(trial: HeadTrial) -> str:
+@moves_head
+def test_move(head: HeadTrial) -> None:
+    """A move returns at once and ends at its goal, at the nearest count."""
     worst_rad = 0.0
     shares: list[tuple[float, str]] = []  # of each way's time, that move() took; a busy machine delays some
     for parts in ((0.3, -0.2), (0.25033, -0.25047), (-0.0007, 0.0004), (-0.6, 0.5), (0.6, -0.5)):
-        goal = trial.goal(*parts)
-        way_rad = away(trial.settled(), goal)
-        began_s = trial.clock.now_s()
-        trial.move(goal)
-        took_s = trial.clock.now_s() - began_s
-        needs_s = way_rad / trial.speed_rad_per_s
+        goal = head.goal(*parts)
+        way_rad = away(head.settled(), goal)
+        began_s = head.clock.now_s()
+        head.move(goal)
+        took_s = head.clock.now_s() - began_s
+        needs_s = way_rad / head.speed_rad_per_s
         expect(took_s < MOVE_TIMEOUT_S, f"move() took {took_s:.2f} s, {MOVE_TIMEOUT_S:g} s are allowed")
         if needs_s >= 0.2:
             words = f"move() came back after {took_s:.2f} s, when the way of {way_rad:.3f} rad was gone"
             shares.append((took_s / needs_s, f"{words}: not at once"))
-        reading = trial.settled()
-        bound_rad = trial.settle_rad + (0.5 * trial.count_rad if trial.count_rad else OUTSIDE_COUNT_RAD)
-        worst_rad = max(worst_rad, trial.check_arrived(reading, goal, bound_rad))
+        reading = head.settled()
+        bound_rad = head.settle_rad + (0.5 * head.count_rad if head.count_rad else OUTSIDE_COUNT_RAD)
+        worst_rad = max(worst_rad, head.check_arrived(reading, goal, bound_rad))
     if shares:
         share, words = min(shares)
         expect(share < 0.7, words)
-    return f"within {worst_rad:.1e} rad"
+    log.info(f"within {worst_rad:.1e} rad")
 
 
-@HEADS.check(
-    "head.under_way",
-    "under way it reports measured angles and motion, and its stamps grow",
-    moves=True,
-)
-def _under_way(trial: HeadTrial) -> str:
-    start = trial.sent(trial.goal(-0.5, -0.5))
-    goal = trial.goal(0.7, 0.6)
+@moves_head
+def test_under_way(head: HeadTrial) -> None:
+    """Under way it reports measured angles and motion, and its stamps grow."""
+    start = head.sent(head.goal(-0.5, -0.5))
+    goal = head.goal(0.7, 0.6)
     way_rad = away(start, goal)
-    began_s = trial.clock.now_s()
-    trial.move(goal)
-    readings = [trial.read()]
+    began_s = head.clock.now_s()
+    head.move(goal)
+    readings = [head.read()]
     until_s = began_s + SETTLES_WITHIN_S
-    while readings[-1].moving and trial.clock.now_s() < until_s:
-        trial.clock.sleep(READ_EVERY_S)
-        readings.append(trial.read())
+    while readings[-1].moving and head.clock.now_s() < until_s:
+        head.clock.sleep(READ_EVERY_S)
+        readings.append(head.read())
     for before, after in pairwise(readings):
         expect(
             after.time_s > before.time_s, "two readings one after the other bear one stamp, or an older one"
@@ -91,75 +92,76 @@ def _under_way(trial: HeadTrial) -> str:
     for reading in readings:
         gone_s = reading.time_s - began_s
         left_rad = away(reading, goal)
-        least_rad = way_rad - 1.1 * trial.speed_rad_per_s * gone_s - 2 * trial.near_rad
+        least_rad = way_rad - 1.1 * head.speed_rad_per_s * gone_s - 2 * head.near_rad
         expect(
             left_rad >= least_rad,
             f"{gone_s:.3f} s after the move it says that {left_rad:.3f} of {way_rad:.3f} rad are left, "
-            f"at {trial.speed_rad_per_s:g} rad/s: commanded, not measured?",
+            f"at {head.speed_rad_per_s:g} rad/s: commanded, not measured?",
         )
         expect(
-            reading.moving or left_rad <= trial.near_rad,
+            reading.moving or left_rad <= head.near_rad,
             f"{left_rad:.3f} rad before its goal, {gone_s:.3f} s after the move, it says that it stands",
         )
         between += 0.05 * way_rad < left_rad < 0.95 * way_rad
     if between < 3:
         raise NotTried(f"only {between} readings came on the way; {LONGER} helps")
-    return f"{between} readings on the way of {way_rad:.3f} rad"
+    log.info(f"{between} readings on the way of {way_rad:.3f} rad")
 
 
-@HEADS.check("head.new_goal", "a new goal replaces the old one at once", moves=True)
-def _new_goal(trial: HeadTrial) -> None:
-    trial.sent(trial.goal(-0.9, -0.3))
-    far, back = trial.goal(0.9, 0.3), trial.goal(-0.6, -0.4)
-    trial.on_its_way(far)
-    trial.move(back)
+@moves_head
+def test_new_goal(head: HeadTrial) -> None:
+    """A new goal replaces the old one at once."""
+    head.sent(head.goal(-0.9, -0.3))
+    far, back = head.goal(0.9, 0.3), head.goal(-0.6, -0.4)
+    head.on_its_way(far)
+    head.move(back)
     nearest_rad = math.inf
-    until_s = trial.clock.now_s() + SETTLES_WITHIN_S
-    while (reading := trial.read()).moving and trial.clock.now_s() < until_s:
+    until_s = head.clock.now_s() + SETTLES_WITHIN_S
+    while (reading := head.read()).moving and head.clock.now_s() < until_s:
         nearest_rad = min(nearest_rad, abs(reading.pan_rad - far[0]))
-        trial.clock.sleep(READ_EVERY_S)
-    expect(nearest_rad > trial.near_rad, "sent back on its way, the head went to its old goal first")
+        head.clock.sleep(READ_EVERY_S)
+    expect(nearest_rad > head.near_rad, "sent back on its way, the head went to its old goal first")
     off_rad = away(reading, back)
-    expect(off_rad <= trial.near_rad, f"it settled {off_rad:.4f} rad from the new goal")
+    expect(off_rad <= head.near_rad, f"it settled {off_rad:.4f} rad from the new goal")
 
 
-@HEADS.check("head.stop", "a stop brakes both axes where they are, and holds", moves=True)
-def _stop(trial: HeadTrial) -> str:
-    trial.sent(trial.goal(-0.9, -0.9))
-    goal = trial.goal(0.9, 0.9)
-    trial.on_its_way(goal)
-    trial.stop()
-    reading = trial.settled()
+@moves_head
+def test_stop(head: HeadTrial) -> None:
+    """A stop brakes both axes where they are, and holds."""
+    head.sent(head.goal(-0.9, -0.9))
+    goal = head.goal(0.9, 0.9)
+    head.on_its_way(goal)
+    head.stop()
+    reading = head.settled()
     left_rad = away(reading, goal)
-    expect(left_rad > trial.near_rad, "the stop came on the way, and the head went on to its goal")
-    until_s = trial.clock.now_s() + HOLDS_S
-    while trial.clock.now_s() < until_s:
-        later = trial.read()
+    expect(left_rad > head.near_rad, "the stop came on the way, and the head went on to its goal")
+    until_s = head.clock.now_s() + HOLDS_S
+    while head.clock.now_s() < until_s:
+        later = head.read()
         expect(
-            away(later, at(reading)) <= trial.near_rad,
+            away(later, at(reading)) <= head.near_rad,
             f"after the stop it moved on by {away(later, at(reading)):.4f} rad",
         )
-        trial.clock.sleep(0.01)
-    trial.sent(trial.goal(0.0, 0.0))
-    return f"{left_rad:.3f} rad before the goal"
+        head.clock.sleep(0.01)
+    head.sent(head.goal(0.0, 0.0))
+    log.info(f"{left_rad:.3f} rad before the goal")
 
 
-@HEADS.check(
-    "head.stop_beside", "a stop comes beside a read and a move under way, and several at once", moves=True
-)
-def _stop_beside(trial: HeadTrial) -> str:
-    goal = trial.goal(0.9, 0.9)
-    trial.sent(trial.goal(-0.9, -0.9))
-    waited_s = _stop_beside_a_move(trial, goal)
+@moves_head
+def test_stop_beside(head: HeadTrial) -> None:
+    """A stop comes beside a read and a move under way, and several at once."""
+    goal = head.goal(0.9, 0.9)
+    head.sent(head.goal(-0.9, -0.9))
+    waited_s = _stop_beside_a_move(head, goal)
     expect(waited_s < STOP_TIMEOUT_S / 2, f"a stop beside a move waited {waited_s:.2f} s for it")
-    trial.sent(trial.goal(-0.9, -0.9))
-    trial.on_its_way(goal)
-    longest_s = _stops_beside_reads(trial)
+    head.sent(head.goal(-0.9, -0.9))
+    head.on_its_way(goal)
+    longest_s = _stops_beside_reads(head)
     words = f"a stop beside reads took {longest_s:.2f} s of {STOP_TIMEOUT_S:g} s"
     expect(longest_s < STOP_TIMEOUT_S, words)
-    left_rad = away(trial.settled(), goal)
-    expect(left_rad > trial.near_rad, "stopped beside reads the head went on to its goal")
-    return f"within {max(longest_s, waited_s):.3f} s"
+    left_rad = away(head.settled(), goal)
+    expect(left_rad > head.near_rad, "stopped beside reads the head went on to its goal")
+    log.info(f"within {max(longest_s, waited_s):.3f} s")
 
 
 def _stop_beside_a_move(trial: HeadTrial, goal: Angles) -> float:
@@ -200,43 +202,45 @@ def _stops_beside_reads(trial: HeadTrial) -> float:
     return longest_s
 
 
-@HEADS.check("head.threads", "calls from several threads at once are all answered", moves=True)
-def _threads(trial: HeadTrial) -> None:
-    goals = [trial.goal(0.1 * step, 0.0) for step in range(5)]
+@moves_head
+def test_threads(head: HeadTrial) -> None:
+    """Calls from several threads at once are all answered."""
+    goals = [head.goal(0.1 * step, 0.0) for step in range(5)]
 
     def work(moves: bool) -> None:
         for goal in goals:
-            trial.head.read()
+            head.head.read()
             if moves:
-                trial.head.move(*goal, trial.speed_rad_per_s)
+                head.head.move(*goal, head.speed_rad_per_s)
 
-    for call in [beside(partial(work, moves), trial.clock) for moves in (True, False, False, False)]:
+    for call in [beside(partial(work, moves), head.clock) for moves in (True, False, False, False)]:
         try:
             ended("a call beside others", call, 2 * PATIENCE_S)
         except DriverError as error:
             raise PromiseBroken(f"a call beside others failed: {error}") from None
-    off_rad = away(trial.settled(), goals[-1])
-    expect(off_rad <= trial.near_rad, f"it settled {off_rad:.4f} rad from the last goal")
+    off_rad = away(head.settled(), goals[-1])
+    expect(off_rad <= head.near_rad, f"it settled {off_rad:.4f} rad from the last goal")
 
 
-@HEADS.check("head.speed", "no axis goes faster than asked", moves=True)
-def _speed(trial: HeadTrial) -> str:
-    asked = 0.5 * trial.speed_rad_per_s
-    fastest, unsure = fastest_seen(trial, asked)
+@moves_head
+def test_speed(head: HeadTrial) -> None:
+    """No axis goes faster than requested."""
+    requested = 0.5 * head.speed_rad_per_s
+    fastest, unsure = fastest_seen(head, requested)
     expect(
-        fastest <= asked * 1.05 + unsure,
-        f"{fastest:.3f} rad/s were measured where {asked:.3f} rad/s were asked for",
+        fastest <= requested * 1.05 + unsure,
+        f"{fastest:.3f} rad/s were measured where {requested:.3f} rad/s were requested",
     )
-    return f"{fastest:.3f} rad/s, asked {asked:.3f}"
+    log.info(f"{fastest:.3f} rad/s, requested {requested:.3f}")
 
 
-def fastest_seen(trial: HeadTrial, asked_rad_per_s: float) -> tuple[float, float]:
+def fastest_seen(trial: HeadTrial, requested_rad_per_s: float) -> tuple[float, float]:
     """Send the head across its box; return the fastest that was seen, rad/s, and how unsure that is."""
     trial.sent(trial.goal(-0.7, -0.7))
     goal = trial.goal(0.3, 0.3)
     readings: list[tuple[float, Angles]] = []
     began_s = trial.clock.now_s()
-    trial.move(goal, asked_rad_per_s)
+    trial.move(goal, requested_rad_per_s)
     while True:
         try:
             reading = trial.read()
@@ -264,33 +268,31 @@ def fastest_seen(trial: HeadTrial, asked_rad_per_s: float) -> tuple[float, float
     return fastest, 2 * count_rad / step_s
 
 
-@HEADS.check(
-    "head.limits", "goals at the limits are reached, and those beyond the driver's own refused", moves=True
-)
-def _limits(trial: HeadTrial) -> None:
-    if trial.limits_rad is None:
+@moves_head
+def test_limits(head: HeadTrial) -> None:
+    """Goals at the limits are reached, and those beyond the driver's own refused."""
+    if head.limits_rad is None:
         raise NotTried("the limits of its motion are not known; state them by --limits")
-    pan, tilt = trial.limits_rad
-    home = trial.sent(trial.goal(0.0, 0.0))
-    for end, far in ((0, -math.inf), (1, math.inf)) if trial.own_limits else ():
+    pan, tilt = head.limits_rad
+    home = head.sent(head.goal(0.0, 0.0))
+    for end, far in ((0, -math.inf), (1, math.inf)) if head.own_limits else ():
         for beyond in (
             (math.nextafter(pan[end], far), at(home)[1]),
             (at(home)[0], math.nextafter(tilt[end], far)),
         ):
-            _refused(trial, beyond, trial.speed_rad_per_s, "beyond a limit")
+            _refused(head, beyond, head.speed_rad_per_s, "beyond a limit")
     for end in (0, 1):
-        trial.sent((pan[end], tilt[end]))
+        head.sent((pan[end], tilt[end]))
 
 
-@HEADS.check(
-    "head.not_a_number", "a goal or speed that is no number, or a speed that is none, is refused", moves=True
-)
-def _not_a_number(trial: HeadTrial) -> None:
-    pan, tilt = trial.goal(0.2, 0.2)
+@moves_head
+def test_not_a_number(head: HeadTrial) -> None:
+    """A goal or speed that is no number, or a speed that is none, is refused."""
+    pan, tilt = head.goal(0.2, 0.2)
     for goal in ((math.nan, tilt), (pan, math.nan), (math.inf, tilt), (pan, -math.inf)):
-        _refused(trial, goal, trial.speed_rad_per_s, "that is no number")
+        _refused(head, goal, head.speed_rad_per_s, "that is no number")
     for speed in (0.0, -1.0, math.nan):
-        _refused(trial, (pan, tilt), speed, "at no speed")
+        _refused(head, (pan, tilt), speed, "at no speed")
 
 
 def _refused(trial: HeadTrial, goal: Angles, speed_rad_per_s: float, words: str) -> None:
@@ -312,45 +314,45 @@ def _refused(trial: HeadTrial, goal: Angles, speed_rad_per_s: float, words: str)
     )
 
 
-@HEADS.check(
-    "head.deadlines", "every call ends within half of the time that the service gives it", moves=True
-)
-def _deadlines(trial: HeadTrial) -> str:
-    goal = trial.goal(0.2, -0.1)
-    told = []
+@moves_head
+def test_deadlines(head: HeadTrial) -> None:
+    """Every call ends within half of the time that the service gives it."""
+    goal = head.goal(0.2, -0.1)
+    measured = []
     for name, call, deadline_s in (
-        ("read", trial.read, READ_TIMEOUT_S),
-        ("move", lambda: trial.move(goal), MOVE_TIMEOUT_S),
-        ("read", trial.read, READ_TIMEOUT_S),
-        ("stop", trial.stop, STOP_TIMEOUT_S),
+        ("read", head.read, READ_TIMEOUT_S),
+        ("move", lambda: head.move(goal), MOVE_TIMEOUT_S),
+        ("read", head.read, READ_TIMEOUT_S),
+        ("stop", head.stop, STOP_TIMEOUT_S),
     ):
         took_s = []
         for _ in range(3):
-            began_s = trial.clock.now_s()
+            began_s = head.clock.now_s()
             call()
-            took_s.append(trial.clock.now_s() - began_s)
+            took_s.append(head.clock.now_s() - began_s)
         expect(min(took_s) < deadline_s / 2, f"{name}() took {min(took_s):.2f} s of {deadline_s:g} s at best")
-        told.append(f"{name} {1e3 * min(took_s):.1f} ms")
-    return ", ".join(told)
+        measured.append(f"{name} {1e3 * min(took_s):.1f} ms")
+    log.info(", ".join(measured))
 
 
-@HEADS.check("head.close", "close stops the head, twice does no harm, and then no reading comes", moves=True)
-def _close(trial: HeadTrial) -> str | None:
-    trial.sent(trial.goal(-0.9, -0.9))
-    goal = trial.goal(0.9, 0.9)
-    trial.on_its_way(goal)
+@moves_head
+def test_close(head: HeadTrial) -> None:
+    """Close stops the head, twice does no harm, and then no reading comes."""
+    head.sent(head.goal(-0.9, -0.9))
+    goal = head.goal(0.9, 0.9)
+    head.on_its_way(goal)
     for words in ("close()", "a second close()"):
         try:
-            trial.worker.call(words, trial.head.close)
+            head.worker.call(words, head.head.close)
         except DriverError as error:
             raise PromiseBroken(f"{words} raised {type(error).__name__}: {error}") from None
     with suppress(DriverError):
-        trial.worker.call("read() of a closed head", trial.head.read)
+        head.worker.call("read() of a closed head", head.head.read)
         raise PromiseBroken("a closed head gave a reading")
-    if trial.open_again is None:
-        trial.closed = True
-        return None
-    trial.head = trial.open_again()
-    reading = trial.settled()
-    expect(away(reading, goal) > trial.near_rad, "closed on its way the head went on to its goal")
-    return f"opened again {away(reading, goal):.3f} rad before the goal"
+    if head.open_again is None:
+        head.closed = True
+        return
+    head.head = head.open_again()
+    reading = head.settled()
+    expect(away(reading, goal) > head.near_rad, "closed on its way the head went on to its goal")
+    log.info(f"opened again {away(reading, goal):.3f} rad before the goal")

@@ -1,4 +1,4 @@
-"""A device's own thread, as the service gives it one: its calls go one at a time, each with an end."""
+"""Calls of a device under test in a thread of its own, as the service makes them, each with a deadline."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ class Worker:
     """One thread that makes a device's calls."""
 
     def __init__(self) -> None:
-        self._asked: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._calls: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         threading.Thread(target=self._serve, name="device under test", daemon=True).start()
 
     def call(self, what: str, function: Callable[[], T], patience_s: float = PATIENCE_S) -> T:
         """Make a call in the device's thread. Raises as `ended`."""
         future, run = _task(function)
-        self._asked.put(run)
+        self._calls.put(run)
         return ended(what, future, patience_s)
 
     def close(self) -> None:
         """Let the thread end when its last call is back."""
-        self._asked.put(None)
+        self._calls.put(None)
 
     def _serve(self) -> None:
-        while (run := self._asked.get()) is not None:
+        while (run := self._calls.get()) is not None:
             run()
 
 
@@ -56,7 +56,7 @@ def ended(what: str, future: Future[T], patience_s: float = PATIENCE_S) -> T:
     DriverError
         What the driver raised.
     NotTried
-        If the door let a move not out.
+        If the limits or keep-outs refused a move.
     PromiseBroken
         If anything else was raised.
     SubjectLost
@@ -73,20 +73,20 @@ def ended(what: str, future: Future[T], patience_s: float = PATIENCE_S) -> T:
             raise PromiseBroken(f"{what} raised TimeoutError where a DriverError is expected") from None
         raise SubjectLost(f"{what} has not come back after {patience_s:g} s") from None
     except BaseException as error:
-        words = " ".join(str(error).split())[:200]
+        message = " ".join(str(error).split())[:200]
         raise PromiseBroken(
-            f"{what} raised {type(error).__name__} ({words}) where a DriverError is expected"
+            f"{what} raised {type(error).__name__} ({message}) where a DriverError is expected"
         ) from error
 
 
 def _task(function: Callable[[], T]) -> tuple[Future[T], Callable[[], None]]:
-    """What is waited for, and what to run for it."""
+    """A future, and the function that fills it."""
     future: Future[T] = Future()
 
     def run() -> None:
         try:
             future.set_result(function())
-        except BaseException as error:  # a foreign driver may raise anything; whoever waits is told
+        except BaseException as error:  # a foreign driver may raise anything; the caller gets it
             future.set_exception(error)
 
     return future, run

@@ -1,0 +1,311 @@
+"""Options and fixtures of the acceptance of drivers: opens the head and the cameras that the tests are given.
+
+`mastctl.testing.plugin` loads it where ``mastctl.testing.drivers`` is on pytest's command line.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.clock import SystemClock
+from drivers.errors import DriverError
+from drivers.hardware import DeviceSettings, HardwareSettings
+from drivers.interfaces import Camera
+from mastctl.config import Config, load_config
+from mastctl.conform.checks import NotTried, PromiseBroken, SubjectLost
+from mastctl.conform.rig import Angles, box
+from mastctl.devices.limits import Limits
+from mastctl.devices.opening import Bounds, head_beside, open_one_camera
+from mastctl.errors import MastctlError
+from mastctl.service.masts import bounds_of
+from mastctl.testing.drivers.calls import beside
+from mastctl.testing.drivers.head_trial import HeadTrial, at
+from mastctl.testing.drivers.test_camera import CameraTrial
+
+log = logging.getLogger(__name__)
+
+STOPS_WITHIN_S = 3.0
+ANYWHERE: tuple[Angles, Angles] = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2))
+"""Where a head may be moved of which nothing is known."""
+SIMULATED_CAMERA = "navcam_left"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options that name a driver and bound its moves."""
+    group = parser.getgroup("drivers", "acceptance of mastctl drivers")
+    group.addoption("--rig", metavar="FILE", help="test the head and the cameras of this configuration")
+    group.addoption("--head", metavar="DRIVER", help="a head's driver: package.module:factory, or its name")
+    group.addoption("--camera", metavar="DRIVER", help="a camera's driver, or with --rig the camera's name")
+    group.addoption(
+        "--options", metavar="JSON", default="{}", help="the driver's options: JSON, or a file that has it"
+    )
+    group.addoption("--motion", action="store_true", help="move the head; 'sim' is moved without it")
+    group.addoption(
+        "--reach", type=float, default=0.3, metavar="RAD",
+        help="how far from its pose the head is moved (default 0.3 rad; inf: over all of its limits)",
+    )  # fmt: skip
+    group.addoption("--speed", type=float, default=0.5, metavar="RAD/S", help="of every move (default 0.5)")
+    group.addoption(
+        "--limits", type=float, nargs=4, metavar=("PAN", "PAN", "TILT", "TILT"),
+        help="the head driver's own lowest and highest angles, radians; they are tried",
+    )  # fmt: skip
+    group.addoption("--size", type=int, nargs=2, metavar=("W", "H"), help="of the camera's images")
+    group.addoption(
+        "--seconds", type=float, default=3.0, metavar="S", help="how long frames are taken (default 3)"
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Refuse options that cannot be."""
+    option = config.option
+    if option.rig is None and (option.head is None) == (option.camera is None):
+        raise pytest.UsageError("--head DRIVER, --camera DRIVER or --rig FILE is expected, one of them")
+    if option.reach <= 0.0 or option.speed <= 0.0 or option.seconds <= 0.0:
+        raise pytest.UsageError("--reach, --speed and --seconds: numbers above zero are expected")
+    _own_limits(config)
+    _options(config)
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Give the tests of cameras each camera that the command line names."""
+    if "camera_name" in metafunc.fixturenames:
+        metafunc.parametrize("camera_name", _camera_names(metafunc.config), scope="session")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Function]) -> None:
+    """Leave out the tests of what the command line does not name."""
+    heads = config.option.camera is None
+    cameras = bool(_camera_names(config))
+    items[:] = [one for one in items if (heads if "head" in one.fixturenames else cameras)]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, object, object]:
+    """Skip what does not apply, and end the run when the device does not answer any more."""
+    try:
+        return (yield)
+    except NotTried as reason:
+        pytest.skip(str(reason))
+    except SubjectLost as reason:
+        pyfuncitem.session.shouldstop = str(reason)
+        raise
+
+
+@pytest.fixture(scope="session")
+def opened_head(request: pytest.FixtureRequest) -> Iterator[HeadTrial]:
+    """The head under test, opened once; stopped and closed at the end."""
+    option = request.config.option
+    settings, bounds = _head(request.config)
+    moves = _may_move(request.config)
+    with (
+        _refusals(),
+        head_under_test(
+            settings, bounds, option.reach, option.speed, _own_limits(request.config), moves=moves
+        ) as trial,
+    ):
+        try:
+            yield trial
+        finally:
+            if moves and not trial.closed:
+                _stop(trial)
+
+
+@pytest.fixture
+def head(request: pytest.FixtureRequest, opened_head: HeadTrial) -> HeadTrial:
+    """The head under test, where the test may have it moved."""
+    if request.node.get_closest_marker("moves_head") is not None and not _may_move(request.config):
+        pytest.skip("the head is moved only with --motion")
+    return opened_head
+
+
+@pytest.fixture(scope="session")
+def camera(request: pytest.FixtureRequest, camera_name: str) -> Iterator[CameraTrial]:
+    """A camera under test, after the head if it is one of a simulator that looks from it."""
+    option = request.config.option
+    size_px = None if option.size is None else (option.size[0], option.size[1])
+    with _refusals(), ExitStack() as stack:
+        if option.rig is None:
+            settings = device_settings(option.camera, _options(request.config), "camera", camera_name)
+        else:
+            config, bounds = _rig(option.rig)
+            chosen = {camera_name: config.hardware.cameras[camera_name]}
+            settings = replace(config.hardware, cameras=chosen)
+            assert bounds.stored is not None
+            size_px = size_px or bounds.stored.rig.cameras[camera_name].model.size_px
+            if settings.cameras[camera_name].driver == "sim":
+                stack.enter_context(head_beside(settings, bounds, SystemClock(), moves=False))()
+
+        def opened() -> Camera:
+            return stack.enter_context(open_one_camera(settings, camera_name))
+
+        again = None if settings.cameras[camera_name].driver in ("sim", "replay") else opened
+        yield CameraTrial(camera_name, opened(), size_px, option.seconds, again)
+
+
+@contextmanager
+def head_under_test(
+    settings: HardwareSettings, bounds: Bounds | None, reach_rad: float, speed_rad_per_s: float,
+    own_limits_rad: tuple[Angles, Angles] | None, *, moves: bool,
+) -> Iterator[HeadTrial]:  # fmt: skip
+    """Open a head whose moves are judged (`mastctl.devices.opening`); leaving closes it.
+
+    Parameters
+    ----------
+    settings
+        What opens it.
+    bounds
+        Of its configuration; None: it has none.
+    reach_rad, speed_rad_per_s
+        How far from its pose it may be moved (infinite: over all of the limits), and how fast.
+    own_limits_rad
+        The driver's own ends, where they are known: it is sent to them, and just beyond, which it has to
+        refuse.
+    moves
+        Whether it is to be moved at all.
+
+    Raises
+    ------
+    Estopped, StateInUse, DriverError
+        As `mastctl.devices.opening.devices_beside`.
+    """
+    ends = own_limits_rad or ANYWHERE
+    if bounds is None:
+        bounds = Bounds(Limits(*ends, speed_rad_per_s))
+    elif own_limits_rad is None:
+        ends = bounds.limits.pan_rad, bounds.limits.tilt_rad
+    known = own_limits_rad is not None or bounds.stored is not None
+    with head_beside(settings, bounds, SystemClock(), moves=moves) as opened:
+        head = opened()
+        counts_rad = head.door.counts_rad.values()
+        count_rad = max(counts_rad) if len(counts_rad) == 2 else None
+        trial = HeadTrial(
+            head, ((0.0, 0.0), (0.0, 0.0)), min(speed_rad_per_s, bounds.limits.speed_rad_per_s),
+            limits_rad=ends if own_limits_rad is not None or (known and math.isinf(reach_rad)) else None,
+            own_limits=own_limits_rad is not None,
+            count_rad=count_rad, open_again=None if settings.pan_tilt.driver == "sim" else opened,
+        )  # fmt: skip
+        if count_rad is not None:
+            trial.settle_rad = head.info.settles_within_counts * count_rad
+        try:
+            first = trial.read()
+        except (PromiseBroken, SubjectLost, DriverError) as reason:  # the tests have to report it
+            trial.unplaced = f"its present pose is not known: {reason}"
+        else:
+            free = head.door.room(at(first))
+            if free is None:
+                trial.unplaced = "it is in a keep-out, or too near to one"
+            else:
+                trial.box_rad = (
+                    box(first.pan_rad, free.pan_rad, reach_rad),
+                    box(first.tilt_rad, free.tilt_rad, reach_rad),
+                )
+        try:
+            yield trial
+        finally:
+            trial.worker.close()
+
+
+def device_settings(driver: str, options: Mapping[str, Any], kind: str, name: str) -> HardwareSettings:
+    """Return the settings that open one device by its driver.
+
+    The options of ``sim`` are the section ``simulation``, over that of the packaged rover.
+    """
+    if driver == "sim":
+        packaged = load_config(None).hardware
+        simulation = {**packaged.simulation, **options}
+        settings = replace(packaged, cameras={}, simulation=simulation, pan_tilt=DeviceSettings("sim"))
+        return replace(settings, cameras={name: DeviceSettings("sim")}) if kind == "camera" else settings
+    device = DeviceSettings(driver, options)
+    if kind == "camera":
+        return HardwareSettings(DeviceSettings("none"), {name: device})
+    return HardwareSettings(device, {})
+
+
+@contextmanager
+def _refusals() -> Iterator[None]:
+    """End the run in one sentence where a device cannot be opened."""
+    try:
+        yield
+    except (MastctlError, DriverError) as error:
+        pytest.exit(str(error), returncode=1)
+
+
+def _rig(file: str) -> tuple[Config, Bounds]:
+    config = load_config(Path(file))
+    return config, bounds_of(config)
+
+
+def _head(config: pytest.Config) -> tuple[HardwareSettings, Bounds | None]:
+    """What opens the head, and what bounds its moves."""
+    if config.option.rig is None:
+        return device_settings(config.option.head, _options(config), "head", ""), None
+    rig, bounds = _rig(config.option.rig)
+    if rig.hardware.pan_tilt.driver == "replay":
+        pytest.skip("a replayed head is at recorded poses only; there is no motion to test")
+    return rig.hardware, bounds
+
+
+def _may_move(config: pytest.Config) -> bool:
+    return bool(config.option.motion) or config.option.head == "sim"
+
+
+def _camera_names(config: pytest.Config) -> Sequence[str]:
+    option = config.option
+    if option.rig is None:
+        known = SIMULATED_CAMERA if option.camera == "sim" else "camera"
+        return [] if option.camera is None else [known]
+    names = list(_rig(option.rig)[0].hardware.cameras)
+    if option.camera is not None and option.camera not in names:
+        raise pytest.UsageError(f"{option.rig} has no camera {option.camera}; it has {', '.join(names)}")
+    return names if option.camera is None else [option.camera]
+
+
+def _own_limits(config: pytest.Config) -> tuple[Angles, Angles] | None:
+    """The driver's own ends of both axes, inside those of its configuration. Raises UsageError."""
+    numbers = config.option.limits
+    if numbers is None:
+        return None
+    pan, tilt = (numbers[0], numbers[1]), (numbers[2], numbers[3])
+    for low, high in (pan, tilt):
+        if not low < high:
+            raise pytest.UsageError(f"--limits: {low:g} {high:g} where the lower angle first is expected")
+    if config.option.rig is not None:
+        limits = _rig(config.option.rig)[1].limits
+        for axis, ends, most in (("pan", pan, limits.pan_rad), ("tilt", tilt, limits.tilt_rad)):
+            if not most[0] <= ends[0] < ends[1] <= most[1]:
+                message = f"{axis} {ends[0]:g} to {ends[1]:g} is not within {most[0]:g} to {most[1]:g}"
+                raise pytest.UsageError(f"--limits: {message}, where the configuration lets it be moved")
+    return pan, tilt
+
+
+def _options(config: pytest.Config) -> dict[str, Any]:
+    """Read the driver's options: JSON, or a file that has it. Raises UsageError."""
+    text = config.option.options
+    try:
+        text = text if text.lstrip().startswith(("{", "[")) else Path(text).read_text(encoding="utf-8")
+        options = json.loads(text)
+    except (OSError, ValueError) as error:
+        message = f"--options: a JSON object, or a file that has one, is expected: {error}"
+        raise pytest.UsageError(message) from None
+    if not isinstance(options, dict):
+        raise pytest.UsageError("--options: a JSON object is expected")
+    return options
+
+
+def _stop(trial: HeadTrial) -> None:
+    """Stop the head; fail the run if that was not confirmed."""
+    try:
+        beside(trial.head.stop).result(STOPS_WITHIN_S)
+    except Exception as error:
+        message = f"the stop at the end failed, the head may still move: {type(error).__name__}: {error}"
+        log.error("%s", message)
+        pytest.fail(message, pytrace=False)
