@@ -307,9 +307,8 @@ def fault_words_page() -> str:
 
 def checks_page() -> str:
     """Return the checks of a rig and the acceptance tests of drivers with their promises."""
-    lines = ["# Checks of rigs and drivers", "", "Written from the code.", ""]
-    rows = [(f"`{one.name}`", "moves" if one.moves else "", one.promise) for one in RIG]
-    lines += ["## Of `mastctl conform URL`", "", *_table("check", rows, "head", "promise")]
+    rows = [(f"`{one.name}`", "moves" * one.moves, one.promise) for one in RIG]
+    lines = ["# Checks of rigs and drivers", "", *_table("check of a rig", rows, "head", "promise")]
     for module in (test_head, test_camera):
         tests = [one for name, one in vars(module).items() if name.startswith("test_")]
         rows = [(f"`{one.__name__}`", "moves" * hasattr(one, "pytestmark"), one.__doc__) for one in tests]
