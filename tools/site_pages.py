@@ -308,11 +308,11 @@ def fault_words_page() -> str:
 def checks_page() -> str:
     """Return the checks of a rig and the acceptance tests of drivers with their promises."""
     rows = [(f"`{one.name}`", "moves" * one.moves, one.promise) for one in RIG]
-    lines = ["# Checks of rigs and drivers", "", *_table("check of a rig", rows, "head", "promise")]
+    lines = ["# Checks", "", *_table("check of a rig", rows, "head", "promise")]
     for module in (test_head, test_camera):
-        tests = [one for name, one in vars(module).items() if name.startswith("test_")]
-        rows = [(f"`{one.__name__}`", "moves" * hasattr(one, "pytestmark"), one.__doc__) for one in tests]
-        lines += [f"## Of `{module.__name__}`", "", *_table("test", rows, "head", "promise")]
+        tests = [(f"`{name}`", one) for name, one in vars(module).items() if name.startswith("test_")]
+        rows = [(name, "moves" * hasattr(one, "pytestmark"), one.__doc__) for name, one in tests]
+        lines += [f"## `{module.__name__}`", "", *_table("test", rows, "head", "promise")]
     return "\n".join(lines)
 
 
