@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+from calib.errors import BadFile
+from calib.files import read_bytes
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.hardware import DeviceSettings, HardwareSettings
@@ -34,6 +36,7 @@ from mastctl.testing.drivers.test_camera import CameraTrial
 log = logging.getLogger(__name__)
 
 STOPS_WITHIN_S = 3.0
+MOST_BYTES = 1_000_000
 ANYWHERE: tuple[Angles, Angles] = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2))
 """Where a head may be moved of which nothing is known."""
 SIMULATED_CAMERA = "navcam_left"
@@ -291,9 +294,9 @@ def _options(config: pytest.Config) -> dict[str, Any]:
     """Read the driver's options: JSON, or a file that has it. Raises UsageError."""
     text = config.option.options
     try:
-        text = text if text.lstrip().startswith(("{", "[")) else Path(text).read_text(encoding="utf-8")
-        options = json.loads(text)
-    except (OSError, ValueError) as error:
+        inline = text.lstrip().startswith(("{", "["))
+        options = json.loads(text if inline else read_bytes(text, MOST_BYTES))
+    except (BadFile, ValueError) as error:
         message = f"--options: a JSON object, or a file that has one, is expected: {error}"
         raise pytest.UsageError(message) from None
     if not isinstance(options, dict):
