@@ -80,7 +80,7 @@ def _bench(args: argparse.Namespace) -> ServoBench:
     if isinstance(benches.get(args.family), UnitBench):
         raise WrongUse(
             f"--family: a {args.family} head has no servos: 'mastctl ptu info PORT' queries it, "
-            "'mastctl conform --config FILE --head' tries it"
+            "'pytest --pyargs mastctl.testing.drivers --rig FILE' tests it"
         )
     if args.family not in families:
         raise WrongUse(f"--family is '{args.family}', expected one of {', '.join(families)}")

@@ -20,7 +20,7 @@ from calib.errors import BadFile
 from calib.files import read_bytes
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
-from drivers.hardware import DeviceSettings, HardwareSettings
+from drivers.hardware import DeviceSettings, HardwareSettings, is_hardware
 from drivers.interfaces import Camera
 from mastctl.config import Config, load_config
 from mastctl.conform.checks import NotTried, PromiseBroken, SubjectLost
@@ -150,8 +150,8 @@ def camera(request: pytest.FixtureRequest, camera_name: str) -> Iterator[CameraT
         def opened() -> Camera:
             return stack.enter_context(open_one_camera(settings, camera_name))
 
-        again = None if settings.cameras[camera_name].driver in ("sim", "replay") else opened
-        yield CameraTrial(camera_name, opened(), size_px, option.seconds, again)
+        again = is_hardware("real", "camera", settings.cameras[camera_name].driver)
+        yield CameraTrial(camera_name, opened(), size_px, option.seconds, opened if again else None)
 
 
 @contextmanager
@@ -190,11 +190,12 @@ def head_under_test(
         head = opened()
         counts_rad = head.door.counts_rad.values()
         count_rad = max(counts_rad) if len(counts_rad) == 2 else None
+        again = not is_hardware("simulated", "head", settings.pan_tilt.driver)
         trial = HeadTrial(
             head, ((0.0, 0.0), (0.0, 0.0)), min(speed_rad_per_s, bounds.limits.speed_rad_per_s),
             limits_rad=ends if own_limits_rad is not None or (known and math.isinf(reach_rad)) else None,
             own_limits=own_limits_rad is not None,
-            count_rad=count_rad, open_again=None if settings.pan_tilt.driver == "sim" else opened,
+            count_rad=count_rad, open_again=opened if again else None,
         )  # fmt: skip
         if count_rad is not None:
             trial.settle_rad = head.info.settles_within_counts * count_rad
@@ -252,7 +253,7 @@ def _head(config: pytest.Config) -> tuple[HardwareSettings, Bounds | None]:
     if config.option.rig is None:
         return device_settings(config.option.head, _options(config), "head", ""), None
     rig, bounds = _rig(config.option.rig)
-    if rig.hardware.pan_tilt.driver == "replay":
+    if is_hardware("replayed", "head", rig.hardware.pan_tilt.driver):
         pytest.skip("a replayed head is at recorded poses only; there is no motion to test")
     return rig.hardware, bounds
 
