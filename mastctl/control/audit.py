@@ -1,7 +1,7 @@
-"""The record of commands: JSON lines in a file that is bounded, written by a thread of its own.
+"""The record of commands: JSON lines in a bounded file, written by a thread of its own.
 
-Whoever says something is never held: not by the disk, not by a lock. What does not fit into the queue, and
-what the disk does not take, is counted, and the count stands in the record where the lines are missing.
+No caller is ever held up by the disk. What does not fit into the queue, and what the disk does not take, is
+counted, and the number is recorded where the lines are missing.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ import os
 import threading
 from collections.abc import Mapping
 from datetime import UTC, datetime
+from logging.handlers import RotatingFileHandler
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import Queue
 from typing import Any
 
 from drivers.clock import Clock, SystemClock
@@ -31,8 +32,7 @@ FILE_BYTES = 4 << 20
 FILES = 8  # 32 MiB: some 100,000 commands
 STRANGERS = "strangers_log"
 STRANGERS_FILES = 2
-LONGEST_LINE_BYTES = 16384
-SYNC_S = 1.0  # what a power cut may take
+LONGEST_LINE = 16384
 
 
 class AuditLog:
@@ -47,7 +47,7 @@ class AuditLog:
     file_bytes, files
         When a new file begins, and how many are kept with it.
     device
-        Under what name its fault is told.
+        The name of its fault.
     """
 
     def __init__(
@@ -58,32 +58,26 @@ class AuditLog:
         files: int = FILES,
         device: str = DEVICE,
     ) -> None:
-        self._path = path
         self._device = device
         self._clock = clock or SystemClock()
-        self._file_bytes = file_bytes
-        self._files = files
-        self._queue: SimpleQueue[Mapping[str, Any] | threading.Event | None] = SimpleQueue()
+        self._queue: Queue[Mapping[str, Any] | threading.Event | None] = Queue()
         self._lost = 0
-        # Reentrant, because a signal's handler may ask for something in the middle of it.
-        self._counting = threading.RLock()
+        self._counting = threading.Lock()
         self._fault: StandingFault | None = None
-        self._descriptor = -1
-        self._good_bytes = 0
-        self._unsynced = False
-        self._closed = False
+        self._closed = path is None
         if path is not None:
+            self._file = _File(path, file_bytes, files)
             self._thread = threading.Thread(target=self._work, name="audit log", daemon=True)
             self._thread.start()
 
     def put(self, record: Mapping[str, Any]) -> None:
         """Have a record written; returns at once."""
-        if self._path is None or self._closed:
+        if self._closed:
             return
         if self._queue.qsize() >= WAITING:
             self._count_lost(1)
-            return
-        self._queue.put(record)
+        else:
+            self._queue.put(record)
 
     def faults(self) -> tuple[StandingFault, ...]:
         """Return what is wrong with the file now; takes no lock."""
@@ -92,7 +86,7 @@ class AuditLog:
 
     def flush(self, timeout_s: float = 1.0) -> bool:
         """Wait until what was put before is written or lost; return whether it is, within the time."""
-        if self._path is None:
+        if self._closed:
             return True
         written = threading.Event()
         self._queue.put(written)
@@ -100,40 +94,32 @@ class AuditLog:
 
     def close(self, timeout_s: float = 1.0) -> None:
         """Write what waits and end, in ``timeout_s`` seconds at most."""
-        if self._path is None or self._closed:
-            return
-        self._closed = True
-        self._queue.put(None)
-        self._thread.join(timeout_s)
+        if not self._closed:
+            self._closed = True
+            self._queue.put(None)
+            self._thread.join(timeout_s)
+
+    def _count_lost(self, lines: int) -> None:
+        with self._counting:
+            self._lost += lines
 
     # In the writing thread
 
     def _work(self) -> None:
-        while True:
-            try:
-                entry = self._queue.get(timeout=SYNC_S if self._unsynced else None)
-            except Empty:
-                self._sync()
-                continue
+        while (entry := self._queue.get()) is not None:
             if isinstance(entry, threading.Event):
                 entry.set()
-            elif entry is None:
-                self._sync()
-                self._close_file()
-                return
             else:
                 self._write(entry)
+        self._file.close()
 
     def _write(self, record: Mapping[str, Any]) -> None:
         lost = self._lost
         try:
-            line = _line(record)
-            if lost:
-                line = _line({"time": datetime.now(UTC).isoformat(), "lost": lost}) + line
-            self._append(line)
+            lines = [{"time": datetime.now(UTC).isoformat(), "lost": lost}] if lost else []
+            self._file.append("\n".join(map(_line, [*lines, record])))
         except Exception as error:  # the disk's, or of a record that cannot be written; the next one may be
             self._count_lost(1)
-            self._close_file()
             self._fail(error)
             return
         if lost:
@@ -141,82 +127,65 @@ class AuditLog:
             log.warning("the audit log is written again; %d lines are missing in it", lost)
         self._fault = None
 
-    def _count_lost(self, lines: int) -> None:
-        with self._counting:
-            self._lost += lines
-
-    def _append(self, line: bytes) -> None:
-        """Write some lines whole, or leave the file as it was."""
-        if self._descriptor < 0:
-            self._open()
-        if self._good_bytes and self._good_bytes + len(line) > self._file_bytes:
-            with contextlib.suppress(OSError):  # then the present file goes on
-                self._rotate()
-        try:
-            written = 0
-            while written < len(line):
-                written += os.write(self._descriptor, line[written:])
-        except OSError:
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._descriptor, self._good_bytes)
-            raise
-        self._good_bytes += len(line)
-        self._unsynced = True
-
-    def _open(self) -> None:
-        """Open the file, without what a crash has left of a line at its end."""
-        assert self._path is not None
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._descriptor = _opened(self._path)
-        self._good_bytes = mend(self._descriptor)
-
-    def _rotate(self) -> None:
-        """Begin a new file; the one that was is ``NAME.1``, and the oldest goes."""
-        assert self._path is not None
-        path, following = self._path, self._path.with_name(self._path.name + ".next")
-        descriptor = _opened(following)  # first, so that without one the present file goes on
-        for number in range(self._files - 1, 0, -1):
-            older = path if number == 1 else path.with_name(f"{path.name}.{number - 1}")
-            with contextlib.suppress(FileNotFoundError):
-                older.replace(path.with_name(f"{path.name}.{number}"))
-        following.replace(path)
-        self._sync()
-        os.close(self._descriptor)
-        self._descriptor, self._good_bytes = descriptor, os.fstat(descriptor).st_size
-
-    def _sync(self) -> None:
-        self._unsynced = False
-        if self._descriptor >= 0:
-            with contextlib.suppress(OSError):
-                os.fdatasync(self._descriptor)
-
-    def _close_file(self) -> None:
-        if self._descriptor >= 0:
-            with contextlib.suppress(OSError):
-                os.close(self._descriptor)
-        self._descriptor = -1
-
     def _fail(self, error: Exception) -> None:
         why = error.strerror if isinstance(error, OSError) else None
-        words = f"commands are not recorded: {self._path}: {why or one_line(error, 200)}"
+        message = f"commands are not recorded: {self._file.baseFilename}: {why or one_line(error, 200)}"
         if self._fault is None:
-            log.error("%s", words)
+            log.error("%s", message)
             until = "a command can be recorded again"
-            self._fault = StandingFault(self._device, "not_recorded", words, self._clock.now_s(), until)
+            self._fault = StandingFault(self._device, "not_recorded", message, self._clock.now_s(), until)
 
 
-def _opened(path: Path) -> int:
-    return os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
+class _File(RotatingFileHandler):
+    """Lines in a file of mode 0600 and in those before it; each is whole, and synced to the disk."""
+
+    def __init__(self, path: Path, most_bytes: int, files: int) -> None:
+        super().__init__(path, maxBytes=most_bytes, backupCount=files - 1, encoding="utf-8", delay=True)
+        self.rotator = _rotate
+
+    def append(self, text: str) -> None:
+        """Append lines, or leave the file as it was when it is opened next. Raises what the disk raises."""
+        try:
+            if self.stream is None:
+                _mend(Path(self.baseFilename))
+            self.emit(logging.makeLogRecord({"msg": text}))
+            if self.stream is not None:
+                os.fdatasync(self.stream.fileno())
+        except BaseException:
+            with contextlib.suppress(OSError):
+                stream, self.stream = self.stream, None
+                if stream is not None:
+                    stream.close()
+            raise
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Raise what `emit` has met."""
+        raise
 
 
-def _line(record: Mapping[str, Any]) -> bytes:
-    """A record as a line; a request that is too long for one is cut, and says so."""
+def _mend(path: Path) -> None:
+    """Make the file if there is none, and take away what a crash or a full disk has left of a line."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        mend(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _rotate(source: str, target: str) -> None:
+    """Keep a full file by its new name, and begin the next with its mode."""
+    Path(source).replace(target)
+    _mend(Path(source))
+
+
+def _line(record: Mapping[str, Any]) -> str:
+    """A record as a line; a request that is too long for one is cut, which its key shows."""
     line = _json(record)
-    if len(line) >= LONGEST_LINE_BYTES and "request" in record:
-        beginning = _json(record["request"]).decode()[: LONGEST_LINE_BYTES // 16]
-        line = _json({**record, "request": {"cut": beginning}})
-    return line[: LONGEST_LINE_BYTES - 1] + b"\n"
+    if len(line) > LONGEST_LINE and "request" in record:
+        line = _json({**record, "request": {"cut": _json(record["request"])[: LONGEST_LINE // 16]}})
+    return line[:LONGEST_LINE]
 
 
-def _json(value: Any) -> bytes:
-    return json.dumps(writable(value), allow_nan=False, separators=(",", ":")).encode()
+def _json(value: Any) -> str:
+    return json.dumps(writable(value), allow_nan=False, separators=(",", ":"))

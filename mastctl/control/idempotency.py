@@ -1,13 +1,11 @@
 """Answers kept by key, so that a command which is sent twice acts once.
 
-What is kept is what acted, or may have: answers, and failures of a device or of the program. A refusal
-changed nothing and is forgotten, so the same key may ask again.
+Answers are kept, and failures of a device or of the program, which may have acted. A refusal changed nothing
+and is forgotten, so the same key may be sent again.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -18,52 +16,54 @@ from mastctl.errors import BadRequest, MastctlError, NotNow
 Answer = TypeVar("Answer", bound=Mapping[str, Any])
 
 KEPT_S = 600.0
-KEPT, KEPT_BYTES = 4096, 4 << 20  # keys, and their answers; for more, the oldest is forgotten before its time
+KEPT = 4096  # keys; for more, the oldest is forgotten before its time
 LONGEST_KEY = 200
 WAIT_S = 30.0  # for the first of two, longer than any command takes that is accepted or refused
 
 
 @dataclass(eq=False)
 class _Kept:
-    """What became of one key."""
+    """The request that came with a key, and its answer or its error."""
 
-    digest: bytes
+    request: Mapping[str, Any]
     since_s: float
-    done: bool = False
-    answer: bytes = b""
+    answer: Any = None
     error: BaseException | None = None
+
+    @property
+    def done(self) -> bool:
+        return self.answer is not None or self.error is not None
 
 
 class Answers:
-    """What was answered to each key; safe to use from any thread.
+    """The answers by their keys; safe to use from any thread.
 
     Parameters
     ----------
     clock
         By which answers are forgotten.
     waits_on
-        What the second of two waits on while the first is at work; the service's clock.
+        On which the second of two waits while the first is at work; the service's clock.
     """
 
     def __init__(self, clock: Clock, waits_on: Clock | None = None) -> None:
         self._clock = clock
         self._changed = (waits_on or SystemClock()).signal()
         self._kept: dict[tuple[str, str], _Kept] = {}  # oldest first
-        self._bytes = 0
 
     def once(
-        self, who: str, key: str, request: Mapping[str, Any], act: Callable[[], Answer]
+        self, client: str, key: str, request: Mapping[str, Any], act: Callable[[], Answer]
     ) -> tuple[Answer, bool]:
         """Return what ``act()`` returns, or returned before, and whether it was before.
 
         Parameters
         ----------
-        who
-            Whose key it is: another's is another key.
+        client
+            The key's client: another's is another key.
         key
-            Printable ASCII, up to 200 signs.
+            Printable ASCII, up to 200 characters.
         request
-            What is asked, as JSON: the same whenever the key is.
+            The same whenever the key is.
 
         Raises
         ------
@@ -73,66 +73,46 @@ class Answers:
             ``key_in_use`` if the first is still at work after 30 s.
         """
         if not (0 < len(key) <= LONGEST_KEY and key.isascii() and key.isprintable()):
-            words = f"Idempotency-Key is '{key[:40]}' where up to {LONGEST_KEY} signs of ASCII are expected"
-            raise BadRequest("bad_request", words)
-        digest = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).digest()
+            expected = f"1 to {LONGEST_KEY} printable ASCII characters are expected"
+            raise BadRequest("bad_request", f"Idempotency-Key is '{key[:40]}' where {expected}")
+        place = client, key
         with self._changed:
-            known = self._kept.get((who, key))
-            if known is not None and not self._old(known):
-                return self._answered(known, key, digest), True
-            self._leave((who, key))  # an old one, so that the order stays
-            self._make_room()
-            mine = self._kept[(who, key)] = _Kept(digest, self._clock.now_s())
-        text = b""
+            now_s = self._clock.now_s()
+            for old, one in list(self._kept.items()):
+                if not one.done:
+                    continue
+                if now_s - one.since_s < KEPT_S and len(self._kept) < KEPT:
+                    break
+                del self._kept[old]
+            known = self._kept.get(place)
+            if known is not None:
+                return self._answer_of(known, key, request), True
+            mine = self._kept[place] = _Kept(request, now_s)
         try:
             answer = act()
-            text = json.dumps(answer).encode()
+            mine.answer = answer
         except BaseException as error:
             mine.error = error
             raise
         finally:
             with self._changed:
-                mine.done, mine.answer = True, text
-                self._bytes += len(text)
                 if isinstance(mine.error, MastctlError):
-                    self._leave((who, key))
+                    del self._kept[place]
                 self._changed.notify_all()
         return answer, False
 
-    def _answered(self, known: _Kept, key: str, digest: bytes) -> Any:
+    def _answer_of(self, known: _Kept, key: str, request: Mapping[str, Any]) -> Any:
         """Return the answer that the first got, or gets; the lock is held."""
-        if known.digest != digest:
-            words = f"Idempotency-Key '{key[:40]}' came before with another request; take a new one"
-            raise BadRequest("key_reused", words)
+        if known.request != request:
+            message = f"Idempotency-Key '{key[:40]}' came before with another request; take a new one"
+            raise BadRequest("key_reused", message)
         until_s = self._clock.now_s() + WAIT_S
         while not known.done:
             left_s = until_s - self._clock.now_s()
             if left_s <= 0:
-                words = f"the request that came first with Idempotency-Key '{key[:40]}' is still at work"
-                raise NotNow("key_in_use", words)
+                message = f"the request that came first with Idempotency-Key '{key[:40]}' is still at work"
+                raise NotNow("key_in_use", message)
             self._changed.wait(left_s, idle=True)
         if known.error is not None:
             raise known.error
-        return json.loads(known.answer)
-
-    def _old(self, one: _Kept) -> bool:
-        return one.done and self._clock.now_s() - one.since_s >= KEPT_S
-
-    def _make_room(self) -> None:
-        """Forget what is old, and the oldest of too many; never what is at work. The lock is held."""
-        leave: list[tuple[str, str]] = []
-        left_bytes = self._bytes
-        for key, one in self._kept.items():
-            crowded = len(self._kept) - len(leave) >= KEPT or left_bytes > KEPT_BYTES
-            if one.done and (crowded or self._old(one)):
-                leave.append(key)
-                left_bytes -= len(one.answer)
-            elif not crowded:
-                break
-        for key in leave:
-            self._leave(key)
-
-    def _leave(self, key: tuple[str, str]) -> None:
-        """Forget a key; the lock is held."""
-        one = self._kept.pop(key, None)
-        self._bytes -= 0 if one is None else len(one.answer)
+        return known.answer

@@ -1,11 +1,11 @@
-"""The record of commands: whole lines in a bounded file, and nobody who waits for the disk."""
+"""The record of commands: whole lines in a bounded file, and no caller that waits for the disk."""
 
 from __future__ import annotations
 
-import errno
 import json
 import os
-import threading
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,33 +24,7 @@ def lines(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in text.splitlines()]
 
 
-class Disk:
-    """Stands for `os.write`: ``room`` bytes fit, the rest is ENOSPC."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.room: int | None = None
-        self.hook = lambda: None
-        self._write = os.write
-        monkeypatch.setattr(audit_module.os, "write", self.write)
-
-    def write(self, descriptor: int, data: bytes) -> int:
-        if threading.current_thread().name != "audit log":
-            return self._write(descriptor, data)
-        self.hook()
-        if self.room is not None:
-            if self.room == 0:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            data = data[: self.room]
-            self.room -= len(data)
-        return self._write(descriptor, data)
-
-
-@pytest.fixture
-def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
-    return Disk(monkeypatch)
-
-
-def test_each_record_is_a_line_in_a_file_that_nobody_else_reads(tmp_path: Path) -> None:
+def test_each_record_is_a_line_in_a_file_that_no_other_user_reads(tmp_path: Path) -> None:
     log = AuditLog(tmp_path / "state" / "audit.jsonl")
     for number in range(3):
         log.put({"number": number})
@@ -69,35 +43,50 @@ def test_a_new_run_goes_on_after_the_last_whole_line(tmp_path: Path) -> None:
     assert [line["number"] for line in lines(path)] == [0, 1]
 
 
+ON_A_FULL_DISK = """
+import json, resource, sys
+from pathlib import Path
+from mastctl.control.audit import AuditLog
+
+log = AuditLog(Path(sys.argv[1]))
+log.put({"number": 0})
+assert log.flush(60.0)
+hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+resource.setrlimit(resource.RLIMIT_FSIZE, (Path(sys.argv[1]).stat().st_size + int(sys.argv[2]), hard))
+for number in range(1, 4):
+    log.put({"number": number})
+assert log.flush(60.0)
+(fault,) = log.faults()
+resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+log.put({"number": 4})
+assert log.flush(60.0)
+print(json.dumps([fault.code, fault.device, fault.message, len(log.faults())]))
+"""
+
+
 @pytest.mark.parametrize("room", [0, 1, 7, 13])
-def test_a_full_disk_leaves_whole_lines_and_what_was_lost_is_told_there(
-    tmp_path: Path, disk: Disk, room: int
-) -> None:
+def test_a_full_disk_leaves_whole_lines_and_the_number_of_lost_ones(tmp_path: Path, room: int) -> None:
     path = tmp_path / "audit.jsonl"
-    log = AuditLog(path)
-    log.put({"number": 0})
-    assert log.flush()
-    disk.room = room
-    for number in range(1, 4):
-        log.put({"number": number})
-    assert log.flush()
-    first = [0, 1] if room == 13 else [0]
-    assert [line["number"] for line in lines(path)] == first
-    (fault,) = log.faults()
-    assert (fault.code, fault.device) == ("not_recorded", "audit_log")
-    assert "No space left on device" in fault.message
-    disk.room = None
-    log.put({"number": 4})
-    assert log.flush()
-    assert log.faults() == ()
-    told = lines(path)[len(first) :]
-    assert (told[0]["lost"], told[1]["number"]) == (4 - len(first), 4)
-    log.close()
+    command = [sys.executable, "-c", ON_A_FULL_DISK, str(path), str(room)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=NET_S)
+    code, device, message, faults_after = json.loads(done.stdout)
+    assert (code, device, faults_after) == ("not_recorded", "audit_log", 0)
+    assert "File too large" in message
+    *first, lost, last = lines(path)
+    assert [line["number"] for line in first] == ([0, 1] if room == 13 else [0])
+    assert (lost["lost"], last["number"]) == (4 - len(first), 4)
 
 
-def test_a_disk_that_hangs_blocks_no_caller_and_losses_are_counted(tmp_path: Path, disk: Disk) -> None:
-    path, hang = tmp_path / "audit.jsonl", Hang()
-    disk.hook = hang
+def test_a_disk_that_hangs_blocks_no_caller_and_losses_are_counted(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path, hang, sync = tmp_path / "audit.jsonl", Hang(), os.fdatasync
+
+    def hanging(descriptor: int) -> None:
+        hang()
+        sync(descriptor)
+
+    monkeypatch.setattr(audit_module.os, "fdatasync", hanging)
     log = AuditLog(path)
     log.put({"number": 0})
     assert hang.entered.wait(NET_S)
