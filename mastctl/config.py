@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import quote
 
-from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
 
 from calib.errors import BadFile
 from calib.files import read_bytes
@@ -161,6 +161,13 @@ class HeadRecord(Record):
     options: Free = Field(default={}, description="below, or the factory's keywords")
 
 
+class _HeadAlone(Record):
+    """A configuration of which only the head counts."""
+
+    model_config = ConfigDict(extra="ignore")
+    pan_tilt: HeadRecord
+
+
 class CameraRecord(HeadRecord):
     """The driver of a camera."""
 
@@ -302,7 +309,7 @@ def load_config(path: str | Path | None = None) -> Config:
 def load_head(path: str | Path) -> HardwareSettings:
     """Read what a configuration says of its head and pass over whatever else it holds. Raises BadFile."""
     document = parse_mapping(read_bytes(Path(path), _MAX_BYTES), path)
-    head = read_record(HeadRecord, document.get("pan_tilt"), path, "pan_tilt")
+    head = read_record(_HeadAlone, document, path).pan_tilt
     return HardwareSettings(DeviceSettings(head.driver, head.options), {}, folder=Path(path).resolve().parent)
 
 

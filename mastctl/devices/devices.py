@@ -288,10 +288,9 @@ class Devices:
         finally:
             self.fault_watch.look()
 
-    @property
-    def stop_pending(self) -> bool:
-        """Whether a stop has not come back from the driver yet."""
-        return self._stops.pending
+    def stops_returned(self, timeout_s: float) -> bool:
+        """Return whether every stop has come back from the driver within ``timeout_s`` seconds."""
+        return self._stops.returned(timeout_s)
 
     def block_moves(self, holder: object, reason: str | Stopped) -> None:
         """Refuse every further move until the holder (any key) allows them again.

@@ -123,10 +123,19 @@ class StopRequests:
             if self._late_s < asked_s:
                 self._fault = None
 
-    @property
-    def pending(self) -> bool:
-        """Whether a stop is on its way, or inside the driver."""
-        return self._queued_s is not None or bool(self._inside)
+    def returned(self, timeout_s: float) -> bool:
+        """Return whether no stop is queued or inside the driver; wait ``timeout_s`` seconds for that.
+
+        A stop that was confirmed beside the head's own thread still has one in that thread's queue.
+        """
+        deadline_s = self._clock.now_s() + timeout_s
+        with self._changed:
+            while self._queued_s is not None or self._inside:
+                left_s = deadline_s - self._clock.now_s()
+                if left_s <= 0.0:
+                    return False
+                self._changed.wait(left_s)
+        return True
 
     def proved(self, ticket: int) -> None:
         """Take back what earlier stops left: the move of a later ticket was taken, and the head rests."""

@@ -23,6 +23,9 @@ from mastctl.safety.state_folder import StateFolder
 from mastctl.safety.stop_socket import StopHandlers
 
 KEPT_S = 1.0  # what the disk is given before an emergency stop is answered without it
+STRAGGLER_S = 1.0
+"""A reset waits this long for stops that follow one that was confirmed already."""
+
 STATE = "state"
 
 
@@ -168,14 +171,14 @@ class Stopping:
         Raises
         ------
         NotNow
-            ``not_estopped`` if none is latched, ``stopping`` while a stop is under way.
+            ``not_estopped`` if none is latched, ``stopping`` if a stop is still under way after 1 s.
         Unable
             ``not_saved`` if the state folder goes on to say that it is latched; ``closing``.
         """
         refusal = self._operations.refusal("latch")
         if refusal is not None:
             raise refusal
-        if self._devices.stop_pending:
+        if not self._devices.stops_returned(STRAGGLER_S):
             raise NotNow("stopping", "the mast is being stopped; an emergency stop is released after that")
         with self._resetting:
             causes = self._latch.release(reason, name)

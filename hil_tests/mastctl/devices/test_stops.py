@@ -118,6 +118,20 @@ def test_a_stop_is_confirmed_by_an_earlier_one_that_comes_back(
     assert len(done) == 5
 
 
+def test_a_stop_queued_behind_a_confirmed_one_is_waited_for(
+    devices: Devices, hardware: FakeHardware, clock: Turned
+) -> None:
+    hangs = Hangs(hardware, "read", times=1)
+    hangs.hang.reached()
+    devices.stop()  # goes out beside the read; its like waits in the head's thread
+    assert not devices.stops_returned(0.0)
+    returned: list[bool] = []
+    waiting = clock.begun(lambda: returned.append(devices.stops_returned(DEADLINE_S)))
+    hangs.let_go()
+    clock.ended(waiting)
+    assert returned == [True] and hardware.head.calls == [("stop",), ("stop",)]
+
+
 def test_stops_repeated_into_a_hanging_driver_pile_up_no_threads(
     devices: Devices, hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch, clock: Turned
 ) -> None:

@@ -338,7 +338,7 @@ def test_a_reset_waits_for_a_stop_that_is_under_way(monkeypatch: pytest.MonkeyPa
             patch.setattr(hardware.head, "stop", hang)
             stopping = threading.Thread(target=stop, args=(daemon.url,))
             stopping.start()
-            until(lambda: daemon.service.devices.stop_pending, "the stop")
+            until(lambda: not daemon.service.devices.stops_returned(0.0), "the stop")
             with pytest.raises(ClientError, match="being stopped") as refused:
                 client.reset(reason="x", name="y")
             assert refused.value.code == "stopping"
