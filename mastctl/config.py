@@ -22,8 +22,10 @@ from calib.files import read_bytes
 from calib.files.records import ABSENT, Free, PathInFile, Record, Text, parse_record, problem, read_record
 from calib.files.yaml_text import kind_of, nearest, parse_mapping
 from calib.geometry.rig import Rig
+from drivers.faults import PAN_TILT
 from drivers.frame_times import MOST_OFFSET_S
-from drivers.hardware import DeviceSettings, HardwareSettings
+from drivers.hardware import DeviceSettings, HardwareSettings, is_hardware
+from drivers.registry import Kind
 from mastctl.devices.keep_out import Box
 from mastctl.devices.limits import LEAST_CONE_RAD, SUN, WIDEST_CONE_RAD, Limits, SunDirection, direction_of
 from mastctl.motion.settings import TrackingSettings
@@ -304,6 +306,14 @@ def load_config(path: str | Path | None = None) -> Config:
     """
     file = default_config() if path is None else Path(path)
     return parse_config(read_bytes(file, _MAX_BYTES), file)
+
+
+def not_simulated(settings: HardwareSettings) -> tuple[str, str] | None:
+    """Return the first device that is not simulated, and its driver; None if all are."""
+    devices: dict[str, tuple[Kind, DeviceSettings]] = {PAN_TILT: ("head", settings.pan_tilt)}
+    devices |= {name: ("camera", one) for name, one in settings.cameras.items()}
+    real = {n: d.driver for n, (k, d) in devices.items() if not is_hardware("simulated", k, d.driver)}
+    return next(iter(real.items()), None)
 
 
 def load_head(path: str | Path) -> HardwareSettings:

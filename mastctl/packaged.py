@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from drivers.registry import HardwareKind
 
 SCHEMAS = "schemas"
 NAMES_SCHEMA = "# yaml-language-server: $schema="
@@ -24,6 +28,13 @@ def config_folder() -> Path:
     raise FileNotFoundError(
         f"{candidates[0]}: the packaged configurations are missing; install mastctl again"
     )
+
+
+def driver_of_hardware(hardware: HardwareKind) -> str:
+    """Return the name of the driver whose heads and cameras are simulated, or replayed."""
+    from drivers.registry import drivers_of
+
+    return next(name for name, driver in drivers_of("head").items() if driver.hardware == hardware)
 
 
 def default_config() -> Path:

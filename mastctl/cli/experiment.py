@@ -81,11 +81,11 @@ def add_commands(subparsers: Any) -> None:
     )  # fmt: skip
     demo.add_argument(
         "--head", choices=HEADS,
-        help="simulated head (default ptu_d46_70; dynamixel_x behind --wire dynamixel)",
+        help="simulated head (default ptu_d46_70, or that of --wire)",
     )  # fmt: skip
     demo.add_argument(
-        "--wire", choices=("dynamixel", "flir_ptu"),
-        help="drive the head through the real driver and a byte simulator (default: in memory)",
+        "--wire", metavar="DRIVER",
+        help="drive the head through this real driver and a byte simulator (default: in memory)",
     )  # fmt: skip
     demo.add_argument(
         "--speed", type=_speed, metavar="N",

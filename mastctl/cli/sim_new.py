@@ -39,8 +39,8 @@ def add_parser(kinds: Any) -> None:
     lens.add_argument("--view-deg", type=number, metavar="DEG", help="or the view across the picture")
     new.add_argument("--size", type=_size, metavar="WxH", help="of the pictures (default 1024x768)")
     new.add_argument("--name", metavar="NAME", help="of the rig (default new_rig)")
-    new.add_argument("--head", choices=HEADS, help="default ptu_d46_70; dynamixel_x behind --wire dynamixel")
-    new.add_argument("--wire", choices=("dynamixel", "flir_ptu"), help="drive the head through bytes")
+    new.add_argument("--head", choices=HEADS, help="default ptu_d46_70, or that of --wire")
+    new.add_argument("--wire", metavar="DRIVER", help="drive the head through bytes by its real driver")
     new.add_argument(
         "--boards",
         type=output.at_least(0),
@@ -70,6 +70,7 @@ def run(args: argparse.Namespace) -> int:
     from drivers.hardware import DeviceSettings, HardwareSettings, clock_for
     from drivers.sim.heads import head_settings
     from drivers.sim.pan_tilt import DEFAULT_HEADS, check_head
+    from mastctl.packaged import driver_of_hardware
     from mastctl.setup.new_rig import built_rig
     from mastctl.setup.rig_folder import boards_about, check_empty, write_built, write_twin
 
@@ -87,8 +88,12 @@ def run(args: argparse.Namespace) -> int:
         simulation["scene"] = {"boards": boards_about(args.boards)}
     if args.speed is not None:
         simulation["speed"] = args.speed if args.speed == "max" else _number(args.speed)
-    clock_for(HardwareSettings(DeviceSettings("sim"), {}, simulation))  # refuses a speed that is none here
+    clock_for(
+        HardwareSettings(DeviceSettings(driver_of_hardware("simulated")), {}, simulation)
+    )  # refuses a speed that is none here
     if args.wire is not None:
+        if args.wire not in DEFAULT_HEADS:
+            raise WrongUse(f"--wire is '{args.wire}', expected one of {', '.join(DEFAULT_HEADS)}")
         check_head(args.wire, head_settings(args.head or DEFAULT_HEADS[args.wire]))
     check_folder(args.folder, "FOLDER")
     check_empty(args.folder, args.force)

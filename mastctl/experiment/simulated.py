@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from drivers.errors import BadOptions
-from drivers.faults import PAN_TILT
 from drivers.sim.rover import SimulatedRover
 from drivers.simulation_clock import MAX
-from mastctl.config import Config, Listen, load_config
+from mastctl.config import Config, Listen, load_config, not_simulated
 from mastctl.devices.frames import camera_and_sequence
 from mastctl.experiment.pointing import (
     PointingExperiment,
@@ -66,10 +65,10 @@ def own_config(
         For a device that is not simulated: nobody knows the truth of it.
     """
     hardware = config.hardware
-    for name, device in {PAN_TILT: hardware.pan_tilt, **hardware.cameras}.items():
-        if device.driver != "sim":
-            words = f"driver {device.driver!r} where the demo expects 'sim', of which it knows the truth"
-            raise BadOptions(words, device=name)
+    if real := not_simulated(hardware):
+        name, driver = real
+        words = f"driver {driver!r} where the demo expects a simulated device, of which it knows the truth"
+        raise BadOptions(words, device=name)
     given = (("head", head), ("wire", wire), ("speed", speed))
     chosen = {key: value for key, value in given if value is not None}
     kept = {key: value for key, value in hardware.simulation.items() if key != "head" or wire is None}

@@ -16,6 +16,7 @@ from calib.files.mast_file import StoredRig, parse_rig
 from calib.files.yaml_text import dump_mapping, parse_mapping
 from drivers.recordings.frames import McapFrame, read_frames, recording_files
 from drivers.recordings.mcap_file import BadRecording, McapContents, McapEntry, read_items
+from mastctl.packaged import driver_of_hardware
 from mastctl.recorder.writer import Attached
 
 log = logging.getLogger(__name__)
@@ -188,7 +189,10 @@ def replay_files(recording: Recording, folder: Path, listen: dict[str, Any]) -> 
         raise BadRecording(f"{recording.path}: holds no picture that could be served")
     name = Path(mast.name).name or "mast.yaml"
     (folder / name).write_bytes(mast.data)
-    device = {"driver": "replay", "options": {"recording": str(recording.path.resolve())}}
+    device = {
+        "driver": driver_of_hardware("replayed"),
+        "options": {"recording": str(recording.path.resolve())},
+    }
     config = {
         "schema": "mastctl/config/1",
         "mast_file": name,

@@ -22,6 +22,7 @@ from drivers.faults import PAN_TILT
 from drivers.probes import ProbedCamera, ProbedHead
 from drivers.registry import driver_of
 from drivers.servo_bus.bench import USUAL_BAUD, ServosOnLine, line_words
+from drivers.sim.pan_tilt import DEFAULT_HEADS
 from mastctl.config import check_cameras, load_config
 from mastctl.packaged import SCHEMAS, config_folder, name_schema
 from mastctl.rig.drawing import (
@@ -131,7 +132,7 @@ def write_simulated(folder: Path, plugged: Plugged, answers: RigAnswers) -> NewR
         focal_px=focal_of(np.deg2rad(answers.view_deg), TWIN_SIZE_PX[0]),
         size_px=TWIN_SIZE_PX,
     )
-    simulation = {"wire": "dynamixel", "seed": TWIN_SEED}
+    simulation = {"wire": next(iter(DEFAULT_HEADS)), "seed": TWIN_SEED}
     rig = built_rig(numbers, np.random.default_rng(TWIN_SEED))
     config = f"--config {quote(str(folder / CONFIG))}"
     steps = (

@@ -20,7 +20,7 @@ from drivers.sim.pan_tilt import DEFAULT_HEADS
 from mastctl.calibration.mast_file import rounded_matrix
 from mastctl.config import CONFIG_SCHEMA, check_cameras, load_config
 from mastctl.errors import MastctlError
-from mastctl.packaged import name_schema
+from mastctl.packaged import driver_of_hardware, name_schema
 from mastctl.setup.true_twin import STATED, Twin, true_twin, usual_covariance
 
 CONFIG, MAST, TRUE_RIG = "config.yaml", "mast.yaml", "true_rig.yaml"
@@ -157,12 +157,13 @@ def _configuration(
         _limits(axis, usual) for axis, usual in zip((head.pan, head.tilt), limits_rad, strict=True)
     )
     speed = min(1.0, head.pan.speed_rad_per_s, head.tilt.speed_rad_per_s)
+    simulated = driver_of_hardware("simulated")
     return {
         "schema": CONFIG_SCHEMA,
         "mast_file": MAST,
         "listen": {"host": "127.0.0.1", "port": 8420},
-        "pan_tilt": {"driver": "sim"},
-        "cameras": {name: {"driver": "sim"} for name in rig.cameras},
+        "pan_tilt": {"driver": simulated},
+        "cameras": {name: {"driver": simulated} for name in rig.cameras},
         "limits": {"pan_rad": pan_rad, "tilt_rad": tilt_rad, "speed_rad_per_s": speed},
         "simulation": {"rover": TRUE_RIG, **simulation},
     }

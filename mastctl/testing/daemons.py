@@ -16,9 +16,8 @@ from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from drivers.errors import BadOptions
-from drivers.faults import PAN_TILT
 from drivers.sim.rover import SimulatedRover
-from mastctl.config import Config, Listen, load_config
+from mastctl.config import Config, Listen, load_config, not_simulated
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.frames import camera_and_sequence
 from mastctl.errors import NotKnown, NotNow
@@ -140,12 +139,11 @@ def config_for_a_test(
         If a device of it is not simulated.
     """
     config = load_config(path)
-    for name, device in {PAN_TILT: config.hardware.pan_tilt, **config.hardware.cameras}.items():
-        if device.driver != "sim":
-            raise BadOptions(
-                f"{config.path}: {name} has driver {device.driver!r}, expected 'sim': tests in parallel "
-                "without an observer move no real head"
-            )
+    if real := not_simulated(config.hardware):
+        raise BadOptions(
+            f"{config.path}: {real[0]} has driver {real[1]!r}, expected a simulated device: tests in "
+            "parallel without an observer move no real head"
+        )
     section = dict(config.hardware.simulation)
     if path is None:
         section.pop("samples", None)  # what the demo looks best with

@@ -83,7 +83,7 @@ def test_a_configuration_with_a_real_device_is_refused(tmp_path: Path) -> None:
     text = (config_folder() / "default.yaml").read_text()
     path = tmp_path / "bench.yaml"
     path.write_text(text.replace("pan_tilt: {driver: sim}", "pan_tilt: {driver: flir_ptu}"))
-    with pytest.raises(BadOptions, match="pan_tilt has driver 'flir_ptu', expected 'sim'"):
+    with pytest.raises(BadOptions, match="pan_tilt has driver 'flir_ptu', expected a simulated device"):
         config_for_a_test(str(path), None, {}, tmp_path)
     path.write_text(text.replace("navcam_left: {driver: sim}", "navcam_left: {driver: v4l2}"))
     with pytest.raises(BadOptions, match="navcam_left has driver 'v4l2'"):

@@ -51,7 +51,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption(
         "--options", metavar="JSON", default="{}", help="the driver's options: JSON, or a file that has it"
     )
-    group.addoption("--motion", action="store_true", help="move the head; 'sim' is moved without it")
+    group.addoption(
+        "--motion", action="store_true", help="move the head; a simulated one is moved without it"
+    )
     group.addoption(
         "--reach", type=float, default=0.3, metavar="RAD",
         help="how far from its pose the head is moved (default 0.3 rad; inf: over all of its limits)",
@@ -144,7 +146,7 @@ def camera(request: pytest.FixtureRequest, camera_name: str) -> Iterator[CameraT
             settings = replace(config.hardware, cameras=chosen)
             assert bounds.stored is not None
             size_px = size_px or bounds.stored.rig.cameras[camera_name].model.size_px
-            if settings.cameras[camera_name].driver == "sim":
+            if is_hardware("simulated", "camera", settings.cameras[camera_name].driver):
                 stack.enter_context(head_beside(settings, bounds, SystemClock(), moves=False))()
 
         def opened() -> Camera:
@@ -221,13 +223,13 @@ def head_under_test(
 def device_settings(driver: str, options: Mapping[str, Any], kind: str, name: str) -> HardwareSettings:
     """Return the settings that open one device by its driver.
 
-    The options of ``sim`` are the section ``simulation``, over that of the packaged rover.
+    The options of a simulated one are the section ``simulation``, over that of the packaged rover.
     """
-    if driver == "sim":
+    if is_hardware("simulated", "head", driver):
         packaged = load_config(None).hardware
         simulation = {**packaged.simulation, **options}
-        settings = replace(packaged, cameras={}, simulation=simulation, pan_tilt=DeviceSettings("sim"))
-        return replace(settings, cameras={name: DeviceSettings("sim")}) if kind == "camera" else settings
+        settings = replace(packaged, cameras={}, simulation=simulation, pan_tilt=DeviceSettings(driver))
+        return replace(settings, cameras={name: DeviceSettings(driver)}) if kind == "camera" else settings
     device = DeviceSettings(driver, options)
     if kind == "camera":
         return HardwareSettings(DeviceSettings("none"), {name: device})
@@ -259,13 +261,13 @@ def _head(config: pytest.Config) -> tuple[HardwareSettings, Bounds | None]:
 
 
 def _may_move(config: pytest.Config) -> bool:
-    return bool(config.option.motion) or config.option.head == "sim"
+    return bool(config.option.motion) or is_hardware("simulated", "head", config.option.head or "")
 
 
 def _camera_names(config: pytest.Config) -> Sequence[str]:
     option = config.option
     if option.rig is None:
-        known = SIMULATED_CAMERA if option.camera == "sim" else "camera"
+        known = SIMULATED_CAMERA if is_hardware("simulated", "camera", option.camera or "") else "camera"
         return [] if option.camera is None else [known]
     names = list(_rig(option.rig)[0].hardware.cameras)
     if option.camera is not None and option.camera not in names:
