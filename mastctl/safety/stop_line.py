@@ -1,4 +1,4 @@
-"""Asking a daemon's stop socket, from another process; needs no configuration that can be read."""
+"""A stop sent to a daemon's socket, from another process; needs no configuration that can be read."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ from mastctl.safety.state_folder import DAEMON_FILE, DAEMON_SCHEMA, folders_of
 from mastctl.safety.stop_socket import FILE
 
 ANSWER_S = 5.0
-TRIES = 3  # a crowd of others may have pushed us out
 
 
 class NoAnswer(Exception):
-    """Nobody there, or nobody who answers as a daemon does."""
+    """No program listens there, or none that answers as a daemon does."""
 
 
 def sockets_of(folder: Path | None, config: Path | None, url: str | None) -> list[Path]:
@@ -59,11 +58,7 @@ def ask(path: Path, line: str) -> dict[str, Any]:
     ValueError
         With the daemon's own sentence, if it could not.
     """
-    for _ in range(TRIES):
-        answer = _asked(path, line)
-        if answer:
-            break
-    verb, _, rest = answer.partition(" ")
+    verb, _, rest = _answer(path, line).partition(" ")
     if verb == "failed:":
         raise ValueError(rest)
     try:
@@ -75,7 +70,7 @@ def ask(path: Path, line: str) -> dict[str, Any]:
     return told
 
 
-def _asked(path: Path, line: str) -> str:
+def _answer(path: Path, line: str) -> str:
     """One line of answer; empty if the other side has closed without one."""
     until_s = time.monotonic() + ANSWER_S
     answer = b""
@@ -91,7 +86,9 @@ def _asked(path: Path, line: str) -> str:
                     break
                 answer += part
         except TimeoutError:
-            raise NoAnswer(f"{path} took the line but did not answer within {ANSWER_S:g} s") from None
+            raise NoAnswer(
+                f"{path} took the line but did not answer within {ANSWER_S:g} s; the head may still move"
+            ) from None
         except (ConnectionResetError, BrokenPipeError):
             return ""
         except OSError as error:

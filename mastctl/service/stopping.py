@@ -214,7 +214,7 @@ VIA = "stop socket"
 
 
 class SocketStops:
-    """Stops from whoever connects to a daemon's socket.
+    """Stops that come by a daemon's socket.
 
     Parameters
     ----------
@@ -229,14 +229,10 @@ class SocketStops:
         self._entry = entry
 
     def stop_told(self) -> StopTold:
-        """Stop the mast; return what is to be told."""
+        """Stop the mast; return the answer."""
         return self._entry.first(STOP, CommandRequest(Caller(role="view", via=VIA)), self._stops.stop_told)
 
     def estop(self, reason: str | None, name: str | None) -> EstopTold:
-        """Stop it and latch; return what is to be told."""
+        """Latch and stop; return the answer."""
         asked = CommandRequest(Caller(role="view", via=VIA), request={"reason": reason, "name": name})
         return self._entry.first(ESTOP, asked, lambda: self._stops.estop(reason, name))
-
-    def latch_estop(self, reason: str | None, name: str | None) -> object:
-        """Let no move out from now on, at once."""
-        return self._stops.latch_estop(reason, name)
