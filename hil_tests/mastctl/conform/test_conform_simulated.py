@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from hil_tests.mastctl.conform.conform_world import accepted
-from mastctl.config import load_config
+from mastctl.config import Listen, load_config
 from mastctl.conform.rig import check_rig, rig_under_test
 from mastctl.conform.rig_checks import RIG
 from mastctl.daemon import RunningDaemon
@@ -21,7 +21,7 @@ def test_the_simulated_rover_conforms_and_a_click_lands() -> None:
     simulation = {**hardware.simulation, "samples": 1, "speed": "max"}
     cameras = {name: camera for name, camera in hardware.cameras.items() if name.startswith("navcam")}
     hardware = replace(hardware, simulation=simulation, cameras=cameras)
-    listen = replace(config.listen, port=0)
+    listen = Listen(port=0)
     with (
         RunningDaemon(replace(config, hardware=hardware, listen=listen)) as daemon,
         rig_under_test(daemon.url, 0.3) as under_test,

@@ -14,7 +14,7 @@ import pytest
 
 from drivers.errors import NoReply
 from hil_tests.waiting import present, until
-from mastctl.config import Config, load_config
+from mastctl.config import Config, Listen, load_config
 from mastctl.motion.requests import AnglesTarget, PixelTarget, PointRequest
 from mastctl.service.service import Service
 
@@ -23,7 +23,7 @@ def configured(speed: object, seed: int = 1, **changes: Any) -> Config:
     config = load_config()
     simulation = {**config.hardware.simulation, "speed": speed, "seed": seed, "samples": 1, **changes}
     hardware = replace(config.hardware, simulation=simulation)
-    return replace(config, hardware=hardware, listen=replace(config.listen, port=0))
+    return replace(config, hardware=hardware, listen=Listen(port=0))
 
 
 @contextmanager

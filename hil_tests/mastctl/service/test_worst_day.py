@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hil_tests.waiting import present, until
-from mastctl.config import load_config
+from mastctl.config import Listen, load_config
 from mastctl.motion.requests import PixelTarget, PointRequest
 from mastctl.packaged import config_folder
 from mastctl.service.service import Service
@@ -27,7 +27,7 @@ def worst_day(**head: Any) -> Iterator[Service]:
     asked = config.hardware.simulation
     simulation = {**asked, "speed": "max", "samples": 1, "head": {**asked["head"], **head}}
     hardware = replace(config.hardware, simulation=simulation)
-    service = Service.open(replace(config, hardware=hardware, listen=replace(config.listen, port=0)))
+    service = Service.open(replace(config, hardware=hardware, listen=Listen(port=0)))
     try:
         yield service
     finally:
