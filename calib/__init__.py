@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from calib.survey.reader import read_survey as read_survey
     from calib.survey.writer import write_survey as write_survey
     from calib.targets.board_file import load_board as load_board
-    from calib.targets.corners import CornersNotFound as CornersNotFound
+    from calib.targets.boards import CornersNotFound as CornersNotFound
     from calib.targets.corners import find_corners as find_corners
     from calib.targets.dots import find_dots as find_dots
 

@@ -20,10 +20,9 @@ from calib.geometry.cahvor import WIDE, CameraModel
 from calib.geometry.rigid import FloatArray, Rigid, rot_y, rot_z
 from calib.survey.alignment import NotAligned, rover_from_station, station_from_board
 from calib.survey.records import Survey, SurveyCamera, SurveyImage
-from calib.targets.boards import Board, Dots
-from calib.targets.dot_grid import DetectionFailure
+from calib.targets.boards import Board, CornersNotFound, Dots
 from calib.targets.dot_order import PredictedBoard, Upright
-from calib.targets.dots import DotsFound, find_dots
+from calib.targets.dots import find_dots
 
 AHEAD = np.array([1.0, 0.0, 0.0])
 DOWN = np.array([0.0, 0.0, 1.0])
@@ -58,7 +57,7 @@ def detect_survey(
     """
     wanted = [image for image in survey.images if image.name not in survey.dots and _has_picture(image)]
     expected = expectations(survey)
-    found: dict[str, DotsFound | DetectionFailure] = {}
+    found: dict[str, Dots | CornersNotFound] = {}
 
     def tell(image: str) -> None:
         if progress is not None:
@@ -73,7 +72,7 @@ def detect_survey(
             found[image.name] = find_in_file(*task)
             tell(image.name)
     else:
-        futures: dict[Future[DotsFound | DetectionFailure], str] = {
+        futures: dict[Future[Dots | CornersNotFound], str] = {
             executor.submit(find_in_file, *task): image.name
             for image, task in zip(wanted, tasks, strict=True)
         }
@@ -85,8 +84,8 @@ def detect_survey(
         result = found.get(image.name)
         if image.name in survey.dots:
             dots[image.name] = survey.dots[image.name]
-        elif isinstance(result, DotsFound):
-            dots[image.name] = result.as_dots()
+        elif isinstance(result, Dots):
+            dots[image.name] = result
         elif result is not None:
             failures[image.name] = result.reason
     return SurveyDots(dots, failures)
@@ -94,24 +93,24 @@ def detect_survey(
 
 def find_in_file(
     path: Path, size_px: tuple[int, int], board: Board, expected: PredictedBoard | Upright | None
-) -> DotsFound | DetectionFailure:
+) -> Dots | CornersNotFound:
     """Find the dots in a picture file; a file that cannot be used is a failure with a reason."""
     try:
         with open_plain(path) as file:
             data = file.read()
     except OSError as error:
-        return DetectionFailure(f"{path.name} cannot be read: {error.strerror or error}")
+        return CornersNotFound(f"{path.name} cannot be read: {error.strerror or error}")
     try:
         image = decode_picture(data)
     except ValueError as reason:
-        return DetectionFailure(f"{path.name} is not a picture that can be read: {reason}")
+        return CornersNotFound(f"{path.name} is not a picture that can be read: {reason}")
     height, width = image.shape[:2]
     if (width, height) != tuple(size_px):
-        return DetectionFailure(
+        return CornersNotFound(
             f"{path.name} is {width} x {height} px where {size_px[0]} x {size_px[1]} are expected"
         )
     if image.dtype not in (np.uint8, np.uint16):
-        return DetectionFailure(f"{path.name} holds {image.dtype} where 8 or 16 bits a pixel are expected")
+        return CornersNotFound(f"{path.name} holds {image.dtype} where 8 or 16 bits a pixel are expected")
     return find_dots(image, board, expected)
 
 

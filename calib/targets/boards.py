@@ -11,15 +11,21 @@ The dot board of a survey has a frame like it: origin at the grid's centre, x al
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from calib.geometry.rigid import FloatArray, IntArray
+
+Grey8 = NDArray[np.uint8]
+"""(h, w) grey levels of 8 bits; the centre of the top-left pixel is (0, 0)."""
+Levels = Grey8 | NDArray[np.uint16]
+"""The same of 8 or 16 bits."""
 
 Bow = tuple[float, float]
 FLAT: Bow = (0.0, 0.0)
@@ -256,6 +262,12 @@ class Corners:
         return len(self.ids)
 
 
+class CornersNotFound(NamedTuple):
+    """The reason, one plain sentence, why an image shows no corners or dots of a board."""
+
+    reason: str
+
+
 @dataclass(frozen=True, eq=False)
 class Board:
     """The dot board; its frame has the origin at the grid's centre, x along a row, y down a column.
@@ -289,12 +301,25 @@ NO_BOARD = Board(0, 0, 0.0, 0.0, {})
 
 @dataclass(frozen=True, eq=False)
 class Dots:
-    """Dots found in one image: rows (n,), columns (n,), pixels_px (n, 2), sigma_px (n,) or None."""
+    """Dots found in one image.
+
+    Attributes
+    ----------
+    rows, columns
+        (n,) from 0.
+    pixels_px
+        (n, 2) the images of the dots' centres.
+    sigma_px
+        (n,) one standard deviation of a dot, each axis; None where it was not measured.
+    residual_px
+        Rms distance per axis to a smooth map of the board; not-a-number where none was fitted.
+    """
 
     rows: IntArray
     columns: IntArray
     pixels_px: FloatArray
     sigma_px: FloatArray | None = None
+    residual_px: float = math.nan
 
     def __len__(self) -> int:
         return len(self.rows)

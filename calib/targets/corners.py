@@ -16,11 +16,21 @@ from numpy.typing import NDArray
 
 from calib.geometry.rigid import FloatArray
 from calib.targets.board_file import FAMILIES
-from calib.targets.boards import AnyBoard, AprilGrid, Board, Charuco, Checkerboard, Corners, DotBoard
+from calib.targets.boards import (
+    AnyBoard,
+    AprilGrid,
+    Board,
+    Charuco,
+    Checkerboard,
+    Corners,
+    CornersNotFound,
+    DotBoard,
+    Grey8,
+    Levels,
+)
 from calib.targets.dot_grid import fit_plane_map
-from calib.targets.dots import DotsFound, find_dots, in_8_bits
+from calib.targets.dots import find_dots, in_8_bits
 from calib.targets.markers import (
-    Image,
     MarkerBoard,
     Markers,
     MeasuredCorners,
@@ -33,7 +43,7 @@ from calib.targets.markers import (
     standing,
 )
 from calib.targets.pattern import Cells, pattern_of
-from calib.targets.saddles import Crossings, Levels, Saddles, fit_saddles
+from calib.targets.saddles import Crossings, Saddles, fit_saddles
 
 DARK_DN = 40
 """Where next to no pixel is brighter, there is no light."""
@@ -118,7 +128,7 @@ def _turned_tags(board: AprilGrid, markers: Markers) -> int:
     return max(0 if one is None else len(one.ids) for one in both)
 
 
-def why_nothing(board: AnyBoard, image: Image) -> str:
+def why_nothing(board: AnyBoard, image: Grey8) -> str:
     """Say why no board is seen."""
     dark, bright = (float(value) for value in np.percentile(image, (1.0, 99.5)))
     if bright < DARK_DN:
@@ -134,14 +144,14 @@ def why_nothing(board: AnyBoard, image: Image) -> str:
     )
 
 
-def _mirrored(board: MarkerBoard, image: Image) -> str:
+def _mirrored(board: MarkerBoard, image: Grey8) -> str:
     flipped = detect(np.ascontiguousarray(image[:, ::-1]), board)
     if standing(flipped, board) is None or len(flipped.ids) < FEWEST_MIRRORED:
         return ""
     return "the board is mirrored: it was printed or the picture was taken the wrong way round"
 
 
-def _blurred(image: Image) -> str:
+def _blurred(image: Grey8) -> str:
     """Say over how many pixels the sharpest edges of a picture are spread, if that is too much."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTH_PX)
     range_dn = float(np.ptp(np.percentile(smooth, (1.0, 99.5))))
@@ -162,7 +172,7 @@ def _blurred(image: Image) -> str:
     return ""
 
 
-def _others(board: MarkerBoard, image: Image) -> str:
+def _others(board: MarkerBoard, image: Grey8) -> str:
     """Markers of another dictionary."""
     mine = board.dictionary if isinstance(board, Charuco) else FAMILIES[board.family]
     border = board.border if isinstance(board, AprilGrid) else 1
@@ -225,12 +235,6 @@ FEWEST = 4
 ROUNDS = 6
 
 
-class CornersNotFound(NamedTuple):
-    """Why there are no corners: one plain sentence."""
-
-    reason: str
-
-
 def find_corners(board: AnyBoard, image: Levels) -> Corners | CornersNotFound:
     """Return the corners of a board that an image shows, or why there are none.
 
@@ -285,7 +289,7 @@ class _Found(NamedTuple):
     saddles: Saddles
 
 
-def _standing(board: MarkerBoard, image: Image) -> StandingMarkers | CornersNotFound:
+def _standing(board: MarkerBoard, image: Grey8) -> StandingMarkers | CornersNotFound:
     """The markers that stand as on the board, or what is wrong."""
     markers = detect(image, board)
     stands = standing(markers, board)
@@ -402,8 +406,9 @@ def _agreeing(board: AnyBoard, found: _Found) -> Corners | CornersNotFound:
 def _dots(board: DotBoard, levels: Levels) -> Corners | CornersNotFound:
     """The dots, rows to the right in the image."""
     found = find_dots(levels, Board(board.rows, board.columns, board.spacing_m, board.dot_diameter_m, {}))
-    if not isinstance(found, DotsFound):
-        return CornersNotFound(found.reason)
+    if isinstance(found, CornersNotFound):
+        return found
+    assert found.sigma_px is not None
     return Corners(found.rows * board.columns + found.columns, found.pixels_px, found.sigma_px)
 
 

@@ -21,9 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from calib.geometry.rigid import FloatArray, IntArray
-from calib.targets.boards import Board
+from calib.targets.boards import Board, CornersNotFound, Grey8
 from calib.targets.dot_middles import centred
-from calib.targets.dot_spots import UNEVEN_AT_MOST, Candidates, Image, contrasts
+from calib.targets.dot_spots import UNEVEN_AT_MOST, Candidates, contrasts
 
 DEGREES = (0, 3, 5)
 """Of the polynomial; the number of dots decides which."""
@@ -218,12 +218,6 @@ MOST_MISSING = 0.2
 """Share of dots that may be hidden; then the others are still counted safely."""
 
 
-class DetectionFailure(NamedTuple):
-    """Why there are no dots: one plain sentence."""
-
-    reason: str
-
-
 class BoardGrid(NamedTuple):
     """Dots with places 0 to counts - 1 along i and j, and their middles to some tenths of a pixel."""
 
@@ -233,7 +227,7 @@ class BoardGrid(NamedTuple):
     map: PlaneMap  # from places to pixels
 
 
-def best_grid(image: Image, found: Candidates, board: Board) -> tuple[BoardGrid | DetectionFailure, int]:
+def best_grid(image: Grey8, found: Candidates, board: Board) -> tuple[BoardGrid | CornersNotFound, int]:
     """The board's grid, grown, else by OpenCV's clustering; and how many spots hang together."""
     wanted = board.rows * board.columns
     lattices = grow_lattices(found, 2.0 * board.spacing_m / board.dot_diameter_m)
@@ -248,7 +242,7 @@ def best_grid(image: Image, found: Candidates, board: Board) -> tuple[BoardGrid 
             whole.append(grid)
     if len(whole) > 1:
         told = f"{len(whole)} grids of {board.rows} x {board.columns} dots are in the image"
-        return DetectionFailure(told), largest
+        return CornersNotFound(told), largest
     if whole:
         return whole[0], largest
     clustered = _clustered(found, board)
@@ -263,7 +257,7 @@ def best_grid(image: Image, found: Candidates, board: Board) -> tuple[BoardGrid 
         f"{spots} spots look like dots, and at most {largest} of them stand in a grid, "
         f"where {wanted} are expected"
     )
-    return DetectionFailure(told), largest
+    return CornersNotFound(told), largest
 
 
 def _same(one: BoardGrid, other: BoardGrid) -> bool:
@@ -291,9 +285,7 @@ def _clustered(found: Candidates, board: Board) -> Lattice | None:
     return Lattice(spots, np.stack([columns, rows], axis=-1))
 
 
-def _complete(
-    image: Image, found: Candidates, lattice: Lattice, board: Board
-) -> BoardGrid | DetectionFailure:
+def _complete(image: Grey8, found: Candidates, lattice: Lattice, board: Board) -> BoardGrid | CornersNotFound:
     """Fill the gaps of a lattice and cut the board out of it, or say what is missing."""
     places, middles = lattice.places, found.middles_px[lattice.spots]
     radius = board.dot_diameter_m / 2 / board.spacing_m
@@ -301,7 +293,7 @@ def _complete(
     for _ in range(3):
         plane_map = _consistent_map(places, middles)
         if plane_map is None:
-            return DetectionFailure("spots that look like dots do not make a flat grid")
+            return CornersNotFound("spots that look like dots do not make a flat grid")
         at = plane_map.pixels(places.astype(np.float64))
         step = np.sqrt(np.abs(np.linalg.det(plane_map.jacobian(places.astype(np.float64)))))
         fits = np.linalg.norm(middles - at, axis=-1) < 0.15 * step
@@ -325,7 +317,7 @@ def _consistent_map(places: IntArray, middles: FloatArray) -> PlaneMap | None:
 
 
 def _gaps(
-    image: Image, places: IntArray, plane_map: PlaneMap, radius: float, contrast_dn: float
+    image: Grey8, places: IntArray, plane_map: PlaneMap, radius: float, contrast_dn: float
 ) -> tuple[IntArray, FloatArray]:
     """Places inside and one beyond the lattice without a spot that hold a dot after all, and where."""
     low, high = places.min(axis=0) - 1, places.max(axis=0) + 1
@@ -342,8 +334,8 @@ def _gaps(
 
 
 def _cut_out(
-    image: Image, places: IntArray, middles: FloatArray, board: Board
-) -> BoardGrid | DetectionFailure:
+    image: Grey8, places: IntArray, middles: FloatArray, board: Board
+) -> BoardGrid | CornersNotFound:
     """The window of the lattice that is the board, if there is only one."""
     wanted = board.rows * board.columns
     low, high = places.min(axis=0), places.max(axis=0)
@@ -357,22 +349,22 @@ def _cut_out(
     number, origin, counts, inside = windows[0]
     spans = high - low + 1
     if number < (1.0 - MOST_MISSING) * wanted or min(spans) < min(counts) or max(spans) < max(counts):
-        return DetectionFailure(_too_few(image, number, spans, middles, board))
+        return CornersNotFound(_too_few(image, number, spans, middles, board))
     own = places[inside] - np.array(origin)
     for axis in (0, 1):
         for line in (0, counts[axis] - 1):
             # An outer line that is hardly there could as well be the one beyond the other side.
             if (own[:, axis] == line).sum() < counts[1 - axis] / 2:
-                return DetectionFailure(_too_few(image, number, spans, middles, board))
+                return CornersNotFound(_too_few(image, number, spans, middles, board))
     if len(windows) > 1 and windows[1][0] > number - 3:
-        return DetectionFailure(f"the grid is larger than {board.rows} x {board.columns} dots")
+        return CornersNotFound(f"the grid is larger than {board.rows} x {board.columns} dots")
     plane_map = fit_plane_map(own.astype(np.float64), middles[inside])
     if plane_map is None:
-        return DetectionFailure("spots that look like dots do not make a flat grid")
+        return CornersNotFound("spots that look like dots do not make a flat grid")
     return BoardGrid(own, middles[inside], counts, plane_map)
 
 
-def _too_few(image: Image, number: int, spans: IntArray, middles: FloatArray, board: Board) -> str:
+def _too_few(image: Grey8, number: int, spans: IntArray, middles: FloatArray, board: Board) -> str:
     """A sentence about a part of a board."""
     height, width = image.shape
     step = np.sqrt(np.prod(np.ptp(middles, axis=0) + 1) / np.prod(spans))

@@ -21,9 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
 from calib.geometry.rigid import FloatArray
-from calib.targets.dot_spots import Image
-
-Levels = NDArray[np.uint8] | NDArray[np.uint16]
+from calib.targets.boards import Grey8, Levels
 
 REACH = 2.0
 """How far the fit looks, in dot radii: neighbours begin at 3 and are blurred."""
@@ -117,7 +115,7 @@ def fit_ellipses(image: Levels, middles_px: FloatArray, shapes_px: FloatArray) -
     return DotCentres(*out)
 
 
-def centred(image: Image, middles_px: FloatArray, shapes_px: FloatArray) -> FloatArray:
+def centred(image: Grey8, middles_px: FloatArray, shapes_px: FloatArray) -> FloatArray:
     """Return the middles moved onto the dark spots that they are nearest to, good to some tenths of a pixel.
 
     Arguments as ``fit_ellipses``, but places may be off by most of a dot's radius.

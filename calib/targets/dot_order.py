@@ -15,8 +15,8 @@ import numpy as np
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray, IntArray, Rigid
-from calib.targets.boards import Board
-from calib.targets.dot_spots import UNEVEN, UNEVEN_AT_MOST, Image
+from calib.targets.boards import Board, Grey8
+from calib.targets.dot_spots import UNEVEN, UNEVEN_AT_MOST
 
 SURE_RAD = np.radians(32.0)
 """The nearest order is taken if it is off by less than this; the next is then 58 degrees off or more."""
@@ -205,7 +205,7 @@ def hopeless(expected: PredictedBoard) -> str:
     return ""
 
 
-def searches(image: Image, board: Board, expected: PredictedBoard | Upright | None) -> Iterator[DotSearch]:
+def searches(image: Grey8, board: Board, expected: PredictedBoard | Upright | None) -> Iterator[DotSearch]:
     """Where to look and for what, the likeliest first."""
     height, width = image.shape
     whole = (0, 0, width, height)

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.geometry.rigid import FloatArray
-
-Image = NDArray[np.uint8]
+from calib.targets.boards import Grey8
 
 WIDEST_RATIO = 3.5  # major to minor axis: a board seen more flatly has dots that nobody tells apart
 FILL = (0.80, 1.15)  # area over the area of the ellipse with the same second moments
@@ -36,7 +35,7 @@ class Candidates(NamedTuple):
 
 
 def dot_candidates(
-    image: Image, diameter_px: float, area_px2: tuple[float, float], uneven: float = UNEVEN
+    image: Grey8, diameter_px: float, area_px2: tuple[float, float], uneven: float = UNEVEN
 ) -> Candidates:
     """Return the spots that look like dots.
 
@@ -104,7 +103,7 @@ def _ellipses(labels: NDArray[np.int32], wanted: NDArray[np.int64], count: int) 
     return Candidates(np.stack([mx, my], axis=-1)[good], shapes[good])
 
 
-def contrasts(smooth: Image, middles_px: FloatArray, shapes_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+def contrasts(smooth: Grey8, middles_px: FloatArray, shapes_px: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return how much darker each middle is than the ring around it, and the ring's spread, grey levels.
 
     Not-a-number where more than a third of the ring is outside the image.
@@ -127,7 +126,7 @@ def contrasts(smooth: Image, middles_px: FloatArray, shapes_px: FloatArray) -> t
         return mean - values[:, 0], np.sqrt((spread**2).sum(axis=1) / seen)
 
 
-def _sampled(image: Image, columns: NDArray[np.float32], rows: NDArray[np.float32]) -> FloatArray:
+def _sampled(image: Grey8, columns: NDArray[np.float32], rows: NDArray[np.float32]) -> FloatArray:
     """Bilinear values; in pieces, since OpenCV wants fewer than 32767 rows."""
     pieces = [
         cv2.remap(image.astype(np.float32), columns[k : k + 30000], rows[k : k + 30000], cv2.INTER_LINEAR)
@@ -136,7 +135,7 @@ def _sampled(image: Image, columns: NDArray[np.float32], rows: NDArray[np.float3
     return np.concatenate(pieces).astype(np.float64)
 
 
-def _in_paper(smooth: Image, spots: Candidates, uneven: float) -> Candidates:
+def _in_paper(smooth: Grey8, spots: Candidates, uneven: float) -> Candidates:
     """Return the spots with an even bright ring around them."""
     if not len(spots.middles_px):
         return spots

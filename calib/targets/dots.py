@@ -8,14 +8,12 @@ image of its centre.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from calib.geometry.rigid import FloatArray, IntArray
-from calib.targets.boards import Board, Dots
-from calib.targets.dot_grid import MOST_MISSING, BoardGrid, DetectionFailure, best_grid, fit_plane_map
-from calib.targets.dot_middles import Levels, bias_through, fit_ellipses
+from calib.geometry.rigid import FloatArray
+from calib.targets.boards import Board, CornersNotFound, Dots, Grey8, Levels
+from calib.targets.dot_grid import MOST_MISSING, BoardGrid, best_grid, fit_plane_map
+from calib.targets.dot_middles import bias_through, fit_ellipses
 from calib.targets.dot_order import (
     Ordered,
     PredictedBoard,
@@ -26,7 +24,7 @@ from calib.targets.dot_order import (
     order_by_steps,
     searches,
 )
-from calib.targets.dot_spots import Candidates, Image, dot_candidates
+from calib.targets.dot_spots import Candidates, dot_candidates
 
 SMALLEST_DOT_PX = 3.5
 
@@ -37,27 +35,9 @@ FAR_OFF = 6.0
 """Sigmas from the map of all dots, beyond which a dot is dropped."""
 
 
-class DotsFound(NamedTuple):
-    """Dots of one image.
-
-    rows, columns (n,) from 0; pixels_px (n, 2), the images of the dots' centres; sigma_px (n,), per axis;
-    residual_px, rms distance per axis to a smooth map of the board.
-    """
-
-    rows: IntArray
-    columns: IntArray
-    pixels_px: FloatArray
-    sigma_px: FloatArray
-    residual_px: float
-
-    def as_dots(self) -> Dots:
-        """Return what a survey holds of an image."""
-        return Dots(self.rows, self.columns, self.pixels_px, self.sigma_px)
-
-
 def find_dots(
     image: Levels, board: Board, expected: PredictedBoard | Upright | None = None
-) -> DotsFound | DetectionFailure:
+) -> Dots | CornersNotFound:
     """Return the dots of the board in an image, or why there are none.
 
     Parameters
@@ -85,9 +65,9 @@ def find_dots(
     if isinstance(expected, PredictedBoard):
         no_hope = hopeless(expected)
         if no_hope:
-            return DetectionFailure(no_hope)
+            return CornersNotFound(no_hope)
         steps_px = expected_steps_px(expected.camera, expected.frame_from_board)
-    failure = DetectionFailure("no spot of the image looks like a dot of the board")
+    failure = CornersNotFound("no spot of the image looks like a dot of the board")
     furthest = -1
     for search in searches(image, board, expected):
         left, top, right, bottom = search.box_px
@@ -97,11 +77,11 @@ def find_dots(
         if isinstance(grid, BoardGrid):
             ordered = _ordered(grid, board, expected, steps_px)
             result = (
-                DetectionFailure(_unsure(steps_px))
+                CornersNotFound(_unsure(steps_px))
                 if ordered is None
                 else _measured(levels, board, grid, ordered)
             )
-            if isinstance(result, DotsFound):
+            if isinstance(result, Dots):
                 return result
             reached += 1
         else:
@@ -112,7 +92,7 @@ def find_dots(
     return failure
 
 
-def in_8_bits(image: Levels) -> Image:
+def in_8_bits(image: Levels) -> Grey8:
     """Return an image in 8 bits: its levels but the darkest and brightest thousandth, spread over them."""
     if image.dtype == np.uint8:
         return image.astype(np.uint8, copy=False)
@@ -142,16 +122,16 @@ def _ordered(
     return order_by_steps(grid.places, grid.counts, steps, board, np.eye(2) if steps_px is None else steps_px)
 
 
-def _measured(image: Levels, board: Board, grid: BoardGrid, ordered: Ordered) -> DotsFound | DetectionFailure:
+def _measured(image: Levels, board: Board, grid: BoardGrid, ordered: Ordered) -> Dots | CornersNotFound:
     """Fit every dot of the grid and correct for the shape of circles."""
     points = board.dots_in_board_m(ordered.rows, ordered.columns)[:, :2]
     radius = board.dot_diameter_m / 2
     first = fit_plane_map(points, grid.middles_px)
     if first is None:
-        return DetectionFailure("spots that look like dots do not make a flat grid")
+        return CornersNotFound("spots that look like dots do not make a flat grid")
     shapes = first.jacobian(points) * radius
     if float(np.linalg.svd(shapes, compute_uv=False)[:, 0].max()) < SMALLEST_DOT_PX / 2:
-        return DetectionFailure(
+        return CornersNotFound(
             f"the dots are smaller than {SMALLEST_DOT_PX:g} px across: the board is too far away"
         )
     fit = fit_ellipses(image, grid.middles_px, shapes)
@@ -159,7 +139,7 @@ def _measured(image: Levels, board: Board, grid: BoardGrid, ordered: Ordered) ->
     reach = np.linalg.norm(shapes, axis=-1)  # of each dot's outline in x and y
     inside = ((fit.middles_px > reach) & (fit.middles_px < [width - 1, height - 1] - reach)).all(axis=1)
     if not np.isfinite(fit.sizes).any():
-        return DetectionFailure("the grid is found but its spots do not look like dots from near")
+        return CornersNotFound("the grid is found but its spots do not look like dots from near")
     with np.errstate(invalid="ignore"):
         good = inside & (fit.contrast_dn > 0.4 * np.nanmedian(fit.contrast_dn))
         good &= np.abs(fit.sizes / np.nanmedian(fit.sizes) - 1.0) < 0.25
@@ -167,13 +147,13 @@ def _measured(image: Levels, board: Board, grid: BoardGrid, ordered: Ordered) ->
     sigma = np.hypot(fit.sigma_px, LEAST_SIGMA_PX)
     for _ in range(5):
         if good.sum() < least:
-            return DetectionFailure(
+            return CornersNotFound(
                 f"only {int(good.sum())} of {board.rows * board.columns} dots can be measured well"
             )
         centres = fit.middles_px - bias_through(first.pixels, points, radius)
         plane_map = fit_plane_map(points[good], centres[good])
         if plane_map is None:
-            return DetectionFailure("spots that look like dots do not make a flat grid")
+            return CornersNotFound("spots that look like dots do not make a flat grid")
         centres = fit.middles_px - bias_through(plane_map.pixels, points, radius)
         off = plane_map.pixels(points) - centres
         first = plane_map
@@ -185,7 +165,7 @@ def _measured(image: Levels, board: Board, grid: BoardGrid, ordered: Ordered) ->
         if not far.any():
             break
         good &= ~far
-    return DotsFound(
+    return Dots(
         ordered.rows[good],
         ordered.columns[good],
         centres[good],

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calib.geometry.rigid import FloatArray, IntArray
 from calib.targets.board_file import FAMILIES
-from calib.targets.boards import AprilGrid, Charuco, Checkerboard
+from calib.targets.boards import AprilGrid, Charuco, Checkerboard, Grey8
 
 NEIGHBOURS = 16
 FEWEST_NEIGHBOURS = 4
@@ -100,7 +100,6 @@ def _homographies(points: FloatArray, pixels: FloatArray) -> tuple[FloatArray, N
     return np.concatenate([h, np.ones((n, 1))], axis=1).reshape(n, 3, 3), told
 
 
-Image = NDArray[np.uint8]
 MarkerBoard = Charuco | AprilGrid
 
 LEAST_PERIMETER = 0.01
@@ -134,7 +133,7 @@ class StandingMarkers:
     homography: FloatArray
 
 
-def detect(image: Image, board: MarkerBoard) -> Markers:
+def detect(image: Grey8, board: MarkerBoard) -> Markers:
     """Return all markers of the board's dictionary in an image."""
     dictionary = board.dictionary if isinstance(board, Charuco) else FAMILIES[board.family]
     border = board.border if isinstance(board, AprilGrid) else 1
@@ -148,7 +147,7 @@ def detect(image: Image, board: MarkerBoard) -> Markers:
     return found
 
 
-def search(image: Image, dictionary: str, border: int) -> Markers:
+def search(image: Grey8, dictionary: str, border: int) -> Markers:
     """Return all markers of a dictionary by OpenCV's name."""
     corners, ids, _ = _detector(dictionary, border).detectMarkers(image)
     if ids is None or len(ids) == 0:
@@ -233,7 +232,7 @@ def _white_first(board: Charuco) -> bool:
     return board.legacy and board.rows % 2 == 0
 
 
-def chessboard_corners(board: Checkerboard, image: Image) -> MeasuredCorners | None:
+def chessboard_corners(board: Checkerboard, image: Grey8) -> MeasuredCorners | None:
     """Return the corners of a chessboard to a pixel; None if it is not seen whole.
 
     Counted so that the colours are those of the print, and if they are so both ways, upright in the image.
@@ -266,7 +265,7 @@ def _handed(grid: np.ndarray) -> float:
     return float(right[0] * down[1] - right[1] * down[0])
 
 
-def _dark_first(image: Image, grid: np.ndarray) -> bool:
+def _dark_first(image: Grey8, grid: np.ndarray) -> bool:
     """Whether the squares on the diagonal of the first four corners are darker than their neighbours."""
     dark: list[int] = []
     light: list[int] = []

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from calib.geometry.rigid import FloatArray, IntArray
+from calib.targets.boards import Levels
 from calib.targets.pattern import Cells
 
 PARAMETERS = 11
@@ -158,8 +159,6 @@ def _markers(edges: list[Edge], insets: FloatArray) -> FloatArray:
         covered += 0.5 * (1.0 + erf(beyond[0] / ROOT_2)) * (1.0 + erf(beyond[1] / ROOT_2))
     return np.asarray(covered * sign)
 
-
-Levels = NDArray[np.uint8] | NDArray[np.uint16]
 
 HALF_PX = 8
 """A window reaches so far from its corner."""

@@ -31,8 +31,8 @@ from calib.matching.patch import match_patch
 from calib.matching.warp import Plane, facing_plane
 from calib.survey.alignment import NotAligned, align, mirrored
 from calib.survey.find_dots import find_in_file
+from calib.targets.boards import Dots
 from calib.targets.dot_order import PredictedBoard
-from calib.targets.dots import DotsFound
 from hil_tests.calib.adjust.small_surveys import survey_of, with_shifted_dots
 from hil_tests.calib.calibrate.test_fit_camera import farthest_px, fit_camera
 from hil_tests.calib.targets.boards import BOARD, COLUMNS, ROWS, SIZE_PX, camera, gravel, pose
@@ -236,7 +236,7 @@ def test_a_picture_of_more_bits_is_measured_with_all_of_them(tmp_path: Path, bit
     path = tmp_path / "board.png"
     cv2.imwrite(str(path), levels.astype(np.uint8 if bits == 8 else np.uint16))
     found = find_in_file(path, SIZE_PX, BOARD, PredictedBoard(model, at))
-    assert isinstance(found, DotsFound), found
+    assert isinstance(found, Dots), found
     assert len(found.rows) == 100
     points = at.points(BOARD.dots_in_board_m(ROWS, COLUMNS))
     wanted = model.project(points)[0].reshape(10, 10, 2)[found.rows, found.columns]

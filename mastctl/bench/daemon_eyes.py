@@ -15,8 +15,8 @@ from calib.calibrate.bench.problem import FEWEST_CORNERS
 from calib.files.mast_file import parse_rig
 from calib.geometry.mode import FLIPS, SensorMode
 from calib.geometry.rig import Rig
-from calib.targets.boards import AnyBoard
-from calib.targets.corners import CornersNotFound, find_corners
+from calib.targets.boards import AnyBoard, CornersNotFound
+from calib.targets.corners import find_corners
 from mastctl.bench.eyes import BenchHead, BenchInterrupted, BenchLook, NoLight, NotThere, SeenBoard
 from mastctl.client import Client, ClientError, Snapshot
 

@@ -116,7 +116,8 @@ def _find(args: argparse.Namespace) -> int:
     from calib.files.atomic import save_bytes
     from calib.files.pictures import decode_picture
     from calib.targets.board_file import load_board
-    from calib.targets.corners import CornersNotFound, find_corners
+    from calib.targets.boards import CornersNotFound
+    from calib.targets.corners import find_corners
     from mastctl.as_json import readable
 
     board = load_board(args.board)

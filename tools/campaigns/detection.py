@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, DotBoard
-from calib.targets.corners import CornersNotFound, find_corners
+from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, CornersNotFound, DotBoard
+from calib.targets.corners import find_corners
 from calib.targets.pattern import pattern_of
 from tools.command import end, options, rms, run_cases, show
 

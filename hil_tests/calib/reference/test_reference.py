@@ -33,9 +33,9 @@ from calib.geometry.handoff import Joints, hand_off
 from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
 from calib.survey.records import Sigma
-from calib.targets.boards import Checkerboard, Corners
+from calib.targets.boards import Checkerboard, Corners, Dots
 from calib.targets.corners import find_corners
-from calib.targets.dots import DotsFound, find_dots
+from calib.targets.dots import find_dots
 from hil_tests.calib.adjust.small_surveys import survey_of
 from hil_tests.calib.calibrate.test_fit_bench import SERVO
 from hil_tests.calib.geometry.test_opencv_lenses import LENSES, camera
@@ -255,7 +255,7 @@ def detections() -> Values:
     for seed, tilt in enumerate(((0.0, 0.0), (35.0, 20.0), (50.0, 100.0))):
         shot = shoot(np.random.default_rng(seed), board_camera(NAVCAM_PX), pose(2.5 + seed, tilt))
         dots = find_dots(shot.image, shot.board)
-        assert isinstance(dots, DotsFound)
+        assert isinstance(dots, Dots)
         out[f"dots {seed}"] = dots.pixels_px, SAME * CORNER_PX
     return out
 

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 import calib.targets.dot_grid
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
-from calib.targets.boards import Board
-from calib.targets.dot_grid import BoardGrid, DetectionFailure, best_grid
+from calib.targets.boards import Board, CornersNotFound, Dots
+from calib.targets.dot_grid import BoardGrid, best_grid
 from calib.targets.dot_order import PredictedBoard, Upright
 from calib.targets.dot_spots import Candidates, dot_candidates
-from calib.targets.dots import DotsFound, find_dots
+from calib.targets.dots import find_dots
 from hil_tests.calib.targets.boards import (
     BOARD,
     COLUMNS,
@@ -41,13 +41,13 @@ SIDE = camera(NAVCAM_PX, (640, 480))
 
 def check(
     shot: Shot,
-    found: DotsFound | DetectionFailure,
+    found: Dots | CornersNotFound,
     wanted_px: float,
     least: int = 100,
     cautious: float = 0.75,
 ) -> None:
     """Dots are in their order, and as exact as they claim."""
-    assert isinstance(found, DotsFound), found
+    assert isinstance(found, Dots), found
     assert len(found.rows) >= least
     errors = found.pixels_px - shot.true_px(found.rows, found.columns)
     assert np.linalg.norm(errors, axis=1).max() < 1.0, "wrong order"
@@ -56,8 +56,8 @@ def check(
     assert cautious < normalised < NORMALISED
 
 
-def reason(found: DotsFound | DetectionFailure) -> str:
-    assert isinstance(found, DetectionFailure)
+def reason(found: Dots | CornersNotFound) -> str:
+    assert isinstance(found, CornersNotFound)
     assert "\n" not in found.reason
     return found.reason
 
@@ -96,7 +96,7 @@ def test_centres_are_corrected_for_the_shape_of_circles() -> None:
     rng = np.random.default_rng(12)
     shot = shoot(rng, camera(NAVCAM_PX), pose(3.0, (45, 20)), noise_dn=0.0)
     found = find_dots(shot.image, BOARD, shot.roughly(rng))
-    assert isinstance(found, DotsFound)
+    assert isinstance(found, Dots)
     errors = found.pixels_px - shot.true_px(found.rows, found.columns)
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.01
 
@@ -105,7 +105,7 @@ def test_the_residual_is_the_scatter_of_the_dots() -> None:
     rng = np.random.default_rng(30)
     shot = shoot(rng, SIDE, pose(6.0, (30, 100), -6), noise_dn=6.0)
     found = find_dots(shot.image, BOARD, shot.roughly(rng))
-    assert isinstance(found, DotsFound)
+    assert isinstance(found, Dots)
     errors = found.pixels_px - shot.true_px(found.rows, found.columns)
     # The map of the board takes up some of the scatter: 8 to 14 numbers of 200.
     assert found.residual_px == pytest.approx(np.sqrt(np.mean(errors**2)), rel=0.15)
@@ -217,7 +217,7 @@ def test_hidden_dots_are_left_out() -> None:
     for x, y in hidden:
         cv2.circle(image, (round(x) + 4, round(y)), 7, 120, -1)
     found = find_dots(image, BOARD, shot.roughly(rng))
-    assert isinstance(found, DotsFound)
+    assert isinstance(found, Dots)
     seen = set(zip(found.rows.tolist(), found.columns.tolist(), strict=True))
     assert len(seen) >= 96 and not seen & {(4, 2), (7, 8)}
     errors = found.pixels_px - shot.true_px(found.rows, found.columns)
@@ -238,7 +238,7 @@ def test_dots_that_just_stand_inside_the_picture_count_and_cut_ones_do_not(roll_
     for aside_m, whole in ((0.72, 100), (0.725, 90)):
         shot = shoot(rng, SIDE, pose(4.0, (60, 90), roll_deg, (aside_m, 0.0)))
         found = find_dots(shot.image, BOARD, PredictedBoard(shot.camera, shot.camera_from_board))
-        assert isinstance(found, DotsFound)
+        assert isinstance(found, Dots)
         assert len(found.rows) == whole
 
 
@@ -291,7 +291,7 @@ def test_every_row_and_column_is_there_once() -> None:
     rng = np.random.default_rng(26)
     shot = shoot(rng, SIDE, pose(4.0, (10, 10)))
     found = find_dots(shot.image, BOARD, shot.roughly(rng))
-    assert isinstance(found, DotsFound)
+    assert isinstance(found, Dots)
     seen = sorted(zip(found.rows.tolist(), found.columns.tolist(), strict=True))
     assert seen == sorted(zip(ROWS.tolist(), COLUMNS.tolist(), strict=True))
 

@@ -12,8 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
-from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, Corners, DotBoard
-from calib.targets.corners import CornersNotFound, find_corners
+from calib.targets.boards import (
+    AnyBoard,
+    AprilGrid,
+    Charuco,
+    Checkerboard,
+    Corners,
+    CornersNotFound,
+    DotBoard,
+)
+from calib.targets.corners import find_corners
 from calib.targets.pattern import pattern_of
 from drivers.sim.bench_boards import BenchBoard, BenchBoards
 
