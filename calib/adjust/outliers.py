@@ -27,9 +27,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.special import chdtri
 
 from calib.adjust.adjustment import Adjustment
+from calib.adjust.gross import at_least_stated, chance_limit
 from calib.adjust.left_out import REDUNDANT, LeftOut, dot_statistics, left_out
 from calib.adjust.scatter import MOST, scatter
 from calib.adjust.terms import ImageTerm, StationTerm
@@ -221,14 +221,14 @@ class _Limits:
     point_scale: float
 
     def dot(self, camera: str) -> float:
-        return float(chdtri(2, Level.MEASUREMENT / max(self.dots, 1))) * self.dot_scales[camera]
+        return chance_limit(Level.MEASUREMENT, self.dots) * self.dot_scales[camera]
 
     def image(self, camera: str, freedom: int, own: float) -> float:
-        limit = float(chdtri(max(freedom, 1), Level.WHOLE_IMAGE / max(self.images, 1)))
+        limit = chance_limit(Level.WHOLE_IMAGE, self.images, max(freedom, 1))
         return limit * max(self.dot_scales[camera], own)
 
     def point(self, freedom: int) -> float:
-        return float(chdtri(freedom, Level.MEASUREMENT / max(self.points, 1))) * self.point_scale
+        return chance_limit(Level.MEASUREMENT, self.points, freedom) * self.point_scale
 
 
 def _tested(
@@ -250,7 +250,7 @@ def _tested(
     ]
     count = sum(len(one.dots) for one in seen)
     dot_scales = _typical_dots(zip(seen, problem.images, strict=True))
-    point_scale = max(1.0, typical_scale(np.concatenate(whole or [np.ones(0)]), 3))
+    point_scale = at_least_stated(np.concatenate(whole or [np.ones(0)]), 3)
     return seen, points, _Limits(count, len(seen), len(points), dot_scales, point_scale)
 
 
@@ -262,7 +262,7 @@ def _typical_dots(seen: Iterable[tuple[JudgedImage, ImageTerm]]) -> dict[str, fl
         if term.keep.any():
             mine.append(judged.dots[term.keep])
     every = [dots for mine in by_camera.values() for dots in mine]
-    whole = max(1.0, typical_scale(np.concatenate(every or [np.ones(0)])))
+    whole = at_least_stated(np.concatenate(every or [np.ones(0)]))
     return {
         camera: max(whole, min(typical_scale(np.concatenate(mine or [np.ones(0)])), MOST**2))
         for camera, mine in by_camera.items()
@@ -312,7 +312,7 @@ def _board_misfit(
     """
     tapes = [p for p in problem.station if p.board == board and p.keep]
     shown = [problem.images[i] for i in images]
-    allowed = float(chdtri(3, Level.MEASUREMENT / max(len(problem.station), 1)))
+    allowed = chance_limit(Level.MEASUREMENT, len(problem.station), 3)
     without = ([p for p in tapes if p is not one] for one in tapes)
     return min(
         _misfit(problem, state, board, shown, tapes),

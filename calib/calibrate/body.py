@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
+from calib.adjust.gross import worst_first
 from calib.calibrate.body_sights import BodySights, Equations, body_sights
 from calib.errors import NoCorrection
 from calib.geometry.covariance import MOST_SIGMAS, RigCovariance, click_rates, pixel_rates
@@ -287,24 +288,18 @@ def _keep(sights: BodySights) -> tuple[np.ndarray, FloatArray, FloatArray]:
     robust = _fit(sights, robust=True)
     statistics = _normal(robust.after, np.ones(count))[2] / robust.scale
     keep = statistics <= limits
-    for _ in range(count):
-        if np.mean(~keep) > MOST_OUTLIERS:
-            break
+
+    def ratios(keep: np.ndarray) -> FloatArray:
+        nonlocal statistics
         fit = _fit(sights.part(keep))
         at = sights.equations(fit.step)
         spread = np.einsum("nij,jk,nlk->nil", at.rates, fit.covariance, at.rates)
         # A fitted residual is less sure than its noise by what the fit took; one left out, more.
         total = fit.scale * at.covariance_px2 - np.where(keep, 1.0, -1.0)[:, None, None] * spread
         statistics = np.einsum("ni,nij,nj->n", at.residual_px, np.linalg.inv(total), at.residual_px)
-        passes = statistics <= limits
-        new = keep | passes
-        failing = keep & ~passes
-        if failing.any():
-            new[np.argmax(np.where(failing, statistics / limits, 0.0))] = False
-        if (new == keep).all():
-            break
-        keep = new
-    return keep, statistics, limits
+        return np.asarray(statistics / limits)
+
+    return worst_first(keep, ratios, MOST_OUTLIERS), statistics, limits
 
 
 def _correction(used: BodySights, fit: _BodyFit, outliers: tuple[LeftOutHandoff, ...]) -> BodyPose:

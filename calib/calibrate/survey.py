@@ -10,10 +10,11 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtrc
 
 from calib.adjust.adjustment import HUBER, Adjustment
 from calib.adjust.goodness import goodness
+from calib.adjust.gross import chance_limit
 from calib.adjust.hypotheses import Finding, explaining, find_change, survey_findings
 from calib.adjust.left_out import left_out_boards
 from calib.adjust.outliers import name_outliers
@@ -248,7 +249,7 @@ def _prism_notes(problem: Adjustment, state: Estimate, mast_parameters: int) -> 
     for setup in state.rover_from_station:
         prisms = [p for p in problem.station if p.setup == setup and p.board is None and p.keep]
         residuals = np.array([problem.station_residual(state, p) for p in prisms])
-        if float(np.sum(residuals**2)) > chdtri(3 * len(prisms), float(Level.STATED)):
+        if float(np.sum(residuals**2)) > chance_limit(Level.STATED, 1, 3 * len(prisms)):
             worst = 1000 * float(np.linalg.norm(residuals, axis=1).max()) * prisms[0].sigma_m
             why = "an upright mast" if mast_parameters == 4 else "their CAD positions"
             notes.append(

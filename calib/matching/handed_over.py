@@ -11,7 +11,6 @@ that the two cameras do not mean the same rover frame (the paper saw 1.5 and 2 p
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -19,6 +18,7 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calib.adjust.gross import at_least_stated, chance_limit
 from calib.geometry.handoff import Handoff, Joints
 from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import Level, chance, sigmas
@@ -207,9 +207,7 @@ def _mean(source: str, camera: str, off_px: FloatArray, covariance_px2: FloatArr
     weights = np.linalg.inv(covariance_px2)
     apart = off_px - np.median(off_px, axis=0)
     statistics = np.einsum("ni,nij,nj->n", apart, weights, apart)
-    # Chi-square of two degrees of freedom is beyond -2 ln p with the chance p.
-    typical = max(1.0, float(np.median(statistics)) / (-2.0 * math.log(0.5)))
-    keep = statistics <= typical * (-2.0 * math.log(Level.MEASUREMENT / len(off_px)))
+    keep = statistics <= at_least_stated(statistics) * chance_limit(Level.MEASUREMENT, len(off_px))
     information = weights[keep].sum(axis=0)
     mean = np.linalg.solve(information, np.einsum("nij,nj->i", weights[keep], off_px[keep]))
     rest = off_px[keep] - mean

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.adjust.adjustment import HUBER, Adjustment
+from calib.adjust.gross import gross_limit
 from calib.adjust.hypotheses import Finding, find_change, find_drifts
 from calib.adjust.model_terms import Tested
 from calib.adjust.result import BenchCalibration
@@ -43,10 +44,6 @@ SLIP_RAD, SLIP_ASIDE = 0.003, 0.1
 
 MENDS = 0.5
 """A change that is tried where the fit is far off counts if the sum of squares falls to this part."""
-
-LONE = 6.0
-"""While changes are looked for, a corner so many times farther off than its image's median counts as
-wrong."""
 
 PART = 4
 """As many pictures on one side of another are no blunders."""
@@ -186,7 +183,7 @@ def _without_lone_strays(problem: Adjustment, state: Estimate) -> Adjustment:
             continue
         length = np.linalg.norm(residual.reshape(-1, 2), axis=1)
         keep = t.keep.copy()
-        keep[keep] = length < LONE * max(float(np.median(length)), 1.0)
+        keep[keep] = length < gross_limit(length, 1.0)
         terms.append(replace(t, keep=keep))
     return problem.with_terms(terms, ())
 

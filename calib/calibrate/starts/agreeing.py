@@ -8,14 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
+from calib.adjust.gross import gross_limit
 from calib.adjust.solver import Minimum, minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import MEDIAN_OF_TWO
-
-GROSS = 6.0
-"""An image is left out if its typical residual is this many times the typical image's and the expected."""
 
 LONE = 3.0
 """A point so many times farther off than an image may be is left out by itself."""
@@ -68,7 +66,7 @@ def fit_agreeing(
         state = minimise(several, state, weak=problem.weak, steps=steps, gain=1e-4).state
     offs = distances_px(problem, state, images)
     sizes = typical_sizes(offs)
-    limit_px = GROSS * max(float(np.median(sizes)), expected_px)
+    limit_px = gross_limit(sizes, expected_px)
     agrees = (sizes < limit_px) | keep_all
     kept: tuple[ImageTerm, ...] = ()
     for _ in range(2):  # a point that only an unfinished lens puts elsewhere comes back

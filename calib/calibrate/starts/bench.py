@@ -20,10 +20,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calib.adjust.gross import gross_limit
 from calib.adjust.terms import ImageTerm
 from calib.adjust.uncertainty import SEEN_RAD
 from calib.adjust.unknowns import Estimate
-from calib.calibrate.starts.agreeing import GROSS
 from calib.calibrate.starts.views import ViewPoses
 from calib.errors import CalibError
 from calib.geometry.rig import MAST_NAMES
@@ -176,7 +176,9 @@ def _tie(images: Sequence[ImageTerm], view: ViewPoses) -> _Tied:
         typical = max(float(np.median(off)), SMALLEST)
         weight = 0.5 * typical / np.maximum(off, 0.5 * typical)
     shifts = np.array([pose.translation_m for pose in chosen])
-    place, places = _places(gimbals, gimbals @ in_head, shifts, at, len(boards), off < GROSS * typical)
+    place, places = _places(
+        gimbals, gimbals @ in_head, shifts, at, len(boards), off < gross_limit(off, SMALLEST)
+    )
     head_from_camera = Rigid(in_head, place)
     mast_from_board = {b: Rigid(in_mast[i], places[i]) for i, b in enumerate(boards)}
     by_image = {
@@ -257,7 +259,8 @@ def _body(images: Sequence[ImageTerm], view: ViewPoses, boards: Mapping[tuple[st
 
 def _far_off(tied: _Tied) -> set[str]:
     """Images whose board stands far from where the others have it."""
-    limits = np.maximum(GROSS * np.median(list(tied.off.values()), axis=0), (NEAR_RAD, NEAR_M))
+    apart = np.array(list(tied.off.values())).T
+    limits = np.maximum([gross_limit(sizes) for sizes in apart], (NEAR_RAD, NEAR_M))
     return {name for name, off in tied.off.items() if (off > limits).any()}
 
 

@@ -16,9 +16,10 @@ import cv2
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
+from calib.adjust.gross import GROSS
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
-from calib.calibrate.starts.agreeing import GROSS, Agreed, fit_agreeing, thinned
+from calib.calibrate.starts.agreeing import Agreed, fit_agreeing, thinned
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel, Kind
 from calib.geometry.rig import MAST_NAMES

@@ -13,10 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
+from calib.adjust.gross import GROSS
 from calib.adjust.solver import Normal
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import MAST, Estimate
-from calib.calibrate.starts.agreeing import GROSS, Agreed, fit_agreeing
+from calib.calibrate.starts.agreeing import Agreed, fit_agreeing
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.parameters import carried_errors, twist_rates

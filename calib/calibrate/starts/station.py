@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.special import chdtri
 
 from calib.adjust.adjustment import Adjustment
+from calib.adjust.gross import chance_limit
 from calib.adjust.outliers import Outlier
 from calib.adjust.solver import covariance_of, minimise
 from calib.adjust.terms import StationTerm, station_terms
@@ -97,7 +97,7 @@ def adjust_prisms(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> Adjust
     drawing = survey.prisms_in_rover_m
     fit = _fit(survey, drawing, station)
     rejected, doubt = list[tuple[str | None, str]](), ""
-    while fit.chi2 > chdtri(fit.degrees_of_freedom, false_alarm):
+    while fit.chi2 > chance_limit(false_alarm, 1, fit.degrees_of_freedom):
         found = _culprit(survey, drawing, station, fit.chi2, false_alarm)
         if found is None:
             rms = np.sqrt(fit.chi2 / fit.degrees_of_freedom)
@@ -142,7 +142,7 @@ def _culprit(
         with suppress(NotAligned):  # three on a line are no set-up
             left.append((_fit(survey, *_without(drawing, station, *one)).chi2, one))
     left.sort(key=lambda entry: entry[0])
-    clear, apart = chdtri(3, false_alarm), chdtri(1, false_alarm)
+    clear, apart = chance_limit(false_alarm, 1, 3), chance_limit(false_alarm, 1, 1)
     if len(left) < 2 or now - left[0][0] < clear or left[1][0] - left[0][0] < apart:
         return None
     return left[0][1]
@@ -257,6 +257,4 @@ def _outlier(
     kind: Literal["prism", "tape"], name: str, where: str, off_m: FloatArray, sigma_m: float
 ) -> Outlier:
     off = float(np.linalg.norm(off_m))
-    return Outlier(
-        kind, f"{kind} {name} {where}", (off / sigma_m) ** 2, float(chdtri(3, float(Level.GROSS))), off
-    )
+    return Outlier(kind, f"{kind} {name} {where}", (off / sigma_m) ** 2, chance_limit(Level.GROSS, 1, 3), off)

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 
 from calib.adjust.adjustment import HUBER, Adjustment
+from calib.adjust.gross import gross_limit
 from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
-from calib.calibrate.starts.agreeing import GROSS
 from calib.calibrate.starts.camera import centred_camera
 from calib.calibrate.starts.wrong_dots import wrong_points
 from calib.errors import CalibError
@@ -108,8 +108,8 @@ def view_poses(
         if found_poses:
             poses[term.name] = tuple(pose for _, pose in found_poses)
             off[term.name] = found_poses[0][0]
-    typical = max(float(np.median(list(off.values()))) if off else np.inf, 1.0)
-    doubtful = {t.name for t in images if t.name not in off or off[t.name] > GROSS * typical}
+    limit = gross_limit(list(off.values()), 1.0) if off else 0.0
+    doubtful = {t.name for t in images if t.name not in off or off[t.name] > limit}
     return ViewPoses(model, poses, wrong, frozenset(doubtful))
 
 
@@ -147,7 +147,7 @@ def _lens(images: Sequence[ImageTerm], start: CameraModel, most: int) -> tuple[f
     placed = [(images[i], poses[0]) for i in some if (poses := poses_of(start, images[i]))]
     if not placed:
         return None
-    limit = GROSS * max(float(np.median([size for _, (size, _) in placed])), 1.0)
+    limit = gross_limit([size for _, (size, _) in placed], 1.0)
     terms, boards = [], {}
     for term, (size, pose) in placed:
         if size <= limit:

@@ -10,12 +10,12 @@ start does (``calib.calibrate.starts.survey``).
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import chdtri
 
+from calib.adjust.gross import at_least_stated, chance_limit
 from calib.adjust.outliers import Outlier
 from calib.adjust.scatter import off_smooth
 from calib.geometry.rigid import FloatArray
-from calib.geometry.significance import Level, typical_scale
+from calib.geometry.significance import Level
 from calib.survey.records import Survey
 from calib.targets.boards import Dots
 
@@ -26,8 +26,8 @@ FEWER = ((16, 2),)
 """The same for a small or partly seen board, where only gross errors are looked for; with still fewer dots
 nothing is tested."""
 
-GROSS = 100.0
-"""A statistic beyond so many times the typical one's is gross: ten sigma."""
+FAR = 100.0
+"""A square beyond so many times the typical one is gross where nothing finer is tested: ten sigma."""
 
 POLYNOMIAL_PX = 0.08
 """What a polynomial of the fourth degree may miss, at the corners of a near board in a wide lens."""
@@ -51,11 +51,11 @@ def wrong_dots(survey: Survey) -> tuple[dict[str, np.ndarray], tuple[Outlier, ..
     every = [statistic for statistic, _ in tested.values() if len(statistic) >= DEGREES[-1][0]]
     fine = 0.0
     if every:
-        scale = _typical(np.concatenate(every))
-        fine = float(chdtri(2, Level.MEASUREMENT / sum(map(len, every)))) * scale
+        squares = np.concatenate(every)
+        fine = chance_limit(Level.MEASUREMENT, len(squares)) * at_least_stated(squares)
     wrong, outliers = dict[str, np.ndarray](), list[Outlier]()
     for name, (statistic, off_px) in tested.items():
-        limit = fine if len(statistic) >= DEGREES[-1][0] else GROSS * _typical(statistic)
+        limit = fine if len(statistic) >= DEGREES[-1][0] else FAR * at_least_stated(statistic)
         bad = statistic > limit
         if not bad.any() or bad.mean() > MANY:
             continue
@@ -85,14 +85,9 @@ def wrong_points(places_m: FloatArray, pixels_px: FloatArray, sigma_px: FloatArr
     scale = max(float(np.abs(places_m - middle).max()), 1e-9)
     sigma = np.hypot(sigma_px, POLYNOMIAL_PX)
     statistic, _ = off_smooth((places_m - middle) / scale, pixels_px, sigma, degree)
-    return np.asarray(statistic > GROSS * _typical(statistic))
+    return np.asarray(statistic > FAR * at_least_stated(statistic))
 
 
 def _degree(dots: int) -> int:
     """Of the polynomial for so many dots; 0 if they are too few."""
     return next((degree for fewest, degree in (*DEGREES, *FEWER) if dots >= fewest), 0)
-
-
-def _typical(statistic: FloatArray) -> float:
-    """By how much the typical statistic is larger than it should be; at least 1."""
-    return max(1.0, typical_scale(statistic))
