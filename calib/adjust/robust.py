@@ -10,15 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from scipy.special import chdtrc
 
 from calib.adjust.adjustment import HUBER, Adjustment
-from calib.adjust.goodness import Component, found_sigmas, variance_components
-from calib.adjust.outliers import judge
+from calib.adjust.goodness import Component, found_sigmas, goodness, variance_components
+from calib.adjust.outliers import judge, name_outliers
 from calib.adjust.scatter import with_scales
 from calib.adjust.solver import Minimum, Normal, covariance_of, minimise
 from calib.adjust.terms import ImageTerm, StationTerm, scattered_images, widened_images
+from calib.adjust.uncertainty import open_directions
 from calib.adjust.unknowns import Estimate
 from calib.errors import CalibError
 from calib.geometry.rigid import FloatArray
@@ -81,6 +84,25 @@ class Weighed:
     def factors(self) -> dict[str, float]:
         """By kind what stated sigmas count times."""
         return {c.kind: c.weighed for c in self.components}
+
+    def part(self, *kinds: str) -> FloatArray:
+        """Return the covariance of the numbers of some kinds of unknowns, the kinds in this order."""
+        numbers = self.problem.unknowns.of_kinds(*kinds)
+        return np.asarray(self.covariance[np.ix_(numbers, numbers)])
+
+    def judged_fields(self, stated: tuple[Adjustment, Minimum[Estimate]]) -> dict[str, Any]:
+        """Return the fields of a `FittedRig` that say how good it is, chi-square by the ``stated`` sigmas."""
+        problem, fit = stated
+        covariance = covariance_of(fit.normal.matrix, problem.weak)
+        chi2, freedom = goodness(problem, fit.state, covariance)
+        return {
+            "chi2": chi2,
+            "degrees_of_freedom": freedom,
+            "chi2_probability": float(chdtrc(freedom, chi2)) if freedom > 0 else float("nan"),
+            "components": self.components,
+            "outliers": name_outliers(self.problem, self.fit.state, self.covariance, self.images),
+            "degenerate": open_directions(self.problem, self.part("camera", "mast")),
+        }
 
 
 def weigh(cleaned: Cleaned, *, narrows: bool = True) -> Weighed:

@@ -9,8 +9,15 @@ from typing import Any
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
-from calib.adjust.result import Calibration, Degenerate, FittedRig, ImageResiduals, StationResidual
-from calib.adjust.terms import ImageTerm
+from calib.adjust.result import (
+    Calibration,
+    Degenerate,
+    FittedRig,
+    ImageResiduals,
+    StationResidual,
+    rig_of,
+)
+from calib.adjust.terms import ImageTerm, lens_notes
 from calib.adjust.unknowns import MAST, Estimate
 from calib.geometry.covariance import pixel_rates
 from calib.geometry.landing import landing_rates
@@ -64,6 +71,52 @@ def image_residuals(
             )
         )
     return tuple(found)
+
+
+def fitted_fields(
+    survey: Survey,
+    problem: Adjustment,
+    state: Estimate,
+    covariance: FloatArray,
+    images: tuple[ImageResiduals, ...],
+    kinds: Sequence[str],
+    notes: Iterable[str],
+) -> dict[str, Any]:
+    """Return the fields of a `FittedRig` that follow from a state and the covariance of the numbers of its
+    ``kinds`` of unknowns."""
+    rig, names = rig_of(survey, state), tuple(problem.values(state, *kinds))
+    sigma = sigma_by_key(rig, names, covariance)
+    return {
+        "rig": rig,
+        "parameter_names": names,
+        "covariance": covariance,
+        "sigma": sigma,
+        "rms_px": rms_by_camera(images),
+        "images": images,
+        "notes": (*notes, *lens_notes(rig, sigma)),
+        "rover_from_board": state.rover_from_board,
+    }
+
+
+def surveyed_fields(
+    survey: Survey,
+    problem: Adjustment,
+    state: Estimate,
+    covariance: FloatArray,
+    images: tuple[ImageResiduals, ...],
+    notes: Iterable[str],
+) -> dict[str, Any]:
+    """Return the same of a survey's `Calibration`; the covariance is of mast and cameras."""
+    kinds = ("mast", "camera")
+    return {
+        **fitted_fields(survey, problem, state, covariance, images, kinds, notes),
+        "estimate": np.array(list(problem.values(state, *kinds).values())),
+        "check_rms_px": check_rms(survey, state, images),
+        "unseen_clicks": unseen_clicks(survey, state),
+        "station": station_residuals(problem, state),
+        "rover_from_station": state.rover_from_station,
+        "prisms_in_rover_m": state.prisms_in_rover_m,
+    }
 
 
 def _seen_from(problem: Adjustment, state: Estimate, term: ImageTerm) -> tuple[FloatArray, FloatArray]:

@@ -24,18 +24,10 @@ import numpy as np
 
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.outliers import Outlier
-from calib.adjust.result import Calibration, ImageResiduals, rig_of
+from calib.adjust.result import Calibration, ImageResiduals
 from calib.adjust.solver import covariance_of, minimise
-from calib.adjust.terms import ImageTerm, StationTerm, lens_notes
-from calib.adjust.uncertainty import (
-    check_rms,
-    image_residuals,
-    open_directions,
-    rms_by_camera,
-    sigma_by_key,
-    station_residuals,
-    unseen_clicks,
-)
+from calib.adjust.terms import ImageTerm, StationTerm
+from calib.adjust.uncertainty import image_residuals, open_directions, surveyed_fields
 from calib.adjust.unknowns import MAST, Estimate
 from calib.calibrate.starts.mast import References
 from calib.calibrate.starts.survey import Start, mast_fit, start_values
@@ -81,33 +73,18 @@ def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
         np.sum((i.residuals_px[i.used] / i.sigma_px[i.used, None]) ** 2) for i in images if i.used.any()
     ]
     count = sum(2 * int(i.used.sum()) for i in images)
-    rig, values = rig_of(survey, state), problem.values(state, "mast", "camera")
     place = {number: i for i, number in enumerate(problem.unknowns.of_kinds("camera", "mast").tolist())}
     order = [place[number] for number in problem.unknowns.of_kinds("mast", "camera").tolist()]
-    covariance = covariance[np.ix_(order, order)]
-    sigma = sigma_by_key(rig, tuple(values), covariance)
+    covariance, notes = covariance[np.ix_(order, order)], (*start.notes, *_bent_notes(start))
     return Calibration(
+        **surveyed_fields(survey, problem, state, covariance, images, notes),
         method="paper",
         mast_parameters=mast_parameters,
-        rig=rig,
-        parameter_names=tuple(values),
-        estimate=np.array(list(values.values())),
-        covariance=covariance,
-        sigma=sigma,
-        rms_px=rms_by_camera(images),
-        check_rms_px=check_rms(survey, state, images),
-        unseen_clicks=unseen_clicks(survey, state),
         outliers=(*start.poses.blunders, *_left_out(images, start), *start.wrong),
         degenerate=open_directions(problem, mast_alone),
-        notes=(*start.notes, *_bent_notes(start), *lens_notes(rig, sigma)),
         chi2=float(sum(in_sigmas)),
-        degrees_of_freedom=float(count - len(values)),
+        degrees_of_freedom=float(count - len(order)),
         chi2_probability=float("nan"),
-        images=images,
-        station=station_residuals(problem, state),
-        rover_from_station=state.rover_from_station,
-        rover_from_board=state.rover_from_board,
-        prisms_in_rover_m=state.prisms_in_rover_m,
         seconds=time.perf_counter() - began,
     )
 

@@ -17,21 +17,12 @@ from calib.adjust.goodness import goodness
 from calib.adjust.gross import chance_limit
 from calib.adjust.hypotheses import Finding, explaining, find_change, survey_findings
 from calib.adjust.left_out import left_out_boards
-from calib.adjust.outliers import name_outliers
-from calib.adjust.result import Calibration, rig_of
+from calib.adjust.result import Calibration
 from calib.adjust.robust import Cleaned, SurveyNotFitted, Weighed, weigh, without_blunders
 from calib.adjust.scatter import own_scales
-from calib.adjust.solver import Minimum, covariance_of, minimise
-from calib.adjust.terms import lens_notes, with_kept
-from calib.adjust.uncertainty import (
-    check_rms,
-    image_residuals,
-    open_directions,
-    rms_by_camera,
-    sigma_by_key,
-    station_residuals,
-    unseen_clicks,
-)
+from calib.adjust.solver import Minimum, minimise
+from calib.adjust.terms import with_kept
+from calib.adjust.uncertainty import image_residuals, surveyed_fields
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.refusals import refuse_far, refuse_unsettled
 from calib.calibrate.starts.survey import Start, start_values
@@ -176,10 +167,8 @@ def _calibration(
 ) -> Calibration:
     """Put together what the fit says, with the stated sigmas and with those that were found."""
     problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
-    rig_numbers = problem.unknowns.of_kinds("camera", "mast")
     notes = list(start.notes)
-    order = problem.unknowns.of_kinds("mast", "camera")
-    mine = covariance[np.ix_(order, order)]
+    mine = weighed.part("mast", "camera")
     chi_square, freedom = goodness(problem, state, covariance)
     if freedom > 0 and chdtrc(freedom, chi_square) < Level.STATED:
         notes.append(
@@ -187,48 +176,22 @@ def _calibration(
             f"(chi-square {chi_square:.0f} for {freedom:.0f}); uncertainties are scaled up by as much"
         )
         mine = mine * chi_square / freedom
-    stated, first = cleaned.as_stated()
-    notes += _prism_notes(stated, first.state, mast_parameters)
-    chi_square, freedom = goodness(stated, first.state, covariance_of(first.normal.matrix, stated.weak))
-    rig, values = rig_of(survey, state), problem.values(state, "mast", "camera")
-    sigma = sigma_by_key(rig, tuple(values), mine)
-    notes += lens_notes(rig, sigma)
+    stated = cleaned.as_stated()
+    notes += _prism_notes(stated[0], stated[1].state, mast_parameters)
     scatter = {t.name: t.scatter for t in weighed.images} | own_scales(
         problem, state, start.checks, weighed.factors, survey.sigma.dot_px
     )
     images = image_residuals(survey, problem, state, start.images, start.checks, scatter)
+    judged = weighed.judged_fields(stated)
+    checks = tuple(f"image {t.name} dot " for t in start.checks)
+    judged["outliers"] += tuple(o for o in start.wrong if o.name.startswith(checks))
     return Calibration(
+        **surveyed_fields(survey, problem, state, mine, images, notes),
+        **judged,
         method="joint",
         mast_parameters=mast_parameters,
-        rig=rig,
-        parameter_names=tuple(values),
-        estimate=np.array(list(values.values())),
-        covariance=mine,
-        sigma=sigma,
-        rms_px=rms_by_camera(images),
-        check_rms_px=check_rms(survey, state, images),
-        unseen_clicks=unseen_clicks(survey, state),
-        outliers=(
-            *name_outliers(problem, state, covariance, weighed.images),
-            *(
-                o
-                for o in start.wrong
-                if o.name.startswith(tuple(f"image {t.name} dot " for t in start.checks))
-            ),
-        ),
-        degenerate=open_directions(problem, covariance[np.ix_(rig_numbers, rig_numbers)]),
-        notes=tuple(notes),
-        chi2=chi_square,
-        degrees_of_freedom=freedom,
-        chi2_probability=float(chdtrc(freedom, chi_square)) if freedom > 0 else float("nan"),
-        images=images,
-        station=station_residuals(problem, state),
-        components=weighed.components,
         wider=(*_left_out_for(change), *_wider(cleaned, weighed)),
         left_out_boards=left_out_boards(problem, weighed.fit, covariance, ["mast"]),
-        rover_from_station=state.rover_from_station,
-        rover_from_board=state.rover_from_board,
-        prisms_in_rover_m=state.prisms_in_rover_m,
         seconds=time.perf_counter() - began,
     )
 

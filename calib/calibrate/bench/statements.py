@@ -7,24 +7,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtrc
 
 from calib.adjust.adjustment import PAN_TILT, Adjustment
 from calib.adjust.goodness import goodness
 from calib.adjust.hypotheses import find_drifts
 from calib.adjust.left_out import left_out_boards
 from calib.adjust.model_terms import TERM_KINDS, Tested, candidate_terms, choose_terms, moves_px, term_motions
-from calib.adjust.outliers import name_outliers
-from calib.adjust.result import BenchCalibration, CheckExpected, ImageResiduals, TermGain, rig_of
+from calib.adjust.result import BenchCalibration, CheckExpected, ImageResiduals, TermGain
 from calib.adjust.robust import Weighed
 from calib.adjust.scatter import own_scales, print_error_m
 from calib.adjust.solver import Minimum, covariance_of
-from calib.adjust.terms import ImageTerm, lens_notes, scattered_images
-from calib.adjust.uncertainty import image_residuals, open_directions, rms_by_camera, sigma_by_key
+from calib.adjust.terms import ImageTerm, scattered_images
+from calib.adjust.uncertainty import fitted_fields, image_residuals, rms_by_camera
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.bench.problem import BenchProblem
 from calib.calibrate.starts.wrong_dots import wrong_points
-from calib.geometry.covariance import RigCovariance
 from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import Level, chance_of_sum, rare_sum
 
@@ -59,48 +56,31 @@ def bench_calibration(
 ) -> BenchCalibration:
     """Put together what the fit says; chi-square is that of the stated sigmas."""
     problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
-    first = stated[1]
-    total, freedom = goodness(stated[0], first.state, covariance_of(first.normal.matrix, stated[0].weak))
     for one in weighed.components:
         if one.wrong or one.generous:
             bench.notes.append(
                 f"{one.kind} scatter by {one.factor:.2f} ± {one.factor_sigma:.2f} times the stated "
                 "sigma; they count with that"
             )
-    # A parameter that is not seen keeps what is weakly known of it, and is reported as open.
-    rig, mine = rig_of(bench.survey, state), problem.unknowns.of_kinds("mast", "joints", "camera")
-    known = RigCovariance(tuple(problem.names[i] for i in mine), covariance[np.ix_(mine, mine)])
-    sigma = sigma_by_key(rig, known.names, known.covariance)
-    rig_numbers = problem.unknowns.of_kinds("camera", "mast")
     order_px = bench.survey.sigma.corner_px
     own = own_scales(problem, state, bench.terms.checks, weighed.factors, order_px)
     checks = scattered_images(bench.terms.checks, own)
     scatter = {t.name: t.scatter for t in (*weighed.images, *checks)}
     images = image_residuals(bench.survey, problem, state, bench.terms.images, bench.terms.checks, scatter)
     checked = _checked(images, bench.terms.checks)
+    # A parameter that is not seen keeps what is weakly known of it, and is reported as open.
+    kinds = ("mast", "joints", "camera")
     return BenchCalibration(
-        rig=rig,
-        parameter_names=known.names,
-        covariance=known.covariance,
-        sigma=sigma,
+        **fitted_fields(bench.survey, problem, state, weighed.part(*kinds), images, kinds, bench.notes),
+        **weighed.judged_fields(stated),
         terms=_gains(bench, candidates, chosen, tests, problem, state),
-        rms_px=rms_by_camera(images),
         check_rms_px=rms_by_camera(checked),
         checks=_expected(checks, weighed, checked),
-        images=images,
-        outliers=name_outliers(problem, state, covariance, weighed.images),
-        degenerate=open_directions(problem, covariance[np.ix_(rig_numbers, rig_numbers)]),
         gauges=_gauges(bench, chosen),
-        notes=(*bench.notes, *lens_notes(rig, sigma)),
-        chi2=total,
-        degrees_of_freedom=freedom,
-        chi2_probability=float(chdtrc(freedom, total)) if freedom > 0 else float("nan"),
-        placements=left_out_boards(problem, weighed.fit, covariance, ["mast", "joints", "camera"]),
+        placements=left_out_boards(problem, weighed.fit, covariance, kinds),
         drifts=find_drifts(problem, state),
-        components=weighed.components,
         joint_rad=problem.joint_rad,
         inexact_m=print_error_m(problem, state),
-        rover_from_board=state.rover_from_board,
         bows_m=state.bows_m,
         seconds=time.perf_counter() - began,
     )
