@@ -16,11 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
+from calib.adjust.goodness import goodness
+from calib.adjust.solver import Minimum, covariance_of
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rig import AXIS_NAMES, JOINTS_NAMES, MAST_NAMES
@@ -101,84 +103,120 @@ def entering_together(terms: Iterable[ModelTerm]) -> list[tuple[str, ...]]:
     return [tuple(group) for group in groups.values()]
 
 
-@dataclass(frozen=True)
-class Tested:
-    """A term beside those that were chosen: what it gains, and the chance of that were it nothing; a first
-    harmonic before the second one, a second one beyond the first. ``hidden_px`` is what its sigma moves
-    pixels by, rms."""
+@dataclass(frozen=True, eq=False)
+class TermGain:
+    """A part of the model that enters if the pictures ask for it, or cannot exclude one that would matter.
 
+    Attributes
+    ----------
+    term
+        What it is; its name is ``pan harmonic 1``, ``tilt backlash``, ``axis offset``, ``bow of b1``.
+    values, sigma
+        What the fit beside the other terms says its parameters are (k,), in the units of their names.
+    chi2, chance
+        By how much the weighted sum of squares is lower with it, and the chance of that were it nothing: of a
+        first harmonic before the second one, of a second one beyond the first.
+    hidden_px
+        What its sigma moves pixels by, rms.
+    moves_px
+        Rms over all corners of what it moves pixels by.
+    entered
+        Whether it is part of the model.
+    """
+
+    term: ModelTerm
+    values: FloatArray
+    sigma: FloatArray
     chi2: float
     chance: float
     hidden_px: float
-    values: FloatArray
-    sigma: FloatArray
+    moves_px: float
+    entered: bool = True
+
+    @property
+    def name(self) -> str:
+        """The term's name for people."""
+        return self.term.name
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Its numbers' names (k,)."""
+        return self.term.parameters
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the term as JSON or YAML."""
+        return {
+            "name": self.name,
+            "entered": self.entered,
+            "values": dict(zip(self.parameters, self.values.tolist(), strict=True)),
+            "sigma": dict(zip(self.parameters, self.sigma.tolist(), strict=True)),
+            "chi2": self.chi2,
+            "chance": self.chance,
+            "moves_px": self.moves_px if self.entered else None,
+            "sentence": self.sentence,
+        }
+
+    @property
+    def sentence(self) -> str:
+        """The term in words."""
+        size = float(np.linalg.norm(self.values))
+        spread = float(np.sqrt(np.mean(self.sigma**2)))
+        unit = "mm" if self.term.kind in ("offset", "bow") else "mrad"
+        value = f"{self.name}: {1e3 * size:.2f} ± {1e3 * spread:.2f} {unit}"
+        if not self.entered:
+            return f"{value}, not significant (chi-square {self.chi2:.1f}): left out"
+        if self.chance > Level.THREE_SIGMAS and self.term.kind != "harmonic 2":
+            return f"{value}, chi-square {self.chi2:.1f}: not significant, but the pictures cannot exclude it"
+        return f"{value}, moves pixels by {self.moves_px:.2f} px rms, lowers chi-square by {self.chi2:.0f}"
 
 
 def choose_terms(
-    terms: Mapping[str, ModelTerm],
-    names: Sequence[str],
-    values: Mapping[str, float],
-    covariance: FloatArray,
-    scale: float,
-    freedom: float,
-    motions: Mapping[tuple[str, ...], FloatArray],
-    enters: float = Level.THREE_SIGMAS,
-) -> tuple[tuple[str, ...], dict[str, Tested]]:
-    """Return the terms that are needed, and how each one does beside these.
-
-    Parameters
-    ----------
-    terms
-        By name; those that were fitted.
-    names, covariance
-        Of the whole fit, stated sigmas taken as they are.
-    values
-        Of the terms' parameters at the fit.
-    scale, freedom
-        The fit's chi-square over its degrees of freedom, and these.
-    motions
-        By group (`entering_together`) the matrix (k, k), px², that gives the mean square of what its
-        numbers move pixels by.
-    enters
-        A group enters if so large a gain, were it nothing, had at most this chance.
-    """
-    at = {name: i for i, name in enumerate(names)}
-    places = {name: [at[number] for number in term.parameters] for name, term in terms.items()}
-    everything = [i for place in places.values() for i in place]
-    of_terms = {i: k for k, i in enumerate(everything)}
-    x = np.array([values[names[i]] for i in everything])
-    c = covariance[np.ix_(everything, everything)]
+    problem: Adjustment, fit: Minimum[Estimate], terms: Mapping[str, ModelTerm]
+) -> tuple[tuple[str, ...], dict[str, TermGain]]:
+    """Return which of the terms that were fitted are needed, and how each one does beside these."""
+    covariance = covariance_of(fit.normal.matrix, problem.weak)
+    total, freedom = goodness(problem, fit.state, covariance)
+    freedom = max(freedom, 1.0)
+    scale = total / freedom
+    values = problem.values(fit.state, *TERM_KINDS)
+    places, numbers = dict[str, list[int]](), list[str]()
+    for name, term in terms.items():
+        places[name] = list(range(len(numbers), len(numbers) + len(term.parameters)))
+        numbers += term.parameters
+    at = [problem.names.index(number) for number in numbers]
+    x, c = np.array([values[number] for number in numbers]), covariance[np.ix_(at, at)]
+    motion = _motion(problem, fit.state, terms, places, at)
 
     def is_play(group: Sequence[str]) -> bool:
         return terms[group[0]].kind == "backlash"
 
-    def told(group: Sequence[str], beside: Sequence[str]) -> Tested:
+    def tested(group: Sequence[str], beside: Sequence[str]) -> TermGain:
         """The test of a group in the model of itself and some other terms."""
-        mine = [of_terms[i] for term in group for i in places[term]]
-        rest = [term for term in places if term not in group and term not in beside]
-        gone = [of_terms[i] for term in rest for i in places[term]]
-        here, spread = x[mine], c[np.ix_(mine, mine)]
+        mine = [i for term in group for i in places[term]]
+        gone = [i for term, own in places.items() if term not in group and term not in beside for i in own]
+        value, spread, moves = x[mine], c[np.ix_(mine, mine)], motion[np.ix_(mine, mine)]
         if gone:
             pull = c[np.ix_(mine, gone)] @ np.linalg.inv(c[np.ix_(gone, gone)])
-            here, spread = here - pull @ x[gone], spread - pull @ c[np.ix_(gone, mine)]
-        gain = float(here @ np.linalg.solve(spread, here))
+            value, spread = value - pull @ x[gone], spread - pull @ c[np.ix_(gone, mine)]
+        gain = float(value @ np.linalg.solve(spread, value))
         # Play is a width: what comes out negative is none.
-        negative = is_play(group) and here[0] <= 0.0
+        negative = is_play(group) and value[0] <= 0.0
         likely = 1.0 if negative else chance(gain, len(mine), scale, freedom)
-        motion = motions.get(tuple(group))
-        hidden = (
-            0.0 if motion is None else float(np.sqrt(max(np.sum(motion * spread) * max(scale, 1.0), 0.0)))
+        hidden, moved = (
+            float(np.sqrt(max(square, 0.0)))
+            for square in (np.sum(moves * spread) * max(scale, 1.0), value @ moves @ value)
         )
-        return Tested(gain, likely, hidden, here, np.sqrt(np.maximum(np.diag(spread), 0.0)))
+        sigma = np.sqrt(np.maximum(np.diag(spread), 0.0))
+        return TermGain(terms[group[0]], value, sigma, gain, likely, hidden, moved)
 
     kept = entering_together(terms.values())
     while kept:
         beside = [term for group in kept for term in group]
-        tests = {group: told(group, beside) for group in kept}
+        tests = {group: tested(group, beside) for group in kept}
         needless = [
             group
             for group, test in tests.items()
-            if test.chance > enters and (test.hidden_px < HIDDEN_PX or is_play(group))
+            if test.chance > Level.THREE_SIGMAS and (test.hidden_px < HIDDEN_PX or is_play(group))
         ]
         if not needless:
             break
@@ -186,10 +224,11 @@ def choose_terms(
     chosen = tuple(term for term in terms if any(term in group for group in kept))
     found = {}
     for name, term in terms.items():
-        found[name] = told((name,), chosen)
+        found[name] = tested((name,), chosen)
         if term.kind == "harmonic 1":  # what it gains alone, before the second one
-            alone = told((name,), [other for other in chosen if terms[other].group != term.group])
+            alone = tested((name,), [other for other in chosen if terms[other].group != term.group])
             found[name] = replace(found[name], chi2=alone.chi2, chance=alone.chance)
+        found[name] = replace(found[name], entered=name in chosen)
     return chosen, found
 
 
@@ -203,55 +242,30 @@ def axis_numbers(chosen: Iterable[str]) -> list[int]:
     return sorted(number for term in chosen if term in AXIS_TERMS for number in AXIS_TERMS[term].numbers)
 
 
-def moves_px(
+def _motion(
     problem: Adjustment,
     state: Estimate,
     terms: Mapping[str, ModelTerm],
-    values: Mapping[str, float],
-) -> dict[str, float]:
-    """Return the rms over all corners of what each term's ``values`` move pixels by, all else held."""
-    at = {name: {problem.names.index(n): values[n] for n in term.parameters} for name, term in terms.items()}
-    total, count = dict.fromkeys(terms, 0.0), 0
-    for image, block in problem.blocks(state):
-        if not isinstance(image, ImageTerm):
-            continue
-        sigma = np.repeat(image.sigma_px[image.keep], 2)
-        columns = block.columns.tolist()
-        for term, mine in at.items():
-            step = np.array([mine.get(i, 0.0) for i in columns])
-            total[term] += float(np.sum((sigma * (block.jacobian @ step)) ** 2))
-        count += len(sigma)
-    return {term: float(np.sqrt(square / max(count, 1))) for term, square in total.items()}
+    places: Mapping[str, Sequence[int]],
+    at: Sequence[int],
+) -> FloatArray:
+    """The matrix (k, k), px², of how the terms' numbers, ``at`` these among all, move pixels.
 
-
-def term_motions(
-    problem: Adjustment, state: Estimate, terms: Mapping[str, ModelTerm]
-) -> dict[tuple[str, ...], FloatArray]:
-    """Return by group of terms (`entering_together`) the matrix (k, k), px², of how they move pixels.
-
-    With numbers x of a group, xᵀ M x is the mean square of the motion. What a joint's harmonics do to all
-    pictures alike is no motion: another zero of the joint, which is none's to know, does the same.
+    With numbers x of a group of terms, xᵀ M x is the mean square of the motion. What a joint's harmonics do
+    to all pictures alike is no motion: another zero of the joint, which pictures leave open, does the same.
     """
-    names = {
-        group: [n for t in group for n in terms[t].parameters] for group in entering_together(terms.values())
-    }
-    found = {group: np.zeros((len(mine), len(mine))) for group, mine in names.items()}
-    count = 0
+    found, count = np.zeros((len(at), len(at))), 0
     for image, block in problem.blocks(state):
-        if not isinstance(image, ImageTerm):
-            continue
-        sigma = np.repeat(image.sigma_px[image.keep], 2)
-        count += len(sigma)
-        place = {problem.names[i]: k for k, i in enumerate(block.columns.tolist())}
-        for group, mine in names.items():
-            if group[0] not in JOINT_TERMS and set(mine) <= set(place):
-                moved = sigma[:, None] * block.jacobian[:, [place[n] for n in mine]]
-                found[group] += moved.T @ moved
-    for group in names:
+        if isinstance(image, ImageTerm):
+            rates = np.zeros((len(block.residual), len(problem.names)))
+            rates[:, block.columns] = np.repeat(image.sigma_px[image.keep], 2)[:, None] * block.jacobian
+            found += rates[:, at].T @ rates[:, at]
+            count += len(rates)
+    found /= max(count, 1)
+    for group in entering_together(terms.values()):
         if group[0] in JOINT_TERMS:
-            found[group] = _by_joint(problem, state, [JOINT_TERMS[term] for term in group])
-        else:
-            found[group] /= max(count, 1)
+            mine = [i for term in group for i in places[term]]
+            found[np.ix_(mine, mine)] = _by_joint(problem, state, [terms[term] for term in group])
     return found
 
 

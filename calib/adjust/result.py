@@ -11,12 +11,11 @@ import numpy as np
 from calib.adjust.goodness import Component
 from calib.adjust.hypotheses import Finding
 from calib.adjust.left_out import LeftOutBoard
-from calib.adjust.model_terms import ModelTerm
+from calib.adjust.model_terms import TermGain
 from calib.adjust.outliers import Outlier
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import FloatArray, Rigid
-from calib.geometry.significance import Level
 from calib.survey.records import Click, Survey
 
 HELD_FIXED = (
@@ -168,60 +167,6 @@ class Calibration(FittedRig):
     wider: tuple[Finding, ...] = ()
     left_out_boards: tuple[LeftOutBoard, ...] = ()
     unseen_clicks: tuple[Click, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class TermGain:
-    """A part of the model that enters if the pictures ask for it, or cannot exclude one that would matter.
-
-    Attributes
-    ----------
-    term
-        What it is; its name is ``pan harmonic 1``, ``tilt backlash``, ``axis offset``, ``bow of b1``.
-    entered
-        Whether it is part of the model.
-    values
-        What the fit with it says its parameters are (k,), in the units of their names.
-    sigma
-        (k,) of these.
-    chi2
-        By how much the weighted sum of squares is lower with it than without it.
-    chance
-        Of so large a gain were it nothing.
-    moves_px
-        Rms over all corners of what it moves pixels by; nan where it did not enter.
-    """
-
-    term: ModelTerm
-    entered: bool
-    values: FloatArray
-    sigma: FloatArray
-    chi2: float
-    chance: float
-    moves_px: float
-
-    @property
-    def name(self) -> str:
-        """The term's name for people."""
-        return self.term.name
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Its numbers' names (k,)."""
-        return self.term.parameters
-
-    @property
-    def sentence(self) -> str:
-        """The term in words."""
-        size = float(np.linalg.norm(self.values))
-        spread = float(np.sqrt(np.mean(self.sigma**2)))
-        milli = "mm" if self.term.kind in ("offset", "bow") else "mrad"
-        told = f"{self.name}: {1e3 * size:.2f} ± {1e3 * spread:.2f} {milli}"
-        if not self.entered:
-            return f"{told}, not significant (chi-square {self.chi2:.1f}): left out"
-        if self.chance > Level.THREE_SIGMAS and self.term.kind != "harmonic 2":
-            return f"{told}, chi-square {self.chi2:.1f}: not significant, but the pictures cannot exclude it"
-        return f"{told}, moves pixels by {self.moves_px:.2f} px rms, lowers chi-square by {self.chi2:.0f}"
 
 
 class CheckExpected(NamedTuple):

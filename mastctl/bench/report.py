@@ -144,7 +144,7 @@ def _terms(fit: BenchCalibration) -> Table:
                 term.name,
                 "in" if term.entered else "left out",
                 f"{1e3 * size:.2f} ± {1e3 * spread:.2f} {'mm' if length else 'mrad'}",
-                f"{term.moves_px:.2f}" if np.isfinite(term.moves_px) else "",
+                f"{term.moves_px:.2f}" if term.entered else "",
                 f"{term.chi2:.1f}",
             ]
         )

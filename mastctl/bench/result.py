@@ -8,7 +8,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from calib.adjust.result import BenchCalibration, TermGain
+from calib.adjust.result import BenchCalibration
 from calib.calibrate.bench.problem import BenchOptions
 from calib.errors import BadFile
 from calib.files.mast_file import StoredRig, joint_keys
@@ -96,7 +96,7 @@ class BenchDone:
             "chi2": finite(fit.chi2),
             "degrees_of_freedom": finite(fit.degrees_of_freedom),
             "sigmas_found": components_told(self.survey, fit),
-            "terms": [term_told(term) for term in fit.terms],
+            "terms": [term.as_json() for term in fit.terms],
             "bows_m": {board: bow.tolist() for board, bow in fit.bows_m.items()},
             "degenerate": [
                 {"parameters": list(d.parameters), "sentence": d.sentence} for d in fit.degenerate
@@ -313,24 +313,10 @@ def _reported(done: BenchDone, folder: Path | None, former: Rig | None, where: W
         ) from None
 
 
-def term_told(term: TermGain) -> dict[str, Any]:
-    """Return a term of the model as JSON or YAML."""
-    return {
-        "name": term.name,
-        "entered": term.entered,
-        "values": dict(zip(term.parameters, term.values.tolist(), strict=True)),
-        "sigma": dict(zip(term.parameters, term.sigma.tolist(), strict=True)),
-        "chi2": float(term.chi2),
-        "chance": float(term.chance),
-        "moves_px": finite(term.moves_px),
-        "sentence": term.sentence,
-    }
-
-
 def with_bench_fit(calibration: BenchCalibration, survey: Survey, verdict: CalibrationVerdict) -> Rig:
     """Return `with_fit` of a bench's calibration."""
     own = {
-        "terms": [term_told(term) for term in calibration.terms],
+        "terms": [term.as_json() for term in calibration.terms],
         "bows_m": {board: bow.tolist() for board, bow in calibration.bows_m.items()},
         "degenerate": [direction.sentence for direction in calibration.degenerate],
         "verdict": verdict.told(),

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from calib.adjust.adjustment import HUBER, Adjustment
 from calib.adjust.gross import gross_limit
 from calib.adjust.hypotheses import Finding, find_change, find_drifts
-from calib.adjust.model_terms import Tested
+from calib.adjust.model_terms import TermGain, candidate_terms, choose_terms
 from calib.adjust.result import BenchCalibration
 from calib.adjust.robust import SurveyNotFitted, judged_again, weigh, without_blunders
 from calib.adjust.scatter import with_scales
@@ -27,7 +27,7 @@ from calib.adjust.solver import Minimum, minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.bench.problem import BenchOptions, BenchProblem, best_cut, without_terms
-from calib.calibrate.bench.statements import bench_calibration, choose
+from calib.calibrate.bench.statements import bench_calibration
 from calib.calibrate.refusals import refuse_far, refuse_unsettled
 from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged
 from calib.survey.records import Survey
@@ -78,8 +78,8 @@ def fit_bench(survey: Survey, options: BenchOptions | None = None) -> BenchCalib
 
 def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     """Fit everything, choose, fit again, and put together what it says."""
-    named = chosen = tuple(bench.options.terms or ())
-    tests: dict[str, Tested] = {}
+    chosen = tuple(bench.options.terms or ())
+    tests: dict[str, TermGain] = {}
     every = bench.candidates()
     bench, problem, start = _look_for_changes(bench, every)
     _refuse_far(bench, problem, start)  # before blunders are looked for one by one where nothing fits
@@ -89,8 +89,9 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
         problem = bench.problem(chosen, start).with_terms(problem.images, ())
     cleaned = without_blunders(problem, start, bench.terms.images, bench.survey.sigma.corner_px)
     if chooses:
-        start, named = cleaned.fit.state, every
-        chosen, tests = choose(bench, every, cleaned.problem, cleaned.fit)
+        start, terms = cleaned.fit.state, candidate_terms(bench.boards)
+        candidates = {name: terms[name] for name in every}
+        chosen, tests = choose_terms(cleaned.problem, cleaned.fit, candidates)
         start = without_terms(start, set(every) - set(chosen))
         last = bench.problem(chosen, start).with_terms(cleaned.problem.images, ())
         cleaned = judged_again(cleaned, last, start)
@@ -99,7 +100,7 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     # counts and the least of corners are known; what a simulated or lucky bench has less is no knowledge
     weighed = weigh(cleaned, narrows=False)
     refuse_unsettled(weighed.fit, "pan and tilt angles and distances")
-    return bench_calibration(bench, cleaned.as_stated(), weighed, named, chosen, tests, began)
+    return bench_calibration(bench, cleaned.as_stated(), weighed, chosen, tests, began)
 
 
 def _look_for_changes(

@@ -9,14 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from calib.adjust.adjustment import PAN_TILT, Adjustment
-from calib.adjust.goodness import goodness
 from calib.adjust.hypotheses import find_drifts
 from calib.adjust.left_out import left_out_boards
-from calib.adjust.model_terms import TERM_KINDS, Tested, candidate_terms, choose_terms, moves_px, term_motions
-from calib.adjust.result import BenchCalibration, CheckExpected, ImageResiduals, TermGain
+from calib.adjust.model_terms import TermGain, candidate_terms, choose_terms
+from calib.adjust.result import BenchCalibration, CheckExpected, ImageResiduals
 from calib.adjust.robust import Weighed
 from calib.adjust.scatter import own_scales, print_error_m
-from calib.adjust.solver import Minimum, covariance_of
+from calib.adjust.solver import Minimum
 from calib.adjust.terms import ImageTerm, scattered_images
 from calib.adjust.uncertainty import fitted_fields, image_residuals, rms_by_camera
 from calib.adjust.unknowns import Estimate
@@ -26,32 +25,12 @@ from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import Level, chance_of_sum, rare_sum
 
 
-def choose(
-    bench: BenchProblem, candidates: Sequence[str], problem: Adjustment, fit: Minimum[Estimate]
-) -> tuple[tuple[str, ...], dict[str, Tested]]:
-    """The terms that are significant, and every term's test."""
-    covariance = covariance_of(fit.normal.matrix, problem.weak)
-    total, freedom = goodness(problem, fit.state, covariance)
-    every = candidate_terms(bench.boards)
-    values = problem.values(fit.state, *TERM_KINDS)
-    return choose_terms(
-        {term: every[term] for term in candidates},
-        problem.names,
-        values,
-        covariance,
-        total / max(freedom, 1.0),
-        max(freedom, 1.0),
-        term_motions(problem, fit.state, {term: every[term] for term in candidates}),
-    )
-
-
 def bench_calibration(
     bench: BenchProblem,
     stated: tuple[Adjustment, Minimum[Estimate]],
     weighed: Weighed,
-    candidates: Sequence[str],
     chosen: Sequence[str],
-    tests: Mapping[str, Tested],
+    tests: Mapping[str, TermGain],
     began: float,
 ) -> BenchCalibration:
     """Put together what the fit says; chi-square is that of the stated sigmas."""
@@ -73,7 +52,7 @@ def bench_calibration(
     return BenchCalibration(
         **fitted_fields(bench.survey, problem, state, weighed.part(*kinds), images, kinds, bench.notes),
         **weighed.judged_fields(stated),
-        terms=_gains(bench, candidates, chosen, tests, problem, state),
+        terms=_gains(bench, chosen, tests, weighed),
         check_rms_px=rms_by_camera(checked),
         checks=_expected(checks, weighed, checked),
         gauges=_gauges(bench, chosen),
@@ -138,29 +117,13 @@ def check_weights(weighed: Weighed, terms: Sequence[ImageTerm]) -> FloatArray:
 
 
 def _gains(
-    bench: BenchProblem,
-    candidates: Sequence[str],
-    chosen: Sequence[str],
-    tests: Mapping[str, Tested],
-    problem: Adjustment,
-    state: Estimate,
+    bench: BenchProblem, chosen: Sequence[str], tests: Mapping[str, TermGain], weighed: Weighed
 ) -> tuple[TermGain, ...]:
-    """Every term with what it gains."""
+    """Every term with what it gains; those of the model beside one another."""
     every = candidate_terms(bench.boards)
-    _, now = choose(bench, chosen, problem, Minimum(state, problem.with_huber(None).normal(state), True, 0))
-    moves = moves_px(
-        problem, state, {term: every[term] for term in chosen}, problem.values(state, *TERM_KINDS)
-    )
-    found = []
-    for term in candidates:
-        test = now[term] if term in chosen else tests[term]
-        found.append(
-            TermGain(
-                every[term], term in chosen, test.values, test.sigma, test.chi2, test.chance,
-                moves.get(term, float("nan")),
-            )
-        )  # fmt: skip
-    return tuple(found)
+    _, gains = choose_terms(weighed.problem, weighed.fit, {name: every[name] for name in chosen})
+    entered = {name: replace(gain, entered=True) for name, gain in gains.items()}
+    return tuple({**tests, **entered}.values())
 
 
 def _gauges(bench: BenchProblem, chosen: Sequence[str]) -> tuple[str, ...]:
