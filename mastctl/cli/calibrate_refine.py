@@ -59,7 +59,7 @@ def _check_out(out: Path, read: list[Path]) -> None:
 
 def _document(proposal: Proposal, saved: StoredRig | None, previous: Path | None) -> dict[str, Any]:
     from mastctl.calibration.refined import pose_told
-    from mastctl.watch.handoffs import bias_told
+    from mastctl.watch.handoffs import bias_record
 
     return {
         "mast_file": None
@@ -77,7 +77,7 @@ def _document(proposal: Proposal, saved: StoredRig | None, previous: Path | None
         "refusals": {
             group: {"code": why.code, "message": str(why)} for group, why in proposal.refusals.items()
         },
-        "bias": [bias_told(one) for one in proposal.bias],
+        "bias": [bias_record(one) for one in proposal.bias],
         "handoffs": len(proposal.handoffs),
         "other_mast": proposal.other_mast,
     }

@@ -53,6 +53,7 @@ from mastctl.service.steering import Steering
 from mastctl.service.stopping import SocketStops, Stopping, state_faults
 from mastctl.service_manager import ServiceManager
 from mastctl.watch.handoffs import HandoffCheck, line_of
+from mastctl.watch.journal import JournalThread
 from mastctl.watch.metrics import Metrics
 from mastctl.watch.reference import SENTINEL_FOLDER
 from mastctl.watch.residuals import CalibrationHealth
@@ -99,12 +100,10 @@ class Service:
         The mast file in use, and the one before it.
     steering, jogs, stopping
         Where the head is sent, turned by hand, and stopped.
-    handoffs
-        What the track's hand-offs say of the mast file in use.
-    health
-        What the pointings' residuals say of it.
-    sentinel
-        What reference pictures, looked at again, say of it.
+    handoffs, health, sentinel
+        The drift watch: offsets of hand-offs, the verdict of residuals, and the result of reference images.
+    journals
+        The thread that reads and writes their files.
     entry, leases, audit, strangers
         Where each command passes, who steers, and what is recorded of it; of strangers' elsewhere.
     metrics
@@ -151,11 +150,12 @@ class Service:
         entries = self.latch.entries
         self.machine = StateMachine(clock, latch=self.latch.held, more_latched=entries[1:])
         publisher = self.machine.publisher
-        self.health = CalibrationHealth(self.folder.path, mast.stored)
+        self.journals = JournalThread(clock)
+        self.health = CalibrationHealth(self.folder.path, mast.stored, self.journals)
         self._open_head(mast)
         publisher.publish("track", "track", self.tracker.status)
         self.stop_threads = StopThreads()
-        self.handoffs = HandoffCheck(config.tracking.handoff_log, mast.stored.digest, clock)
+        self.handoffs = HandoffCheck(config.tracking.handoff_log, mast.stored.digest, clock, self.journals)
         self.recorder = Recorder(
             config.record,
             config.record.folder or self.folder.path / RECORDS_FOLDER,
@@ -186,7 +186,9 @@ class Service:
             hardware.kind == "simulated",
         )
         self.reports = Reports(self.folder.path, self.guide.runs)
-        self.sentinel = SentinelFindings(self.folder.path / SENTINEL_FOLDER, lambda: self.stored.digest)
+        self.sentinel = SentinelFindings(
+            self.folder.path / SENTINEL_FOLDER, lambda: self.stored.digest, self.journals
+        )
         self.metrics = Metrics(
             lambda: self.state().told(),
             self.devices.errors,
@@ -307,18 +309,18 @@ class Service:
             faults=faults,
             control=self.leases.told(),
             calibration=self.mast_verdict(),
-            sentinel=cast(SentinelTold | None, self.sentinel.told()),
+            sentinel=cast(SentinelTold | None, self.sentinel.summary()),
             stop_socket=None if self.stop_socket is None else str(self.stop_socket.path),
         )
 
     def mast_verdict(self) -> CalibrationTold:
         """Return whether the mast file still holds, by all three kinds of evidence."""
-        return mast_verdict(self.health.verdict, self.sentinel.told(), self.handoffs.told())
+        return mast_verdict(self.health.verdict, self.sentinel.summary(), self.handoffs.summary())
 
     def track_told(self, status: TrackStatus | None = None) -> TrackTold:
         """Return the track, as it is or was, and the self-check of now as ``GET /track`` tells them."""
         told = (status or self.tracker.status).told(self.clock.now_s())
-        return {**told, "self_check": cast(SelfCheck, self.handoffs.told())}
+        return {**told, "self_check": cast(SelfCheck, self.handoffs.summary())}
 
     def track_in(self, frame: StampedFrame) -> dict[str, float] | None:
         """Return where a frame should show the track's target, pixels, with one sigma as an ellipse.
@@ -388,9 +390,7 @@ class Service:
             self.machine.publisher.close,
             self.metrics.close,
             self.stop_threads.close,
-            self.handoffs.close,
-            self.health.close,
-            self.sentinel.close,
+            self.journals.close,
             self.recorder.close,
             lambda: bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S),
             *(one.close for one in maybe if one is not None),
@@ -405,6 +405,7 @@ class Service:
         """What is wrong with the daemon's own files; takes no lock."""
         return (
             *self.handoffs.faults(),
+            *self.journals.faults(),
             *self.recorder.faults(),
             *self.audit.faults(),
             *self.strangers.faults(),

@@ -1,12 +1,11 @@
-"""The mast's self-check in service: the record of hand-offs, and what they say together.
+"""The mast's self-check in service: the log of hand-offs, and their mean offsets.
 
-Keys of a line of the record: ``schema`` (``mastctl/handoff/1``), ``time`` (ISO 8601, UTC), ``mast_digest``,
+Keys of a line of the log: ``schema`` (``mastctl/handoff/1``), ``time`` (ISO 8601, UTC), ``mast_digest``,
 ``source`` (left and right camera), ``pan_rad``, ``tilt_rad``, ``joint_sigma_rad``, ``left_px``, ``right_px``,
 ``sigma_px`` (of each coordinate of those), ``to_pan_rad``, ``to_tilt_rad``, and ``destinations``, by camera:
 ``geometric_px``, ``geometric_covariance_px2`` (of the clicks), ``verdict``, ``reason``, ``found_px`` and
 ``found_covariance_px2``, the last two null unless the verdict is ``accepted``. Angles are true ones, by the
-joints of the mast file that ``mast_digest`` names. The file may hang or be full: a thread of its own reads
-and writes it, and nobody waits for that.
+joints of the mast file that ``mast_digest`` names.
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ import json
 import logging
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -31,11 +30,11 @@ from calib.files.yaml_text import plain
 from calib.geometry.handoff import Joints
 from calib.matching.handed_over import HandoffBias, Landed, MatchedHandoff, handoff_bias
 from calib.matching.handoff import RefinedVerdict
-from drivers.clock import Clock, SystemClock
+from drivers.clock import Clock
 from drivers.recordings.mcap_file import BadRecording, is_mcap, read_messages
 from mastctl.as_json import picked
 from mastctl.control.standing import StandingFault
-from mastctl.json_lines import OtherFile, append_line
+from mastctl.watch.journal import Journal, JournalThread
 
 log = logging.getLogger(__name__)
 
@@ -113,39 +112,9 @@ class ReadLog:
     handoffs: tuple[MatchedHandoff, ...]
 
 
-class HandoffLog:
-    """A record that grows; several processes may append to one file.
-
-    Parameters
-    ----------
-    path
-        Made by the first `append`, its folder too.
-    """
-
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-
-    def append(self, handoff: MatchedHandoff) -> None:
-        """Add one hand-off as one line; it is on the disk, whole, when this returns.
-
-        What a crash has left of a line at the end of the file is taken away first.
-
-        Raises
-        ------
-        BadFile
-            If the file cannot be written, or is something else than a record of hand-offs.
-        ValueError
-            If a number is not finite.
-        """
-        line = (json.dumps(line_of(handoff), allow_nan=False) + "\n").encode()
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            append_line(self.path, line, begins=_BEGIN)
-        except OtherFile:
-            words = "is no record of hand-offs; a new or another file is expected"
-            raise BadFile(self.path, "", words) from None
-        except OSError as error:
-            raise BadFile(self.path, "", f"cannot be appended to: {error.strerror or error}") from None
+def handoff_log(path: Path) -> Journal[MatchedHandoff]:
+    """Return the log of hand-offs at a path."""
+    return Journal(path, "hand-offs", line_of, lambda value: handoff_of(path, 0, value), _BEGIN)
 
 
 def line_of(handoff: MatchedHandoff) -> dict[str, Any]:
@@ -169,7 +138,7 @@ def line_of(handoff: MatchedHandoff) -> dict[str, Any]:
     return dict(plain(document))
 
 
-def bias_told(bias: HandoffBias) -> dict[str, Any]:
+def bias_record(bias: HandoffBias) -> dict[str, Any]:
     """Return a camera's mean offset as JSON."""
     sigma_px = np.sqrt(np.diag(bias.covariance_px2)).tolist()
     names = ("source", "camera", "handoffs", "left_out", "offset_px", "sigmas", "sentence")
@@ -230,164 +199,100 @@ def handoff_of(path: str | Path, number: int, value: Any) -> MatchedHandoff:
 NAME = "handoff_log"
 KEPT = 2000
 """Newest hand-offs that count, and that wait for a file that cannot be written."""
-SLOW_S = 5.0  # a file that takes longer than this is a fault
-CLOSE_S = 2.0
 
 
 class HandoffCheck:
-    """What hand-offs say of the mast file in use; safe to use from any thread, never waits for a file.
+    """The offsets that hand-offs show with the mast file in use; safe from any thread, waits for no file.
 
     Parameters
     ----------
     path
-        The record, read at the start and appended to; None: only what comes is known.
+        The log, read at the start and appended to; None: earlier hand-offs are not known.
     digest
         Of the mast file in use.
     clock
         Dates the faults.
-    file_time
-        What the file's slowness is measured by; the machine's own clock by default: a file is real, also
-        beside a simulation whose time goes by faster.
+    thread
+        Reads and writes the log.
     """
 
-    def __init__(self, path: Path | None, digest: str, clock: Clock, file_time: Clock | None = None) -> None:
-        self._path = path
+    def __init__(self, path: Path | None, digest: str, clock: Clock, thread: JournalThread) -> None:
+        self._journal = None if path is None else handoff_log(path)
         self._clock = clock
-        self._file_time = file_time or SystemClock()
+        self._thread = thread
         self._lock = threading.Lock()
         self._handoffs: deque[MatchedHandoff] = deque(maxlen=KEPT)
+        self._unwritten: deque[MatchedHandoff] = deque(maxlen=KEPT)
         self._digest = digest
-        self._judged: tuple[int, tuple[HandoffBias, ...]] = (0, ())  # how many count, what stands out
-        self._unread: StandingFault | None = None
-        self._unwritten: StandingFault | None = None
-        # Since when the file has not answered: by the clock, and by the file's time.
-        self._asked_s: tuple[float, float] | None = None
-        self._queue: SimpleQueue[MatchedHandoff | None] = SimpleQueue()
-        self._thread = threading.Thread(target=self._work, name=NAME, daemon=True)
-        if path is not None:
-            self._thread.start()
+        self._judged: tuple[int, tuple[HandoffBias, ...]] = (0, ())  # how many count, the offsets
+        self._fault: StandingFault | None = None
+        if self._journal is not None:
+            thread.put(self._read)
 
     def add(self, handoff: MatchedHandoff) -> None:
-        """Count a hand-off, and have it written down."""
-        with self._lock:
-            self._handoffs.append(handoff)
-            news = self._judge()
-        _log_news(news)
-        if self._path is not None:
-            self._queue.put(handoff)
+        """Count a hand-off, and have it logged."""
+        self._judge(lambda: self._handoffs.append(handoff))
+        if self._journal is not None:
+            self._thread.put(lambda: self._write(handoff))
 
     def use_mast(self, digest: str) -> None:
         """Count only the hand-offs of this mast file from now on."""
-        with self._lock:
-            self._digest = digest
-            news = self._judge()
-        _log_news(news)
+        self._digest = digest
+        self._judge(lambda: None)
 
-    def told(self) -> dict[str, Any]:
-        """Return how many hand-offs of the mast file count, and the offsets that stand out, as JSON."""
+    def summary(self) -> dict[str, Any]:
+        """Return how many hand-offs of the mast file count, and the significant offsets, as JSON."""
         counted, offsets = self._judged
-        return {"handoffs": counted, "offsets": [bias_told(one) for one in offsets]}
+        return {"handoffs": counted, "offsets": [bias_record(one) for one in offsets]}
 
     def faults(self) -> tuple[StandingFault, ...]:
-        """Return what is wrong with the record's file."""
-        faults = [one for one in (self._unread, self._unwritten) if one is not None]
-        asked_s = self._asked_s
-        if asked_s is not None and self._file_time.now_s() - asked_s[1] > SLOW_S:
-            faults.append(
-                StandingFault(
-                    NAME,
-                    "slow",
-                    f"{self._path} does not answer; hand-offs wait for it",
-                    asked_s[0],
-                    "the file answers",
-                )
-            )
-        return tuple(faults)
+        """Return what is wrong with the log's file."""
+        fault = self._fault
+        return () if fault is None else (fault,)
 
-    def close(self) -> None:
-        """Write down what waits; bounded."""
-        if self._path is None:
-            return
-        self._queue.put(None)
-        self._thread.join(CLOSE_S)
-        if self._thread.is_alive():
-            log.error("%s does not answer; the newest hand-offs are not written down", self._path)
+    def _judge(self, change: Callable[[], None]) -> None:
+        """Change the hand-offs, find their offsets anew, and log those that are new."""
+        with self._lock:
+            change()
+            those = [one for one in self._handoffs if one.mast_digest == self._digest]
+            known = {(one.source, one.camera) for one in self._judged[1]}
+            offsets = tuple(one for one in handoff_bias(those) if one.significant)
+            self._judged = sum(bool(one.found) for one in those), offsets
+        for one in offsets:
+            if (one.source, one.camera) not in known:
+                log.warning("hand-offs show an offset: %s", one.sentence)
 
-    def _judge(self) -> list[HandoffBias]:
-        """Sum up anew and return what stands out newly; the lock is held, so nothing is logged here."""
-        those = [one for one in self._handoffs if one.mast_digest == self._digest]
-        known = {(one.source, one.camera) for one in self._judged[1]}
-        offsets = tuple(one for one in handoff_bias(those) if one.significant)
-        self._judged = sum(bool(one.found) for one in those), offsets
-        return [one for one in offsets if (one.source, one.camera) not in known]
+    # In the journals' thread
 
-    # In the file's thread
-
-    def _work(self) -> None:
-        assert self._path is not None
-        self._read(self._path)
-        writer = HandoffLog(self._path)
-        waiting: deque[MatchedHandoff] = deque(maxlen=KEPT)
-        while True:
-            handoff = self._queue.get()
-            if handoff is not None:
-                waiting.append(handoff)
-            self._write(writer, waiting)
-            if handoff is None:
-                return
-
-    def _read(self, path: Path) -> None:
-        self._ask()
+    def _read(self) -> None:
+        assert self._journal is not None
         try:
-            before = read_log(path).handoffs if path.is_file() else ()
-        except (BadFile, OSError) as error:
-            words = f"{' '.join(str(error).split())}; earlier records do not count"
-            with self._lock:
-                self._unread = StandingFault(
-                    NAME, "unreadable", words, self._clock.now_s(), "the file is right at the next start"
-                )
-            log.error("%s", words)
-            before = ()
-        with self._lock:
+            before = self._journal.read()
+        except BadFile as error:
+            log.error("%s; earlier hand-offs do not count", " ".join(str(error).split()))
+            return
+
+        def join() -> None:
             self._handoffs = deque((*before, *self._handoffs), maxlen=KEPT)
-            news = self._judge()
-        _log_news(news)
-        self._answered()
 
-    def _write(self, writer: HandoffLog, waiting: deque[MatchedHandoff]) -> None:
-        """Write down what waits, oldest first, as far as it goes."""
-        words = ""
-        self._ask()
-        while waiting and not words:
-            try:
-                writer.append(waiting[0])
-                waiting.popleft()
-            except BadFile as error:
-                words = f"{' '.join(str(error).split())}; hand-offs count, and wait to be written down"
-            except ValueError as error:
-                log.error("a hand-off cannot be written down: %s", error)
-                waiting.popleft()
-        self._answered()
-        with self._lock:
-            before = self._unwritten
-            since_s = self._clock.now_s() if before is None else before.since_s
-            self._unwritten = (
-                StandingFault(NAME, "unwritable", words, since_s, "a hand-off is written down")
-                if words
-                else None
-            )
-        if words and before is None:
-            log.error("%s", words)
+        self._judge(join)
 
-    def _ask(self) -> None:
-        with self._lock:
-            self._asked_s = self._clock.now_s(), self._file_time.now_s()
-
-    def _answered(self) -> None:
-        with self._lock:
-            self._asked_s = None
-
-
-def _log_news(news: list[HandoffBias]) -> None:
-    for one in news:
-        log.warning("hand-offs show an offset: %s", one.sentence)
+    def _write(self, handoff: MatchedHandoff) -> None:
+        """Log what waits, oldest first, as far as it goes."""
+        assert self._journal is not None
+        self._unwritten.append(handoff)
+        try:
+            while self._unwritten:
+                try:
+                    self._journal.append(self._unwritten[0])
+                except ValueError as error:
+                    log.error("a hand-off cannot be logged: %s", error)
+                self._unwritten.popleft()
+        except BadFile as error:
+            message = f"{' '.join(str(error).split())}; hand-offs count, and wait to be logged"
+            if self._fault is None:
+                log.error("%s", message)
+            since_s = self._clock.now_s() if self._fault is None else self._fault.since_s
+            self._fault = StandingFault(NAME, "unwritable", message, since_s, "a hand-off is logged")
+        else:
+            self._fault = None

@@ -22,7 +22,7 @@ from calib.files import read_bytes
 from calib.files.atomic import replace_bytes
 from calib.files.records import Moment, Record, Text, problem, read_record
 from calib.matching.warp import Grey, grey
-from mastctl.json_lines import append_line, read_lines
+from mastctl.watch.journal import Journal
 
 SCHEMA = "mastctl/sentinel/1"
 SENTINEL_FOLDER = "sentinel"
@@ -30,8 +30,6 @@ SENTINEL_FOLDER = "sentinel"
 
 REFERENCE, LOOKS = "reference.json", "looks.jsonl"
 MOST_BYTES, MOST_PICTURE_BYTES = 4_000_000, 1 << 28
-MOST_LOOKS_BYTES = 16_000_000
-"""Of the looks' file; what is older than that is not read."""
 
 
 _Angle = Annotated[float, Field(ge=-100.0, le=100.0)]
@@ -183,15 +181,17 @@ def read_reference(folder: Path) -> Reference:
 
 def add_look(folder: Path, reference: Reference, time: str, drift: SceneDrift) -> dict[str, Any]:
     """Append what a look at a reference found, and return it. Raises BadFile."""
-    line = look_line(reference, time, drift)
-    path = folder / LOOKS
+    look = look_line(reference, time, drift)
     try:
-        append_line(path, json.dumps(line).encode() + b"\n")
-    except OSError as error:
-        raise BadFile(
-            path, "", f"cannot be written: {error.strerror or error}; the look is not kept"
-        ) from None
-    return line
+        look_journal(folder).append(look)
+    except BadFile as error:
+        raise BadFile(error.path, error.place, f"{error.reason}; the look is not kept") from None
+    return look
+
+
+def look_journal(folder: Path) -> Journal[dict[str, Any]]:
+    """Return the journal of the looks in a folder."""
+    return Journal(folder / LOOKS, "looks", lambda look: look, _look)
 
 
 def look_line(reference: Reference, time: str, drift: SceneDrift) -> dict[str, Any]:
@@ -225,20 +225,15 @@ def read_looks(folder: Path, reference: Reference) -> list[dict[str, Any]]:
     BadFile
         If there is a file of looks that cannot be read.
     """
-    path = folder / LOOKS
-    try:
-        rows = read_lines(path, MOST_LOOKS_BYTES)
-    except OSError as error:
-        raise BadFile(path, "", f"cannot be read: {error.strerror or error}") from None
-    return [look for row in rows if (look := _look(row)) and look.get("reference") == reference.time]
+    return [look for look in look_journal(folder).read() if look.get("reference") == reference.time]
 
 
-def _look(row: bytes) -> dict[str, Any] | None:
-    """A line of the looks' file, None if it is none."""
-    try:
-        told = json.loads(row)
-        datetime.fromisoformat(told["time"]).astimezone(UTC)
-        whole = isinstance(told["sentence"], str) and told["views"] >= 0
-    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
-        return None
-    return told if whole and isinstance(told["named"], str | None) else None
+def _look(value: Any) -> dict[str, Any]:
+    """Pass the object of a look. Raises ValueError and others."""
+    datetime.fromisoformat(value["time"]).astimezone(UTC)
+    if not (
+        isinstance(value["sentence"], str) and value["views"] >= 0 and isinstance(value["named"], str | None)
+    ):
+        raise ValueError("it is no look")
+    look: dict[str, Any] = value
+    return look

@@ -1,4 +1,4 @@
-"""What the residuals of the last days say of the mast file, judged in a thread that nobody waits for.
+"""The verdict of the last days' residuals on the mast file.
 
 Windows begin every six hours and last until now; each is judged by itself, so that what began on Tuesday is
 not watered down by Monday. A window's evidence exceeds 4000 by chance in one of 4000 at most, however many
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -19,7 +18,6 @@ from datetime import UTC, datetime
 from functools import reduce
 from operator import add, sub
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any, Literal
 
 import numpy as np
@@ -29,9 +27,11 @@ from calib.files.mast_file import StoredRig
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
+from mastctl.as_json import as_json
 from mastctl.control.records import Operation
 from mastctl.watch.evidence import Evidence, Expected, Judge, Sums, expected, sums_of
-from mastctl.watch.pointings import FILE, Journal, Measured, measured_by
+from mastctl.watch.journal import JournalThread
+from mastctl.watch.pointings import Measured, measured_by, pointing_journal
 
 log = logging.getLogger(__name__)
 
@@ -119,7 +119,7 @@ class Windows:
                 del self._spans[span], self._sums[span]
 
     def evidence(self) -> Evidence | None:
-        """Return that of the window which speaks loudest; None with too few pointings."""
+        """Return that of the window with the strongest; None with too few pointings."""
         found: Evidence | None = None
         spans = sorted(self._spans, reverse=True)
         for number in range(1, len(spans) + 1):
@@ -176,7 +176,7 @@ class ResidualVerdict:
     log10_evidence: float | None = None
     turned: dict[str, dict[str, Any]] = field(default_factory=dict)
 
-    def told(self) -> dict[str, Any]:
+    def short(self) -> dict[str, Any]:
         """Return the short form, of ``GET /status``."""
         return {
             "verdict": self.word,
@@ -185,9 +185,9 @@ class ResidualVerdict:
             "since": self.since,
         }
 
-    def told_whole(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """Return all of it."""
-        return self.told() | {
+        return self.short() | {
             "times_expected": self.times,
             "log10_evidence": self.log10_evidence,
             "log10_threshold": LOG_THRESHOLD / math.log(10),
@@ -200,7 +200,7 @@ NOTHING_YET = ResidualVerdict("few", f"fewer than {FEWEST} pointings with this m
 
 
 def verdict_of(evidence: Evidence | None, pointings: int) -> ResidualVerdict:
-    """Return what is to be said of the evidence of the loudest window."""
+    """Return the verdict on the evidence of the strongest window."""
     if evidence is None:
         return ResidualVerdict("few", NOTHING_YET.sentence, pointings)
     since = datetime.fromtimestamp(evidence.since_s, UTC).isoformat(timespec="seconds")
@@ -246,13 +246,12 @@ def _what_drifts(evidence: Evidence, since: str) -> str:
     )
 
 
-TOLD = 50
-"""Newest pointings that are told one by one."""
-CLOSE_S = 2.0
+SHOWN = 50
+"""Newest pointings that are shown one by one."""
 
 
 class CalibrationHealth:
-    """What pointings say of the mast file in use; safe to use from any thread, never waits for a file.
+    """The verdict of residuals on the mast file in use; safe to use from any thread, waits for no file.
 
     Parameters
     ----------
@@ -260,12 +259,17 @@ class CalibrationHealth:
         Where the pointings of the last days are kept.
     mast
         The mast file in use.
+    thread
+        Reads and writes them, and judges.
     wall_s
         The time of day, seconds since 1970: pointings of a week ago may be from before a restart.
     """
 
-    def __init__(self, folder: Path, mast: StoredRig, wall_s: Callable[[], float] = time.time) -> None:
-        self._journal = Journal(folder / FILE)
+    def __init__(
+        self, folder: Path, mast: StoredRig, thread: JournalThread, wall_s: Callable[[], float] = time.time
+    ) -> None:
+        self._journal = pointing_journal(folder)
+        self._thread = thread
         self._wall_s = wall_s
         self._mast = mast
         self._known: deque[Measured] = deque(maxlen=KEPT)
@@ -274,30 +278,28 @@ class CalibrationHealth:
         self._newest: tuple[Judged, ...] = ()
         self._not_kept = ""
         self.verdict = NOTHING_YET
-        self._queue: SimpleQueue[Measured | StoredRig | None] = SimpleQueue()
-        self._queue.put(self._mast)
-        self._thread = threading.Thread(target=self._work, name="calibration health", daemon=True)
-        self._thread.start()
+        thread.put(self._read)
+        thread.put(lambda: self._judge_by(mast))
 
     def ended(self, mast: StoredRig, operation: Operation) -> None:
         """Keep what a pointing measured, if it did; ``mast`` was in use when it began."""
         one = measured_by(operation, mast, self._wall_s())
         if one is not None:
-            self._queue.put(one)
+            self._thread.put(lambda: self._count(one))
 
     def use_mast(self, mast: StoredRig) -> None:
         """Judge by this mast file from now on."""
         self._mast = mast
         self.verdict, self._newest = NOTHING_YET, ()
-        self._queue.put(self._mast)
+        self._thread.put(lambda: self._judge_by(mast))
 
-    def told(self) -> dict[str, Any]:
-        """Return all that is known, as ``GET /calibration/health`` tells it."""
-        return self.verdict.told_whole() | {
+    def summary(self) -> dict[str, Any]:
+        """Return all that is known, as ``GET /calibration/health`` has it."""
+        return self.verdict.as_json() | {
             "write_error": self._not_kept or None,
             "newest": [
                 {
-                    **one.measured.told(),
+                    **as_json(one.measured),
                     "sigma_px": list(one.sigma_px),
                     "chi_square": one.square,
                 }
@@ -305,53 +307,43 @@ class CalibrationHealth:
             ],
         }
 
-    def close(self) -> None:
-        """Write down what waits; bounded."""
-        self._queue.put(None)
-        self._thread.join(CLOSE_S)
-        if self._thread.is_alive():
-            log.error("%s does not answer; the newest pointings are not kept", self._journal.path)
+    # In the journals' thread
 
-    # In the thread
-
-    def _work(self) -> None:
+    def _read(self) -> None:
         try:
             self._known.extend(self._journal.read())
         except BadFile as error:
             log.error("%s; pointings from before do not count", error)
-        while (news := self._queue.get()) is not None:
-            try:
-                self._take(news)
-            except Exception:  # a pointing that nobody foresaw must not end the watch
-                log.exception("the calibration's health met a defect of the program")
 
-    def _take(self, news: Measured | StoredRig) -> None:
-        now_s = self._wall_s()
-        if isinstance(news, Measured):
-            self._known.append(news)
-            self._keep(news, now_s)
-            if self._windows is not None:
-                self._windows.add(news)
-        else:
-            self._judges_by = news
-            try:
-                self._windows = Windows(news.rig, news.digest)
-            except CalibError as error:
-                self._windows = None
-                self._say(
-                    ResidualVerdict("unknown", f"residuals are kept, and judged by nothing: {error}"), ()
-                )
-            else:
-                for one in self._known:
-                    self._windows.add(one)
-        windows = self._windows
-        if windows is not None:
-            windows.forget(now_s)
-            pointings = windows.pointings
-            self._say(verdict_of(windows.evidence(), len(pointings)), tuple(pointings[-TOLD:]))
+    def _count(self, one: Measured) -> None:
+        self._known.append(one)
+        self._keep(one)
+        if self._windows is not None:
+            self._windows.add(one)
+            self._judge()
 
-    def _say(self, verdict: ResidualVerdict, newest: tuple[Judged, ...]) -> None:
-        """Let a verdict be known, unless another mast file is in use by now."""
+    def _judge_by(self, mast: StoredRig) -> None:
+        self._judges_by = mast
+        try:
+            self._windows = Windows(mast.rig, mast.digest)
+        except CalibError as error:
+            self._windows = None
+            sentence = f"residuals are kept, and judged by nothing: {error}"
+            self._set_verdict(ResidualVerdict("unknown", sentence), ())
+            return
+        for one in self._known:
+            self._windows.add(one)
+        self._judge()
+
+    def _judge(self) -> None:
+        assert self._windows is not None
+        self._windows.forget(self._wall_s())
+        pointings = self._windows.pointings
+        verdict = verdict_of(self._windows.evidence(), len(pointings))
+        self._set_verdict(verdict, tuple(pointings[-SHOWN:]))
+
+    def _set_verdict(self, verdict: ResidualVerdict, newest: tuple[Judged, ...]) -> None:
+        """Publish a verdict, unless another mast file is in use by now."""
         if self._judges_by is not self._mast:
             return
         before, self.verdict, self._newest = self.verdict, verdict, newest
@@ -360,11 +352,11 @@ class CalibrationHealth:
         elif before.word == "drifts" and verdict.word != "drifts":
             log.info("the calibration does not drift any more: %s", verdict.sentence)
 
-    def _keep(self, one: Measured, now_s: float) -> None:
-        """Write a pointing down; what cannot be written is said once."""
-        counting = [kept for kept in self._known if kept.time_s > now_s - DAYS * DAY_S]
+    def _keep(self, one: Measured) -> None:
+        """Write a pointing to the journal; a failure is logged once."""
+        counting = [kept for kept in self._known if kept.time_s > self._wall_s() - DAYS * DAY_S]
         try:
-            self._journal.add(one, counting)
+            self._journal.append(one, counting)
         except BadFile as error:
             if not self._not_kept:
                 log.error("%s; pointings count, and are not kept over a restart", error)

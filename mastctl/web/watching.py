@@ -50,7 +50,7 @@ def add_watching(app: FastAPI) -> None:
     )
     async def calibration(here: Here) -> CalibrationHealthTold:
         service = here.service
-        told = {**service.health.told(), **service.mast_verdict(), "sentinel": service.sentinel.told()}
+        told = {**service.health.summary(), **service.mast_verdict(), "sentinel": service.sentinel.summary()}
         return cast(CalibrationHealthTold, told)
 
     @app.get(f"{PREFIX}/sentinel", summary="The findings of the drift sentinel, and the age of its last look")

@@ -26,7 +26,7 @@ from mastctl.cli.tasks import refuse_task_options, run_bar
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.experiment.simulated import Rover, SimulationTruth, running_rover
-from mastctl.watch.handoffs import HandoffLog
+from mastctl.watch.handoffs import handoff_log
 from tools.command import end, options, run_cases, show
 from tools.studies.handoff_run import STEPS, HandoffRecord, run_handoff_experiment
 
@@ -100,7 +100,7 @@ def handoff_rows(records: Sequence[HandoffRecord]) -> list[dict[str, Any]]:
 def write_handoffs(folder: Path, records: Sequence[HandoffRecord]) -> None:
     """Write handoffs.jsonl into ``folder`` (made if need be)."""
     folder.mkdir(parents=True, exist_ok=True)
-    log = HandoffLog(folder / "handoffs.jsonl")
+    log = handoff_log(folder / "handoffs.jsonl")
     log.path.unlink(missing_ok=True)
     for record in records:
         if record.matched is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,8 +26,9 @@ from hil_tests.calib.matching.handed_over import (
 )
 from hil_tests.mastctl.service_fakes import Hang
 from hil_tests.waiting import until
-from mastctl.watch import handoffs as module
-from mastctl.watch.handoffs import NAME, HandoffCheck, HandoffLog, read_log
+from mastctl.watch import journal
+from mastctl.watch.handoffs import NAME, HandoffCheck, read_log
+from mastctl.watch.journal import Journal, JournalThread
 
 DIGEST, OTHER = "d" * 64, "e" * 64
 
@@ -59,23 +61,30 @@ def handed(rig: Rig, count: int, yaw_rad: float = 0.0, digest: str = DIGEST) -> 
     ]
 
 
-def check(path: Path | None) -> HandoffCheck:
-    return HandoffCheck(path, DIGEST, ManualClock(10.0))
+@pytest.fixture
+def thread() -> Iterator[JournalThread]:
+    made = JournalThread(ManualClock(10.0))
+    yield made
+    made.close()
+
+
+def check(path: Path | None, thread: JournalThread) -> HandoffCheck:
+    return HandoffCheck(path, DIGEST, ManualClock(10.0), thread)
 
 
 def test_a_turned_body_pair_is_told_after_enough_hand_offs(
-    rig: Rig, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    rig: Rig, tmp_path: Path, caplog: pytest.LogCaptureFixture, thread: JournalThread
 ) -> None:
     first, *others = handed(rig, 20, yaw_rad=0.004)  # turned to the right: targets appear further left
-    selfcheck = check(tmp_path / "h.jsonl")
+    selfcheck = check(tmp_path / "h.jsonl", thread)
     selfcheck.add(first)
-    assert selfcheck.told() == {"handoffs": 1, "offsets": []}
+    assert selfcheck.summary() == {"handoffs": 1, "offsets": []}
     for one in others:
         selfcheck.add(one)
-    told = selfcheck.told()
-    assert told["handoffs"] == 20
-    assert [one["camera"] for one in told["offsets"]] == list(HAZCAMS)
-    for one in told["offsets"]:
+    summary = selfcheck.summary()
+    assert summary["handoffs"] == 20
+    assert [one["camera"] for one in summary["offsets"]] == list(HAZCAMS)
+    for one in summary["offsets"]:
         model = rig.cameras[one["camera"]].model
         focal_px = float(np.linalg.norm(np.cross(model.A, model.H)))
         assert one["offset_px"] == pytest.approx([-0.004 * focal_px, 0.0], abs=0.5)
@@ -83,52 +92,52 @@ def test_a_turned_body_pair_is_told_after_enough_hand_offs(
         assert f"{one['camera']} sees targets" in one["sentence"]
         assert "px left" in one["sentence"] and "of where navcam puts them" in one["sentence"]
     assert sum("show an offset: hazcam_left" in words for words in caplog.messages) == 1, "told once"
-    selfcheck.close()
+    thread.close()
     assert len(read_log(tmp_path / "h.jsonl").handoffs) == 20
 
 
-def test_only_hand_offs_of_the_mast_file_in_use_count(rig: Rig) -> None:
-    selfcheck = check(None)
+def test_only_hand_offs_of_the_mast_file_in_use_count(rig: Rig, thread: JournalThread) -> None:
+    selfcheck = check(None, thread)
     for one in [*handed(rig, 12, 0.004), *handed(rig, 5, 0.0, OTHER)]:
         selfcheck.add(one)
-    assert (selfcheck.told()["handoffs"], len(selfcheck.told()["offsets"])) == (12, 2)
+    assert (selfcheck.summary()["handoffs"], len(selfcheck.summary()["offsets"])) == (12, 2)
     selfcheck.use_mast(OTHER)
-    assert selfcheck.told() == {"handoffs": 5, "offsets": []}
+    assert selfcheck.summary() == {"handoffs": 5, "offsets": []}
     selfcheck.use_mast(DIGEST)
-    assert len(selfcheck.told()["offsets"]) == 2
+    assert len(selfcheck.summary()["offsets"]) == 2
 
 
-def test_a_record_that_cannot_be_written_is_a_fault_and_nothing_else(rig: Rig) -> None:
+def test_a_record_that_cannot_be_written_is_a_fault_and_nothing_else(rig: Rig, thread: JournalThread) -> None:
     path = Path("/dev/full")
-    selfcheck = check(path)
+    selfcheck = check(path, thread)
     for one in handed(rig, 12, 0.004):
         selfcheck.add(one)
-    assert len(selfcheck.told()["offsets"]) == 2
+    assert len(selfcheck.summary()["offsets"]) == 2
     until(lambda: any(one.code == "unwritable" for one in selfcheck.faults()), "the fault")
     fault = selfcheck.faults()[-1]
     assert fault.device == NAME
     assert fault.message.startswith(str(path)) and "hand-offs count, and wait" in fault.message
     assert "\n" not in fault.message
-    selfcheck.close()
 
 
 def test_a_file_that_hangs_keeps_nobody_waiting(
     rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hang, clock, file_time = Hang(), ManualClock(10.0), ManualClock()
-    monkeypatch.setattr(HandoffLog, "append", lambda self, handoff: hang())
-    monkeypatch.setattr(module, "CLOSE_S", 0.05)
-    selfcheck = HandoffCheck(tmp_path / "h.jsonl", DIGEST, clock, file_time)
+    monkeypatch.setattr(Journal, "append", lambda self, handoff: hang())
+    monkeypatch.setattr(journal, "CLOSE_S", 0.05)
+    thread = JournalThread(clock, file_time)
+    selfcheck = HandoffCheck(tmp_path / "h.jsonl", DIGEST, clock, thread)
     for one in handed(rig, 3):
         selfcheck.add(one)
     assert hang.entered.wait(60.0)
-    assert (selfcheck.told()["handoffs"], selfcheck.faults()) == (3, ())
+    assert (selfcheck.summary()["handoffs"], thread.faults()) == (3, ())
     clock.advance(60.0)  # a simulated rover's minute may be a moment of the file's
-    assert selfcheck.faults() == ()
+    assert thread.faults() == ()
     file_time.advance(60.0)
-    (fault,) = selfcheck.faults()
+    (fault,) = thread.faults()
     assert (fault.code, fault.since_s) == ("slow", 10.0)
     assert "does not answer" in fault.message
-    selfcheck.close()
+    thread.close()
     hang.let_go()
-    until(lambda: not any(t.name == NAME for t in threading.enumerate()), "its thread ends")
+    until(lambda: not any(t.name == journal.NAME for t in threading.enumerate()), "its thread ends")

@@ -14,7 +14,7 @@ import pytest
 from calib.errors import BadFile
 from calib.geometry.handoff import Joints
 from calib.matching.handed_over import Landed, MatchedHandoff
-from mastctl.watch.handoffs import HandoffLog, line_of, read_log
+from mastctl.watch.handoffs import handoff_log, line_of, read_log
 
 
 def one(index: int = 0) -> MatchedHandoff:
@@ -31,7 +31,7 @@ def one(index: int = 0) -> MatchedHandoff:
 
 def test_what_is_appended_is_read_back_to_the_last_digit(tmp_path: Path) -> None:
     path = tmp_path / "new" / "handoffs.jsonl"
-    log = HandoffLog(path)
+    log = handoff_log(path)
     for index in range(3):
         log.append(one(index))
     read = read_log(path)
@@ -43,7 +43,7 @@ def test_what_is_appended_is_read_back_to_the_last_digit(tmp_path: Path) -> None
 
 def test_a_line_that_a_crash_cut_short_is_passed_over_and_then_taken_away(tmp_path: Path) -> None:
     path = tmp_path / "h.jsonl"
-    log = HandoffLog(path)
+    log = handoff_log(path)
     log.append(one(0))
     whole = path.read_bytes()
     path.write_bytes(whole + whole[:100])
@@ -58,13 +58,13 @@ def test_a_line_that_a_crash_cut_short_is_passed_over_and_then_taken_away(tmp_pa
 def test_a_file_of_something_else_is_not_appended_to(tmp_path: Path) -> None:
     path = tmp_path / "mast.yaml"
     path.write_text("schema: mastctl/mast/1\n")
-    with pytest.raises(BadFile, match="no record of hand-offs"):
-        HandoffLog(path).append(one())
+    with pytest.raises(BadFile, match="holds no hand-offs"):
+        handoff_log(path).append(one())
     assert path.read_text() == "schema: mastctl/mast/1\n"
-    with pytest.raises(BadFile, match="cannot be appended to"):
-        HandoffLog(tmp_path).append(one())
+    with pytest.raises(BadFile, match="cannot be written"):
+        handoff_log(tmp_path).append(one())
     with pytest.raises(ValueError, match="JSON"):
-        HandoffLog(tmp_path / "new.jsonl").append(replace(one(), sigma_px=float("nan")))
+        handoff_log(tmp_path / "new.jsonl").append(replace(one(), sigma_px=float("nan")))
     assert not (tmp_path / "new.jsonl").exists()
 
 

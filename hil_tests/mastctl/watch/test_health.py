@@ -9,13 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.clock import SystemClock
 from drivers.interfaces import COARSE_COUNT_RAD
 from hil_tests.mastctl.watch.histories import NOON_S, bumped, pointing, stored_rig
 from hil_tests.waiting import until
+from mastctl.as_json import as_json
 from mastctl.control.records import Operation
 from mastctl.motion.results import Step
-from mastctl.watch import pointings as journal_module
-from mastctl.watch.pointings import FILE, Journal, Measured, measured_by, measured_of
+from mastctl.watch import pointings
+from mastctl.watch.journal import JournalThread
+from mastctl.watch.pointings import FILE, Measured, measured_by, measured_of, pointing_journal
 from mastctl.watch.residuals import CalibrationHealth
 
 STORED = stored_rig()
@@ -53,7 +56,7 @@ def test_a_pointing_tells_what_measured_joints_do_not_explain() -> None:
     assert one.residual_px == (0.5, 1.5)
     assert one.off_px == pytest.approx((-0.5, 0.5))
     assert one.count_rad == (1e-4, COARSE_COUNT_RAD)
-    assert measured_of(json.loads(json.dumps(one.told()))) == one
+    assert measured_of(json.loads(json.dumps(as_json(one)))) == one
 
 
 def test_what_other_eyes_did_not_confirm_counts_as_such() -> None:
@@ -76,44 +79,46 @@ def test_what_has_measured_nothing_is_not_kept(change: dict[str, object]) -> Non
 
 def test_pointings_outlive_a_restart_and_a_torn_line_costs_one(tmp_path: Path) -> None:
     for one in history(4):
-        Journal(tmp_path / FILE).add(one, [])
+        pointing_journal(tmp_path).append(one)
     with (tmp_path / FILE).open("ab") as file:
         file.write(b'{"time_s": 1')
-    Journal(tmp_path / FILE).add(history(5)[4], [])
-    assert Journal(tmp_path / FILE).read() == history(5)
+    pointing_journal(tmp_path).append(history(5)[4])
+    assert pointing_journal(tmp_path).read() == history(5)
 
 
 def test_a_file_that_is_full_is_written_anew_with_what_counts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(journal_module, "MOST_BYTES", 3000)
-    journal, known = Journal(tmp_path / FILE), history(30)
+    monkeypatch.setattr(pointings, "MOST_BYTES", 3000)
+    journal, known = pointing_journal(tmp_path), history(30)
     for number, one in enumerate(known):
-        journal.add(one, known[max(0, number - 1) : number + 1])
+        journal.append(one, known[max(0, number - 1) : number + 1])
         assert (tmp_path / FILE).stat().st_size <= 3000
     assert journal.read()[-2:] == known[-2:]
 
 
 def test_a_drift_is_told_after_a_restart_and_ends_with_another_mast_file(tmp_path: Path) -> None:
     for one in history(6, 2e-3):
-        Journal(tmp_path / FILE).add(one, [])
-    health = CalibrationHealth(tmp_path, STORED, lambda: NOON_S + 600.0)
+        pointing_journal(tmp_path).append(one)
+    thread = JournalThread(SystemClock())
+    health = CalibrationHealth(tmp_path, STORED, thread, lambda: NOON_S + 600.0)
     until(lambda: health.verdict.word == "drifts", "it drifts")
-    told = health.told()
-    assert "pancam_left" in told["sentence"] and "mrad" in told["sentence"]
-    assert len(told["newest"]) == told["pointings"] == 6
+    summary = health.summary()
+    assert "pancam_left" in summary["sentence"] and "mrad" in summary["sentence"]
+    assert len(summary["newest"]) == summary["pointings"] == 6
     health.use_mast(replace(STORED, digest="0" * 64))
-    assert health.verdict.word == "few" and health.told()["newest"] == []
+    assert health.verdict.word == "few" and health.summary()["newest"] == []
     health.use_mast(STORED)
     until(lambda: health.verdict.word == "drifts", "it drifts")
-    health.close()
+    thread.close()
 
 
 def test_a_mast_file_that_does_not_say_how_sure_it_is_is_not_judged_by(tmp_path: Path) -> None:
     unsure = replace(STORED, rig=replace(STORED.rig, fit={}))
-    health = CalibrationHealth(tmp_path, unsure, lambda: NOON_S)
+    thread = JournalThread(SystemClock())
+    health = CalibrationHealth(tmp_path, unsure, thread, lambda: NOON_S)
     health.ended(unsure, ended_pointing())
-    health.close()
+    thread.close()
     assert health.verdict.word == "unknown"
     assert "fit.covariance" in health.verdict.sentence
-    assert len(Journal(tmp_path / FILE).read()) == 1
+    assert len(pointing_journal(tmp_path).read()) == 1

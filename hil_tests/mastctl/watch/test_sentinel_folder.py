@@ -139,34 +139,6 @@ def test_two_looks_must_name_the_same_before_it_is_told(
     assert phrase in now.sentence
 
 
-def history(sizes: list[float], sigma: float = 1e-4) -> list[dict[str, Any]]:
-    """A look a day, the last an hour ago; each measured a slip of so much."""
-    looks = []
-    for number, size in enumerate(sizes):
-        look = day(len(sizes) - 1 - number + 1 / 24, "pan slipped" if abs(size) > 6 * sigma else None)
-        looks.append(
-            {**look, "changes": {"pan slipped": {"values": [size], "sigma": [sigma], "sigmas": 1.0}}}
-        )
-    return looks
-
-
-def test_a_change_that_grew_is_slow_with_a_rate_and_a_step_is_not() -> None:
-    rng = np.random.default_rng(2)
-    days = np.arange(1, 31)
-    reference = Reference((NOW - timedelta(days=30, hours=1)).isoformat(), "d" * 64, (), (), Path())
-    noise = 5e-5 * rng.normal(size=30)
-    grown = standing(reference, history(list(4e-5 * days + noise)), NOW)
-    assert grown.level == "bad"
-    assert "grown slowly, 0.04 mrad a day, since 3" in grown.sentence
-    step = standing(reference, history(list(np.where(days > 20, 1.2e-3, 0.0) + noise)), NOW)
-    assert "slowly" not in step.sentence
-    assert "since 9 days" in step.sentence
-    late = standing(reference, history(list(6e-5 * np.maximum(days - 10, 0) + noise)), NOW)
-    assert "grown slowly, 0.059 mrad a day, since 20 days" in late.sentence
-    since = datetime.fromisoformat(late.since or "")
-    assert abs((NOW - since) / timedelta(days=1) - 20) < 3
-
-
 def test_a_clock_that_was_set_back_does_not_stop_the_looks() -> None:
     reference = Reference((NOW + timedelta(days=3)).isoformat(), "d" * 64, (), (), Path())
     assert "at a time 3 days ahead of this clock" in standing(reference, [], NOW).sentence

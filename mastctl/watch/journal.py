@@ -1,0 +1,174 @@
+"""Growing files of records, one JSON line each, and the one thread that reads and writes them."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, Generic, TypeVar
+
+from calib.errors import BadFile
+from calib.files.atomic import replace_bytes
+from drivers.clock import Clock, SystemClock
+from mastctl.control.standing import StandingFault
+from mastctl.json_lines import OtherFile, append_line, read_lines
+
+log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+NEWEST_BYTES = 16_000_000
+"""So much of a file without a bound is read, its newest part."""
+NAME = "drift_watch"
+POLL_S = 2.0
+SLOW_S = 5.0
+CLOSE_S = 2.0
+
+
+class Journal(Generic[T]):
+    """A file of records; several processes may append to one that has no bound.
+
+    Parameters
+    ----------
+    path
+        Made by the first `append`, its folder too.
+    what
+        The records in the plural, for messages.
+    to_json, from_json
+        A record's object, and the record of an object; ``from_json`` raises ValueError, TypeError,
+        LookupError or BadFile for anything else.
+    begins
+        How each line begins; a file that begins otherwise is not appended to.
+    most_bytes
+        At which the file is written anew with the records that still count; None: never.
+    """
+
+    def __init__(
+        self, path: Path, what: str, to_json: Callable[[T], Mapping[str, Any]],
+        from_json: Callable[[Any], T], begins: bytes = b"", most_bytes: int | None = None,
+    ) -> None:  # fmt: skip
+        self.path = path
+        self._what = what
+        self._to_json, self._from_json = to_json, from_json
+        self._begins = begins
+        self._most_bytes = most_bytes
+
+    def read(self) -> list[T]:
+        """Return the records, oldest first; lines that are none are left out, and logged.
+
+        Raises
+        ------
+        BadFile
+            If the file system refuses.
+        """
+        try:
+            lines = read_lines(self.path, 2 * self._most_bytes if self._most_bytes else NEWEST_BYTES)
+        except OSError as error:
+            raise BadFile(self.path, "", f"cannot be read: {error.strerror or error}") from None
+        records = []
+        for line in lines:
+            try:
+                records.append(self._from_json(json.loads(line)))
+            except (ValueError, TypeError, LookupError, OverflowError, RecursionError, BadFile):
+                continue
+        if len(records) < len(lines):
+            left_out = len(lines) - len(records)
+            log.warning("%s: %d of %d lines are no %s", self.path, left_out, len(lines), self._what)
+        return records
+
+    def append(self, record: T, counting: Sequence[T] = ()) -> None:
+        """Add a record; it is on the disk, whole, when this returns.
+
+        What a crash has left of a line at the end of the file is taken away first. At its bound the file is
+        written anew with ``counting``, which has the record too.
+
+        Raises
+        ------
+        BadFile
+            If the file system refuses, or the file holds something else.
+        ValueError
+            If a number is not finite.
+        """
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            if not append_line(self.path, self._line(record), self._most_bytes, self._begins):
+                replace_bytes(self.path, b"".join(map(self._line, counting)))
+        except OtherFile:
+            message = f"holds no {self._what}; a new or another file is expected"
+            raise BadFile(self.path, "", message) from None
+        except OSError as error:
+            raise BadFile(self.path, "", f"cannot be written: {error.strerror or error}") from None
+
+    def _line(self, record: T) -> bytes:
+        return (json.dumps(self._to_json(record), allow_nan=False) + "\n").encode()
+
+
+class JournalThread:
+    """Does what may have to wait for a file, one after the other.
+
+    Parameters
+    ----------
+    clock
+        Dates the fault.
+    file_time
+        Measures how long a file does not answer; the machine's own clock by default: a file is real, also
+        beside a simulation.
+    """
+
+    def __init__(self, clock: Clock, file_time: Clock | None = None) -> None:
+        self._clock = clock
+        self._file_time = file_time or SystemClock()
+        self._queue: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._polled: list[Callable[[], None]] = []
+        self._busy_since_s: tuple[float, float] | None = None
+        self._thread = threading.Thread(target=self._work, name=NAME, daemon=True)
+        self._thread.start()
+
+    def put(self, act: Callable[[], None]) -> None:
+        """Have something done."""
+        self._queue.put(act)
+
+    def poll(self, act: Callable[[], None]) -> None:
+        """Have something done now and every few seconds."""
+        self._queue.put(lambda: self._polled.append(act))
+        self._queue.put(act)
+
+    def faults(self) -> tuple[StandingFault, ...]:
+        """Return what is wrong with the files: one does not answer."""
+        busy = self._busy_since_s
+        if busy is None or self._file_time.now_s() - busy[1] <= SLOW_S:
+            return ()
+        message = "a file of the drift watch does not answer; hand-offs and residuals wait for it"
+        return (StandingFault(NAME, "slow", message, busy[0], "the file answers"),)
+
+    def close(self) -> None:
+        """Finish what was put in; bounded."""
+        self._queue.put(None)
+        self._thread.join(CLOSE_S)
+        if self._thread.is_alive():
+            log.error("a file of the drift watch does not answer; the newest records are not kept")
+
+    def _work(self) -> None:
+        polled_s = time.monotonic()
+        while True:
+            acts: list[Callable[[], None]] = []
+            try:
+                act = self._queue.get(timeout=POLL_S)
+                if act is None:
+                    return
+                acts.append(act)
+            except Empty:
+                pass
+            if time.monotonic() - polled_s >= POLL_S:
+                polled_s = time.monotonic()
+                acts += self._polled
+            for act in acts:
+                self._busy_since_s = self._clock.now_s(), self._file_time.now_s()
+                try:
+                    act()
+                except Exception:  # an unexpected record must not end the watch
+                    log.exception("the drift watch met a defect of the program")
+                self._busy_since_s = None
