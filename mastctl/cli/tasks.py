@@ -88,7 +88,7 @@ def results_of(
     done
         Called with each result as it comes, in any order.
     found
-        What a result is worth a line for, if it is no failure; empty for none.
+        A line for a result that is no failure; empty for none.
 
     Returns
     -------

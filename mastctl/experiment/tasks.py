@@ -1,8 +1,4 @@
-"""Tasks of an experiment or campaign: named by all that decides their results, run anywhere, kept.
-
-A task's name is a digest of its function, its inputs and the program: the source, the packaged rigs, and the
-versions of what computes. After an upgrade every task has another name, so that no result of an old program
-is taken for one of the new.
+"""Tasks of an experiment or campaign: run on any executor, their results kept.
 
 Processes of this machine or a Dask cluster run them. A task carries its own seed and results are put in the
 order of the tasks, so the numbers are the same. To the last digit they are if linear algebra runs in one
@@ -12,74 +8,55 @@ in another order.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
-import importlib.metadata
+import json
 import os
 import pickle
-import platform
-import socket
-import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import AbstractContextManager, contextmanager, suppress
-from datetime import date
-from enum import Enum
-from functools import cache
+from importlib.metadata import version
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-import numpy as np
-
 from calib.files.atomic import save_bytes
+from mastctl.as_json import as_json
 from mastctl.errors import MastctlError
-from mastctl.packaged import config_folder
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-COMPUTES = ("numpy", "scipy", "opencv-python-headless", "numba")
-"""Packages whose versions decide digits."""
-
-OURS = ("mastctl", "drivers", "calib")
 SUFFIX = ".task"
 
 
 class TaskFailed(MastctlError):
-    """A task ended without a result; what others came to is kept, if results are kept."""
+    """A task ended without a result; the results of others are kept, if results are kept."""
 
     code = "task_failed"
 
 
-class OtherProgram(MastctlError):
-    """A worker runs another program than the one that asks: its numbers would go under a false name."""
-
-    code = "other_program"
-    exit_code = 2
-
-
 class _Broke(Exception):
-    """What went wrong in a task, in words."""
+    """The error of a task, as a sentence."""
 
 
 class Work(Generic[Task, Result]):
-    """Tasks of one function, which decides by a task's value alone what it comes to.
+    """Tasks of one function, whose result depends on a task's value alone.
 
     Parameters
     ----------
     function
         Of a module, so that another process finds it by its name.
     tasks
-        Values of dataclasses, arrays, numbers, words and what holds them; the same value is the same task.
+        Dataclasses of arrays, numbers, texts and such; the same value is the same task.
     label
-        What a person calls a task.
+        Describes a task.
 
     Attributes
     ----------
     ids
-        Of the tasks, in their order.
+        Of the tasks, in their order: by function, version of the program, and value.
     """
 
     def __init__(
@@ -88,9 +65,7 @@ class Work(Generic[Task, Result]):
         self.function = function
         self.tasks = tuple(tasks)
         self.label = label
-        self.program = program_of(function)
-        name = f"{function.__module__}.{function.__qualname__}"
-        self.ids = tuple(_digest((name, self.program, _plain(task))) for task in self.tasks)
+        self.ids = tuple(_id(function, task) for task in self.tasks)
 
     def run(
         self,
@@ -113,8 +88,6 @@ class Work(Generic[Task, Result]):
         ------
         TaskFailed
             If a task raised an error, after all the others have ended; or if a process of the executor died.
-        OtherProgram
-            If a worker runs another version of the program.
         BadFile
             If a result cannot be kept.
         """
@@ -138,16 +111,12 @@ class Work(Generic[Task, Result]):
         self, executor: Executor, todo: Mapping[str, Task], kept: KeptResults | None
     ) -> Iterator[tuple[str, Result]]:
         """Run tasks; their names and results as they come."""
-        futures = {
-            executor.submit(_one, self.function, task, self.program): name for name, task in todo.items()
-        }
+        futures = {executor.submit(_one, self.function, task): name for name, task in todo.items()}
         failed: list[tuple[str, Exception]] = []
         for future in as_completed(futures):
             name = futures[future]
             try:
                 result = future.result()
-            except OtherProgram:
-                raise
             except BrokenExecutor as error:
                 raise TaskFailed(
                     f"a process that ran a task died (killed, or out of memory?): {error}"
@@ -156,7 +125,7 @@ class Work(Generic[Task, Result]):
                 failed.append((name, error))
                 continue
             if kept is not None:
-                kept.write(name, self.label(todo[name]), result)
+                kept.write(name, result)
             yield name, result
         if failed:
             name, first = failed[0]
@@ -177,102 +146,35 @@ class KeptResults:
         self.folder = folder
 
     def holds(self, name: str) -> bool:
-        """Tell whether a whole result of a task is there."""
-        return self._payload(name) is not None
+        """Return whether the result of a task is kept."""
+        return self._path(name).is_file()
 
     def read(self, name: str) -> Any | None:
-        """Return the result of a task; None where there is none, or none that is whole."""
-        payload = self._payload(name)
-        return None if payload is None else pickle.loads(payload)
+        """Return the result of a task; None where there is none."""
+        return pickle.loads(self._path(name).read_bytes()) if self.holds(name) else None
 
-    def write(self, name: str, label: str, result: object) -> None:
-        """Keep a result, unless it is there; raises BadFile."""
-        if self.holds(name):
-            return
+    def write(self, name: str, result: object) -> None:
+        """Keep a result. Raises BadFile."""
         with suppress(FileExistsError):
             self.folder.mkdir(parents=True, exist_ok=True)
-        payload = pickle.dumps(result, protocol=5)
-        head = f"{hashlib.sha256(payload).hexdigest()} {' '.join(label.split())}\n"
-        save_bytes(self._path(name), head.encode() + payload)
-
-    def _payload(self, name: str) -> bytes | None:
-        try:
-            head, _, payload = self._path(name).read_bytes().partition(b"\n")
-        except FileNotFoundError:
-            return None
-        whole = head.split(b" ", 1)[0] == hashlib.sha256(payload).hexdigest().encode()
-        return payload if whole else None
+        save_bytes(self._path(name), pickle.dumps(result, protocol=5))
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{name}{SUFFIX}"
 
 
-def _one(function: Callable[[Task], Result], task: Task, program: str) -> Result:
-    """Run one task where this program is the one that asked."""
-    here = program_of(function)
-    if here != program:
-        raise OtherProgram(
-            f"the worker on {socket.gethostname()} runs another program ({here}) than this one ({program}); "
-            "install the same version of everything there"
-        )
+def _one(function: Callable[[Task], Result], task: Task) -> Result:
+    """Run one task."""
     try:
         return function(task)
-    except Exception as error:  # not every error survives the way between processes; its words do
+    except Exception as error:  # not every error survives between processes; its sentence does
         raise _Broke(f"{type(error).__name__}: {error}") from error
 
 
-def program_of(function: Callable[..., Any]) -> str:
-    """Return what decides numbers beside a task's inputs, in words: versions, and a digest of the source."""
-    return _program(function.__module__.partition(".")[0])
-
-
-@cache
-def _program(package: str) -> str:
-    source = hashlib.sha256()
-    for name in dict.fromkeys((*OURS, package)):
-        module = sys.modules[name] if name in sys.modules else __import__(name)
-        # a folder without __init__.py may be found by two ways
-        for root in sorted({Path(place).resolve() for place in getattr(module, "__path__", ())}):
-            _feed(source, name, root, "*.py")
-        if not hasattr(module, "__path__") and module.__file__ is not None:
-            source.update(Path(module.__file__).read_bytes())
-    _feed(source, "configs", config_folder(), "*.yaml")
-    versions = [f"python {platform.python_version()} {platform.machine()}"]
-    for name in COMPUTES:
-        with suppress(importlib.metadata.PackageNotFoundError):
-            versions.append(f"{name} {importlib.metadata.version(name)}")
-    return ", ".join([*versions, f"source {source.hexdigest()[:12]}"])
-
-
-def _feed(source: Any, name: str, root: Path, pattern: str) -> None:
-    """Digest files of a folder, each with its name."""
-    for path in sorted(root.rglob(pattern)):
-        data = path.read_bytes()
-        source.update(f"{name}/{path.relative_to(root).as_posix()} {len(data)}\n".encode() + data)
-
-
-def _digest(plain: object) -> str:
-    return hashlib.sha256(repr(plain).encode()).hexdigest()[:16]
-
-
-def _plain(value: Any) -> Any:
-    """A value as nested tuples of words and numbers whose ``repr`` tells any two values apart."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = tuple((f.name, _plain(getattr(value, f.name))) for f in dataclasses.fields(value))
-        return type(value).__module__, type(value).__qualname__, fields
-    if isinstance(value, np.ndarray) and value.dtype != object:
-        return "array", value.dtype.str, value.shape, value.tobytes()
-    if isinstance(value, (np.generic, Enum)):
-        return type(value).__name__, _plain(value.item() if isinstance(value, np.generic) else value.value)
-    if isinstance(value, Mapping):
-        return "mapping", tuple((_plain(key), _plain(one)) for key, one in value.items())
-    if isinstance(value, (tuple, list)):
-        return type(value).__name__, tuple(map(_plain, value))
-    if value is None or type(value) in (bool, int, float, str, bytes):
-        return value
-    if isinstance(value, date):
-        return "date", value.isoformat()
-    raise TypeError(f"a task holds {type(value).__name__}, whose value no name can hold")
+def _id(function: Callable[[Task], Any], task: Task) -> str:
+    """A name of a task that another run of the same version gives it too."""
+    made_by = function.__module__, function.__qualname__, version("mastctl"), type(task).__qualname__
+    return hashlib.sha256(json.dumps([*made_by, as_json(task)]).encode()).hexdigest()[:16]
 
 
 DASK = "dask:"

@@ -56,17 +56,9 @@ def test_what_is_kept_is_not_run_again_and_comes_back_to_the_last_bit(tmp_path: 
         assert one.tobytes() == other.tobytes()
 
 
-@pytest.mark.parametrize(
-    "damage", [lambda data: data[: len(data) // 2], lambda data: data[:-1] + b"x", lambda data: b""]
-)
-def test_a_torn_result_is_run_again(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
-    one = work(1)
-    whole = one.run(threads, KeptResults(tmp_path))[0]
-    file = tmp_path / f"{one.ids[0]}.task"
-    file.write_bytes(damage(file.read_bytes()))
-    assert not KeptResults(tmp_path).holds(one.ids[0])
-    np.testing.assert_array_equal(one.run(threads, KeptResults(tmp_path))[0], whole)
-    assert calls == [0, 0] and KeptResults(tmp_path).holds(one.ids[0])
+def test_another_value_or_function_is_another_task() -> None:
+    assert len({*work(3).ids, *work(3, broken_when_odd).ids, *Work(drawn, [Draw(0, 4)], str).ids}) == 7
+    assert work(2).ids == work(3).ids[:2]
 
 
 def test_a_task_that_fails_takes_no_other_with_it(tmp_path: Path) -> None:
