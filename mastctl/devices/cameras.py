@@ -529,8 +529,7 @@ class Cameras:
         ended_s = frame.mid_exposure_s + frame.exposure_s / 2
         until_s = self._time.now_s() + READINGS_S
         while (newest := self._history.newest) is None or newest.time_s < ended_s:
-            self._read()
-            if self._time.now_s() > until_s:
+            if self._read().time_s < ended_s and self._time.now_s() > until_s:
                 raise BadReply("the readings stay behind the frame's exposure", device=self._head)
         joints = self._history.at_exposure(began_s, frame.mid_exposure_s, ended_s, self._head)
         frame_id, mast_digest = self._store.name(camera, frame.sequence)

@@ -20,7 +20,7 @@ from drivers.interfaces import CameraInfo, Frame, FrameTime, Reading
 from hil_tests.mastctl.devices.turned import DIGEST, LIMITS, Hang, Turned
 from hil_tests.mastctl.service_fakes import FakeCamera, FakeHardware, rig
 from hil_tests.waiting import until
-from mastctl.devices import joint_history
+from mastctl.devices import cameras, joint_history
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import KEPT_FRAMES, StampedFrame
 from mastctl.devices.joint_history import JointHistory
@@ -593,6 +593,13 @@ def test_readings_that_do_not_reach_around_the_exposure_are_refused(
 ) -> None:
     with pytest.raises(BadReply, match=words):
         history(*((t, 0.0, 0.0, moves) for t in times_s)).at_exposure(5.0, 5.01, 5.02, "head")
+
+
+def test_a_reading_that_reaches_beyond_the_exposure_serves_however_late(
+    devices: Devices, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cameras, "READINGS_S", -1.0)  # over before any reading comes
+    assert devices.frames(["navcam_left"], now(devices), 1.0)
 
 
 def test_a_late_reading_of_a_head_at_rest_is_no_fault() -> None:
