@@ -35,9 +35,8 @@ class StateMachine:
         Stamps the changes.
     publisher
         Where they are published; one of its own by default.
-    latch, more_latched
-        The emergency stop that held when the daemon ended, if one did, and those of further people: it
-        begins ``stopped``.
+    latched
+        The causes of the emergency stop that held when the daemon ended: it begins ``stopped`` with any.
 
     Attributes
     ----------
@@ -49,15 +48,14 @@ class StateMachine:
         self,
         clock: Clock,
         publisher: Publisher | None = None,
-        latch: Latched | None = None,
-        more_latched: tuple[Latched, ...] = (),
+        latched: Sequence[Latched] = (),
     ) -> None:
         self.publisher = publisher or Publisher()
         self._clock = clock
         self._lock = threading.RLock()
         now = Standing(since_s=clock.now_s())
-        if latch is not None:
-            now = replace(now, word="stopped", latch=latch, more_latched=more_latched)
+        if latched:
+            now = replace(now, word="stopped", latched=tuple(latched))
         self._standing = replace(now, reason=why(now))
         self.publisher.publish("state", "machine", self._standing)
 
@@ -141,33 +139,22 @@ class StateMachine:
         """Take that a stop is over: the head has confirmed it, or its fault was told before."""
         self._take(lambda now: ("stop_ended", replace(now, stops=max(0, now.stops - 1))))
 
-    def estop_asked(self, latch: Latched, instead_of: Latched | None = None) -> None:
+    def estop_asked(self, latched: Callable[[], Sequence[Latched]]) -> None:
         """Take an emergency stop, between `stop_asked` and `stop_ended` of its stop.
 
-        From then on nothing may begin. One that is latched already stays, but for the one whose place it
-        takes; the first one stays in front.
+        From then on nothing may begin. ``latched`` returns all causes of then; it must not wait.
         """
-
-        def news(now: Standing) -> tuple[Event, Standing]:
-            entries = tuple(latch if one == instead_of else one for one in now.latched)
-            entries = entries if latch in entries else (*entries, latch)
-            return "estop_asked", replace(now, latch=entries[0], more_latched=entries[1:], held=AFTER_A_STOP)
-
-        self._take(news)
+        self._take(lambda now: ("estop_asked", replace(now, latched=tuple(latched()), held=AFTER_A_STOP)))
 
     def reset(self, name: str, reason: str, latched: Callable[[], Sequence[Latched]] = tuple) -> None:
-        """Take that a latch was released, of a service that asked `refusal` of ``latch`` before.
+        """Take that a latch was released, of a service that called `refusal` of ``latch`` before.
 
-        ``latched`` tells what is latched then: other people's emergency stops, and what came since. It must
-        not wait.
+        ``latched`` returns the causes that came since. It must not wait.
         """
         held = f"reset by {name}: {reason}; the next command starts"
 
         def news(now: Standing) -> tuple[Event, Standing] | None:
-            if now.latch is None:
-                return None
-            first, *more = latched() or (None,)
-            return "reset", replace(now, latch=first, more_latched=tuple(more), held=held)
+            return ("reset", replace(now, latched=tuple(latched()), held=held)) if now.latched else None
 
         self._take(news)
 

@@ -40,7 +40,7 @@ def refusal_of(now: Standing, need: Need) -> MastctlError | None:
     if to == "refused: stopping":
         return NotNow("stopping", f"{now.reason}; ask again when that is over")
     if to == "refused: estopped" and need not in ("rest", "idle"):
-        return NotNow("estopped", now.reason if now.latch is None else latched_sentence(now.latched))
+        return NotNow("estopped", latched_sentence(now.latched) if now.latched else now.reason)
     if need == "latch":
         return None
     if now.operation is not None:

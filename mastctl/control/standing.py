@@ -50,12 +50,12 @@ class Residual:
 
 @dataclass(frozen=True)
 class Latched:
-    """An emergency stop that holds until somebody resets it.
+    """One cause of an emergency stop, which holds until a reset.
 
     Attributes
     ----------
     name, reason
-        Who asked for it and why, as told.
+        The client and its reason, as given.
     at
         When, ISO 8601 in UTC: it outlives the clock of this run.
     """
@@ -70,9 +70,8 @@ class Latched:
 
     @property
     def sentence(self) -> str:
-        """What is told to whoever wants the head to move."""
-        words = f"an emergency stop is latched ({self.name}: {self.reason})"
-        return f"{words}; 'mastctl reset' with a reason and a name releases it"
+        """The refusal of a move."""
+        return latched_sentence((self,))
 
 
 def latched_sentence(entries: Sequence[Latched]) -> str:
@@ -110,10 +109,8 @@ class Standing:
         operation or a track has begun since.
     faults
         What is wrong with the head.
-    latch
-        The emergency stop that holds, None without one; the oldest of several.
-    more_latched
-        Those of further people.
+    latched
+        The causes of the emergency stop that is latched, the oldest first; empty without one.
     """
 
     word: Word = "starting"
@@ -128,13 +125,7 @@ class Standing:
     stops: int = 0
     held: str = ""
     faults: tuple[StandingFault, ...] = ()
-    latch: Latched | None = None
-    more_latched: tuple[Latched, ...] = ()
-
-    @property
-    def latched(self) -> tuple[Latched, ...]:
-        """All emergency stops that hold, the oldest first."""
-        return () if self.latch is None else (self.latch, *self.more_latched)
+    latched: tuple[Latched, ...] = ()
 
 
 CLOSING = "the service is closing"
@@ -153,7 +144,7 @@ def why(now: Standing) -> str:
             return now.held
         case "stopping":
             return _why_stopping(now)
-        case "stopped" if now.latch is not None:
+        case "stopped" if now.latched:
             return "; ".join([latched_sentence(now.latched), *(_told(fault) for fault in now.faults[:1])])
         case "fault" if now.faults:
             more = len(now.faults) - 1

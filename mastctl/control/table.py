@@ -143,7 +143,7 @@ def after_a_stop(now: Standing) -> Word:
     """Return the state when a part of a stop is done, or the latch released: stopping until all is done."""
     if now.stops or now.operation is not None:
         return "stopping"
-    if now.latch is not None:
+    if now.latched:
         return "stopped"
     return "fault" if now.faults else "holding"
 

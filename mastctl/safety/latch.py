@@ -1,7 +1,7 @@
 """The latch of a head: in memory from the first moment, and on the disk across restarts.
 
 It lies in the head's place (`mastctl.safety.heads`), or in the state folder for a head in this program's
-memory. It keeps a log of its causes, one a person, and a reset releases all of them.
+memory. It keeps a log of its causes, and a reset releases all of them.
 
 What cannot be read counts as latched: so a stop is written over the file that says that none is, which is
 there from the start, and quick. The disk never holds the stop up: a thread of its own writes, after the head
@@ -33,9 +33,8 @@ FILE = "latch.json"
 USED_SCHEMA = "mastctl/latch-used/1"
 USED = "latch.used.json"
 """Says where a latch file was: where it is gone, nobody knows what it said."""
-NOBODY, NO_REASON = "anonymous", "no reason given"
-MOST = 5
-OTHERS = "others"  # stops of more people than entries are kept of
+NO_NAME, NO_REASON = "anonymous", "no reason given"
+MOST = 5  # causes: strangers with many names fill no disk
 HEAD_FIRST_S = 0.1  # how long the disk waits for the head to be told, at most
 AGAIN_S = 2.0
 PATIENCE_S = 2.0  # of a reset for a disk that is busy
@@ -52,7 +51,7 @@ class Estopped(Stopped):
 
 
 class Latch:
-    """The emergency stops of one head; safe to use from any thread.
+    """The emergency stop of one head; safe to use from any thread.
 
     Parameters
     ----------
@@ -66,7 +65,7 @@ class Latch:
     Attributes
     ----------
     entries
-        The stops that are latched, the oldest first; read without a lock.
+        The causes, the oldest first, empty if nothing is latched; read without a lock.
     folder
         Where they are kept.
     since_s
@@ -108,44 +107,38 @@ class Latch:
 
     @property
     def held(self) -> Latched | None:
-        """The oldest stop that is latched, None if none is; read without a lock."""
+        """The oldest cause, None if nothing is latched; read without a lock."""
         entries = self.entries
         return entries[0] if entries else None
 
     def hold(self, reason: str | None, name: str | None) -> Latched:
-        """Latch in memory, at once; returns the entry of who asks, which stays as it is if there is one.
+        """Latch in memory, at once; return the cause. The log keeps each once, and the first `MOST`.
 
         The disk is written to when `head_told` is called, or a moment later.
         """
         with self._changed:
             self._asked += 1
-            entry = Latched(_told(name, NOBODY), _told(reason, NO_REASON), _now())
-            for one in self.entries:
-                if one.name == entry.name:
-                    return one
-            before = len(self.entries)
-            if before >= MOST - 1:  # strangers with many names fill no disk
-                entry = replace(entry, name=OTHERS, reason=f"stops of more than {MOST - 1} people")
-            self.entries = _merged(self.entries, (entry,))
-            if len(self.entries) > before:
+            cause = Latched(_line(name, NO_NAME), _line(reason, NO_REASON), _now())
+            before = self.entries
+            self.entries = _merged(before, (cause,))
+            if self.entries is not before:
                 now_s = time.monotonic()
                 self.since_s = self.since_s if before else now_s
                 self._due_s = now_s + HEAD_FIRST_S
                 self._changed.notify_all()
-            return next(one for one in self.entries if one.name == entry.name)
+            return next((one for one in self.entries if _same(one, cause)), cause)
 
     def explain(self, reason: str | None, name: str | None) -> tuple[Latched, Latched] | None:
         """Give the cause without name and reason those that came after its stop; return it before and after.
 
-        None if there is no such cause, or another one of that name, which stays as it is.
+        None if there is no such cause.
         """
         with self._changed:
-            bare = next((one for one in self.entries if (one.name, one.reason) == (NOBODY, NO_REASON)), None)
-            name = _told(name, NOBODY)
-            if bare is None or name in [one.name for one in self.entries if one is not bare]:
+            bare = next((one for one in self.entries if (one.name, one.reason) == (NO_NAME, NO_REASON)), None)
+            if bare is None:
                 return None
             self._asked += 1  # a reset that is under way has not released this
-            cause = replace(bare, name=name, reason=_told(reason, NO_REASON))
+            cause = replace(bare, name=_line(name, NO_NAME), reason=_line(reason, NO_REASON))
             self.entries = tuple(cause if one is bare else one for one in self.entries)
             self._changed.notify_all()
             return bare, cause
@@ -196,7 +189,7 @@ class Latch:
         Unable
             ``not_saved`` if the disk goes on to say that one is: a restart would be latched again.
         """
-        name, reason = _told(name, ""), _told(reason, "")
+        name, reason = _line(name, ""), _line(reason, "")
         if not self._disk.acquire(timeout=PATIENCE_S):
             words = "the disk has not taken the emergency stop yet; a reset follows it"
             raise Unable("not_saved", words, PATIENCE_S)
@@ -390,18 +383,22 @@ def _document(entries: tuple[Latched, ...]) -> dict[str, Any]:
 
 
 def _merged(entries: tuple[Latched, ...], more: tuple[Latched, ...]) -> tuple[Latched, ...]:
-    """Entries with those of further people; the same ones if there are none."""
+    """Causes with further ones, `MOST` at most; the same tuple if there are none."""
     for one in more:
-        if one.name not in [other.name for other in entries]:
+        if len(entries) < MOST and not any(_same(one, other) for other in entries):
             entries = (*entries, one)
     return entries
+
+
+def _same(one: Latched, other: Latched) -> bool:
+    return (one.name, one.reason) == (other.name, other.reason)
 
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
-def _told(text: str | None, otherwise: str) -> str:
+def _line(text: str | None, otherwise: str) -> str:
     """One line of bounded length."""
     return one_line(text or "", LONGEST) or otherwise
 

@@ -147,8 +147,7 @@ class Service:
         self.head_folder = head
         beside = heads.others(head_name(config.hardware), head)
         self.latch = Latch(folder, others=beside) if head is None else Latch(head, folder, beside)
-        entries = self.latch.entries
-        self.machine = StateMachine(clock, latch=self.latch.held, more_latched=entries[1:])
+        self.machine = StateMachine(clock, latched=self.latch.entries)
         publisher = self.machine.publisher
         self.journals = JournalThread(clock)
         self.health = CalibrationHealth(self.folder.path, mast.stored, self.journals)

@@ -119,7 +119,7 @@ def standing_told(now: Standing, now_s: float) -> StandingTold:
         "state": now.word,
         "reason": now.reason,
         "state_for_s": max(0.0, now_s - now.since_s),
-        "estop": as_json(now.latch),
+        "estop": as_json(now.latched[0]) if now.latched else None,
         "estops": as_json(now.latched),
         "operation": now.operation,
         "target": as_json(now.target),

@@ -134,7 +134,7 @@ class Stopping:
         self._machine.stop_asked()
         try:
             held = self._latch.hold(reason, name)
-            self._machine.estop_asked(held)
+            self._machine.estop_asked(self._causes)
             self._devices.block_moves(held, Estopped(held.sentence))
         finally:
             self._machine.stop_ended()
@@ -148,7 +148,7 @@ class Stopping:
             return None
         bare, held = explained
         self._machine.stop_asked()
-        self._machine.estop_asked(held, instead_of=bare)
+        self._machine.estop_asked(self._causes)
         self._devices.block_moves(held, Estopped(held.sentence))
         self._devices.allow_moves(bare)
         self._machine.stop_ended()
@@ -184,8 +184,11 @@ class Stopping:
             causes = self._latch.release(reason, name)
             for one in causes:  # and not what another one blocks that came meanwhile
                 self._devices.allow_moves(one)
-            self._machine.reset(name, reason, lambda: self._latch.entries)
+            self._machine.reset(name, reason, self._causes)
             return {"latched": bool(self._latch.entries), "released": causes[0].told()}
+
+    def _causes(self) -> tuple[Latched, ...]:
+        return self._latch.entries
 
 
 def state_faults(folder: StateFolder, latch: Latch, started_s: float) -> Iterator[StandingFault]:

@@ -41,7 +41,7 @@ def stopped_head(machine: StateMachine) -> None:
 
 def latched(machine: StateMachine) -> None:
     machine.stop_asked()
-    machine.estop_asked(LATCH)
+    machine.estop_asked(lambda: (LATCH,))
     machine.stop_ended()
 
 
@@ -73,7 +73,7 @@ TELL: dict[str, Callable[[StateMachine], Any]] = {
     "track_ended": lambda machine: machine.track_ended("1"),
     "stop_asked": lambda machine: machine.stop_asked(),
     "stop_ended": lambda machine: machine.stop_ended(),
-    "estop_asked": lambda machine: machine.estop_asked(LATCH),
+    "estop_asked": lambda machine: machine.estop_asked(lambda: (LATCH,)),
     "reset": lambda machine: asked_reset(machine, "Ana"),
     "fault_stands": lambda machine: machine.head_faults((HOT,)),
     "fault_cleared": lambda machine: machine.head_faults(()),
@@ -149,7 +149,7 @@ def test_an_unconfirmed_stop_ends_in_a_fault_or_latched() -> None:
     assert machine.standing.word == "stopped"
     assert "Ana: a hand in the way" in machine.standing.reason and "silent" in machine.standing.reason
     machine.reset("Ben", "nobody there")
-    assert machine.standing.word == "fault" and machine.standing.latch is None
+    assert machine.standing.word == "fault" and machine.standing.latched == ()
     machine.head_faults(())
     assert machine.standing.word == "holding"
     assert "Ben: nobody there" in machine.standing.reason
@@ -229,14 +229,14 @@ def test_what_ended_before_ends_nothing_that_runs_now() -> None:
 
 
 def test_a_latch_from_before_the_start_blocks_at_once() -> None:
-    machine = StateMachine(ManualClock(), latch=LATCH)
+    machine = StateMachine(ManualClock(), latched=(LATCH,))
     assert machine.standing.word == "stopped"
     machine.head_read(False)
     assert machine.standing.word == "stopped"
     machine.stop_asked()
-    machine.estop_asked(Latched("Ben", "again", ""))
+    machine.estop_asked(lambda: (LATCH, Latched("Ben", "again", "")))
     machine.stop_ended()
-    assert machine.standing.latch == LATCH
+    assert machine.standing.latched[0] == LATCH and len(machine.standing.latched) == 2
     machine.reset("Ben", "checked")
     assert (machine.standing.word, machine.standing.reason) == (
         "holding",

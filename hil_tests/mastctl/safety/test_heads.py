@@ -143,10 +143,14 @@ def test_a_latch_logs_its_causes_and_a_reset_releases_all(folder: StateFolder) -
     latch = Latch(folder)
     latch.hold("smoke", "Ana")
     latch.hold("a hand in the way", "Ben")
-    latch.hold("again", "Ana")  # hers stays as it is
+    latch.hold("smoke", "Ana")  # once in the log
+    latch.hold("sparks", "Ana")
+    for number in range(10):
+        latch.hold("a stranger", f"client {number}")
     latch.head_told()
     assert latch.kept_within(NET_S)
-    causes = [("Ana", "smoke"), ("Ben", "a hand in the way")]
+    causes = [("Ana", "smoke"), ("Ben", "a hand in the way"), ("Ana", "sparks")]
+    causes += [(f"client {number}", "a stranger") for number in range(2)]
     assert [(one.name, one.reason) for one in Latch(folder).entries] == causes
     assert [(one.name, one.reason) for one in latch.release("aired", "Cem")] == causes
     assert latch.held is None and Latch(folder).entries == ()
