@@ -238,45 +238,38 @@ def _add_check(actions: Any) -> None:
 
 
 def camera_check(args: argparse.Namespace) -> int:
-    """Measure what a camera delivers, and show what it can do."""
-    from calib.files.mast_file import sensor_mode_keys
-    from mastctl.setup.camera_check import quality_of
-
+    """Compare some seconds of a camera's frames with what a driver promises, and show what it can do."""
     if args.config is not None:
         config = config_of(args)
         if config.hardware.cameras[args.camera].driver != camera_driver()[0]:
-            return _check_any(args, config)
+            return _shown(args, _checked_beside(args, config))
     if args.with_head:
         raise output.WrongUse(
             f"--with-head goes with --config and a camera of another driver than {camera_driver()[0]}"
         )
+    from drivers.clock import SystemClock
+    from mastctl.setup.camera_check import CameraCheck
+
     with opened_camera(args) as camera:
-        measured = _measured(camera, args.seconds)
-        frame = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
-        quality = quality_of(frame.image)
-        problems = [problem.message for problem in camera.capture.problems]
-        document: dict[str, Any] = {
-            "card": camera.capture.identity.card,
-            "bus": camera.capture.identity.bus,
-            "driver": camera.capture.identity.driver,
-            "format": camera.capture.format.code,
-            "size_px": list(camera.capture.format.size_px),
-            **sensor_mode_keys(camera.capture.sensor_mode),
-            "asked_rate_hz": 1 / camera.capture.period_s,
-            **measured,
-            "quality": quality.told(),
-            "problems": problems,
+        capture, before = camera.capture, camera.counters
+        found = CameraCheck(args.camera, camera, SystemClock(), capture.format.size_px).run(args.seconds)
+        after = camera.counters
+        lost = {name: getattr(after, name) - getattr(before, name) for name in ("dropped", "damaged", "late")}
+        found |= {
+            "driver": capture.identity.driver,
+            "card": capture.identity.card,
+            "bus": capture.identity.bus,
+            "format": capture.format.code,
+            "asked_rate_hz": 1 / capture.period_s,
+            **lost,
             **camera.abilities(),
         }
-    if args.json:
-        output.print_json(document)
-    else:
-        _print_check(document)
-    return 0
+        found["problems"] += [problem.message for problem in capture.problems]
+    return _shown(args, found)
 
 
-def _check_any(args: argparse.Namespace, config: Config) -> int:
-    """Hold a configured camera of any driver against what a driver promises."""
+def _checked_beside(args: argparse.Namespace, config: Config) -> dict[str, Any]:
+    """Check a configured camera of any driver, after the head if that is asked for."""
     from drivers.clock import SystemClock
     from mastctl.devices.opening import devices_beside, open_one_camera
     from mastctl.service.masts import bounds_of
@@ -293,68 +286,17 @@ def _check_any(args: argparse.Namespace, config: Config) -> int:
     else:
         with open_one_camera(settings, args.camera, clock) as camera:
             found = CameraCheck(args.camera, camera, clock, size_px).run(args.seconds)
-    found |= {
-        "driver": settings.cameras[args.camera].driver,
-        "offset_s": settings.cameras[args.camera].offset_s,
-    }
+    device = settings.cameras[args.camera]
+    return found | {"driver": device.driver, "offset_s": device.offset_s}
+
+
+def _shown(args: argparse.Namespace, found: dict[str, Any]) -> int:
+    """Show a check; 1 if no frame came."""
     if args.json:
         output.print_json(found)
     else:
-        _print_any_check(found)
+        _print_check(found)
     return 0 if found["frames"] else 1
-
-
-def _measured(camera: Any, seconds: float) -> dict[str, Any]:
-    """Rate, losses and delays over some seconds."""
-    before = camera.counters
-    frame = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
-    first, until_s = frame, time.monotonic() + seconds
-    delays_s, count = [frame.received_s - frame.stamp_s], 0
-    while time.monotonic() < until_s:
-        after_s = frame.mid_exposure_s - frame.exposure_s / 2
-        frame = camera.next_frame(after_s, FRAME_TIMEOUT_S)
-        delays_s.append(frame.received_s - frame.stamp_s)
-        count += 1
-    counters = camera.counters
-    span_s = frame.stamp_s - first.stamp_s
-    return {
-        "rate_hz": (frame.sequence - first.sequence) / span_s if span_s > 0 else None,
-        "dropped": counters.dropped - before.dropped,
-        "damaged": counters.damaged - before.damaged,
-        "late": counters.late - before.late,
-        "delay_s": [min(delays_s), sorted(delays_s)[len(delays_s) // 2], max(delays_s)],
-        "mid_exposure_uncertainty_s": frame.mid_uncertainty_s,
-        "seconds": seconds,
-    }
-
-
-def _print_check(told: dict[str, Any]) -> None:
-    """The check as tables for people."""
-    quality = told["quality"]
-    low, median, high = (1e3 * delay_s for delay_s in told["delay_s"])
-    rate = "-" if told["rate_hz"] is None else f"{told['rate_hz']:.2f} Hz"
-    width, height = told["size_px"]
-    rows = [
-        ("camera", f"{told['card']} at {told['bus']} ({told['driver']})"),
-        ("format", f"{told['format']} {width}x{height}, {told['asked_rate_hz']:.4g} Hz promised"),
-        ("sensor_mode", _mode_words(told)),
-        ("rate", f"{rate} over {told['seconds']:g} s"),
-        ("dropped, damaged, late", f"{told['dropped']}, {told['damaged']}, {told['late']}"),
-        ("stamp to here", f"{low:.1f} to {high:.1f} ms, median {median:.1f} ms"),
-        ("mid-exposure known to", f"+-{1e3 * told['mid_exposure_uncertainty_s']:.1f} ms"),
-        ("grey levels", f"mean {quality['mean']:.0f}, median {quality['median']:.0f}"),
-        ("dark, saturated", f"{quality['dark_share']:.1%}, {quality['saturated_share']:.1%} of the pixels"),
-        ("sharpness", f"{quality['sharpness']:.1f}"),
-    ]
-    output.print_table("check", ("what", "found"), rows, [f"problem: {p}" for p in told["problems"]])
-    _print_levels(quality)
-    output.print_table(
-        "formats", ("code", "sizes"), [(f["code"], f["sizes"]) for f in told["formats"] if f["readable"]]
-    )
-    controls = [
-        (c["name"], c["kind"], str(c["value"]), f"{c['minimum']} to {c['maximum']}") for c in told["controls"]
-    ]
-    output.print_table("controls", ("name", "kind", "value", "range"), controls)
 
 
 def _mode_words(told: dict[str, Any]) -> str:
@@ -376,20 +318,26 @@ def _print_levels(quality: dict[str, Any]) -> None:
     output.print_table("grey levels", ("level", "share", ""), bars)
 
 
-def _print_any_check(told: dict[str, Any]) -> None:
-    """The check of any driver's camera as tables for people."""
-    problems = [f"problem: {p}" for p in told["problems"]] or ["no problem was found"]
-    rows = [("driver", told["driver"]), ("frames", f"{told['frames']} in {told['seconds']:g} s")]
-    if told["frames"]:
-        width, height = told["size_px"]
-        low, median, high = (1e3 * delay_s for delay_s in told["delay_s"])
-        shortest, longest = (1e3 * exposure_s for exposure_s in told["exposure_s"])
-        uncertainty_s = told["mid_exposure_uncertainty_s"]
+def _print_check(found: dict[str, Any]) -> None:
+    """The check as tables for people."""
+    problems = [f"problem: {p}" for p in found["problems"]] or ["no problem was found"]
+    rows = [("driver", found["driver"]), ("frames", f"{found['frames']} in {found['seconds']:g} s")]
+    if "card" in found:
         rows += [
-            ("pictures", f"{width}x{height}, {'colour' if told['colour'] else 'grey'}"),
-            ("rate", "-" if told["rate_hz"] is None else f"{told['rate_hz']:.2f} Hz by counts and stamps"),
-            ("passed over, refused", f"{told['missed']}, {told['refused']}"),
-            ("exposure's end to here", f"{low:.1f} to {high:.1f} ms, median {median:.1f} ms"),
+            ("camera", f"{found['card']} at {found['bus']}"),
+            ("format", f"{found['format']}, {found['asked_rate_hz']:.4g} Hz promised"),
+            ("dropped, damaged, late", f"{found['dropped']}, {found['damaged']}, {found['late']}"),
+        ]
+    if found["frames"]:
+        width, height = found["size_px"]
+        low, median, high = (1e3 * delay_s for delay_s in found["delay_s"])
+        shortest, longest = (1e3 * exposure_s for exposure_s in found["exposure_s"])
+        uncertainty_s, quality = found["mid_exposure_uncertainty_s"], found["quality"]
+        rows += [
+            ("images", f"{width}x{height}, {'colour' if found['colour'] else 'grey'}"),
+            ("rate", "-" if found["rate_hz"] is None else f"{found['rate_hz']:.2f} Hz by counts and stamps"),
+            ("passed over, refused", f"{found['missed']}, {found['refused']}"),
+            ("end of exposure to arrival", f"{low:.1f} to {high:.1f} ms, median {median:.1f} ms"),
             ("exposure", f"{shortest:.1f} to {longest:.1f} ms"),
             (
                 "mid-exposure known to",
@@ -397,10 +345,24 @@ def _print_any_check(told: dict[str, Any]) -> None:
                 if uncertainty_s is None
                 else f"+-{1e3 * uncertainty_s:.1f} ms",
             ),
-            ("sensor_mode", _mode_words(told)),
-            ("offset_s in use", f"{told['offset_s']:g}"),
-            ("tells of itself", ", ".join(told["abilities"]) or "nothing"),
+            ("sensor_mode", _mode_words(found)),
+            ("offset_s in use", f"{found.get('offset_s', 0.0):g}"),
+            ("states of itself", ", ".join(found["abilities"]) or "nothing"),
+            ("grey levels", f"mean {quality['mean']:.0f}, median {quality['median']:.0f}"),
+            (
+                "dark, saturated",
+                f"{quality['dark_share']:.1%}, {quality['saturated_share']:.1%} of the pixels",
+            ),
+            ("sharpness", f"{quality['sharpness']:.1f}"),
         ]
-    output.print_table(f"check of {told['camera']}", ("what", "found"), rows, problems)
-    if told["frames"]:
-        _print_levels(told["quality"])
+    output.print_table(f"check of {found['camera']}", ("what", "found"), rows, problems)
+    if found["frames"]:
+        _print_levels(found["quality"])
+    if "formats" in found:
+        formats = [(f["code"], f["sizes"]) for f in found["formats"] if f["readable"]]
+        output.print_table("formats", ("code", "sizes"), formats)
+        controls = [
+            (c["name"], c["kind"], str(c["value"]), f"{c['minimum']} to {c['maximum']}")
+            for c in found["controls"]
+        ]
+        output.print_table("controls", ("name", "kind", "value", "range"), controls)

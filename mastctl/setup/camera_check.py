@@ -1,4 +1,4 @@
-"""What a camera really delivers, held against what a driver promises, and how good its pictures are."""
+"""The frames of a camera compared with what a driver promises, and the quality of its images."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class CameraCheck:
             thread.close(1.0)
         self._check_count()
         self._check_abilities()
-        return self._told(seconds)
+        return self._summary(seconds)
 
     def problems(self, promise: str | None = None) -> list[str]:
         """Return what was found against a promise, or against any.
@@ -101,8 +101,8 @@ class CameraCheck:
                     return
                 after_s = self._clock.now_s()
                 continue
-            told_s = getattr(answer, "mid_uncertainty_s", None)
-            self._uncertainty_s = float(told_s) if isinstance(told_s, float) else None
+            uncertainty_s = getattr(answer, "mid_uncertainty_s", None)
+            self._uncertainty_s = uncertainty_s if isinstance(uncertainty_s, float) else None
             self._frames.append(frame)
             self._delays_s.append(now_s - (frame.mid_exposure_s + frame.exposure_s / 2))
             after_s = now_s if len(self._frames) % 5 == 0 else frame.exposure_began_s
@@ -152,9 +152,9 @@ class CameraCheck:
         counted, span_s = last.sequence - first.sequence, last.mid_exposure_s - first.mid_exposure_s
         return counted / span_s if counted > 0 and span_s > 0 else None
 
-    def _told(self, seconds: float) -> dict[str, Any]:
+    def _summary(self, seconds: float) -> dict[str, Any]:
         frames, info = self._frames, self._camera.info
-        told: dict[str, Any] = {
+        summary: dict[str, Any] = {
             "camera": self._name,
             "seconds": seconds,
             "frames": len(frames),
@@ -165,18 +165,18 @@ class CameraCheck:
             "problems": self.problems(),
         }
         if isinstance(info.sensor_mode, SensorMode):
-            told |= sensor_mode_keys(info.sensor_mode)
+            summary |= sensor_mode_keys(info.sensor_mode)
         if frames:
             image = frames[-1].image
-            told |= {
+            summary |= {
                 "size_px": [image.shape[1], image.shape[0]],
                 "colour": image.ndim == 3,
                 "missed": sum(max(0, b.sequence - a.sequence - 1) for a, b in pairwise(frames)),
                 "delay_s": [min(self._delays_s), statistics.median(self._delays_s), max(self._delays_s)],
                 "exposure_s": [min(f.exposure_s for f in frames), max(f.exposure_s for f in frames)],
-                "quality": quality_of(image).told(),
+                "quality": asdict(quality_of(image)),
             }
-        return told
+        return summary
 
 
 STATED = ("size_px", "sensor_mode", "period_s")
@@ -206,10 +206,6 @@ class Quality:
     dark_share: float
     saturated_share: float
     sharpness: float
-
-    def told(self) -> dict[str, Any]:
-        """Return it as JSON."""
-        return asdict(self)
 
 
 def quality_of(image: Image) -> Quality:
