@@ -26,8 +26,8 @@ class BadFile(CalibError):
         self.path = Path(path)
         self.place = place
         self.reason = reason
-        told = (_one_line(text, limit) for text, limit in ((str(path), 300), (place, 120), (reason, 250)))
-        super().__init__(": ".join(text for text in told if text))
+        parts = (_one_line(text, limit) for text, limit in ((str(path), 300), (place, 120), (reason, 250)))
+        super().__init__(": ".join(text for text in parts if text))
 
 
 def _one_line(text: str, limit: int) -> str:

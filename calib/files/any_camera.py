@@ -73,7 +73,7 @@ LENSES: dict[str, Kind] = {
     "equidistant": FISHEYE,
     "tilted": "OPENCV14",
 }
-"""The lenses that can be asked for, by the kind that a camera then is."""
+"""The lenses that can be requested, by the kind that a camera then is."""
 
 _OFFERED: dict[str, tuple[str, ...]] = {
     "opencv": ("plumb_bob", "rational_polynomial", "equidistant", "tilted"),
@@ -184,7 +184,7 @@ class Conversion:
 
 
 def format_of(path: str | Path) -> str:
-    """Return the format that a name asks for: by its suffix, or by the word before it (``left.ros.yaml``).
+    """Return the format that a name requests: by its suffix, or by what precedes it (``left.ros.yaml``).
 
     Raises
     ------

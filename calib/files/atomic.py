@@ -59,7 +59,7 @@ def save_bytes(path: str | Path, data: bytes) -> None:
     Raises
     ------
     BadFile
-        If the file system refuses; the file then holds what it held before.
+        If the file system refuses; the file is then as it was before.
     """
     try:
         target = Path(path).resolve()

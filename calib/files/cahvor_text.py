@@ -1,7 +1,7 @@
 """The ``.cahvor`` text files of JPL's camera-model library and of mrcal.
 
 Lines ``KEY = value`` in any order, ``#`` comments. ``Model`` is ``CAHV``, ``CAHVOR``, ``CAHVORE1``,
-``CAHVORE2`` or ``CAHVORE3,linearity``, each followed by words that are ignored. ``S`` and ``S internal`` head
+``CAHVORE2`` or ``CAHVORE3,linearity``, each followed by text that is ignored. ``S`` and ``S internal`` head
 matrices, one row a line: the covariance of the vectors' components, and of Hs, Hc, Vs, Vc, Theta (all five
 follow from the vectors). JPL's readers find keys by scanning forward for ``C =`` or ``Hs    =`` with exactly
 these blanks, so this writer keeps JPL's order and blanks. Numbers are in shortest round-trip form instead of
@@ -36,8 +36,8 @@ _LINE = re.compile(r"\s*([A-Za-z]\w*(?: internal)?)\s*=\s*(.*?)\s*")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _MODEL = re.compile(r"(CAHVORE|CAHVOR|CAHV)\s*(\d*)\s*(?:,\s*([^\s=]+))?\s*(?:=.*)?")
 _SCALARS = ("Hs", "Hc", "Vs", "Vc", "Theta")
-_MODEL_WORDS = {"CAHV": "perspective, linear", "CAHVOR": "perspective, distortion"}
-_CAHVORE_WORDS = {1: "perspective, distortion, pupil", 2: "fish-eye", 3: "general"}
+_MODEL_NAMES = {"CAHV": "perspective, linear", "CAHVOR": "perspective, distortion"}
+_CAHVORE_NAMES = {1: "perspective, distortion, pupil", 2: "fish-eye", 3: "general"}
 
 
 def looks_like_cahvor(data: bytes) -> bool:
@@ -98,7 +98,7 @@ def save_cahvor(camera: CameraFile, path: str | Path) -> tuple[str, ...]:
 def format_cahvor(camera: CameraFile) -> tuple[str, tuple[str, ...]]:
     """Return the .cahvor text of a camera, and what of the camera the format cannot hold."""
     model = camera.model
-    if model.kind not in (*_MODEL_WORDS, "CAHVORE"):
+    if model.kind not in (*_MODEL_NAMES, "CAHVORE"):
         raise ValueError(f".cahvor text holds CAHV, CAHVOR and CAHVORE, not {model.kind}; use save_any")
     lines = [
         "# camera model in CAHVOR vectors, metres and pixels; the centre of the first pixel is (0, 0)",
@@ -106,10 +106,10 @@ def format_cahvor(camera: CameraFile) -> tuple[str, tuple[str, ...]]:
     ]
     if model.kind == "CAHVORE":
         comma = f",{_fixed(model.linearity)}" if model.cahvore_type == 3 else ""
-        words = _CAHVORE_WORDS[model.cahvore_type]
-        lines += [f"Model = CAHVORE{model.cahvore_type}{comma} = {words}"]
+        name = _CAHVORE_NAMES[model.cahvore_type]
+        lines += [f"Model = CAHVORE{model.cahvore_type}{comma} = {name}"]
     else:
-        lines += [f"Model = {model.kind} = {_MODEL_WORDS[model.kind]}"]
+        lines += [f"Model = {model.kind} = {_MODEL_NAMES[model.kind]}"]
     lines += ["", f"Dimensions = {model.size_px[0]} {model.size_px[1]}", ""]
     lines += [f"{letter} = {' '.join(map(repr, getattr(model, letter).tolist()))}" for letter in model.kind]
 
@@ -231,25 +231,25 @@ def _kind(values: Values, path: str | Path) -> tuple[Kind, int, float | None]:
     return "CAHVORE", int(cahvore_type), number
 
 
-def _number(word: str, path: str | Path, line: int) -> float:
-    value = float(word) if _NUMBER.fullmatch(word) else math.nan
+def _number(text: str, path: str | Path, line: int) -> float:
+    value = float(text) if _NUMBER.fullmatch(text) else math.nan
     if not math.isfinite(value):
-        raise BadFile(path, f"line {line}", f"'{word[:40]}' where a finite number is expected")
+        raise BadFile(path, f"line {line}", f"'{text[:40]}' where a finite number is expected")
     return value
 
 
 def _numbers(values: Values, key: str, count: int, path: str | Path) -> list[float]:
     text, line = values[key]
-    words = text.split()
-    if len(words) != count:
-        raise BadFile(path, f"line {line}", f"{key} has {len(words)} numbers where {count} are expected")
-    return [_number(word, path, line) for word in words]
+    parts = text.split()
+    if len(parts) != count:
+        raise BadFile(path, f"line {line}", f"{key} has {len(parts)} numbers where {count} are expected")
+    return [_number(part, path, line) for part in parts]
 
 
 def _matrix(rows: Rows, order: Sequence[str], path: str | Path) -> FloatArray:
     """Read the covariance: as many rows and columns as the model has components."""
     size = len(order)
-    table = [[_number(word, path, line) for word in text.split()] for text, line in rows]
+    table = [[_number(part, path, line) for part in text.split()] for text, line in rows]
     if len(table) != size or any(len(row) != size for row in table):
         shape = f"{len(table)} rows of {sorted({len(row) for row in table})} numbers"
         raise BadFile(path, "S", f"{shape} where {size} rows of {size} are expected")
@@ -260,7 +260,7 @@ def _matrix(rows: Rows, order: Sequence[str], path: str | Path) -> FloatArray:
 
 
 def _check_internal(values: Values, model: CameraModel, path: str | Path) -> tuple[str, ...]:
-    """Tell where Hs, Hc, Vs, Vc of the file do not follow from its vectors; the vectors count."""
+    """Report where Hs, Hc, Vs, Vc of the file do not follow from its vectors; the vectors count."""
     internal = internal_parameters(model)
     notes = []
     for key in _SCALARS[:4]:

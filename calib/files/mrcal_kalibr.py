@@ -6,7 +6,7 @@ axes. LENSMODEL_CAHVOR and LENSMODEL_CAHVORE_linearity=p hold fx fy cx cy, alpha
 E2. O is (sin α cos β, sin β, cos α cos β) in camera axes. Since 2.5 ``extrinsics`` are called ``rt_cam_ref``
 too; before 1.0 the lens stood under ``lens_model`` or, as DISTORTION_..., under ``distortion_model``. They
 are exact twins of ours if H and V are at right angles. LENSMODEL_PINHOLE and OPENCV4, 5, 8, 12 are read too,
-and OPENCV5 and 8 written where asked for. Source: https://mrcal.secretsauce.net/cameramodels.html and
+and OPENCV5 and 8 written on request. Source: https://mrcal.secretsauce.net/cameramodels.html and
 lensmodels.html.
 
 Kalibr's camchain has cameras ``cam0``, ``cam1``, ... in YAML, each placed against the one before.
@@ -82,7 +82,7 @@ def parse_mrcal(data: bytes, path: str | Path) -> CameraFile:
     """
     bare = _INPUTS.sub(b"", data)
     notes: tuple[str, ...] = ("optimization_inputs: not read",) if bare != data else ()
-    # A mapping of numbers, words and lists in Python's form is one in YAML's too.
+    # A mapping of numbers, texts and lists in Python's form is one in YAML's too.
     top = ForeignMapping(path, "", parse_mapping(bare, path))
     lens_key, pose_key = top.need(*_MRCAL_LENS), top.need(*_MRCAL_POSE)
     for key in ("intrinsics", "imagersize"):

@@ -156,7 +156,7 @@ _LENS_KEYS = "distortion_model (plumb_bob, rational_polynomial or equidistant) a
 
 
 def camera_matrix(section: ForeignMapping, key: str, matrix: FloatArray) -> FloatArray:
-    """Return a matrix K (3, 3), which has no skew: cv2 and those who build on it leave a skew out."""
+    """Return a matrix K (3, 3), which has no skew: cv2 and programs built on it leave a skew out."""
     if matrix[0, 1] or matrix[1, 0] or matrix[2].tolist() != [0.0, 0.0, 1.0]:
         raise section.bad(key, f"{matrix.tolist()} where [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] is expected")
     return matrix

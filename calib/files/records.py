@@ -104,7 +104,7 @@ Free = Annotated[dict[str, Any], AfterValidator(_finite)]
 
 
 class _Schema(GenerateJsonSchema):
-    """Without titles that nobody wrote, and with plain defaults alone."""
+    """Without generated titles, and with plain defaults alone."""
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False

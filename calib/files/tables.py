@@ -116,10 +116,10 @@ def _row(cells: Sequence[str], path: str | Path, place: str, columns: Sequence[s
             if len(cells) == 1 and delimiter in cells[0]:
                 hint = f", separated by ',' and not by {name}"
         raise BadFile(path, place, f"{len(cells)} cells where {len(columns)} are expected{hint}")
-    words = [cell.strip() for cell in cells]
-    if not any(words):
-        return [np.nan] * len(words)
-    for word, column in zip(words, columns, strict=True):
-        if not NUMBER.fullmatch(word):
-            raise BadFile(path, f"{place}, {column}", f"'{word[:40]}' where a number is expected")
-    return [float(word) for word in words]
+    texts = [cell.strip() for cell in cells]
+    if not any(texts):
+        return [np.nan] * len(texts)
+    for text, column in zip(texts, columns, strict=True):
+        if not NUMBER.fullmatch(text):
+            raise BadFile(path, f"{place}, {column}", f"'{text[:40]}' where a number is expected")
+    return [float(text) for text in texts]

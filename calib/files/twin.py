@@ -107,7 +107,7 @@ class TwinError:
 
 
 def error_sentence(error: TwinError) -> str:
-    """Return how far a twin is, in words."""
+    """Return how far a twin is, as a part of a sentence."""
     if error.worst_px < EXACT_PX:
         return "exact"
     x, y = error.worst_at_px

@@ -1,8 +1,8 @@
 """YAML read strictly: plain data, each refusal with its place; and written as people would.
 
 PyYAML splits the text into events; this module builds the data from them: one document, no aliases, no tags,
-no duplicate keys. Plain scalars follow the core schema of YAML 1.2, not PyYAML's YAML 1.1: ``on`` stays a
-word, ``1e-3`` is a number, ``1:30`` is not, dates are strings.
+no duplicate keys. Plain scalars follow the core schema of YAML 1.2, not PyYAML's YAML 1.1: ``on`` stays
+text, ``1e-3`` is a number, ``1:30`` is not, dates are strings.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _MAX_DIGITS = 400
 
 _INT = re.compile(r"[-+]?[0-9]+")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
-_WORDS: dict[str, Any] = {
+_CONSTANTS: dict[str, Any] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
     **dict.fromkeys(("true", "True", "TRUE"), True),
     **dict.fromkeys(("false", "False", "FALSE"), False),
@@ -119,7 +119,7 @@ class _Builder:
         keys: dict[str, Any] = {}
         while not isinstance(event := next(self.events), yaml.MappingEndEvent):
             if isinstance(event, (yaml.SequenceStartEvent, yaml.MappingStartEvent)):
-                raise BadFile(self.path, _line(event), "a list or mapping stands where a key is expected")
+                raise BadFile(self.path, _line(event), "a list or mapping where a key is expected")
             self._value(event, place, depth)  # refuses an alias or a tag
             at = f"{place}.{event.value}" if place else event.value
             if event.value in keys:
@@ -133,8 +133,8 @@ def _scalar(event: Any, path: str | Path) -> Any:
     text: str = event.value
     if not event.implicit[0]:
         return text
-    if text in _WORDS:
-        return _WORDS[text]
+    if text in _CONSTANTS:
+        return _CONSTANTS[text]
     if _INT.fullmatch(text):
         if len(text) > _MAX_DIGITS:
             raise BadFile(path, _line(event), f"a number of {len(text)} digits")
@@ -156,7 +156,7 @@ def _problem_of(error: yaml.YAMLError) -> str:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes every word that either YAML 1.1 or 1.2 would read as something else."""
+    """Quotes all text that either YAML 1.1 or 1.2 would read as something else."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -217,7 +217,7 @@ def plain(value: Any) -> Any:
     raise TypeError(f"a value of type {type(value).__name__}")
 
 
-def nearest(word: str, known: Sequence[str]) -> str:
-    """Return the end of a refusal: the nearest known word, or all of them."""
-    near = get_close_matches(word, known, n=1, cutoff=0.5)
+def nearest(name: str, known: Sequence[str]) -> str:
+    """Return the end of a refusal: the nearest known name, or all of them."""
+    near = get_close_matches(name, known, n=1, cutoff=0.5)
     return f"the nearest known is '{near[0]}'" if near else f"known are {', '.join(known)}"

@@ -282,11 +282,11 @@ def _doubt(
         one = [name for name, use in zip(names, used, strict=True) if use]
         return f"the distances agree but the shape does not; any of {', '.join(one)} may be off"
     size, first, second, in_a, in_b = lines[0]
-    told = (
+    sentence = (
         f"{names[first]} and {names[second]} are {in_a:.4f} m apart in one list and {in_b:.4f} m in the other"
         f" ({1000 * abs(in_a - in_b):.1f} mm, {size:.0f} sigma)"
     )
     shared = set(off[0][1:3]).intersection(*(line[1:3] for line in off[1:]))
     if len(off) > 1 and len(shared) == 1:
-        told += f"; every distance that disagrees is one of {names[shared.pop()]}"
-    return told
+        sentence += f"; every distance that disagrees is one of {names[shared.pop()]}"
+    return sentence

@@ -59,7 +59,7 @@ def detect_survey(
     expected = expectations(survey)
     found: dict[str, Dots | CornersNotFound] = {}
 
-    def tell(image: str) -> None:
+    def report(image: str) -> None:
         if progress is not None:
             progress(len(found), len(wanted), image)
 
@@ -70,7 +70,7 @@ def detect_survey(
     if executor is None:
         for image, task in zip(wanted, tasks, strict=True):
             found[image.name] = find_in_file(*task)
-            tell(image.name)
+            report(image.name)
     else:
         futures: dict[Future[Dots | CornersNotFound], str] = {
             executor.submit(find_in_file, *task): image.name
@@ -78,7 +78,7 @@ def detect_survey(
         }
         for future in as_completed(futures):
             found[futures[future]] = future.result()
-            tell(futures[future])
+            report(futures[future])
     dots, failures = {}, {}
     for image in survey.images:
         result = found.get(image.name)
@@ -129,12 +129,12 @@ def expectations(survey: Survey) -> dict[str, PredictedBoard | Upright | None]:
     first: dict[str, SurveyImage] = {}
     for image in survey.images:
         first.setdefault(image.camera, image)
-    told: dict[str, PredictedBoard | Upright | None] = {}
+    expected: dict[str, PredictedBoard | Upright | None] = {}
     for image in survey.images:
         camera = survey.cameras[image.camera]
         key = (image.setup, image.placement)
         if image.setup not in setups or key not in placements:
-            told[image.name] = None
+            expected[image.name] = None
             continue
         rover_from_board = setups[image.setup] @ placements[key]
         turn = _head_turn(image, camera)
@@ -142,14 +142,14 @@ def expectations(survey: Survey) -> dict[str, PredictedBoard | Upright | None]:
             down = rover_from_board.inverse.vectors(turn @ DOWN)
             # A body camera looks down as well, but its picture's down is nearest to the rover's.
             upright = _rough_model(camera, np.zeros(3), AHEAD, np.eye(3), np.eye(3))
-            told[image.name] = Upright(upright.moved(CAMERA_FROM_CARRIER), down)
+            expected[image.name] = Upright(upright.moved(CAMERA_FROM_CARRIER), down)
         else:
             turned = turn @ _head_turn(first[image.camera], camera).T
             C = pivot + turned @ (camera.rough_C_m - pivot) if camera.on == "head" else camera.rough_C_m
-            told[image.name] = PredictedBoard(
+            expected[image.name] = PredictedBoard(
                 _rough_model(camera, C, camera.rough_A, turn, turned), rover_from_board
             )
-    return told
+    return expected
 
 
 def _has_picture(image: SurveyImage) -> bool:

@@ -123,7 +123,7 @@ def _camera_mixups(survey: Survey, camera: SurveyCamera, mine: list[Sight]) -> I
         reasons = []
         off_rad = float(np.abs(np.angle(np.exp(1j * (angle - usual_aside)))))
         if image.pan_rad is not None and off_rad > _reach_rad(camera, image, range_m, off_m):
-            reasons.append(f"its board stands {np.degrees(off_rad):.0f} degrees aside of where pan looks")
+            reasons.append(f"its board is {np.degrees(off_rad):.0f} degrees aside of where pan looks")
         off = max(size / usual_size, usual_size / size)
         if off > SIZE * (1 + off_m / max(range_m, off_m)):
             larger = "larger" if size > usual_size else "smaller"

@@ -34,13 +34,13 @@ from calib.targets.markers import (
     MarkerBoard,
     Markers,
     MeasuredCorners,
-    StandingMarkers,
+    PlacedMarkers,
     chessboard_corners,
     count_of,
     detect,
+    placed_markers,
     predicted,
     search,
-    standing,
 )
 from calib.targets.pattern import Cells, pattern_of
 from calib.targets.saddles import Crossings, Saddles, fit_saddles
@@ -65,16 +65,16 @@ FEWEST_OTHERS = 6
 FEWEST_MIRRORED = 3
 
 
-def doubled(board: MarkerBoard, markers: Markers, stands: StandingMarkers | None) -> str:
+def doubled(board: MarkerBoard, markers: Markers, placed: PlacedMarkers | None) -> str:
     """Say that two boards with the same markers are in view; '' if not."""
     ids = [int(number) for number in markers.ids if 0 <= number - board.first_id < count_of(board)]
     twice = sorted({number for number in ids if ids.count(number) > 1})
     if len(twice) < 2:
         return ""
     middles = [markers.corners_px[k].mean(axis=0) for k in np.flatnonzero(markers.ids == twice[0])[:2]]
-    if stands is not None:
+    if placed is not None:
         # the same marker read twice at one place is one marker
-        side = float(np.linalg.norm(stands.corners_px[0, 1] - stands.corners_px[0, 0]))
+        side = float(np.linalg.norm(placed.corners_px[0, 1] - placed.corners_px[0, 0]))
         if np.linalg.norm(middles[1] - middles[0]) < side:
             return ""
     places = " and ".join(f"({x:.0f}, {y:.0f})" for x, y in middles)
@@ -84,34 +84,34 @@ def doubled(board: MarkerBoard, markers: Markers, stands: StandingMarkers | None
     )
 
 
-def why_not_this_board(board: MarkerBoard, markers: Markers, stands: StandingMarkers | None) -> str:
+def why_not_this_board(board: MarkerBoard, markers: Markers, placed: PlacedMarkers | None) -> str:
     """Say that the markers in view are of a board drawn otherwise; '' if they are of this one."""
     found = len(markers.ids)
-    standing_count = 0 if stands is None else len(stands.ids)
+    placed_count = 0 if placed is None else len(placed.ids)
     last = board.first_id + count_of(board) - 1
     outside = [int(number) for number in markers.ids if not board.first_id <= number <= last]
     mine = found - len(outside)  # others may be of a second board, which is no harm
-    if found < 4 or standing_count == mine > 0:
+    if found < 4 or placed_count == mine > 0:
         return ""
     if isinstance(board, Charuco):
-        flipped = standing(markers, replace(board, legacy=not board.legacy))
-        if flipped is not None and len(flipped.ids) > standing_count:
+        flipped = placed_markers(markers, replace(board, legacy=not board.legacy))
+        if flipped is not None and len(flipped.ids) > placed_count:
             today, before = (
                 "as OpenCV draws it today (legacy: false)",
                 "as OpenCV before 4.6 draws it (legacy: true)",
             )
             drawn = today if board.legacy else before
             return f"the markers in view stand as on another board: {drawn}; BOARD.yaml says otherwise"
-    if mine and standing_count >= MOST_ELSEWHERE * mine:
+    if mine and placed_count >= MOST_ELSEWHERE * mine:
         return ""
-    if isinstance(board, AprilGrid) and _turned_tags(board, markers) > max(0.8 * found, standing_count):
+    if isinstance(board, AprilGrid) and _turned_tags(board, markers) > max(0.8 * found, placed_count):
         return (
             "each tag is half a turn off Kalibr's, as OpenCV's dictionary draws it; "
             "print the board of 'mastctl board make --kind aprilgrid'"
         )
     for other, what in _relatives(board):
-        others = standing(markers, other)
-        if others is not None and len(others.ids) > max(0.8 * found, standing_count):
+        others = placed_markers(markers, other)
+        if others is not None and len(others.ids) > max(0.8 * found, placed_count):
             return f"the markers in view stand as on another board: {what}, where {_drawn(board)} is expected"
     if len(outside) > MOST_ELSEWHERE * found:
         wanted = f"{board.first_id} to {last} are expected"
@@ -124,7 +124,7 @@ def _turned_tags(board: AprilGrid, markers: Markers) -> int:
     turned = Markers(markers.ids, np.roll(markers.corners_px, 2, axis=1))
     row, column = np.divmod(markers.ids - board.first_id, board.columns)
     from_top = (board.rows - 1 - row) * board.columns + column + board.first_id
-    both = (standing(one, board) for one in (turned, Markers(from_top, turned.corners_px)))
+    both = (placed_markers(one, board) for one in (turned, Markers(from_top, turned.corners_px)))
     return max(0 if one is None else len(one.ids) for one in both)
 
 
@@ -136,9 +136,9 @@ def why_nothing(board: AnyBoard, image: Grey8) -> str:
     if bright - dark < FLAT_DN:
         return f"the picture shows next to nothing: its levels are between {dark:.0f} and {bright:.0f} of 255"
     if isinstance(board, Charuco | AprilGrid):
-        told = _mirrored(board, image) or _others(board, image)
-        if told:
-            return told
+        reason = _mirrored(board, image) or _others(board, image)
+        if reason:
+            return reason
     return _blurred(image) or (
         "the board is not in the picture, or too far away, too slanted or too much covered to be read"
     )
@@ -146,7 +146,7 @@ def why_nothing(board: AnyBoard, image: Grey8) -> str:
 
 def _mirrored(board: MarkerBoard, image: Grey8) -> str:
     flipped = detect(np.ascontiguousarray(image[:, ::-1]), board)
-    if standing(flipped, board) is None or len(flipped.ids) < FEWEST_MIRRORED:
+    if placed_markers(flipped, board) is None or len(flipped.ids) < FEWEST_MIRRORED:
         return ""
     return "the board is mirrored: it was printed or the picture was taken the wrong way round"
 
@@ -202,8 +202,8 @@ def _drawn(board: MarkerBoard) -> str:
 
 
 def _some(numbers: list[int]) -> str:
-    told = ", ".join(map(str, sorted(numbers)[:4]))
-    return told + (f" and {len(numbers) - 4} more" if len(numbers) > 4 else "")
+    first = ", ".join(map(str, sorted(numbers)[:4]))
+    return first + (f" and {len(numbers) - 4} more" if len(numbers) > 4 else "")
 
 
 LEAST_SIGMA_PX = 0.001
@@ -270,10 +270,10 @@ def find_corners(board: AnyBoard, image: Levels) -> Corners | CornersNotFound:
         if start is None:
             return CornersNotFound(why_nothing(board, eight))
     else:
-        stands = _standing(board, eight)
-        if isinstance(stands, CornersNotFound):
-            return stands
-        start = _beside(board, stands)
+        placed = _placed(board, eight)
+        if isinstance(placed, CornersNotFound):
+            return placed
+        start = _beside(board, placed)
     found = _inside(_fitted(board, levels, pattern, start), levels.shape)
     if len(found.ids) < FEWEST:
         return CornersNotFound(
@@ -289,24 +289,24 @@ class _Found(NamedTuple):
     saddles: Saddles
 
 
-def _standing(board: MarkerBoard, image: Grey8) -> StandingMarkers | CornersNotFound:
+def _placed(board: MarkerBoard, image: Grey8) -> PlacedMarkers | CornersNotFound:
     """The markers that stand as on the board, or what is wrong."""
     markers = detect(image, board)
-    stands = standing(markers, board)
-    twice = doubled(board, markers, stands)
+    placed = placed_markers(markers, board)
+    twice = doubled(board, markers, placed)
     if twice:
         return CornersNotFound(twice)
-    another = why_not_this_board(board, markers, stands)
+    another = why_not_this_board(board, markers, placed)
     if another:
         return CornersNotFound(another)
-    if stands is None:
+    if placed is None:
         return CornersNotFound(why_nothing(board, image))
-    return stands
+    return placed
 
 
-def _beside(board: MarkerBoard, stands: StandingMarkers) -> MeasuredCorners:
+def _beside(board: MarkerBoard, placed: PlacedMarkers) -> MeasuredCorners:
     """The corners next to markers, predicted from these."""
-    known = MeasuredCorners(stands.corners_m.reshape(-1, 2), stands.corners_px.reshape(-1, 2))
+    known = MeasuredCorners(placed.corners_m.reshape(-1, 2), placed.corners_px.reshape(-1, 2))
     ids = board.ids
     places = board.in_board_m(ids)[:, :2]
     away = np.linalg.norm(places[:, None] - known.points_m[None], axis=-1).min(axis=1)

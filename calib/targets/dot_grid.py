@@ -228,7 +228,7 @@ class BoardGrid(NamedTuple):
 
 
 def best_grid(image: Grey8, found: Candidates, board: Board) -> tuple[BoardGrid | CornersNotFound, int]:
-    """The board's grid, grown, else by OpenCV's clustering; and how many spots hang together."""
+    """The board's grid, and how many spots are connected."""
     wanted = board.rows * board.columns
     lattices = grow_lattices(found, 2.0 * board.spacing_m / board.dot_diameter_m)
     largest = len(lattices[0].spots) if lattices else 0
@@ -241,48 +241,24 @@ def best_grid(image: Grey8, found: Candidates, board: Board) -> tuple[BoardGrid 
         if isinstance(grid, BoardGrid) and not any(_same(grid, other) for other in whole):
             whole.append(grid)
     if len(whole) > 1:
-        told = f"{len(whole)} grids of {board.rows} x {board.columns} dots are in the image"
-        return CornersNotFound(told), largest
+        reason = f"{len(whole)} grids of {board.rows} x {board.columns} dots are in the image"
+        return CornersNotFound(reason), largest
     if whole:
         return whole[0], largest
-    clustered = _clustered(found, board)
-    if clustered is not None:
-        grid = _complete(image, found, clustered, board)
-        if isinstance(grid, BoardGrid):
-            return grid, wanted
     if grids:
         return grids[0], largest
     spots = len(found.middles_px)
-    told = (
+    reason = (
         f"{spots} spots look like dots, and at most {largest} of them stand in a grid, "
         f"where {wanted} are expected"
     )
-    return CornersNotFound(told), largest
+    return CornersNotFound(reason), largest
 
 
 def _same(one: BoardGrid, other: BoardGrid) -> bool:
     """Whether two grids stand at the same place."""
     apart = np.linalg.norm(one.middles_px.mean(axis=0) - other.middles_px.mean(axis=0))
     return bool(apart < 0.25 * np.ptp(one.middles_px, axis=0).max())
-
-
-def _clustered(found: Candidates, board: Board) -> Lattice | None:
-    """OpenCV's grid finder on the candidates, if they are few enough for it to end soon."""
-    wanted = board.rows * board.columns
-    if not wanted <= len(found.middles_px) <= 1.5 * wanted:
-        return None
-    points = found.middles_px.astype(np.float32).reshape(-1, 1, 2)
-    flags = cv2.CALIB_CB_SYMMETRIC_GRID + cv2.CALIB_CB_CLUSTERING
-    size = (board.columns, board.rows)
-    # Without a detector OpenCV takes the picture for the points; its type hints do not know.
-    finder: Any = cv2.findCirclesGrid
-    done, corners = finder(points, size, flags, None, cv2.CirclesGridFinderParameters())
-    if not done or corners is None:
-        return None
-    corners = corners.reshape(-1, 2)
-    spots = np.linalg.norm(found.middles_px[None] - corners[:, None], axis=-1).argmin(axis=1)
-    rows, columns = np.divmod(np.arange(wanted), board.columns)
-    return Lattice(spots, np.stack([columns, rows], axis=-1))
 
 
 def _complete(image: Grey8, found: Candidates, lattice: Lattice, board: Board) -> BoardGrid | CornersNotFound:
@@ -379,6 +355,7 @@ def _too_few(image: Grey8, number: int, spans: IntArray, middles: FloatArray, bo
         )
         if near
     ]
-    told = f"only {number} dots in a grid of {min(spans)} x {max(spans)} are seen"
-    told += f" where {board.rows} x {board.columns} are expected"
-    return told + (f"; the board reaches over the {' and '.join(beyond)} edge of the image" if beyond else "")
+    reason = f"only {number} dots in a grid of {min(spans)} x {max(spans)} are seen"
+    reason += f" where {board.rows} x {board.columns} are expected"
+    edges = " and ".join(beyond)
+    return f"{reason}; the board reaches over the {edges} edge of the image" if beyond else reason

@@ -55,7 +55,7 @@ def order_by_steps(
         None if no way to count fits within ``SURE_RAD``.
     """
     best: Ordered | None = None
-    for columns, rows, c_from_ij in _ways(places, counts, board):
+    for columns, rows, c_from_ij in _countings(places, counts, board):
         found = steps_px @ np.linalg.inv(c_from_ij)
         if np.linalg.det(found) * np.linalg.det(expected_px) <= 0.0:
             continue
@@ -91,7 +91,7 @@ def order_by_gravity(
     if homography is None:
         return None
     best: Ordered | None = None
-    for columns, rows, c_from_ij in _ways(places, counts, board):
+    for columns, rows, c_from_ij in _countings(places, counts, board):
         affine = np.eye(3)  # from metres on the board to (i, j)
         shift = np.array([columns[0], rows[0]]) - c_from_ij @ places[0]
         middle = np.array([board.columns - 1, board.rows - 1]) / 2
@@ -134,11 +134,11 @@ def expected_steps_px(camera: CameraModel, frame_from_board: Rigid) -> FloatArra
     return np.asarray(jacobian @ frame_from_board.rotation[:, :2]) if valid else None
 
 
-def _ways(
+def _countings(
     places: IntArray, counts: tuple[int, int], board: Board
 ) -> list[tuple[IntArray, IntArray, FloatArray]]:
     """All ways to count: columns (n,), rows (n,) and the matrix from steps of (i, j) to (column, row)."""
-    ways = []
+    countings = []
     last = np.array(counts) - 1
     for swap in (False, True):
         if (counts[::-1] if swap else counts) != (board.columns, board.rows):
@@ -147,8 +147,8 @@ def _ways(
             flipped = np.where(flips, last - places, places)
             c, r = flipped.T[::-1] if swap else flipped.T
             signs = np.diag([-1.0 if f else 1.0 for f in flips])
-            ways.append((c, r, signs[::-1] if swap else signs))
-    return ways
+            countings.append((c, r, signs[::-1] if swap else signs))
+    return countings
 
 
 def _turn_of(matrix: FloatArray) -> float:
@@ -196,8 +196,8 @@ class DotSearch(NamedTuple):
 def hopeless(expected: PredictedBoard) -> str:
     """Say why the board cannot be seen where it is predicted, or nothing."""
     in_board = expected.frame_from_board.inverse
-    eye = in_board.points(expected.camera.C)
-    away = float(np.arctan2(-eye[2], np.hypot(eye[0], eye[1])))
+    camera_m = in_board.points(expected.camera.C)
+    away = float(np.arctan2(-camera_m[2], np.hypot(camera_m[0], camera_m[1])))
     if away < -PREDICTED_WITHIN_RAD:
         return "by the survey the camera sees the back of the board"
     if expected_steps_px(expected.camera, expected.frame_from_board) is None:

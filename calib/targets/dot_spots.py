@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calib.geometry.rigid import FloatArray
 from calib.targets.boards import Grey8
 
-WIDEST_RATIO = 3.5  # major to minor axis: a board seen more flatly has dots that nobody tells apart
+WIDEST_RATIO = 3.5  # major to minor axis: a board seen more flatly has dots that cannot be distinguished
 FILL = (0.80, 1.15)  # area over the area of the ellipse with the same second moments
 UNEVEN = 0.22  # spread of the ring of paper, in units of its contrast to the dot
 UNEVEN_AT_MOST = 0.4  # the same where the strict search found no grid

@@ -20,7 +20,7 @@ from calib.targets.boards import AprilGrid, Charuco, Checkerboard, Grey8
 
 NEIGHBOURS = 16
 FEWEST_NEIGHBOURS = 4
-LEAST_TOLD = 1e-9
+LEAST_EIGENVALUE = 1e-9
 NEXT = 1.3
 """A corner lies next to a known one if it is no farther than so many of the widest steps of the grid."""
 
@@ -62,17 +62,18 @@ def predicted(known: MeasuredCorners, ids: IntArray, places_m: FloatArray) -> Me
     middles = known.pixels_px[near].mean(axis=1)
     pixels = known.pixels_px[near] - middles[:, None]
     reach = np.maximum(np.abs(pixels).max(axis=(1, 2)), 1e-6)
-    H, told = _homographies(points, pixels / reach[:, None, None])
+    H, determined = _homographies(points, pixels / reach[:, None, None])
     at = H[:, :2, 2] * reach[:, None]
     # of (H x) / (h x) at 0
     jacobians = (reach / scale)[:, None, None] * (H[:, :2, :2] - H[:, :2, 2:] * H[:, 2:, :2])
-    kept = told & np.isfinite(at).all(axis=1) & (np.linalg.det(jacobians) > 0.0)
+    kept = determined & np.isfinite(at).all(axis=1) & (np.linalg.det(jacobians) > 0.0)
     return MeasuredCorners(np.empty((0, 2)), (at + middles)[kept], np.asarray(ids)[kept], jacobians[kept])
 
 
 def _homographies(points: FloatArray, pixels: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return the homographies (n, 3, 3), lower right 1, of points (n, k, 2) to pixels (n, k, 2), by two
-    rounds of least squares, and which are told; what a point is divided by weighs its equation in the second.
+    """Return homographies (n, 3, 3), lower right 1, of points (n, k, 2) to pixels, and which are determined.
+
+    Two rounds of least squares; what a point is divided by weighs its equation in the second.
     """
     n, k, _ = points.shape
     ones, none = np.ones((n, k)), np.zeros((n, k, 3))
@@ -91,13 +92,13 @@ def _homographies(points: FloatArray, pixels: FloatArray) -> tuple[FloatArray, N
         b = (pixels * weights[..., None]).reshape(n, 2 * k, 1)
         normal = A.transpose(0, 2, 1) @ A
         values = np.linalg.eigvalsh(normal)
-        told = values[:, 0] > LEAST_TOLD * values[:, -1]
-        normal[~told] = np.eye(8)
+        determined = values[:, 0] > LEAST_EIGENVALUE * values[:, -1]
+        normal[~determined] = np.eye(8)
         h = np.linalg.solve(normal, A.transpose(0, 2, 1) @ b)[..., 0]
         below = np.einsum("nki,ni->nk", points, h[:, 6:]) + 1.0
-        told &= (below > 0.1).all(axis=1)
+        determined &= (below > 0.1).all(axis=1)
         weights = 1.0 / np.maximum(below, 0.1)
-    return np.concatenate([h, np.ones((n, 1))], axis=1).reshape(n, 3, 3), told
+    return np.concatenate([h, np.ones((n, 1))], axis=1).reshape(n, 3, 3), determined
 
 
 MarkerBoard = Charuco | AprilGrid
@@ -121,7 +122,7 @@ class Markers(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class StandingMarkers:
+class PlacedMarkers:
     """Markers that stand as on the board, each id once.
 
     ids (n,); corners_px (n, 4, 2); corners_m (n, 4, 2) on the board; homography (3, 3) from metres to pixels.
@@ -193,7 +194,7 @@ def corners_on_board_m(board: MarkerBoard) -> FloatArray:
     return np.asarray((middles[:, None] + square) * [1.0, board.aspect], dtype=np.float64)
 
 
-def standing(markers: Markers, board: MarkerBoard) -> StandingMarkers | None:
+def placed_markers(markers: Markers, board: MarkerBoard) -> PlacedMarkers | None:
     """Return the markers that stand as on the board; None if too few do."""
     on_board = corners_on_board_m(board)
     mine = (markers.ids >= board.first_id) & (markers.ids < board.first_id + len(on_board))
@@ -218,7 +219,7 @@ def standing(markers: Markers, board: MarkerBoard) -> StandingMarkers | None:
     keep &= np.isin(np.arange(len(ids)), first)
     if keep.sum() < FEWEST:
         return None
-    return StandingMarkers(ids[keep], pixels[keep], metres[keep], np.asarray(H))
+    return PlacedMarkers(ids[keep], pixels[keep], metres[keep], np.asarray(H))
 
 
 def carried(homography: FloatArray, points: FloatArray) -> FloatArray:
@@ -235,7 +236,7 @@ def _white_first(board: Charuco) -> bool:
 def chessboard_corners(board: Checkerboard, image: Grey8) -> MeasuredCorners | None:
     """Return the corners of a chessboard to a pixel; None if it is not seen whole.
 
-    Counted so that the colours are those of the print, and if they are so both ways, upright in the image.
+    Counted so that the colours are those of the print, and if they are so in two orders, upright in the image.
     """
     across, down = board.columns - 1, board.rows - 1
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
@@ -247,14 +248,14 @@ def chessboard_corners(board: Checkerboard, image: Grey8) -> MeasuredCorners | N
     if not found:
         return None
     grid = np.asarray(corners, dtype=np.float64).reshape(down, across, 2)
-    ways = [grid, grid[::-1, ::-1], grid[:, ::-1], grid[::-1]]
+    orders = [grid, grid[::-1, ::-1], grid[:, ::-1], grid[::-1]]
     if across == down:
-        ways += [way.transpose(1, 0, 2) for way in ways]
-    ways = [way for way in ways if _handed(way) > 0]
-    dark = [_dark_first(image, way) for way in ways]
-    # both ways may be right by colour; then the one whose rows run to the right
-    likely = [way for way, first in zip(ways, dark, strict=True) if first] or ways
-    upright = max(likely, key=lambda way: float((way[:, -1] - way[:, 0]).sum(axis=0)[0]))
+        orders += [order.transpose(1, 0, 2) for order in orders]
+    orders = [order for order in orders if _handed(order) > 0]
+    dark = [_dark_first(image, order) for order in orders]
+    # two orders may be right by colour; then the one whose rows run to the right
+    likely = [order for order, first in zip(orders, dark, strict=True) if first] or orders
+    upright = max(likely, key=lambda order: float((order[:, -1] - order[:, 0]).sum(axis=0)[0]))
     places = board.in_board_m(board.ids)[:, :2]
     return predicted(MeasuredCorners(places, upright.reshape(-1, 2)), board.ids, places)
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import calib.targets.dot_grid
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
 from calib.targets.boards import Board, CornersNotFound, Dots
@@ -272,13 +271,6 @@ def test_a_board_seen_from_behind_by_the_survey_is_said() -> None:
     turned = Rigid(Rotation.from_rotvec([0, np.radians(170), 0]).as_matrix(), np.array([0, 0, 4.0]))
     told = reason(find_dots(np.zeros((480, 640), dtype=np.uint8), BOARD, PredictedBoard(SIDE, turned)))
     assert "back of the board" in told
-
-
-def test_where_the_grid_does_not_grow_the_clustering_finder_helps(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(25)
-    shot = shoot(rng, SIDE, pose(4.0, (20, 10), 5))
-    monkeypatch.setattr(calib.targets.dot_grid, "grow_lattices", lambda found, spacing: [])
-    check(shot, find_dots(shot.image, BOARD, shot.roughly(rng)), WANTED_PX)
 
 
 def test_images_of_another_kind_are_refused() -> None:
