@@ -236,7 +236,7 @@ def _white_first(board: Charuco) -> bool:
 def chessboard_corners(board: Checkerboard, image: Grey8) -> MeasuredCorners | None:
     """Return the corners of a chessboard to a pixel; None if it is not seen whole.
 
-    Counted so that the colours are those of the print, and if they are so in two orders, upright in the image.
+    Counted so that the colours are those of the print; if two orders have these, upright in the image.
     """
     across, down = board.columns - 1, board.rows - 1
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
