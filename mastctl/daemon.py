@@ -30,7 +30,7 @@ from drivers.faults import LOG
 from drivers.hardware import Hardware
 from mastctl import signals
 from mastctl.config import Config, Listen
-from mastctl.errors import MastctlError
+from mastctl.errors import MastctlError, Unable
 from mastctl.guided.guide import WayIn
 from mastctl.http.access import Access
 from mastctl.http.entrance import EntryRules, HostNames
@@ -54,7 +54,7 @@ UNREAD_S = 10.0  # after that the kernel ends a connection whose client takes no
 LARGEST_HEADERS_BYTES = 16384
 LARGEST_MESSAGE_BYTES = 1024  # of a WebSocket's client
 PING_S = 20.0
-REVOKED_S = 0.5  # how late a stream may end after its token
+REREAD_S = 0.5  # how late a new or a revoked token may be known
 SWITCH_S = 0.0005  # a stop goes through five threads and may wait so long for each; 5 ms by default
 START_TIMEOUT_S = 600.0  # the first start compiles the simulator's kernels
 END_TIMEOUT_S = 20.0
@@ -101,15 +101,15 @@ def run(
         service = _opened(config, clock, _state_folder(config), url)
         _let_log_stall(service)
         try:
-            with _entrance(service, url) as entrance:
+            rules = _entry_rules(service, url)
 
-                def ready(_: Callable[[], None]) -> None:
-                    on_ready(url)
-                    threading.Thread(target=_load_ahead, name="loading", daemon=True).start()
-                    if draws_ahead:
-                        _draw_ahead(service)
+            def ready(_: Callable[[], None]) -> None:
+                on_ready(url)
+                threading.Thread(target=_load_ahead, name="loading", daemon=True).start()
+                if draws_ahead:
+                    _draw_ahead(service)
 
-                asyncio.run(_serve(service, listener, ready, entrance, in_process=True))
+            asyncio.run(_serve(service, listener, ready, rules, in_process=True))
         finally:
             service.close()
 
@@ -142,7 +142,7 @@ class RunningDaemon:
             raise
         self._exit.callback(self.service.close)
         try:
-            self._entrance = self._exit.enter_context(_entrance(self.service, self.url))
+            self._entrance = _entry_rules(self.service, self.url)
         except BaseException:
             self._exit.close()
             raise
@@ -293,7 +293,7 @@ async def _serve(
     listener.listen(WAITING_IN_KERNEL)  # asyncio has one number for this and for how many it takes at once
     beside = [asyncio.create_task(_report_state(service, manager))]
     if entrance.access is not None:
-        beside.append(asyncio.create_task(_end_revoked(streams, entrance.access)))
+        beside.append(asyncio.create_task(_reread_tokens(entrance.access, waiting, streams)))
     if in_process:
         for number, handler in handlers.items():  # uvicorn has set its own: the mast is stopped first
             signal.signal(number, handler)
@@ -324,11 +324,13 @@ async def _serve(
         await loop.run_in_executor(None, service.close)
 
 
-async def _end_revoked(streams: Streams, access: Access) -> None:
-    """End streams with the tokens that opened them, until cancelled."""
-    while True:
-        await asyncio.sleep(REVOKED_S)
-        streams.end_revoked(access.stands)
+async def _reread_tokens(access: Access, waiting: Waiting, streams: Streams) -> None:
+    """Read the tokens again when they change, and end the streams of those that are gone, until the end."""
+    with contextlib.suppress(Unable):
+        while True:
+            await asyncio.sleep(REREAD_S)
+            await waiting.run(access.reread)
+            streams.end_revoked(access.stands)
 
 
 async def _report_state(service: Service, manager: ServiceManager) -> None:
@@ -362,28 +364,21 @@ def _settings(app: ASGIApp) -> uvicorn.Config:
     )
 
 
-@contextlib.contextmanager
-def _entrance(service: Service, url: str) -> Iterator[EntryRules]:
-    """Say who comes in, by where the daemon listens. Raises BadFile."""
+def _entry_rules(service: Service, url: str) -> EntryRules:
+    """Return the rules for clients, by the address that the daemon listens at. Raises BadFile."""
     listen = service.config.listen
     names = HostNames(frozenset(listen.hosts), any_address=listen.needs_token)
     service.guide.door = WayIn(url)
     if not listen.needs_token:
-        yield EntryRules(names, None, "loopback" if listen.socket is None else "unix")
-        return
+        return EntryRules(names, None, "loopback" if listen.socket is None else "unix")
     tokens = TokenList(service.folder.path)
     access = Access(tokens)
     service.guide.door = WayIn(url, access.lend)
     service.leases.stands = access.stands
-    try:
-        log.warning("%s asks everybody for a token, but for a stop; tokens lie in %s", url, tokens.folder)
-        if listen.socket is None:
-            log.warning(
-                "%s speaks plain HTTP: others can read tokens and images unless a proxy encrypts", url
-            )
-        yield EntryRules(names, access, "token")
-    finally:
-        access.close()
+    log.warning("%s requires a token, except for a stop; the tokens are in %s", url, tokens.folder)
+    if listen.socket is None:
+        log.warning("%s speaks plain HTTP: others can read tokens and images unless a proxy encrypts", url)
+    return EntryRules(names, access, "token")
 
 
 def _suspend(service: Service) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -140,9 +139,7 @@ def _list(args: argparse.Namespace) -> int:
     tokens = _tokens(args)
     held = tokens.read() or ()
     if args.json:
-        output.print_json(
-            {"tokens": [{k: v for k, v in asdict(one).items() if k != "sha256"} for one in held]}
-        )
+        output.print_json({"tokens": [one.model_dump(exclude={"sha256"}) for one in held]})
         return 0
     rows = [(one.name, one.role, one.made) for one in held]
     output.print_table(f"tokens in {tokens.folder}", ("name", "role", "made"), rows)

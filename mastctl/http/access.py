@@ -1,25 +1,20 @@
-"""The owners of tokens. Memory holds digests only, which are compared in constant time."""
+"""The tokens that a daemon accepts. Memory has digests only, which are compared in constant time."""
 
 from __future__ import annotations
 
 import hmac
 import logging
-import secrets
-import threading
 from collections.abc import Callable
-from datetime import UTC, datetime
 
 from calib.errors import BadFile
 from mastctl.errors import NotLetIn
-from mastctl.http.tokens import TOKEN_BYTES, Token, TokenList, digest_of
+from mastctl.http.tokens import Token, TokenList, digest_of, new_token
 
 log = logging.getLogger(__name__)
 
-REREAD_S = 0.5  # how late a new or a revoked token may be known
-
 
 class Access:
-    """The tokens of a daemon, read again when they change. Only `reread` touches a file.
+    """The tokens of a daemon, read again by `reread` when they have changed.
 
     Parameters
     ----------
@@ -37,13 +32,10 @@ class Access:
         self._tokens = tokens.first_run()
         self._lent: tuple[Token, ...] = ()
         self._seen = self._stamp()
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="tokens", daemon=True)
-        self._thread.start()
 
     @property
     def folder(self) -> str:
-        """Where the tokens lie."""
+        """The folder of the tokens."""
         return str(self._list.folder)
 
     def token_of(self, text: str) -> Token:
@@ -54,12 +46,11 @@ class Access:
         return found
 
     def lend(self, name: str) -> tuple[str, Callable[[], None]]:
-        """Return a new token of the role operate for a program of this daemon's own, and what takes it back.
+        """Return a new token of the role operate for a program of this daemon's own, and its revocation.
 
-        It is in memory only. Safe to use from any thread, as long as one lends at a time.
+        It is in memory only. Safe to use from any thread, one call at a time.
         """
-        text = secrets.token_urlsafe(TOKEN_BYTES)
-        token = Token(name, "operate", digest_of(text), datetime.now(UTC).isoformat(timespec="seconds"))
+        text, token = new_token(name, "operate")
         self._lent = (*self._lent, token)
 
         def take_back() -> None:
@@ -68,7 +59,7 @@ class Access:
         return text, take_back
 
     def known(self, text: str) -> Token | None:
-        """Return the token of a text, if it is one; as slow for a text that is none."""
+        """Return the token of a text, None for another text; takes the same time for both."""
         digest, found = digest_of(text), None
         for token in (*self._tokens, *self._lent):
             if hmac.compare_digest(token.sha256, digest):
@@ -76,11 +67,11 @@ class Access:
         return found
 
     def stands(self, credential: str) -> bool:
-        """Return whether a token, by its digest, still lets in. Safe to use from any thread."""
+        """Return whether a token, by its digest, is still valid. Safe to use from any thread."""
         return any(one.sha256 == credential for one in (*self._tokens, *self._lent))
 
     def reread(self) -> None:
-        """Take the list as it is now, if it has changed; a damaged one leaves everything as it was."""
+        """Read the list again if it has changed; a damaged one changes nothing."""
         stamp = self._stamp()
         if stamp == self._seen:
             return
@@ -96,16 +87,8 @@ class Access:
         self._tokens = tokens
         log.info("%d tokens: %s", len(tokens), ", ".join(one.name for one in tokens) or "none")
 
-    def close(self) -> None:
-        """Look at the list no longer."""
-        self._closing.set()
-
-    def _watch(self) -> None:
-        while not self._closing.wait(REREAD_S):
-            self.reread()
-
     def _stamp(self) -> tuple[int, int, int] | None:
-        """What changes when the list does."""
+        """A value that changes with the list."""
         try:
             found = self._list.path.stat()
         except OSError:

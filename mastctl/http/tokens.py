@@ -10,17 +10,18 @@ import contextlib
 import fcntl
 import hashlib
 import os
-import re
 import secrets
 import stat
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated
+
+from pydantic import Field
 
 from calib.errors import BadFile
 from calib.files.atomic import remove, replace_bytes
+from calib.files.records import Record, read_value
 from mastctl.answers import Role
 from mastctl.control.caller import ROLES
 from mastctl.errors import MastctlError
@@ -42,24 +43,16 @@ class TokenRefused(MastctlError):
     exit_code = 2
 
 
-@dataclass(frozen=True)
-class Token:
-    """One token, as it is kept: without itself.
-
-    Attributes
-    ----------
-    name, role
-        Whose it is, and what it allows.
-    sha256
-        Hexadecimal digest of its text.
-    made
-        When it was made, ISO 8601, UTC.
-    """
+class Token(Record):
+    """One token, as it is kept: its name and rights, and the digest of its text."""
 
     name: str
     role: Role
-    sha256: str
-    made: str
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$", description="64 hexadecimal digits")]
+    made: str  # ISO 8601, UTC
+
+
+_TOKENS = Annotated[list[Token], Field(max_length=MOST_TOKENS)]
 
 
 def digest_of(token: str) -> str:
@@ -82,7 +75,7 @@ class TokenList:
         self._file = StateFile(self.path, SCHEMA)
 
     def file_of(self, role: Role) -> Path:
-        """Return where the token lies that the first run made for a role."""
+        """Return the file of the token that the first run made for a role."""
         return self.folder / f"{role}.token"
 
     def read(self) -> tuple[Token, ...] | None:
@@ -98,10 +91,7 @@ class TokenList:
         document = self._file.read()
         if document is None:
             return None
-        held = document.get("tokens")
-        if not isinstance(held, list) or len(held) > MOST_TOKENS:
-            raise BadFile(self.path, "tokens", f"a list of at most {MOST_TOKENS} tokens is expected")
-        tokens = tuple(_token(self.path, number, one) for number, one in enumerate(held))
+        tokens = tuple(read_value(_TOKENS, document.get("tokens"), self.path, "tokens"))
         if len({one.name for one in tokens}) != len(tokens):
             raise BadFile(self.path, "tokens", "a name is there twice")
         return tokens
@@ -120,7 +110,7 @@ class TokenList:
                 return tokens
             made = []
             for role in ROLES:
-                text, token = _new(role, role)
+                text, token = new_token(role, role)
                 _save(self.file_of(role), f"{text}\n".encode())
                 made.append(token)
             self._write(made)
@@ -137,20 +127,20 @@ class TokenList:
             As `first_run`.
         """
         if not name or len(name) > LONGEST_NAME or not all(c.isalnum() or c in "._-" for c in name):
-            words = f"'{name[:60]}' where 1 to {LONGEST_NAME} letters, digits, dots, dashes are expected"
-            raise TokenRefused(words)
+            expected = f"1 to {LONGEST_NAME} letters, digits, dots, dashes are expected"
+            raise TokenRefused(f"'{name[:60]}' where {expected}")
         with self._locked():
             tokens = list(self.read() or ())
             if any(one.name == name for one in tokens):
                 raise TokenRefused(f"there is a token '{name}' already; revoke it first")
             if len(tokens) >= MOST_TOKENS:
                 raise TokenRefused(f"there are {MOST_TOKENS} tokens; revoke one first")
-            text, token = _new(name, role)
+            text, token = new_token(name, role)
             self._write([*tokens, token])
             return text
 
     def revoke(self, name: str) -> Token:
-        """Let a token open nothing any more.
+        """Revoke a token; it is valid no longer.
 
         Raises
         ------
@@ -171,7 +161,7 @@ class TokenList:
             return found
 
     def _write(self, tokens: Sequence[Token]) -> None:
-        self._file.write({"tokens": [asdict(one) for one in tokens]})
+        self._file.write({"tokens": [one.model_dump() for one in tokens]})
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
@@ -187,23 +177,11 @@ class TokenList:
             os.close(lock)
 
 
-def _new(name: str, role: Role) -> tuple[str, Token]:
-    """A token's text, and how it is kept."""
+def new_token(name: str, role: Role) -> tuple[str, Token]:
+    """Return a new token's text, and the token as it is kept."""
     text = secrets.token_urlsafe(TOKEN_BYTES)
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    return text, Token(name, role, digest_of(text), made)
-
-
-def _token(path: Path, number: int, held: Any) -> Token:
-    """One entry of the list. Raises BadFile."""
-    keys = {"name", "role", "sha256", "made"}
-    if not isinstance(held, dict) or set(held) != keys or not all(isinstance(v, str) for v in held.values()):
-        raise BadFile(path, f"tokens[{number}]", f"an object of {', '.join(sorted(keys))} is expected")
-    if held["role"] not in get_args(Role):
-        raise BadFile(path, f"tokens[{number}].role", f"one of {', '.join(ROLES)} is expected")
-    if not re.fullmatch("[0-9a-f]{64}", held["sha256"]):
-        raise BadFile(path, f"tokens[{number}].sha256", "64 hexadecimal digits are expected")
-    return Token(**held)
+    return text, Token(name=name, role=role, sha256=digest_of(text), made=made)
 
 
 def _check_private(path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,10 +18,8 @@ def tokens(tmp_path: Path) -> TokenList:
 
 
 @pytest.fixture
-def access(tokens: TokenList) -> Iterator[Access]:
-    made = Access(tokens)
-    yield made
-    made.close()
+def access(tokens: TokenList) -> Access:
+    return Access(tokens)
 
 
 def token(tokens: TokenList, role: Role = "operate") -> str:

@@ -28,9 +28,7 @@ class Inside:
 
 @pytest.fixture(scope="module")
 def access(tmp_path_factory: pytest.TempPathFactory) -> Access:
-    made = Access(TokenList(tmp_path_factory.mktemp("tokens")))
-    made.close()
-    return made
+    return Access(TokenList(tmp_path_factory.mktemp("tokens")))
 
 
 def asked(access: Access | None, headers: dict[str, str], query: bytes = b"", told: bool = True) -> Any:
