@@ -1,11 +1,12 @@
-"""Finds changes since reference pictures were taken: in their differences, tested, and named.
+"""Finds a change since reference images were taken: in their differences, tested, with its size.
 
-Each view (a camera at a rest of the head) is looked at again; its features have moved by little. A robust fit
+Each view (a camera at a rest of the head) is taken again; its features have moved by little. A robust fit
 turns them into four numbers: shift x and y of the picture's middle, a turn about it, a change of scale.
 Things that moved by themselves (rocks, shadows' edges) are left out there. The numbers of all views are then
-explained by one change at a time: a camera turned in the head, a lens refocused, a joint slipped, the rover
-turned under the mast. Light and weather spoil a view as a whole, so each view has an error of its own beside
-that of its features, and each rest one of both joints.
+tested against what one change would do to them: a camera turned in the head, a lens refocused, a joint
+slipped, the rover turned under the mast. The likeliest counts; which one it was is not reported. Light and
+weather spoil a view as a whole, so each view has an error of its own beside that of its features, and each
+rest one of both joints.
 """
 
 from __future__ import annotations
@@ -35,9 +36,6 @@ JOINT_SIGMA_RAD = 2e-4
 
 VIEW_SIGMA = np.array([0.1, 0.1, 1e-4, 1e-4])
 """The motion of a whole view by light, weather and temperature: px, px, rad, part of the scale."""
-
-AS_GOOD = 9.0
-"""A change that explains a chi-square less by this little would do as well."""
 
 LEAST_FEATURES = 8
 LEAST_PART, MOST_SPREAD_PX = 0.4, 1.5
@@ -91,65 +89,31 @@ class ViewChange(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class SceneChange:
-    """One thing that would explain the differences.
-
-    Attributes
-    ----------
-    what
-        ``NAME turned``, ``NAME refocused``, ``pan slipped``, ``tilt slipped``, ``rover turned``.
-    values, covariance
-        Of the change (k,), (k, k): radians about x, y, z of the head (of the rover for ``rover turned``),
-        the part of the focal length, or radians of the joint.
-    sigmas
-        How unlikely the differences are without it.
-    """
-
-    what: str
-    values: FloatArray
-    covariance: FloatArray
-    sigmas: float
-
-    @property
-    def sentence(self) -> str:
-        """The change as a person says it: ``navcam_left turned 1.8 mrad about y, 9 sigma``."""
-        size = 1e3 * self.values
-        if self.what.endswith(" refocused"):
-            return f"{self.what}: focal length {0.1 * size[0]:+.3f} %, {self.sigmas:.0f} sigma"
-        if len(size) == 1:
-            return f"{self.what} by {size[0]:+.2f} mrad, {self.sigmas:.0f} sigma"
-        main = int(np.abs(size).argmax())
-        about = f"{abs(size[main]):.2f} mrad about {'-' if size[main] < 0 else ''}{'xyz'[main]}"
-        whole = float(np.linalg.norm(size))
-        rest = "" if abs(size[main]) > 0.9 * whole else f" ({whole:.2f} in all)"
-        return f"{self.what} {about}{rest}, {self.sigmas:.0f} sigma"
-
-
-@dataclass(frozen=True, eq=False)
 class SceneDrift:
-    """What a look says: views that told something and not, the changes by likelihood, and the one to name.
+    """The result of taking the views of a reference again.
 
-    ``named`` is the plainest change that explains nearly all; None below ``ALARM_SIGMAS``. ``instead`` are
-    others that would do as well: these pictures cannot tell them from it. ``missing`` says why a camera, or
-    one at a rest, gave no picture.
+    ``views`` could be compared, ``silent`` not. ``sigmas``: how unlikely the differences are without a
+    change; ``moved_px``: how far it moves a pixel, at most. ``missing`` says why a camera,
+    or one at a rest, gave no image.
     """
 
     views: int
-    silent: tuple[str, ...]
-    changes: tuple[SceneChange, ...]
-    named: SceneChange | None
-    instead: tuple[str, ...] = ()
+    silent: tuple[str, ...] = ()
+    sigmas: float = 0.0
+    moved_px: float = 0.0
     missing: Mapping[str, str] = field(default_factory=dict)
 
     @property
+    def changed(self) -> bool:
+        """Whether something has changed, from ``ALARM_SIGMAS`` on."""
+        return self.sigmas >= ALARM_SIGMAS
+
+    @property
     def sentence(self) -> str:
-        """What is to be told, '' if nothing is."""
-        if self.named is None:
+        """The change by its size: ``the images moved by up to 2.1 px, 9 sigma``; empty without one."""
+        if not self.changed:
             return ""
-        other = (
-            f" (or {' or '.join(self.instead)}: these pictures cannot separate them)" if self.instead else ""
-        )
-        return self.named.sentence + other
+        return f"the images moved by up to {self.moved_px:.2f} px, {self.sigmas:.0f} sigma"
 
 
 def view_change(shift: ViewShift, size_px: tuple[int, int]) -> ViewChange | None:
@@ -204,13 +168,16 @@ def find_drift(rig: Rig, shifts: Sequence[ViewShift], joint_sigma_rad: float = J
         else:
             told.append((shift, change))
     if not told:
-        return SceneDrift(0, tuple(silent), (), None)
+        return SceneDrift(0, tuple(silent))
     y = np.concatenate([change.numbers for _, change in told])
     columns = _columns(rig, [shift for shift, _ in told])
     covariance = _noise(told, columns, joint_sigma_rad)
     inverse = np.linalg.inv(covariance)
-    changes = []
-    for what, rates in _explanations(rig, columns).items():
+    sizes_px = [rig.cameras[shift.camera].model.size_px for shift, _ in told]
+    corner_px = np.array([np.hypot(width, height) / 2.0 for width, height in sizes_px])
+    per_number = float(np.log(len(y)))  # what a number more must explain: Schwarz's criterion
+    best, drift = -np.inf, SceneDrift(len(told), tuple(silent))
+    for rates in _explanations(rig, columns):
         normal = rates.T @ inverse @ rates
         if np.linalg.cond(normal) > 1e12:
             continue
@@ -219,37 +186,24 @@ def find_drift(rig: Rig, shifts: Sequence[ViewShift], joint_sigma_rad: float = J
         left = max(float(y @ inverse @ y) - gain, 0.0)
         freedom = max(len(y) - len(values), 1)
         scale = max(1.0, left / freedom)
-        by_chance = chance(gain, len(values), scale, freedom)
-        spread = np.asarray(scale * np.linalg.inv(normal), dtype=np.float64)
-        changes.append((gain / scale, SceneChange(what, values, spread, sigmas(by_chance))))
-    per_number = float(np.log(len(y)))  # what a number more must explain: Schwarz's criterion
-    changes.sort(key=lambda one: per_number * len(one[1].values) - one[0])
-    ranked = [change for _, change in changes]
-    best = ranked[0] if ranked and ranked[0].sigmas >= ALARM_SIGMAS else None
-    instead = []
-    if best is not None:
-        explained = {change.what: gain for gain, change in changes}
-        instead = [
-            change.what
-            for change in ranked
-            if change is not best and explained[change.what] > explained[best.what] - AS_GOOD
-        ]
-    return SceneDrift(len(told), tuple(silent), tuple(ranked), best, tuple(instead))
+        if gain / scale - per_number * len(values) > best:
+            best = gain / scale - per_number * len(values)
+            x, y_px, turn, scaled = (rates @ values).reshape(-1, 4).T
+            moved_px = float((np.hypot(x, y_px) + corner_px * np.hypot(turn, scaled)).max())
+            by_chance = sigmas(chance(gain, len(values), scale, freedom))
+            drift = replace(drift, sigmas=by_chance, moved_px=moved_px)
+    return drift
 
 
-def _explanations(rig: Rig, columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
-    """By change: how the views' numbers (4v,) follow it (4v, k)."""
-    found = {}
+def _explanations(rig: Rig, columns: dict[str, FloatArray]) -> list[FloatArray]:
+    """Of each change that is tested: how the views' numbers (4v,) follow it (4v, k)."""
+    found = []
     for name, camera in rig.cameras.items():
         if camera.on == "head" and f"cameras.{name}.turn.x" in columns:
-            found[f"{name} turned"] = np.column_stack(
-                [columns[f"cameras.{name}.turn.{axis}"] for axis in "xyz"]
-            )
-            found[f"{name} refocused"] = columns[f"cameras.{name}.scale"][:, None]
-    for joint in ("pan", "tilt"):
-        found[f"{joint} slipped"] = columns[joint][:, None]
-    found["rover turned"] = np.column_stack([columns[f"rover.{axis}"] for axis in "xyz"])
-    return found
+            found.append(np.column_stack([columns[f"cameras.{name}.turn.{axis}"] for axis in "xyz"]))
+            found.append(columns[f"cameras.{name}.scale"][:, None])
+    found += [columns[joint][:, None] for joint in ("pan", "tilt")]
+    return [*found, np.column_stack([columns[f"rover.{axis}"] for axis in "xyz"])]
 
 
 def _noise(

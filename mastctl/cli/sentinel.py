@@ -24,7 +24,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     sentinel = subparsers.add_parser(
         "sentinel",
         help="notice a bumped camera, a slipped joint, a lens refocused",
-        description="Keeps images of a few poses of the head, takes them again, names what has changed.",
+        description="Keeps images of a few poses of the head, takes them again, reports a change.",
     )
     acts = sentinel.add_subparsers(dest="act", required=True, metavar="ACT")
     reference = acts.add_parser("reference", help="take the pictures that later looks are compared with")

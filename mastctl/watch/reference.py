@@ -196,24 +196,16 @@ def look_journal(folder: Path) -> Journal[dict[str, Any]]:
 
 def look_line(reference: Reference, time: str, drift: SceneDrift) -> dict[str, Any]:
     """Return what is kept of a look at a reference."""
-    named = drift.named
     return {
         "time": time,
         "reference": reference.time,
         "views": drift.views,
         "silent": list(drift.silent),
         "missing": dict(drift.missing),
-        "named": None if named is None else named.what,
+        "changed": drift.changed,
+        "sigmas": drift.sigmas,
+        "moved_px": drift.moved_px,
         "sentence": drift.sentence,
-        "instead": list(drift.instead),
-        "changes": {
-            change.what: {
-                "sigmas": change.sigmas,
-                "values": change.values.tolist(),
-                "sigma": np.sqrt(np.diag(change.covariance)).tolist(),
-            }
-            for change in drift.changes
-        },
     }
 
 
@@ -231,9 +223,7 @@ def read_looks(folder: Path, reference: Reference) -> list[dict[str, Any]]:
 def _look(value: Any) -> dict[str, Any]:
     """Pass the object of a look. Raises ValueError and others."""
     datetime.fromisoformat(value["time"]).astimezone(UTC)
-    if not (
-        isinstance(value["sentence"], str) and value["views"] >= 0 and isinstance(value["named"], str | None)
-    ):
+    look: dict[str, Any] = {"changed": bool(value.get("named")), **value}  # before 0.1 a change had a name
+    if not isinstance(look["sentence"], str) or look["views"] < 0:
         raise ValueError("it is no look")
-    look: dict[str, Any] = value
     return look

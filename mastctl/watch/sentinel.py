@@ -16,7 +16,7 @@ from mastctl.watch.reference import LOOKS, REFERENCE, Reference, read_looks, rea
 log = logging.getLogger(__name__)
 
 CONFIRMED = 2
-"""So many looks one after the other must name the same change before it is told."""
+"""So many looks one after the other must see a change before it is reported."""
 
 OLD_DAYS = 7.0
 """What was found by a look longer ago than this is told with the age first."""
@@ -30,7 +30,7 @@ class SentinelStanding:
     """What the looks say together.
 
     level
-        ``good``, ``bad`` for a change that two looks name alike, ``unsure`` for none, one, or silent ones.
+        ``good``, ``bad`` for a change that two looks see, ``unsure`` for no look, one, or silent ones.
     sentence
         For a person.
     looks
@@ -60,12 +60,12 @@ def standing(reference: Reference, looks: Sequence[Mapping[str, Any]], now: date
     silent = len(looks) - 1 - max(at for at, look in enumerate(looks) if look["views"])
     blind = f"; {_looks(silent)} since then saw nothing they knew" if silent else ""
     seen = f"last looked {ago(last['time'], now)}"
-    if not last["named"]:
+    if not last["changed"]:
         words = f"nothing has changed, {_looks(len(telling))}, {seen}{blind}"
         return SentinelStanding("good" if silent < SILENT else "unsure", words, len(looks), None)
     alike = 0
     for look in reversed(telling):
-        if look["named"] != last["named"]:
+        if not look["changed"]:
             break
         alike += 1
     first = telling[-alike]["time"]

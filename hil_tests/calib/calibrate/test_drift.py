@@ -8,7 +8,7 @@ import pytest
 
 from calib.calibrate.drift import ALARM_SIGMAS, VIEW_SIGMA, ViewShift, find_drift, seen_again, view_change
 from calib.geometry.cahvor import CameraModel
-from hil_tests.support.feature_days import RESTS, SIZE, ChangedRig, FeatureSite, rig, shown
+from hil_tests.support.feature_days import FOCAL_PX, SIZE, ChangedRig, FeatureSite, rig
 
 SEED = 11
 
@@ -20,37 +20,29 @@ def look_at(truth: ChangedRig, seed: int = SEED):  # type: ignore[no-untyped-def
 @pytest.mark.parametrize("seed", range(5))
 def test_days_of_weather_light_and_moving_rocks_are_no_change(seed: int) -> None:
     drift = look_at(ChangedRig(), seed)
-    assert drift.named is None
-    assert drift.sentence == ""
-    assert max(change.sigmas for change in drift.changes) < ALARM_SIGMAS - 1.0
+    assert drift.sigmas < ALARM_SIGMAS - 1.0
+    assert (drift.changed, drift.sentence) == (False, "")
+
+
+CORNER_PX = np.hypot(*SIZE) / 2
 
 
 @pytest.mark.parametrize(
-    ("truth", "what", "value"),
+    ("truth", "moved_px"),
     [
-        (ChangedRig(turned={"navcam_left": np.array([0.0, 1.8e-3, 0.0])}), "navcam_left turned", 1.8e-3),
-        (ChangedRig(focal={"navcam_right": 3e-3}), "navcam_right refocused", 3e-3),
-        (ChangedRig(slip=(3e-3, 0.0)), "pan slipped", 3e-3),
-        (ChangedRig(slip=(0.0, -3e-3)), "tilt slipped", -3e-3),
-        (ChangedRig(rover=np.array([4e-3, 0.0, 0.0])), "rover turned", 4e-3),
+        (ChangedRig(turned={"navcam_left": np.array([0.0, 1.8e-3, 0.0])}), 1.8e-3 * FOCAL_PX),
+        (ChangedRig(focal={"navcam_right": 3e-3}), 3e-3 * CORNER_PX),
+        (ChangedRig(slip=(3e-3, 0.0)), 3e-3 * FOCAL_PX),
+        (ChangedRig(slip=(0.0, -3e-3)), 3e-3 * FOCAL_PX),
+        (ChangedRig(rover=np.array([4e-3, 0.0, 0.0])), 4e-3 * FOCAL_PX),
     ],
     ids=["bump", "focus", "pan", "tilt", "rover"],
 )
-def test_a_change_is_named_with_its_size(truth: ChangedRig, what: str, value: float) -> None:
+def test_a_change_is_found_with_its_size(truth: ChangedRig, moved_px: float) -> None:
     drift = look_at(truth)
-    assert drift.named is not None
-    assert drift.named.what == what
-    largest = drift.named.values[np.abs(drift.named.values).argmax()]
-    assert largest == pytest.approx(value, abs=0.15 * abs(value) + 2e-4)
-    assert drift.named.sigmas >= ALARM_SIGMAS
-
-
-def test_the_sentence_has_the_camera_the_angle_the_axis_and_its_sigmas() -> None:
-    drift = look_at(ChangedRig(turned={"navcam_left": np.array([0.0, 1.8e-3, 0.0])}))
-    words = drift.sentence
-    assert words.startswith("navcam_left turned 1.")
-    assert " mrad about y, " in words
-    assert words.endswith(" sigma")
+    assert drift.changed
+    assert drift.moved_px == pytest.approx(moved_px, rel=0.35)  # angles off the axis move pixels by more
+    assert drift.sentence == f"the images moved by up to {drift.moved_px:.2f} px, {drift.sigmas:.0f} sigma"
 
 
 def test_rocks_that_move_together_do_not_move_a_view() -> None:
@@ -98,23 +90,9 @@ def test_another_scene_says_nothing_instead_of_something() -> None:
         for eye in ("navcam_left", "navcam_right")
     ]
     drift = find_drift(rig(), views)
-    assert (drift.views, drift.named) == (0, None)
+    assert (drift.views, drift.changed) == (0, False)
     assert len(drift.silent) == 8
     assert "navcam_left at rest 0" in drift.silent
-
-
-def test_one_eye_at_one_rest_cannot_tell_a_bump_from_a_slip_and_says_so() -> None:
-    rng = np.random.default_rng(SEED)
-    site = FeatureSite(rng)
-    then = site.then[1, "navcam_left"]
-    pan, tilt = RESTS[1]
-    now = shown(site.points[1, "navcam_left"], "navcam_left", pan, tilt, ChangedRig(slip=(0.0, 5e-3)))
-    moved = now - then + 0.05 * rng.normal(size=then.shape)
-    drift = find_drift(rig(), [ViewShift("navcam_left", 1, pan, tilt, then, moved, np.full(len(then), 0.05))])
-    assert drift.named is not None
-    named = {drift.named.what, *drift.instead}
-    assert {"tilt slipped"} < named
-    assert "these pictures cannot separate them" in drift.sentence
 
 
 def test_features_are_seen_again_where_they_moved_and_not_elsewhere() -> None:

@@ -72,10 +72,10 @@ def undated(sentence: str) -> str:
     return sentence.partition(", since ")[0]
 
 
-def test_a_bumped_camera_is_named_by_two_looks_and_reported_everywhere(
+def test_a_bumped_camera_is_seen_by_two_looks_and_reported_everywhere(
     daemon: RunningDaemon, run: Run, client: Client
 ) -> None:
-    what = "navcam_left turned 1."
+    what = "the images moved by up to "
     rover = daemon.service.hardware.simulation
     assert rover is not None
     before = stands(client)
