@@ -87,7 +87,7 @@ def described() -> Described:
 def answers_checked() -> Iterator[list[str]]:
     """Have every daemon of this process checked; yields what was not as described."""
     complaints: list[str] = []
-    plain: Callable[..., ASGIApp] = daemon_module.create_app
+    plain: Callable[..., ASGIApp] = daemon_module.create_app  # type: ignore[attr-defined]
 
     def create_app(*args: Any, **options: Any) -> ASGIApp:
         app, known = plain(*args, **options), described()

@@ -209,15 +209,15 @@ def test_the_installed_command_points_a_small_rover_and_checks_it(
             pointed = json.loads(
                 run(mastctl, "experiment", "pointing", *words, timeout_s=TIMEOUT_S, **how).stdout
             )
-            words = ("conform", url, "--json")
-            told = json.loads(run(mastctl, *words, timeout_s=TIMEOUT_S, **how).stdout)
+            conform = ("conform", url, "--json")
+            report = json.loads(run(mastctl, *conform, timeout_s=TIMEOUT_S, **how).stdout)
         finally:
             daemon.terminate()
     assert [(row["distance_m"], row["targets"], row["failed"]) for row in pointed["distances"]] == [
         (6.0, 1, 0)
     ]
     assert_report(tmp_path / "pointed" / "report.html")
-    assert told["conforms"] and told["passed"] > 10 and told["failed"] == 0
+    assert report["conforms"] and report["passed"] > 10 and report["failed"] == 0
 
 
 def assert_report(path: Path) -> None:

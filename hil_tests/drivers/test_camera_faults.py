@@ -111,7 +111,7 @@ def test_camera_hangs_in_the_named_call_until_the_fault_is_over(clock: Any, numb
         info=CameraInfo(period_s=0.1),
         exposure_held=contextlib.nullcontext,
     )
-    camera = HangingCamera(inner, SensorMode(SIZE), time_now, panel)
+    camera = HangingCamera(inner, SensorMode(SIZE), time_now, panel)  # type: ignore[arg-type]
     panel.set("cam_left", "hang", call=number)
     for place, (name, call) in enumerate(CALLS.items(), 1):
         back = threading.Event()

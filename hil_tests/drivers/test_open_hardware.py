@@ -185,7 +185,7 @@ def test_a_head_that_hangs_in_closing_keeps_no_camera_open() -> None:
             closed.set()
             raise SystemExit(1)
 
-    hardware = Hardware(Slow(), {"navcam_left": Closes()}, {})
+    hardware = Hardware(Slow(), {"navcam_left": Closes()}, {})  # type: ignore[dict-item]
     closing = threading.Thread(target=hardware.close)
     closing.start()
     assert closed.wait(60.0)

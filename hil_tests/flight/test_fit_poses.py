@@ -57,7 +57,7 @@ class TwoLines:
         """Distance of the lines, and how far their angle is from a right one."""
         normal = np.cross(self.pan_axis, self.tilt_axis)
         gap = (self.tilt_point - self.pan_point) @ normal / np.linalg.norm(normal)
-        return abs(gap), abs(np.arcsin(self.pan_axis @ self.tilt_axis))
+        return float(abs(gap)), float(abs(np.arcsin(self.pan_axis @ self.tilt_axis)))
 
 
 def about(point: np.ndarray, axis: np.ndarray, angle_rad: float) -> Rigid:

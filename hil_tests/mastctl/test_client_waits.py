@@ -58,7 +58,7 @@ def test_a_wait_asks_once_and_then_listens(
     publisher = pair[0].service.machine.publisher
     before = publisher.listeners
 
-    def on_step(step: dict[str, Any]) -> None:
+    def on_step(step: Any) -> None:
         steps.append(step["name"])
 
     with ThreadPoolExecutor(1) as pool:
@@ -118,7 +118,8 @@ def test_a_stream_that_breaks_is_begun_again(
     client: Client, go: threading.Event, pair: BOTH, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     operation = client.point(pan_rad=0.0, tilt_rad=0.0)
-    heard, broken = connection_module.DaemonHttp.heard, []
+    heard = connection_module.DaemonHttp.heard
+    broken: list[Any] = []
 
     def breaking(self: Any, *args: Any) -> Any:
         for event in heard(self, *args):

@@ -43,7 +43,7 @@ def test_the_client_keeps_the_head_turning_and_lets_go_at_the_end(
     hardware = pair[1]
     with client.jog() as jog:
         jog.rates(0.1, 0.0)
-        until(lambda: jog.check() or len(moves(hardware)) > 8, "more goals than one heartbeat is good for")
+        until(lambda: jog.check() or len(moves(hardware)) > 8, "more goals than one heartbeat is good for")  # type: ignore[func-returns-value]
         jog.rates(0.0, 0.0)
         until(lambda: ("stop",) in hardware.head.calls, "a stop")
         jog.rates(0.0, -0.1)

@@ -96,7 +96,7 @@ class FeatureSite:
                 far = rng.uniform(2.0, 25.0, FEATURES)[:, None]
                 points = MAST_M + (place + ahead * far) @ (about(2, pan) @ about(1, tilt)).T
                 self.points[pose, camera] = points
-                self.then[pose, camera] = shown(
+                self.then[pose, camera] = shown(  # type: ignore[call-arg]
                     points, camera, *(np.array([pan, tilt]) + off[pose]), ChangedRig()
                 )
 
@@ -110,7 +110,7 @@ class FeatureSite:
             light = rng.normal(0.0, LIGHT_PX)
             angles = np.array([pan, tilt]) + rng.normal(0.0, JOINT_SIGMA_RAD, 2) + bend
             for camera in CAMERAS_M:
-                now = shown(self.points[pose, camera], camera, *angles, truth)
+                now = shown(self.points[pose, camera], camera, *angles, truth)  # type: ignore[call-arg]
                 moved = now - self.then[pose, camera]
                 sigma = rng.uniform(0.03, 0.15, FEATURES)
                 moved = moved + spoil * sigma[:, None] * rng.normal(0, 1, moved.shape)

@@ -86,7 +86,7 @@ def measure(
 ) -> FloatArray:
     """Return found minus true (n, 2) px of patches carried from the first pose to the second."""
     first, second = (renderer.image(camera, pose, samples) for pose in site_from_head)
-    first, second = (cv2.GaussianBlur(image, (0, 0), BLUR_PX) for image in (first, second))
+    first, second = (cv2.GaussianBlur(image, (0, 0), BLUR_PX) for image in (first, second))  # type: ignore[assignment]
     texture = texture_of(first)
     width, height = camera.size_px
     edge = HALF_PX + MARGIN_PX
@@ -166,7 +166,7 @@ def match(
     warp[:, 2] += rng.uniform(-0.5, 0.5, 2) - best[:, :2] @ [HALF_PX, HALF_PX] - corner
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-7)
     try:
-        _, warp = cv2.findTransformECC(
+        _, warp = cv2.findTransformECC(  # type: ignore[assignment]
             template, window, np.ascontiguousarray(warp, np.float32), cv2.MOTION_AFFINE, criteria, None, 1
         )
     except cv2.error as error:

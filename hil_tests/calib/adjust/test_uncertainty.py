@@ -197,7 +197,7 @@ def test_hand_off_from_pancam_to_navcam(joint: Calibration, true_rig: Rig, dista
         if not valid or (right < 0).any() or (right > [1023, 767]).any():
             continue
         cameras = (joint.rig.camera_in_rover(n, *at) for n in ("pancam_left", "pancam_right"))
-        found = triangulate(*cameras, left, right)
+        found = triangulate(*cameras, left, right)  # type: ignore[call-arg]
         for name in ("navcam_left", "navcam_right"):
             wanted, _ = true_rig.camera_in_rover(name, *at).project(target)
             given, _ = joint.rig.camera_in_rover(name, *at).project(found.position_m)

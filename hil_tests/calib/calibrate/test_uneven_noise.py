@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calib.adjust.robust import SurveyNotFitted
 from calib.calibrate.bench.fit import fit_bench
-from calib.calibrate.survey import SurveyNotFitted, fit_joint
+from calib.calibrate.survey import fit_joint
 from calib.survey.check import check_survey
 from calib.survey.records import Sigma, Survey
 from hil_tests.calib.adjust.small_surveys import with_shifted_dots

@@ -405,5 +405,5 @@ def test_a_written_table_comes_back_bit_for_bit(tmp_path: Path) -> None:
     lines = stream.getvalue().splitlines()
     assert (len(lines), lines[8]) == (501, ",,")
     (tmp_path / "p.csv").write_text(stream.getvalue())
-    expected = np.where(np.isfinite(values).all(axis=1)[:, None], values, np.nan)
+    expected = np.where(np.isfinite(values).all(axis=1)[:, None], values, np.nan)  # type: ignore[index]
     np.testing.assert_array_equal(read_table(tmp_path / "p.csv", COLUMNS), expected)

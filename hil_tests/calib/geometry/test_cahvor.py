@@ -72,7 +72,7 @@ def test_wrong_shapes_are_refused() -> None:
     for call in (plain("CAHV").project, plain("CAHV").project_jacobian):
         with pytest.raises(ValueError, match=r"points of shape \(2,\)"):
             call([0.0, 1.0])
-    for call in (plain("CAHV").ray, plain("CAHV").ray_jacobian):
+    for call in (plain("CAHV").ray, plain("CAHV").ray_jacobian):  # type: ignore[assignment]
         with pytest.raises(ValueError, match=r"pixels of shape \(4, 3\)"):
             call(np.zeros((4, 3)))
 

@@ -125,7 +125,7 @@ def test_numbers_that_are_not_finite_have_no_image(kind: str, bad: float) -> Non
             pixels, valid = model.project(points)
             assert np.isfinite(pixels).all() if valid.all() else np.isnan(pixels).all()
             assert not valid.any() or np.isfinite(bad)
-    for pixels in ([bad, 1.0], [1.0, bad], [[bad, 1.0]], [[1.0, bad]]):
+    for pixels in ([bad, 1.0], [1.0, bad], [[bad, 1.0]], [[1.0, bad]]):  # type: ignore[assignment]
         rays = model.ray(pixels)
         assert np.isfinite(rays.directions).all() if rays.valid.all() else np.isnan(rays.directions).all()
         assert not rays.valid.any() or np.isfinite(bad)

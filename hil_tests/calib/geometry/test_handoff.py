@@ -331,6 +331,6 @@ def test_how_far_a_click_is_off_the_epipolar_line_is_told_in_its_pixels(rig: Rig
     exact = clicks(rig, PAIR, TARGET, AT)
     eyes = [rig.camera_in_rover(name, *at) for name in PAIR]
     allowed = click_covariance(rig, PAIR, *at, TARGET, sigma_px=0.2)
-    gap = ray_gap(triangulate(*eyes, exact[0], exact[1] + [0.0, off_px]), allowed)
+    gap = ray_gap(triangulate(*eyes, exact[0], exact[1] + [0.0, off_px]), allowed)  # type: ignore[call-arg]
     assert gap.across_px == pytest.approx(abs(off_px), rel=0.05)
     assert gap.across_px / gap.across_sigma_px == pytest.approx(gap.sigmas)

@@ -196,7 +196,7 @@ def test_waves_are_texture_enough_if_noise_moves_them_less_than_is_allowed(
 def test_straight_edge_is_flat_along_itself() -> None:
     edge = np.full(SIZE_PX[::-1], 60.0, np.float32)
     edge[:, 180:] = 180.0
-    edge += np.random.default_rng(0).normal(scale=NOISE_DN, size=edge.shape).astype(np.float32)
+    edge += np.random.default_rng(0).normal(scale=NOISE_DN, size=edge.shape).astype(np.float32)  # type: ignore[attr-defined]
     found = match_patch(
         edge, LEFT.model, (180.0, 140.0), facing_plane(LEFT.model, (180, 140), 4), edge, LEFT.model, 10
     )

@@ -31,7 +31,7 @@ def test_point_covariance_and_misfit_are_those_of_least_squares() -> None:
 
     fit = least_squares(rest, BELIEVED, jac="3-point", xtol=1e-14, ftol=1e-14)
     np.testing.assert_allclose(found.position_m, fit.x, atol=1e-8)
-    np.testing.assert_allclose(found.covariance_m2, np.linalg.inv(fit.jac.T @ fit.jac), rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(found.covariance_m2, np.linalg.inv(fit.jac.T @ fit.jac), rtol=1e-4, atol=1e-9)  # type: ignore[operator]
     assert np.isclose(found.chi2, 2 * fit.cost, rtol=1e-6)
 
 

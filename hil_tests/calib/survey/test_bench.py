@@ -195,7 +195,7 @@ def test_a_kill_leaves_images_with_all_corners_or_none(
     bench = grown(tmp_path)
     bench.append(image("a"), corners_at(10.0), b"picture")
     left = [steps]
-    truly = bench_writer.replace_bytes
+    truly = bench_writer.replace_bytes  # type: ignore[attr-defined]
 
     def until_killed(path: Path, data: bytes, mode: int = 0o600) -> None:
         if left[0] == 0:

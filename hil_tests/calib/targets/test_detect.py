@@ -81,12 +81,12 @@ def test_dots_on_gravel_are_as_exact_as_wanted(focal_px, range_m, tilt_deg, want
 def test_bad_pictures_cost_exactness_but_not_honesty(stress: str) -> None:
     rng = np.random.default_rng(11)
     y, x = np.mgrid[0:480, 0:640]
-    how: dict[str, Any] = {
+    looks: dict[str, dict[str, Any]] = {
         "noise": {"noise_dn": 6.0},
         "contrast": {"noise_dn": 3.0, "look": BoardLook(150.0, 90.0)},
         "gradient": {"shade": 1.0 - 0.6 * (x + y) / (640 + 480)},
-    }[stress]
-    shot = shoot(rng, SIDE, pose(6.0, (30, 100), -6), **how)
+    }
+    shot = shoot(rng, SIDE, pose(6.0, (30, 100), -6), **looks[stress])
     check(shot, find_dots(shot.image, BOARD, shot.roughly(rng)), 0.06)
 
 

@@ -17,7 +17,7 @@ def test_charuco_corners_are_opencvs() -> None:
     theirs = cv2.aruco.CharucoBoard((9, 12), 0.02, 0.015, dictionary).getChessboardCorners()
     ours = CHARUCO.in_board_m(CHARUCO.ids)
     assert ours.shape == (88, 3)
-    assert np.allclose(ours - ours[0], theirs - theirs[0], atol=1e-7)
+    assert np.allclose(np.subtract(ours, ours[0]), np.subtract(theirs, theirs[0]), atol=1e-7)
     assert np.allclose(ours.mean(axis=0), 0.0)
 
 

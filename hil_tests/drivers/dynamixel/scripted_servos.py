@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from drivers.clock import Clock, SystemClock
-from drivers.dynamixel.link import REPLY_TIMEOUT_S, Link
+from drivers.dynamixel.link import Link
 from drivers.serial_line import OpenLine, SerialLine
+from drivers.servo_bus.exchange import REPLY_TIMEOUT_S
 from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.dynamixel_packets import Instruction, InstructionParser, status_packet
 from drivers.sim.wire.line import PtyLine

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from drivers.v4l2 import abi, controls
+from drivers.v4l2 import abi
 from drivers.v4l2.controls import get_value, list_controls, set_by_name, set_value
 
 BRIGHTNESS, POWER_LINE, LINK_MHZ, PAYLOAD, GONE, MASK = (0x980900 + n for n in (0, 24, 30, 40, 41, 50))
@@ -98,7 +98,7 @@ class Driver:
 
 @pytest.fixture
 def node(monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setattr(controls.fcntl, "ioctl", Driver().ioctl)
+    monkeypatch.setattr("fcntl.ioctl", Driver().ioctl)
 
     class Opened:
         def fileno(self) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from drivers.errors import StreamFailed
-from drivers.v4l2 import abi, node
+from drivers.v4l2 import abi
 from drivers.v4l2.node import Node
 
 Answers = dict[int, Callable[[Any], bytes]]
@@ -39,7 +39,7 @@ def answers(monkeypatch: pytest.MonkeyPatch) -> Answers:
         memoryview(argument).cast("B")[: len(told)] = told
         return 0
 
-    monkeypatch.setattr(node.fcntl, "ioctl", ioctl)
+    monkeypatch.setattr("fcntl.ioctl", ioctl)
     return answers
 
 
@@ -81,8 +81,8 @@ def refused_start(monkeypatch: pytest.MonkeyPatch, number: int) -> str:
         memoryview(argument).cast("B")[: len(told)] = told
         return 0
 
-    monkeypatch.setattr(node.fcntl, "ioctl", ioctl)
-    monkeypatch.setattr(node.mmap, "mmap", lambda *_, **__: io.BytesIO())
+    monkeypatch.setattr("fcntl.ioctl", ioctl)
+    monkeypatch.setattr("mmap.mmap", lambda *_, **__: io.BytesIO())
     monkeypatch.setattr(Node, "queue", lambda *_: None)
     with Node("/dev/null", "navcam_left") as opened, pytest.raises(StreamFailed) as raised:
         opened.start(4)

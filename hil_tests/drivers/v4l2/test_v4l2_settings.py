@@ -119,7 +119,7 @@ def test_a_value_the_camera_changed_or_refused_is_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with bench(monkeypatch, "uvc", controls=ALL, values=VALUES, focus=30) as seen:
-        real = settings.set_value
+        real = settings.set_value  # type: ignore[attr-defined]
 
         def clamps(node: object, control: CameraControl, value: int) -> ControlProblem | None:
             if control.id == GAIN.id:
@@ -145,7 +145,7 @@ def test_a_refused_value_leaves_the_automatic_on(monkeypatch: pytest.MonkeyPatch
             seen.camera.adjust({"gain": 200.0})
         gain = next(one for one in seen.camera.settings() if one.name == "gain")
         assert gain.automatic and gain.value is None
-        real = settings.set_value
+        real = settings.set_value  # type: ignore[attr-defined]
 
         def keeps_off(node: object, control: CameraControl, value: int) -> ControlProblem | None:
             if (control.id, value) == (AUTOGAIN.id, 1):

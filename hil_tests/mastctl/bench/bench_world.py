@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,15 +48,12 @@ def corner_bench(
     seed: int = 1,
     one_sided: bool = True,
     of: Callable[[Path], tuple[Rig, Rig]] = rigs,
-    **axis: object,
+    **axis: Any,
 ) -> CornerBench:
     """A PTU's counts; ``axis`` is of both joints."""
     true, believed = of(repository)
     head = BenchHead(believed, (-2.6, 2.6), (-1.2, 0.5), one_sided, PTU_COUNT_RAD)
-    pan, tilt = (
-        TrueAxis(PTU_COUNT_RAD, one_sided=one_sided, **axis)
-        for _ in range(2)  # type: ignore[arg-type]
-    )
+    pan, tilt = (TrueAxis(PTU_COUNT_RAD, one_sided=one_sided, **axis) for _ in range(2))
     return CornerBench(head, true, BOARD, np.random.default_rng(seed), pan, tilt)
 
 

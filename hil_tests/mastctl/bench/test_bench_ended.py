@@ -103,7 +103,7 @@ def test_a_full_disk_leaves_a_whole_folder_that_a_later_run_goes_on_with(
 ) -> None:
     bench = corner_bench(repository, seed=4)
     run, _ = run_of(bench, tmp_path / "bench")
-    whole, files = bench_writer.replace_bytes, 0
+    whole, files = bench_writer.replace_bytes, 0  # type: ignore[attr-defined]
 
     def until_full(path: Path, data: bytes, mode: int) -> None:
         nonlocal files
@@ -163,7 +163,7 @@ def test_a_search_that_finds_another_board_ends_soon_and_says_why(
         seen = tuple(replace(one, why=told) for one in looked(*at).seen)
         return BenchLook(seen, 0, 0, 1.0)
 
-    bench.look = look  # type: ignore[method-assign]
+    bench.look = look  # type: ignore[assignment, method-assign]
     with pytest.raises(BoardNotFound, match=re.escape(why)):
         run.run()
     assert bench.looks <= 12
@@ -186,7 +186,7 @@ def in_the_night(bench: CornerBench, whys: Sequence[str]) -> None:
             raise NoLight(why)
         return replace(seen, seen=tuple(replace(one, corners=None, why=why) for one in seen.seen))
 
-    bench.look = look  # type: ignore[method-assign]
+    bench.look = look  # type: ignore[assignment, method-assign]
 
 
 DARK = "navcam_left: the picture is dark: its brightest hundredth is at 2 of 255"

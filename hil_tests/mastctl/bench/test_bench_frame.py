@@ -123,7 +123,7 @@ def test_a_placement_that_moved_is_left_out_with_a_sentence(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     survey = read_survey(folder)
-    whole = frame.fit_bench
+    whole = frame.fit_bench  # type: ignore[attr-defined]
 
     def fits_only_without_p1(survey: Survey, options: BenchOptions) -> BenchCalibration:
         if any(image.placement == "p1" for image in survey.images):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,11 +89,11 @@ class Mortal:
     def __init__(self, bench: CornerBench, looks: int) -> None:
         self.bench, self.left, self.head = bench, looks, bench.head
 
-    def look(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> BenchLook:
+    def look(self, *at: Any) -> BenchLook:
         if not self.left:
             raise Dying
         self.left -= 1
-        return self.bench.look(pan_rad, tilt_rad, approach)
+        return self.bench.look(*at)
 
 
 def test_a_run_that_died_goes_on_at_its_placement_without_asking(repository: Path, tmp_path: Path) -> None:
@@ -125,7 +126,7 @@ def test_a_board_that_is_taken_away_ends_the_run_and_loses_nothing(repository: P
             bench.rover_from_board = None
         return looked(pan_rad, tilt_rad, approach)
 
-    bench.look = look  # type: ignore[method-assign]
+    bench.look = look  # type: ignore[assignment, method-assign]
     with pytest.raises(BoardLost, match="Put it back or place it anew"):
         run.run()
     assert len(list(looks_of(read_survey(tmp_path / "bench")))) == 5

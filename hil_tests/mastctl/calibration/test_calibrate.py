@@ -100,7 +100,7 @@ def test_a_second_calibration_keeps_the_first_and_compares_with_it(
 ) -> None:
     out = tmp_path / "m.yaml"
     true = navcam_rig()
-    old = save_rig(replace(true, mast=replace(true.mast, rotation_rad=[0.0, 0.0, 0.0])), out)
+    old = save_rig(replace(true, mast=replace(true.mast, rotation_rad=np.zeros(3))), out)
     before = out.read_bytes()
     assert main(["calibrate", str(survey_folder), "--out", str(out), "--method", "paper", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

@@ -107,7 +107,7 @@ def test_ray_gives_origin_and_direction(folder: Path, capsys: pytest.CaptureFixt
     assert run.rows()[0] == ["ox_m", "oy_m", "oz_m", "dx", "dy", "dz"]
     values = np.array(run.rows()[1:], dtype=float)
     half = math.sqrt(0.5)
-    np.testing.assert_allclose(values, [[0, 0, 0, 1, 0, 0], [0, 0, 0, half, half, 0]], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(values, [[0, 0, 0, 1, 0, 0], [0, 0, 0, half, half, 0]], rtol=0, atol=1e-15)  # type: ignore[arg-type]
 
 
 def test_solve_puts_the_target_on_the_pixel(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -254,7 +254,7 @@ def stands_short_of(url: str, goal_rad: float) -> bool:
         return bool(status["state"] == "holding" and abs(status["joints"]["pan_rad"] - goal_rad) > 0.01)
 
 
-def at_rest(client: Client) -> dict[str, Any] | None:
+def at_rest(client: Client) -> Any:
     status = client.status()
     return None if status["moving"] or status["operation"] else status
 

@@ -13,7 +13,6 @@ import pytest
 
 from hil_tests.mastctl.service_fakes import Hang
 from hil_tests.waiting import NET_S
-from mastctl.control import audit as audit_module
 from mastctl.control.audit import WAITING, AuditLog
 
 
@@ -86,7 +85,7 @@ def test_a_disk_that_hangs_blocks_no_caller_and_losses_are_counted(
         hang()
         sync(descriptor)
 
-    monkeypatch.setattr(audit_module.os, "fdatasync", hanging)
+    monkeypatch.setattr("os.fdatasync", hanging)
     log = AuditLog(path)
     log.put({"number": 0})
     assert hang.entered.wait(NET_S)

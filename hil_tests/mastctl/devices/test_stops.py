@@ -283,7 +283,7 @@ def test_rest_after_a_move_of_before_the_stop_proves_nothing(
     fault = one_fault(devices)
     hardware.head.moving = False
     since_s = clock.now_s()
-    clock.until(lambda: clock.now_s() > since_s + 2 * devices_module.REST_S and devices.read(), "rest")
+    clock.until(lambda: clock.now_s() > since_s + 2 * devices_module.REST_S and devices.read(), "rest")  # type: ignore[attr-defined]
     assert devices.faults() == (fault,)
     hardware.head.hook = lambda name: None
     devices.move(0.3, 0.1)

@@ -43,7 +43,7 @@ def test_a_run_outlives_its_killed_daemon_only_as_a_folder_to_go_on(tmp_path: Pa
     path = config(tmp_path, repository)
 
     def pictures(client: Client) -> int:
-        return (client.bench()["run"] or {"pictures": 0})["pictures"]
+        return run["pictures"] if (run := client.bench()["run"]) else 0
 
     with started(path) as (daemon, port), Client(f"http://127.0.0.1:{port}", name="Ana") as client:
         name = client.begin_bench("charuco_a2")["name"]

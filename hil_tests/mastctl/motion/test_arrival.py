@@ -49,7 +49,7 @@ class Turning:
 
 def request(turning: Turning, cancelled: threading.Event | None = None) -> SteeredHead:
     limits = Limits((-2.0, 2.0), (-1.0, 1.0), SPEED_RAD_PER_S)
-    return SteeredHead(turning, limits, turning.clock, SETTINGS, cancelled or threading.Event())
+    return SteeredHead(turning, limits, turning.clock, SETTINGS, cancelled or threading.Event())  # type: ignore[arg-type]
 
 
 def standing(pan_rad: float = 0.3, tilt_rad: float = -0.2) -> Turning:

@@ -75,9 +75,9 @@ class Rig:
     def pass_by(self, duration_s: float) -> None:
         self.clock.sleep(duration_s)
 
-    def beats(self, pan: float, tilt: float, for_s: float, **how: Any) -> dict[str, Any]:
+    def beats(self, pan: float, tilt: float, for_s: float, **how: Any) -> Any:
         """Heartbeats, one a tick; the last answer."""
-        answer: dict[str, Any] = {}
+        answer: Any = {}
         for _ in range(round(for_s / TICK_S)):
             answer = self.jogs.beat(Beat((pan, tilt), **how))
             self.pass_by(TICK_S)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ def truth_of(world: World, result: PointingResult, point: np.ndarray) -> list[np
     return [world.true_pixel(one.frame_id, point) - np.array(MIDDLE_PX) for one in result.pointings]
 
 
-def pointed(world: World, **more: object) -> tuple[PointingResult, np.ndarray, list[str]]:
+def pointed(world: World, **more: Any) -> tuple[PointingResult, np.ndarray, list[str]]:
     frame = world.shoot()
     point = world.true_point(frame, *PIXEL)
     if more.pop("range_told", False):

@@ -6,6 +6,7 @@ import json
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -143,7 +144,9 @@ def test_a_frame_from_a_pose_that_looks_elsewhere_is_refused_by_name() -> None:
 
 
 @pytest.mark.parametrize("frame", ["rover", "site"])
-def test_a_position_is_pointed_at_and_its_missing_residual_is_explained(frame: str) -> None:
+def test_a_position_is_pointed_at_and_its_missing_residual_is_explained(
+    frame: Literal["rover", "site"],
+) -> None:
     world = World()
     result, steps = run(world, PointRequest(PositionTarget((4.0, 0.7, 0.0), frame)))
     (pointing,) = result.pointings

@@ -147,24 +147,24 @@ def test_the_suns_keep_out_knows_a_pose_before_the_look_from_it_begins(
     daemon: RunningDaemon, client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started(client)
-    told: list[str] = []
+    called: list[str] = []
     door, operations = daemon.service.devices.door, daemon.service.operations
     stands, start = door.rover_stands, operations.start
 
     def rover_stands(rover_from_site: Any) -> None:
-        told.append("stands")
+        called.append("stands")
         stands(rover_from_site)
 
     def begin(*work: Any) -> Any:
-        told.append("look")
+        called.append("look")
         return start(*work)
 
     monkeypatch.setattr(door, "rover_stands", rover_stands)
     monkeypatch.setattr(operations, "start", begin)
     drive(client, 0.5, 2.0)
-    assert told == ["stands", "look"]
+    assert called == ["stands", "look"]
     refusal(lambda: drive(client, 1.0, 1.5), "pose_runs_backwards")
-    assert told == ["stands", "look"], "a refused pose turns no sun"
+    assert called == ["stands", "look"], "a refused pose turns no sun"
 
 
 def test_a_lost_target_stays_lost_with_its_reason_until_a_look_finds_it(
@@ -207,12 +207,12 @@ def test_a_pose_that_jumps_loses_the_target_and_looks_nowhere(client: Client) ->
 def test_poses_that_run_backwards_or_say_too_little_are_refused(client: Client) -> None:
     started(client)
     before = client.track()
-    told = refusal(lambda: drive(client, 0.1, 0.5), "pose_runs_backwards")
-    assert "0.5 s" in told
-    assert "1 s" in told
+    sentence = refusal(lambda: drive(client, 0.1, 0.5), "pose_runs_backwards")
+    assert "0.5 s" in sentence
+    assert "1 s" in sentence
     refusal(lambda: client.pose([0.1, 0, 0], [1, 0, 0, 0], sigma=SIGMA), "pose_without_time")
-    told = refusal(lambda: client.pose([0, 0, 0], [1, 0, 0, 0], time_s=2.0), "pose_without_covariance")
-    assert "covariance (6 rows of 6) or sigma" in told
+    sentence = refusal(lambda: client.pose([0, 0, 0], [1, 0, 0, 0], time_s=2.0), "pose_without_covariance")
+    assert "covariance (6 rows of 6) or sigma" in sentence
     assert client.track()["sequence"] == before["sequence"], "a refused pose changes nothing"
     refusal(lambda: client.pose([0.1, 0, 0], [1, 0, 0, 0], time_s=2.0), "pose_without_covariance")
     track = client.track()
@@ -225,10 +225,10 @@ def test_poses_that_run_backwards_or_say_too_little_are_refused(client: Client) 
 def test_a_first_pose_while_a_track_begins_ends_it_and_its_motion(
     client: Client, pair: tuple[RunningDaemon, FakeHardware], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told, goes_on = threading.Event(), threading.Event()
-    monkeypatch.setattr(ScriptedLooker, "begin", staticmethod(lambda: (told.set(), goes_on.wait(NET_S))))
+    begun, goes_on = threading.Event(), threading.Event()
+    monkeypatch.setattr(ScriptedLooker, "begin", staticmethod(lambda: (begun.set(), goes_on.wait(NET_S))))  # type: ignore[func-returns-value]
     operation = client.start_track(pixel=click(client))
-    assert told.wait(NET_S)
+    assert begun.wait(NET_S)
     assert client.pose([0.1, 0, 0], [1, 0, 0, 0])["track"]["state"] == "stopped"
     assert ("stop",) in pair[1].head.calls, "nothing turns for a track that has ended"
     goes_on.set()
@@ -329,7 +329,7 @@ def test_a_stop_ends_look_and_track(
 ) -> None:
     started(client)
     hang = Hang()
-    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(lambda track: (hang(), found(track))[1]))
+    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(lambda track: (hang(), found(track))[1]))  # type: ignore[func-returns-value]
     operation = client.pose([0.5, 0, 0], [1, 0, 0, 0], sigma=SIGMA, time_s=2.0)["operation"]
     assert hang.entered.wait(60.0)
     assert client.stop()["operation"] == operation

@@ -97,7 +97,7 @@ class Drive:
         self._told = self._told @ motion @ error
         return self.tell(sigma)
 
-    def tell(self, sigma: tuple[float, float]) -> dict[str, Any]:
+    def tell(self, sigma: tuple[float, float]) -> Any:
         x, y, z, w = Rotation.from_matrix(self._told.rotation).as_quat().tolist()
         position = self._told.translation_m.tolist()
         answer = self._client.pose(position, (w, x, y, z), sigma=sigma)

@@ -19,11 +19,11 @@ from calib.files.atomic import save_bytes
 from calib.files.mast_file import load_rig
 from calib.files.yaml_text import parse_mapping
 from drivers.dynamixel.settings import dynamixel_settings
-from drivers.dynamixel.workshop import BENCH, FoundServo
+from drivers.dynamixel.workshop import BENCH
 from drivers.feetech.head import feetech_settings
 from drivers.flir_ptu.options import options_from
 from drivers.probes import ProbedCamera
-from drivers.servo_bus.bench import ServosOnLine
+from drivers.servo_bus.bench import FoundServo, ServosOnLine
 from drivers.sim.heads import PRESETS, HeadSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
@@ -41,11 +41,12 @@ from mastctl.packaged import schema_files
 from mastctl.rig import folder as folder_module
 from mastctl.rig import plugged
 from mastctl.rig.drawing import RigAnswers
-from mastctl.rig.folder import CONFIG, MAST, README, RULES, write_rig
+from mastctl.rig.folder import README, RULES, write_rig
 from mastctl.rig.plugged import Plugged, head_probes
 from mastctl.rig.questions import Prompts
 from mastctl.setup import doctor
 from mastctl.setup.machine import ExaminedMachine
+from mastctl.setup.rig_folder import CONFIG, MAST
 
 X = PRESETS["dynamixel_x"]
 HEAD_PROBES = head_probes()
@@ -61,7 +62,7 @@ class Bench:
     def axes(self, head: HeadSettings = X) -> list[WireAxis]:
         """A head's two axes."""
         now_s = self.clock.now_s()
-        return [WireAxis(axis, number=n, time_s=now_s) for n, axis in enumerate((head.pan, head.tilt))]
+        return [WireAxis(axis, number=n, time_s=now_s) for n, axis in enumerate((head.pan, head.tilt))]  # type: ignore[arg-type]
 
     def servos(self, ids: tuple[int, int]) -> list[SimulatedServo]:
         """Two XL330 at 1 Mbaud."""

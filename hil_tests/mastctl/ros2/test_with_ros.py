@@ -147,7 +147,7 @@ def test_stamps_are_the_daemons_own(beside: Beside) -> None:
     assert ros.heard("clock_offset", 1, 60.0)[0][1]["data"] == pytest.approx(offset_s, abs=STAMP_S)
     measured: set[float] = set()
     for event in beside.client.events("joints"):
-        measured.add(event["value"]["measured_s"])
+        measured.add(event["value"]["measured_s"])  # type: ignore[call-overload, typeddict-item]
         if len(measured) >= 20:
             break
     told = np.array([seconds(one["header"]) - offset_s for _, one in ros.heard("joint_states", 100, 60.0)])

@@ -158,7 +158,7 @@ def test_a_signal_stops_the_head_where_it_is(
 
     def turns() -> bool:
         heads = getattr(sys.modules.get("shifted_rig"), "HEADS", ())  # the import may be under way
-        return bool(heads) and abs(heads[-1].at(time.monotonic())[0]) > 0.02
+        return bool(heads) and abs(heads[-1].at(time.monotonic())[0]) > 0.02  # type: ignore[misc]
 
     def interrupt() -> None:
         until(turns, "the head turns")

@@ -66,7 +66,7 @@ def pointing(
         eyes = [rig.camera_in_rover(name, *read) for name in source]
         if not all(eye.holds(click) for eye, click in zip(eyes, clicks, strict=True)):
             continue
-        point = triangulate(*eyes, *clicks, MATCH_PX)
+        point = triangulate(*eyes, *clicks, MATCH_PX)  # type: ignore[arg-type, call-arg]
         aimed = solve(rig.mast, rig.cameras[camera].model, point.position_m.tolist())[0]
         after = aimed.pan_rad + rng.uniform(-1e-3, 1e-3), aimed.tilt_rad + rng.uniform(-1e-3, 1e-3)
         found = true.camera_in_rover(camera, *after).project(target)[0] + rng.normal(0.0, MATCH_PX, 2)

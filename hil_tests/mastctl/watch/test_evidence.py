@@ -29,7 +29,7 @@ def test_evidence_is_a_fair_bet_while_the_mast_file_holds() -> None:
                 judge.weigh(sums_of(Expected(np.eye(2), rates, turned), (off[0], off[1]), 0.0)).log_evidence
             )
         )
-    assert np.mean(ratios) == pytest.approx(1.0, abs=5 * np.std(ratios) / math.sqrt(len(ratios)))
+    assert np.mean(ratios) == pytest.approx(1.0, abs=5 * float(np.std(ratios)) / math.sqrt(len(ratios)))
 
 
 def test_an_honest_rig_raises_no_alarm_and_stays_within_expectation() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ def history(count: int, turn_rad: float = 0.0) -> list[Measured]:
 def ended_pointing() -> Operation:
     at = {"pan_rad": 0.103, "tilt_rad": -0.198, "true_pan_rad": 0.1, "true_tilt_rad": -0.2}
     predicted = STORED.rig.camera_in_rover("pancam_left", 0.1, -0.2).project((3.0, 0.2, -1.0))[0]
-    details = {
+    details: dict[str, Any] = {
         "rest": at,
         "triangulate": {"position_m": [3.0, 0.2, -1.0], "range_m": 3.1},
         "settle": at | {"count_rad": {"pan": 1e-4}},

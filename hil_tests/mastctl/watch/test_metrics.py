@@ -102,7 +102,7 @@ def test_frames_that_were_not_requested_are_not_missed(publisher: Publisher) -> 
     for number, sequence in enumerate((7, 8, 12), 1):
         publisher.publish("frame", "navcam_left", SimpleNamespace(sequence=sequence))
         taken = "mastctl_frames_total", (("camera", "navcam_left"),)
-        until(lambda number=number, taken=taken: scraped(metrics).get(taken) == number, "the frame")
+        until(lambda number=number, taken=taken: scraped(metrics).get(taken) == number, "the frame")  # type: ignore[misc]
     found, counting = scraped(metrics), (("camera", "hazcam_left"),)
     assert [name for name in found if name[0] == "mastctl_frames_missed_total"] == [
         ("mastctl_frames_missed_total", counting)

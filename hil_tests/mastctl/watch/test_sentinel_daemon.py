@@ -100,7 +100,8 @@ def test_a_bumped_camera_is_seen_by_two_looks_and_reported_everywhere(
     assert (health["verdict"], health["since"]) == ("drifts", told["since"])
     assert health["sentence"].startswith(f"reference pictures: {what}")
     assert client.status()["calibration"] == {
-        key: health[key] for key in client.status()["calibration"] or ()
+        key: health[key]  # type: ignore[literal-required]
+        for key in client.status()["calibration"] or ()
     }
     assert health["sentinel"] is not None and health["sentinel"]["sentence"].startswith(what)
     text = daemon.service.metrics.text().decode()
