@@ -286,12 +286,6 @@ class SimulatedRover:
         pixels, _ = model.project(np.asarray(point_in_rover_m, dtype=np.float64).reshape(3))
         return pixels
 
-    def stones_m(self) -> FloatArray:
-        """Return middles and radii (n, 4) of balls around the scene's stones, rover frame, metres."""
-        spheres_m = self.scene.world.rocks.spheres_m  # those of stones, then of bricks
-        stones_m = spheres_m[: len(spheres_m) - len(self.scene.bricks)]
-        return np.hstack([self.site_from_rover.inverse.points(stones_m[:, :3]), stones_m[:, 3:]])
-
     def draw_ahead(self, time_s: float) -> None:
         """Draw what each camera sees at a moment, so that its first picture is there when it is asked for.
 

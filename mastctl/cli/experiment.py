@@ -28,7 +28,6 @@ from mastctl.cli.tasks import (
 )
 
 if TYPE_CHECKING:
-    from calib.geometry.rigid import FloatArray
     from mastctl.client import Client
     from mastctl.experiment.pointing import ClickTruth, PointingExperiment, TargetRecord
 
@@ -203,7 +202,7 @@ def run_demo(args: argparse.Namespace) -> int:
         behind = f" behind {args.wire} bytes" if args.wire else ""
         output.tell(f"simulated rover at {daemon.url}, head {rover.settings.head.name}{behind}")
         truth = SimulationTruth(rover)
-        experiment = _run(args, client, DEFAULT_DISTANCES_M, truth, notes, rover.stones_m())
+        experiment = _run(args, client, DEFAULT_DISTANCES_M, truth, notes)
     return _report(args, experiment)
 
 
@@ -213,7 +212,6 @@ def _run(
     distances_m: tuple[float, ...],
     truth: ClickTruth | None,
     notes: tuple[str, ...],
-    rocks_m: FloatArray | None = None,
 ) -> PointingExperiment:
     """Run with a progress bar on stderr, one step a target."""
 
@@ -239,7 +237,6 @@ def _run(
             notes=notes,
             on_target=show,
             pictures=PICTURES_PER_DISTANCE if args.out is not None else 0,
-            rocks_m=rocks_m,
         )
 
 

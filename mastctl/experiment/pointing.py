@@ -17,7 +17,6 @@ import numpy as np
 
 from calib.files.mast_file import parse_rig
 from calib.geometry.rig import Rig
-from calib.geometry.rigid import FloatArray
 from drivers.interfaces import Image
 from mastctl.client import Client, ClientError
 from mastctl.experiment.targets import VIEWS_PER_TARGET, Target, TargetViews, pointed
@@ -89,7 +88,6 @@ class PointingExperiment:
     started: str
     seconds: float
     notes: tuple[str, ...] = ()
-    on_rocks: tuple[TargetRecord, ...] = ()  # chosen for their pictures, in no summary
 
     def as_json(self) -> dict[str, Any]:
         """Return the document that ``--json`` prints, with all that is known of each distance."""
@@ -197,7 +195,6 @@ def on_demand(client: Client) -> bool:
 
 # Targets lie this far to either side of straight ahead: the pan range of the paper's calibration (III.C).
 PAN_RANGE_RAD = 1.0
-ROCKS_PER_DISTANCE = 4  # looked at for a target to show
 
 
 class ClickTruth(Protocol):
@@ -225,7 +222,6 @@ def run_pointing_experiment(
     on_target: Callable[[TargetRecord], None] | None = None,
     pictures: int = 0,
     first: int = 0,
-    rocks_m: FloatArray | None = None,
 ) -> PointingExperiment:
     """Run the experiment and return its record.
 
@@ -250,9 +246,6 @@ def run_pointing_experiment(
         How many targets of each distance keep their images in the record, for the report.
     first
         The number of the first target at each distance.
-    rocks_m
-        Middles and radii (n, 4) of balls around rocks, rover frame, metres. Where targets keep their images,
-        a rock near each distance is pointed at after the drawn targets; it is in no summary.
 
     Raises
     ------
@@ -279,13 +272,9 @@ def run_pointing_experiment(
         records += rows
         summaries.append(summarise_distance(distance_m, rows, clock.since_s(distance_begun_s)))
     seconds = clock.since_s()
-    on_rocks = []
-    if pictures and rocks_m is not None:
-        found = (bench.one_rock(distance_m, rocks_m) for distance_m in distances_m)
-        on_rocks = [record for record in found if record is not None]
     return PointingExperiment(
         clock.where, status, seed, pair[0], aim_px, tuple(records), tuple(summaries), clock.started, seconds,
-        tuple(notes), tuple(on_rocks),
+        tuple(notes),
     )  # fmt: skip
 
 
@@ -359,17 +348,6 @@ class _PointingRun:
             reason,
             self._clock.since_s(begun_s),
         )
-
-    def one_rock(self, distance_m: float, rocks_m: FloatArray) -> TargetRecord | None:
-        """Point at the first rock near the distance that offers a target; None if none does."""
-        begun_s = self._clock.now_s()
-        rng = np.random.default_rng([self._seed, round(1000 * distance_m)])
-        views = TargetViews(self._client, self._rig, self._pair, self._limits, rng, PAN_RANGE_RAD)
-        for rock_m in views.rocks_near(distance_m, rocks_m)[:ROCKS_PER_DISTANCE]:
-            target = views.find_target_on(rock_m)
-            if target is not None:
-                return self._point_at(target, distance_m, 0, begun_s, with_pictures=True)
-        return None
 
     def _point_at(
         self, target: Target, distance_m: float, index: int, begun_s: float, with_pictures: bool

@@ -46,16 +46,11 @@ def write_pointing_report(experiment: PointingExperiment, folder: Path) -> Path:
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "targets.csv", CSV_COLUMNS, [_csv_row(record) for record in experiment.records])
-    targets, on_rocks = (
-        [
-            {"distance_m": r.distance_m, "target": r.index, "error": r.error, "operation": dict(r.operation)}
-            for r in records
-        ]
-        for records in (experiment.records, experiment.on_rocks)
-    )
-    record = experiment.as_json() | {
-        "status": dict(experiment.status), "targets": targets, "on_rocks": on_rocks,
-    }  # fmt: skip
+    targets = [
+        {"distance_m": r.distance_m, "target": r.index, "error": r.error, "operation": dict(r.operation)}
+        for r in experiment.records
+    ]
+    record = experiment.as_json() | {"status": dict(experiment.status), "targets": targets}
     write_json(folder / "record.json", record)
     page = folder / "report.html"
     page.write_text(_page(experiment), encoding="utf-8", errors="backslashreplace")
@@ -119,7 +114,6 @@ def _page(experiment: PointingExperiment) -> str:
         failures=Table(("distance", "target", "reason"), failures),
         landed=landed,
         scatter=_scatter(experiment) if landed and plots.installed() else None,
-        on_rocks=[(r.error, _pictures(experiment, r)) for r in experiment.on_rocks],
         views=_views(experiment),
         targets=_targets(experiment.records),
     )
@@ -190,9 +184,7 @@ def _pictures(experiment: PointingExperiment, record: TargetRecord) -> list[Figu
     cv2.circle(view, clicked, 22, pictures.ORANGE_BGR, 3, cv2.LINE_AA)
     cv2.circle(view, clicked, 3, pictures.ORANGE_BGR, -1, cv2.LINE_AA)
     small = cv2.resize(view, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    caption = f"{record.range_m:.1f} m away, clicked in {record.camera}"
-    if record not in experiment.on_rocks:
-        caption = f"target {record.index}: {caption}"
+    caption = f"target {record.index}: {record.range_m:.1f} m away, clicked in {record.camera}"
     chosen = pictures.enlarged(record.clicked_image, record.clicked_px, CROP_PX, CROP_SCALE)
     shown = [
         pictures.photo(small, "the target chosen", caption),

@@ -16,7 +16,7 @@ from calib.errors import NoStereoPoint, Unreachable
 from calib.geometry import pointing
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
-from calib.geometry.rigid import FloatArray, rot_z
+from calib.geometry.rigid import FloatArray
 from calib.geometry.solutions import Solution, choose
 from calib.geometry.stereo import triangulate
 from calib.matching.partner import find_partner
@@ -138,8 +138,6 @@ def texture_mask(image: Image) -> NDArray[np.bool_]:
     return np.asarray(mask, dtype=np.bool_)
 
 
-BESIDE_RAD = 0.2  # a rock that is shown lies so far to one side before the head turns to it
-ROCK_SLACK = 0.3  # a rock is shown for "10 m" within this share of the distance
 # A view that offers no usable target is left for another; after this many in a row the distance is given up.
 VIEWS_PER_TARGET = 12
 OPERATION_TIMEOUT_S = 60.0
@@ -179,52 +177,6 @@ class TargetViews:
             return None
         models = tuple(self._rig.camera_in_rover(shot.camera, *shot.true_rad) for shot in pair)
         return choose_target(*pair, models[0], models[1], distance_m, self._rng)
-
-    def rocks_near(self, distance_m: float, rocks_m: FloatArray) -> FloatArray:
-        """Return those of some balls (n, 4), as for `find_target_on`, that are ahead and near the distance.
-
-        What looks largest from the head comes first.
-        """
-        away_m = rocks_m[:, :3] - self._rig.mast.rover_from_head(0.0, 0.0).translation_m
-        ranges_m = np.linalg.norm(away_m, axis=-1)
-        near = np.abs(ranges_m - distance_m) <= ROCK_SLACK * distance_m
-        near &= np.abs(np.arctan2(away_m[:, 1], away_m[:, 0])) <= self._pan_range_rad
-        order = np.argsort(-rocks_m[:, 3] / ranges_m, kind="stable")
-        return np.asarray(rocks_m[order[near[order]]])
-
-    def find_target_on(self, rock_m: FloatArray) -> Target | None:
-        """Turn so that a rock is to one side of the image and choose a textured pixel on it.
-
-        Parameters
-        ----------
-        rock_m
-            Middle and radius (4,) of a ball around the rock, rover frame, metres.
-
-        Raises
-        ------
-        ClientError
-            If the daemon does not turn the head or gives no pictures.
-        """
-        middle_m, radius_m = rock_m[:3], rock_m[3]
-        pair = self.look_at(rot_z(BESIDE_RAD) @ middle_m)
-        if pair is None:
-            return None
-        left, right = (self._rig.camera_in_rover(shot.camera, *shot.true_rad) for shot in pair)
-        (middle_px, top_px), seen = left.project([middle_m, middle_m - [0.0, 0.0, radius_m]])
-        if not np.all(seen):
-            return None
-        rows, columns = np.nonzero(texture_mask(pair[0].image))
-        pixels = np.stack([columns, rows], axis=-1)
-        off_px = np.linalg.norm(pixels - middle_px, axis=-1)
-        on_it = np.argsort(off_px)[: np.count_nonzero(off_px <= np.linalg.norm(top_px - middle_px) / 2)]
-        for pixel in pixels[on_it[:: max(1, len(on_it) // TRIES_PER_VIEW)]].astype(np.float64):
-            target = target_at(*pair, left, right, pixel)
-            if target is None:
-                continue
-            point_m = triangulate(left, right, pixel, target.right_px).position_m
-            if np.linalg.norm(point_m - middle_m) <= radius_m:
-                return target
-        return None
 
     def look_at(self, point_m: FloatArray) -> tuple[Snapshot, Snapshot] | None:
         """Turn to a point (3,) of the rover frame and take both pictures; None outside the head's limits.

@@ -18,17 +18,14 @@ from calib.files.mast_file import load_rig
 from mastctl.cli.experiment import become_study
 from mastctl.cli.output import WrongUse
 from mastctl.client import Client, ClientError
-from mastctl.devices.frames import camera_and_sequence
 from mastctl.experiment.pointing import (
     Landing,
     PointingExperiment,
     TargetRecord,
     rms,
-    run_pointing_experiment,
     summarise_distance,
 )
 from mastctl.experiment.pointing_report import CSV_COLUMNS, write_pointing_report
-from mastctl.experiment.simulated import Rover, running_rover
 from mastctl.experiment.targets import on_level_ground, pointed, texture_mask
 
 NAN = math.nan
@@ -95,19 +92,6 @@ def test_report_holds_every_target_and_what_devices_say_is_escaped(tmp_path: Pat
     assert (rows[0]["first_x_px"], rows[0]["second_true_y_px"]) == ("0.25", "0.1")
     assert (rows[1]["first_x_px"], rows[1]["range_m"]) == ("", "")
     assert len(json.loads((folder / "record.json").read_text())["targets"]) == 2
-
-
-def test_a_target_on_a_rock_is_on_a_rock_of_the_scene() -> None:
-    pytest.importorskip("numba", reason="the simulated rover needs numba (extra sim)")
-    with running_rover(Rover("ptu_d46_70", 1)) as (_, client, rover):
-        stones_m = rover.stones_m()
-        told = run_pointing_experiment(client, targets=1, distances_m=(2.0,), pictures=1, rocks_m=stones_m)
-        (record,) = told.on_rocks
-        point_m = rover.true_point(*camera_and_sequence(record.frame_id), record.clicked_px)
-    assert point_m is not None
-    assert (np.linalg.norm(stones_m[:, :3] - point_m, axis=-1) <= stones_m[:, 3]).any()
-    assert len(record.landings) == 2 and len(record.landed_images) == 2
-    assert [row.targets for row in told.summaries] == [1]
 
 
 def test_only_texture_in_both_directions_counts() -> None:
