@@ -33,7 +33,7 @@ EXPLAINS = 0.5
 """A hypothesis explains an excess of chi-square if it would take away this part of it."""
 
 FEWEST = 4
-"""Of a survey's images or standstills, for a change among them to be looked for."""
+"""Of images or standstills, for a change among them to be looked for."""
 
 BEND_DEGREE = 4
 """Of the polynomials of the place in the picture by which a lens may be bent otherwise than modelled."""
@@ -57,6 +57,9 @@ LARGEST = 0.5
 
 FURTHER_MAST = {4: (3, 4), 6: (6, 7)}
 """Which numbers of the mast a fit of so many parameters leaves out that the next wider one has."""
+
+ALL, FOCUS, TURN = (0, 1, 2, 3), (0,), (1, 2, 3)
+"""Places of a camera's focal length and turn among its motions."""
 
 Course = Literal["always", "once", "each", "from", "drift"]
 Rates = Callable[[ImageTerm, Motions], FloatArray]
@@ -201,7 +204,7 @@ def explaining(findings: Sequence[Finding], excess: float) -> tuple[Finding, ...
 def find_drifts(problem: Adjustment, state: Estimate) -> tuple[Finding, ...]:
     """Return how far each joint and each camera drifts, the least likely by chance first."""
     fit = ScoredFit(problem, state)
-    found = fit.findings([*_joint_drifts(fit), *_camera_drifts(fit)])
+    found = fit.findings(_drifts(fit))
     found = [replace(f, chance=min(1.0, len(found) * f.chance)) for f in found]
     return tuple(sorted(found, key=lambda f: f.chance))
 
@@ -240,6 +243,7 @@ class ScoredFit:
         self.covariance = covariance_of(matrix, problem.weak)
         self.freedom = max(goodness(problem, state, self.covariance)[1], 1.0)
         self.images = [image for image in problem.images if image.keep.any()]
+        self.cameras = tuple(dict.fromkeys(image.camera for image in self.images))
         self.motions = problem.motions(state, self.images)
         self.least = MADE_UP if problem.station else UNSEEN
         last = max(len(self.images) - 1, 1)
@@ -254,9 +258,9 @@ class ScoredFit:
                 found.append(self._row(image, motions.block, mine, mine))
         return found
 
-    def of_camera(self, name: str, rates: Rates | None = None) -> list[Row]:
-        """The images of one camera, by its focal length and turn where no rates are given."""
-        return self.rows(rates or (lambda _, motions: motions.camera), lambda image: image.camera == name)
+    def of_camera(self, name: str, rates: Rates) -> list[Row]:
+        """The images of one camera by the rates of their residuals."""
+        return self.rows(rates, lambda image: image.camera == name)
 
     def of_board(self, board: tuple[str, str]) -> list[Row]:
         """The images of one board, by its pose."""
@@ -321,7 +325,7 @@ class ScoredFit:
         """Chi-square over its degrees of freedom that a gain leaves."""
         return (self.chi2 - gain.chi2) / self.freedom
 
-    def findings(self, hypotheses: Sequence[Hypothesis] | Iterator[Hypothesis]) -> list[Finding]:
+    def findings(self, hypotheses: Iterator[Hypothesis]) -> list[Finding]:
         """What hypotheses gain, each where its gain is the least likely."""
         found = []
         for what in hypotheses:
@@ -380,30 +384,54 @@ def _of_surveys(fit: ScoredFit) -> Iterator[Hypothesis]:
     yield from _axes(fit)
     if fit.readings:
         yield from _harmonics(fit)
-        if len({row.group for row in fit.readings}) >= FEWEST:
-            yield from _readings(fit)
-            yield from _slips(fit)
-            yield from _joint_drifts(fit)
+        yield from _readings(fit)
+        yield from _joints(fit, "slip", "from", _slip_sentence)
+    yield from _drifts(fit)
     yield from _lenses(fit)
-    enough = {name for name in _cameras(fit) if sum(i.camera == name for i in fit.images) >= FEWEST}
-    yield from (one for one in (*_camera_changes(fit), *_camera_drifts(fit)) if one.subject[1] in enough)
+    yield from _cameras(fit, "change", ALL, "from", _change_sentence)
     yield from _board_shape(fit)
     yield from _moved_before_tapes(fit)
     yield from _drawing(fit)
+
+
+def _drifts(fit: ScoredFit) -> Iterator[Hypothesis]:
+    """Joints and cameras that change more with every picture."""
+    yield from _joints(fit, "drift", "drift", _joint_drift_sentence)
+    yield from _cameras(fit, "drift", ALL, "drift", _camera_drift_sentence)
 
 
 def _changes(fit: ScoredFit) -> Iterator[Hypothesis]:
     """The changes between two pictures that are looked for where a fit fails; one picture is a blunder."""
     for board in dict.fromkeys(image.board for image in fit.images):
         if board not in fit.problem.held:
-            mine = fit.of_board(board)
-            yield Hypothesis("board moved", ("board", *board), mine, _board_sentence, "from", side=2)
-    yield from _slips(fit, side=2)
-    for name in _cameras(fit):
-        rows = fit.of_camera(name)
-        for what, part, sentence in (("focus", [0], _focus_sentence), ("knock", [1, 2, 3], _knock_sentence)):
-            some = [row.part(part) for row in rows]
-            yield Hypothesis(f"{what} of {name}", ("camera", name), some, sentence, "from", side=2)
+            rows = fit.of_board(board)
+            yield Hypothesis("board moved", ("board", *board), rows, _board_sentence, "from", side=2)
+    yield from _joints(fit, "slip", "from", _slip_sentence, side=2)
+    yield from _cameras(fit, "focus", FOCUS, "from", _focus_sentence, side=2)
+    yield from _cameras(fit, "knock", TURN, "from", _knock_sentence, side=2)
+
+
+def _joints(
+    fit: ScoredFit, what: str, course: Course, sentence: Callable[[Finding], str], side: int = 1
+) -> Iterator[Hypothesis]:
+    """Of each joint that it reads otherwise."""
+    for joint, name in enumerate(("pan", "tilt") if fit.readings else ()):
+        rows = [row.part([joint]) for row in fit.readings]
+        yield Hypothesis(f"{what} of {name}", ("joint", name), rows, sentence, course, side)
+
+
+def _cameras(
+    fit: ScoredFit,
+    what: str,
+    numbers: Sequence[int],
+    course: Course,
+    sentence: Callable[[Finding], str],
+    side: int = 1,
+) -> Iterator[Hypothesis]:
+    """Of each camera that has images left that its focal length or direction is another."""
+    for name in fit.cameras:
+        rows = fit.of_camera(name, lambda _, motions: motions.camera[:, numbers])
+        yield Hypothesis(f"{what} of {name}", ("camera", name), rows, sentence, course, side)
 
 
 def _axes(fit: ScoredFit) -> Iterator[Hypothesis]:
@@ -462,25 +490,6 @@ def _readings(fit: ScoredFit) -> Iterator[Hypothesis]:
     yield Hypothesis("attitude", (), fit.readings, one, "once")
 
 
-def _slips(fit: ScoredFit, side: int = 1) -> Iterator[Hypothesis]:
-    """Joints that read otherwise from one picture on."""
-    for joint, name in enumerate(("pan", "tilt")):
-        rows = [row.part([joint]) for row in fit.readings]
-        yield Hypothesis(f"slip of {name}", ("joint", name), rows, _slip_sentence, "from", side)
-
-
-def _joint_drifts(fit: ScoredFit) -> Iterator[Hypothesis]:
-    """Joints that read more and more otherwise."""
-    for joint, name in enumerate(("pan", "tilt")):
-        rows = [row.part([joint]) for row in fit.readings]
-        yield Hypothesis(f"drift of {name}", ("joint", name), rows, _joint_drift_sentence, "drift")
-
-
-def _cameras(fit: ScoredFit) -> list[str]:
-    """The cameras that have an image left, in the order of their first."""
-    return list(dict.fromkeys(image.camera for image in fit.images))
-
-
 def _lenses(fit: ScoredFit) -> Iterator[Hypothesis]:
     """Lenses that bend otherwise than their models."""
     powers = [(i, j) for i in range(BEND_DEGREE + 1) for j in range(BEND_DEGREE + 1 - i)]
@@ -494,26 +503,12 @@ def _lenses(fit: ScoredFit) -> Iterator[Hypothesis]:
         terms = np.stack([u**i * v**j for i, j in powers], axis=1) / sigma
         return np.asarray(np.einsum("nk,ij->nijk", terms, np.eye(2)).reshape(2 * len(u), -1))
 
-    for name in _cameras(fit):
+    for name in fit.cameras:
         text = (
             f"the rest over {name}'s image is not noise: its lens is bent otherwise than "
             f"{fit.state.cameras[name].kind} can be, or its dots are off in a pattern"
         )
         yield Hypothesis(f"lens of {name}", (), fit.of_camera(name, bends), text)
-
-
-def _camera_changes(fit: ScoredFit) -> Iterator[Hypothesis]:
-    """Cameras that are others from one picture on: refocused, or moved on their mount."""
-    for name in _cameras(fit):
-        rows = fit.of_camera(name)
-        yield Hypothesis(f"change of {name}", ("camera", name), rows, _change_sentence, "from")
-
-
-def _camera_drifts(fit: ScoredFit) -> Iterator[Hypothesis]:
-    """Cameras that change more and more."""
-    for name in _cameras(fit):
-        rows = fit.of_camera(name)
-        yield Hypothesis(f"drift of {name}", ("camera", name), rows, _camera_drift_sentence, "drift")
 
 
 def _board_shape(fit: ScoredFit) -> Iterator[Hypothesis]:
