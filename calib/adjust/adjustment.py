@@ -66,13 +66,12 @@ from calib.geometry.rig import (
 )
 from calib.geometry.rigid import FloatArray, moved_rigid, rigid_rates, rigid_twists
 
-HUBER = 3.0
-"""Length of a residual, in sigmas, from which its pull no longer grows while blunders are looked for."""
+HUBER, SCAN_HUBER = 3.0, 100.0
+"""Length of a residual, in sigmas, from which its pull no longer grows while blunders are looked for, and
+while changes are, which are no blunders."""
 
 USUAL_JOINT_RAD = 0.01
 """A joint's usual harmonics and backlash, one sigma, radians; hobby servos have 6 to 9 mrad."""
-
-NO_BOW = np.zeros(2)
 
 USUAL_BOW_M = 0.005
 """How far a board's edges are usually from flat, one sigma, metres."""
@@ -448,7 +447,7 @@ class Adjustment:
             shifts = ((shifts - head.translation_m)[:, None] @ head.rotation)[:, 0]
             turns = head.rotation.transpose(0, 2, 1) @ turns
         points = stack.in_board_m
-        bows = [state.bows_m.get(t.board[0], NO_BOW) for t in stack.terms]
+        bows = [state.bows_m.get(t.board[0], np.zeros(2)) for t in stack.terms]
         if np.any(bows):
             points = points.copy()
             for part, bow in zip(stack.parts, bows, strict=True):

@@ -15,7 +15,10 @@ from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import typical_scale
 
 GROSS = 6.0
-"""What is so many times farther off than the typical one, or than expected, is a blunder."""
+"""What is so many times farther off than the typical one, or than expected, is a blunder, and no noise."""
+
+MANY = 0.25
+"""With more than this part of an image's dots beyond their limit, it is not the dots that are wrong."""
 
 
 def gross_limit(sizes: ArrayLike, expected: float = 0.0) -> float:

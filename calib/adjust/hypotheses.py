@@ -25,12 +25,12 @@ from calib.adjust.score import MADE_UP, Gain, Score
 from calib.adjust.solver import covariance_of
 from calib.adjust.terms import DRAWING, ImageTerm
 from calib.adjust.unknowns import Estimate, ResidualBlock
-from calib.geometry.rig import AXIS_NAMES, MAST_NAMES
+from calib.geometry.rig import AXIS_NAMES, MAST_FREE, MAST_NAMES
 from calib.geometry.rigid import FloatArray, rigid_rates
 from calib.geometry.significance import Level, chance
 
 EXPLAINS = 0.5
-"""A hypothesis explains an excess of chi-square if it would take away this part of it."""
+"""A hypothesis explains what a fit leaves, or a change mends it, if it takes away this part."""
 
 FEWEST = 4
 """Of images or standstills, for a change among them to be looked for."""
@@ -54,9 +54,6 @@ boards to the rover: tapes show a slip that sharp images alone leave to their bo
 
 LARGEST = 0.5
 """Radians, or part of the focal length: what is larger is no slip, knock or other focus."""
-
-FURTHER_MAST = {4: (3, 4), 6: (6, 7)}
-"""Which numbers of the mast a fit of so many parameters leaves out that the next wider one has."""
 
 ALL, FOCUS, TURN = (0, 1, 2, 3), (0,), (1, 2, 3)
 """Places of a camera's focal length and turn among its motions."""
@@ -224,7 +221,7 @@ def find_change(problem: Adjustment, state: Estimate) -> Finding | None:
     most = max(gain.chi2 for _, _, gain in possible)
     as_good = [one for one in possible if one[2].chi2 >= AS_GOOD * most]
     what, at, gain = min(as_good, key=lambda one: (len(one[2].values), -one[2].chi2))
-    sure = fit.left(gain) <= STILL_FAR or gain.chi2 >= 0.5 * fit.chi2
+    sure = fit.left(gain) <= STILL_FAR or gain.chi2 >= EXPLAINS * fit.chi2
     if not sure and what.subject[0] == "camera":  # it is the model that is wrong
         return None
     found = fit.finding(what, at, gain, len(tried))
@@ -437,8 +434,8 @@ def _cameras(
 def _axes(fit: ScoredFit) -> Iterator[Hypothesis]:
     """The axes of the mast."""
     fitted = len(fit.problem.mast_free)
-    further = FURTHER_MAST.get(fitted)
-    if further is None or not fit.readings:
+    further = sorted(set(MAST_FREE.get(fitted + 2, ())) - set(fit.problem.mast_free.tolist()))
+    if not (fitted and further and fit.readings):
         return
 
     def sentence(found: Finding) -> str:

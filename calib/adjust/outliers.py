@@ -29,9 +29,9 @@ from typing import Literal
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
-from calib.adjust.gross import at_least_stated, chance_limit
+from calib.adjust.gross import GROSS, MANY, at_least_stated, chance_limit
 from calib.adjust.left_out import REDUNDANT, LeftOut, dot_statistics, left_out
-from calib.adjust.scatter import MOST, scatter
+from calib.adjust.scatter import scatter
 from calib.adjust.terms import ImageTerm, StationTerm
 from calib.adjust.unknowns import Estimate, ResidualBlock
 from calib.geometry.rigid import FloatArray, moved_rigid
@@ -73,9 +73,6 @@ class Outlier:
         return f"{self.name} is off by {off} and was not used"
 
 
-BAD_IMAGE = 0.25
-"""With more than this part of its dots beyond their limit an image is judged as a whole."""
-
 TELL_APART = 8
 """With more images of a board than this, the rest says which of two is wrong."""
 
@@ -110,10 +107,10 @@ class JudgedImage:
         good = self.dots <= most
         if not fitted:
             good = self.predicted.agreeing(good, most)
-        many_bad = bool(good.mean() < 1 - BAD_IMAGE)
+        many_bad = bool(good.mean() < 1 - MANY)
         statistic, freedom = self.predicted.statistic(np.isfinite(self.dots) if many_bad else good)
         own = scatter(self.term, self.predicted.residual, good)
-        limit = limits.image(self.term.camera, freedom, min(own.square, MOST**2) if own else 1.0)
+        limit = limits.image(self.term.camera, freedom, min(own.square, GROSS**2) if own else 1.0)
         return good, statistic, limit, many_bad or statistic > limit
 
 
@@ -264,7 +261,7 @@ def _typical_dots(seen: Iterable[tuple[JudgedImage, ImageTerm]]) -> dict[str, fl
     every = [dots for mine in by_camera.values() for dots in mine]
     whole = at_least_stated(np.concatenate(every or [np.ones(0)]))
     return {
-        camera: max(whole, min(typical_scale(np.concatenate(mine or [np.ones(0)])), MOST**2))
+        camera: max(whole, min(typical_scale(np.concatenate(mine or [np.ones(0)])), GROSS**2))
         for camera, mine in by_camera.items()
     }
 

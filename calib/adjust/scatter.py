@@ -7,7 +7,7 @@ noisy it is, before anybody asks whether it agrees with the others; and a whole 
 that sigma is tested for coherent shifts alone.
 
 Images of a camera that agree with each other have one scale, their camera's; luck changes none. Nothing is
-taken for more exact than stated here. Scales end at `MOST`, or `ORDER` times what the survey states of all
+taken for more exact than stated here. Scales end at `GROSS`, or `ORDER` times what the survey states of all
 dots: gross blunders are no noise.
 """
 
@@ -21,16 +21,15 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from calib.adjust.adjustment import Adjustment
+from calib.adjust.gross import GROSS
 from calib.adjust.terms import ImageTerm, scattered_images, widened_images
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import Level, typical_scale
 
-MOST = 6.0
-"""Noise is at most so many times what is stated: five times is what a careless focus makes of it."""
-
 ORDER = 2.0
-"""Or until a dot's sigma is so many times what the survey states of all dots: dots come with sigmas of their
+"""Noise is at most `GROSS` times what is stated: five times is what a careless focus makes of it. Or until a
+dot's sigma is so many times what the survey states of all dots: dots come with sigmas of their
 own that may be much less, and a near board shows its print's errors most."""
 
 DEGREES = ((60, 3), (24, 2), (10, 1))
@@ -239,7 +238,7 @@ def _whole(term: ImageTerm) -> ImageTerm:
 
 def _most(term: ImageTerm, order_px: float) -> float:
     """The largest scale that is noise."""
-    return max(MOST, ORDER * order_px / float(np.median(term.sigma_px)))
+    return max(GROSS, ORDER * order_px / float(np.median(term.sigma_px)))
 
 
 def _own(one: Scatter, camera: float, freedom: float, most: float) -> float:

@@ -162,14 +162,10 @@ def scattered_images(images: Sequence[ImageTerm], scales: Mapping[str, float]) -
     )
 
 
-O_SIGMA_RAD = 0.02
-R_SIGMA = (0.5, 1.0)
-E_SIGMA_M = 0.01
-"""The prior of lenses, one sigma: O beside A, R1 and R2, E0 to E2. Flight cameras stay within some 2.5 of
-these; a survey that sees a lens well does not feel them, and one that does not cannot run away with it."""
-
-LIMITS = {"O": (O_SIGMA_RAD,) * 3, "R": R_SIGMA, "E": (E_SIGMA_M,) * 3}
-"""The same by a camera's letters."""
+LENS_SIGMA: Mapping[str, tuple[float, ...]] = {"O": (0.02,) * 3, "R": (0.5, 1.0), "E": (0.01,) * 3}
+"""The prior of lenses, one sigma: O beside A (radians), R1 and R2, E0 to E2 (metres). Flight cameras stay
+within some 2.5 of these; a survey that sees a lens well does not feel them, and one that does not cannot run
+away with it."""
 
 D_SIGMA = {"p": 0.02, "s": 0.05, "tau": 0.1, "k": 1.0}
 """The prior of OpenCV's coefficients, one sigma, by their first letter. Both parts of a ratio of polynomials
@@ -196,27 +192,18 @@ HARDLY_ALONE = 0.5
 
 def lens_knowledge(model: CameraModel) -> tuple[FloatArray, FloatArray]:
     """Return how far a lens is from usual, in sigmas, and the Jacobian to the step; nothing of a CAHV."""
-    kind = model.kind
-    size = len(parameter_names(kind))
-    if "O" not in model.letters:
-        sigma = coefficient_sigma(kind) if "D" in model.letters else np.zeros(0)
+    kind, size = model.kind, len(parameter_names(model.kind))
+    usual = {"O": model.O - model.A, "R": model.R[1:], "E": model.E, "D": model.distortion}
+    residuals, rates = [np.zeros(0)], [np.zeros((0, size))]
+    for letter in (letter for letter in usual if letter in model.letters):
+        sigma = coefficient_sigma(kind) if letter == "D" else np.array(LENS_SIGMA[letter])
         rows = np.zeros((len(sigma), size))
-        if len(sigma):
-            rows[:, parameter_part(kind, "D")] = np.diag(1 / sigma)
-        return (model.distortion / sigma if len(sigma) else sigma), rows
-    aside = np.zeros((3, size))
-    aside[:, parameter_part(kind, "O")] = tangents(model.O).T / O_SIGMA_RAD
-    aside[:, parameter_part(kind, "A")] = -tangents(model.A).T / O_SIGMA_RAD
-    residuals, blocks = [(model.O - model.A) / O_SIGMA_RAD, model.R[1:] / np.array(R_SIGMA)], [aside]
-    bends = np.zeros((2, size))
-    bends[:, parameter_part(kind, "R")] = np.diag(1 / np.array(R_SIGMA))
-    blocks.append(bends)
-    if "E" in kind:
-        enters = np.zeros((3, size))
-        enters[:, parameter_part(kind, "E")] = np.eye(3) / E_SIGMA_M
-        blocks.append(enters)
-        residuals.append(model.E / E_SIGMA_M)
-    return np.concatenate(residuals), np.concatenate(blocks)
+        rows[:, parameter_part(kind, letter)] = tangents(model.O).T if letter == "O" else np.eye(len(sigma))
+        if letter == "O":
+            rows[:, parameter_part(kind, "A")] = -tangents(model.A).T
+        residuals.append(usual[letter] / sigma)
+        rates.append(rows / sigma[:, None])
+    return np.concatenate(residuals), np.concatenate(rates)
 
 
 def lens_notes(rig: Rig, sigma: Mapping[str, Any]) -> tuple[str, ...]:
@@ -232,7 +219,7 @@ def lens_notes(rig: Rig, sigma: Mapping[str, Any]) -> tuple[str, ...]:
                 continue
             found = np.array(sigma["cameras"][name][letter])
             found = found[1:] if letter == "R" else found[:1] if letter == "E" else found
-            if (found > HARDLY * np.array(LIMITS[letter])[: len(found)]).any():
+            if (found > HARDLY * np.array(LENS_SIGMA[letter])[: len(found)]).any():
                 held.append(word)
         kind = camera.model.kind
         if "D" in camera.model.letters and name in sigma["cameras"]:

@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtrc
 
-from calib.adjust.adjustment import HUBER, Adjustment
+from calib.adjust.adjustment import HUBER, SCAN_HUBER, Adjustment
 from calib.adjust.goodness import goodness
-from calib.adjust.gross import chance_limit
+from calib.adjust.gross import GROSS, chance_limit
 from calib.adjust.hypotheses import Finding, explaining, find_change, survey_findings
 from calib.adjust.left_out import left_out_boards
 from calib.adjust.result import Calibration
@@ -32,12 +32,6 @@ from calib.survey.records import Survey
 
 FEW_LEFT_OUT = 3
 """So many images, tapes and prisms that are left out may have a common cause."""
-
-SCAN_HUBER = 100.0
-"""Length in sigmas from which pulls are bounded while changes are looked for: these are no blunders."""
-
-WRONG_MINIMUM = 6.0
-"""A fit is refused if the typical dot is this many times farther off than its sigma."""
 
 MANY = 0.15
 """More than this part of the tapes left out (and more than three) are no blunders: the model fails."""
@@ -145,7 +139,7 @@ def _refuse_wrong_minimum(
         problem,
         state,
         dot_px,
-        most=WRONG_MINIMUM,
+        most=GROSS,
         dot="dot",
         disagree=f": {change.sentence}"
         if change is not None

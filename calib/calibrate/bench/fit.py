@@ -16,9 +16,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.adjust.adjustment import HUBER, Adjustment
+from calib.adjust.adjustment import HUBER, SCAN_HUBER, Adjustment
 from calib.adjust.gross import gross_limit
-from calib.adjust.hypotheses import Finding, find_change, find_drifts
+from calib.adjust.hypotheses import EXPLAINS, Finding, find_change, find_drifts
 from calib.adjust.model_terms import TermGain, candidate_terms, choose_terms
 from calib.adjust.result import BenchCalibration
 from calib.adjust.robust import SurveyNotFitted, judged_again, weigh, without_blunders
@@ -26,7 +26,7 @@ from calib.adjust.scatter import with_scales
 from calib.adjust.solver import Minimum, minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
-from calib.calibrate.bench.problem import BenchOptions, BenchProblem, best_cut, without_terms
+from calib.calibrate.bench.problem import MOVES, BenchOptions, BenchProblem, best_cut, without_terms
 from calib.calibrate.bench.statements import bench_calibration
 from calib.calibrate.refusals import refuse_far, refuse_unsettled
 from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged
@@ -35,21 +35,12 @@ from calib.survey.records import Survey
 WRONG_MINIMUM = 3.0
 """A fit is refused if the typical corner is this many times farther off than its sigma."""
 
-SCAN_HUBER = 100.0
-"""Length in sigmas from which pulls are bounded while changes are looked for: these are no blunders."""
-
 SLIP_RAD, SLIP_ASIDE = 0.003, 0.1
 """A board that moved by more than this about the pan axis, and by less than this part of it otherwise
 (radians and metres), did not move: pan slipped."""
 
-MENDS = 0.5
-"""A change that is tried where the fit is far off counts if the sum of squares falls to this part."""
-
 PART = 4
 """As many pictures on one side of another are no blunders."""
-
-CHANGES = 4
-"""Boards that moved are looked for so many times."""
 
 
 def fit_bench(survey: Survey, options: BenchOptions | None = None) -> BenchCalibration:
@@ -118,7 +109,7 @@ def _look_for_changes(
     """
     wrong = {n: s for view in bench.views.values() for n, s in view.wrong.items()}
     tried: tuple[Finding, BenchProblem, Adjustment, Minimum[Estimate]] | None = None
-    for left in range(CHANGES, -1, -1):
+    for left in range(MOVES, -1, -1):
         problem = bench.seen(chosen, bench.start)
         problem = problem.with_terms([replace(t, keep=t.keep & ~wrong[t.name]) for t in problem.images], ())
         fit = minimise(problem, bench.start, weak=problem.weak, gain=1e-4)
@@ -129,7 +120,7 @@ def _look_for_changes(
         problem = _without_lone_strays(problem, fit.state).with_huber(SCAN_HUBER)
         fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-6)
         if tried is not None:
-            if not fit.normal.cost < MENDS * tried[3].normal.cost:
+            if not fit.normal.cost < (1.0 - EXPLAINS) * tried[3].normal.cost:
                 _, bench, problem, fit = tried
                 break
             if tried[0].subject[0] != "board":

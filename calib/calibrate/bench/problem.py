@@ -92,7 +92,7 @@ def bench_terms(survey: Survey) -> BenchTerms:
 
 
 MOVES = 4
-"""Boards that moved far are looked for so many times."""
+"""Boards that moved are looked for so many times."""
 
 TURNABOUTS = 0.34
 """A board stood at two places in turn if no cut divides its pictures but for this part of the fewer ones."""

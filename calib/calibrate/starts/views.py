@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from calib.adjust.adjustment import HUBER, Adjustment
-from calib.adjust.gross import gross_limit
+from calib.adjust.gross import MANY, gross_limit
 from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
@@ -29,10 +29,6 @@ FEWEST_POINTS = 8
 
 IMAGES_FOR_LENS = 16
 """As many images, spread over all, are enough for a camera to start from."""
-
-NEARLY_AS_GOOD = 6.0
-"""The second pose of an image counts if its typical corner is at most so many times farther off than the
-first's."""
 
 
 class ViewsTooFew(CalibError):
@@ -116,7 +112,7 @@ def view_poses(
 def _wrong(term: ImageTerm) -> np.ndarray:
     """Which points are not where the rest of their image says; none where so many are that it cannot tell."""
     bad = wrong_points(term.in_board_m[:, :2], term.pixels_px, term.sigma_px)
-    return bad if bad.mean() <= 0.25 else np.zeros_like(bad)
+    return bad if bad.mean() <= MANY else np.zeros_like(bad)
 
 
 def _focal_lengths(
@@ -193,4 +189,5 @@ def poses_of(model: CameraModel, term: ImageTerm) -> list[tuple[float, Rigid]]:
         off = (pixels - term.pixels_px[keep])[valid] / term.sigma_px[keep][valid, None]
         found.append((float(np.sqrt(np.median(np.sum(off**2, axis=1)))), pose))
     found.sort(key=lambda one: one[0])
-    return [one for one in found if one[0] <= NEARLY_AS_GOOD * max(found[0][0], 1.0)]
+    limit = gross_limit([off for off, _ in found[:1]], 1.0) if found else 0.0
+    return [one for one in found if one[0] <= limit]

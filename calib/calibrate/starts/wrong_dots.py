@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.adjust.gross import at_least_stated, chance_limit
+from calib.adjust.gross import MANY, at_least_stated, chance_limit
 from calib.adjust.outliers import Outlier
 from calib.adjust.scatter import off_smooth
 from calib.geometry.rigid import FloatArray
@@ -31,9 +31,6 @@ FAR = 100.0
 
 POLYNOMIAL_PX = 0.08
 """What a polynomial of the fourth degree may miss, at the corners of a near board in a wide lens."""
-
-MANY = 0.25
-"""With more than this part of its dots beyond the limit, it is not the dots that are wrong."""
 
 
 def wrong_dots(survey: Survey) -> tuple[dict[str, np.ndarray], tuple[Outlier, ...]]:
