@@ -211,7 +211,8 @@ def find_change(problem: Adjustment, state: Estimate) -> Finding | None:
 
     ``problem`` and ``state`` are a fit with pulls bounded. For every picture from which on a board may have
     stood elsewhere, a joint read otherwise, or a camera had another focal length or another direction, the
-    gain is found. Of changes that explain the same, that with the fewest numbers is reported.
+    gain is found. Of changes that explain the same, that with the fewest numbers is reported; none where axes
+    of the mast that do not meet at a right angle explain more.
     """
     fit = ScoredFit(problem, state)
     tried = [(what, at, gain) for what in _changes(fit) for at, gain in fit.gains(what)]
@@ -222,7 +223,7 @@ def find_change(problem: Adjustment, state: Estimate) -> Finding | None:
     as_good = [one for one in possible if one[2].chi2 >= AS_GOOD * most]
     what, at, gain = min(as_good, key=lambda one: (len(one[2].values), -one[2].chi2))
     sure = fit.left(gain) <= STILL_FAR or gain.chi2 >= EXPLAINS * fit.chi2
-    if not sure and what.subject[0] == "camera":  # it is the model that is wrong
+    if not what.subject or (not sure and what.subject[0] == "camera"):  # it is the model that is wrong
         return None
     found = fit.finding(what, at, gain, len(tried))
     if found.chance > Level.CHANGED or (len(gain.values) > 1 and gain.chi2 < LEAST_PART * fit.chi2):
@@ -403,6 +404,8 @@ def _changes(fit: ScoredFit) -> Iterator[Hypothesis]:
         if board not in fit.problem.held:
             rows = fit.of_board(board)
             yield Hypothesis("board moved", ("board", *board), rows, _board_sentence, "from", side=2)
+    if not fit.problem.upright:
+        yield from _axes(fit)
     yield from _joints(fit, "slip", "from", _slip_sentence, side=2)
     yield from _cameras(fit, "focus", FOCUS, "from", _focus_sentence, side=2)
     yield from _cameras(fit, "knock", TURN, "from", _knock_sentence, side=2)
@@ -435,7 +438,7 @@ def _axes(fit: ScoredFit) -> Iterator[Hypothesis]:
     """The axes of the mast."""
     fitted = len(fit.problem.mast_free)
     further = sorted(set(MAST_FREE.get(fitted + 2, ())) - set(fit.problem.mast_free.tolist()))
-    if not (fitted and further and fit.readings):
+    if not (fitted and further and fit.readings and fit.problem.station):
         return
 
     def sentence(found: Finding) -> str:

@@ -20,13 +20,12 @@ from calib.adjust.left_out import left_out_boards
 from calib.adjust.result import Calibration
 from calib.adjust.robust import Cleaned, SurveyNotFitted, Weighed, weigh, without_blunders
 from calib.adjust.scatter import own_scales
-from calib.adjust.solver import Minimum, minimise
+from calib.adjust.solver import minimise
 from calib.adjust.terms import with_kept
 from calib.adjust.uncertainty import image_residuals, surveyed_fields
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.refusals import refuse_far, refuse_unsettled
 from calib.calibrate.starts.survey import Start, start_values
-from calib.geometry.rig import MAST_FREE
 from calib.geometry.significance import Level
 from calib.survey.records import Survey
 
@@ -96,21 +95,7 @@ def _what_changed(cleaned: Cleaned) -> Finding | None:
     every = every.with_terms(whole, every.station).with_huber(SCAN_HUBER)
     fit = minimise(every, cleaned.fit.state, weak=every.weak, gain=1e-6)
     change = find_change(every, fit.state) if np.isfinite(fit.normal.cost) else None
-    if change is None or not change.sure or change.subject[0] == "board":
-        return None
-    return None if _skew_axes_explain(every, fit, change.gain) else change
-
-
-def _skew_axes_explain(every: Adjustment, fit: Minimum[Estimate], chi2: float) -> bool:
-    """Whether axes that do not meet at a right angle explain twice as much as a change does."""
-    if every.upright or not 0 < len(every.mast_free) < len(MAST_FREE[8]):
-        return False
-    skew = Adjustment(
-        every.images, every.station, fit.state, mast_parameters=8, prisms_cad_m=every.prisms_cad_m,
-        prism_cad_m=every.prism_cad_m, joint_rad=every.joint_rad, huber=every.huber,
-    )  # fmt: skip
-    wider = minimise(skew, fit.state, weak=skew.weak, gain=1e-6)
-    return fit.normal.cost - wider.normal.cost > chi2  # the cost is half a sum of squares
+    return change if change is not None and change.sure and change.subject[0] != "board" else None
 
 
 def _left_out_for(change: Finding | None) -> tuple[Finding, ...]:
