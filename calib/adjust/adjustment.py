@@ -6,8 +6,8 @@ so the prisms' places on the rover and the joint angles of every head attitude. 
 prisms and tapes (station), prisms from CAD and joint angles; each residual is divided by its sigma. The
 prisms' CAD positions define the rover frame.
 
-A bench has no station: its boards' poses are unknown, or one of them is held; the rover frame is the mast's
-own or hangs on what is held; and the joints' errors (``calib.geometry.rig``) and the boards' bows may be
+A bench has no station: its boards' poses are unknown, or one of them is fixed; the rover frame is the mast's
+own or hangs on what is fixed; and the joints' errors (``calib.geometry.rig``) and the boards' bows may be
 unknowns too. A prior of usual joints and boards holds such an unknown where pictures hardly show it.
 
 A residual of the station is taken in the rover frame: turning it does not change its size, since the
@@ -111,7 +111,7 @@ class Adjustment:
         Which of ``calib.geometry.rig.JOINTS_NAMES`` move.
     bowed
         Boards whose bow is unknown, by the first part of their images' ``board``.
-    held
+    fixed
         Boards that stay where the start has them.
     start
         The state to start from; it settles which unknowns there are.
@@ -131,7 +131,7 @@ class Adjustment:
         joint_rad: float = 0.0,
         joint_errors: Sequence[int] = (),
         bowed: Sequence[str] = (),
-        held: Sequence[tuple[str, str]] = (),
+        fixed: Sequence[tuple[str, str]] = (),
         huber: float | None = None,
     ) -> None:
         self.images, self.station = tuple(images), tuple(station)
@@ -141,7 +141,7 @@ class Adjustment:
             mast_parameters = MAST_FREE.get(mast_parameters, ())
         self.mast_free = np.array(mast_parameters, dtype=int)
         self.joint_errors = np.array(joint_errors, dtype=int)
-        self.bowed, self.held = tuple(bowed), frozenset(held)
+        self.bowed, self.fixed = tuple(bowed), frozenset(fixed)
         self.unknowns = Unknowns(self._declared(start))
 
     def _declared(self, start: Estimate) -> Iterator[Unknown]:
@@ -164,7 +164,7 @@ class Adjustment:
         for setup in start.rover_from_station:
             yield _pose(("setup", setup), f"set-up {setup}")
         for placement in start.rover_from_board:
-            if placement not in self.held:
+            if placement not in self.fixed:
                 yield _pose(("board", placement), f"placement {placement[0]}/{placement[1]}")
         if self.prism_cad_m > 0:
             for prism in start.prisms_in_rover_m:
@@ -245,7 +245,7 @@ class Adjustment:
                 n: moved_rigid(p, of(("setup", n))) for n, p in state.rover_from_station.items()
             },
             rover_from_board={
-                n: p if n in self.held else moved_rigid(p, of(("board", n)))
+                n: p if n in self.fixed else moved_rigid(p, of(("board", n)))
                 for n, p in state.rover_from_board.items()
             },
             prisms_in_rover_m=prisms,
@@ -258,7 +258,7 @@ class Adjustment:
         return moved
 
     def cost(self, state: Estimate) -> float:
-        """Return the weighted sum of squares (pulls bounded if asked); infinite where a dot has no pixel."""
+        """Return the weighted sum of squares, pulls bounded; infinite where a dot has no pixel."""
         total = sum(self._loss(self._off(state, stack)) for stack in self._stacks)
         total += sum(float(block.residual @ block.residual) for _, block in self.known(state))
         return total if np.isfinite(total) else float("inf")
@@ -311,7 +311,7 @@ class Adjustment:
         for term in images:
             kind = (
                 term.camera, term.attitude is None, self._own_reading(term),
-                term.board[0] in self.bowed, term.board in self.held,
+                term.board[0] in self.bowed, term.board in self.fixed,
             )  # fmt: skip
             groups.setdefault(kind, []).append(term)
         return [image_stack(mine, self.unknowns, self._image_keys) for mine in groups.values()]
@@ -325,7 +325,7 @@ class Adjustment:
             yield JOINT_ERRORS
             if self._own_reading(image):
                 yield "attitude", image.attitude
-        if image.board not in self.held:
+        if image.board not in self.fixed:
             yield "board", image.board
         if image.board[0] in self.bowed:
             yield "bow", image.board[0]
@@ -466,7 +466,7 @@ class Adjustment:
             own = PAN_TILT if self._own_reading(stack.terms[0]) else []
             free = np.array([*self.mast_free, *(len(MAST_NAMES) + self.joint_errors), *own], dtype=int)
             parts.append(-self._head_twists(state, stack.terms, head)[:, free])
-        if stack.terms[0].board not in self.held:
+        if stack.terms[0].board not in self.fixed:
             parts.append(rigid_twists(np.array([board.translation_m for board in boards])))
         if stack.terms[0].board[0] in self.bowed:
             parts.append(np.array([[[0.0, 0.0, 0.0, *board.rotation[:, 2]]] for board in boards]))
@@ -562,7 +562,7 @@ class Adjustment:
         return (state.bows_m if kind == "bow" else state.prisms_in_rover_m)[str(which)]
 
     def values(self, state: Estimate, *kinds: str) -> dict[str, float]:
-        """Return the numbers of all unknowns of some kinds by name, the kinds in the order asked for."""
+        """Return the numbers of all unknowns of some kinds by name, in the order of ``kinds``."""
         return {
             name: float(value)
             for kind in kinds

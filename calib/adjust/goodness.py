@@ -111,16 +111,23 @@ def variance_components(
     spread = 2 * np.diag(np.linalg.pinv(helmert)) if kinds else np.zeros(0)
     found = []
     for index, kind in enumerate(kinds):
-        told, r = before.get(kind, 1.0), float(redundancy[index])
+        times, r = before.get(kind, 1.0), float(redundancy[index])
         if r < FEWEST:
-            found.append(Component(kind, counts[kind], r, float("nan"), float("nan"), told, 1.0))
+            found.append(Component(kind, counts[kind], r, float("nan"), float("nan"), times, 1.0))
             continue
-        factor = float(np.sqrt(squares[kind] / r)) * told
+        factor = float(np.sqrt(squares[kind] / r)) * times
         sigma = factor * float(np.sqrt(spread[index])) / 2
-        square = squares[kind] * told**2
+        square = squares[kind] * times**2
         found.append(
             Component(
-                kind, counts[kind], r, factor, sigma, told, float(chdtrc(r, square)), float(chdtr(r, square))
+                kind,
+                counts[kind],
+                r,
+                factor,
+                sigma,
+                times,
+                float(chdtrc(r, square)),
+                float(chdtr(r, square)),
             )
         )
     return tuple(found)
@@ -133,12 +140,12 @@ def found_sigmas(components: Sequence[Component], *, narrows: bool = True) -> di
     was before stays so a little longer, so that none comes and goes. Tapes and prisms are taken together
     where they agree. Without ``narrows`` no sigma becomes smaller than stated.
     """
-    told = [c for c in components if np.isfinite(c.factor)]
-    found = {c.kind: c.factor for c in told}
-    limit = {c.kind: (STAYS if c.weighed != 1.0 else 1.0) * Level.STATED / len(told) for c in told}
-    odd = {c.kind: 2 * min(c.chance, c.small_chance) if narrows else c.chance for c in told}
+    known = [c for c in components if np.isfinite(c.factor)]
+    found = {c.kind: c.factor for c in known}
+    limit = {c.kind: (STAYS if c.weighed != 1.0 else 1.0) * Level.STATED / len(known) for c in known}
+    odd = {c.kind: 2 * min(c.chance, c.small_chance) if narrows else c.chance for c in known}
     wrong = {kind for kind, chance in odd.items() if chance < limit[kind]}
-    station = {c.kind: c for c in told if c.kind in (TAPES, PRISMS)}
+    station = {c.kind: c for c in known if c.kind in (TAPES, PRISMS)}
     if len(station) == 2 and wrong & set(station) and as_one(station[TAPES], station[PRISMS]):
         square = sum(c.redundancy * c.factor**2 for c in station.values())
         together = float(np.sqrt(square / sum(c.redundancy for c in station.values())))

@@ -401,7 +401,7 @@ def _drifts(fit: ScoredFit) -> Iterator[Hypothesis]:
 def _changes(fit: ScoredFit) -> Iterator[Hypothesis]:
     """The changes between two pictures that are looked for where a fit fails; one picture is a blunder."""
     for board in dict.fromkeys(image.board for image in fit.images):
-        if board not in fit.problem.held:
+        if board not in fit.problem.fixed:
             rows = fit.of_board(board)
             yield Hypothesis("board moved", ("board", *board), rows, _board_sentence, "from", side=2)
     if not fit.problem.upright:

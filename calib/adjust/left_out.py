@@ -208,7 +208,7 @@ def left_out_boards(
     for board, group in groups.items():
         touched = np.unique(np.concatenate([block.columns for _, block in group]))
         numbers = np.intersect1d(compared, touched)
-        own = problem.at(("board", board)) if board not in problem.held else np.zeros(0, dtype=int)
+        own = problem.at(("board", board)) if board not in problem.fixed else np.zeros(0, dtype=int)
         spread = covariance[np.ix_(numbers, numbers)]
         found.append(_left_out(board, group, whole, own, numbers, spread, noise.get(board, [])))
     return tuple(sorted(found, key=lambda one: one.least_chance))

@@ -293,7 +293,7 @@ def _culprit(problem: Adjustment, state: Estimate, suspect: int) -> int:
     """
     board = problem.images[suspect].board
     together = [i for i, t in enumerate(problem.images) if t.board == board and t.keep.any()]
-    if not 2 <= len(together) <= TELL_APART or board in problem.held:
+    if not 2 <= len(together) <= TELL_APART or board in problem.fixed:
         return suspect
     misfits = {i: _board_misfit(problem, state, board, [j for j in together if j != i]) for i in together}
     best = min(misfits, key=lambda i: misfits[i])

@@ -84,7 +84,7 @@ class FittedRig:
     parameter_names, covariance
         (p,) and (p, p) of what was fitted of the mast, the joints and the cameras, as
         ``mast.translation_m.x`` and ``cameras.navcam_left.H.x`` (``calib.geometry.covariance``); what was
-        held is exact. A and O of a camera have two each (``A.1``, ``A.2``): radians along
+        fixed is exact. A and O of a camera have two each (``A.1``, ``A.2``): radians along
         ``calib.geometry.rigid.tangents``.
     sigma
         Standard deviations under the mast file's keys: ``{"mast": {...}, "cameras": {name: {C: [3], ...}}}``.
@@ -191,7 +191,7 @@ class BenchCalibration(FittedRig):
     gauges
         Quantities that pictures cannot determine, and how they were fixed, a sentence each.
     placements
-        Each placement held against the others, the least likely first.
+        Each placement tested against the others, the least likely first.
     drifts
         How far each joint and each camera drifts, the least likely first.
     joint_rad

@@ -29,7 +29,7 @@ from calib.geometry.significance import typical_scale
 
 
 class SurveyNotFitted(CalibError):
-    """The survey does not determine what is asked of it, or no start leads to its noise."""
+    """The survey does not determine what is to be fitted, or no start leads to its noise."""
 
 
 ROUNDS = 40
@@ -195,7 +195,7 @@ def typical_length(
     """Return how far the typical dot of some images is off, in sigmas, and the median of these, pixels; no
     sigma counts as less than ``least_px``."""
     own_px = np.concatenate([t.sigma_px[t.keep] for t in images])
-    told_px = np.maximum(own_px, least_px)
+    own_sigma_px = np.maximum(own_px, least_px)
     residuals = np.concatenate([r.reshape(-1, 2) for r in problem.image_residuals(state, images)])
-    lengths = np.linalg.norm(residuals, axis=1) * own_px / told_px
-    return float(np.sqrt(typical_scale(lengths**2))), float(np.median(told_px))
+    lengths = np.linalg.norm(residuals, axis=1) * own_px / own_sigma_px
+    return float(np.sqrt(typical_scale(lengths**2))), float(np.median(own_sigma_px))

@@ -178,7 +178,7 @@ def print_error_m(problem: Adjustment, state: Estimate) -> float:
     It is the same in all pictures, where noise is another in each; 0 where chance makes them agree as much.
     """
     sums: dict[tuple[str, int], tuple[FloatArray, FloatArray]] = {}
-    shown = [t for t in problem.images if t.keep.any() and t.ids is not None and t.board not in problem.held]
+    shown = [t for t in problem.images if t.keep.any() and t.ids is not None and t.board not in problem.fixed]
     for term, block in zip(shown, problem.image_blocks(state, shown), strict=True):
         axes = state.rover_from_board[term.board].rotation[:, :2]
         by_place = block.rates(("board", term.board))[:, 3:].reshape(-1, 2, 3) @ axes

@@ -147,8 +147,8 @@ def _try(
         moved = problem.stepped(state, step)
     except ValueError:
         return None, float("inf")
-    there = problem.cost(moved)
-    return (moved if there < cost else None), there
+    reached = problem.cost(moved)
+    return (moved if reached < cost else None), reached
 
 
 def covariance_of(matrix: FloatArray, weak: FloatArray | None = None) -> FloatArray:

@@ -211,26 +211,26 @@ def lens_notes(rig: Rig, sigma: Mapping[str, Any]) -> tuple[str, ...]:
 
     ``sigma`` is that of ``calib.adjust.result.Calibration``.
     """
-    by_words: dict[str, list[str]] = {}
+    by_parts: dict[str, list[str]] = {}
     for name, camera in rig.cameras.items():
-        held = []
-        for letter, word in (("O", "lens axis"), ("R", "distortion"), ("E", "entrance point")):
+        hardly = []
+        for letter, part in (("O", "lens axis"), ("R", "distortion"), ("E", "entrance point")):
             if letter not in camera.model.letters or name not in sigma["cameras"]:
                 continue
             found = np.array(sigma["cameras"][name][letter])
             found = found[1:] if letter == "R" else found[:1] if letter == "E" else found
             if (found > HARDLY * np.array(LENS_SIGMA[letter])[: len(found)]).any():
-                held.append(word)
+                hardly.append(part)
         kind = camera.model.kind
         if "D" in camera.model.letters and name in sigma["cameras"]:
             open_ones = np.array(sigma["cameras"][name]["distortion"]) > HARDLY_ALONE * coefficient_sigma(
                 kind
             )
-            held += [", ".join(np.array(_coefficients(kind))[open_ones])] if open_ones.any() else []
-        if held:
-            by_words.setdefault(" and ".join(held), []).append(name)
+            hardly += [", ".join(np.array(_coefficients(kind))[open_ones])] if open_ones.any() else []
+        if hardly:
+            by_parts.setdefault(" and ".join(hardly), []).append(name)
     return tuple(
-        f"the survey hardly shows {words} of {', '.join(names)}, so what lenses are usually like decides; "
+        f"the survey hardly shows {parts} of {', '.join(names)}, so what lenses are usually like decides; "
         "pixels beyond the dots suffer"
-        for words, names in by_words.items()
+        for parts, names in by_parts.items()
     )

@@ -302,16 +302,16 @@ def open_directions(problem: Adjustment, covariance: FloatArray) -> tuple[Degene
     added.
     """
     rig = problem.unknowns.of_kinds("camera", "mast")
-    asked = ~problem.unknowns.usual[rig]
-    shown = rig[asked]
+    tested = ~problem.unknowns.usual[rig]
+    shown = rig[tested]
     names = [problem.names[i] for i in shown]
-    found = open_parameters(names, covariance[np.ix_(asked, asked)], problem.weak[shown])
+    found = open_parameters(names, covariance[np.ix_(tested, tested)], problem.weak[shown])
     return tuple(Degenerate(parts, _reason(problem, parts)) for parts in found)
 
 
 def _reason(problem: Adjustment, parameters: Sequence[str]) -> str:
     """Why a direction is open, and what to measure."""
-    what = f"the survey does not fix {in_words(parameters)}"
+    what = f"the survey does not fix {in_english(parameters)}"
     head = [t for t in problem.images if t.attitude is not None and t.keep.any()]
     owners = {problem.unknowns.owner(name) for name in parameters}
     cameras = {str(key[1]) for key in owners if key[0] == "camera"}
@@ -334,13 +334,13 @@ def _reason(problem: Adjustment, parameters: Sequence[str]) -> str:
     return f"{what}; take more images of purpose mast, spread over pan and tilt"
 
 
-def in_words(parameters: Sequence[str]) -> str:
+def in_english(parameters: Sequence[str]) -> str:
     """Return some parameters as a person says them."""
-    named = list(dict.fromkeys(_words(p) for p in parameters))
+    named = list(dict.fromkeys(_in_english(p) for p in parameters))
     return ", ".join(named[:4]) + (" and more" if len(named) > 4 else "")
 
 
-def _words(parameter: str) -> str:
+def _in_english(parameter: str) -> str:
     """A parameter as a person says it."""
     first, *rest = parameter.split(".")
     if first == "mast":

@@ -1,4 +1,4 @@
-"""The unknowns of a fit, each declared once and asked for by its key; a state of them, and what it leaves.
+"""The unknowns of a fit, each declared once and found by its key; a state of them, and what it leaves.
 
 Every unknown declares its numbers' names, how far each may be off at all, and what is known of it beforehand.
 What each unknown's step does to a state, and how residuals depend on it, is `calib.adjust.adjustment`'s.
@@ -88,10 +88,10 @@ class Unknowns(Mapping[Key, Unknown]):
     @cached_property
     def usual(self) -> np.ndarray:
         """(p,) which numbers are ``usual``."""
-        held = [
+        every = [
             np.zeros(len(one.names), dtype=bool) if one.usual is None else one.usual for one in self.values()
         ]
-        return np.concatenate([np.zeros(0, dtype=bool), *held])
+        return np.concatenate([np.zeros(0, dtype=bool), *every])
 
     def owner(self, name: str) -> Key:
         """Return the key of the unknown that has a number of this name."""
@@ -106,7 +106,7 @@ class Unknowns(Mapping[Key, Unknown]):
         return self._places[key]
 
     def of_kinds(self, *kinds: str) -> np.ndarray:
-        """Return the indices of all unknowns of some kinds, the kinds in the order that is asked for."""
+        """Return the indices of all unknowns of some kinds, the kinds in this order."""
         found = [self.at(key) for kind in kinds for key in self if key[0] == kind]
         return np.concatenate([np.zeros(0, dtype=int), *found])
 

@@ -100,7 +100,7 @@ def _cameras_by_mast(start: Start, mast_parameters: int) -> Start:
     boards = state.rover_from_board
     cameras = {name: state.cameras[name] for name in settings}
     alone = Estimate(cameras, mast, {}, boards, {}, np.zeros((0, 2)))
-    problem = Adjustment(of_cameras, (), alone, mast_parameters=0, held=tuple(boards))
+    problem = Adjustment(of_cameras, (), alone, mast_parameters=0, fixed=tuple(boards))
     fitted = minimise(problem, alone, weak=problem.weak, gain=1e-13).state.cameras
     head = {name: mast_of(mast).rover_from_head(*setting) for name, setting in settings.items()}
     in_rover = {name: model.moved(head[name]) for name, model in fitted.items()}

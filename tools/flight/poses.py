@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from calib.adjust.solver import Minimum, Normal, covariance_of, minimise
-from calib.adjust.uncertainty import SEEN_RAD, in_words, open_parameters
+from calib.adjust.uncertainty import SEEN_RAD, in_english, open_parameters
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import MAST_FREE, MAST_NAMES, Mast, gimbal, gimbal_rates, mast_of, numbers_of
@@ -284,5 +284,6 @@ def _check_determined(
     still = [f"{joint} by {moved:.2g} rad" for joint, moved in moves.items() if moved < SEEN_RAD]
     how = f" ({' and '.join(still)} in all)" if still else ""
     raise PosesTooFew(
-        f"the joint angles vary too little{how} to fix {in_words(found[0])}; add poses that move both joints"
+        f"the joint angles vary too little{how} to fix {in_english(found[0])}; add poses that move both "
+        "joints"
     )

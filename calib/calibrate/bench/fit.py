@@ -2,7 +2,7 @@
 alone.
 
 The estimator is that of surveys (``calib.adjust.adjustment``), with boards of unknown pose and no station.
-Start (``calib.calibrate.starts.bench``), pulls bounded, what changed half-way told apart
+Start (``calib.calibrate.starts.bench``), pulls bounded, what changed half-way found
 (``calib.adjust.hypotheses``), blunders left out by the tests of ``calib.adjust.outliers``, terms chosen
 (``calib.adjust.model_terms``), least squares.
 """

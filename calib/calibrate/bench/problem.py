@@ -267,7 +267,7 @@ class BenchProblem:
             joint_rad=self.joint_rad,
             joint_errors=joint_numbers(chosen),
             bowed=[b for b in self.boards if bow_of(b).name in chosen],
-            held=() if known is None else (known[0],),
+            fixed=() if known is None else (known[0],),
             huber=HUBER,
         )
 

@@ -82,7 +82,7 @@ def fit_camera(
         state = Estimate(
             {still[0].camera: model}, np.zeros(len(MAST_NAMES)), {}, boards, {}, np.zeros((0, 2))
         )
-        problem = Adjustment(still, (), state, mast_parameters=0, held=tuple(boards))
+        problem = Adjustment(still, (), state, mast_parameters=0, fixed=tuple(boards))
         fit = fit_agreeing(problem, state, expected_px)
         if fit is not None and (best is None or fit.typical_px < best.typical_px):
             best = fit

@@ -127,7 +127,7 @@ def fit_mast(
         if mast_parameters == 4 and mast[3:5].any() and rough is None:
             continue
         state = Estimate(references.in_head(mast), mast, {}, boards, {}, np.zeros((0, 2)))
-        problem = MastAlone(images, (), state, mast_parameters=mast_parameters, held=tuple(boards))
+        problem = MastAlone(images, (), state, mast_parameters=mast_parameters, fixed=tuple(boards))
         problem.references = references
         fit = fit_agreeing(problem, state, expected_px, keep_all=keep_all)
         if fit is not None and (best is None or fit.typical_px < best.typical_px):
