@@ -1,4 +1,4 @@
-"""Who asks: a name, what it may do, and the way it came."""
+"""The client of a request: its name, its rights, and the way it came."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ NETWORK = "network"
 
 @dataclass(frozen=True)
 class Caller:
-    """Who asks for something. Equal callers are one party.
+    """The client of a request. Equal callers are one party.
 
     Attributes
     ----------
     name
-        As told by the caller, for people and for the record; it proves nothing.
+        As given by the client, for people and for the record; it proves nothing.
     role
-        What it may do. On the way that needs no token everybody is ``admin``.
+        Its rights. On the way that needs no token every client is ``admin``.
     via
         The way it came: ``loopback``, ``unix``, ``token``, ``inside`` (this process itself), ``network``
-        (a stranger, who showed nothing that is known).
+        (a stranger without a valid token).
     address
-        Where it came from; empty where it came from inside.
+        The address it came from; empty from inside.
     credential
-        Digest of the token or the session that it showed; empty for none.
+        Digest of its token; empty without one.
     """
 
     name: str = ANONYMOUS
@@ -42,26 +42,26 @@ class Caller:
 
     @property
     def stranger(self) -> bool:
-        """Whether nothing is known of it but its address."""
+        """Whether only its address is known."""
         return self.via == NETWORK
 
     def may(self, role: Role) -> bool:
-        """Return whether it may do what ``role`` may."""
+        """Return whether it has the rights of ``role``."""
         return ROLES.index(self.role) >= ROLES.index(role)
 
-    def check_may(self, role: Role, what: str) -> None:
-        """Pass who may do what ``role`` may. Raises NotAllowed ``role``."""
+    def check_may(self, role: Role, command: str) -> None:
+        """Pass a client with the rights of ``role``. Raises NotAllowed ``role``."""
         if not self.may(role):
-            raise NotAllowed("role", f"{self.name} may {self.role}; {what} needs the role {role}")
+            raise NotAllowed("role", f"{self.name} may {self.role}; {command} needs the role {role}")
 
 
-def told_name(header: str | None) -> str:
-    """Return what a caller calls itself as one printable line, cut to 80 signs; `ANONYMOUS` for nothing.
+def client_name(header: str | None) -> str:
+    """Return the name that a client gives itself as one printable line of 80 characters at most.
 
-    Headers are read as Latin-1; what is UTF-8 in one is told as that. Never refuses: a stop with a strange
-    name is a stop.
+    `ANONYMOUS` for an empty one. Headers are read as Latin-1, and as UTF-8 where that is possible. Never
+    refuses: a stop with a strange name is a stop.
     """
-    told = header or ""
-    with contextlib.suppress(UnicodeError):  # what is no UTF-8 is told as it came
-        told = told.encode("latin-1").decode()
-    return one_line(told, LONGEST_NAME).strip() or ANONYMOUS
+    name = header or ""
+    with contextlib.suppress(UnicodeError):
+        name = name.encode("latin-1").decode()
+    return one_line(name, LONGEST_NAME).strip() or ANONYMOUS

@@ -1,8 +1,7 @@
-"""The one entry: each command passes here, and leaves who, under which lease, what, and with which result.
+"""The one entry: each command passes here, and is recorded with its client, lease, request and result.
 
-The order: may this role; was this asked before under the same key; is it too late; does somebody else steer;
-does the state allow it; then the act. What came of it is recorded after it. A stop goes the other way round
-(`CommandEntry.first`): it acts, and everything else follows.
+The order of the checks: role, idempotency key, deadline, lease, state; then the act, then the record. A stop
+goes the other way round (`CommandEntry.first`): it acts, and everything else follows.
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ from mastctl.control.refusals import Need
 from mastctl.errors import BadRequest, MastctlError, NotNow, Stopped, error_body
 
 LONGEST_DEADLINE_S = 3600.0
-FOLLOWED = 256  # operations whose end is still recorded with who began them
-PUBLISHED = 256  # records that who begins to listen still hears of
+FOLLOWED = 256  # operations whose end is still recorded with the client that began them
+PUBLISHED = 256  # records that a new listener still gets
 PUBLISHED_OF_STRANGERS = 32  # beside them
 
 
@@ -41,19 +40,19 @@ class Command:
     Attributes
     ----------
     name
-        As it stands in the record.
+        Its name in the record.
     role
-        What a caller must be allowed at least.
+        The rights that its caller needs.
     steers
-        Whether it is refused while somebody else steers.
+        Whether it is refused while another client steers.
     need
         What it needs of the daemon's state; None for nothing.
     goes_on
         Whether it is sent again and again to keep its operation going: then only the first is recorded, and
         what is refused.
     grants
-        Whether its answer tells a lease's id, which proves the lease: none by a key that may be anybody's,
-        and none that has ended.
+        Whether its answer has a lease's id, which proves the lease: never by a key of an anonymous client,
+        and never of a lease that has ended.
     """
 
     name: str
@@ -69,18 +68,16 @@ JOG = Command("jog", steers=True, goes_on=True)
 TRACK = Command("track", steers=True, need="track")
 TRACK_LOOK = Command("track.look", steers=True, need="motion")
 TRACK_STOP = Command("track.stop", steers=True)
-MAST = Command("mast", steers=True)  # the service asks whether the head rests, after reading it
+MAST = Command("mast", steers=True)  # the service checks whether the head is at rest, after reading it
 MAST_BACK = Command("mast.back", steers=True)
-RELOAD = Command("reload", "admin", steers=True)  # asked as a mast file is
+RELOAD = Command("reload", "admin", steers=True)  # checked as a mast file is
 CAMERA_SETTINGS = Command("camera.settings", steers=True, need="idle")
-POSE = Command(
-    "pose"
-)  # a fact about the rover, told by who knows it; the track that looks has its own holder
+POSE = Command("pose")  # a fact about the rover; the track that uses it has its own holder
 SUN = Command("limits.sun")  # a fact too
 SUN_FORGET = Command("limits.sun.forget")
 STOP = Command("stop", "view")
 ESTOP = Command("estop", "view")
-OPERATION_STOP = Command("operation.stop")  # of that one only: whoever steers by now is not disturbed
+OPERATION_STOP = Command("operation.stop")  # of that one only: the client that steers by now is not disturbed
 RESET = Command("reset", need="latch")
 RECORD_START = Command("record.start")
 RECORD_STOP = Command("record.stop")
@@ -88,7 +85,7 @@ RECORD_DELETE = Command("record.delete", "admin")  # of a fault, the evidence
 PLACE_KEEP = Command("place.keep")
 PLACE_FORGET = Command("place.forget")
 BENCH = Command("bench", steers=True, need="track")
-BENCH_STANDS = Command("bench.stands")  # a fact about the board, told by who has placed it
+BENCH_STANDS = Command("bench.stands")  # a fact about the board
 BENCH_LEAVE = Command("bench.leave")
 BENCH_FORGET = Command("bench.forget")
 LEASE = Command("lease", grants=True)
@@ -110,9 +107,9 @@ class CommandRequest:
     Attributes
     ----------
     caller
-        Who asks.
+        The client.
     request
-        What exactly, as JSON.
+        The request itself, as JSON.
     lease
         The lease's id that came with it.
     key
@@ -144,8 +141,8 @@ class CommandRequest:
 
 
 class JudgesAndEnds(Protocol):
-    """What of `mastctl.control.operations.OperationRunner` refuses what does not fit, and ends what is
-    late, or was asked for before a stop."""
+    """What of `mastctl.control.operations.OperationRunner` refuses a command, and ends an operation that is
+    late, or was requested before a stop."""
 
     def refusal(self, need: Need) -> MastctlError | None: ...
     def end_within(self, name: str, left_s: float, told_s: float) -> None: ...
@@ -158,15 +155,15 @@ class CommandEntry:
     Parameters
     ----------
     clock
-        What deadlines run on, and what stamps the records: the daemon's.
+        The clock of deadlines and records: the daemon's.
     leases, answers, audit
-        Who steers, what was answered to each key, where records go.
+        The client that steers, the answers by key, the log of records.
     operations
         Refuses what does not fit the state, and ends operations at their deadline.
     publisher
-        Gets each record, the newest 256 to be had later; one of its own by default.
+        Gets each record, and keeps the newest 256; one of its own by default.
     strangers
-        Where records of strangers go, who may be many: they push nobody else's out of ``audit``.
+        The log for strangers, who may be many: they push no other record out of ``audit``.
     """
 
     def __init__(
@@ -186,12 +183,12 @@ class CommandEntry:
         self._answers = answers
         self._operations = operations
         self._publisher = publisher or Publisher()
-        # Keys, oldest first: of who is known, and of strangers.
+        # Keys, oldest first: of known clients, and of strangers.
         self._published: tuple[deque[str], deque[str]] = deque(), deque()
         self._numbers = itertools.count(1)
         self._matching = threading.Lock()
-        self._began: dict[str, dict[str, Any]] = {}  # operation: who began it, until it has ended
-        self._ended: dict[str, dict[str, Any]] = {}  # operation: how it ended, until it is known who began it
+        self._began: dict[str, dict[str, Any]] = {}  # operation: the client that began it, until it has ended
+        self._ended: dict[str, dict[str, Any]] = {}  # operation: how it ended, until its client is known
 
     def run(
         self, command: Command, asked: CommandRequest, act: Callable[[], Answer], usual_s: float | None = None
@@ -204,11 +201,11 @@ class CommandEntry:
         command
             Its kind.
         asked
-            Who asks, and how.
+            The request.
         act
             Carries it out.
         usual_s
-            What an operation is given if nothing else was asked for, seconds.
+            The time allowed for an operation without a deadline, seconds.
 
         Raises
         ------
@@ -225,10 +222,8 @@ class CommandEntry:
         try:
             asked.caller.check_may(command.role, command.name)
             if command.grants and asked.key is not None and asked.caller.name == ANONYMOUS:
-                words = (
-                    "Idempotency-Key without a name (Mastctl-Client) may be anybody's; a lease is one party's"
-                )
-                raise BadRequest("bad_request", words)
+                message = "a lease with an Idempotency-Key needs a name (Mastctl-Client)"
+                raise BadRequest("bad_request", message)
             if asked.key is None:
                 answer = self._act(command, asked, act, usual_s)
             else:
@@ -245,7 +240,7 @@ class CommandEntry:
         return answer
 
     def first(self, command: Command, asked: CommandRequest, act: Callable[[], Answer]) -> Answer:
-        """Carry out a stop: it acts before anything is asked, locked or written, and is recorded after."""
+        """Carry out a stop: it acts before anything is checked or written, and is recorded after."""
         by = asked.caller.name
         how = f"an emergency stop ({by})" if command is ESTOP else by
         self.leases.stop_came(f"the head was stopped by {how}")  # takes no lock
@@ -277,13 +272,13 @@ class CommandEntry:
     def _act(
         self, command: Command, asked: CommandRequest, act: Callable[[], Answer], usual_s: float | None
     ) -> Answer:
-        """Carry it out if nothing stands against it; an operation of it gets its deadline."""
+        """Carry it out if no check fails; its operation gets its deadline."""
         if asked.deadline_s is not None and self._left_s(asked, asked.deadline_s) <= 0.0:
-            words = f"the {asked.deadline_s:g} s for {command.name} were over before it could begin"
-            raise NotNow("deadline_passed", words)
+            message = f"the {asked.deadline_s:g} s for {command.name} were over before it could begin"
+            raise NotNow("deadline_passed", message)
         if self._stopped_since(command, asked):
             raise Stopped(
-                f"{command.name} was asked for before a stop came, and is not carried out; ask again"
+                f"{command.name} was requested before a stop, and is not carried out; send it again"
             )
         steering: AbstractContextManager[None] = nullcontext()
         if command.steers:
@@ -309,7 +304,7 @@ class CommandEntry:
             raise NotNow(over.code, f"{over}, with another Idempotency-Key") from None
 
     def _stopped_since(self, command: Command, asked: CommandRequest) -> bool:
-        """Whether a stop came after a command that steers was asked for."""
+        """Whether a stop came after the request of a command that steers."""
         return command.steers and asked.last_stop not in (None, self.leases.last_stop)
 
     def _left_s(self, asked: CommandRequest, allowed_s: float) -> float:
@@ -324,7 +319,7 @@ class CommandEntry:
         again: bool = False,
         begins: bool = True,
     ) -> None:
-        """Record what came of a command; ``begins``: an operation that its answer names is one it began."""
+        """Record a command's result; ``begins``: whether it began the operation that its answer names."""
         caller = asked.caller
         operation = None if answer is None else _operation_of(answer)
         if command.goes_on and error is None and (operation is None or operation in self._began):
@@ -346,7 +341,7 @@ class CommandEntry:
             self._matched(self._began, operation, {"number": number, **who})
 
     def _matched(self, known: dict[str, dict[str, Any]], operation: str, told: dict[str, Any]) -> None:
-        """Keep who began an operation, or how it ended; record the end when both are known."""
+        """Keep an operation's client, or how it ended; record the end when both are known."""
         with self._matching:
             known[operation] = told
             if operation in self._began and operation in self._ended:
@@ -369,7 +364,7 @@ class CommandEntry:
 
 
 def _who(command: str, caller: Caller) -> dict[str, Any]:
-    """What is asked, and who asks, as it is recorded."""
+    """A command and its caller, as they are recorded."""
     who = {"command": command, "who": caller.name, "role": caller.role, "via": caller.via}
     return who | ({"address": caller.address} if caller.address else {})
 

@@ -1,8 +1,8 @@
-"""Who comes in, and whose page asks: a caller by its token, in a header or a cookie, or by its connection.
+"""The client of a request: by its token, in a header or a cookie, or by its connection; and its page.
 
 Every web page that a browser has open can send requests to whatever the browser's machine reaches. A foreign
-name in Host means that a name of somebody else's resolves to this daemon (DNS rebinding). A foreign Origin or
-Sec-Fetch-Site means that another site's page asks.
+name in Host means that another site's name resolves to this daemon (DNS rebinding). A foreign Origin or
+Sec-Fetch-Site means that the request is of another site's page.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from mastctl.config import is_loopback
-from mastctl.control.caller import NETWORK, Caller, told_name
+from mastctl.control.caller import NETWORK, Caller, client_name
 from mastctl.errors import NotLetIn
 from mastctl.http.access import Access
 from mastctl.http.refusals import GuardError
@@ -30,7 +30,7 @@ class HostNames:
     hosts
         Beside the loopback ones, in lower case.
     any_address
-        Whether any IP address will do as one: what no name server can point elsewhere.
+        Whether any IP address will do as one: no name server can point it elsewhere.
     """
 
     hosts: frozenset[str] = frozenset()
@@ -46,8 +46,8 @@ class HostNames:
         if is_loopback(name) or name in self.hosts or (self.any_address and _is_address(name)):
             return
         known = ", ".join(sorted(self.hosts)) or "a loopback name such as 127.0.0.1"
-        words = f"Host is '{_shown(host)}' where {known} is expected (listen.hosts of the configuration)"
-        raise GuardError(403, "foreign_host", words)
+        expected = f"{known} is expected (listen.hosts of the configuration)"
+        raise GuardError(403, "foreign_host", f"Host is '{_shown(host)}' where {expected}")
 
     def check_origin(self, headers: Mapping[str, str]) -> None:
         """Pass a request that comes from no other site's page. Raises GuardError ``foreign_origin``."""
@@ -60,17 +60,17 @@ class HostNames:
             parts = urlsplit("")
         host = headers.get("host", "").lower()
         if not host or parts.netloc.lower() != host or parts.scheme not in SCHEMES:
-            words = f"Origin is '{_shown(origin)}', which is not this service"
-            raise GuardError(403, "foreign_origin", words)
+            message = f"Origin is '{_shown(origin)}', which is not this service"
+            raise GuardError(403, "foreign_origin", message)
 
 
 def check_site(headers: Mapping[str, str], *, page: bool = False) -> None:
-    """Pass what a browser does not say another site's page asks for.
+    """Pass a request that no browser marks as one of another site's page.
 
     Parameters
     ----------
     page
-        Whether it is a page, to which others may lead.
+        Whether it is for a page, to which others may link.
 
     Raises
     ------
@@ -82,8 +82,8 @@ def check_site(headers: Mapping[str, str], *, page: bool = False) -> None:
         return
     if page and headers.get("sec-fetch-mode") == "navigate" and headers.get("sec-fetch-dest") == "document":
         return
-    words = f"Sec-Fetch-Site is '{_shown(site)}': only the service's own page may ask for this"
-    raise GuardError(403, "foreign_origin", words)
+    message = f"Sec-Fetch-Site is '{_shown(site)}': only the service's own page may request this"
+    raise GuardError(403, "foreign_origin", message)
 
 
 def _is_address(name: str) -> bool:
@@ -113,17 +113,17 @@ class Shown:
 
 @dataclass
 class EntryRules:
-    """What a daemon asks of who comes in.
+    """A daemon's rules for its clients.
 
     Attributes
     ----------
     names
         The names it answers to.
     access
-        Its tokens; None where everybody who reaches it may do everything: this machine's loopback address
+        Its tokens; None where every client that reaches it may do everything: this machine's loopback address
         under loopback names, or a Unix socket.
     via
-        That way: ``loopback`` or ``unix``.
+        The way of such a client: ``loopback`` or ``unix``.
     """
 
     names: HostNames = field(default_factory=HostNames)
@@ -142,11 +142,12 @@ class EntryRules:
         """
         if self.access is None:
             if by := forwarded(headers):
-                words = (
-                    f"{by.title()} says that the request came through a proxy, and this daemon has no tokens"
+                reason = f"{by.title()} shows that the request came through a proxy"
+                message = (
+                    f"{reason}, and this daemon has no tokens: set listen.hosts, so that clients need one"
                 )
-                raise NotLetIn("no_token", f"{words}: set listen.hosts, so that clients need one")
-            name = told_name(headers.get("mastctl-client"))
+                raise NotLetIn("no_token", message)
+            name = client_name(headers.get("mastctl-client"))
             return Caller(name, "admin", self.via, address_of(scope))
         shown = shown_token(scope, headers)
         if shown.token is None:
@@ -157,7 +158,7 @@ class EntryRules:
         return _named(token, scope, headers)
 
     def stopper(self, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
-        """Return who asks for a stop or for health: anybody may. Nothing is counted and nothing is logged."""
+        """Return the caller of a stop or of a health check, which every client may request."""
         if self.access is None:
             return self.stranger(scope, headers) if forwarded(headers) else self.caller(scope, headers)
         shown = shown_token(scope, headers)
@@ -165,14 +166,14 @@ class EntryRules:
         return self.stranger(scope, headers) if token is None else _named(token, scope, headers)
 
     def stranger(self, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
-        """Return who asks without a token what needs none, or is refused before it is known."""
-        return Caller(told_name(headers.get("mastctl-client")), "view", NETWORK, address_of(scope))
+        """Return the caller of a request without a token, or of one that is refused before that is known."""
+        return Caller(client_name(headers.get("mastctl-client")), "view", NETWORK, address_of(scope))
 
 
 def _named(token: Token, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
-    """Who shows a token: its name, which is proven, and what the program calls itself, which is not."""
-    told = headers.get("mastctl-client")
-    name = f"{token.name}/{told_name(told)}" if told else token.name
+    """The caller with a token: the token's name is proven, the one that the program gives itself is not."""
+    given = headers.get("mastctl-client")
+    name = f"{token.name}/{client_name(given)}" if given else token.name
     return Caller(name, token.role, "token", address_of(scope), token.sha256)
 
 
@@ -195,13 +196,13 @@ def cookie_name(scope: Mapping[str, Any]) -> str:
 
 
 def address_of(scope: Mapping[str, Any]) -> str:
-    """Return the address that a request came from; what headers say of it is not asked."""
+    """Return the address that a request came from; headers are not trusted for it."""
     client = scope.get("client")
     return str(client[0]) if client else "a socket of this machine"
 
 
 def from_this_machine(scope: Mapping[str, Any], headers: Mapping[str, str]) -> bool:
-    """Return whether a request came from this machine and by no proxy that says otherwise."""
+    """Return whether a request came from this machine and by no proxy that states otherwise."""
     client, server = scope.get("client"), scope.get("server")
     if forwarded(headers):
         return False
@@ -209,15 +210,15 @@ def from_this_machine(scope: Mapping[str, Any], headers: Mapping[str, str]) -> b
 
 
 def forwarded(headers: Mapping[str, str]) -> str:
-    """Return by which header a proxy says that a request came from elsewhere; empty if by none.
+    """Return the header by which a proxy states that a request came from elsewhere; empty without one.
 
-    What it says is not asked: its client may have written it.
+    Its value is not used: the client may have written it.
     """
     return next((name for name in headers if name in FORWARDED or name.startswith("x-forwarded-")), "")
 
 
 FORWARDED = ("forwarded", "via", "x-real-ip", "x-client-ip", "true-client-ip", "cf-connecting-ip")
-"""Headers by which a proxy says that a request came from elsewhere, beside all of ``X-Forwarded-...``."""
+"""Headers by which a proxy states that a request came from elsewhere, beside all of ``X-Forwarded-...``."""
 
 
 def changes(scope: Mapping[str, Any]) -> bool:

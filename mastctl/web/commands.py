@@ -13,7 +13,7 @@ from typing import Annotated, Any, TypeVar
 from fastapi import Depends, FastAPI, Header, Request
 from pydantic import BaseModel
 
-from mastctl.control.caller import Caller, told_name
+from mastctl.control.caller import Caller, client_name
 from mastctl.control.entry import Command, CommandRequest
 from mastctl.control.idempotency import Answer
 from mastctl.errors import Unable
@@ -165,7 +165,9 @@ async def stopped(service: Service, stop: Callable[[], T]) -> T:
 def caller_of(request: Request) -> Caller:
     """Return who asks, as whoever let the request in found; else by its name alone."""
     caller = request.scope.get("state", {}).get("caller")
-    return caller if isinstance(caller, Caller) else Caller(told_name(request.headers.get("mastctl-client")))
+    return (
+        caller if isinstance(caller, Caller) else Caller(client_name(request.headers.get("mastctl-client")))
+    )
 
 
 def _told(given: Mapping[str, Any]) -> dict[str, Any]:

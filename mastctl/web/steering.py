@@ -28,7 +28,7 @@ from mastctl.answers import (
     TrackTold,
 )
 from mastctl.as_json import as_json
-from mastctl.control.caller import told_name
+from mastctl.control.caller import client_name
 from mastctl.control.entry import (
     ESTOP,
     JOG,
@@ -322,7 +322,7 @@ def add_lease(app: FastAPI) -> None:
 def _terms(body: LeaseBody) -> dict[str, Any]:
     """What a lease is granted with, by the names of `LeaseTable.acquire`."""
     terms = body.model_dump(exclude={"reason"})
-    return terms | {"name": None if body.name is None else told_name(body.name)}
+    return terms | {"name": None if body.name is None else client_name(body.name)}
 
 
 def _granted(leases: LeaseTable, lease: Lease) -> LeaseGranted:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from mastctl.control.caller import ANONYMOUS, LONGEST_NAME, ROLES, Caller, told_name
+from mastctl.control.caller import ANONYMOUS, LONGEST_NAME, ROLES, Caller, client_name
 from mastctl.errors import NotAllowed
 
 
@@ -23,14 +23,14 @@ def test_who_may_not_is_told_which_role_it_needs() -> None:
 
 
 def test_who_tells_no_name_is_anonymous() -> None:
-    assert {told_name(header) for header in (None, "", "  ", "\t")} == {ANONYMOUS}
+    assert {client_name(header) for header in (None, "", "  ", "\t")} == {ANONYMOUS}
 
 
 @example("a" * 500)
 @example("\u00c2\u00a1\x80")  # UTF-8 but for its last sign
 @given(st.text())
 def test_any_header_makes_a_name_of_one_printable_line(header: str) -> None:
-    name = told_name(header)
+    name = client_name(header)
     assert name.isprintable()
     assert 0 < len(name) <= LONGEST_NAME
-    assert told_name(name.encode().decode("latin-1")) == name, "as a header of UTF-8 comes"
+    assert client_name(name.encode().decode("latin-1")) == name, "as a header of UTF-8 comes"

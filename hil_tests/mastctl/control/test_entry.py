@@ -243,7 +243,7 @@ def test_a_move_requested_before_a_stop_is_not_done_after_it(world: World) -> No
     early = world.asked(last_stop=world.leases.last_stop)
     world.entry.first(STOP, world.asked(ROVER), dict[str, Any])
     words = refused("stopped", lambda: world.entry.run(POINT, early, world.act))
-    assert "asked for before a stop came" in words and world.acts == 0
+    assert "requested before a stop" in words and world.acts == 0
     world.entry.run(POSE, early, dict[str, Any])  # moves nothing
     world.entry.run(POINT, world.asked(last_stop=world.leases.last_stop), world.act)
     assert world.acts == 1 and world.ended_by_stop == []
