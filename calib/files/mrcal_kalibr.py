@@ -43,11 +43,10 @@ from calib.files.opencv_ros import (
     matrix_of,
     pose_of,
     read_document,
-    row,
 )
 from calib.files.records import Number, Text
 from calib.files.twin import FISHEYE
-from calib.files.yaml_text import kind_of, parse_mapping
+from calib.files.yaml_text import dump_mapping, kind_of, parse_mapping
 from calib.geometry.cahvor import FREE, CameraModel, Kind
 from calib.geometry.rigid import Rigid
 
@@ -151,17 +150,17 @@ def format_mrcal(camera: CameraModel, frame: str) -> bytes:
         name, numbers, pose = _numbers_of(camera)
     camera_from_frame = pose.inverse
     turn = Rotation.from_matrix(camera_from_frame.rotation).as_rotvec()
-    lines = [
-        f"# reference frame: {frame!r}; the centre of the first pixel is (0, 0)",
-        "{",
-        f"    'lensmodel':  '{name}',",
-        f"    'intrinsics': {row(numbers)},",
-        "    # extrinsics are rt_fromref: rotation vector, translation in metres",
-        f"    'extrinsics': {row([*turn, *camera_from_frame.translation_m])},",
-        f"    'imagersize': [{camera.size_px[0]}, {camera.size_px[1]}],",
-        "}",
-    ]
-    return ("\n".join(lines) + "\n").encode()
+    extrinsics = [*turn, *camera_from_frame.translation_m]
+    return f"""\
+# reference frame: {frame!r}; the centre of the first pixel is (0, 0)
+{{
+    'lensmodel':  '{name}',
+    'intrinsics': {np.asarray(numbers, dtype=np.float64).tolist()},
+    # extrinsics are rt_fromref: rotation vector, translation in metres
+    'extrinsics': {np.asarray(extrinsics).tolist()},
+    'imagersize': {list(camera.size_px)},
+}}
+""".encode()
 
 
 def _numbers_of(model: CameraModel) -> tuple[str, list[float], Rigid]:
@@ -280,21 +279,20 @@ def _kalibr_camera(
 
 
 def format_kalibr(cameras: Mapping[str, CameraModel], frame: str) -> bytes:
-    """Return the cameras, all placed in one frame, as a camchain in their order; names go into comments."""
-    lines = [f"# T_cn_cnm1 of cam0 maps coordinates in the frame {frame!r}, metres, to cam0's"]
+    """Return the cameras, all placed in one frame, as a camchain in their order; topics have their names."""
+    chain: dict[str, dict[str, object]] = {}
     before = Rigid.identity()
     for at, (name, camera) in enumerate(cameras.items()):
-        pose = matrix44(lens_pose(camera).inverse @ before)
-        before = lens_pose(camera)
-        lines += [
-            f"cam{at}:  # {name}",
-            "  camera_model: pinhole",
-            f"  intrinsics: {row(camera.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]])}",
-            f"  distortion_model: {'equidistant' if camera.kind == FISHEYE else 'radtan'}",
-            f"  distortion_coeffs: {row(camera.distortion if len(camera.distortion) else np.zeros(4))}",
-            f"  resolution: [{camera.size_px[0]}, {camera.size_px[1]}]",
-            f"  rostopic: /{name}/image_raw",
-            "  T_cn_cnm1:",
-            *(f"  - {row(one)}" for one in pose),
-        ]
-    return ("\n".join(lines) + "\n").encode()
+        pose = lens_pose(camera)
+        chain[f"cam{at}"] = {
+            "camera_model": "pinhole",
+            "intrinsics": camera.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]],
+            "distortion_model": "equidistant" if camera.kind == FISHEYE else "radtan",
+            "distortion_coeffs": camera.distortion if len(camera.distortion) else np.zeros(4),
+            "resolution": camera.size_px,
+            "rostopic": f"/{name}/image_raw",
+            "T_cn_cnm1": matrix44(pose.inverse @ before),
+        }
+        before = pose
+    head = f"# T_cn_cnm1 of cam0 maps coordinates in the frame {frame!r}, metres, to cam0's\n"
+    return head.encode() + dump_mapping(chain)

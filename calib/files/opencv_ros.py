@@ -23,6 +23,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any
 
+import cv2
 import numpy as np
 from pydantic import BeforeValidator, Field
 
@@ -220,11 +221,6 @@ def as_camera_file(
     """
     notes = (*notes, *blind_notes(camera, section.path, section.place))
     return CameraFile(camera, frame, {}, {}, notes, Path(section.path), digest)
-
-
-def row(values: Any) -> str:
-    """Return numbers as YAML's and Python's list, in shortest round-trip form."""
-    return f"[{', '.join(repr(float(value)) for value in np.asarray(values).ravel())}]"
 
 
 def lens_pose(camera: CameraModel) -> Rigid:
@@ -500,27 +496,18 @@ def format_opencv(camera: CameraModel, frame: str) -> bytes:
     """Return the camera as OpenCV's YAML, its pose with it."""
     fisheye = camera.kind == FISHEYE
     distortion = camera.distortion if len(camera.distortion) else np.zeros(4)
-    lines = [
-        "%YAML:1.0",
-        "---",
-        "# The centre of the first pixel is (0, 0); camera_from_frame: metres of 'frame' to camera axes.",
-        f"image_width: {camera.size_px[0]}",
-        f"image_height: {camera.size_px[1]}",
-        f"camera_model: {'fisheye' if fisheye else 'pinhole'}",
-        f"fisheye_model: {int(fisheye)}",
-        *_matrix("camera_matrix", camera.camera_matrix),
-        *_matrix("distortion_coefficients", distortion[:, None] if fisheye else distortion[None]),
-        f'frame: "{_quoted(frame)}"',
-        *_matrix("camera_from_frame", matrix44(lens_pose(camera).inverse)),
-    ]
-    return ("\n".join(lines) + "\n").encode()
-
-
-def _matrix(name: str, values: FloatArray) -> list[str]:
-    rows, columns = values.shape
-    head = f"{name}: !!opencv-matrix"
-    return [head, f"   rows: {rows}", f"   cols: {columns}", "   dt: d", f"   data: {row(values)}"]
-
-
-def _quoted(text: str) -> str:
-    return text.replace("\\", "\\\\").replace('"', '\\"')
+    storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.writeComment("The centre of the first pixel is (0, 0); metres of 'frame' to camera axes")
+    keys = {
+        "image_width": camera.size_px[0],
+        "image_height": camera.size_px[1],
+        "camera_model": "fisheye" if fisheye else "pinhole",
+        "fisheye_model": int(fisheye),
+        "camera_matrix": camera.camera_matrix,
+        "distortion_coefficients": distortion[:, None] if fisheye else distortion[None],
+        "frame": frame,
+        "camera_from_frame": matrix44(lens_pose(camera).inverse),
+    }
+    for key, value in keys.items():
+        storage.write(key, value)
+    return storage.releaseAndGetString().encode()
