@@ -94,7 +94,7 @@ def _beside(value: Any, info: ValidationInfo) -> Any:
         return value
     if not isinstance(value, str) or not value.strip():
         raise problem("", f"{kind_of(value)} where text is expected")
-    return info.context / _printable(value)
+    return info.context.resolve() / _printable(value)
 
 
 PathInFile = Annotated[Path, BeforeValidator(_beside), WithJsonSchema({"type": "string", "pattern": r"\S"})]
@@ -177,7 +177,7 @@ def read_record(kind: type[Kind], document: object, path: str | Path, place: str
         With the place of the first mistake, its value and what would be right; see `_order`.
     """
     try:
-        return kind.model_validate(document, context=Path(path).resolve().parent)
+        return kind.model_validate(document, context=Path(path).parent)
     except ValidationError as error:
         raise _refusal(error, schema_of(kind, ""), path, place) from None
 

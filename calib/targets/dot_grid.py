@@ -47,8 +47,7 @@ class PlaneMap:
     def pixels(self, points_m: ArrayLike) -> FloatArray:
         """Return pixels (..., 2) of points (..., 2), metres in the board's plane."""
         points = np.asarray(points_m, dtype=np.float64)
-        carried = points @ self.homography[:, :2].T + self.homography[:, 2]
-        pixels = carried[..., :2] / carried[..., 2:]
+        pixels = carried(self.homography, points)
         if self.degree:
             pixels = pixels + _powers(points / self.scale_m, self.degree) @ self.bend
         return np.asarray(pixels)
@@ -67,6 +66,12 @@ class PlaneMap:
     def parameters(self) -> int:
         """How many numbers were fitted."""
         return 8 + 2 * max(0, len(self.bend) - 4)
+
+
+def carried(homography: FloatArray, points: FloatArray) -> FloatArray:
+    """Return points (..., 2) after a homography (3, 3)."""
+    whole = points @ homography[:, :2].T + homography[:, 2]
+    return np.asarray(whole[..., :2] / whole[..., 2:])
 
 
 def fit_plane_map(points_m: FloatArray, pixels_px: FloatArray) -> PlaneMap | None:

@@ -94,7 +94,7 @@ def fit_ellipses(image: Levels, middles_px: FloatArray, shapes_px: FloatArray) -
         weight = square[some] / np.maximum(freedom[some], 1.0) / SIZE_SIGMA**2
         normal[some, 2, 2] += weight
         gradient[:, 2, 0] += weight * (1.0 - state[some, 2])
-        damped = normal[some] + 1e-4 * _diagonals(normal[some]) + 1e-9 * np.eye(PARAMETERS)
+        damped = normal[some] + 1e-4 * diagonals(normal[some]) + 1e-9 * np.eye(PARAMETERS)
         step = np.linalg.solve(damped, gradient)[..., 0]
         step[:, :2] = np.clip(step[:, :2], -0.5, 0.5)
         state[some] = state[some] + step
@@ -104,7 +104,7 @@ def fit_ellipses(image: Levels, middles_px: FloatArray, shapes_px: FloatArray) -
         if not open_.any():
             break
     noise = np.sqrt(square / np.maximum(freedom, 1.0))
-    covariance = np.linalg.inv(normal + 1e-6 * _diagonals(normal) + 1e-12 * np.eye(PARAMETERS))
+    covariance = np.linalg.inv(normal + 1e-6 * diagonals(normal) + 1e-12 * np.eye(PARAMETERS))
     sigma = noise * np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
     good = (freedom > 0) & ~open_ & (np.linalg.norm(state[:, :2], axis=1) < farthest)
     good &= (state[:, 7] > 0.0) & (state[:, 2] > 0.5) & (state[:, 2] < 2.0)
@@ -197,8 +197,8 @@ def _model(
     return (levels - fitted) * weights, J
 
 
-def _diagonals(matrices: NDArray[np.float64]) -> FloatArray:
-    """The same matrices with everything off the diagonal nil."""
+def diagonals(matrices: NDArray[np.float64]) -> FloatArray:
+    """Return the same matrices with everything off the diagonal nil."""
     return np.asarray(matrices * np.eye(matrices.shape[-1]))
 
 

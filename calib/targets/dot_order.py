@@ -54,15 +54,14 @@ def order_by_steps(
     ordered
         None if no way to count fits within ``SURE_RAD``.
     """
-    best: Ordered | None = None
+    orders: list[Ordered] = []
     for columns, rows, c_from_ij in _countings(places, counts, board):
         found = steps_px @ np.linalg.inv(c_from_ij)
         if np.linalg.det(found) * np.linalg.det(expected_px) <= 0.0:
             continue
         turned = _turn_of(found @ np.linalg.inv(expected_px))
-        if best is None or abs(turned) < abs(best.turned_rad):
-            best = Ordered(columns, rows, turned)
-    return best if best is not None and abs(best.turned_rad) < SURE_RAD else None
+        orders.append(Ordered(columns, rows, turned))
+    return _surest(orders)
 
 
 def order_by_gravity(
@@ -90,7 +89,7 @@ def order_by_gravity(
     homography = _camera_from_places(camera, places, middles_px)
     if homography is None:
         return None
-    best: Ordered | None = None
+    orders: list[Ordered] = []
     for columns, rows, c_from_ij in _countings(places, counts, board):
         affine = np.eye(3)  # from metres on the board to (i, j)
         shift = np.array([columns[0], rows[0]]) - c_from_ij @ places[0]
@@ -106,8 +105,13 @@ def order_by_gravity(
         if np.hypot(down[0], down[1]) < STEEPEST:
             continue
         turned = float(np.arctan2(-down[0], down[1]))
-        if best is None or abs(turned) < abs(best.turned_rad):
-            best = Ordered(columns, rows, turned)
+        orders.append(Ordered(columns, rows, turned))
+    return _surest(orders)
+
+
+def _surest(orders: list[Ordered]) -> Ordered | None:
+    """The order that is turned least, if it is near enough."""
+    best = min(orders, key=lambda one: abs(one.turned_rad), default=None)
     return best if best is not None and abs(best.turned_rad) < SURE_RAD else None
 
 

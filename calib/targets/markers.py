@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from calib.geometry.rigid import FloatArray, IntArray
 from calib.targets.board_file import FAMILIES
 from calib.targets.boards import AprilGrid, Charuco, Checkerboard, Grey8
+from calib.targets.dot_grid import carried
 
 NEIGHBOURS = 16
 FEWEST_NEIGHBOURS = 4
@@ -220,12 +221,6 @@ def placed_markers(markers: Markers, board: MarkerBoard) -> PlacedMarkers | None
     if keep.sum() < FEWEST:
         return None
     return PlacedMarkers(ids[keep], pixels[keep], metres[keep], np.asarray(H))
-
-
-def carried(homography: FloatArray, points: FloatArray) -> FloatArray:
-    """Return points (..., 2) after a homography (3, 3)."""
-    whole = points @ homography[:, :2].T + homography[:, 2]
-    return np.asarray(whole[..., :2] / whole[..., 2:])
 
 
 def _white_first(board: Charuco) -> bool:

@@ -23,6 +23,7 @@ from scipy.special import erf
 
 from calib.geometry.rigid import FloatArray, IntArray
 from calib.targets.boards import Levels
+from calib.targets.dot_middles import diagonals
 from calib.targets.pattern import Cells
 
 PARAMETERS = 11
@@ -348,7 +349,7 @@ def fit_saddles(
     square, normal, settled = _minimised(state, pixels, insets, SETTLED_PX)
     freedom = pixels.weights.sum(axis=1) - PARAMETERS
     noise = np.sqrt(square / np.maximum(freedom, 1.0))
-    covariance = np.linalg.inv(normal + 1e-9 * (_diagonals(normal) + np.eye(PARAMETERS)))
+    covariance = np.linalg.inv(normal + 1e-9 * (diagonals(normal) + np.eye(PARAMETERS)))
     sigma = noise * np.sqrt(np.abs(covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
     contrast = state[:, CONTRAST] * signs
     moved_px = np.linalg.norm(state[:, :2], axis=1)
@@ -391,7 +392,7 @@ def _minimised(
         if not len(some):
             break
         damped = (
-            normal[some] + damping[some, None, None] * _diagonals(normal[some]) + 1e-9 * np.eye(PARAMETERS)
+            normal[some] + damping[some, None, None] * diagonals(normal[some]) + 1e-9 * np.eye(PARAMETERS)
         )
         step = np.linalg.solve(damped, gradient[some, :, None])[..., 0]
         step[:, :2] = np.clip(step[:, :2], -1.0, 1.0)
@@ -413,8 +414,3 @@ def _minimised(
         bottom = better | (before < UNDAMPED) | (damping[some] > 1.0)
         open_[some[(np.abs(step[:, :2]).max(axis=1) < settled_px) & bottom]] = False
     return square, normal, ~open_
-
-
-def _diagonals(matrices: FloatArray) -> FloatArray:
-    """The same matrices with everything off the diagonal nil."""
-    return np.asarray(matrices * np.eye(matrices.shape[-1]))
