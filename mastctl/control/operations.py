@@ -1,12 +1,12 @@
 """Operations: one at a time, in a thread of its own, each with a record of what it did.
 
 This module does not know how to point. It runs what it is given, keeps the record, and makes sure that a
-stop is the last word: from the moment a stop is asked for until the operation has ended, no move goes out.
+stop is final: from its request until the operation has ended, no move goes out.
 
 What is read from here (`OperationRunner.get`, `.all`) is read without a lock: the records are a mapping
 that is replaced, never edited. The lock is for those that write, and is not held while anything else is
-waited for. What runs and what is being stopped is told to the machine (`mastctl.control.machine`), each
-change of a record to its publisher.
+waited for. The machine (`mastctl.control.machine`) gets what runs and what is being stopped, its publisher
+each change of a record.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 KEPT_OPERATIONS = 200
 END_TIMEOUT_S = 5.0  # for a cancelled operation to notice, when the service closes
 REASON_S = 2.0  # what the record of an operation waits for the reason of a stop that came without it
-ENDS_SOON_S = 0.25  # a stopped operation ends within 20 ms or so; who comes next waits for that
+ENDS_SOON_S = 0.25  # a stopped operation ends within 20 ms or so; the next command waits for that
 
 STOP_ASKED = "a stop was asked for"
 
@@ -66,7 +66,7 @@ class OperationRunner:
     on_ended
         Gets the last record of each operation, in its thread; must return at once.
     machine
-        Is told what runs, and refuses what may not begin now; one of its own by default.
+        Gets what runs, and refuses what may not begin now; one of its own by default.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class OperationRunner:
         """Start ``work(record_step, cancelled)`` in a thread and return its first record.
 
         ``on_end`` gets the last record, in the same thread, when the next operation may be started already.
-        Waits for nobody: `let_stopped_end` does, before any lock is taken.
+        Waits for nothing: `let_stopped_end` does, before any lock is taken.
 
         Raises
         ------
@@ -135,7 +135,7 @@ class OperationRunner:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Let no operation start and no move go out inside the block; waits for nobody."""
+        """Let no operation start and no move go out inside the block; waits for nothing."""
         hold = object()
         self._machine.stop_asked()
         self._mover.block_moves(hold, STOP_ASKED)
@@ -148,8 +148,8 @@ class OperationRunner:
     def stop(self, reason: str = STOP_ASKED, reason_follows: bool = False) -> str | None:
         """Stop the mast, then the running operation, if any; return its id.
 
-        The head comes first: nothing is asked, written or locked before it was told. ``reason`` is what the
-        operation's record says; if a better ``reason_follows``, the record waits for it (`explain`).
+        The head comes first: nothing is written before its stop was sent. ``reason`` goes into the
+        operation's record; if a better ``reason_follows``, the record waits for it (`explain`).
 
         Raises
         ------
@@ -174,7 +174,7 @@ class OperationRunner:
         return name
 
     def explain(self, reason: str | None) -> None:
-        """Say why the last stop came, which was asked for without its reason; None for no better one."""
+        """Give the reason of the last stop, which came without it; None for no better one."""
         if reason is not None:
             self._cancelled_because = Stopped(reason)
         self._reason_is_known.set()
@@ -233,8 +233,8 @@ class OperationRunner:
         try:
             self._time.thread(watch, f"deadline of {name}").start()
         except RuntimeError as error:
-            words = f"operation {name} was ended, since nothing could watch its deadline: {error}"
-            self._end_by(name, Unable("no_thread", words))
+            message = f"operation {name} was ended, since nothing could watch its deadline: {error}"
+            self._end_by(name, Unable("no_thread", message))
 
     def end_stopped(self, name: str, reason: str = STOP_ASKED) -> None:
         """Stop the mast and end an operation if it runs: one that began after a stop which came before it was
@@ -267,8 +267,8 @@ class OperationRunner:
         """
         operation = self._records.get(name)
         if operation is None:
-            words = f"operation {name[:80]} is not known; the newest {KEPT_OPERATIONS} of this run are kept"
-            raise NotKnown("operation_unknown", words)
+            message = f"operation {name[:80]} is not known; the newest {KEPT_OPERATIONS} of this run are kept"
+            raise NotKnown("operation_unknown", message)
         return operation
 
     def all(self) -> list[Operation]:
@@ -348,14 +348,14 @@ class OperationRunner:
         return name
 
     def _work(self, name: str, work: Work, cancelled: threading.Event, on_end: OnEnd | None) -> None:
-        """Run one operation, then tell who wants to know."""
+        """Run one operation, then hand over its last record."""
         self._run_to_end(name, work, cancelled)
         for tell in (self._on_ended, on_end):
             if tell is None:
                 continue
             try:
                 tell(self.get(name))
-            except Exception:  # nothing is left that it could be told to
+            except Exception:  # its record is closed
                 log.exception("a step after operation %s met a defect of the program", name)
 
     def _run_to_end(self, name: str, work: Work, cancelled: threading.Event) -> None:
@@ -411,6 +411,6 @@ class OperationRunner:
             if known is not None:  # last, since it is what clients wait for
                 ended_s = self._clock.now_s()
                 self._keep(replace(known, state=state, result=result, error=error, ended_s=ended_s))
-            self._current = None  # whoever waits for the end finds it told
+            self._current = None  # after the record, which a waiting client reads
         with self._ended:
             self._ended.notify_all()

@@ -1,6 +1,6 @@
-"""What stands before the routes: server and connections, who comes in, what is refused, what waits.
+"""The checks before the routes: the client of a request, refusals, and requests that wait.
 
-It knows no route and nothing of what the daemon does.
+The package knows no route and nothing of the daemon's work.
 """
 
 PREFIX = "/api/v1"

@@ -44,7 +44,7 @@ PAGE = (
     "default-src 'self'; img-src 'self' blob: data:; object-src 'none'; base-uri 'none'; "
     "form-action 'self'; frame-ancestors 'none'"
 )
-"""The Content-Security-Policy of a page: its own files only, no script inside it, in nobody's frame."""
+"""The Content-Security-Policy of a page: its own files only, no script inside it, in no frame."""
 
 RENAMED = {"goes_on": "resume"}
 """Keys of bodies by their names before version 0.1."""
@@ -81,36 +81,36 @@ def error_response(
 ) -> JSONResponse:
     """Return an error in the one form of docs/reference/http.md."""
     body = {"error": {"code": code, "message": message, "detail": detail}}
-    told = {**HEADERS, "content-security-policy": NO_PAGE, **(headers or {})}
-    return JsonAnswer(body, status_code=status, headers=told)
+    all_headers = {**HEADERS, "content-security-policy": NO_PAGE, **(headers or {})}
+    return JsonAnswer(body, status_code=status, headers=all_headers)
 
 
 @asynccontextmanager
 async def query_of(line: WebSocket, model: type[Query], listed: str) -> AsyncIterator[Query]:
     """Yield a WebSocket's query, read as that of a route; ``listed`` may stand in it more than once.
 
-    The line is told of a query that is wrong, and of what the block refuses before it accepts.
+    A wrong query is refused on the line, and so is what the block refuses before it accepts.
     """
     given = line.query_params
-    asked: dict[str, Any] = {name: given[name] for name in given if name != listed}
+    query: dict[str, Any] = {name: given[name] for name in given if name != listed}
     try:
-        yield model.model_validate(asked | ({listed: given.getlist(listed)} if listed in given else {}))
+        yield model.model_validate(query | ({listed: given.getlist(listed)} if listed in given else {}))
     except ValidationError as error:
         first = error.errors()[0]
-        words = sentence({**first, "loc": ("query", *first["loc"])}, model)
-        await line.send_denial_response(error_response(422, "bad_request", words))
+        message = sentence({**first, "loc": ("query", *first["loc"])}, model)
+        await line.send_denial_response(error_response(422, "bad_request", message))
     except MastctlError as error:
         await line.send_denial_response(refusal_response(error))
 
 
 def marked(headers: Iterable[tuple[bytes, bytes]]) -> Headers:
     """Return an answer's headers with those of every answer that it does not have already."""
-    told = list(headers)
-    had = {name.lower() for name, _ in told}
-    kind = next((value for name, value in told if name.lower() == b"content-type"), b"")
+    given = list(headers)
+    names = {name.lower() for name, _ in given}
+    kind = next((value for name, value in given if name.lower() == b"content-type"), b"")
     policy = PAGE if kind.startswith(b"text/html") else NO_PAGE
     wanted = {**HEADERS, "content-security-policy": policy}
-    return told + [(n.encode(), v.encode()) for n, v in wanted.items() if n.encode() not in had]
+    return given + [(n.encode(), v.encode()) for n, v in wanted.items() if n.encode() not in names]
 
 
 def sentence(problem: Mapping[str, Any], model: object) -> str:
@@ -121,15 +121,15 @@ def sentence(problem: Mapping[str, Any], model: object) -> str:
     problem
         One entry of pydantic's list of errors.
     model
-        What the body or the query is read by, for the keys it knows and the words for what is expected; of a
+        The model of the body or the query, for its keys and for the description of what is expected; of a
         path, the parameter's own facts. None if not known.
     """
     where = tuple(str(step) for step in problem["loc"])
     place = _place(where)
     kind = problem["type"]
-    words = str(problem["msg"])
+    message = str(problem["msg"])
     if kind == "value_error":
-        return words.removeprefix("Value error, ")
+        return message.removeprefix("Value error, ")
     if kind == "missing":
         return f"{place} is missing" if len(where) > 1 else "the body is missing; a JSON object is expected"
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
@@ -146,14 +146,14 @@ def sentence(problem: Mapping[str, Any], model: object) -> str:
     if kind in ("model_attributes_type", "model_type", "dict_type", "dataclass_type"):
         return f"{place}: {value} where an object with keys is expected"
     for start in ("Input should be ", "String should have "):
-        if words.startswith(start):
-            expected = words.removeprefix(start).partition(", unable to")[0]
+        if message.startswith(start):
+            expected = message.removeprefix(start).partition(", unable to")[0]
             return f"{place}: {value} where {expected} is expected"
-    return f"{place}: {value}: {words}"
+    return f"{place}: {value}: {message}"
 
 
 def _keys(model: object, place: Sequence[str]) -> list[str]:
-    """The keys that a model or dataclass knows, or at a place inside it what stands there."""
+    """The keys of a model or dataclass, or of the one at a place inside it."""
     for candidate in (model, *get_args(model)):
         fields = getattr(candidate, "model_fields", None) or getattr(candidate, "__pydantic_fields__", None)
         if fields is None:
@@ -166,7 +166,7 @@ def _keys(model: object, place: Sequence[str]) -> list[str]:
 
 
 def _described(model: object, place: Sequence[str]) -> str | None:
-    """What is expected at a place, in the words of the model, or of a path's parameter itself."""
+    """What is expected at a place, by the description of the model, or of a path's parameter itself."""
     for candidate in (model, *get_args(model)):
         fields = getattr(candidate, "model_fields", None) or {}
         if place and place[0] in fields:
@@ -242,11 +242,11 @@ def add_errors(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def http(request: Request, error: HTTPException) -> JSONResponse:
-        words = {
+        known = {
             404: ("not_found", f"there is nothing at {request.url.path[:120]}; see /openapi.json"),
             405: ("method_not_allowed", f"{request.method} is not possible at {request.url.path[:120]}"),
         }
-        code, message = words.get(error.status_code, ("bad_request", str(error.detail)))
+        code, message = known.get(error.status_code, ("bad_request", str(error.detail)))
         headers = dict(error.headers or {})
         if error.status_code == 405:
             headers["Allow"] = ", ".join(_methods_of(app, request))

@@ -1,4 +1,4 @@
-"""The place where the latch of a head lies: by what the head is, not by who drives it and from where.
+"""The folder of a head's latch: by what the head is, not by the program that drives it.
 
 A head has a name (`drivers.hardware.head_name`), and its place is a folder of that name in
 ``/var/lib/mastctl/heads``, where ``/var/lib/mastctl`` is there (the systemd unit makes it) and this user may

@@ -1,11 +1,11 @@
 """The latch of a head: in memory from the first moment, and on the disk across restarts.
 
-It lies in the head's place (`mastctl.safety.heads`), or in the state folder for a head in this program's
+It is kept in the head's place (`mastctl.safety.heads`), or in the state folder for a head in this program's
 memory. It keeps a log of its causes, and a reset releases all of them.
 
-What cannot be read counts as latched: so a stop is written over the file that says that none is, which is
+A file that cannot be read means latched: so a stop is written over the file of a released latch, which is
 there from the start, and quick. The disk never holds the stop up: a thread of its own writes, after the head
-was told, and tries again for as long as the disk refuses.
+was stopped, and tries again for as long as the disk refuses.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ SCHEMA = "mastctl/latch/1"
 FILE = "latch.json"
 USED_SCHEMA = "mastctl/latch-used/1"
 USED = "latch.used.json"
-"""Says where a latch file was: where it is gone, nobody knows what it said."""
+"""Names a place where a latch file was: where it is gone, its content is unknown."""
 NO_NAME, NO_REASON = "anonymous", "no reason given"
 MOST = 5  # causes: strangers with many names fill no disk
-HEAD_FIRST_S = 0.1  # how long the disk waits for the head to be told, at most
+HEAD_FIRST_S = 0.1  # how long the disk waits for the head's stop, at most
 AGAIN_S = 2.0
 PATIENCE_S = 2.0  # of a reset for a disk that is busy
 ROOM_BYTES = 32768  # for the longest reasons and names of all entries, however they are written
@@ -83,7 +83,7 @@ class Latch:
             others = (*others, state.path)
         self._others = [_file_in(other) for other in others]
         self._changed = threading.Condition()
-        self._disk = threading.Lock()  # for who writes; a disk that hangs holds nobody else
+        self._disk = threading.Lock()  # for writers; a disk that hangs holds no other thread
         self.entries: tuple[Latched, ...] = ()
         self._kept: tuple[Latched, ...] | None = ()  # what a restart would find latched
         self._problem = ""
@@ -180,24 +180,24 @@ class Latch:
         Parameters
         ----------
         reason, name
-            Why, and who says so.
+            Of the reset.
 
         Raises
         ------
         NotNow
             ``not_estopped`` if none is latched, ``stopping`` if another stop came meanwhile.
         Unable
-            ``not_saved`` if the disk goes on to say that one is: a restart would be latched again.
+            ``not_saved`` if the disk still has the stop: a restart would be latched again.
         """
         name, reason = _line(name, ""), _line(reason, "")
         if not self._disk.acquire(timeout=PATIENCE_S):
-            words = "the disk has not taken the emergency stop yet; a reset follows it"
-            raise Unable("not_saved", words, PATIENCE_S)
+            message = "the disk has not taken the emergency stop yet; a reset follows it"
+            raise Unable("not_saved", message, PATIENCE_S)
         try:
             causes, asked = self.entries, self._asked
             if not causes:
                 raise NotNow("not_estopped", "no emergency stop is latched")
-            with self._changed:  # before the disk changes: from here on nobody is told that it holds a stop
+            with self._changed:  # before the disk changes: from here on no answer states that it has the stop
                 self._kept = None
             if self._on_disk:
                 released = {"by": name, "reason": reason, "at": _now()}
@@ -250,14 +250,14 @@ class Latch:
                 return
         with self._changed:  # what the disk says is not known: the thread writes it again
             self._changed.notify_all()
-        words = f"the emergency stop stays latched, since its release cannot be kept: {refused}"
-        raise Unable("not_saved", words)
+        message = f"the emergency stop stays latched, since its release cannot be kept: {refused}"
+        raise Unable("not_saved", message)
 
     def _keep(self) -> None:
         """Write what is latched, in a thread of its own."""
         with self._disk:
             if not self.entries and not self._folder.is_temporary and not self._file.has_room:
-                with contextlib.suppress(BadFile):  # then a stop is written anew, and tells what is wrong
+                with contextlib.suppress(BadFile):  # then a stop is written anew, and reports the fault
                     self._file.write({"latched": False})
             self._mark()
         while True:
@@ -302,11 +302,11 @@ class Latch:
         self._on_disk = True
 
     def _says_latched(self) -> bool:
-        """Whether a restart would take the file for a latched stop."""
+        """Whether a restart would read the file as latched."""
         return bool(_entries(self._file))
 
     def _tried(self, held: tuple[Latched, ...], problem: str) -> None:
-        """Note how the writing went, and say each change once."""
+        """Note how the writing went, and log each change once."""
         if problem and problem != self._problem:
             log.error("the emergency stop would not survive a restart: %s", problem)
         with self._changed:
@@ -320,7 +320,7 @@ class Latch:
 
 
 def latched_at(folders: Sequence[Path], others: Sequence[Path]) -> tuple[Latched, ...]:
-    """Return the stops of a head, for a program that only asks.
+    """Return the causes of a head's latch, for a program that only reads.
 
     ``folders`` are its place and the state folder, as far as they are known; ``others`` as of `Latch`.
     """
@@ -340,7 +340,7 @@ def _file_in(folder: Path) -> StateFile:
 
 
 def _names(mark: StateFile, file: StateFile) -> bool:
-    """Whether a mark says that a latch file was there; one that cannot be read says so too."""
+    """Whether a mark names a latch file; one that cannot be read is treated so too."""
     try:
         told = mark.read()
     except BadFile:
@@ -352,12 +352,12 @@ def _gone(file: StateFile, marks: Sequence[StateFile]) -> tuple[Latched, ...]:
     """What holds where there is no latch file: nothing, unless there was one."""
     if not any(_names(mark, file) for mark in marks):
         return ()
-    words = f"whether one was latched is not known, since {file.path} is gone"
-    return (Latched("mastctl", one_line(words, LONGEST), _now()),)
+    reason = f"whether one was latched is not known, since {file.path} is gone"
+    return (Latched("mastctl", one_line(reason, LONGEST), _now()),)
 
 
 def _entries(file: StateFile) -> tuple[Latched, ...] | None:
-    """What a latch file says is latched; None if there is none. What cannot be read counts as latched."""
+    """The causes in a latch file, None without a file; one that cannot be read means latched."""
     try:
         document = file.read()
     except BadFile as error:

@@ -23,7 +23,7 @@ class NoAnswer(Exception):
 
 
 def sockets_of(folder: Path | None, config: Path | None, url: str | None) -> list[Path]:
-    """Return the stop sockets of what is known of a daemon; whether somebody listens is not asked.
+    """Return the stop sockets of a daemon, whether a program listens there or not.
 
     Parameters
     ----------
@@ -49,12 +49,12 @@ def sockets_of(folder: Path | None, config: Path | None, url: str | None) -> lis
 
 
 def ask(path: Path, line: str) -> dict[str, Any]:
-    """Send one line; return what the daemon tells of what it did.
+    """Send one line; return the daemon's answer.
 
     Raises
     ------
     NoAnswer
-        If nobody listens, or no daemon of this program answers.
+        If no program listens, or none that answers as a daemon does.
     ValueError
         With the daemon's own sentence, if it could not.
     """
@@ -97,12 +97,12 @@ def _answer(path: Path, line: str) -> str:
 
 
 def _connect(peer: socket.socket, path: Path, until_s: float) -> None:
-    """Connect, after those who wait for the same. Raises OSError."""
+    """Connect, after other waiting clients. Raises OSError."""
     while True:
         try:
             peer.connect(str(path))
             return
-        except BlockingIOError:  # the kernel keeps no more of us waiting; they are taken in quickly
+        except BlockingIOError:  # the kernel's queue is full; it is emptied quickly
             if time.monotonic() > until_s:
                 raise TimeoutError from None
             time.sleep(0.001)

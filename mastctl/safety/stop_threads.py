@@ -54,13 +54,13 @@ class StopThreads:
                 "has come back; the head may still move: switch its power off"
             )
         future: Future[T] = Future()
-        future.set_running_or_notify_cancel()  # who no longer waits does not take the stop back
+        future.set_running_or_notify_cancel()  # a caller that waits no longer does not cancel the stop
 
         def call() -> None:
             self._began_s[future] = self._clock.now_s()
             try:
                 result = function()
-            except BaseException as error:  # it belongs to who waits
+            except BaseException as error:  # it belongs to the caller
                 self._began_s.pop(future)
                 future.set_exception(error)
             else:
