@@ -8,7 +8,6 @@ Contract section 2. A and O are normalised on load; a note says so when that mov
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -36,9 +35,7 @@ from calib.geometry.rig import MOST_HARMONICS, AxisJoint, JointErrors, Mast, Rig
 MAST_SCHEMA = "mastctl/mast/1"
 CAMERA_SCHEMA = "mastctl/camera/1"
 
-CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
-"""``<pair>_left`` and ``<pair>_right`` for the cameras of a pair; a single camera has no side."""
-CAMERA_NAME_WORDS = "a camera's name is letters, digits, '_' and '-'"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _ROUNDED, _NO_ROTATION = 1e-15, 1e-3
 
 _Size = Annotated[int, Field(ge=1, le=LARGEST_IMAGE_PX)]
@@ -50,13 +47,13 @@ _TurnRow = Annotated[list[_Turn], Field(min_length=3, max_length=3)]
 _Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
-def name_of(what: str) -> Callable[[str], str]:
+def _refuse_name(what: str) -> AfterValidator:
     def check(name: str) -> str:
-        if not CAMERA_NAME.fullmatch(name):
+        if not _NAME.fullmatch(name):
             raise problem("", f"a {what}'s name is letters, digits, '_' and '-'")
         return name
 
-    return check
+    return AfterValidator(check)
 
 
 def _pair(names: object) -> object:
@@ -68,9 +65,10 @@ def _pair(names: object) -> object:
     return names
 
 
-_NAMED = WithJsonSchema({"type": "string", "pattern": f"^{CAMERA_NAME.pattern}$"})
-CameraName = Annotated[str, AfterValidator(name_of("camera")), _NAMED]
-_PairName = Annotated[str, AfterValidator(name_of("pair")), _NAMED]
+_NAMED = WithJsonSchema({"type": "string", "pattern": f"^{_NAME.pattern}$"})
+CameraName = Annotated[str, _refuse_name("camera"), _NAMED]
+"""``<pair>_left`` and ``<pair>_right`` for the cameras of a pair; a single camera has no side."""
+_PairName = Annotated[str, _refuse_name("pair"), _NAMED]
 _SIDES = [{"type": "string", "pattern": "_left$"}, {"type": "string", "pattern": "_right$"}]
 _Pair = Annotated[
     Any,
