@@ -55,29 +55,29 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def _start(args: argparse.Namespace) -> int:
     with client_of(args) as client:
-        told = client.start_recording(args.name)
-    tell_result(args, told, f"recording {told['run']} in {told['folder']}; 'mastctl record stop' ends it")
+        found = client.start_recording(args.name)
+    tell_result(args, found, f"recording {found['run']} in {found['folder']}; 'mastctl record stop' ends it")
     return 0
 
 
 def _stop(args: argparse.Namespace) -> int:
     with client_of(args) as client:
-        told = client.stop_recording()
-    line = f"{told['file']}: {told['size_mb']:.1f} MB{_dropped(told['dropped'])}"
-    tell_result(args, told, line)
+        found = client.stop_recording()
+    line = f"{found['file']}: {found['size_mb']:.1f} MB{_dropped(found['dropped'])}"
+    tell_result(args, found, line)
     return 0
 
 
 def _list(args: argparse.Namespace) -> int:
     with client_of(args) as client:
-        told = client.recordings()
+        found = client.recordings()
     if args.json:
-        output.print_json(told)
+        output.print_json(found)
         return 0
     rows = [
-        (one["kind"], one["name"], f"{one['size_mb']:.1f}", str(one["files"])) for one in told["recordings"]
+        (one["kind"], one["name"], f"{one['size_mb']:.1f}", str(one["files"])) for one in found["recordings"]
     ]
-    now = told["recorder"]
+    now = found["recorder"]
     notes = [f"now: {now['run'] or now['file'] or 'nothing is recorded'}{_dropped(now['dropped'])}"]
     notes += [now["fault"]] if now["fault"] else []
     output.print_table(f"recordings in {now['folder']}", ("kind", "name", "MB", "files"), rows, notes)
@@ -93,19 +93,19 @@ def _show(args: argparse.Namespace) -> int:
     from mastctl.recorder.recorded import read_whole
 
     recording = read_whole(args.file)
-    told = recording.summary()
+    found = recording.summary()
     if args.json:
-        output.print_json(told)
+        output.print_json(found)
         return 0
     rows = [
-        ("length", f"{told['seconds']:.1f} s, {told['messages']} messages, {told['size_mb']:.1f} MB"),
+        ("length", f"{found['seconds']:.1f} s, {found['messages']} messages, {found['size_mb']:.1f} MB"),
         (
             "holds",
-            f"{told['frames']} pictures, {told['operations']} operations, {told['handoffs']} hand-offs",
+            f"{found['frames']} pictures, {found['operations']} operations, {found['handoffs']} hand-offs",
         ),
-        ("mast file", ", ".join(f"{one['name']} ({one['digest'][:12]})" for one in told["masts"]) or "none"),
-        ("configuration", told["config"] or "none"),
-        ("hardware", told["facts"].get("hardware", "unknown")),
+        ("mast file", ", ".join(f"{one['name']} ({one['digest'][:12]})" for one in found["masts"]) or "none"),
+        ("configuration", found["config"] or "none"),
+        ("hardware", found["facts"].get("hardware", "unknown")),
         ("state", _state(recording)),
     ]
     output.print_table(str(args.file), ("what", "is"), rows)
@@ -114,12 +114,12 @@ def _show(args: argparse.Namespace) -> int:
 
 def _state(recording: Recording) -> str:
     """Whether it is whole, and what would be done about it."""
-    told = recording.summary()
-    if told["complete"] and not told["damaged"]:
+    found = recording.summary()
+    if found["complete"] and not found["damaged"]:
         return "whole"
-    parts = [f"{told['damaged']} damaged chunks"] if told["damaged"] else []
+    parts = [f"{found['damaged']} damaged chunks"] if found["damaged"] else []
     parts += (
-        [] if told["complete"] else [f"not ended, {told['left_over_bytes']} bytes at its end are no record"]
+        [] if found["complete"] else [f"not ended, {found['left_over_bytes']} bytes at its end are no record"]
     )
     return f"{'; '.join(parts)}; 'mastctl record repair {recording.path}' writes what is whole anew"
 
@@ -130,13 +130,13 @@ def _repair(args: argparse.Namespace) -> int:
 
     out = args.out or args.file.with_name(f"{args.file.stem}.repaired.mcap")
     found = repair(recording_files(args.file), out)
-    told = {
+    result = {
         "file": str(out), "messages": found.messages, "seconds": found.seconds, "damaged": found.damaged,
         "left_over_bytes": found.left_over_bytes, "was_complete": found.was_complete,
     }  # fmt: skip
     lost = f", {found.damaged} damaged chunks were left out" if found.damaged else ""
     lost += f", {found.left_over_bytes} bytes at the end were no record" if found.left_over_bytes else ""
-    tell_result(args, told, f"{out}: {found.messages} messages, {found.seconds:.1f} s{lost}")
+    tell_result(args, result, f"{out}: {found.messages} messages, {found.seconds:.1f} s{lost}")
     return 0
 
 
@@ -153,7 +153,7 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _served(args: argparse.Namespace) -> int:
-    """Serve a recording until told to end."""
+    """Serve a recording until it is ended."""
     from mastctl import signals
     from mastctl.config import load_config
     from mastctl.recorder.recorded import read_whole, replay_files
@@ -167,13 +167,13 @@ def _served(args: argparse.Namespace) -> int:
     return 0
 
 
-def _listen(words: str | None) -> dict[str, Any]:
+def _listen(text: str | None) -> dict[str, Any]:
     """``HOST:PORT`` as the configuration has it."""
-    if words is None:
+    if text is None:
         return {}
-    host, _, port = words.rpartition(":")
+    host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or int(port) > 65535:
-        raise WrongUse(f"--listen is '{words}' where HOST:PORT is expected, e.g. 127.0.0.1:8421")
+        raise WrongUse(f"--listen is '{text}' where HOST:PORT is expected, e.g. 127.0.0.1:8421")
     return {"host": host.strip("[]"), "port": int(port)}
 
 
@@ -187,7 +187,7 @@ def _what_if(args: argparse.Namespace, recording: Recording) -> int:
     mast = load_rig(args.mast)
     frames = {name: frame.facts for name, frame in recording.frames.items()}
     seen, others = seen_in(recording.operations, frames)
-    handoffs = [handoff_of(args.file, at, told) for at, told in enumerate(recording.handoffs, start=1)]
+    handoffs = [handoff_of(args.file, at, found) for at, found in enumerate(recording.handoffs, start=1)]
     what_if = WhatIf(
         recording, mast, pointings_with(mast.rig, seen), handoffs_with(mast.rig, handoffs), others
     )

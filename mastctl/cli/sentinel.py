@@ -94,12 +94,12 @@ def _reference(args: argparse.Namespace) -> int:
     saved = save_reference(args.folder, now_utc().isoformat(timespec="seconds"), rests, taken.pictures)
     counts = f"{len(saved.pictures)} images at {len(rests)} poses"
     words = f"{args.folder}: {counts}, mast file {saved.mast_digest[:12]}"
-    told = {
+    result = {
         "folder": str(args.folder),
         "pictures": len(saved.pictures),
         "rests": [list(rest) for rest in rests],
     }
-    tell_result(args, told, words)
+    tell_result(args, result, words)
     return 0
 
 
@@ -124,14 +124,14 @@ def _tell(args: argparse.Namespace, look: dict[str, Any] | None) -> int:
 
     reference = read_reference(args.folder)
     now = standing(reference, read_looks(args.folder, reference), now_utc())
-    told = {
+    result = {
         "level": now.level,
         "sentence": now.sentence,
         "since": now.since,
         "looks": now.looks,
         "look": look,
     }
-    tell_result(args, told, now.sentence)
+    tell_result(args, result, now.sentence)
     for which, why in (look or {}).get("missing", {}).items():
         output.tell(f"{which}: no picture: {why}")
     return 1 if now.level == "bad" else 0

@@ -1,1 +1,1 @@
-"""What a daemon, a head or a camera promises, asked of any of them: checks that pytest and a command run."""
+"""What a rig promises through its daemon: the checks of ``mastctl conform``."""

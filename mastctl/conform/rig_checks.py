@@ -222,9 +222,9 @@ def _stop(trial: RigTrial) -> str:
     for attempt in range(STOP_TRIES):
         way = 1 if attempt % 2 == 0 else -1
         trial.point(trial.goal(-way, -way))
-        told = _stopped_on_the_way(trial, trial.goal(way, way))
-        if told:
-            return told
+        measured = _stopped_on_the_way(trial, trial.goal(way, way))
+        if measured:
+            return measured
     raise NotTried("the head had come too near to its goal before the stop; a larger --reach shows it")
 
 
@@ -281,8 +281,8 @@ def _after_stop(trial: RigTrial) -> None:
 def _estop(trial: RigTrial) -> str:
     reason, name = "a check of this rig's promises", "mastctl conform"
     before = trial.joints()
-    told = trial.client.estop(reason=reason, name=name)
-    expect(told.get("latched") is True, "POST /estop does not answer that it is latched")
+    answer = trial.client.estop(reason=reason, name=name)
+    expect(answer.get("latched") is True, "POST /estop does not answer that it is latched")
     try:
         try:
             trial.start(trial.goal(0.5, 0.5))
@@ -296,7 +296,7 @@ def _estop(trial: RigTrial) -> str:
     trial.let_pass(10 * POLL_S)
     moved_rad = _away(before, trial.joints())
     expect(moved_rad <= ARRIVED_RAD, f"emergency stop and reset moved the head by {moved_rad:.4f} rad")
-    return "kept across a restart" if told.get("kept") else "not kept across a restart"
+    return "kept across a restart" if answer.get("kept") else "not kept across a restart"
 
 
 @_check("clicks.pointed", "a click on a frame ends with a residual measured in a newer picture", moves=True)
@@ -315,8 +315,8 @@ def _clicked(trial: RigTrial) -> str:
         code, message = (str(field(record, "error", key)) for key in ("code", "message"))
         expect(code in OF_THE_SCENE, f"the operation ended {record['state']}: {code}: {message}")
         reasons.append(f"{code}: {message}")
-    words = reasons[-1] if reasons else "the picture shows nothing that stands out"
-    raise NotTried(f"nothing that was clicked could be pointed at; the last time {words}")
+    reason = reasons[-1] if reasons else "the picture shows nothing that stands out"
+    raise NotTried(f"nothing that was clicked could be pointed at; the last time {reason}")
 
 
 def _clicked_camera(trial: RigTrial) -> str:
@@ -333,8 +333,8 @@ def _places(trial: RigTrial, shot: Snapshot) -> list[tuple[float, float]]:
     """Pixels that stand out, the clearest first, near enough to the image centre for the reach."""
     grey = shot.image if shot.image.ndim == 2 else cv2.cvtColor(shot.image, cv2.COLOR_BGR2GRAY)
     height, width = grey.shape
-    told = trial.mast_cameras[shot.camera]
-    focal_px = float(np.linalg.norm(np.cross(told["A"], told["H"])))
+    vectors = trial.mast_cameras[shot.camera]
+    focal_px = float(np.linalg.norm(np.cross(vectors["A"], vectors["H"])))
     half = round(min(0.25 * min(width, height), 0.5 * trial.reach_rad * focal_px))
     mask = np.zeros_like(grey)
     mask[height // 2 - half : height // 2 + half, width // 2 - half : width // 2 + half] = 255

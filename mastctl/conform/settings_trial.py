@@ -19,7 +19,7 @@ def settings_tried(
     adjust: Callable[[str, float], Sequence[str]],
     of_a_frame: Callable[[], Mapping[str, float | None]],
 ) -> str:
-    """Try each setting that may be changed now but focus, and return their names in words.
+    """Try each setting that may be changed now but focus, and return their names.
 
     A focus is left alone: its motor may not come back to the calibrated place.
 
@@ -50,8 +50,8 @@ def settings_tried(
             raise
         adjust(one.name, one.value)
         back = _now(read, one.name)
-        words = f"{one.name} is {back} where {one.value:.6g} was put back"
-        expect(back is not None and _same(back, one.value), words)
+        message = f"{one.name} is {back} where {one.value:.6g} was put back"
+        expect(back is not None and _same(back, one.value), message)
         tried.append(one.name)
     if not tried:
         raise NotTried("it has no setting but focus that can be changed now")
@@ -70,13 +70,13 @@ def _change(
     now = _now(read, name)
     expect(now is not None, f"{name} is not known after it was set to {other:.6g}")
     assert now is not None
-    words = f"{name} is {now:.6g} where {other:.6g} was set, and no note says so"
-    expect(_same(now, other) or notes, words)
+    message = f"{name} is {now:.6g} where {other:.6g} was set, and no note says so"
+    expect(_same(now, other) or notes, message)
     for _ in range(FRAMES):
-        told = of_a_frame().get(name)
-        if told is not None:
-            words = f"a frame exposed after {name} was set to {now:.6g} has {told:.6g}"
-            expect(_same(told, now), words)
+        value = of_a_frame().get(name)
+        if value is not None:
+            message = f"a frame exposed after {name} was set to {now:.6g} has {value:.6g}"
+            expect(_same(value, now), message)
             return
     expect(False, f"none of {FRAMES} frames after {name} was set has its value")
 

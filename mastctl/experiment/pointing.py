@@ -1,6 +1,6 @@
 """The paper's pointing experiment (section IV, Table VI) through the HTTP interface of a running daemon.
 
-For each distance: look at the ground there, choose a textured pixel of the left image at random, ask the
+For each distance: turn to the ground, choose a textured pixel of the left image at random, ask the
 daemon to point at it twice, and take the residuals that the daemon measured in new images. A target that
 fails is a row of its own with the reason; it never leaves the record.
 """
@@ -162,9 +162,9 @@ class RunTime:
     Attributes
     ----------
     started
-        The date, or words that say that there is none.
+        The date, or a sentence that there is none.
     where
-        The daemon's address, or words.
+        The daemon's address, or that it is simulated.
     """
 
     def __init__(self, client: Client) -> None:
@@ -279,7 +279,7 @@ def run_pointing_experiment(
 
 
 def head_pair(rig: Rig, served: set[str]) -> tuple[str, str]:
-    """Return the stereo pair to point with: on the head, both eyes served; the Navcam where there is one.
+    """Return the stereo pair to point with: on the head, both cameras served; the Navcam where there is one.
 
     Raises
     ------
@@ -358,8 +358,8 @@ class _PointingRun:
             pixel = (target.shot.camera, target.shot.frame_id, target.x_px, target.y_px)
             operation = pointed(self._client, pixel=pixel, pointings=2)
             if operation["state"] != "done":
-                told = operation["error"] or {"code": operation["state"], "message": "stopped"}
-                error = f"{told['code']}: {told['message']}"
+                reason = operation["error"] or {"code": operation["state"], "message": "stopped"}
+                error = f"{reason['code']}: {reason['message']}"
         except ClientError as refusal:
             error = f"{refusal.code}: {refusal}"
         entries = operation["pointings"] if operation is not None else []

@@ -1,7 +1,7 @@
 """The pointing experiment on the packaged simulated rover, the truth beside each measurement.
 
 A task's rover, its daemon and its draw begin anew, and time passes only on demand, so that a target comes to
-the same to the last bit whatever was done before it, here or elsewhere.
+the same to the last bit whatever was done before it, on this machine or another.
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ def own_config(
     Raises
     ------
     BadOptions
-        For a device that is not simulated: nobody knows the truth of it.
+        For a device that is not simulated: the truth of it is not known.
     """
     hardware = config.hardware
     if real := not_simulated(hardware):
         name, driver = real
-        words = f"driver {driver!r} where the demo expects a simulated device, of which it knows the truth"
-        raise BadOptions(words, device=name)
+        message = f"driver {driver!r} where the demo expects a simulated device, of which it knows the truth"
+        raise BadOptions(message, device=name)
     given = (("head", head), ("wire", wire), ("speed", speed))
     chosen = {key: value for key, value in given if value is not None}
     kept = {key: value for key, value in hardware.simulation.items() if key != "head" or wire is None}
@@ -76,7 +76,7 @@ def own_config(
 
 
 def head_note(rover: SimulatedRover, rig: Rig, camera: str) -> str:
-    """Return what the head's counts and backlash allow, in words and pixels of a camera."""
+    """Return what the head's counts and backlash allow, as a sentence in pixels of a camera."""
     model = rig.cameras[camera].model
     # A pixel's step of the ray at the image centre: what a turn of the head moves the picture by.
     x, y = model.image_center_px
@@ -85,14 +85,14 @@ def head_note(rover: SimulatedRover, rig: Rig, camera: str) -> str:
     head = rover.settings.head
     axis = head.pan
     count_px, backlash_px = axis.count_rad * px_per_rad, axis.backlash_rad * px_per_rad
-    told = (
+    sentence = (
         f"head {head.name}: one count is {count_px:.2f} px of {camera}, so rounding alone leaves "
         f"{count_px / 12**0.5:.2f} px rms an axis; backlash {backlash_px:.2f} px"
     )
     if axis.approach_rad > 0:
-        return f"{told}, taken up by always approaching from one side."
+        return f"{sentence}, taken up by always approaching from one side."
     own_px = (backlash_px + count_px) / 2
-    return f"{told}, not taken up: a residual of up to {own_px:.1f} px an axis is the head's own."
+    return f"{sentence}, not taken up: a residual of up to {own_px:.1f} px an axis is the head's own."
 
 
 class SimulationTruth:

@@ -1,4 +1,4 @@
-"""Targets as a person would choose them: anywhere in a view of the ground, on texture, seen by both eyes."""
+"""Targets as a person would choose them: in a view of the ground, on texture, seen by both cameras."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NOISE_DN = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A pixel of a snapshot, its partner in the other eye (``right_px`` of ``right``), and its range.
+    """A pixel of a snapshot, its partner in the other camera (``right_px`` of ``right``), and its range.
 
     ``kind`` says what it is: ``ground`` for a pixel chosen by its texture. ``point_m`` (3,) is where it is in
     the rover frame, if that is known from elsewhere.

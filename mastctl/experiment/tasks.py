@@ -2,8 +2,8 @@
 
 Processes of this machine or a Dask cluster run them. A task carries its own seed and results are put in the
 order of the tasks, so the numbers are the same. To the last digit they are if linear algebra runs in one
-thread everywhere, as it does in the workers of Dask and in those that are started here: more threads add up
-in another order.
+thread everywhere, as it does in the workers of Dask and in those that this program starts: more threads add
+up in another order.
 """
 
 from __future__ import annotations
@@ -78,11 +78,11 @@ class Work(Generic[Task, Result]):
         Parameters
         ----------
         executor
-            Opens what runs them; not called where every result is there already.
+            Opens what runs them; not called where every result is kept already.
         kept
-            Results that are there need no run, and each that comes is kept at once.
+            Kept results need no run, and each that comes is kept at once.
         done
-            Called here with each task and result as they come, first those that were there.
+            Called with each task and result as they come, first those that were kept.
 
         Raises
         ------
@@ -206,7 +206,7 @@ def open_executor(name: str, workers: int | None = None) -> Iterator[Executor]:
         If the name is another, Dask is not installed, or its scheduler does not answer.
     """
     if name == "local":
-        # Started afresh: the threads of a progress bar run here, which a fork would copy half.
+        # Started afresh: the threads of a progress bar run in this process, which a fork would copy half.
         context = get_context("spawn")
         processes = workers or os.cpu_count() or 1
         with _environment(ONE_THREAD), ProcessPoolExecutor(processes, context, _end_with_parent) as pool:

@@ -63,7 +63,7 @@ class RecordFolder:
     Raises
     ------
     OSError
-        From every method, if the disk does not do what is asked.
+        From every method, if the disk refuses.
     """
 
     def __init__(self, folder: Path, clock_s: Callable[[], float] = time.monotonic) -> None:

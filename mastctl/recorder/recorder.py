@@ -123,7 +123,7 @@ class Recorder:
         self._thread = threading.Thread(target=self._work, name=NAME, daemon=True)
         self._thread.start()
 
-    # For any thread: only what is asked of the writing thread waits for the disk, and that bounded
+    # For any thread: only requests to the writing thread wait for the disk, and that bounded
 
     def use_mast(self, mast: AttachedMast) -> None:
         """Attach another mast file, for what comes from now on."""
@@ -383,7 +383,7 @@ class Recorder:
 
     def _notice_fault(self, one: Entry) -> None:
         """Have the ring kept soon after a fault that is new."""
-        if one.topic != "fault" or one.key == NAME:  # a disk that is full is not asked to keep more
+        if one.topic != "fault" or one.key == NAME:  # a full disk is not made to keep more
             return
         now_s = time.monotonic()
         standing = {(one.key, fault.code) for fault in one.value}
@@ -444,7 +444,7 @@ class Recorder:
                 f"{self._settings.free_mb:g} MB are left to others; nothing is recorded{run}"
             )
             self._end_file()
-            self._set_fault("disk_low", message, "there is more room")
+            self._set_fault("disk_low", message, "the disk has more space")
             self._now.retry_s = time.monotonic() + RETRY_S
             return True
         return False

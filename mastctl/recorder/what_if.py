@@ -1,6 +1,6 @@
 """What if: the pointings and hand-offs of a recording, evaluated again with another mast file.
 
-A pointing's record holds the pixels in which the pair saw the target, with the joint angles there; the angles
+A pointing's record holds the pixels in which the pair saw the target, with the joint angles then; the angles
 that were commanded, and those that were reached; and the pixel in which the target was seen then. With
 another mast file, position and commanded angles come out differently; where the target would have been seen
 at those follows from where it was seen, since the way between the two angles is short and the same mast
@@ -42,9 +42,9 @@ class SeenAgain:
     operation, pointing, mast_digest
         Which one, and with which mast file.
     pair, pair_px, pair_sigma_px, pair_rad
-        The two cameras, (2, 2) pixels of the target in them, their sigma, and (pan, tilt) read there.
+        The two cameras, (2, 2) pixels of the target in them, their sigma, and (pan, tilt) read at it.
     pair_approach, measured_approach
-        From which side pan and tilt had come there, and to the new picture.
+        From which side pan and tilt had come to it, and to the new picture.
     aim_camera, aim_px
         Where the target was wanted.
     commanded_rad, measured_rad

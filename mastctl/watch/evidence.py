@@ -194,7 +194,7 @@ def _log_mean(logs: list[float]) -> float:
 
 
 CLICK_SIGMA_PX = 0.1
-"""One sigma of a match in each eye of the pair."""
+"""One sigma of a match in each camera of the pair."""
 UNMODELLED_PX = 0.1
 """What no camera model describes and no match knows of, one sigma: another at each place of an image."""
 
@@ -208,9 +208,9 @@ class Expected(ReadOnlyArrays):
     noise_px2
         (2, 2) what differs from pointing to pointing: matches, counts.
     rates
-        (2, p) by each of the rig's parameters that were asked for.
+        (2, p) by each of the rig's parameters that were requested.
     turned
-        (2, 3 c) px/rad by a turn of each of the cameras that were asked for about x, y and z of the frame
+        (2, 3 c) px/rad by a turn of each of the cameras that were requested about x, y and z of the frame
         that it is mounted on.
     """
 
@@ -238,17 +238,19 @@ def expected(rig: Rig, parameters: Sequence[str], cameras: Sequence[str], one: M
     CalibError
         If the rig lacks a camera of it, or cannot have seen the target so.
     """
-    pair, eyes = (one.source, one.partner), {one.source, one.partner, one.camera}
-    if missing := eyes - set(rig.cameras):
+    pair, involved = (one.source, one.partner), {one.source, one.partner, one.camera}
+    if missing := involved - set(rig.cameras):
         raise CalibError(f"the mast file has no camera {min(missing)}")
     known = set(parameters)
     free = [
-        f"cameras.{name}.{part}" for name in eyes for part in parameter_names(rig.cameras[name].model.kind)
+        f"cameras.{name}.{part}"
+        for name in involved
+        for part in parameter_names(rig.cameras[name].model.kind)
     ]
     names = (*parameters, *(name for name in free if name not in known), *JOINT_NAMES)
     point = np.array(one.position_m)
-    there = _rates_of_position(rig, pair, one.from_rad, point)
-    by_click = rig.camera_in_rover(one.camera, *one.to_rad).project_jacobian(point)[1] @ there
+    position_rates = _rates_of_position(rig, pair, one.from_rad, point)
+    by_click = rig.camera_in_rover(one.camera, *one.to_rad).project_jacobian(point)[1] @ position_rates
     before = by_click @ click_rates(rig, names, pair, *one.from_rad, point)
     after = pixel_rates(rig, names, one.camera, *one.to_rad, point[None]).to_rig[0]
     joints = np.concatenate([before[:, -2:], after[:, -2:]], axis=1)
@@ -263,7 +265,7 @@ def expected(rig: Rig, parameters: Sequence[str], cameras: Sequence[str], one: M
     at = {name: i for i, name in enumerate(names)}
     turned = np.zeros((2, 3 * len(cameras)))
     for number, camera in enumerate(cameras):
-        if camera in eyes:
+        if camera in involved:
             model = rig.cameras[camera].model
             mine = [at[f"cameras.{camera}.{part}"] for part in parameter_names(model.kind)]
             turned[:, 3 * number : 3 * number + 3] = rates[:, mine] @ _turn_rates(model)

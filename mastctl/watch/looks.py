@@ -55,7 +55,7 @@ def usual_rests(client: Client) -> list[tuple[float, float]]:
 
 
 def is_idle(client: Client, for_s: float = 0.0) -> str:
-    """Return '' where a look disturbs nobody, else why it would; ``for_s``: how long nothing has happened."""
+    """Return '' where a look disturbs no client, else why; ``for_s``: how long the head must be unused."""
     if (control := client.control()) is not None:
         return f"{control['holder']} steers"
     status = client.status()
@@ -74,21 +74,21 @@ def take_pictures(
 ) -> Taken:
     """Return a picture of each camera at each rest (pan, tilt as read), and bring the head back.
 
-    The client should hold the lease. A camera that gives no picture is asked no more; the others go on.
+    The client should hold the lease. A camera that gives no image is left out; the others go on.
 
     Raises
     ------
     LookEnded
-        If somebody stops the head.
+        If the head is stopped.
     ClientError
         If the daemon refuses, or no camera gives a picture.
     """
     joints = client.status()["joints"]
-    taken, asked = Taken(), list(cameras)
+    taken, left = Taken(), list(cameras)
     try:
         for pose, (pan_rad, tilt_rad) in enumerate(rests):
             _turn(client, pan_rad, tilt_rad)
-            for camera in tuple(asked):
+            for camera in tuple(left):
                 try:
                     shot = client.snapshot(camera)
                 except ClientError as error:
@@ -96,9 +96,9 @@ def take_pictures(
                         raise
                     taken.missing[f"{camera} at rest {pose}"] = str(error)
                     if error.code == "bad_frame":
-                        continue  # too dark or too bright here: elsewhere it may see
-                    asked.remove(camera)
-                    if not asked and not taken.pictures:
+                        continue  # too dark or too bright at this rest
+                    left.remove(camera)
+                    if not left and not taken.pictures:
                         raise
                     continue
                 if shot.moving:
@@ -110,7 +110,7 @@ def take_pictures(
                 progress(pose + 1, len(rests))
     except ClientError:
         if joints is not None:
-            with suppress(ClientError, LookEnded):  # refused if somebody else steers by now
+            with suppress(ClientError, LookEnded):  # refused if another client steers by now
                 _turn(client, float(joints["pan_rad"]), float(joints["tilt_rad"]))
         raise
     if joints is not None:
@@ -120,11 +120,11 @@ def take_pictures(
 
 def _turn(client: Client, pan_rad: float, tilt_rad: float) -> None:
     operation = client.turn(pan_rad, tilt_rad, TURN_TIMEOUT_S)
-    told: Mapping[str, Any] = operation.get("error") or {}
+    error: Mapping[str, Any] = operation.get("error") or {}
     if operation["state"] == "stopped":
-        raise LookEnded(f"{told.get('message', 'somebody stopped the head')}; nothing was kept")
+        raise LookEnded(f"{error.get('message', 'the head was stopped')}; nothing was kept")
     if operation["state"] != "done":
-        raise ClientError(str(told.get("code", "failed")), str(told.get("message", "the move failed")))
+        raise ClientError(str(error.get("code", "failed")), str(error.get("message", "the move failed")))
 
 
 def head_cameras(client: Client) -> tuple[Rig, list[str]]:
@@ -144,7 +144,7 @@ def look_again(
     Raises
     ------
     LookEnded
-        If another mast file or other cameras are in use than at the reference, or somebody stops the head.
+        If another mast file or other cameras are in use than at the reference, or the head is stopped.
     BadFile
         If a picture of the reference is damaged.
     """
@@ -201,7 +201,7 @@ def view_shifts(rig: Rig, reference: Reference, pictures: Sequence[ReferencePict
             )
         pixels, moved, sigma = seen_again(model, then.image, now.image)
         if len(pixels):
-            # what the head itself tells that it stands elsewhere is no drift
+            # a pose that the head itself reports as another is no drift
             moved = moved - _told_px(rig, then, now, pixels)
         shifts.append(ViewShift(now.camera, now.pose, then.pan_rad, then.tilt_rad, pixels, moved, sigma))
     return shifts
@@ -218,7 +218,7 @@ def _told_px(rig: Rig, then: ReferencePicture, now: ReferencePicture, pixels: np
 
 LEASE_S = 30.0
 RETRY_S = 60.0
-"""After so long it is tried again, where a look is due and somebody needs the head, or had it given up."""
+"""After so long it is tried again, where a look is due and a client needs the head."""
 
 NAME = "sentinel"
 
@@ -283,12 +283,12 @@ def watch(
     every_s
         From look to look, seconds, counted from the reference's time on.
     idle_s
-        So long nobody must have used the head.
+        So long the head must not have been used.
 
     Raises
     ------
     BadFile
-        If there is no reference at the start. What fails later is told, and tried again.
+        If there is no reference at the start. What fails later is reported, and tried again.
     """
     read_reference(folder)
     said = ""

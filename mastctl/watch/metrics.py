@@ -1,6 +1,6 @@
 """``GET /metrics``: what a daemon is and has done, in Prometheus' text format.
 
-What is true at the moment is read from the status when somebody asks; what happened is counted as it is
+The present state is read from the status at each request; events are counted as they are
 published, in a thread of its own, so that nothing that happens waits for being counted.
 """
 
@@ -46,7 +46,7 @@ class Metrics:
     Parameters
     ----------
     status
-        Returns what ``GET /status`` tells.
+        Returns the answer of ``GET /status``.
     errors
         Returns how often calls to devices have failed: by device, call, and the error's code.
     frame_counts
@@ -90,11 +90,11 @@ class Metrics:
         """Count no more."""
         self._news.close()
 
-    def _counter(self, name: str, words: str, *labels: str) -> Counter:
-        return Counter(name, words, labels, namespace="mastctl", registry=self._registry)
+    def _counter(self, name: str, summary: str, *labels: str) -> Counter:
+        return Counter(name, summary, labels, namespace="mastctl", registry=self._registry)
 
-    def _histogram(self, name: str, words: str, bounds: tuple[float, ...], *labels: str) -> Histogram:
-        return Histogram(name, words, labels, namespace="mastctl", buckets=bounds, registry=self._registry)
+    def _histogram(self, name: str, summary: str, bounds: tuple[float, ...], *labels: str) -> Histogram:
+        return Histogram(name, summary, labels, namespace="mastctl", buckets=bounds, registry=self._registry)
 
     # In the listener's thread
 
@@ -108,7 +108,7 @@ class Metrics:
             for one in news:
                 try:
                     self._counted(one)
-                except Exception:  # a record that nobody foresaw must not end the counting
+                except Exception:  # an unexpected record must not end the counting
                     log.exception("a message published under %s could not be counted", one.topic)
 
     def _counted(self, one: Published) -> None:
@@ -126,13 +126,13 @@ class Metrics:
     def _operation(self, operation: Operation) -> None:
         if operation.state not in ENDED:
             return
-        told = operation.told()
-        error = told["error"]
+        record = operation.told()
+        error = record["error"]
         self._operations.labels(operation.state, "" if error is None else error["code"]).inc()
-        for step in told["steps"]:
+        for step in record["steps"]:
             if step.get("duration_s") is not None:
                 self._step.labels(str(step["name"])).observe(step["duration_s"])
-        for pointing in told["pointings"]:
+        for pointing in record["pointings"]:
             residual = pointing.get("residual_px") or ()
             for off, sigma in zip(residual, pointing.get("residual_sigma_px") or (), strict=False):
                 if off is not None and sigma:
@@ -145,7 +145,7 @@ class Metrics:
 
 
 class _NowMetrics:
-    """What is true at the moment, read when somebody asks."""
+    """The present state, read at each request."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class _NowMetrics:
         self._temperatures_c = temperatures_c
 
     def describe(self) -> Iterable[Metric]:
-        """Return nothing: without it the library would ask for a status to find out the names."""
+        """Return nothing: without it the library would read a status to find the names."""
         return ()
 
     def collect(self) -> Iterable[Metric]:
@@ -223,34 +223,34 @@ class _NowMetrics:
 
 def _steering(control: Mapping[str, Any] | None) -> Iterable[Metric]:
     """What steers, and for how long; the holder is no label, since clients choose their names."""
-    held = GaugeMetricFamily("mastctl_lease", "1 for what steers: lease, operation.", labels=["kind"])
+    lease = GaugeMetricFamily("mastctl_lease", "1 for what steers: lease, operation.", labels=["kind"])
     left = GaugeMetricFamily("mastctl_lease_left_seconds", "Until the lease is over.")
     if control is not None:
-        held.add_metric([str(control["kind"])], 1.0)
+        lease.add_metric([str(control["kind"])], 1.0)
         if control.get("for_s") is not None:
             left.add_metric([], float(control["for_s"]))
-    yield held
+    yield lease
     yield left
 
 
-def _drift(told: Mapping[str, Any] | None) -> Iterable[Metric]:
+def _drift(record: Mapping[str, Any] | None) -> Iterable[Metric]:
     """What the drift sentinel's looks say; nothing without a reference."""
-    if told is not None and told["reference"] is not None:
-        bad = float(told["level"] == "bad")
+    if record is not None and record["reference"] is not None:
+        bad = float(record["level"] == "bad")
         yield GaugeMetricFamily("mastctl_sentinel_drift", "1 if looks found a change.", bad)
-        if told["age_s"] is not None:
+        if record["age_s"] is not None:
             yield GaugeMetricFamily(
-                "mastctl_sentinel_look_age_seconds", "Since the last look.", told["age_s"]
+                "mastctl_sentinel_look_age_seconds", "Since the last look.", record["age_s"]
             )
 
 
-def _calibration(told: Mapping[str, Any] | None) -> Iterable[Metric]:
+def _calibration(record: Mapping[str, Any] | None) -> Iterable[Metric]:
     """Whether the mast file still holds."""
-    if told is not None:
-        drifts = float(told["verdict"] == "drifts")
+    if record is not None:
+        drifts = float(record["verdict"] == "drifts")
         yield GaugeMetricFamily(
             "mastctl_calibration_drifts", "1 if anything says that the mast file does not hold.", drifts
         )
         yield GaugeMetricFamily(
-            "mastctl_calibration_pointings", "Of the last days, that are judged.", float(told["pointings"])
+            "mastctl_calibration_pointings", "Of the last days, that are judged.", float(record["pointings"])
         )

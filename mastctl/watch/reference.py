@@ -26,7 +26,7 @@ from mastctl.watch.journal import Journal
 
 SCHEMA = "mastctl/sentinel/1"
 SENTINEL_FOLDER = "sentinel"
-"""In a daemon's state folder: there its status finds it."""
+"""In a daemon's state folder, where its status reads it."""
 
 REFERENCE, LOOKS = "reference.json", "looks.jsonl"
 MOST_BYTES, MOST_PICTURE_BYTES = 4_000_000, 1 << 28
@@ -137,7 +137,7 @@ def save_reference(
         replace_bytes(folder / REFERENCE, json.dumps(document, indent=1).encode(), 0o644)
     except OSError as error:
         if inner is not None:
-            shutil.rmtree(inner, ignore_errors=True)  # what was there before still counts
+            shutil.rmtree(inner, ignore_errors=True)  # the former reference still counts
         raise BadFile(folder, "", f"cannot be written: {error.strerror or error}") from None
     (folder / LOOKS).unlink(missing_ok=True)
     for old in folder.glob("pictures-*"):

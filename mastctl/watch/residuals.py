@@ -144,7 +144,7 @@ def _sums(one: Judged) -> Sums:
 VerdictWord = Literal["good", "drifts", "few", "unknown"]
 
 AS_LIKELY = math.log(20.0)
-"""Cameras whose evidence is nearer than this to the strongest one's cannot be told from it."""
+"""Cameras whose evidence is nearer than this to the strongest one's cannot be distinguished from it."""
 
 
 @dataclass(frozen=True)

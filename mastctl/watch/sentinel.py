@@ -19,7 +19,7 @@ CONFIRMED = 2
 """So many looks one after the other must see a change before it is reported."""
 
 OLD_DAYS = 7.0
-"""What was found by a look longer ago than this is told with the age first."""
+"""What was found by a look longer ago than this is reported with the age first."""
 
 SILENT = 3
 """So many looks since the last that knew anything, and it is not known any more that all is well."""
@@ -49,20 +49,20 @@ def standing(reference: Reference, looks: Sequence[Mapping[str, Any]], now: date
     """Return what the looks at a reference say together; ``now`` for how long ago."""
     telling = [look for look in looks if look["views"]]
     if not telling:
-        words = (
+        sentence = (
             f"no look yet at the reference of {ago(reference.time, now)}"
             if not looks
             else f"{_looks(len(looks))} saw nothing they knew: night, fog, other light, another place? "
             f"The last {ago(looks[-1]['time'], now)}"
         )
-        return SentinelStanding("unsure", words, len(looks), None)
+        return SentinelStanding("unsure", sentence, len(looks), None)
     last = telling[-1]
     silent = len(looks) - 1 - max(at for at, look in enumerate(looks) if look["views"])
     blind = f"; {_looks(silent)} since then saw nothing they knew" if silent else ""
     seen = f"last looked {ago(last['time'], now)}"
     if not last["changed"]:
-        words = f"nothing has changed, {_looks(len(telling))}, {seen}{blind}"
-        return SentinelStanding("good" if silent < SILENT else "unsure", words, len(looks), None)
+        sentence = f"nothing has changed, {_looks(len(telling))}, {seen}{blind}"
+        return SentinelStanding("good" if silent < SILENT else "unsure", sentence, len(looks), None)
     alike = 0
     for look in reversed(telling):
         if not look["changed"]:
@@ -70,11 +70,11 @@ def standing(reference: Reference, looks: Sequence[Mapping[str, Any]], now: date
         alike += 1
     first = telling[-alike]["time"]
     if alike < CONFIRMED:
-        words = f"{last['sentence']}, seen once {ago(first, now)}: look again{blind}"
-        return SentinelStanding("unsure", words, len(looks), first)
+        sentence = f"{last['sentence']}, seen once {ago(first, now)}: look again{blind}"
+        return SentinelStanding("unsure", sentence, len(looks), first)
     old = (age := age_s(last["time"], now)) is not None and age > 86400.0 * OLD_DAYS
-    words = f"{last['sentence']}, since {for_long(first, now)}{f' ({seen})' if old else ''}{blind}"
-    return SentinelStanding("bad", words, len(looks), first)
+    sentence = f"{last['sentence']}, since {for_long(first, now)}{f' ({seen})' if old else ''}{blind}"
+    return SentinelStanding("bad", sentence, len(looks), first)
 
 
 def findings(folder: Path, mast_digest: str) -> dict[str, Any]:
@@ -134,23 +134,23 @@ def age_s(time: str, now: datetime) -> float | None:
 
 
 def for_long(time: str, now: datetime) -> str:
-    """Return how long ago in words: ``3 days``."""
+    """Return how long ago that was, as ``3 days``."""
     age = age_s(time, now)
     if age is None:
         return "an unknown time"
     hours = abs(age) / 3600.0
     if hours < 1.0:
-        words = f"{60.0 * hours:.0f} min"
+        text = f"{60.0 * hours:.0f} min"
     else:
-        words = f"{hours:.0f} h" if hours < 48.0 else f"{hours / 24.0:.0f} days"
-    return words if age > -90.0 else f"a time {words} ahead of this clock"
+        text = f"{hours:.0f} h" if hours < 48.0 else f"{hours / 24.0:.0f} days"
+    return text if age > -90.0 else f"a time {text} ahead of this clock"
 
 
 def ago(time: str, now: datetime) -> str:
-    """Return when that was in words: ``3 days ago``."""
+    """Return when that was, as ``3 days ago``."""
     age = age_s(time, now)
-    words = for_long(time, now)
-    return f"at {words}" if age is None or age <= -90.0 else f"{words} ago"
+    text = for_long(time, now)
+    return f"at {text}" if age is None or age <= -90.0 else f"{text} ago"
 
 
 RENEWED_S = 60.0
@@ -163,7 +163,7 @@ class SentinelFindings:
     Parameters
     ----------
     folder
-        Where a sentinel keeps its reference and looks; need not be there.
+        Where a sentinel keeps its reference and looks; need not exist.
     mast_digest
         Returns that of the mast file in use.
     thread

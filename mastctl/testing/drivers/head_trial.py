@@ -72,7 +72,7 @@ class HeadTrial:
 
     @property
     def near_rad(self) -> float:
-        """How near to a goal a settled head stands."""
+        """How near to a goal a settled head is."""
         return (OUTSIDE_COUNT_RAD if self.count_rad is None else self.count_rad) + self.settle_rad
 
     def goal(self, pan_part: float, tilt_part: float) -> Angles:
@@ -137,8 +137,8 @@ class HeadTrial:
         """Read until the head says that it does not move."""
         until_s = self.clock.now_s() + SETTLES_WITHIN_S
         while (reading := self.read()).moving:
-            words = f"the head still says that it moves after {SETTLES_WITHIN_S:g} s"
-            expect(self.clock.now_s() < until_s, words)
+            message = f"the head still says that it moves after {SETTLES_WITHIN_S:g} s"
+            expect(self.clock.now_s() < until_s, message)
             self.clock.sleep(0.005)
         return reading
 
@@ -152,8 +152,8 @@ class HeadTrial:
     def check_arrived(self, reading: Reading, goal: Angles, bound_rad: float) -> float:
         """Return how far from its goal a settled head stands. Raises PromiseBroken beyond the bound."""
         off_rad = away(reading, goal)
-        words = f"sent to {goal[0]:.5f}, {goal[1]:.5f} rad it settled {off_rad:.5f} rad away"
-        expect(off_rad <= bound_rad, f"{words}, {bound_rad:.1e} is allowed")
+        message = f"sent to {goal[0]:.5f}, {goal[1]:.5f} rad it settled {off_rad:.5f} rad away"
+        expect(off_rad <= bound_rad, f"{message}, {bound_rad:.1e} is allowed")
         return off_rad
 
     def on_its_way(self, goal: Angles, part: float = 0.2) -> Reading:

@@ -81,7 +81,7 @@ def test_frames(camera: CameraTrial) -> None:
 def test_fresh(camera: CameraTrial) -> None:
     """No frame comes whose exposure began before the requested moment."""
     low, median, high = (1e3 * delay_s for delay_s in camera.summary("fresh")["delay_s"])
-    log.info(f"from the exposure's end to here {low:.1f} to {high:.1f} ms, median {median:.1f} ms")
+    log.info(f"from the exposure's end to arrival {low:.1f} to {high:.1f} ms, median {median:.1f} ms")
 
 
 def test_order(camera: CameraTrial) -> None:
@@ -100,7 +100,7 @@ def test_stated(camera: CameraTrial) -> None:
 
 
 def test_threads(camera: CameraTrial) -> None:
-    """Two threads that ask at once both get fresh frames."""
+    """Two threads at once both get fresh frames."""
 
     def work() -> None:
         for _ in range(FRAMES_EACH):
@@ -130,11 +130,11 @@ def test_close(camera: CameraTrial) -> None:
     waits = beside(lambda: driver.next_frame(time.monotonic() + 60.0, WAITS_S))
     time.sleep(0.1)
     began_s = time.monotonic()
-    for words in ("close()", "a second close()"):
+    for name in ("close()", "a second close()"):
         try:
-            ended(words, beside(driver.close))
+            ended(name, beside(driver.close))
         except DriverError as error:
-            raise PromiseBroken(f"{words} raised {type(error).__name__}: {error}") from None
+            raise PromiseBroken(f"{name} raised {type(error).__name__}: {error}") from None
     try:
         ended("next_frame() of a closed camera", waits)
         raise PromiseBroken("a frame that cannot have been exposed yet came when the camera was closed")

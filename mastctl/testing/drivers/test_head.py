@@ -60,14 +60,14 @@ def test_move(head: HeadTrial) -> None:
         needs_s = way_rad / head.speed_rad_per_s
         expect(took_s < MOVE_TIMEOUT_S, f"move() took {took_s:.2f} s, {MOVE_TIMEOUT_S:g} s are allowed")
         if needs_s >= 0.2:
-            words = f"move() came back after {took_s:.2f} s, when the way of {way_rad:.3f} rad was gone"
-            shares.append((took_s / needs_s, f"{words}: not at once"))
+            message = f"move() came back after {took_s:.2f} s, when the way of {way_rad:.3f} rad was gone"
+            shares.append((took_s / needs_s, f"{message}: not at once"))
         reading = head.settled()
         bound_rad = head.settle_rad + (0.5 * head.count_rad if head.count_rad else OUTSIDE_COUNT_RAD)
         worst_rad = max(worst_rad, head.check_arrived(reading, goal, bound_rad))
     if shares:
-        share, words = min(shares)
-        expect(share < 0.7, words)
+        share, message = min(shares)
+        expect(share < 0.7, message)
     log.info(f"within {worst_rad:.1e} rad")
 
 
@@ -100,7 +100,7 @@ def test_under_way(head: HeadTrial) -> None:
         )
         expect(
             reading.moving or left_rad <= head.near_rad,
-            f"{left_rad:.3f} rad before its goal, {gone_s:.3f} s after the move, it says that it stands",
+            f"{left_rad:.3f} rad before its goal, {gone_s:.3f} s after the move, it says that it is at rest",
         )
         between += 0.05 * way_rad < left_rad < 0.95 * way_rad
     if between < 3:
@@ -157,8 +157,8 @@ def test_stop_beside(head: HeadTrial) -> None:
     head.sent(head.goal(-0.9, -0.9))
     head.on_its_way(goal)
     longest_s = _stops_beside_reads(head)
-    words = f"a stop beside reads took {longest_s:.2f} s of {STOP_TIMEOUT_S:g} s"
-    expect(longest_s < STOP_TIMEOUT_S, words)
+    message = f"a stop beside reads took {longest_s:.2f} s of {STOP_TIMEOUT_S:g} s"
+    expect(longest_s < STOP_TIMEOUT_S, message)
     left_rad = away(head.settled(), goal)
     expect(left_rad > head.near_rad, "stopped beside reads the head went on to its goal")
     log.info(f"within {max(longest_s, waited_s):.3f} s")
@@ -185,14 +185,14 @@ def _timed_stop(trial: HeadTrial) -> float:
 def _stops_beside_reads(trial: HeadTrial) -> float:
     """Stop twice at once, twice over, while two threads read; return how long the longest took."""
 
-    def ask() -> None:
+    def read_often() -> None:
         for _ in range(8):
             try:
                 trial.head.read()
             except (NoReply, BadReply):  # a stop that cuts in may cost an answer: the service asks once more
                 trial.head.read()
 
-    reads = [beside(ask, trial.clock) for _ in range(2)]
+    reads = [beside(read_often, trial.clock) for _ in range(2)]
     longest_s = 0.0
     for _ in range(2):
         for stop in [beside(partial(_timed_stop, trial), trial.clock) for _ in range(2)]:
@@ -244,7 +244,7 @@ def fastest_seen(trial: HeadTrial, requested_rad_per_s: float) -> tuple[float, f
     while True:
         try:
             reading = trial.read()
-        except BadReply:  # asked too slowly to be sure of an axis at this speed: the next may be
+        except BadReply:  # read too seldom to be sure of an axis at this speed: the next may be
             if trial.clock.now_s() > began_s + SETTLES_WITHIN_S:
                 raise
             continue
@@ -295,7 +295,7 @@ def test_not_a_number(head: HeadTrial) -> None:
         _refused(head, (pan, tilt), speed, "at no speed")
 
 
-def _refused(trial: HeadTrial, goal: Angles, speed_rad_per_s: float, words: str) -> None:
+def _refused(trial: HeadTrial, goal: Angles, speed_rad_per_s: float, message: str) -> None:
     """Send the head where it cannot go: a DriverError, and nothing moves."""
     before = trial.settled()
     what = f"move({goal[0]!r}, {goal[1]!r}, {speed_rad_per_s!r})"
@@ -305,7 +305,7 @@ def _refused(trial: HeadTrial, goal: Angles, speed_rad_per_s: float, words: str)
         expect("\n" not in str(error), f"{what}: {str(error)!r} is not one sentence")
     else:
         trial.stop()
-        raise PromiseBroken(f"{what}, a goal {words}, was not refused")
+        raise PromiseBroken(f"{what}, a goal {message}, was not refused")
     trial.clock.sleep(0.05)
     after = trial.read()
     expect(
@@ -341,11 +341,11 @@ def test_close(head: HeadTrial) -> None:
     head.sent(head.goal(-0.9, -0.9))
     goal = head.goal(0.9, 0.9)
     head.on_its_way(goal)
-    for words in ("close()", "a second close()"):
+    for call in ("close()", "a second close()"):
         try:
-            head.worker.call(words, head.head.close)
+            head.worker.call(call, head.head.close)
         except DriverError as error:
-            raise PromiseBroken(f"{words} raised {type(error).__name__}: {error}") from None
+            raise PromiseBroken(f"{call} raised {type(error).__name__}: {error}") from None
     with suppress(DriverError):
         head.worker.call("read() of a closed head", head.head.read)
         raise PromiseBroken("a closed head gave a reading")
