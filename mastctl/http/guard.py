@@ -109,8 +109,7 @@ class Guard:
                 self._let_in(scope, headers)
                 if changes(scope) and scope["path"] != TRACK_STOP:
                     body = await whole_body(receive, headers)
-                    scope["state"]["json"] = read_json(body, headers)
-                    receive = once(body, receive)
+                    scope["state"] |= {"body": body, "json": read_json(body, headers)}
             await self._app(scope, receive, send_marked)
         except (GuardError, MastctlError) as refused:
             if not started:
@@ -280,20 +279,6 @@ def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
             raise ValueError(f"the key '{key[:60]}' is there twice")
         found[key] = value
     return found
-
-
-def once(body: bytes, receive: Receive) -> Receive:
-    """Give the body that was read already, then whatever comes."""
-    given = False
-
-    async def again() -> Message:
-        nonlocal given
-        if not given:
-            given = True
-            return {"type": "http.request", "body": body, "more_body": False}
-        return await receive()
-
-    return again
 
 
 def _stop_scope(scope: Scope) -> Scope:

@@ -73,6 +73,9 @@ def create_app(
 class _Read(Request):
     """A request whose body the guard has read."""
 
+    async def body(self) -> bytes:
+        return bytes(self.scope["state"].get("body", b""))
+
     async def json(self) -> Any:
         return self.scope["state"]["json"]
 
