@@ -1,12 +1,22 @@
-"""The options of a driver, and the settings of a simulation, as a configuration gives them: read strictly."""
+"""The options of a driver, and the settings of a simulation, as a configuration gives them: read strictly.
+
+The options of a camera's driver are a `DriverOptions`: its fields state keys, types, bounds, defaults and
+descriptions once, for the check, the sentence of a refusal and the JSON Schema (`calib.files.records`).
+"""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
-from dataclasses import fields, is_dataclass, replace
-from typing import Any, TypeGuard
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, TypeGuard, TypeVar
 
+from pydantic import AfterValidator, ConfigDict
+from pydantic_core import CoreSchema
+from pydantic_core.core_schema import no_info_plain_validator_function
+
+from calib.errors import BadFile
+from calib.files.records import Record, problem, read_record
 from drivers.errors import BadOptions
 from drivers.faults import nearest
 
@@ -23,6 +33,75 @@ def is_number(value: object) -> TypeGuard[int | float]:
 def is_whole(value: object) -> TypeGuard[int]:
     """Return whether a value is a whole number and not a truth value."""
     return isinstance(value, int) and not isinstance(value, bool)
+
+
+class DriverOptions(Record):
+    """The options of one driver; a key that is left out or null has its default."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+
+D = TypeVar("D", bound=DriverOptions)
+
+
+def read_options(kind: type[D], options: Mapping[str, Any], device: str = "") -> D:
+    """Return a driver's options. Raises BadOptions with the place, the value and what would be right."""
+    try:
+        return read_record(kind, dict(options), "")
+    except BadFile as error:
+        place = f"options.{error.place}" if error.place else "options"
+        raise BadOptions(f"{place}: {error.reason}", device=device) from None
+
+
+def one_of(known: Iterable[str]) -> AfterValidator:
+    """Return what passes the names that a driver knows, and refuses another with the nearest of them."""
+
+    def check(name: str) -> str:
+        if name not in known:
+            raise problem("", f"{name!r}, which this driver does not read{nearest(name, known)}")
+        return name
+
+    return AfterValidator(check)
+
+
+def named_values(is_name: Callable[[str], bool], kinds: tuple[type, ...], expected: str) -> Any:
+    """Return what annotates a mapping of names to values of a few kinds."""
+
+    def check(values: dict[str, Any]) -> dict[str, Any]:
+        for name, value in values.items():
+            if not is_name(name) or not isinstance(value, kinds) or value != value:
+                raise problem(name, f"{value!r}, expected {expected}")
+        return values
+
+    return AfterValidator(check)
+
+
+@dataclass(frozen=True)
+class TwoWholes:
+    """Annotates a pair of whole numbers within bounds, such as a picture's size."""
+
+    low: int
+    high: int
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
+        return no_info_plain_validator_function(self._check)
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        items = {"type": "integer", "minimum": self.low, "maximum": self.high}
+        return {"type": "array", "minItems": 2, "maxItems": 2, "items": items}
+
+    def _check(self, value: Any) -> tuple[int, int]:
+        two = list(value) if isinstance(value, list | tuple) else []
+        if len(two) != 2 or not all(is_whole(one) and self.low <= one <= self.high for one in two):
+            raise problem("", f"{value!r}, expected two whole numbers from {self.low} to {self.high}")
+        return two[0], two[1]
+
+
+def check_in_frame(key: str, exposure_s: float | None, rate_hz: float | None) -> None:
+    """Refuse, in a validator, an exposure time for which a camera would have to stretch its frames."""
+    if exposure_s is not None and rate_hz is not None and exposure_s > 1 / rate_hz:
+        words = f"{exposure_s:g} s, longer than a frame at rate_hz {rate_hz:g} ({1 / rate_hz:.4g} s)"
+        raise problem(key, f"{words}; a shorter one, or a lower rate, is expected")
 
 
 class OptionReader:
@@ -122,15 +201,6 @@ class OptionReader:
         if isinstance(value, bool) or value not in allowed:
             raise self.bad(key, between.join(str(one) for one in allowed))
         return allowed[allowed.index(value)]  # 1 for 1.0
-
-    def check_in_frame(self, key: str, exposure_s: float | None, rate_hz: float | None) -> None:
-        """Refuse an exposure time for which a camera would have to stretch its frames. Raises BadOptions."""
-        if exposure_s is not None and rate_hz is not None and exposure_s > 1 / rate_hz:
-            raise self.refused(
-                key,
-                f" is {exposure_s:g} s, longer than a frame at rate_hz {rate_hz:g} ({1 / rate_hz:.4g} s); "
-                "a shorter one, or a lower rate, is expected",
-            )
 
     def pair(self, key: str, expected: str) -> tuple[float, float]:
         """Return two numbers."""

@@ -4,66 +4,75 @@ from __future__ import annotations
 
 import ipaddress
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from drivers.faults import nearest
-from drivers.options import OptionReader, is_number
+from pydantic import AfterValidator, ConfigDict, Field, WithJsonSchema, model_validator
+
+from calib.files.records import Text, problem
+from drivers.options import DriverOptions, TwoWholes, check_in_frame, named_values, one_of, read_options
 from drivers.pixels import GENICAM
 
-OPTIONS = (
-    "serial", "address", "id", "format", "size_px", "offset_px", "rate_hz", "colour", "features",
-    "exposure_s", "gain", "trigger_source", "trigger", "stamp", "margin_s", "buffers",
-)  # fmt: skip
 Stamped = Literal["start", "end", "either"]
+FEATURES = named_values(
+    str.isidentifier, (int, float, str), "the GenICam name of a feature with a number, text, true or false"
+)
 
 
-@dataclass(frozen=True)
-class AravisOptions:
-    """How one camera is to be opened.
+def _address(text: str) -> str:
+    try:
+        return str(ipaddress.IPv4Address(text))
+    except ValueError:
+        raise problem("", f"{text!r}, expected an IPv4 address, such as 192.168.0.20") from None
 
-    Attributes
-    ----------
-    serial, address, id
-        Which camera: by its serial number, its IP address (GigE Vision) or the name that Aravis lists.
-    format, size_px, offset_px, rate_hz
-        Requested of it; a rate of None (null) stays as it is. The answer is checked against them.
-    colour
-        Whether frames are BGR; grey otherwise.
-    features
-        The camera's own features by their GenICam names, set in this order before all else.
-    exposure_s, gain
-        Fixed exposure time, and gain in the camera's own unit, each with its automatic turned off; None
-        leaves it alone.
-    trigger_source
-        Empty: free-running. Else the input line whose rising edge exposes a frame, by its GenICam name.
-    trigger
-        The name of the hardware trigger that exposes it, the same for all cameras on it; empty: none.
-    stamp
-        Whether the camera stamps the start or the end of an exposure; either: it is not known.
-    margin_s
-        How much later than the end of its exposure the first packet of a frame may come at best, seconds: for
-        cameras whose clock cannot be read.
-    buffers
-        How many frames may lie here while this process is held up.
-    """
 
-    serial: str = ""
-    address: str = ""
-    id: str = ""
-    format: str = "Mono8"
-    size_px: tuple[int, int] = (640, 480)
-    offset_px: tuple[int, int] = (0, 0)
-    rate_hz: float | None = 30.0
+def _input(text: str) -> str:
+    if text == "Software":
+        raise problem("", f"{text!r}, expected an input line, such as Line1: a request exposes no frame")
+    return text
+
+
+class AravisOptions(DriverOptions):
+    """How one camera is to be opened."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "if": {"not": {"anyOf": [{"required": [key]} for key in ("serial", "address", "id")]}},
+            "then": False,
+        }
+    )
+
+    serial: Text = ""
+    """The camera's serial number, as mastctl camera list shows it."""
+    address: Annotated[Text, AfterValidator(_address)] = ""
+    """Of a GigE Vision camera: opened without a search."""
+    id: Text = ""
+    """The name that Aravis lists: maker, model, serial number."""
+    format: Annotated[Text, one_of(GENICAM), WithJsonSchema({"enum": sorted(GENICAM)})] = "Mono8"
+    """By GenICam's name; requested of the camera, whose answer is checked."""
+    size_px: Annotated[tuple[int, int], TwoWholes(1, 32768)] = (640, 480)
+    """As in the mast file."""
+    offset_px: Annotated[tuple[int, int], TwoWholes(0, 32768)] = (0, 0)
+    """Where the picture begins on the sensor."""
+    rate_hz: Annotated[float, Field(ge=0.1, le=1000.0)] | None = 30.0
+    """Frames per second; null leaves the camera's; not beside trigger_source."""
     colour: bool = False
-    features: Mapping[str, Any] = field(default_factory=dict)
-    exposure_s: float | None = None
-    gain: float | None = None
-    trigger_source: str = ""
-    trigger: str = ""
+    """Frames in color; without it they are grey."""
+    features: Annotated[dict[str, Any], FEATURES] = {}  # noqa: RUF012  frozen
+    """The camera's own features by their GenICam names, set in this order before all else."""
+    exposure_s: Annotated[float, Field(ge=1e-6, le=10.0)] | None = None
+    """Fixed exposure time, the camera's automatic off."""
+    gain: Annotated[float, Field(ge=-1000.0, le=1e6)] | None = None
+    """Fixed, its automatic off; dB in most cameras."""
+    trigger_source: Annotated[Text, AfterValidator(_input)] = ""
+    """The input line whose rising edge exposes a frame, by its GenICam name; left out: free-running."""
+    trigger: Text = ""
+    """A name, the same for all cameras that one hardware trigger exposes: they are paired by count."""
     stamp: Stamped = "either"
-    margin_s: float = 0.01
-    buffers: int = 8
+    """The moment of an exposure that the camera stamps; either: it is not known."""
+    margin_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.01
+    """How late after the exposure's end the first packet comes at best; for a clock that cannot be read."""
+    buffers: Annotated[int, Field(ge=3, le=64)] = 8
+    """Frames that Aravis holds while this process is delayed."""
 
     @property
     def free_running(self) -> bool:
@@ -76,71 +85,21 @@ class AravisOptions:
         named = (("serial number", self.serial), ("address", self.address), ("id", self.id))
         return " and ".join(f"{what} {value}" for what, value in named if value)
 
+    @model_validator(mode="after")
+    def _check(self) -> AravisOptions:
+        if not (self.serial or self.address or self.id):
+            raise problem("", "serial, address or id is expected: which camera it is")
+        if self.trigger_source and "rate_hz" in self.model_fields_set and self.rate_hz is not None:
+            raise problem("rate_hz", "stands beside trigger_source; a triggered camera has no rate")
+        if self.trigger_source:
+            object.__setattr__(self, "rate_hz", None)
+        check_in_frame("exposure_s", self.exposure_s, self.rate_hz)
+        return self
+
 
 def parse_options(options: Mapping[str, Any], name: str) -> AravisOptions:
     """Read a camera's options.
 
     Raises BadOptions naming the camera, the option, its value and what is expected.
     """
-    read = OptionReader(options, OPTIONS, device=name)
-    usual = AravisOptions()
-    serial, address, identity = (read.text(key, "a text", "") for key in ("serial", "address", "id"))
-    if not (serial or address or identity):
-        raise read.refused("serial", ", address or id is expected: which camera it is")
-    if address:
-        _check_address(read, address)
-    code = read.text("format", "a text", usual.format)
-    if code not in GENICAM:
-        raise read.refused("format", f" is {code!r}, which this driver does not read{nearest(code, GENICAM)}")
-    rate_hz = None
-    source = read.text("trigger_source", "a text", usual.trigger_source)
-    if source == "Software":
-        raise read.bad("trigger_source", "an input line, such as Line1: a request exposes no frame")
-    if options.get("rate_hz", 0) is not None and not source:
-        rate_hz = read.number("rate_hz", usual.rate_hz, 0.1, 1000.0)
-    elif source and options.get("rate_hz") is not None:
-        raise read.refused(
-            "rate_hz", " stands beside trigger_source; a triggered camera has no rate of its own"
-        )
-    exposure_s = read.number("exposure_s", None, 1e-6, 10.0)
-    read.check_in_frame("exposure_s", exposure_s, rate_hz)
-    stamp: Stamped = read.one_of("stamp", usual.stamp, ("start", "end", "either"))
-    return AravisOptions(
-        serial=serial,
-        address=address,
-        id=identity,
-        format=code,
-        size_px=read.wholes("size_px", 2, 1, 32768) or usual.size_px,
-        offset_px=read.wholes("offset_px", 2, 0, 32768) or usual.offset_px,
-        rate_hz=rate_hz,
-        colour=read.flag("colour", usual.colour),
-        features=_features(read),
-        exposure_s=exposure_s,
-        gain=read.number("gain", None, -1000.0, 1e6),
-        trigger_source=source,
-        trigger=read.text("trigger", "a text", usual.trigger),
-        stamp=stamp,
-        margin_s=read.number("margin_s", usual.margin_s, 0.0, 1.0),
-        buffers=read.whole("buffers", usual.buffers, 3, 64),
-    )
-
-
-def _check_address(read: OptionReader, address: str) -> None:
-    """Refuse what is no IP address. Raises BadOptions."""
-    try:
-        ipaddress.IPv4Address(address)
-    except ValueError:
-        raise read.bad("address", "an IPv4 address, such as 192.168.0.20") from None
-
-
-def _features(read: OptionReader) -> dict[str, Any]:
-    """The option ``features``."""
-    value = read.values.get("features", {})
-    if not isinstance(value, Mapping) or not all(
-        isinstance(name, str)
-        and name.isidentifier()
-        and (is_number(setting) or isinstance(setting, str | bool))
-        for name, setting in value.items()
-    ):
-        raise read.bad("features", "GenICam names with numbers, texts, true or false")
-    return dict(value)
+    return read_options(AravisOptions, options, name)

@@ -8,12 +8,16 @@ have the same exposure; it looks at the brightest of them.
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
+from calib.files.records import Text
 from drivers.errors import BadOptions
 from drivers.interfaces import Image
+from drivers.options import DriverOptions
 
 PERCENTILE, TARGET, TOLERANCE = 95.0, 180.0, 25.0
 """The percentile of the grey levels is brought to the target, and left alone within the tolerance of it (the
@@ -23,21 +27,18 @@ PATIENCE = 6  # so many looks of one camera without one of the others: that one 
 MOST_STEP = 4.0  # no change by more than this factor at once: levels far from the target tell little
 
 
-@dataclass(frozen=True)
-class AutoExposureSettings:
-    """What the automatic exposure aims at.
+Seconds = Annotated[float, Field(ge=1e-5, le=10.0)]
 
-    Attributes
-    ----------
-    group
-        Cameras of one name share their exposure; empty for a camera by itself.
-    shortest_s, longest_s
-        Bounds of the exposure time, seconds.
-    """
 
-    group: str = ""
-    shortest_s: float = 1e-4
-    longest_s: float = 0.03
+class AutoExposureSettings(DriverOptions):
+    """What the automatic exposure aims at."""
+
+    group: Text = ""
+    """Cameras of one name share their exposure."""
+    shortest_s: Seconds = 1e-4
+    """Shortest exposure."""
+    longest_s: Seconds = 0.03
+    """Longest exposure; a frame at most."""
 
 
 def level(image: Image, percentile: float) -> float:
@@ -176,7 +177,7 @@ class _Groups:
 
 def _check_same(camera: str, group: _Group, settings: AutoExposureSettings, exposure_s: float) -> None:
     """Refuse settings that differ from a group's. Raises BadOptions."""
-    options = [(f"auto_exposure.{f.name}", f.name) for f in fields(AutoExposureSettings) if f.name != "group"]
+    options = [(f"auto_exposure.{name}", name) for name in ("shortest_s", "longest_s")]
     here = {option: getattr(settings, name) for option, name in options} | {"exposure_s": exposure_s}
     there = {option: getattr(group.settings, name) for option, name in options}
     for option, value in (there | {"exposure_s": group.exposure_s}).items():

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from drivers.clock import Clock
 from drivers.errors import BadSetting
@@ -177,10 +177,5 @@ def change(
 def with_settings(options: CameraOptions, became: Mapping[str, float]) -> CameraOptions:
     """Return the options that open the camera as it is now."""
     whole = {name: round(value) for name, value in became.items() if name != EXPOSURE.name}
-    return replace(
-        options,
-        exposure_s=became.get(EXPOSURE.name, options.exposure_s),
-        gain=whole.get("gain", options.gain),
-        white_balance_k=whole.get("white_balance_k", options.white_balance_k),
-        focus=whole.get("focus", options.focus),
-    )
+    exposure_s = became.get(EXPOSURE.name, options.exposure_s)
+    return options.model_copy(update={**whole, EXPOSURE.name: exposure_s})

@@ -17,13 +17,13 @@ from calib.files.records import schema_of
 from calib.files.yaml_text import parse_mapping
 from calib.survey.reader import SurveyRecord
 from calib.targets.board_file import BoardFileRecord
-from drivers.aravis import options as aravis
+from drivers.aravis.options import AravisOptions
 from drivers.dynamixel.settings import dynamixel_settings
 from drivers.errors import BadOptions
 from drivers.feetech.head import feetech_settings
 from drivers.flir_ptu import options as flir_ptu
 from drivers.options import OptionReader
-from drivers.v4l2 import options as v4l2
+from drivers.v4l2.options import CameraOptions
 from hil_tests.calib.files import test_store
 from hil_tests.calib.survey import test_survey
 from hil_tests.calib.survey.survey_case import FILES as FILES_OF_A_SURVEY
@@ -110,7 +110,6 @@ X = {**AXIS, "model": "XM430-W350", "current_limit_A": 1.0}
 STS = {**AXIS, "model": "STS3215"}
 TURNED = {"limits_rad": [-0.5, 0.5]}
 PORT = {"port": "/dev/x"}
-V4L2 = {"device": "/dev/v4l/by-id/x", "exposure_s": 0.01, "auto_exposure": {}}
 OPTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "dynamixel": (dynamixel_settings, {**PORT, "pan": X, "tilt": {**X, "id": 2}}),
     "feetech": (feetech_settings, {**PORT, "pan": STS, "tilt": {**STS, "id": 2}}),
@@ -118,10 +117,10 @@ OPTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         flir_ptu.options_from,
         {**PORT, "pan": TURNED, "tilt": TURNED},
     ),
-    "v4l2": (lambda options: v4l2.parse_options(options, "cam"), V4L2),
-    "aravis": (lambda options: aravis.parse_options(options, "cam"), {"serial": "1", "exposure_s": 0.01}),
 }
-"""How each driver of ours reads its options, and options that it reads."""
+"""How each driver of heads reads its options, and options that it reads."""
+OF_DRIVERS: dict[str, type[BaseModel]] = {"v4l2": CameraOptions, "aravis": AravisOptions}
+"""Records of the options of cameras' drivers."""
 
 BY_MODEL = ("pan.settle_rad", "tilt.settle_rad", "pan.current_limit_A", "tilt.current_limit_A")
 """Bounds that depend on the servo's model: the schema has the widest."""
@@ -151,6 +150,12 @@ def changed(options: dict[str, Any], path: str, value: object) -> dict[str, Any]
     """The options with another value at a path."""
     key, _, rest = path.partition(".")
     return {**options, key: changed(options[key], rest, value) if rest else value}
+
+
+@pytest.mark.parametrize("driver", OF_DRIVERS)
+def test_a_drivers_schema_is_that_of_the_record_that_reads_its_options(driver: str) -> None:
+    stated = schema_of(OF_DRIVERS[driver], "")
+    assert options_schema(driver) == {k: stated[k] for k in stated if k not in ("$schema", "title")}
 
 
 @pytest.mark.parametrize("driver", OPTIONS)

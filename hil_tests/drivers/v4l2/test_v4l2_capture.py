@@ -369,17 +369,17 @@ def test_a_given_frame_does_not_change_with_its_buffer(bench: Bench, camera: V4l
     [
         ({}, "'device', 'card' or 'bus' is expected"),
         ({"device": "/dev/video0"}, "/dev/video0 is a number that changes when cameras are plugged in"),
-        ({"device": "/dev/v4l/by-id/a", "card": "b"}, "options.device stands beside card or bus"),
-        ({"card": "a", "format": "H264"}, "options.format is 'H264', which this driver does not read"),
+        ({"device": "/dev/v4l/by-id/a", "card": "b"}, "options.device: stands beside card or bus"),
+        ({"card": "a", "format": "H264"}, "options.format: 'H264', which this driver does not read"),
         (
             {"card": "a", "size_px": [640]},
-            r"options.size_px is \[640\], expected 2 whole numbers from 1 to 16384",
+            r"options.size_px: \[640\], expected two whole numbers from 1 to 16384",
         ),
-        ({"card": "a", "rate_hz": float("nan")}, "options.rate_hz is nan"),
-        ({"card": "a", "buffers": 1}, "options.buffers is 1, expected a whole number from 3 to 32"),
+        ({"card": "a", "rate_hz": float("nan")}, "options.rate_hz: nan where"),
+        ({"card": "a", "buffers": 1}, "options.buffers: 1 where an integer from 3 to 32 is expected"),
         (
             {"card": "a", "auto_exposure": {"shortest_s": 0.1}, "exposure_s": 0.01},
-            "options.auto_exposure.shortest_s is 0.1 s, expected less than longest_s",
+            "options.auto_exposure.shortest_s: 0.1 s, expected less than longest_s",
         ),
     ],
 )
