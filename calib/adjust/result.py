@@ -73,6 +73,16 @@ class Degenerate:
     sentence: str
 
 
+class CheckExpected(NamedTuple):
+    """What a camera's check images are off by, rms per axis, pixels; what they should be, and the most that
+    chance allows; and the chance of more than they are."""
+
+    seen_px: float
+    expected_px: float
+    most_px: float
+    chance: float
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FittedRig:
     """A fitted rig and what is needed to judge it, whatever it was fitted to.
@@ -103,6 +113,8 @@ class FittedRig:
     components
         How large the errors of each kind of measurement are, against its stated sigma; empty where the method
         does not weigh by them. The covariance is by what they were.
+    checks
+        Camera to what its check images are off by, and how likely it is that they are off by more.
     rover_from_board
         Poses by set-up, or board, and placement.
     seconds
@@ -123,6 +135,7 @@ class FittedRig:
     degrees_of_freedom: float
     chi2_probability: float
     components: tuple[Component, ...] = ()
+    checks: Mapping[str, CheckExpected]
     rover_from_board: Mapping[tuple[str, str], Rigid]
     seconds: float
 
@@ -169,15 +182,6 @@ class Calibration(FittedRig):
     unseen_clicks: tuple[Click, ...] = ()
 
 
-class CheckExpected(NamedTuple):
-    """What a camera's check images should be off by, rms per axis, pixels: expected, and the most that chance
-    allows; and the chance of more than they are."""
-
-    rms_px: float
-    most_px: float
-    chance: float
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BenchCalibration(FittedRig):
     """A rig fitted to pictures of boards that stood anywhere.
@@ -186,8 +190,6 @@ class BenchCalibration(FittedRig):
     ----------
     terms
         Every term that could have entered.
-    checks
-        Camera to what check images should be off by, and how likely it is that they are off by more.
     gauges
         Quantities that pictures cannot determine, and how they were fixed, a sentence each.
     placements
@@ -203,7 +205,6 @@ class BenchCalibration(FittedRig):
     """
 
     terms: tuple[TermGain, ...]
-    checks: Mapping[str, CheckExpected]
     gauges: tuple[str, ...]
     placements: tuple[LeftOutBoard, ...]
     drifts: tuple[Finding, ...]

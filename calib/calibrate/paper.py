@@ -23,6 +23,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
+from calib.adjust.checks import checked, expected_checks
 from calib.adjust.outliers import Outlier
 from calib.adjust.result import Calibration, ImageResiduals
 from calib.adjust.solver import covariance_of, minimise
@@ -33,6 +34,7 @@ from calib.calibrate.starts.mast import References
 from calib.calibrate.starts.survey import Start, mast_fit, start_values
 from calib.geometry.rig import mast_of
 from calib.geometry.rigid import FloatArray
+from calib.geometry.significance import Level
 from calib.survey.records import Survey
 
 SAME_SETTING_RAD = 1e-9
@@ -67,17 +69,16 @@ def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
         prism_cad_m=survey.sigma.prism_cad_m,
         joint_rad=survey.sigma.joint_rad,
     )
-    covariance, mast_alone = two_step_covariance(problem, state, start.references, start.camera_images)
+    whole, mast_alone = two_step_covariance(problem, state, start.references, start.camera_images)
     images = image_residuals(survey, problem, state, start.images, start.checks)
     in_sigmas = [
         np.sum((i.residuals_px[i.used] / i.sigma_px[i.used, None]) ** 2) for i in images if i.used.any()
     ]
     count = sum(2 * int(i.used.sum()) for i in images)
-    place = {number: i for i, number in enumerate(problem.unknowns.of_kinds("camera", "mast").tolist())}
-    order = [place[number] for number in problem.unknowns.of_kinds("mast", "camera").tolist()]
-    covariance, notes = covariance[np.ix_(order, order)], (*start.notes, *_bent_notes(start))
+    order, notes = problem.unknowns.of_kinds("mast", "camera"), (*start.notes, *_bent_notes(start))
     return Calibration(
-        **surveyed_fields(survey, problem, state, covariance, images, notes),
+        **surveyed_fields(survey, problem, state, whole[np.ix_(order, order)], images, notes),
+        checks=expected_checks(problem, state, whole, start.checks, checked(images), Level.STATED),
         method="paper",
         mast_parameters=mast_parameters,
         outliers=(*start.poses.blunders, *_left_out(images, start), *start.wrong),
@@ -120,7 +121,7 @@ def _cameras_by_mast(start: Start, mast_parameters: int) -> Start:
 def two_step_covariance(
     problem: Adjustment, state: Estimate, references: References, camera_images: frozenset[str]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance of cameras (head or rover) and mast: all of it, and for noise of dots alone."""
+    """Return the covariance of all unknowns, and that of cameras and mast for noise of dots alone."""
     total = len(problem.names)
     first, second, station = np.zeros((total, total)), np.zeros((total, total)), np.diag(problem.weak)
     for what, block in problem.blocks(state):
@@ -143,10 +144,14 @@ def two_step_covariance(
     dots = follow @ by_dots_k @ follow.T
     dots[len(k) :, len(k) :] += by_dots_m
     by_s = np.concatenate([k_by_s, m_by_s])
-    of_station = by_s @ covariance_of(station[np.ix_(s, s)]) @ by_s.T
-    rig = np.concatenate([k, m])
+    of_station = covariance_of(station[np.ix_(s, s)])
+    rig, errors = np.concatenate([k, m]), np.zeros((total, total))
+    errors[np.ix_(rig, rig)] = dots + by_s @ of_station @ by_s.T
+    errors[np.ix_(rig, s)] = by_s @ of_station
+    errors[np.ix_(s, rig)] = errors[np.ix_(rig, s)].T
+    errors[np.ix_(s, s)] = of_station
     to_head = rates[np.ix_(rig, rig)]
-    return to_head @ (dots + of_station) @ to_head.T, to_head @ dots @ to_head.T
+    return rates @ errors @ rates.T, to_head @ dots @ to_head.T
 
 
 def _bent_notes(start: Start) -> list[str]:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calib.adjust.adjustment import HUBER, SCAN_HUBER, Adjustment
+from calib.adjust.checks import checked, expected_checks
 from calib.adjust.goodness import goodness
 from calib.adjust.gross import GROSS, chance_limit
 from calib.adjust.hypotheses import Finding, explaining, find_change, survey_findings
@@ -21,7 +22,7 @@ from calib.adjust.result import Calibration
 from calib.adjust.robust import Cleaned, SurveyNotFitted, Weighed, weigh, without_blunders
 from calib.adjust.scatter import own_scales
 from calib.adjust.solver import minimise
-from calib.adjust.terms import with_kept
+from calib.adjust.terms import scattered_images, widened_images, with_kept
 from calib.adjust.uncertainty import image_residuals, surveyed_fields
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.refusals import refuse_far, refuse_unsettled
@@ -157,16 +158,19 @@ def _calibration(
         mine = mine * chi_square / freedom
     stated = cleaned.as_stated()
     notes += _prism_notes(stated[0], stated[1].state, mast_parameters)
-    scatter = {t.name: t.scatter for t in weighed.images} | own_scales(
-        problem, state, start.checks, weighed.factors, survey.sigma.dot_px
-    )
+    own = own_scales(problem, state, start.checks, weighed.factors, survey.sigma.dot_px)
+    checks = scattered_images(start.checks, own)
+    scatter = {t.name: t.scatter for t in (*weighed.images, *checks)}
     images = image_residuals(survey, problem, state, start.images, start.checks, scatter)
     judged = weighed.judged_fields(stated)
-    checks = tuple(f"image {t.name} dot " for t in start.checks)
-    judged["outliers"] += tuple(o for o in start.wrong if o.name.startswith(checks))
+    of_checks = tuple(f"image {t.name} dot " for t in start.checks)
+    judged["outliers"] += tuple(o for o in start.wrong if o.name.startswith(of_checks))
     return Calibration(
         **surveyed_fields(survey, problem, state, mine, images, notes),
         **judged,
+        checks=expected_checks(
+            problem, state, covariance, widened_images(checks, weighed.factors), checked(images), Level.STATED
+        ),
         method="joint",
         mast_parameters=mast_parameters,
         wider=(*_left_out_for(change), *_wider(cleaned, weighed)),

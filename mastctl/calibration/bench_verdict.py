@@ -141,9 +141,7 @@ def _checks(calibration: BenchCalibration) -> Iterator[Reason]:
             yield Reason("bad", words)
     if not (calibration.check_rms_px or any(lost.values())):
         yield Reason("care", "there is no check picture: nothing shows how well the result predicts")
-    for camera, xy in calibration.check_rms_px.items():
-        expected, most, _ = calibration.checks[camera]
-        seen = float(np.sqrt(np.mean(np.square(xy))))
+    for camera, (seen, expected, most, _) in calibration.checks.items():
         yield Reason(
             "good" if seen <= most else "bad",
             f"check pictures of {camera} are off by {seen:.2f} px rms an axis where {expected:.2f} are "

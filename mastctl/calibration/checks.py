@@ -1,115 +1,13 @@
-"""What images that were not fitted say: how far off a survey's own noise lets them be, and which board they
-show."""
+"""Which board an image shows that contradicts the one that it names."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
 
 from calib.adjust.result import Calibration, ImageResiduals
-from calib.adjust.terms import DOTS_OF, JOINTS, PRISMS, TAPES
-from calib.adjust.uncertainty import pixel_covariance
-from calib.geometry.rigid import FloatArray, rigid_rates
-from calib.geometry.significance import Level
-from calib.survey.alignment import Alignment, NotAligned, rover_from_station, station_from_board
 from calib.survey.records import Survey
-
-
-class CheckSize(NamedTuple):
-    """Rms per axis of what was seen, and of what noise and the covariance of the fit make of it; pixels.
-
-    ``limit_px`` is passed once in a thousand times, if the sigmas are right; ``chance`` is that of more than
-    was seen.
-    """
-
-    seen_px: float
-    expected_px: float
-    limit_px: float
-    chance: float
-
-
-def check_sizes(survey: Survey, calibration: Calibration) -> dict[str, CheckSize]:
-    """Return by camera how large the residuals of its check images are, and what would explain them.
-
-    Their boards stand as the station measured them, and one board's error moves all its dots together: a
-    board counts as two measurements, not as two hundred, and the near ones, which move most, for most of
-    all (Satterthwaite's degrees of freedom).
-    """
-    try:
-        setups = rover_from_station(_with_station(survey, calibration.widened(PRISMS)))
-        boards = station_from_board(_with_station(survey, calibration.widened(TAPES)))
-    except NotAligned:
-        return {}
-    squares: dict[str, list[tuple[float, float]]] = {}
-    for image in calibration.images:
-        key = (image.setup, image.placement)
-        known = key in boards and image.setup in setups
-        if image.purpose == "check" and known and np.isfinite(image.residuals_px).all():
-            seen = float(np.mean(image.residuals_px**2))
-            expected = _expected_px2(survey, calibration, image, setups[image.setup], boards[key])
-            squares.setdefault(image.camera, []).append((seen, expected))
-    sizes = {}
-    for camera, pairs in squares.items():
-        seen, expected = np.sqrt(np.mean(pairs, axis=0))
-        each = np.array([part for _, part in pairs])
-        freedom = 2 * each.sum() ** 2 / np.sum(each**2)
-        limit = expected * np.sqrt(chdtri(freedom, float(Level.STATED)) / freedom)
-        rarer = float(chdtrc(freedom, freedom * (seen / expected) ** 2))
-        sizes[camera] = CheckSize(float(seen), float(expected), float(limit), rarer)
-    return sizes
-
-
-def _with_station(survey: Survey, factor: float) -> Survey:
-    """The survey with the station's sigma as the fit takes it."""
-    return replace(survey, sigma=replace(survey.sigma, station_m=factor * survey.sigma.station_m))
-
-
-def _expected_px2(
-    survey: Survey, calibration: Calibration, image: ImageResiduals, setup: Alignment, board: Alignment
-) -> float:
-    """Mean square per axis that dots, tapes and the fit's covariance explain.
-
-    What prisms got wrong turns and shifts rig and board together and shows in no residual: it is taken out
-    of the fit's covariance again.
-    """
-    pan, tilt = image.pan_rad or 0.0, image.tilt_rad or 0.0
-    in_board = survey.board.dots_in_board_m(image.rows, image.columns)
-    points = calibration.rover_from_board[image.setup, image.placement].points(in_board)
-    model = calibration.rig.camera_in_rover(image.camera, pan, tilt)
-    _, rates, _ = model.project_jacobian(points)
-    in_station = rigid_rates(rates @ setup.b_from_a.rotation, board.b_from_a.vectors(in_board), np.zeros(3))
-    by_board = np.einsum("nip,pq,niq->ni", in_station, board.covariance, in_station)
-    in_rover = rigid_rates(rates, points, setup.b_from_a.translation_m)
-    common = np.einsum("nip,pq,niq->ni", in_rover, setup.covariance, in_rover)
-    _, by_fit = pixel_covariance(calibration, image.camera, pan, tilt, points)
-    dots = calibration.widened(DOTS_OF + image.camera) * image.scatter
-    by_joints = _by_joints_px2(calibration, image, points, survey.sigma.joint_rad)
-    relative = np.maximum(np.einsum("nii->ni", by_fit) - common, 0.0)
-    return float(np.nanmean(by_board + relative + by_joints + (dots * image.sigma_px[:, None]) ** 2))
-
-
-def _by_joints_px2(
-    calibration: Calibration, image: ImageResiduals, points_m: FloatArray, joint_rad: float
-) -> FloatArray:
-    """Variances (n, 2) that errors of a check image's own joint readings make: it has no part in the fit."""
-    found = np.zeros((len(points_m), 2))
-    if image.pan_rad is None or image.tilt_rad is None or joint_rad == 0.0:
-        return found
-    sigma_rad = calibration.widened(JOINTS) * joint_rad
-    for pan, tilt in ((sigma_rad, 0.0), (0.0, sigma_rad)):
-        ends = [
-            calibration.rig.camera_in_rover(
-                image.camera, image.pan_rad + sign * pan, image.tilt_rad + sign * tilt
-            ).project(points_m)[0]
-            for sign in (1, -1)
-        ]
-        found += ((ends[0] - ends[1]) / 2) ** 2
-    return found
-
 
 CLOSER = 0.1
 """Another board is the one that is shown if it fits the image so many times better than its own."""

@@ -17,7 +17,7 @@ from calib.adjust.uncertainty import pointing_covariance
 from calib.errors import CalibError
 from calib.geometry.significance import Level
 from calib.survey.records import Survey, SurveyFinding
-from mastctl.calibration.checks import check_sizes, exchanged_boards
+from mastctl.calibration.checks import exchanged_boards
 from mastctl.calibration.tested import allowed, cross_validation_px, wrong_sentence
 
 Grade = Literal["good", "care", "bad"]
@@ -113,7 +113,7 @@ def judge_calibration(
         *_by_the_others(calibration),
         *_jointly(survey, jointly),
         *_odd_images(calibration),
-        *_checks(survey, calibration),
+        *_checks(calibration),
         *_open(calibration),
         *_turned(calibration),
         *_pointing(calibration),
@@ -302,7 +302,7 @@ def _odd_images(calibration: Calibration) -> list[Reason]:
     return reasons
 
 
-def _checks(survey: Survey, calibration: Calibration) -> list[Reason]:
+def _checks(calibration: Calibration) -> list[Reason]:
     """Whether images that were not fitted are predicted as well as they should be."""
     reasons = [
         Reason("bad", f"check image {image.name} cannot show placement {image.placement}, which it names")
@@ -319,13 +319,13 @@ def _checks(survey: Survey, calibration: Calibration) -> list[Reason]:
     ]
     if not (calibration.check_rms_px or reasons):
         return [Reason("care", "there is no check image: nothing shows how well the result predicts")]
-    for camera, size in check_sizes(survey, calibration).items():
+    for camera, size in calibration.checks.items():
         words = (
             f"check images of {camera} are off by {size.seen_px:.2f} px rms an axis where the survey's noise "
             f"explains {size.expected_px:.2f}"
         )
-        grade: Grade = "good" if size.seen_px <= size.limit_px else "bad"
-        reasons.append(Reason(grade, f"{words}; more than {size.limit_px:.2f} would be bad"))
+        grade: Grade = "good" if size.seen_px <= size.most_px else "bad"
+        reasons.append(Reason(grade, f"{words}; more than {size.most_px:.2f} would be bad"))
     return reasons
 
 

@@ -8,21 +8,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.adjust.adjustment import PAN_TILT, Adjustment
+from calib.adjust.adjustment import Adjustment
+from calib.adjust.checks import expected_checks
 from calib.adjust.hypotheses import find_drifts
 from calib.adjust.left_out import left_out_boards
 from calib.adjust.model_terms import TermGain, candidate_terms, choose_terms
-from calib.adjust.result import BenchCalibration, CheckExpected, ImageResiduals
+from calib.adjust.result import BenchCalibration, ImageResiduals
 from calib.adjust.robust import Weighed
 from calib.adjust.scatter import own_scales, print_error_m
 from calib.adjust.solver import Minimum
-from calib.adjust.terms import ImageTerm, scattered_images
+from calib.adjust.terms import ImageTerm, scattered_images, widened_images
 from calib.adjust.uncertainty import fitted_fields, image_residuals, rms_by_camera
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.bench.problem import BenchProblem
 from calib.calibrate.starts.wrong_dots import wrong_points
-from calib.geometry.rigid import FloatArray
-from calib.geometry.significance import Level, chance_of_sum, rare_sum
+from calib.geometry.significance import Level
 
 
 def bench_calibration(
@@ -43,7 +43,7 @@ def bench_calibration(
             )
     order_px = bench.survey.sigma.corner_px
     own = own_scales(problem, state, bench.terms.checks, weighed.factors, order_px)
-    checks = scattered_images(bench.terms.checks, own)
+    checks = widened_images(scattered_images(bench.terms.checks, own), weighed.factors)
     scatter = {t.name: t.scatter for t in (*weighed.images, *checks)}
     images = image_residuals(bench.survey, problem, state, bench.terms.images, bench.terms.checks, scatter)
     checked = _checked(images, bench.terms.checks)
@@ -54,7 +54,7 @@ def bench_calibration(
         **weighed.judged_fields(stated),
         terms=_gains(bench, chosen, tests, weighed),
         check_rms_px=rms_by_camera(checked),
-        checks=_expected(checks, weighed, checked),
+        checks=expected_checks(problem, state, covariance, checks, checked, Level.PREDICTED),
         gauges=_gauges(bench, chosen),
         placements=left_out_boards(problem, weighed.fit, covariance, kinds),
         drifts=find_drifts(problem, state),
@@ -63,57 +63,6 @@ def bench_calibration(
         bows_m=state.bows_m,
         seconds=time.perf_counter() - began,
     )
-
-
-def _expected(
-    checks: Sequence[ImageTerm], weighed: Weighed, checked: Sequence[ImageResiduals]
-) -> dict[str, CheckExpected]:
-    """By camera what check images should be off by, each by its own scatter."""
-    used = {image.name: image.used for image in checked}
-    terms = [replace(t, keep=used[t.name]) for t in checks if used[t.name].any()]
-    expected = {}
-    for camera in dict.fromkeys(t.camera for t in terms):
-        mine = [t for t in terms if t.camera == camera]
-        weights = check_weights(weighed, mine)
-        names = {t.name for t in mine}
-        square = sum(float(np.sum(i.residuals_px[i.used] ** 2)) for i in checked if i.name in names)
-        expected[camera] = CheckExpected(
-            float(np.sqrt(weights.mean())),
-            float(np.sqrt(rare_sum(Level.PREDICTED, weights) / len(weights))),
-            chance_of_sum(square, weights),
-        )
-    return expected
-
-
-def check_weights(weighed: Weighed, terms: Sequence[ImageTerm]) -> FloatArray:
-    """Return what the squares of independent unit errors count in the sum of squares of a camera's check
-    images, (m,), px²: their corners, m numbers in all, scatter as those that were fitted; all images hang on
-    one calibration and share its error; on one reading, all of one standstill.
-    """
-    problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
-    scatter = {c.kind: c.weighed for c in weighed.components}
-    exact = problem.with_huber(None).at_rest()
-    standstills = list(dict.fromkeys((t.pan_rad, t.tilt_rad, t.approach) for t in terms))
-    by_all, by_readings, own_px = [], [], []
-    for term, motions in zip(terms, exact.motions(state, terms), strict=True):
-        sigma_px = np.repeat(term.sigma_px[term.keep], 2)[:, None]
-        rates = np.zeros((len(sigma_px), len(covariance)))
-        rates[:, motions.block.columns] = sigma_px * motions.block.jacobian
-        readings = np.zeros((len(sigma_px), len(standstills), 2))
-        if term.attitude is not None and problem.joint_rad > 0:
-            at = standstills.index((term.pan_rad, term.tilt_rad, term.approach))
-            readings[:, at] = sigma_px * problem.joint_rad * motions.head[:, PAN_TILT]
-        by_all.append(rates)
-        by_readings.append(readings.reshape(len(rates), -1))
-        own_px.append(scatter.get(term.kind, 1.0) * sigma_px)
-    rates = np.concatenate(by_all)
-    touched = rates.any(axis=0)
-    root = _root(covariance[np.ix_(touched, touched)])
-    shared = np.hstack([rates[:, touched] @ root, np.concatenate(by_readings)])
-    together = np.linalg.svd(shared, compute_uv=False) ** 2
-    weights = np.sort(np.concatenate(own_px)[:, 0] ** 2)[::-1]
-    weights[: len(together)] += together
-    return weights
 
 
 def _gains(
@@ -163,9 +112,3 @@ def _checked(images: Sequence[ImageResiduals], checks: Sequence[ImageTerm]) -> l
         for i in images
         if i.name in wrong
     ]
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    """A square root of a covariance."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -11,6 +11,7 @@ import pytest
 
 from calib.adjust import hypotheses
 from calib.adjust.adjustment import PAN_TILT, Motions
+from calib.adjust.checks import check_weights
 from calib.adjust.hypotheses import Finding, find_drifts
 from calib.adjust.model_terms import candidate_terms, entering_together
 from calib.adjust.result import BenchCalibration
@@ -19,7 +20,6 @@ from calib.adjust.uncertainty import pixel_covariance
 from calib.adjust.unknowns import ResidualBlock
 from calib.calibrate.bench.fit import fit_bench
 from calib.calibrate.bench.problem import BenchOptions, BenchProblem
-from calib.calibrate.bench.statements import check_weights
 from calib.calibrate.starts.bench import BenchNotFitted
 from calib.geometry.rig import Mast
 from calib.geometry.rigid import Rigid
@@ -310,8 +310,7 @@ def test_a_print_less_exact_than_its_corners_are_found_is_weighed_and_not_refuse
     fit = fit_bench(simulate_bench(3, plan))
     assert fit.inexact_m == pytest.approx(1e-4, rel=0.25)
     for name in plan.cameras:
-        seen_px = float(np.sqrt(np.mean(np.square(fit.check_rms_px[name]))))
-        expected_px, most_px, _ = fit.checks[name]
+        seen_px, expected_px, most_px, _ = fit.checks[name]
         assert 0.03 < seen_px < most_px
         assert 0.7 < seen_px / expected_px < 1.4
 
@@ -332,15 +331,15 @@ def test_check_images_of_a_camera_share_the_error_of_its_calibration() -> None:
     by_pan = np.full((4, 20), 1e4) * (np.arange(20) == PAN_TILT[0])
     reads = Motions(block, by_pan, np.zeros((4, 4)))
     exact = SimpleNamespace(motions=lambda state, terms: [reads] * len(terms))
-    problem = SimpleNamespace(
+    problem: Any = SimpleNamespace(
         with_huber=lambda huber: SimpleNamespace(at_rest=lambda: exact), joint_rad=0.002
     )
-    weighed: Any = SimpleNamespace(
-        problem=problem, fit=SimpleNamespace(state=None), covariance=np.array([[0.25]]), components=()
-    )
+    state: Any = None
     shared = np.array([[0.5, 2.0, 0.0]] * 8 + [[0.5, 0.0, 2.0]] * 4)
     expected = np.sort(np.full(12, 0.01) + np.append(np.zeros(9), np.linalg.eigvalsh(shared.T @ shared)))
-    np.testing.assert_allclose(np.sort(check_weights(weighed, terms)), expected, atol=1e-6)
+    np.testing.assert_allclose(
+        np.sort(check_weights(problem, state, np.array([[0.25]]), terms)), expected, atol=1e-6
+    )
 
 
 def test_corners_far_beyond_what_the_folder_allows_are_refused() -> None:
