@@ -34,7 +34,7 @@ class Level(float, Enum):
     WHOLE_IMAGE = 1e-4, "of 10,000 surveys, one loses a right image: noise is not quite normal"
     PREDICTED = 3e-5, "of 30,000 right cameras, one is said not to predict its check images"
     CHANGED = 1e-7, "of ten million right fits, one is said to have changed half-way"
-    GROSS = 1e-9, "no right measurement fails this, though its stated sigma be twice too small"
+    GROSS = 1e-9, "of a hundred placements whose stated sigma is twice too small, one fails"
 
 
 MEDIAN_OF_TWO = 2 * np.log(2.0)
