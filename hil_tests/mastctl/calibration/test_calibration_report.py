@@ -106,11 +106,8 @@ def test_the_worst_reason_decides(fitted: tuple[Survey, Calibration]) -> None:
     assert judge_calibration(survey, replace(calibration, degenerate=(left_open,))).grade == "bad"
     noisy = replace(calibration, chi2=9.0 * calibration.degrees_of_freedom, chi2_probability=0.0)
     assert judge_calibration(survey, noisy).grade == "bad"
-    off = [
-        replace(i, residuals_px=i.residuals_px + 3.0) if i.purpose == "check" else i
-        for i in calibration.images
-    ]
-    bad = judge_calibration(survey, replace(calibration, images=tuple(off)))
+    off = {name: size._replace(seen_px=3.0) for name, size in calibration.checks.items()}
+    bad = judge_calibration(survey, replace(calibration, checks=off))
     assert bad.grade == "bad"
     assert any(r.grade == "bad" and "check images of navcam_left" in r.sentence for r in bad.reasons)
 
@@ -154,5 +151,5 @@ def test_what_the_papers_method_made_is_judged_by_the_joint_fits_tests(
     assert any(
         r.grade == "care" and r.sentence.startswith("fitted jointly, tapes scatter") for r in verdict.reasons
     )
-    lost = judge_calibration(survey, by_paper, jointly=SurveyNotFitted("no start was found"))
+    lost = judge_calibration(survey, fit_paper(survey), jointly=SurveyNotFitted("no start was found"))
     assert lost.grade == "care" and any("was not tested" in r.sentence for r in lost.reasons)
