@@ -68,11 +68,6 @@ class Latched:
         """Return it as JSON."""
         return {"name": self.name, "reason": self.reason, "at": self.at}
 
-    @property
-    def sentence(self) -> str:
-        """The refusal of a move."""
-        return latched_sentence((self,))
-
 
 def latched_sentence(entries: Sequence[Latched]) -> str:
     """Return the sentence of a latch with all its causes."""

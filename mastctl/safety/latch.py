@@ -128,8 +128,8 @@ class Latch:
                 self._changed.notify_all()
             return next((one for one in self.entries if _same(one, cause)), cause)
 
-    def explain(self, reason: str | None, name: str | None) -> tuple[Latched, Latched] | None:
-        """Give the cause without name and reason those that came after its stop; return it before and after.
+    def explain(self, reason: str | None, name: str | None) -> Latched | None:
+        """Give the cause without name and reason those that came after its stop; return it.
 
         None if there is no such cause.
         """
@@ -141,7 +141,7 @@ class Latch:
             cause = replace(bare, name=_line(name, NO_NAME), reason=_line(reason, NO_REASON))
             self.entries = tuple(cause if one is bare else one for one in self.entries)
             self._changed.notify_all()
-            return bare, cause
+            return cause
 
     def head_told(self) -> None:
         """Let the disk be written to: the head comes first."""

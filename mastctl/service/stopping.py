@@ -14,7 +14,7 @@ from mastctl.control.caller import Caller
 from mastctl.control.entry import ESTOP, STOP, CommandEntry, CommandRequest
 from mastctl.control.machine import StateMachine
 from mastctl.control.operations import STOP_ASKED, OperationRunner
-from mastctl.control.standing import Latched, StandingFault
+from mastctl.control.standing import Latched, StandingFault, latched_sentence
 from mastctl.devices.devices import Devices
 from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.motion.tracker import Tracker
@@ -56,8 +56,8 @@ class Stopping:
         self._machine = machine
         self._latch = latch
         self._resetting = threading.Lock()
-        for entry in latch.entries:
-            devices.block_moves(entry, Estopped(entry.sentence))
+        self._blocking = threading.Lock()
+        self._block_moves()
 
     def stop(self, reason: str = STOP_ASKED, reason_follows: bool = False) -> str | None:
         """Stop the mast, then what runs and the track; return the stopped operation's id.
@@ -135,7 +135,7 @@ class Stopping:
         try:
             held = self._latch.hold(reason, name)
             self._machine.estop_asked(self._causes)
-            self._devices.block_moves(held, Estopped(held.sentence))
+            self._block_moves()
         finally:
             self._machine.stop_ended()
         return held
@@ -146,14 +146,12 @@ class Stopping:
         if explained is None:
             self._operations.explain(None)
             return None
-        bare, held = explained
         self._machine.stop_asked()
         self._machine.estop_asked(self._causes)
-        self._devices.block_moves(held, Estopped(held.sentence))
-        self._devices.allow_moves(bare)
+        self._block_moves()
         self._machine.stop_ended()
-        self._operations.explain(f"an emergency stop: {held.reason} ({held.name})")
-        return held
+        self._operations.explain(f"an emergency stop: {explained.reason} ({explained.name})")
+        return explained
 
     def reset(self, reason: str, name: str) -> ResetTold:
         """Release the emergency stop; nothing moves before a command comes.
@@ -182,13 +180,20 @@ class Stopping:
             raise NotNow("stopping", "the mast is being stopped; an emergency stop is released after that")
         with self._resetting:
             causes = self._latch.release(reason, name)
-            for one in causes:  # and not what another one blocks that came meanwhile
-                self._devices.allow_moves(one)
+            self._block_moves()
             self._machine.reset(name, reason, self._causes)
             return {"latched": bool(self._latch.entries), "released": causes[0].told()}
 
     def _causes(self) -> tuple[Latched, ...]:
         return self._latch.entries
+
+    def _block_moves(self) -> None:
+        """Refuse moves while anything is latched; after each change of the latch, and in turn."""
+        with self._blocking:
+            if causes := self._latch.entries:
+                self._devices.block_moves(self._latch, Estopped(latched_sentence(causes)))
+            else:
+                self._devices.allow_moves(self._latch)
 
 
 def state_faults(folder: StateFolder, latch: Latch, started_s: float) -> Iterator[StandingFault]:

@@ -18,6 +18,7 @@ from hil_tests.waiting import NET_S, present, until
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped
+from mastctl.safety.latch import MOST
 from mastctl.safety.stop_line import ask
 
 ANGLES: dict[str, Any] = {"pan_rad": 0.1, "tilt_rad": -0.1}
@@ -293,3 +294,13 @@ def test_stops_over_http_and_over_their_own_socket_leave_their_lines(
     ]
     assert [line["request"].get("reason") for line in told] == [None, "smoke", "no fire", "smoke again"]
     assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_reset_allows_moves_again_however_many_stops_were_latched(pair: Pair, bench: Client) -> None:
+    devices = pair[0].service.devices
+    for number in range(2 * MOST):  # more than the log of causes has
+        bench.estop(reason="smoke", name=f"client {number}")
+    with pytest.raises(Stopped, match="smoke"):
+        devices.move(0.1, 0.1)
+    bench.reset(reason="no fire", name="bench")
+    devices.move(0.1, 0.1)
