@@ -81,7 +81,7 @@ class GenicamCapture:
         self._streams = 0
         self._last_sequence = -1
         self._last_number: int | None = None
-        self._held: int | None = None
+        self._kept_buffer: int | None = None
         self._delayed = 0
         self._pause_s = FIRST_PAUSE_S
         self._device: Device | None = self._open()
@@ -180,7 +180,7 @@ class GenicamCapture:
         """Close a stream before it is opened again; wait only a second for a camera that is gone."""
         self._device = None
         self.newest.forget()
-        self._held = None
+        self._kept_buffer = None
         closing = threading.Thread(target=device.close, name=f"closing {self._name}", daemon=True)
         closing.start()
         closing.join(CLOSE_PATIENCE_S if self._over.is_set() else CLOSING_S)
@@ -273,9 +273,9 @@ class GenicamCapture:
             window = self._window(filled, sent_s)
         frame = ArrivedGenicam(filled, window, settings, self._last_sequence, self._streams, received_s)
         self.newest.publish(frame, partial(self._made, device, filled.handle), dropped=dropped, late=False)
-        held, self._held = self._held, filled.handle
-        if held is not None:
-            device.queue(held)
+        previous, self._kept_buffer = self._kept_buffer, filled.handle
+        if previous is not None:
+            device.queue(previous)
         self._pause_s = FIRST_PAUSE_S
 
     def _window(self, filled: Filled, longest_s: float) -> GenicamWindow:

@@ -95,7 +95,7 @@ class Device:
     def __init__(self, options: AravisOptions, name: str, adjusted: Mapping[str, float]) -> None:
         self._arv = library(name)
         self._options, self._name, self._adjusted = options, name, adjusted
-        self._asking = threading.Lock()  # Aravis's features are not made for several threads
+        self._feature_lock = threading.Lock()  # Aravis's features are not made for several threads
         self.lost = threading.Event()
         self.problems: list[str] = []
         self._wall = WallClock()
@@ -155,25 +155,27 @@ class Device:
     def _set_region(self) -> None:
         """Set size and offset, and check what the camera made of them."""
         arv, camera, options = self._arv, self._camera, self._options
-        asked = (*options.offset_px, *options.size_px)
+        requested = (*options.offset_px, *options.size_px)
         bounds = {side: self._bounds(f"camera_get_{side}_bounds") for side in ("width", "height")}
         offered = " and ".join(f"{side} {low} to {high}" for side, (low, high) in bounds.items())
-        told = f"the camera does not take {asked[2]}x{asked[3]} px at ({asked[0]}, {asked[1]})"
+        sentence = (
+            f"the camera does not take {requested[2]}x{requested[3]} px at ({requested[0]}, {requested[1]})"
+        )
         # Aravis writes what it is told, and not every camera refuses what it cannot do.
         for side, (low, high) in zip(options.size_px, bounds.values(), strict=True):
             if not low <= side <= high:
-                raise UnsupportedFormat(f"{told}; it has {offered}", device=self._name)
+                raise UnsupportedFormat(f"{sentence}; it has {offered}", device=self._name)
         got = [ctypes.c_int() for _ in range(4)]
         reason = ""
         try:
-            arv("camera_set_region", camera, *asked)
+            arv("camera_set_region", camera, *requested)
         except GenicamError as error:
             reason = f" ({error})"
         arv("camera_get_region", camera, *(ctypes.byref(one) for one in got))
         x, y, width, height = (one.value for one in got)
-        if (x, y, width, height) != asked:
+        if (x, y, width, height) != requested:
             made = f"it made {width}x{height} at ({x}, {y}) of it"
-            raise UnsupportedFormat(f"{told}{reason}; {made} and has {offered}", device=self._name)
+            raise UnsupportedFormat(f"{sentence}{reason}; {made} and has {offered}", device=self._name)
 
     def _sensor_mode(self) -> SensorMode:
         """Which pixels of the sensor frames show. Region and offset count binned pixels (GenICam SFNC)."""
@@ -292,7 +294,7 @@ class Device:
             return None
         command, value = self._latch
         try:
-            with self._asking:
+            with self._feature_lock:
                 before_s = time.monotonic()
                 self._arv("camera_execute_command", self._camera, command)
                 after_s = time.monotonic()
@@ -303,7 +305,7 @@ class Device:
 
     def settings(self) -> list[CameraSetting]:
         """Return what may be changed, as the camera has it now. Raises DriverError."""
-        with self._asking:
+        with self._feature_lock:
             self._check_open()
             try:
                 return settings_of(self._arv, self._camera, self._options, self.period_s)
@@ -314,7 +316,7 @@ class Device:
         self, wanted: Mapping[str, float], in_force: Mapping[str, ValuesSet]
     ) -> tuple[dict[str, float], Sequence[str], DriverError | None]:
         """Change settings, as `drivers.aravis.settings.change`. Raises NoCamera if it was closed."""
-        with self._asking:
+        with self._feature_lock:
             self._check_open()
             return change(self._arv, self._camera, wanted, in_force, self._name)
 
@@ -353,19 +355,19 @@ class Device:
 
     def _sent_with(self, handle: int) -> dict[str, float]:
         """The settings that came with a buffer; those that cannot be true are left out."""
-        told = {}
+        values = {}
         for one in self._chunks:
             with suppress(GenicamError):  # not in this frame
                 chunk = self._arv("chunk_parser_get_float_value", self._parser, handle, f"Chunk{one.feature}")
                 value = one.unit * float(chunk)
                 highest = self._longest_s * (1 + ROUNDING)
                 if math.isfinite(value) and (one is not EXPOSURE or 0.0 < value <= highest):
-                    told[one.name] = value
+                    values[one.name] = value
                 elif not self._told_chunk:
                     self._told_chunk = True
                     words = "%s: a frame came with %s %.6g, which cannot be; such values are left out"
                     log.warning(words, self._name, one.name, value)
-        return told
+        return values
 
     def bytes_of(self, handle: int) -> tuple[NDArray[np.uint8], PictureFormat]:
         """Return a buffer's picture, uint8 (n,), which is Aravis's memory, and how it is laid out.
@@ -385,7 +387,7 @@ class Device:
 
     def close(self) -> None:
         """Stop and let go; never raises. It takes seconds for a camera that is gone: Aravis asks it again."""
-        with self._asking:
+        with self._feature_lock:
             if self._stream is not None:
                 try:
                     self._arv("camera_stop_acquisition", self._camera)

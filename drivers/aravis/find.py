@@ -80,16 +80,16 @@ def options_for(camera: FoundGenicam, by_serial: bool, fastest_hz: float) -> dic
 
 def is_meant(options: AravisOptions, found: FoundGenicam) -> bool:
     """Return whether the options name a camera that was found."""
-    asked = ((options.serial, found.serial), (options.address, found.address), (options.id, found.id))
-    return all(wanted in ("", got) for wanted, got in asked)
+    pairs = ((options.serial, found.serial), (options.address, found.address), (options.id, found.id))
+    return all(wanted in ("", got) for wanted, got in pairs)
 
 
 def _listed(arv: Library) -> list[FoundGenicam]:
-    asked = ("id", "vendor", "model", "serial_nbr", "address", "protocol")
+    names = ("id", "vendor", "model", "serial_nbr", "address", "protocol")
     with _LISTING:
         arv("update_device_list")
         count = arv("get_n_devices")
-        return [FoundGenicam(*(arv(f"get_device_{one}", i) or "" for one in asked)) for i in range(count)]
+        return [FoundGenicam(*(arv(f"get_device_{one}", i) or "" for one in names)) for i in range(count)]
 
 
 def open_camera(options: AravisOptions, name: str) -> int:

@@ -71,9 +71,9 @@ class Control:
 
     def __init__(self, arv: Library, camera: int, meaning: Meaning) -> None:
         self._arv, self._camera, self.meaning = arv, camera, meaning
-        asked = (meaning.feature,) * (not meaning.called)
+        arguments = (meaning.feature,) * (not meaning.called)
         name = f"is_{meaning.called or 'feature'}_available"
-        self.exists = bool(arv(f"camera_{name}", camera, *asked))
+        self.exists = bool(arv(f"camera_{name}", camera, *arguments))
 
     def _kind(self) -> str:
         """How GenICam keeps the feature."""
@@ -106,9 +106,9 @@ class Control:
         kind = "" if one.called else self._kind()
         number = ctypes.c_int64 if kind == "integer" else ctypes.c_double
         low, high = number(), number()
-        asked = (one.feature,) if kind else ()
+        arguments = (one.feature,) if kind else ()
         name = f"camera_get_{kind or one.called}_bounds"
-        self._arv(name, self._camera, *asked, ctypes.byref(low), ctypes.byref(high))
+        self._arv(name, self._camera, *arguments, ctypes.byref(low), ctypes.byref(high))
         return one.unit * low.value, one.unit * high.value
 
     def set(self, value: float) -> None:

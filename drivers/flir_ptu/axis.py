@@ -84,11 +84,11 @@ class StepAxis:
                 "home it (mastctl ptu home), it does not know before",
                 device=DEVICE,
             )
-        told = options.resolution_arcsec
-        if told is not None and abs(resolution_arcsec / told - 1) > SAME_RESOLUTION:
+        configured = options.resolution_arcsec
+        if configured is not None and abs(resolution_arcsec / configured - 1) > SAME_RESOLUTION:
             raise WrongDevice(
                 f"says that a {name} position is {resolution_arcsec:g} seconds of arc, "
-                f"options.{name}.resolution_arcsec {told:g}. Either its step mode was changed, "
+                f"options.{name}.resolution_arcsec {configured:g}. Either its step mode was changed, "
                 "or it is an E46 that was not homed yet (mastctl ptu home)",
                 device=DEVICE,
             )

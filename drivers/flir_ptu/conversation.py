@@ -46,11 +46,11 @@ LONGEST_DRAIN_S = 0.4
 PATIENT_TRIES = 3
 STEP_TRIES = 3
 AGREEING_TRIES = 5
-ORDER_S = 0.01  # how long a shout waits for another thread's write
+ORDER_S = 0.01  # how long a halt waits for another thread's write
 
 
 class StopCameFirst(DriverError):
-    """Something was shouted meanwhile; the command was not sent, and its caller gives way."""
+    """Something was sent at once meanwhile; the command was not sent, and its caller gives way."""
 
     code = "interrupted"
 
@@ -79,7 +79,7 @@ class Conversation:
     Attributes
     ----------
     gives_way
-        Whether nothing is asked any more when something was shouted.
+        Whether no question is sent any more after something was sent at once.
     """
 
     def __init__(self, line: ByteLine, device: str, on_hit: Callable[[str], None], clock: Clock) -> None:
@@ -94,8 +94,8 @@ class Conversation:
         self._tries = 1
         self._turn = 0
         self._last_written = ""
-        self._order = threading.Lock()  # nothing is asked between a shout and its answer
-        self._shouts = 0  # whose answers are still to come
+        self._order = threading.Lock()  # no question goes out between what is sent at once and its answer
+        self._unanswered = 0  # whose answers are still to come
         self.gives_way = True
         self._answered = b""  # the last line that was taken for an answer
         self.byte_s = line.byte_s
@@ -150,12 +150,12 @@ class Conversation:
 
     def _twice(self, command: str, ask: Callable[[], T], before: T | None) -> T:
         """The first of the answers that is the same as the one before it."""
-        told: list[T] = [] if before is None else [before]
-        while len(told) < AGREEING_TRIES:
-            told.append(ask())
-            if len(told) > 1 and told[-1] == told[-2]:
-                return told[-1]
-        words = ", ".join(f"'{str(one)[:40]}'" for one in told)
+        answers: list[T] = [] if before is None else [before]
+        while len(answers) < AGREEING_TRIES:
+            answers.append(ask())
+            if len(answers) > 1 and answers[-1] == answers[-2]:
+                return answers[-1]
+        words = ", ".join(f"'{str(one)[:40]}'" for one in answers)
         raise BadReply(f"answers {command} otherwise each time: {words}", device=self._device)
 
     def tell(self, command: str, patience_s: float = 0.0) -> str:
@@ -177,31 +177,31 @@ class Conversation:
         if not answer.good:
             raise Refused(f"refuses R: {answer.text or 'without words'}", device=self._device)
 
-    def shout(self, command: str) -> None:
+    def send_at_once(self, command: str) -> None:
         """Send a command beside a call under way, from any thread.
 
-        That call gets its answer, and `StopCameFirst` with its next question; then `shouted` takes this
-        one's. Raises LineLost.
+        That call gets its answer, and `StopCameFirst` with its next question; then `sent_at_once` takes
+        this one's. Raises LineLost.
         """
         ordered = self._order.acquire(timeout=ORDER_S)
         try:
-            self._shouts += 1
+            self._unanswered += 1
             self._line.write(f"{command} ".encode())
         finally:
             if ordered:
                 self._order.release()
 
-    def shouted(self, command: str) -> bool:
-        """Take the answer of what was shouted; return whether it was a good one, and nothing else came.
+    def sent_at_once(self, command: str) -> bool:
+        """Take the answer of what was sent at once; return whether it was a good one, and nothing else came.
 
         A unit answers in order, and echoes letter by letter which question it answers: so both sides are in
-        step still. If anything is otherwise, or nothing was shouted, `tell` says what is to be done. Raises
-        LineLost.
+        step still. If anything is otherwise, or nothing was sent at once, `tell` says what is to be
+        done. Raises LineLost.
         """
-        if not (self._shouts and self._in_step and self._manners.exact):
+        if not (self._unanswered and self._in_step and self._manners.exact):
             return False
         self._in_step = False
-        while self._shouts:
+        while self._unanswered:
             self._answered, self._last_written = b"", command  # two stops have the same answer
             try:
                 answer = self._next_answer(command, self._clock.now_s() + self.reply_s, skip=False)
@@ -210,7 +210,7 @@ class Conversation:
             if not (answer.good and answer.exact):
                 return False
             with self._order:
-                self._shouts -= 1
+                self._unanswered -= 1
         self._answered = b""
         self._in_step = True
         return True
@@ -267,8 +267,8 @@ class Conversation:
         return answer.text
 
     def _give_way(self, command: str) -> None:
-        """Raise Interrupted if something was shouted; who makes a unit ready goes through with it."""
-        if self._shouts and self.gives_way and self._tries == 1:
+        """Raise Interrupted if something was sent at once; what makes a unit ready goes through with it."""
+        if self._unanswered and self.gives_way and self._tries == 1:
             self._in_step = True
             raise StopCameFirst(f"a stop came before {command} was sent", device=self._device)
 
@@ -366,7 +366,7 @@ class Conversation:
         """Throw away what comes until nothing has come for a while; limit hits are noted."""
         self._in_step = False
         self._answered = b""
-        self._shouts = 0
+        self._unanswered = 0
         unknown = self._manners.exact is None
         quiet_s = QUIET_S if unknown or self._manners.exact else max(QUIET_S, self.reply_s)
         until_s = self._clock.now_s() + quiet_s + LONGEST_DRAIN_S

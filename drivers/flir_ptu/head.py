@@ -235,7 +235,7 @@ class FlirPtu(PanTilt):
         try:
             line = self._open_line(self._options.port, self._options.baud, DEVICE)
             talk = self._talk = Conversation(line, DEVICE, self._hit, self._time)
-            talk.shout("H")  # before any question: it may still be under way
+            talk.send_at_once("H")  # before any question: it may still be under way
             resolutions = talk.in_step()
             self._deaf = False
             self._check(talk, resolutions)
@@ -310,7 +310,7 @@ class FlirPtu(PanTilt):
 
     def _halt(self, talk: Conversation) -> None:
         """Halt both axes; a halt that was sent beside another call needs its answer only."""
-        if not talk.shouted("H"):
+        if not talk.sent_at_once("H"):
             talk.tell("H")
         self._count.halt_owed = False
         for axis in self._axes.values():
@@ -321,7 +321,7 @@ class FlirPtu(PanTilt):
         talk = self._talk
         if talk is not None:
             with suppress(LineLost):  # told by what is asked next
-                talk.shout("H")
+                talk.send_at_once("H")
 
     def _halt_in_order(self) -> None:
         """Halt both axes in a conversation that is in step."""
@@ -390,8 +390,8 @@ def halt(
     line = open_line(read.port, read.baud, DEVICE)
     talk = Conversation(line, DEVICE, lambda axis: None, clock or SystemClock())
     try:
-        talk.shout("H")  # before any question
-        talk.shout("H")
+        talk.send_at_once("H")  # before any question
+        talk.send_at_once("H")
         talk.in_step()
         with talk.patient():
             talk.tell("H")

@@ -51,28 +51,28 @@ def measure(talk: Conversation, pan: StepAxis, tilt: StepAxis, clock: Clock) -> 
     Raises BadReply if the positions contradict each other, or as `Conversation.ask`; NoReply, Refused,
     LineLost.
     """
-    asked: dict[StepAxis, list[SeenPosition]] = {tilt: [], pan: []}
+    seen_of: dict[StepAxis, list[SeenPosition]] = {tilt: [], pan: []}
     at_rest: dict[StepAxis, SeenPosition] = {}
     found: tuple[SeenPosition, SeenPosition] | None = None
     while found is None:
-        for axis, answers in asked.items():
+        for axis, answers in seen_of.items():
             if axis not in at_rest and found is None:
                 if len(answers) == ASKED_AT_MOST:
                     words = ", ".join(str(seen.position) for seen in answers)
                     raise BadReply(
                         f"gives {axis.name} positions that contradict each other: {words}", device=DEVICE
                     )
-                answers.append(_asked(talk, axis, clock))
+                answers.append(_measured(talk, axis, clock))
                 if axis.rests_at(answers[-1]):
                     at_rest[axis] = answers[-1]
-                if len(asked[pan]) and len(asked[tilt]):
-                    found = _found(pan, tilt, asked[pan], asked[tilt], at_rest)
+                if len(seen_of[pan]) and len(seen_of[tilt]):
+                    found = _found(pan, tilt, seen_of[pan], seen_of[tilt], at_rest)
     for axis, seen in zip((pan, tilt), found, strict=True):
         axis.take(seen)
     return found[0].time_s
 
 
-def _asked(talk: Conversation, axis: StepAxis, clock: Clock) -> SeenPosition:
+def _measured(talk: Conversation, axis: StepAxis, clock: Clock) -> SeenPosition:
     """One answer, and when it was measured."""
     before_s = clock.now_s()
     number = talk.ask(ask.POSITION[axis.name])

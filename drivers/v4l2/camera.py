@@ -195,7 +195,7 @@ class V4l2Camera(CapturedCamera):
         wanted_s = control.exposure_s
         if wanted_s == stream.asked_exposure_s and shows and frame.received_s >= self._judge_after_s:
             self._judge_after_s = frame.received_s + JUDGE_EVERY_S
-            if not control.held:
+            if not control.is_fixed:
                 wanted_s = control.see(self.name, pixels.grey(frame.format, data), wanted_s)
         if wanted_s != stream.asked_exposure_s:  # also when another camera of the group wanted it
             self._change(stream, wanted_s)

@@ -90,7 +90,7 @@ class Capture:
         self._streams = 0
         self._offset: int | None = 0  # from the driver's count to ours; None until a new stream's first frame
         self._last_sequence = -1
-        self._held: int | None = None  # the buffer of the newest good frame
+        self._kept_buffer: int | None = None  # the buffer of the newest good frame
         self._lengths: tuple[int, ...] = ()
         self._check, self._spacing = StampCheck(), Spacing(None, 0.0)  # of the stream that is open
         with ExitStack() as opened:  # what is open when a later step fails is closed again
@@ -192,7 +192,7 @@ class Capture:
                     self._lose(f"{self._name}: the capture failed: {type(error).__name__}: {error}")
                 finally:
                     self.newest.forget()
-                    self._held = None
+                    self._kept_buffer = None
                     stream.close()
             if self._closing_after(self._pause_s):
                 return
@@ -242,22 +242,22 @@ class Capture:
         self._last_sequence = sequence
         window = None
         if not wrong:
-            told = {name: values.of(sequence, buffer.stamp_s) for name, values in stream.in_force.items()}
-            timing = Timing(*told[EXPOSURE.name], *self._spacing.see(sequence, buffer.stamp_s))
+            reported = {name: values.of(sequence, buffer.stamp_s) for name, values in stream.in_force.items()}
+            timing = Timing(*reported[EXPOSURE.name], *self._spacing.see(sequence, buffer.stamp_s))
             window = exposure_window(stream.rule, timing, buffer.flags, buffer.stamp_s, received_s)
         if window is None:
             self.newest.refuse(dropped, wrong)
             stream.node.queue(buffer.number)
             return
-        settings = {name: value for name, (value, _) in told.items()}
+        settings = {name: value for name, (value, _) in reported.items()}
         arrived = Arrived(
             buffer, stream.format, timing, window, sequence, self._streams, received_s, settings
         )
         late = received_s - buffer.stamp_s > stream.period_s + LATE_S
         self.newest.publish(arrived, partial(self._made, stream.node, arrived), dropped=dropped, late=late)
-        held, self._held = self._held, buffer.number
-        if held is not None:
-            stream.node.queue(held)
+        previous, self._kept_buffer = self._kept_buffer, buffer.number
+        if previous is not None:
+            stream.node.queue(previous)
         self._pause_s = FIRST_PAUSE_S
         if self._between is not None:
             self._between(stream, arrived, np.frombuffer(stream.node.bytes_of(buffer), np.uint8))

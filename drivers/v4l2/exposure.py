@@ -71,7 +71,7 @@ class ExposureControl:
             return self._exposure_s
 
     @property
-    def held(self) -> bool:
+    def is_fixed(self) -> bool:
         """Whether a measurement is under way, during which nothing changes."""
         with self._lock:
             return self._holds > 0

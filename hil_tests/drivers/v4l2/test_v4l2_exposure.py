@@ -40,9 +40,9 @@ def test_nothing_changes_during_a_measurement() -> None:
     control.hold()
     control.hold()
     control.release()
-    assert control.held and set(settle(control, 1e7)) == {0.005}
+    assert control.is_fixed and set(settle(control, 1e7)) == {0.005}
     control.release()
-    assert not control.held and settle(control, 1e7)[-1] < 0.005
+    assert not control.is_fixed and settle(control, 1e7)[-1] < 0.005
 
 
 def test_cameras_of_a_group_have_one_exposure_by_the_brightest() -> None:

@@ -42,10 +42,10 @@ class Wanted:
         return self.exposure_s
 
     def hold(self) -> None:
-        self.held = True
+        self.is_fixed = True
 
     def release(self) -> None:
-        self.held = False
+        self.is_fixed = False
 
 
 @dataclass
@@ -236,7 +236,7 @@ def test_a_hold_lets_a_pending_change_show_first(monkeypatch: pytest.MonkeyPatch
 
         thread = threading.Thread(target=measure)
         thread.start()
-        until(lambda: wanted.held, "the hold")
+        until(lambda: wanted.is_fixed, "the hold")
         came = 0
         while not held.is_set():
             seen.arrive(sensor.shoot(PERIOD_S, 0.036 if came < 4 else 0.002))
