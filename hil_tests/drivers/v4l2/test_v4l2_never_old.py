@@ -36,7 +36,7 @@ class Wanted:
     """Stands for the group's exposure control: a test says which exposure time it wants."""
 
     exposure_s: float
-    held: bool = False
+    is_fixed: bool = False
 
     def see(self, camera: str, image: object, exposure_s: float) -> float:
         return self.exposure_s
