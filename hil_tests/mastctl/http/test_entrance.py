@@ -307,7 +307,8 @@ def test_each_refusal_is_recorded_with_its_address(
         assert {(line["via"], line["role"], line["address"]) for line in strangers} == {
             ("network", "view", "127.0.0.1")
         }
-        assert [(line["command"], line["result"]) for line in strangers] == [
+        listed = ((line["command"], line["result"]) for line in strangers)
+        assert [one for one, _ in itertools.groupby(listed)] == [  # a late reason of a stop has its own line
             ("GET /api/v1/status", "wrong_token"),
             ("POST /api/v1/point", "foreign_origin"),
             ("POST /api/v1/stop", "foreign_origin"),
