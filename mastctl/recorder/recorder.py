@@ -136,8 +136,8 @@ class Recorder:
 
     def add_handoff(self, line: dict[str, Any]) -> None:
         """Record a hand-off, a line of the log of hand-offs."""
-        time_s = self._clock.now_s()
-        self._request(lambda: self._write([Entry("handoff", line["time"], line, time_s)]))
+        entry = Entry("handoff", line["time"], line, self._clock.now_s())
+        self._request(lambda: self._write([entry], time.monotonic()))
 
     def summary(self) -> RecorderTold:
         """Return what is recorded now, as JSON: the run's name, sizes in 10⁶ bytes, what was dropped."""
@@ -289,14 +289,16 @@ class Recorder:
     # In the writing thread
 
     def _work(self) -> None:
+        taken_s = time.monotonic()
         while True:
             with self._requests_lock:
                 closing, requests, self._requests = self._closing, self._requests, deque()
             news = self._news.wait(0.0 if requests else WAIT_S)
+            since_s, taken_s = taken_s, time.monotonic()  # these values were published between the two
             self._busy_since_s = time.monotonic(), self._clock.now_s()
             time_s = self._clock.now_s()
             entries = [Entry(one.topic, one.key, one.value, time_s) for one in news]
-            self._guarded(lambda entries=entries: self._write(entries))  # type: ignore[misc]
+            self._guarded(lambda: self._write(entries, since_s))  # noqa: B023
             for act, answer in requests:
                 self._answer(act, answer)
             self._guarded(self._look_after)
@@ -347,8 +349,8 @@ class Recorder:
         if before is None or before.code != code:
             log.error("%s", message)
 
-    def _write(self, entries: list[Entry]) -> None:
-        """Write what was published into the file, if there is one to be written."""
+    def _write(self, entries: list[Entry], since_s: float) -> None:
+        """Write what was published since a moment into the file, if there is one to be written."""
         for at, one in enumerate(entries):
             try:
                 self._notice_fault(one)
@@ -358,7 +360,7 @@ class Recorder:
                 assert self._now.file is not None
                 if one.topic == "frame" and not isinstance(one.value, StampedFrame):
                     one = replace(one, value=self._frame_by_id(one.value.frame_id))
-                self._entries.write(self._now.file, one, time.monotonic())
+                self._entries.write(self._now.file, one, since_s)
             except MastctlError:  # the frame is gone
                 self._dropped[one.topic] += 1
             except OSError:

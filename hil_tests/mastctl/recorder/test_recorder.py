@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -30,6 +33,7 @@ from mastctl.control import publisher
 from mastctl.control.standing import StandingFault
 from mastctl.errors import NotNow, Unable
 from mastctl.recorder import recorder as module
+from mastctl.recorder.entries import Entries
 from mastctl.recorder.folder import RecordFolder
 from mastctl.recorder.recorder import AttachedMast
 from mastctl.recorder.writer import Attached, RecordFile
@@ -182,6 +186,32 @@ def test_a_disk_that_hangs_holds_nobody_and_what_was_dropped_is_told(
     assert len(records(path, "/camera/navcam_left/frame")) == 5
 
 
+def test_what_came_while_a_file_began_is_on_the_disk_as_soon_as_it_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = ManualClock(10.0)
+    fake = SimpleNamespace(monotonic=clock.now_s, time_ns=time.time_ns, sleep=time.sleep)
+    monkeypatch.setattr(module, "time", fake)
+    begin = Entries.begin
+
+    def slow(self: Entries, *where: Any) -> None:  # as the first fit of the cameras is
+        begin(self, *where)
+        one.publish("command", "2", {"number": 2})
+        clock.advance(1.0)
+
+    monkeypatch.setattr(Entries, "begin", slow)
+    one = Recording(tmp_path)
+    one.publish("command", "1", {"number": 1})
+
+    def on_the_disk() -> list[int]:
+        items = [item for path in files(tmp_path) for item in read_items(path, McapContents())]
+        commands = [i for i in items if isinstance(i, McapEntry) and i.channel.topic == "/command"]
+        return [json.loads(item.message.data)["number"] for item in commands]
+
+    until(lambda: on_the_disk() == [1, 2], "both are on the disk")
+    one.recorder.close()
+
+
 def test_a_disk_that_refuses_is_a_fault_and_is_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -276,8 +306,8 @@ def test_a_run_whose_file_goes_is_a_fault_until_the_next_one(
     run = one.recorder.start_run("rock")["run"]
     (path,) = files(tmp_path)
     one.publish("command", "1", {"number": 1})
-    one.written()
     until(lambda: one.summary()["size_mb"], "it is written")
+    one.written()  # the round that wrote it has ended
     goes(path)
     until(lambda: one.recorder.faults(), "it says so")
     one.publish("command", "2", {"number": 2})
