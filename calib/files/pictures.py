@@ -52,7 +52,8 @@ def _without_end(data: bytes) -> bytes:
     at, frame = segments.get(JPEG_SCAN), segments.get(0xC0, segments.get(0xC1))
     if at is None or frame is None or data[at] != data[frame + 5]:
         return data
-    scan = data[at : max(at, data.rfind(b"\xff\xd9"))]
+    end = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]").search(data, at)  # some cameras add a second picture
+    scan = b"" if end is None else data[at : end.start()]
     restarts = re.findall(rb"\xff([\xd0-\xd7])", scan)
     in_order = all(one[0] == 0xD0 + number % 8 for number, one in enumerate(restarts))
     return data[:at] + scan + bytes(16) if scan and in_order else b""

@@ -339,10 +339,15 @@ def test_a_jpeg_whose_data_end_before_its_picture_is_refused(interval: int) -> N
     for picture in (grey, np.full_like(grey, 128)):  # the grey of a part that is missing
         whole = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_RST_INTERVAL, interval])[1].tobytes()
         np.testing.assert_array_equal(decode_picture(whole), cv2.imdecode(np.frombuffer(whole, np.uint8), 0))
+        # Cameras add zeros, and some a second picture such as a preview.
+        for more in (bytes(99), whole):
+            np.testing.assert_array_equal(decode_picture(whole + more), decode_picture(whole))
     whole = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_RST_INTERVAL, interval])[1].tobytes()
     for at in range(len(whole) // 2, len(whole) - 60, 97):
         with pytest.raises(ValueError, match="cut short or damaged"):
             decode_picture(whole[:at] + b"\xff\xd9")
+        with pytest.raises(ValueError, match="cut short or damaged"):
+            decode_picture(whole[:at] + whole)
 
 
 def test_a_png_is_whole_to_its_last_byte_or_said_to_be_cut_short() -> None:
