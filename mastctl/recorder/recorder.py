@@ -332,6 +332,9 @@ class Recorder:
 
     def _failed(self, error: OSError) -> None:
         """Give the file up, as a killed daemon leaves it, and try another one after a while."""
+        with contextlib.suppress(OSError):
+            if self._now.file is not None and self._gone(self._now.file):
+                return  # the file went between two looks at the disk, and that is the reason
         message = f"{self._folder.path} cannot be written: {error.strerror or error}; nothing is recorded"
         if self._now.run is not None:
             message += f", and the run {self._now.run} has ended"

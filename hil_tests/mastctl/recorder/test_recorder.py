@@ -266,6 +266,24 @@ def test_the_room_of_others_is_left_free_the_ring_giving_way_first(
     assert all(McapContents is not None and list(read_items(path)) for path in files(tmp_path))
 
 
+def test_a_file_that_goes_while_the_disk_is_checked_is_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = Recording(tmp_path / "recordings", ring_s=0.0)
+    one.recorder.start_run("rock")
+    (path,) = files(tmp_path)
+
+    def checked(folder: RecordFolder) -> int:
+        with_its_folder(path)
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(folder.path))
+
+    monkeypatch.setattr(RecordFolder, "free_bytes", checked)
+    one.publish("command", "1", {"number": 1})
+    until(lambda: one.recorder.faults(), "it says so")
+    assert one.recorder.faults()[0].code == "run_gone"
+    one.recorder.close()
+
+
 def test_a_run_ends_at_its_size_and_says_so(tmp_path: Path) -> None:
     one = Recording(tmp_path, run_mb=1.0, ring_s=0.0)
     one.recorder.start_run("full")
