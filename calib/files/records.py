@@ -93,7 +93,7 @@ def _beside(value: Any, info: ValidationInfo) -> Any:
     if info.context is None:
         return value
     if not isinstance(value, str) or not value.strip():
-        raise problem("", f"{kind_of(value)} where text is expected")
+        raise problem("", f"{kind_of(value)} where a path is expected")
     return info.context.resolve() / _printable(value)
 
 

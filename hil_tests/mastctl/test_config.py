@@ -99,6 +99,7 @@ BAD: list[tuple[str, Any, str, str]] = [
     ("schema", "mastctl/config/2", "schema", "mastctl/config/1"),
     ("mast_fiel", "x", "mast_fiel", "unknown key; the nearest known is 'mast_file'"),
     ("mast_file", ..., "mast_file", "missing"),
+    ("mast_file", "", "mast_file", "the text '' where a path is expected"),
     ("pan_tilt/driver", ..., "pan_tilt.driver", "missing"),
     ("pan_tilt/options", {"x": float("nan")}, "pan_tilt.options.x", "finite"),
     ("cameras/navcam_left", "v4l2", "cameras.navcam_left", "a mapping with driver"),
