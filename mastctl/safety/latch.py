@@ -139,7 +139,7 @@ class Latch:
                 return None
             self._asked += 1  # a reset that is under way has not released this
             cause = replace(bare, name=_line(name, NO_NAME), reason=_line(reason, NO_REASON))
-            self.entries = tuple(cause if one is bare else one for one in self.entries)
+            self.entries = _merged((), tuple(cause if one is bare else one for one in self.entries))
             self._changed.notify_all()
             return cause
 

@@ -144,6 +144,8 @@ def test_a_latch_logs_its_causes_and_a_reset_releases_all(folder: StateFolder) -
     latch.hold("smoke", "Ana")
     latch.hold("a hand in the way", "Ben")
     latch.hold("smoke", "Ana")  # once in the log
+    latch.hold(None, None)
+    latch.explain("smoke", "Ana")  # nor twice if it came after its stop
     latch.hold("sparks", "Ana")
     for number in range(10):
         latch.hold("a stranger", f"client {number}")
