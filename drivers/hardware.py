@@ -23,7 +23,7 @@ from drivers.sim import ROVER
 from drivers.simulation_clock import SimulationClock, simulation_speed
 
 if TYPE_CHECKING:
-    from drivers.sim.rover import SimulatedRover
+    from drivers.sim.rover import RoverModel
 
 
 log = logging.getLogger(__name__)
@@ -141,7 +141,7 @@ class Hardware:
         self.cameras = MappingProxyType({name: whole(camera, Camera) for name, camera in cameras.items()})
         self._kinds = dict(kinds)
         self._shared = shared
-        self.simulation: SimulatedRover | None = shared.get(ROVER)
+        self.simulation: RoverModel | None = shared.get(ROVER)
 
     @property
     def kind(self) -> HardwareKind:

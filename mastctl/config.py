@@ -153,7 +153,7 @@ _KeepOutName = Annotated[
 ]
 
 
-class HeadRecord(Record):
+class HeadDriverRecord(Record):
     """The driver of the head."""
 
     driver: Text = Field(
@@ -167,10 +167,10 @@ class _HeadAlone(Record):
     """A configuration of which only the head counts."""
 
     model_config = ConfigDict(extra="ignore")
-    pan_tilt: HeadRecord
+    pan_tilt: HeadDriverRecord
 
 
-class CameraRecord(HeadRecord):
+class CameraDriverRecord(HeadDriverRecord):
     """The driver of a camera."""
 
     offset_s: Annotated[float, Field(ge=-MOST_OFFSET_S, le=MOST_OFFSET_S)] = Field(
@@ -281,9 +281,9 @@ class ConfigRecord(Record):
 
     schema_: Literal["mastctl/config/1"] = Field(alias="schema")
     mast_file: PathInFile = Field(description="relative paths in a configuration start at its folder")
-    pan_tilt: HeadRecord = Field(description="the head")
+    pan_tilt: HeadDriverRecord = Field(description="the head")
     limits: LimitsRecord
-    cameras: dict[str, CameraRecord] = Field(
+    cameras: dict[str, CameraDriverRecord] = Field(
         default={},
         description="cameras by name; each must be in the mast file. None: the head alone, pointed by joint "
         "angles",

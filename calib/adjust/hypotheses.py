@@ -63,7 +63,7 @@ Rates = Callable[[ImageTerm, Motions], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class Effect:
     """A measurement that a hypothesis concerns: of a picture, or of the station.
 
     ``name`` is the picture's or placement's, ``group`` what changes only as a whole: a standstill, a
@@ -78,7 +78,7 @@ class Row:
     moves_px: FloatArray
     elapsed: float = 0.0
 
-    def part(self, numbers: Sequence[int]) -> Row:
+    def part(self, numbers: Sequence[int]) -> Effect:
         """Return the same for some of its numbers."""
         return replace(self, rates=self.rates[:, numbers], moves_px=self.moves_px[:, numbers])
 
@@ -113,15 +113,15 @@ class Hypothesis:
 
     name: str
     subject: tuple[str, ...]
-    rows: Sequence[Row]
+    rows: Sequence[Effect]
     sentence: Callable[[Finding], str] | str
     course: Course = "always"
     side: int = 1
 
     @cached_property
-    def groups(self) -> list[list[Row]]:
+    def groups(self) -> list[list[Effect]]:
         """The rows that change only together, in the order of their first."""
-        found: dict[Hashable, list[Row]] = {}
+        found: dict[Hashable, list[Effect]] = {}
         for row in self.rows:
             found.setdefault(row.group, []).append(row)
         return list(found.values())
@@ -247,7 +247,7 @@ class ScoredFit:
         last = max(len(self.images) - 1, 1)
         self.elapsed = {image.name: k / last for k, image in enumerate(self.images)}
 
-    def rows(self, rates: Rates, only: Callable[[ImageTerm], bool] | None = None) -> list[Row]:
+    def rows(self, rates: Rates, only: Callable[[ImageTerm], bool] | None = None) -> list[Effect]:
         """The images, or some, by the rates (m, k) of their residuals."""
         found = []
         for image, motions in zip(self.images, self.motions, strict=True):
@@ -256,22 +256,22 @@ class ScoredFit:
                 found.append(self._row(image, motions.block, mine, mine))
         return found
 
-    def of_camera(self, name: str, rates: Rates) -> list[Row]:
+    def of_camera(self, name: str, rates: Rates) -> list[Effect]:
         """The images of one camera by the rates of their residuals."""
         return self.rows(rates, lambda image: image.camera == name)
 
-    def of_board(self, board: tuple[str, str]) -> list[Row]:
+    def of_board(self, board: tuple[str, str]) -> list[Effect]:
         """The images of one board, by its pose."""
         key = ("board", board)
         return self.rows(lambda _, motions: motions.block.rates(key), lambda image: image.board == board)
 
-    def _row(self, image: ImageTerm, block: ResidualBlock, rates: FloatArray, moves: FloatArray) -> Row:
+    def _row(self, image: ImageTerm, block: ResidualBlock, rates: FloatArray, moves: FloatArray) -> Effect:
         sigma_px = np.repeat(image.sigma_px[image.keep], 2)[:, None]
         group = image.name if image.attitude is None else image.attitude
-        return Row(image.name, group, block, rates, sigma_px * moves, self.elapsed[image.name])
+        return Effect(image.name, group, block, rates, sigma_px * moves, self.elapsed[image.name])
 
     @cached_property
-    def readings(self) -> list[Row]:
+    def readings(self) -> list[Effect]:
         """The head's images by what pan and tilt read.
 
         Where readings have a sigma it is that measurement which changes, and images only show where the head
@@ -348,7 +348,7 @@ class ScoredFit:
         said = what.sentence
         return replace(found, sentence=said if isinstance(said, str) else said(found))
 
-    def _scatter(self, readings: Sequence[Row], gain: float) -> float:
+    def _scatter(self, readings: Sequence[Effect], gain: float) -> float:
         """How much larger the squares of a joint's readings are than their sigma allows, less a gain.
 
         A joint whose readings scatter more than stated, by an unknown play, has not slipped.
@@ -452,7 +452,7 @@ def _axes(fit: ScoredFit) -> Iterator[Hypothesis]:
     yield Hypothesis("mast", (), _on_head(fit, further), sentence)
 
 
-def _on_head(fit: ScoredFit, numbers: Sequence[int]) -> list[Row]:
+def _on_head(fit: ScoredFit, numbers: Sequence[int]) -> list[Effect]:
     """The head's images by some of the numbers that move it."""
     rows = fit.rows(
         lambda image, motions: motions.head[:, numbers] if image.attitude is not None else motions.head
@@ -515,7 +515,7 @@ def _board_shape(fit: ScoredFit) -> Iterator[Hypothesis]:
     """The board's shape."""
     half_m = float(max(np.abs(image.in_board_m[image.keep]).max() for image in fit.images))
 
-    def moved(moves_m: Callable[[FloatArray, FloatArray], FloatArray]) -> list[Row]:
+    def moved(moves_m: Callable[[FloatArray, FloatArray], FloatArray]) -> list[Effect]:
         """Images by how numbers move the board's points (3, k, n), metres in the board."""
 
         def rates(image: ImageTerm, motions: Motions) -> FloatArray:
@@ -561,7 +561,7 @@ def _moved_before_tapes(fit: ScoredFit) -> Iterator[Hypothesis]:
         for point, block in zip(mine, fit.problem.station_blocks(fit.state, mine), strict=True):
             rates = rigid_rates(eye, pose.points(point.in_board_m)[None], pose.translation_m)[0]
             name = f"placement {board[1]} (set-up {board[0]})"
-            rows.append(Row(name, board, block, -rates / point.sigma_m, np.zeros((0, 6))))
+            rows.append(Effect(name, board, block, -rates / point.sigma_m, np.zeros((0, 6))))
 
     def sentence(found: Finding) -> str:
         turn, shift = (1e3 * float(np.linalg.norm(part)) for part in np.split(found.values, 2))
@@ -584,7 +584,9 @@ def _drawing(fit: ScoredFit) -> Iterator[Hypothesis]:
     as_one = rigid_rates(np.eye(3)[None], places, places.mean(axis=0)).reshape(-1, 6)
     apart = null_space(as_one.T).reshape(len(names), 3, -1)
     rows = [
-        Row(p.point, p.setup, block, -apart[names.index(p.point)] / p.sigma_m, np.zeros((0, apart.shape[2])))
+        Effect(
+            p.point, p.setup, block, -apart[names.index(p.point)] / p.sigma_m, np.zeros((0, apart.shape[2]))
+        )
         for p, block in zip(mine, fit.problem.station_blocks(fit.state, mine), strict=True)
     ]
 

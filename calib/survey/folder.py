@@ -42,7 +42,7 @@ def _picture_size_px(data: bytes) -> tuple[int, int] | None:
     return width, height
 
 
-class Row:
+class TableRow:
     """One row of a table; ``line`` counts from 1, the header's line."""
 
     def __init__(self, path: Path, line: int, cells: Mapping[str, str]) -> None:
@@ -108,7 +108,7 @@ class Once:
     def __init__(self) -> None:
         self._lines: dict[tuple[object, ...], int] = {}
 
-    def __call__(self, row: Row, what: str, *key: object) -> None:
+    def __call__(self, row: TableRow, what: str, *key: object) -> None:
         if key in self._lines:
             raise row.bad("", f"{what} is there twice, first on line {self._lines[key]}")
         self._lines[key] = row.line
@@ -141,7 +141,7 @@ class SurveyFolder:
         columns: Sequence[str],
         may_be_there: Sequence[str] | None = None,
         required: bool = False,
-    ) -> Iterator[Row]:
+    ) -> Iterator[TableRow]:
         """Yield a table's rows, none of one that is not there and not required; blanks around a cell go.
 
         ``columns`` are exactly these in this order; or, with ``may_be_there``, these and any of those, in any
@@ -161,9 +161,9 @@ class SurveyFolder:
                 raise BadFile(path, "", f"has more than {MAX_ROWS} rows, the most that is read")
             if len(cells) != len(header):
                 raise BadFile(path, f"line {line}", f"{len(cells)} cells where {len(header)} are expected")
-            yield Row(path, line, dict(zip(header, map(str.strip, cells), strict=True)))
+            yield TableRow(path, line, dict(zip(header, map(str.strip, cells), strict=True)))
 
-    def check_picture(self, row: Row, file: str, camera: SurveyCamera) -> None:
+    def check_picture(self, row: TableRow, file: str, camera: SurveyCamera) -> None:
         """Refuse a picture of another size, and note its content; one that is missing is for the check."""
         path = self.path / file
         try:

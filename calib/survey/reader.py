@@ -20,7 +20,7 @@ from calib.files.records import ABSENT, Record, Text, Vector, parse_record, prob
 from calib.files.yaml_text import nearest, parse_mapping
 from calib.geometry.cahvor import Kind
 from calib.geometry.rigid import FloatArray, frozen_array
-from calib.survey.folder import Once, Row, SurveyFolder
+from calib.survey.folder import Once, SurveyFolder, TableRow
 from calib.survey.records import (
     Approach,
     Click,
@@ -304,7 +304,7 @@ def _refuse_empty(rows: list[Any], read: SurveyFolder, name: str, what: str) -> 
         raise BadFile(read.path / name, "", f"has a header and no rows; one for each of {what} is expected")
 
 
-def _joint_rad(row: Row, column: str, camera: SurveyCamera) -> float | None:
+def _joint_rad(row: TableRow, column: str, camera: SurveyCamera) -> float | None:
     """Read an angle, which a head camera has and one on the body has not."""
     row.none_on_body(column, camera)
     if camera.on == "rover":
@@ -314,7 +314,7 @@ def _joint_rad(row: Row, column: str, camera: SurveyCamera) -> float | None:
     return row.number(column, LARGEST_ANGLE_RAD)
 
 
-def _approach(row: Row, column: str, camera: SurveyCamera) -> Approach:
+def _approach(row: TableRow, column: str, camera: SurveyCamera) -> Approach:
     """Read from which side a joint came to rest."""
     cell = row.cells.get(column, "")
     row.none_on_body(column, camera)
@@ -324,7 +324,7 @@ def _approach(row: Row, column: str, camera: SurveyCamera) -> Approach:
     return cast(Approach, int(value))
 
 
-def _image(row: Row, images: Mapping[str, SurveyImage]) -> SurveyImage:
+def _image(row: TableRow, images: Mapping[str, SurveyImage]) -> SurveyImage:
     name = row.cells["image"]
     return images[name if name in images else row.choice("image", tuple(images), "image of images.csv")]
 

@@ -19,7 +19,7 @@ from drivers.aravis import find
 from drivers.aravis.camera_clock import WallClock
 from drivers.aravis.library import CONTROL_LOST, GenicamError, library
 from drivers.aravis.options import AravisOptions
-from drivers.aravis.settings import CHUNKS, EXPOSURE, ROUNDING, Control, Meaning, change, set_up, settings_of
+from drivers.aravis.settings import CHUNKS, EXPOSURE, ROUNDING, Control, Feature, change, set_up, settings_of
 from drivers.errors import CameraBusy, DriverError, NoCamera, StreamFailed, UnsupportedFormat
 from drivers.interfaces import CameraSetting
 from drivers.pixels import GENICAM, PictureFormat
@@ -100,7 +100,7 @@ class Device:
         self.problems: list[str] = []
         self._wall = WallClock()
         self._parser: int | None = None
-        self._chunks: list[Meaning] = []
+        self._chunks: list[Feature] = []
         self._longest_s, self._told_chunk = math.inf, False
         self._stream: int | None = None
         self._latch: tuple[str, str] | None = None

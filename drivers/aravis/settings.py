@@ -23,7 +23,7 @@ ROUNDING = 1e-6  # of a value that went through the camera's own number format
 
 
 @dataclass(frozen=True)
-class Meaning:
+class Feature:
     """Which features a setting is.
 
     Attributes
@@ -48,13 +48,13 @@ class Meaning:
 
 # Names: GenICam's Standard Features Naming Convention (SFNC); white balance and focus as The Imaging Source's
 # cameras have them (tiscamera), which the SFNC does not name.
-EXPOSURE = Meaning("exposure_s", "exposure time", "ExposureTime", "ExposureAuto", "exposure_time", 1e-6)
-GAIN = Meaning("gain", "gain", "Gain", "GainAuto", "gain")
+EXPOSURE = Feature("exposure_s", "exposure time", "ExposureTime", "ExposureAuto", "exposure_time", 1e-6)
+GAIN = Feature("gain", "gain", "Gain", "GainAuto", "gain")
 MEANINGS = (
     EXPOSURE,
     GAIN,
-    Meaning("white_balance_k", "white balance", "BalanceWhiteTemperature", "BalanceWhiteAuto"),
-    Meaning("focus", "focus", "Focus", "FocusAuto"),
+    Feature("white_balance_k", "white balance", "BalanceWhiteTemperature", "BalanceWhiteAuto"),
+    Feature("focus", "focus", "Focus", "FocusAuto"),
 )
 CHUNKS = (EXPOSURE, GAIN)
 """Those that GenICam has as chunk data."""
@@ -69,7 +69,7 @@ class Control:
         Whether the camera has it.
     """
 
-    def __init__(self, arv: Library, camera: int, meaning: Meaning) -> None:
+    def __init__(self, arv: Library, camera: int, meaning: Feature) -> None:
         self._arv, self._camera, self.meaning = arv, camera, meaning
         arguments = (meaning.feature,) * (not meaning.called)
         name = f"is_{meaning.called or 'feature'}_available"
@@ -167,7 +167,7 @@ def set_up(
     return values, problems
 
 
-def _other(one: Meaning, value: float | None, wanted: float) -> list[str]:
+def _other(one: Feature, value: float | None, wanted: float) -> list[str]:
     """A sentence for a value that became another than wanted; none if it did not."""
     if value is None:
         return [f"{one.name} stays with the camera's automatic where {wanted:.6g} was asked for"]

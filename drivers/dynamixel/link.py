@@ -34,7 +34,7 @@ from drivers.dynamixel.packets import (
     take_status,
     tick_at,
 )
-from drivers.dynamixel.registers import Register
+from drivers.dynamixel.registers import ControlItem
 from drivers.errors import BadReply, DriverError, LineLost, Refused
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.exchange import REPLY_TIMEOUT_S, BusLink
@@ -108,7 +108,7 @@ class Link(BusLink):
         noise = max(0, port.received_bytes - before - understood)
         return [found[servo_id] for servo_id in sorted(found)], noise
 
-    def proven(self, servo_id: int, *registers: Register) -> list[int]:
+    def proven(self, servo_id: int, *registers: ControlItem) -> list[int]:
         """Return registers' values, each of an answer that is certainly of its question.
 
         Takes a silence of some 20 ms if any of the registers is not read with the servo's counter. Raises
@@ -122,18 +122,18 @@ class Link(BusLink):
                 found[register.window] = self.block(Part(servo_id, *register.window)).statuses[servo_id].data
         return [register.decode_window(found[register.window]) for register in registers]
 
-    def agreed(self, servo_id: int, register: Register) -> int:
+    def agreed(self, servo_id: int, register: ControlItem) -> int:
         """Return a register of any servo, also of one whose counter stands elsewhere; raises as `proven`."""
         found = self._agreed(servo_id, {register.window: register})
         return register.decode_window(found[register.window])
 
-    def heard(self, servo_id: int, register: Register) -> int:
+    def heard(self, servo_id: int, register: ControlItem) -> int:
         """Return what a register seems to be, asked one time and after a silence; raises as `proven`."""
         self.quiet(QUIET_S)
         return register.decode(self.read(servo_id, *register.window, register.name))
 
     def _agreed(
-        self, servo_id: int, requested: dict[tuple[int, int], Register]
+        self, servo_id: int, requested: dict[tuple[int, int], ControlItem]
     ) -> dict[tuple[int, int], bytes]:
         """What is said twice in a row, around a silence, of each window."""
         found: dict[tuple[int, int], bytes] = {}
@@ -158,14 +158,14 @@ class Link(BusLink):
                 before[window] = now
         return found
 
-    def _outcome(self, servo_id: int, register: Register) -> bytes | Refused:
+    def _outcome(self, servo_id: int, register: ControlItem) -> bytes | Refused:
         """One answer to a question for a register's window, or its refusal; raises NoReply, LineLost."""
         try:
             return self.read(servo_id, *register.window, register.name)
         except Refused as refused:
             return refused
 
-    def write(self, servo_id: int, register: Register, value: int) -> None:
+    def write(self, servo_id: int, register: ControlItem, value: int) -> None:
         """Set a register and wait for the servo's word that it did.
 
         Raises NoReply, BadReply, Refused, LineLost.
@@ -173,7 +173,7 @@ class Link(BusLink):
         data = register.address.to_bytes(2, "little") + register.encode(value)
         self.ask(servo_id, WRITE, data, 0, register.name)
 
-    def write_unanswered(self, servo_id: int, register: Register, value: int) -> None:
+    def write_unanswered(self, servo_id: int, register: ControlItem, value: int) -> None:
         """Set a register of a servo that is set to keep silent; an answer is dropped. Raises LineLost."""
         data = register.address.to_bytes(2, "little") + register.encode(value)
         self.port.send(instruction_packet(servo_id, WRITE, data), 0)

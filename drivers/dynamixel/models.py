@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from drivers.dynamixel.registers import Register, vendor_names, vendor_table
+from drivers.dynamixel.registers import ControlItem, vendor_names, vendor_table
 from drivers.errors import BadOptions
 from drivers.faults import nearest
 from drivers.servo_bus.settings import CountedModel
@@ -80,7 +80,7 @@ class ServoModel(CountedModel):
     """
 
     number: int
-    registers: Mapping[str, Register]
+    registers: Mapping[str, ControlItem]
     most_current_counts: int
     watchdog_firmware: int
 

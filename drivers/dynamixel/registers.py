@@ -60,7 +60,7 @@ _WINDOWS = {
 
 
 @dataclass(frozen=True)
-class Register:
+class ControlItem:
     """One entry of a control table: its address, its size in bytes, whether it is signed.
 
     ``window`` is the address and the length of what is read to know the register: see `_WINDOWS`.
@@ -89,7 +89,7 @@ class Register:
 class VendorTable(NamedTuple):
     """What the SDK says of one model: its registers, and the ends and the middle of its turn."""
 
-    registers: Mapping[str, Register]
+    registers: Mapping[str, ControlItem]
     low_count: int
     high_count: int
     centre_count: int
@@ -108,7 +108,7 @@ def vendor_names() -> Mapping[int, str]:
     return {number: file.stem for number, file in _files().items()}
 
 
-def vendor_registers(number: int) -> list[Register]:
+def vendor_registers(number: int) -> list[ControlItem]:
     """Return every register that the SDK's table of a model holds, by address; indirect ones are left out.
 
     Signed are those that the table says to be, and positions.
@@ -120,7 +120,7 @@ def vendor_registers(number: int) -> list[Register]:
         if not theirs.startswith("Indirect"):
             window = int(address), int(length)
             name = re.sub(r"\W+", "_", theirs.lower()).strip("_")
-            registers[window] = Register(name, *window, theirs in signed, window=window)
+            registers[window] = ControlItem(name, *window, theirs in signed, window=window)
     return [registers[window] for window in sorted(registers)]
 
 
@@ -147,14 +147,14 @@ def _sections(file: Path) -> dict[str, list[list[str]]]:
     return {section: rows[1:] for section, rows in found.items()}
 
 
-def _registers(rows: Sequence[Sequence[str]]) -> Mapping[str, Register]:
+def _registers(rows: Sequence[Sequence[str]]) -> Mapping[str, ControlItem]:
     """The registers of one model, those that the driver knows, by name."""
     places: dict[str, tuple[int, int]] = {}
     for address, length, theirs in rows:
         places[_NAMES.get(theirs, theirs.lower().replace(" ", "_"))] = int(address), int(length)
     tick = places["realtime_tick"][0]
     windows = [(places[name][0], count) for name, count in _WINDOWS.items()]
-    registers: dict[str, Register] = {}
+    registers: dict[str, ControlItem] = {}
     for word in _KNOWN.split():
         name = word.removeprefix("-")
         if name not in places:
@@ -163,14 +163,14 @@ def _registers(rows: Sequence[Sequence[str]]) -> Mapping[str, Register]:
         first, end = min(at, tick), max(at + size, tick + 2)
         fitting = (w for w in windows if w[0] <= at and at + size <= sum(w))
         window = next(fitting, (first, end - first))
-        registers[name] = Register(name, at, size, word != name, window)
+        registers[name] = ControlItem(name, at, size, word != name, window)
     return MappingProxyType(registers)
 
 
 class RegisterBlock:
     """Neighbouring registers that are read in one go, and their decoding."""
 
-    def __init__(self, registers: Mapping[str, Register], first: str, last: str) -> None:
+    def __init__(self, registers: Mapping[str, ControlItem], first: str, last: str) -> None:
         start, end = registers[first].address, registers[last].address
         inside = sorted((r for r in registers.values() if start <= r.address <= end), key=lambda r: r.address)
         codes, at = "<", start

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from drivers.dynamixel.link import Link, Pinged
 from drivers.dynamixel.packets import GroupAnswer, Part
-from drivers.dynamixel.registers import Register, RegisterBlock
+from drivers.dynamixel.registers import ControlItem, RegisterBlock
 from drivers.errors import BadReply, Refused, WrongDevice
 from drivers.servo_bus.exchange import ATTEMPTS, LATE_S, again
 from drivers.servo_bus.port import QUIET_S
@@ -30,7 +30,7 @@ def identified(link: Link, servo_id: int, name: str) -> Pinged:
 class ServoTable:
     """The control table of one servo."""
 
-    def __init__(self, link: Link, servo_id: int, registers: Mapping[str, Register], name: str) -> None:
+    def __init__(self, link: Link, servo_id: int, registers: Mapping[str, ControlItem], name: str) -> None:
         self.name = name
         self._link = link
         self._servo_id = servo_id

@@ -11,7 +11,7 @@ from drivers.interfaces import Camera, PanTilt
 from drivers.registry import Context, Driver
 
 if TYPE_CHECKING:
-    from drivers.sim.rover import SimulatedRover
+    from drivers.sim.rover import RoverModel
 
 ROVER = "simulated rover"
 """The key of the rover among what the devices share."""
@@ -35,14 +35,14 @@ def _device(options: Mapping[str, Any], context: Context) -> PanTilt | Camera:
     return HangingCamera(rover.cameras[name], rover.sensor_modes[name], context.clock, rover.faults)
 
 
-def _rover(context: Context) -> SimulatedRover:
+def _rover(context: Context) -> RoverModel:
     if ROVER not in context.shared:
-        from drivers.sim.rover import SimulatedRover
+        from drivers.sim.rover import RoverModel
         from drivers.sim.settings import simulation_settings
 
         settings = simulation_settings(context.simulation, context.folder)
-        context.shared[ROVER] = SimulatedRover(settings, context.clock)
-    rover: SimulatedRover = context.shared[ROVER]
+        context.shared[ROVER] = RoverModel(settings, context.clock)
+    rover: RoverModel = context.shared[ROVER]
     return rover
 
 

@@ -167,7 +167,7 @@ def clock_settings(values: Any) -> dict[str, ClockSettings]:
     return clocks
 
 
-class CameraClock:
+class SimulatedCameraClock:
     """Turns true times into stamps and back; both agree at ``start_s`` but for ``stamped_late_s``."""
 
     def __init__(self, settings: ClockSettings, start_s: float) -> None:

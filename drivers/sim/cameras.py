@@ -23,7 +23,7 @@ from drivers.clock import Clock
 from drivers.errors import BadSetting, NoFreshFrame, NoReply
 from drivers.faults import Fault, FaultPanel
 from drivers.interfaces import Camera, CameraInfo, CameraSetting, Frame, FrameTime, Image
-from drivers.sim.camera_settings import CameraClock, CameraSettings, ClockSettings
+from drivers.sim.camera_settings import CameraSettings, ClockSettings, SimulatedCameraClock
 from drivers.sim.optics.exposure import AutoExposure, FixedExposure, FrameExposure
 from drivers.sim.optics.readout import Noise, Readout
 
@@ -101,7 +101,7 @@ class SimulatedCamera(Camera):
         self._faults = faults
         self._lock = threading.Lock()
         self._epoch_lock = threading.Lock()
-        self._own = CameraClock(own, start_s)
+        self._own = SimulatedCameraClock(own, start_s)
         self._epochs = [_Epoch(self._own.first_s, 0, self._own.true_period_s(1 / settings.rate_hz))]
         self._last: Frame | None = None
         self._frozen: tuple[Fault, Image] | None = None

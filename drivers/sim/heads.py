@@ -135,7 +135,7 @@ def check_together(axis: AxisSettings) -> None:
 
 
 @dataclass(frozen=True)
-class HeadSettings:
+class HeadModel:
     """A head: its name and two axes."""
 
     name: str
@@ -143,25 +143,25 @@ class HeadSettings:
     tilt: AxisSettings
 
 
-PRESETS: Mapping[str, HeadSettings] = {
-    "ptu_d46_70": HeadSettings(
+PRESETS: Mapping[str, HeadModel] = {
+    "ptu_d46_70": HeadModel(
         "ptu_d46_70",
         _PTU,
         replace(_PTU, low_rad=math.radians(-80), high_rad=math.radians(31), sag_rad=_SAG_RAD),
     ),
     # The shortest way, not one-sided: the table shows what counts and backlash allow untreated.
-    "dynamixel_x": HeadSettings(
+    "dynamixel_x": HeadModel(
         "dynamixel_x", _X, replace(_X, low_rad=-math.pi / 2, high_rad=math.pi / 2, sag_rad=_SAG_RAD)
     ),
     # Dynamixel PH42: counts on the motor's side (607500 a turn of the output), so the backlash (6', vendor)
     # is what matters, and it is taken up. Speed and acceleration are assumed, as for the X.
-    "ph42": HeadSettings(
+    "ph42": HeadModel(
         "ph42", _PH42, replace(_PH42, low_rad=-math.pi / 2, high_rad=math.pi / 2, sag_rad=_SAG_RAD)
     ),
 }
 
 
-def head_settings(value: Any) -> HeadSettings:
+def head_settings(value: Any) -> HeadModel:
     """Return the head that a configuration names.
 
     Raises BadOptions for an unknown preset or key, a value that is not a number of the right sign or within
@@ -187,7 +187,7 @@ def head_settings(value: Any) -> HeadSettings:
     return head
 
 
-def with_joints(head: HeadSettings, joints: JointErrors) -> HeadSettings:
+def with_joints(head: HeadModel, joints: JointErrors) -> HeadModel:
     """Return a head whose encoders and gears err as a true rig's ``joints`` say; the same if they read true.
 
     Raises BadOptions if the head has errors of its encoders already, or comes to its goals over less than the

@@ -19,7 +19,7 @@ from drivers.faults import PAN_TILT, Fault, FaultPanel
 from drivers.interfaces import AxisMotion, HeadInfo, PanTilt, Reading
 from drivers.serial_line import OpenLine
 from drivers.sim.axis import AxisSettings
-from drivers.sim.heads import PRESETS, HeadSettings
+from drivers.sim.heads import PRESETS, HeadModel
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.carrier import WireDevice
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
@@ -69,7 +69,7 @@ DEFAULT_HEADS: Mapping[str, str] = MappingProxyType({"dynamixel": "dynamixel_x",
 """The wires there are, and the head behind each where a configuration names none."""
 
 
-def check_head(wire: str, head: HeadSettings) -> None:
+def check_head(wire: str, head: HeadModel) -> None:
     """Pass a head that can stand behind a wire. Raises BadOptions, naming those that can."""
     fitting = [name for name, one in _HEADS.items() if one.wire == wire]
     if head.name not in fitting:
@@ -95,7 +95,7 @@ class SimulatedPanTilt(PanTilt):
         The panel that is asked for faults of ``pan_tilt``; none when left out.
     """
 
-    def __init__(self, head: HeadSettings, clock: Clock, faults: FaultPanel | None = None) -> None:
+    def __init__(self, head: HeadModel, clock: Clock, faults: FaultPanel | None = None) -> None:
         self.head = head
         self._clock = clock
         self._faults = faults or FaultPanel(clock.now_s, ())
@@ -263,7 +263,7 @@ class WiredHead:
         Those of ``pan_tilt`` act on the axes and on the line.
     """
 
-    def __init__(self, wire: str, head: HeadSettings, clock: Clock, faults: FaultPanel) -> None:
+    def __init__(self, wire: str, head: HeadModel, clock: Clock, faults: FaultPanel) -> None:
         check_head(wire, head)
         if not clock.runs:
             raise BadOptions(f"simulation.wire {wire!r} needs a clock that goes on by itself")
@@ -297,7 +297,7 @@ class WiredHead:
 _Made = tuple[WireDevice, Callable[[Mapping[str, Any], Clock, OpenLine], PanTilt], dict[str, Any]]
 
 
-def _dynamixel(kind: _Wire, head: HeadSettings, axes: tuple[WireAxis, WireAxis], time_s: float) -> _Made:
+def _dynamixel(kind: _Wire, head: HeadModel, axes: tuple[WireAxis, WireAxis], time_s: float) -> _Made:
     """Two servos at 1 Mbaud, ids 1 and 2."""
     from drivers.dynamixel.head import open_head
 
@@ -327,7 +327,7 @@ def _dynamixel(kind: _Wire, head: HeadSettings, axes: tuple[WireAxis, WireAxis],
     return DynamixelBus(servos), open_head, options
 
 
-def _flir_ptu(kind: _Wire, head: HeadSettings, axes: tuple[WireAxis, WireAxis], time_s: float) -> _Made:
+def _flir_ptu(kind: _Wire, head: HeadModel, axes: tuple[WireAxis, WireAxis], time_s: float) -> _Made:
     """A unit in eighth steps, which counts pan to the left."""
     from drivers.flir_ptu.head import open_head
 

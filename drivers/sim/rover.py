@@ -76,7 +76,7 @@ class FrameTruth:
     site_from_rover: Rigid
 
 
-class SimulatedRover:
+class RoverModel:
     """A rover in memory: one head, all cameras of its true rig, one scene, one panel of faults.
 
     Raises BadOptions if the true rig's file cannot be used, or a fault of the settings is unknown.

@@ -19,7 +19,7 @@ from drivers.sim.camera_settings import (
     clock_settings,
     temperature_settings,
 )
-from drivers.sim.heads import HeadSettings, head_settings
+from drivers.sim.heads import HeadModel, head_settings
 from drivers.sim.pan_tilt import DEFAULT_HEADS, check_head
 from drivers.sim.placed import read_list
 from drivers.sim.scene import SceneSettings
@@ -50,7 +50,7 @@ class SimulationSettings:
     """
 
     rover: Path
-    head: HeadSettings
+    head: HeadModel
     camera: CameraSettings = field(default_factory=CameraSettings)
     samples: int = 2
     scene: SceneSettings = field(default_factory=SceneSettings)

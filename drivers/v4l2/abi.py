@@ -267,7 +267,7 @@ class _PlaneMemory(Union):
     _fields_ = (("mem_offset", c_uint32), ("userptr", c_uint64), ("fd", c_int32))
 
 
-class Plane(Structure):
+class BufferPlane(Structure):
     """struct v4l2_plane."""
 
     _fields_ = (

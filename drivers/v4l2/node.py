@@ -97,7 +97,7 @@ class Node:
             raise
         self._in_planes = not self.identity.capabilities & abi.CAP_VIDEO_CAPTURE
         self._type = abi.BUF_TYPE_VIDEO_CAPTURE_MPLANE if self._in_planes else abi.BUF_TYPE_VIDEO_CAPTURE
-        self._planes = (abi.Plane * abi.MAX_PLANES)()
+        self._planes = (abi.BufferPlane * abi.MAX_PLANES)()
         self._exchanged = self._buffer(0)  # for the requests made for every frame; made once, as each costs
         self._exchanged_at = ctypes.addressof(self._exchanged)
 

@@ -23,7 +23,7 @@ EXPOSURE_UNIT_S = 1e-4  # of V4L2_CID_EXPOSURE_ABSOLUTE
 
 
 @dataclass(frozen=True)
-class Meaning:
+class ControlMeaning:
     """Which controls a setting is.
 
     Attributes
@@ -46,7 +46,7 @@ class Meaning:
         return round(value / self.unit)
 
 
-EXPOSURE = Meaning(
+EXPOSURE = ControlMeaning(
     "exposure_s",
     "exposure",
     abi.CID_EXPOSURE_AUTO,
@@ -56,21 +56,21 @@ EXPOSURE = Meaning(
 )
 MEANINGS = (
     EXPOSURE,
-    Meaning("gain", "gain", abi.CID_AUTOGAIN, 0, abi.CID_GAIN),
-    Meaning(
+    ControlMeaning("gain", "gain", abi.CID_AUTOGAIN, 0, abi.CID_GAIN),
+    ControlMeaning(
         "white_balance_k", "white balance", abi.CID_AUTO_WHITE_BALANCE, 0, abi.CID_WHITE_BALANCE_TEMPERATURE
     ),
-    Meaning("focus", "focus", abi.CID_FOCUS_AUTO, 0, abi.CID_FOCUS_ABSOLUTE),
+    ControlMeaning("focus", "focus", abi.CID_FOCUS_AUTO, 0, abi.CID_FOCUS_ABSOLUTE),
 )
 
 
-def is_automatic(node: Node, controls: Sequence[CameraControl], one: Meaning) -> bool:
+def is_automatic(node: Node, controls: Sequence[CameraControl], one: ControlMeaning) -> bool:
     """Return whether the camera itself sets it now."""
     automatic = first_of(controls, (one.automatic,))
     return automatic is not None and get_value(node, automatic) not in (one.off, None)
 
 
-def value_of(node: Node, controls: Sequence[CameraControl], one: Meaning) -> float | None:
+def value_of(node: Node, controls: Sequence[CameraControl], one: ControlMeaning) -> float | None:
     """Return what is set now; None if the camera has no such control, or sets it itself."""
     control = first_of(controls, (one.control,))
     if control is None or is_automatic(node, controls, one):
@@ -109,7 +109,7 @@ def settings_of(node: Node, options: CameraOptions, period_s: float | None) -> l
     return found
 
 
-def _refusal(one: Meaning, options: CameraOptions) -> str:
+def _refusal(one: ControlMeaning, options: CameraOptions) -> str:
     """Why a setting is not to be changed at run time."""
     if one is EXPOSURE and options.auto_exposure is not None:
         return "is set by 'auto_exposure' of the camera's options"

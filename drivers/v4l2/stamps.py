@@ -59,7 +59,7 @@ class Timing(NamedTuple):
     before_apart_s: float | None
 
 
-class Window(NamedTuple):
+class StampWindow(NamedTuple):
     """A stretch of time in which the whole exposure lay, seconds of CLOCK_MONOTONIC."""
 
     begin_s: float
@@ -99,7 +99,7 @@ class Arrived(NamedTuple):
     buffer: Dequeued
     format: PictureFormat
     timing: Timing
-    window: Window
+    window: StampWindow
     sequence: int
     stream: int
     received_s: float
@@ -108,7 +108,7 @@ class Arrived(NamedTuple):
 
 def exposure_window(
     rule: StampRule, timing: Timing, flags: int, stamp_s: float, received_s: float
-) -> Window | None:
+) -> StampWindow | None:
     """Return the window of a frame's exposure, None if nothing says when that began at the earliest.
 
     No row is exposed before its last picture was read out, and one readout follows the other. So readout and
@@ -147,7 +147,7 @@ def exposure_window(
         if apart_s is not None and longest_s is not None:
             ends_s = stamp_s + longest_s + apart_s
     begin_s -= rule.margin_s
-    return Window(begin_s, max(begin_s, min(ends_s, received_s)))
+    return StampWindow(begin_s, max(begin_s, min(ends_s, received_s)))
 
 
 class Spacing:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from drivers.clock import ManualClock
 from drivers.interfaces import Reading
 from drivers.sim.axis import AxisSettings
-from drivers.sim.heads import PRESETS, HeadSettings
+from drivers.sim.heads import PRESETS, HeadModel
 from drivers.sim.pan_tilt import SimulatedPanTilt
 from mastctl.devices.judge import REST_S, KeepOutJudge
 from mastctl.devices.keep_out import Box, KeptOut, Pair, Span
@@ -179,7 +179,7 @@ class _Drive:
         return None
 
 
-def _head(rng: random.Random) -> HeadSettings:
+def _head(rng: random.Random) -> HeadModel:
     """Two axes that have little in common."""
     preset = PRESETS[rng.choice(sorted(PRESETS))]
     approach = rng.choice((0.0, 0.0, 0.01, 0.05))
@@ -197,10 +197,10 @@ def _head(rng: random.Random) -> HeadSettings:
             ring_damping=rng.uniform(0.02, 0.2),
         )
 
-    return HeadSettings(preset.name, axis(preset.pan), axis(preset.tilt))
+    return HeadModel(preset.name, axis(preset.pan), axis(preset.tilt))
 
 
-def _margin_rad(head: HeadSettings) -> float:
+def _margin_rad(head: HeadModel) -> float:
     """What such a head needs around a box: backlash, counts, sag, and ringing that meets itself."""
     axes = (head.pan, head.tilt)
     ringing = [

@@ -27,7 +27,7 @@ from drivers.flir_ptu.head import open_head as open_flir_ptu
 from drivers.interfaces import PanTilt
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.sim.axis import AxisSettings
-from drivers.sim.heads import HeadSettings
+from drivers.sim.heads import HeadModel
 from drivers.sim.pan_tilt import SimulatedPanTilt
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.carrier import WireDevice
@@ -101,7 +101,7 @@ def in_memory(turned: bool = False) -> Iterator[HeadRig]:
         for low, high in LIMITS_RAD
     ]
     panel = FaultPanel(clock.now_s, ())
-    head = SimulatedPanTilt(HeadSettings("in memory", *axes), clock, panel)
+    head = SimulatedPanTilt(HeadModel("in memory", *axes), clock, panel)
     try:
         yield HeadRig("in memory", head, clock, panel, head.true_joints, X_COUNT_RAD)
     finally:

@@ -8,11 +8,11 @@ from typing_extensions import TypedDict
 
 from mastctl.answers.bench import BenchRunTold
 from mastctl.answers.motion import OperationTold, TrackTold
-from mastctl.answers.status import FaultTold, Joints, LeaseTold, MastTold, StandingTold
+from mastctl.answers.status import FaultTold, LeaseTold, MastTold, MeasuredJoints, StandingTold
 from mastctl.answers.words import Count, Json, Role, Seconds
 
 
-class HeadTold(Joints):
+class HeadTold(MeasuredJoints):
     """A reading of the head."""
 
     moving: bool

@@ -28,7 +28,7 @@ class ReadyTold(TypedDict):
     reason: str
 
 
-class Joints(TypedDict):
+class MeasuredJoints(TypedDict):
     """The head's joints as last measured, radians; ``measured_s`` of CLOCK_MONOTONIC.
 
     ``true_...`` by the mast file's ``joints``; ``..._approach``: from which side an axis came, 1 from smaller
@@ -260,7 +260,7 @@ class Status(StandingTold):
     simulated: bool
     hardware: str
     moving: bool
-    joints: Joints | None
+    joints: MeasuredJoints | None
     axes: dict[str, AxisTold]
     limits: SoftLimits
     pose: PoseTold | None

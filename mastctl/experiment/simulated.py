@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from drivers.errors import BadOptions
-from drivers.sim.rover import SimulatedRover
+from drivers.sim.rover import RoverModel
 from drivers.simulation_clock import MAX
 from mastctl.config import Config, Listen, load_config, not_simulated
 from mastctl.devices.frames import camera_and_sequence
@@ -75,7 +75,7 @@ def own_config(
     return replace(config, listen=Listen(port=0), hardware=replace(hardware, simulation={**kept, **chosen}))
 
 
-def head_note(rover: SimulatedRover, rig: Rig, camera: str) -> str:
+def head_note(rover: RoverModel, rig: Rig, camera: str) -> str:
     """Return what the head's counts and backlash allow, as a sentence in pixels of a camera."""
     model = rig.cameras[camera].model
     # A pixel's step of the ray at the image centre: what a turn of the head moves the picture by.
@@ -98,7 +98,7 @@ def head_note(rover: SimulatedRover, rig: Rig, camera: str) -> str:
 class SimulationTruth:
     """Where a clicked point really is in a later frame (`mastctl.experiment.pointing.ClickTruth`)."""
 
-    def __init__(self, rover: SimulatedRover) -> None:
+    def __init__(self, rover: RoverModel) -> None:
         self._rover = rover
         self._points: dict[tuple[str, tuple[float, float]], FloatArray | None] = {}
 
@@ -141,7 +141,7 @@ class PointingTask:
 
 
 @contextmanager
-def running_rover(rover: Rover) -> Iterator[tuple[RunningDaemon, Client, SimulatedRover]]:
+def running_rover(rover: Rover) -> Iterator[tuple[RunningDaemon, Client, RoverModel]]:
     """Start the rover behind a daemon of its own, with a client of it, and end both."""
     from mastctl.client import Client
     from mastctl.daemon import RunningDaemon  # late: `mastctl demo` compiles its renderer meanwhile

@@ -12,7 +12,7 @@ from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.frame_facts import FrameFacts
 from mastctl.recorder import messages
-from mastctl.recorder.schemas import DroppedRecord, JointsRecord
+from mastctl.recorder.schemas import DroppedRecord, RecordedJoints
 from mastctl.recorder.writer import RecordFile
 
 SAME_RAD = 1e-6
@@ -116,7 +116,7 @@ class Entries:
         if still and now_s - self._joints_written_s < REST_S:
             return
         self._joints_written_s = now_s
-        record: JointsRecord = {
+        record: RecordedJoints = {
             "pan_rad": reading.pan_rad,
             "tilt_rad": reading.tilt_rad,
             "moving": reading.moving,

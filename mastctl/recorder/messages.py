@@ -23,7 +23,7 @@ from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import Rigid, quaternion_of
 from mastctl.as_json import as_json
 from mastctl.devices.frames import StampedFrame
-from mastctl.recorder.schemas import CameraRecord, TargetRecord
+from mastctl.recorder.schemas import RecordedCamera, RecordedTarget
 
 TARGET_M = 0.1
 TARGET_COLOUR = (0.9, 0.2, 0.1, 0.8)
@@ -55,11 +55,11 @@ def picture(frame: StampedFrame, time_ns: int) -> Message:
 
 def calibration(
     name: str, camera: RigCamera, digest: str, time_ns: int
-) -> tuple[Message | None, CameraRecord]:
+) -> tuple[Message | None, RecordedCamera]:
     """Return the nearest ``plumb_bob`` camera (None if there is none) and the camera itself, as JSON."""
     model = camera.model
 
-    def record(near: dict[str, Any]) -> CameraRecord:
+    def record(near: dict[str, Any]) -> RecordedCamera:
         return {
             "camera": name, "model": _model_record(model), "plumb_bob": near, "on": camera.on,
             "mast_digest": digest,
@@ -131,7 +131,7 @@ def residuals(operation: Mapping[str, Any]) -> Sequence[dict[str, Any]]:
     return [one for one in records if one.get("residual_px") is not None]
 
 
-def target(operation: Mapping[str, Any]) -> TargetRecord | None:
+def target(operation: Mapping[str, Any]) -> RecordedTarget | None:
     """Return where an operation's target is; None if that is not known."""
     result = operation.get("result") or {}
     if not result.get("position_m"):

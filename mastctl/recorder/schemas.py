@@ -36,7 +36,7 @@ PROTOBUF: Mapping[str, type[Message]] = {
 """The messages that Foxglove, Lichtblick and Rerun draw."""
 
 
-class JointsRecord(TypedDict):
+class RecordedJoints(TypedDict):
     """A reading of the head: radians as read and true, and the side of approach (1 from smaller readings,
     -1 from larger, 0 not known); seconds of the daemon's monotonic clock."""
 
@@ -50,7 +50,7 @@ class JointsRecord(TypedDict):
     tilt_approach: float
 
 
-class CameraRecord(TypedDict):
+class RecordedCamera(TypedDict):
     """A camera in its frame as a mast file has it, and how far the nearest plumb_bob camera is, pixels."""
 
     camera: str
@@ -60,7 +60,7 @@ class CameraRecord(TypedDict):
     plumb_bob: Json
 
 
-class TargetRecord(TypedDict):
+class RecordedTarget(TypedDict):
     """A target in the rover frame."""
 
     operation: str
@@ -90,18 +90,18 @@ class DroppedRecord(TypedDict):
 
 
 RECORDS: Mapping[str, Any] = {
-    "cahvor": CameraRecord,
+    "cahvor": RecordedCamera,
     "command": CommandTold,
     "fault": FaultRecord,
     "frame": FrameFacts,
-    "joints": JointsRecord,
+    "joints": RecordedJoints,
     "lease": WhoSteers,
     "mast": MastTold,
     "operation": Operation,
     "recorder": DroppedRecord,
     "residual": ResidualRecord,
     "state": Standing,
-    "target": TargetRecord,
+    "target": RecordedTarget,
 }
 """The type of each kind of JSON message; any object where there is none."""
 

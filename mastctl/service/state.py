@@ -14,8 +14,8 @@ from mastctl.answers import (
     CameraTold,
     ControlTold,
     FaultTold,
-    Joints,
     MastTold,
+    MeasuredJoints,
     SentinelTold,
     StandingTold,
     Status,
@@ -139,7 +139,7 @@ def frame_told(frame: StampedFrame | None, now_s: float) -> CameraTold:
     }
 
 
-def joints_told(reading: HeadReading, now_s: float) -> Joints:
+def joints_told(reading: HeadReading, now_s: float) -> MeasuredJoints:
     """Return a reading of the head as ``GET /status`` tells it."""
     return {
         "pan_rad": reading.pan_rad,

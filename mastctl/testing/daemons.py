@@ -16,7 +16,7 @@ from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from drivers.errors import BadOptions
-from drivers.sim.rover import SimulatedRover
+from drivers.sim.rover import RoverModel
 from mastctl.config import Config, Listen, load_config, not_simulated
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.frames import camera_and_sequence
@@ -42,7 +42,7 @@ class Daemons:
             return action(**order)
 
     @property
-    def _rover(self) -> SimulatedRover:
+    def _rover(self) -> RoverModel:
         if self._daemon is None or self._daemon.hardware.simulation is None:
             raise NotKnown("no_daemon", "the daemon does not run; start_daemon() starts it")
         return self._daemon.hardware.simulation

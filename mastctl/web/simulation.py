@@ -45,7 +45,7 @@ from mastctl.web.parts import Here
 
 if TYPE_CHECKING:
     from drivers.sim.bench_boards import BenchBoard
-    from drivers.sim.rover import SimulatedRover
+    from drivers.sim.rover import RoverModel
 
 BoardName = Annotated[
     str,
@@ -150,7 +150,7 @@ def add_simulation(app: FastAPI) -> None:
         return _faults_told(panel)
 
 
-def _rover(service: Service, what: str) -> SimulatedRover:
+def _rover(service: Service, what: str) -> RoverModel:
     """The simulated rover, whose ``what`` are asked for. Raises NotKnown."""
     if service.hardware.simulation is None:
         kind = service.hardware.kind
@@ -163,12 +163,12 @@ def _panel(service: Service) -> FaultPanel:
     return _rover(service, "faults").faults
 
 
-def _stand_told(rover: SimulatedRover) -> StandTold:
+def _stand_told(rover: RoverModel) -> StandTold:
     pose = RoverPose(rover.site_from_rover).told(0.0)
     return {"position_m": pose["position_m"], "quaternion": pose["quaternion"]}
 
 
-def _board_told(rover: SimulatedRover, stands: BenchBoard) -> BoardStands:
+def _board_told(rover: RoverModel, stands: BenchBoard) -> BoardStands:
     pose = rover.site_from_rover.inverse @ stands.site_from_board
     return {
         "board": document_of(stands.board),
@@ -178,7 +178,7 @@ def _board_told(rover: SimulatedRover, stands: BenchBoard) -> BoardStands:
     }
 
 
-def _boards_told(rover: SimulatedRover) -> BoardsTold:
+def _boards_told(rover: RoverModel) -> BoardsTold:
     return {"boards": {name: _board_told(rover, one) for name, one in rover.boards.items()}}
 
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
-from drivers.sim.rover import SimulatedRover
+from drivers.sim.rover import RoverModel
 from drivers.simulation_clock import MAX
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.config import Config, load_config
@@ -101,7 +101,7 @@ def click_all(task: ClicksTask) -> list[TrueClick]:
         return [click(client, rover, task.group, rng) for _ in range(task.cases)]
 
 
-def click(client: Client, rover: SimulatedRover, group: str, rng: np.random.Generator) -> TrueClick:
+def click(client: Client, rover: RoverModel, group: str, rng: np.random.Generator) -> TrueClick:
     """Click a random pixel of the group in a random view, and hold the residual against the truth."""
     shot, pixel = random_click(client, rover, group, rng)
     seen_by = camera_of(rover, shot, pixel[1])
@@ -124,7 +124,7 @@ def click(client: Client, rover: SimulatedRover, group: str, rng: np.random.Gene
     return TrueClick(hidden, "", error_px=tuple(error_px.tolist()), sigma_px=tuple(sigma_px))
 
 
-def camera_of(rover: SimulatedRover, shot: Snapshot, row_px: float) -> CameraModel:
+def camera_of(rover: RoverModel, shot: Snapshot, row_px: float) -> CameraModel:
     """The true camera of a picture in the rover frame, the mean over the exposure of one of its rows.
 
     Of a rolling shutter each row has a time of its own, and the mast may ring.
@@ -140,7 +140,7 @@ def camera_of(rover: SimulatedRover, shot: Snapshot, row_px: float) -> CameraMod
 
 
 def random_click(
-    client: Client, rover: SimulatedRover, group: str, rng: np.random.Generator
+    client: Client, rover: RoverModel, group: str, rng: np.random.Generator
 ) -> tuple[Snapshot, tuple[float, float]]:
     """A picture of a random view with something of the group in it, and a random pixel of that."""
     model = rover.rig.cameras[LEFT].model
@@ -161,7 +161,7 @@ def random_click(
     raise RuntimeError(f"no view of {VIEWS} has {group} {NEAR_M:g} to {FAR_M:g} m away")
 
 
-def of_group(rover: SimulatedRover, camera: CameraModel, pixels: FloatArray, group: str) -> NDArray[np.bool_]:
+def of_group(rover: RoverModel, camera: CameraModel, pixels: FloatArray, group: str) -> NDArray[np.bool_]:
     """Which pixels (n, 2) of a camera in the rover frame show a rock (or ground) in range."""
     points = hit(rover, camera, pixels)
     ranges_m = np.linalg.norm(points - camera.C, axis=1)
@@ -173,14 +173,14 @@ def of_group(rover: SimulatedRover, camera: CameraModel, pixels: FloatArray, gro
     return np.asarray(inside)
 
 
-def hit(rover: SimulatedRover, camera: CameraModel, pixels: FloatArray) -> FloatArray:
+def hit(rover: RoverModel, camera: CameraModel, pixels: FloatArray) -> FloatArray:
     """Where the rays of a camera's pixels (n, 2) meet the scene, (n, 3) in the rover frame; nan for sky."""
     rays, site = camera.ray(pixels), rover.site_from_rover
     ranges_m = rover.scene.cast(site.points(rays.origins_m), site.vectors(rays.directions))
     return np.asarray(rays.origins_m + ranges_m[:, None] * rays.directions)
 
 
-def shown(rover: SimulatedRover, camera: CameraModel, point_m: FloatArray) -> bool:
+def shown(rover: RoverModel, camera: CameraModel, point_m: FloatArray) -> bool:
     """Whether a camera sees a point (3,) of the rover frame: inside, and hidden by nothing nearer."""
     pixel, valid = camera.project(point_m)
     if not (valid and camera.holds(pixel, 0.0)):

@@ -33,7 +33,7 @@ from calib.survey.reader import read_survey
 from calib.survey.records import Sigma
 from calib.survey.writer import write_survey
 from drivers.clock import ManualClock
-from drivers.sim.heads import PRESETS, HeadSettings
+from drivers.sim.heads import PRESETS, HeadModel
 from drivers.sim.pan_tilt import SimulatedPanTilt
 from hil_tests.support.sim_survey.plan import Ring, SurveyPlan
 from hil_tests.support.sim_survey.survey import simulate_survey
@@ -212,7 +212,7 @@ def projection_error_px(truth: Rig, belief: Rig, camera: str, distance_m: float)
 def pointing_error_px(
     truth: Rig,
     belief: Rig,
-    head: HeadSettings,
+    head: HeadModel,
     pair: str,
     distance_m: float,
     targets: int,

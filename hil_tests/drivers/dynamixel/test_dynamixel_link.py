@@ -15,7 +15,7 @@ import pytest
 from drivers.dynamixel.link import Link
 from drivers.dynamixel.models import MODELS
 from drivers.dynamixel.packets import Part
-from drivers.dynamixel.registers import Register
+from drivers.dynamixel.registers import ControlItem
 from drivers.errors import BadOptions, BadReply, LineLost, NoReply, Refused
 from drivers.serial_line import SerialLine
 from drivers.servo_bus.bus import Bus
@@ -37,7 +37,7 @@ def always(*replies: Reply) -> Callable[[Instruction, int], Sequence[Reply]]:
     return lambda instruction, count: replies
 
 
-def asked(link: Link, servo_id: int, register: Register) -> int:
+def asked(link: Link, servo_id: int, register: ControlItem) -> int:
     """A register's value by one question, proven by nothing."""
     data = link.read(servo_id, register.address, register.size, register.name)
     return register.decode(data)

@@ -13,7 +13,7 @@ from calib.geometry.mode import SensorMode
 from calib.geometry.rigid import Rigid
 from drivers.clock import ManualClock
 from drivers.sim.render import Renderer
-from drivers.sim.rover import SimulatedRover
+from drivers.sim.rover import RoverModel
 from drivers.sim.scene import Scene
 from drivers.sim.settings import simulation_settings
 
@@ -23,7 +23,7 @@ QUIET = {"read_noise_dn": 0, "shot_noise_dn": 0}
 LEFT, RIGHT = "navcam_left", "navcam_right"
 
 
-_MADE: list[SimulatedRover] = []
+_MADE: list[RoverModel] = []
 
 
 @pytest.fixture(autouse=True)
@@ -33,10 +33,10 @@ def closed() -> Iterator[None]:
         _MADE.pop().close()
 
 
-def rover(rig: Path, **simulation: Any) -> tuple[SimulatedRover, ManualClock]:
+def rover(rig: Path, **simulation: Any) -> tuple[RoverModel, ManualClock]:
     clock = ManualClock(1000.0)
     section = {"rover": rig.name, "seed": 5, "samples": 1, "cameras": QUIET, **simulation}
-    _MADE.append(SimulatedRover(simulation_settings(section, rig.parent), clock))
+    _MADE.append(RoverModel(simulation_settings(section, rig.parent), clock))
     return _MADE[-1], clock
 
 

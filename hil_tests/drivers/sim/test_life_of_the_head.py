@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from drivers.clock import ManualClock
 from drivers.sim.axis import AxisSettings
-from drivers.sim.heads import HeadSettings, head_settings
+from drivers.sim.heads import HeadModel, head_settings
 from drivers.sim.motion import Motion
 from drivers.sim.pan_tilt import SimulatedPanTilt
 from drivers.sim.wire.axis import WireAxis
@@ -53,7 +53,7 @@ def test_ringing_is_what_integration_of_the_mode_gives(after_s: float) -> None:
     assert told == pytest.approx(expected, abs=2e-5)
 
 
-def moved(head: HeadSettings, goals: list[tuple[float, float]]) -> tuple[SimulatedPanTilt, ManualClock]:
+def moved(head: HeadModel, goals: list[tuple[float, float]]) -> tuple[SimulatedPanTilt, ManualClock]:
     """A head that was sent somewhere and says it has arrived."""
     clock = ManualClock(100.0)
     device = SimulatedPanTilt(head, clock)
@@ -86,7 +86,7 @@ def test_an_encoder_reads_beside_the_truth_by_its_harmonics(read: float) -> None
     assert device.true_joints(clock.now_s())[1] == pytest.approx(device.read().tilt_rad, abs=6e-5)
 
 
-def hanging(turnover_rad: float, friction: float) -> HeadSettings:
+def hanging(turnover_rad: float, friction: float) -> HeadModel:
     return head_settings(
         {
             "preset": "dynamixel_x", "count_rad": 1e-6, "backlash_rad": 0.004, "sag_rad": 0.0,

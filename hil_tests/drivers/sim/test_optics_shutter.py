@@ -11,7 +11,7 @@ from calib.geometry.rigid import Rigid
 from drivers.clock import ManualClock
 from drivers.interfaces import Frame
 from drivers.sim.render import Renderer
-from drivers.sim.rover import SimulatedRover
+from drivers.sim.rover import RoverModel
 from drivers.sim.scene import Scene
 from drivers.sim.settings import simulation_settings
 
@@ -25,13 +25,13 @@ APART_DN = 1.3
 """What four rays a pixel leave of the texture that is finer than a pixel."""
 
 
-def rover(rig: Path, **cameras: object) -> tuple[SimulatedRover, ManualClock]:
+def rover(rig: Path, **cameras: object) -> tuple[RoverModel, ManualClock]:
     clock = ManualClock(100.0)
     section = {"rover": rig.name, "seed": 5, "samples": 2, "cameras": {**QUIET, **cameras}}
-    return SimulatedRover(simulation_settings(section, rig.parent), clock), clock
+    return RoverModel(simulation_settings(section, rig.parent), clock), clock
 
 
-def underway(rig: Path, exposure_s: float, **cameras: object) -> tuple[SimulatedRover, Frame]:
+def underway(rig: Path, exposure_s: float, **cameras: object) -> tuple[RoverModel, Frame]:
     """A frame from the middle of a long turn, the eye on the ground."""
     device, clock = rover(rig, exposure_s=exposure_s, **cameras)
     device.pan_tilt.move(-0.5, -0.7)
@@ -41,11 +41,11 @@ def underway(rig: Path, exposure_s: float, **cameras: object) -> tuple[Simulated
     return device, device.cameras[EYE].next_frame(clock.now_s(), 1.0)
 
 
-def pose_at(device: SimulatedRover, time_s: float) -> Rigid:
+def pose_at(device: RoverModel, time_s: float) -> Rigid:
     return device.rig.mast.rover_from_head(*device.true_joints(float(time_s)))
 
 
-def seen(device: SimulatedRover, renderer: Renderer, times_s: np.ndarray) -> np.ndarray:
+def seen(device: RoverModel, renderer: Renderer, times_s: np.ndarray) -> np.ndarray:
     """The mean light of moments."""
     model = device.rig.cameras[EYE].model
     return np.mean([renderer.image(model, pose_at(device, time_s), 2) for time_s in times_s], axis=0)

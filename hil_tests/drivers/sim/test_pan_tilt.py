@@ -12,7 +12,7 @@ import pytest
 from drivers.clock import ManualClock
 from drivers.errors import BadOptions
 from drivers.sim.axis import AxisSettings
-from drivers.sim.heads import HeadSettings, head_settings
+from drivers.sim.heads import HeadModel, head_settings
 from drivers.sim.pan_tilt import SimulatedPanTilt
 
 GAP = 0.004
@@ -21,7 +21,7 @@ AXIS = AxisSettings(0.001, GAP, -1.0, 1.0, 1.0, 2.0)
 
 def head(axis: AxisSettings, **tilt: Any) -> tuple[SimulatedPanTilt, ManualClock]:
     clock = ManualClock(50.0)
-    return SimulatedPanTilt(HeadSettings("test head", axis, replace(axis, **tilt)), clock), clock
+    return SimulatedPanTilt(HeadModel("test head", axis, replace(axis, **tilt)), clock), clock
 
 
 def settle(device: SimulatedPanTilt, clock: ManualClock) -> None:
@@ -34,7 +34,7 @@ def settle(device: SimulatedPanTilt, clock: ManualClock) -> None:
 
 def test_the_load_follows_a_stepped_model_of_the_gap() -> None:
     device, clock = head(AXIS)
-    without_gap = SimulatedPanTilt(HeadSettings("no gap", *2 * [replace(AXIS, backlash_rad=0.0)]), clock)
+    without_gap = SimulatedPanTilt(HeadModel("no gap", *2 * [replace(AXIS, backlash_rad=0.0)]), clock)
     rng = np.random.default_rng(4)
     load, step_s, worst = -GAP / 2, 0.002, 0.0
     for _ in range(40):

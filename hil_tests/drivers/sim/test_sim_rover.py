@@ -12,7 +12,7 @@ from calib.files.mast_file import load_rig
 from drivers.clock import ManualClock
 from drivers.errors import BadOptions
 from drivers.sim.render import Renderer
-from drivers.sim.rover import SimulatedRover
+from drivers.sim.rover import RoverModel
 from drivers.sim.scene import Scene
 from drivers.sim.settings import simulation_settings
 
@@ -22,13 +22,13 @@ NOISE_DN = 2.2
 """Mean square of the noise at the brightest ground, as a level."""
 
 
-def rover(rig: Path, **simulation: object) -> tuple[SimulatedRover, ManualClock]:
+def rover(rig: Path, **simulation: object) -> tuple[RoverModel, ManualClock]:
     clock = ManualClock(100.0)
     settings = simulation_settings({"rover": rig.name, "seed": 5, **simulation}, rig.parent)
-    return SimulatedRover(settings, clock), clock
+    return RoverModel(settings, clock), clock
 
 
-def settle(device: SimulatedRover, clock: ManualClock, pan: float, tilt: float) -> None:
+def settle(device: RoverModel, clock: ManualClock, pan: float, tilt: float) -> None:
     device.pan_tilt.move(pan, tilt)
     for _ in range(2000):
         if not device.pan_tilt.read().moving:

@@ -14,14 +14,14 @@ from drivers.faults import PAN_TILT
 from drivers.hardware import DeviceSettings, HardwareSettings, clock_for
 from drivers.interfaces import Reading
 from drivers.open_hardware import open_hardware
-from drivers.sim.rover import SimulatedRover
+from drivers.sim.rover import RoverModel
 from hil_tests.waiting import until
 
 pytestmark = pytest.mark.usefixtures("one_scene")
 
 
 @contextmanager
-def wired(rig: Path) -> Iterator[tuple[SimulatedRover, Clock]]:
+def wired(rig: Path) -> Iterator[tuple[RoverModel, Clock]]:
     section = {"rover": rig.name, "seed": 5, "head": "dynamixel_x", "wire": "dynamixel", "speed": "max"}
     sim = DeviceSettings("sim")
     settings = HardwareSettings(sim, {"navcam_left": sim}, section, rig.parent)
@@ -33,13 +33,13 @@ def wired(rig: Path) -> Iterator[tuple[SimulatedRover, Clock]]:
             yield rover, clock
 
 
-def settled(device: SimulatedRover, clock: Clock, pan: float, tilt: float) -> Reading:
+def settled(device: RoverModel, clock: Clock, pan: float, tilt: float) -> Reading:
     device.pan_tilt.move(pan, tilt)
     until(lambda: not device.pan_tilt.read().moving, "rest", clock=clock)
     return device.pan_tilt.read()
 
 
-def fails(device: SimulatedRover) -> bool:
+def fails(device: RoverModel) -> bool:
     try:
         device.pan_tilt.read()
     except DriverError:

@@ -14,7 +14,7 @@ SIZES = {
     "PixFormat": 48,
     "PlanePixFormat": 20,
     "PixFormatMplane": 192,
-    "Plane": 64,
+    "BufferPlane": 64,
     "Format": 208,
     "CaptureParm": 40,
     "StreamParm": 204,
@@ -69,4 +69,4 @@ def test_fields_lie_where_c_puts_them() -> None:
     )
     assert abi.Format.fmt.offset == 8
     assert (abi.PixFormatMplane.plane_fmt.offset, abi.PixFormatMplane.num_planes.offset) == (20, 180)
-    assert abi.Plane.data_offset.offset == 16
+    assert abi.BufferPlane.data_offset.offset == 16

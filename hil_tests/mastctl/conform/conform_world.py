@@ -24,7 +24,7 @@ from drivers.errors import NoFreshFrame, NoReply
 from drivers.faults import FaultPanel
 from drivers.interfaces import Camera, CameraInfo, CameraSetting, Frame
 from drivers.sim.axis import AxisSettings
-from drivers.sim.heads import HeadSettings
+from drivers.sim.heads import HeadModel
 from drivers.sim.pan_tilt import SimulatedPanTilt
 from hil_tests.mastctl.service_fakes import CONFIG, SIZE_PX, rig
 from hil_tests.waiting import NET_S
@@ -45,7 +45,7 @@ def open_head(low_rad: float = -2.0, high_rad: float = 2.0, name: str = "") -> S
     """A head in memory; ``name`` tells it from those of other daemons in this process."""
     axis = AxisSettings(COUNT_RAD, 0.0, low_rad, high_rad, FASTEST_RAD_PER_S, 20.0)
     clock = SystemClock()
-    return SimulatedPanTilt(HeadSettings("in memory", axis, axis), clock, FaultPanel(clock.now_s, ()))
+    return SimulatedPanTilt(HeadModel("in memory", axis, axis), clock, FaultPanel(clock.now_s, ()))
 
 
 class NoiseCamera(Camera):

@@ -24,7 +24,7 @@ from drivers.feetech.head import feetech_settings
 from drivers.flir_ptu.options import options_from
 from drivers.probes import ProbedCamera
 from drivers.servo_bus.bench import FoundServo, ServosOnLine
-from drivers.sim.heads import PRESETS, HeadSettings
+from drivers.sim.heads import PRESETS, HeadModel
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
@@ -59,7 +59,7 @@ class Bench:
         self.clock = SimulationClock(start_s=1000.0)
         self._patch = monkeypatch
 
-    def axes(self, head: HeadSettings = X) -> list[WireAxis]:
+    def axes(self, head: HeadModel = X) -> list[WireAxis]:
         """A head's two axes."""
         now_s = self.clock.now_s()
         return [WireAxis(axis, number=n, time_s=now_s) for n, axis in enumerate((head.pan, head.tilt))]  # type: ignore[arg-type]
