@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
 import io
@@ -124,3 +125,12 @@ def test_every_path_in_a_page_or_docstring_is_there(repository: Path) -> None:
 )
 def test_a_name_that_is_gone_is_noticed(name: str, there: bool) -> None:
     assert resolves(name) == there
+
+
+def test_no_public_class_of_the_product_has_anothers_name(repository: Path) -> None:
+    found: dict[str, list[str]] = {}
+    for path in (one for package in PACKAGES[:3] for one in (repository / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                found.setdefault(node.name, []).append(str(path.relative_to(repository)))
+    assert {name: places for name, places in found.items() if len(places) > 1} == {}

@@ -30,7 +30,7 @@ MOST = 0.5
 Placement = tuple[str, str]
 
 
-class Sight(NamedTuple):
+class BoardBearing(NamedTuple):
     """Where an image's board is, seen from about where its camera is: to the right, upwards, and how far."""
 
     image: SurveyImage
@@ -39,16 +39,18 @@ class Sight(NamedTuple):
     range_m: float
 
 
-def sights(survey: Survey) -> dict[str, list[Sight]]:
+def sights(survey: Survey) -> dict[str, list[BoardBearing]]:
     """Return by camera the images whose board's place prisms and tapes determine."""
     boards, cameras_m = _rover_from_boards(survey), _cameras_in_rover_m(survey)
-    found: dict[str, list[Sight]] = {name: [] for name in survey.cameras}
+    found: dict[str, list[BoardBearing]] = {name: [] for name in survey.cameras}
     for image in survey.images:
         pose = boards.get((image.setup, image.placement))
         if pose is not None:
             away = pose.translation_m - cameras_m[image.camera]
             right, up = np.arctan2(away[1], away[0]), np.arctan2(-away[2], np.hypot(away[0], away[1]))
-            found[image.camera].append(Sight(image, float(right), float(up), float(np.linalg.norm(away))))
+            found[image.camera].append(
+                BoardBearing(image, float(right), float(up), float(np.linalg.norm(away)))
+            )
     return found
 
 
@@ -102,7 +104,7 @@ def _facing_away(
             )
 
 
-def _camera_mixups(survey: Survey, camera: SurveyCamera, mine: list[Sight]) -> Iterator[SurveyFinding]:
+def _camera_mixups(survey: Survey, camera: SurveyCamera, mine: list[BoardBearing]) -> Iterator[SurveyFinding]:
     off_m = CAMERA_OFF_M if camera.rough_C_m is None else ROUGH_OFF_M
     seen, sizes = [], []
     for sight in mine:
