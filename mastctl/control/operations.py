@@ -159,8 +159,8 @@ class OperationRunner:
         with self.held():
             running = self._current
             if running is not None:  # what ends from here on, ends by the stop
-                if reason_follows:
-                    self._reason_is_known.clear()
+                known = self._reason_is_known  # one that never came keeps no later stop waiting
+                (known.clear if reason_follows else known.set)()
                 self._cancelled_because = Stopped(reason)
                 running[1].set()
             try:

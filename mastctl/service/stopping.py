@@ -23,9 +23,7 @@ from mastctl.safety.state_folder import StateFolder
 from mastctl.safety.stop_socket import StopHandlers
 
 KEPT_S = 1.0  # what the disk is given before an emergency stop is answered without it
-STRAGGLER_S = 1.0
-"""A reset waits this long for stops that follow one that was confirmed already."""
-
+STRAGGLER_S = 1.0  # what a reset waits for stops that follow one that was confirmed already
 STATE = "state"
 
 
@@ -142,16 +140,17 @@ class Stopping:
 
     def explain_estop(self, reason: str | None, name: str | None) -> Latched | None:
         """Add the name and the reason that came after their stop; return its cause if that has changed."""
-        explained = self._latch.explain(reason, name) if reason or name else None
-        if explained is None:
-            self._operations.explain(None)
-            return None
-        self._machine.stop_asked()
-        self._machine.estop_asked(self._causes)
-        self._block_moves()
-        self._machine.stop_ended()
-        self._operations.explain(f"an emergency stop: {explained.reason} ({explained.name})")
-        return explained
+        cause, sentence = self._latch.explain(reason, name) if reason or name else None, None
+        if cause is not None:  # else there is none left to explain, after a reset for example
+            sentence = f"an emergency stop: {cause.reason} ({cause.name})"
+            self._machine.stop_asked()
+            try:
+                self._machine.estop_asked(self._causes)
+                self._block_moves()
+            finally:
+                self._machine.stop_ended()
+        self._operations.explain(sentence)
+        return cause
 
     def reset(self, reason: str, name: str) -> ResetTold:
         """Release the emergency stop; nothing moves before a command comes.

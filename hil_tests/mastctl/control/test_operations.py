@@ -77,13 +77,14 @@ def pointed(*residuals: Any) -> FakeResult:
 
 
 def test_a_stop_blocks_and_halts_before_it_ends_what_runs(
-    operations: OperationRunner, mover: Mover, machine: StateMachine
+    operations: OperationRunner, mover: Mover, machine: StateMachine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("mastctl.control.operations.REASON_S", 2.0 * NET_S)  # a reason that never comes
     name = operations.start({}, until_cancelled).id
     until(lambda: operations.get(name).steps, "its step")
     seen: list[Any] = []
     mover.hook = lambda _: seen.append((dict(mover.blocks).values(), machine.standing.word))
-    assert operations.stop() == name
+    assert operations.stop(reason_follows=True) == operations.stop() == name
     assert mover.told[:2] == [("block", STOP_ASKED), ("stop", None)]
     assert [(list(blocks), word) for blocks, word in seen[:1]] == [([STOP_ASKED], "stopping")]
     record = ended(operations, name)

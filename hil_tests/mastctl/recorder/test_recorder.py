@@ -271,10 +271,9 @@ def test_a_file_that_goes_while_the_disk_is_checked_is_the_reason(
 ) -> None:
     one = Recording(tmp_path / "recordings", ring_s=0.0)
     one.recorder.start_run("rock")
-    (path,) = files(tmp_path)
 
     def checked(folder: RecordFolder) -> int:
-        with_its_folder(path)
+        shutil.rmtree(folder.path, ignore_errors=True)
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(folder.path))
 
     monkeypatch.setattr(RecordFolder, "free_bytes", checked)
