@@ -66,7 +66,7 @@ print(json.dumps([fault.code, fault.device, fault.message, len(log.faults())]))
 @pytest.mark.parametrize("room", [0, 1, 7, 13])
 def test_a_full_disk_leaves_whole_lines_and_the_number_of_lost_ones(tmp_path: Path, room: int) -> None:
     path = tmp_path / "audit.jsonl"
-    command = [sys.executable, "-c", ON_A_FULL_DISK, str(path), str(room)]
+    command = [sys.executable, "-B", "-c", ON_A_FULL_DISK, str(path), str(room)]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=NET_S)
     code, device, message, faults_after = json.loads(done.stdout)
     assert (code, device, faults_after) == ("not_recorded", "audit_log", 0)
