@@ -72,7 +72,7 @@ def words(survey: Path, out: Path, *more: str) -> list[str]:
 
 
 def run(code: str, *argv: str, **options: Any) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-B", "-c", code, *argv]  # Python 3.11 keeps a module that a full disk cut short
+    command = [sys.executable, "-B", "-c", code, *argv]  # -B: 3.11 keeps a module that a full disk cuts
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, **options)
 
 
