@@ -113,7 +113,7 @@ def stored_covariance(rig: Rig) -> RigCovariance | None:
     if not square or not np.isfinite(covariance).all() or (np.diag(covariance) < 0).any():
         raise CalibError(
             f"fit.covariance of the mast file is not {len(names)} rows of {len(names)} numbers with a "
-            "positive diagonal, as its fit.parameters ask"
+            "positive diagonal, as many as fit.parameters names"
         )
     if _impossible(covariance):
         raise CalibError(
@@ -190,19 +190,19 @@ def pixel_rates(
 ) -> PixelRates:
     """Return pixels of rover-frame points (n, 3) and how they depend on named parameters and the points.
 
-    ``names`` (p,) are ``mast.KEY.x``, ``joints.pan.c1`` (the readings held), ``cameras.NAME.C.x``,
-    ``pan_rad`` and ``tilt_rad``; what is not among them is held. The angles are true ones; from which side
-    the axes came there says how the backlash counts.
+    ``names`` (p,) are ``mast.KEY.x``, ``joints.pan.c1`` (the readings fixed), ``cameras.NAME.C.x``,
+    ``pan_rad`` and ``tilt_rad``; what is not among them is fixed. The angles are true ones; from which side
+    the axes came there says how the backlash matters.
     """
-    held = rig.cameras[camera]
+    mounted = rig.cameras[camera]
     at = {name: i for i, name in enumerate(names)}
     out = np.zeros((2, len(names), len(points_m)))
-    if held.on == "rover":
-        seen = camera_rates(held.model, points_m)
+    if mounted.on == "rover":
+        seen = camera_rates(mounted.model, points_m)
         to_points = seen.to_motion[:, 3:].transpose(2, 0, 1)
     else:
         head = gimbal(numbers_of(rig.mast), pan_rad, tilt_rad)
-        seen = camera_rates(held.model, (points_m - head.translation_m) @ head.rotation)
+        seen = camera_rates(mounted.model, (points_m - head.translation_m) @ head.rotation)
         to_points = seen.to_motion[:, 3:].transpose(2, 0, 1) @ head.rotation.T
         twists = head.twists
         if any(name in at for name in JOINTS_NAMES):
@@ -211,7 +211,7 @@ def pixel_rates(
         free = [i for i, name in enumerate(_HEAD_NAMES) if name in at]
         # The head carries the camera: points move the other way before it.
         out[:, [at[_HEAD_NAMES[i]] for i in free]] = -head.in_head(twists[free]) @ seen.to_motion
-    mine = [f"cameras.{camera}.{part}" for part in parameter_names(held.model.kind)]
+    mine = [f"cameras.{camera}.{part}" for part in parameter_names(mounted.model.kind)]
     known = [i for i, name in enumerate(mine) if name in at]
     out[:, [at[mine[i]] for i in known]] = seen.to_step[:, known]
     return PixelRates(seen.pixels_px, out.transpose(2, 0, 1), to_points)
@@ -251,16 +251,8 @@ def click_covariance(
 ) -> FloatArray:
     """Return the covariance (2k, 2k), px², of a point's clicks in k cameras and of all that is off with them.
 
-    Parameters
-    ----------
-    rig, cameras, pan_rad, tilt_rad
-        The camera that sees it, and the true joint angles.
-    position_m
-        (3,) the point, rover frame.
-    sigma_px, sigma_rad
-        Of each pixel coordinate of a click, and of each joint reading.
-    calibration
-        Covariance of the rig; exact when left out.
+    ``position_m`` (3,) is the point, rover frame; ``sigma_px`` that of each pixel coordinate of a click,
+    ``sigma_rad`` of each joint reading. The rig is exact without a ``calibration``.
     """
     total = sigma_px * sigma_px * np.eye(2 * len(cameras))
     known = calibration.of(cameras) if calibration else None
@@ -273,24 +265,57 @@ def click_covariance(
     return np.asarray(total + sigma_rad * sigma_rad * (turned @ turned.T))
 
 
+class PlaceRates(NamedTuple):
+    """How the place (3,) of a point depends on its clicks in k cameras (3, 2k) and on parameters (3, p)."""
+
+    to_clicks: FloatArray
+    to_rig: FloatArray
+
+
+def place_rates(
+    rig: Rig,
+    names: Sequence[str],
+    cameras: Sequence[str],
+    pan_rad: float,
+    tilt_rad: float,
+    position_m: FloatArray,
+    approach: Approach = UNKNOWN,
+) -> PlaceRates:
+    """Return how a point (3,) that a stereo pair shows, or one camera that is given the range, would move.
+
+    Raises
+    ------
+    CalibError
+        If a camera does not see the point.
+    """
+    point = position_m[None]
+    seen = [pixel_rates(rig, names, camera, pan_rad, tilt_rad, point, approach) for camera in cameras]
+    for camera, one in zip(cameras, seen, strict=True):
+        if not (np.isfinite(one.pixels_px).all() and np.isfinite(one.to_rig).all()):
+            raise CalibError(f"camera {camera} does not see the target at {position_m.round(3).tolist()} m")
+    models = [rig.camera_in_rover(camera, pan_rad, tilt_rad) for camera in cameras]
+    if len(cameras) == 1:
+        along = models[0].ray(seen[0].pixels_px[0]).directions
+        to_clicks = np.linalg.inv(np.vstack([seen[0].to_points[0], along]))[:, :2]
+    else:
+        left_px, right_px = (one.pixels_px[0] for one in seen)
+        to_clicks = triangulate(models[0], models[1], left_px, right_px).rates_m_per_px
+    return PlaceRates(to_clicks, -to_clicks @ np.concatenate([one.to_rig[0] for one in seen]))
+
+
 MOST_SIGMAS = 3.2905
 """Two clicks are of no point beyond it: a normal error is, either side, with the chance `Level.STATED`."""
 
 RIG_PX = 1.0
-"""One sigma, each pixel coordinate, of what a camera is taken to be wrong by whose errors its rig does not
-tell: the residuals of the paper's mast calibration are 0.85 to 1.13 px rms."""
+"""One sigma, each pixel coordinate, of the assumed error of a camera whose errors the rig does not state: the
+residuals of the paper's mast calibration are 0.85 to 1.13 px rms."""
 
 
 @dataclass(frozen=True)
 class RayGap:
-    """How far two rays pass each other, and how far that is from what explains it.
+    """How far two rays pass each other: the length of their common normal, with one sigma.
 
-    Attributes
-    ----------
-    gap_m, sigma_m
-        The length of the rays' common normal, and one sigma of it.
-    across_px, across_sigma_px
-        The same in the right picture: how far its pixel is off the line on which the left one's ray lies.
+    ``across_px`` is the same in the right picture: how far its pixel is off the left one's epipolar line.
     """
 
     gap_m: float
@@ -321,19 +346,8 @@ def silent_cameras(pair: tuple[str, str], calibration: RigCovariance | None) -> 
 def refuse_two_points(gap: RayGap, pair: tuple[str, str], by: str) -> None:
     """Refuse two clicks whose rays pass each other farther than their noise explains.
 
-    Parameters
-    ----------
-    gap
-        As `ray_gap` gives it.
-    pair
-        The cameras' names, left first.
-    by
-        The causes of a gap that were considered, in words.
-
-    Raises
-    ------
-    NoStereoPoint
-        ``not_one_point``.
+    ``pair`` are the cameras' names, left first; ``by`` is the subject of "... explain 0.3 px at most".
+    Raises NoStereoPoint ``not_one_point``.
     """
     if gap.sigmas <= MOST_SIGMAS:
         return
@@ -357,18 +371,10 @@ def clicked_point(
     sigma_rad: float = 0.0,
     calibration: RigCovariance | None = None,
 ) -> tuple[Triangulation, RayGap]:
-    """Return the point that two clicks in a pair's pictures mean, rover frame, and the gap of its rays.
+    """Return the point that two clicks (2,) in a pair's pictures mean, rover frame, and the gap of its rays.
 
-    Parameters
-    ----------
-    rig, pair, pan_rad, tilt_rad
-        The cameras that see it, left one first, and the joint readings.
-    left_px, right_px
-        (2,) clicks.
-    sigma_px, sigma_rad
-        Of each pixel coordinate of a click, and of each joint reading.
-    calibration
-        Covariance of the rig. A camera of which it says nothing is taken to be wrong by ``RIG_PX``.
+    ``sigma_px`` is that of each pixel coordinate of a click, ``sigma_rad`` of each joint reading. A camera of
+    which the rig's covariance says nothing is assumed to be wrong by ``RIG_PX``.
 
     Raises
     ------
@@ -406,12 +412,8 @@ def clicked_point(
 def rig_in_mode(rig: Rig, camera: str, mode: Mode) -> Rig:
     """Return a rig one of whose cameras is in another mode, with its covariance and the sensor's mode.
 
-    Of ``fit`` the covariance stays. Other figures there are of the calibrated picture and go.
-
-    Raises
-    ------
-    BadMode, CalibError
-        As `in_mode`, and if the covariance does not fit the rig.
+    Of ``fit`` the covariance stays. Other figures there are of the calibrated picture and go. Raises BadMode
+    as `in_mode`, and CalibError if the covariance does not fit the rig.
     """
     before = rig.cameras[camera]
     model = in_mode(before.model, mode)

@@ -51,17 +51,10 @@ class Joints:
 
 @dataclass(frozen=True, eq=False)
 class PredictedPixel:
-    """Where a camera sees the target.
+    """Where a camera sees the target: pixel (2,), and its covariance (2, 2) by the clicks' noise alone.
 
-    Attributes
-    ----------
-    pixel_px
-        (2,) pixel x, y.
-    covariance_px2
-        (2, 2) of the clicks' noise alone.
-    search_px2
-        (2, 2) of everything that was said to be uncertain: clicks, joint readings, calibration. Its ellipse
-        is where to search for the target.
+    ``search_px2`` (2, 2) is that of everything stated to be uncertain: clicks, joint readings, calibration.
+    Its ellipse is where to search for the target.
     """
 
     pixel_px: FloatArray
@@ -75,19 +68,16 @@ class Handoff:
 
     Attributes
     ----------
-    seen
-        The result of the source pair: position in the rover frame and its covariance from the clicks.
-    gap
-        How far its two rays pass each other, and what explains that.
+    seen, gap
+        The result of the source pair in the rover frame, its covariance from the clicks alone; and how far
+        its two rays pass each other.
     covariance_m2
-        (3, 3) of the position from everything that was said to be uncertain, rover frame.
-    pixels
-        By destination camera; None where it does not see the target.
+        (3, 3) of the position from everything stated to be uncertain, rover frame.
+    pixels, reasons
+        By destination camera; where it does not see the target, None and the reason.
     joint_px2
         (2n, 2n) as ``search_px2`` of all n pixels that are not None, in their order, together: what they
         share (the target's place, the calibration) moves them together.
-    reasons
-        For each None, why, in words.
     pan_rad, tilt_rad
         Joint angles of the destination images.
     """
@@ -114,27 +104,16 @@ def hand_off(
     sigma_px: float = 0.2,
     calibration: RigCovariance | None = None,
 ) -> Handoff:
-    """Hand a target over from a stereo pair to other cameras.
+    """Hand a target, clicked (2,) in both images of a stereo pair, over to other cameras of body or head.
 
     Parameters
     ----------
-    rig
-        Mast and cameras.
-    pair
-        The source's left and right camera.
-    to
-        Destination cameras, on the body or on the head.
-    joints
-        Joint angles of the source images.
-    left_px, right_px
-        (2,) pixels of the target in the source images.
-    to_joints
-        Joint angles of the destination images; the same reading as ``joints`` when left out, and then its
-        error is the same too.
+    joints, to_joints
+        Of the source and of the destination images. Without the latter both have one reading with one error.
     sigma_px
-        Sigma of each pixel coordinate of a click.
+        Of each pixel coordinate of a click.
     calibration
-        Covariance of the rig. When left out, the returned covariances count it as exact, and the rays' gap is
+        Covariance of the rig. Without it the returned covariances assume an exact rig, and the rays' gap is
         judged by `calib.geometry.covariance.RIG_PX`.
 
     Raises
@@ -157,8 +136,8 @@ def hand_off(
     reasons = {name: why for name, model in cameras.items() if (why := _unseen(model, seen.position_m))}
     shown = [name for name in to if name not in reasons]
     if not shown:
-        words = "; ".join(f"{name}: {why}" for name, why in reasons.items())
-        raise NoHandoff("not_seen", f"no destination camera sees the target: {words}")
+        whys = "; ".join(f"{name}: {why}" for name, why in reasons.items())
+        raise NoHandoff("not_seen", f"no destination camera sees the target: {whys}")
 
     total = _other_covariance(rig, pair, shown, joints, to_joints, seen, calibration)
     places, rates = [], []

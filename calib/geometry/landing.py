@@ -17,25 +17,15 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.errors import CalibError
-from calib.geometry.covariance import JOINT_NAMES, pixel_rates
+from calib.geometry.covariance import JOINT_NAMES, pixel_rates, place_rates
 from calib.geometry.pointing import solve
 from calib.geometry.rig import UNKNOWN, Approach, Rig
 from calib.geometry.rigid import FloatArray
-from calib.geometry.stereo import triangulate
 
 
 class LandingRates(NamedTuple):
-    """How far a target lands off, to first order.
-
-    Attributes
-    ----------
-    to_rig
-        (2, p) pixels for the errors of the named parameters.
-    to_clicks
-        (2, 2k) for those of the clicks in k cameras.
-    to_readings
-        (2, 4) for the errors of pan and tilt at the click, and of both at the landing; pixels a radian.
-    """
+    """How far a target lands off, to first order: pixels for errors of the named parameters (2, p) and of the
+    clicks in k cameras (2, 2k); pixels a radian for pan and tilt at the click, and at the landing (2, 4)."""
 
     to_rig: FloatArray
     to_clicks: FloatArray
@@ -55,8 +45,8 @@ def landing_rates(
 
     Parameters
     ----------
-    rig, names
-        The rig, and which of its parameters (p,) may be off (`calib.geometry.covariance.pixel_rates`).
+    names
+        Which of the rig's parameters (p,) may be off (`calib.geometry.covariance.pixel_rates`).
     cameras
         Of the head: the pair in which it is clicked, left one first, or one camera that is given the range.
     pan_rad, tilt_rad
@@ -72,32 +62,16 @@ def landing_rates(
         If a camera does not see the target, or it cannot be pointed at.
     """
     every, size = (*names, *JOINT_NAMES), len(names)
-    clicked = [
-        pixel_rates(rig, every, camera, pan_rad, tilt_rad, target_m[None], approaches[0])
-        for camera in cameras
-    ]
-    models = [rig.camera_in_rover(camera, pan_rad, tilt_rad) for camera in cameras]
-    for camera, seen in zip(cameras, clicked, strict=True):
-        if not (np.isfinite(seen.pixels_px).all() and np.isfinite(seen.to_rig).all()):
-            raise CalibError(f"camera {camera} does not see the target at {target_m.round(3).tolist()} m")
-    if len(cameras) == 1:
-        along = models[0].ray(clicked[0].pixels_px[0]).directions
-        by_clicks = np.linalg.inv(np.vstack([clicked[0].to_points[0], along]))[:, :2]
-    else:
-        (left, right), (one, other) = models, (seen.pixels_px[0] for seen in clicked)
-        by_clicks = triangulate(left, right, one, other).rates_m_per_px
-    place = -by_clicks @ np.concatenate([seen.to_rig[0] for seen in clicked])
-    model = rig.cameras[cameras[0]].model
-    angles = solve(rig.mast, model, target_m, from_pan_rad=pan_rad, from_tilt_rad=tilt_rad)[0]
-    landed = pixel_rates(
-        rig, every, cameras[0], angles.pan_rad, angles.tilt_rad, target_m[None], approaches[1]
-    )
-    if not np.isfinite(landed.to_rig).all():
-        raise CalibError(f"camera {cameras[0]} does not see the target where it should land")
+    place = place_rates(rig, every, cameras, pan_rad, tilt_rad, target_m, approaches[0])
+    camera, model = cameras[0], rig.cameras[cameras[0]].model
+    at = solve(rig.mast, model, target_m, from_pan_rad=pan_rad, from_tilt_rad=tilt_rad)[0]
+    landed = pixel_rates(rig, every, camera, at.pan_rad, at.tilt_rad, target_m[None], approaches[1])
     by_place, by_rig = landed.to_points[0], landed.to_rig[0]
-    clicking = by_place @ place
+    if not np.isfinite(by_rig).all():
+        raise CalibError(f"camera {camera} does not see the target where it should land")
+    clicking = by_place @ place.to_rig
     return LandingRates(
         -(by_rig[:, :size] + clicking[:, :size]),
-        -by_place @ by_clicks,
+        -by_place @ place.to_clicks,
         -np.hstack([clicking[:, size:], by_rig[:, size:]]),
     )

@@ -1,6 +1,6 @@
 """One camera's knowledge of a target: a line of sight, and how far along it the target may be.
 
-Along the line counts the inverse range, 1/m: the pixel of a far target in another view depends on it almost
+What is estimated is the inverse range, 1/m: the pixel of a far target in another view depends on it almost
 linearly, and infinity is 0. What another view of the same thing shows (of the same camera, once the head has
 turned, if it is off the axes) says more about it, by as much as the two views stand apart and no more than
 mast file, joint readings and matches allow.
@@ -14,15 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.errors import CalibError
-from calib.geometry.covariance import RIG_PX, RigCovariance, moved_rig
+from calib.geometry.covariance import JOINT_NAMES, RIG_PX, RigCovariance, pixel_rates, place_rates
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, ReadOnlyArrays, frozen_array
 
 NORMAL_95 = 1.96
 FARTHEST_M = 1e5
 """The assumed range of a target whose range cannot be measured."""
-_STEP_RAD = 1e-5
-_STEP_SIGMA = 1e-2
 _ROUNDS = 6
 
 
@@ -107,8 +105,7 @@ def range_to_plane(
     towards = float(direction @ normal) / float(np.linalg.norm(normal))
     away = float((point_m - origin) @ normal) / float(np.linalg.norm(normal))
     if abs(towards) < 1e-3 or not 0.0 < away / towards < FARTHEST_M:
-        place = ", ".join(f"{value:g}" for value in pixel_px)
-        raise CalibError(f"the ray of pixel ({place}) of {camera} does not meet the plane")
+        raise CalibError(f"the ray of pixel {_text(pixel_px)} of {camera} does not meet the plane")
     return away / towards
 
 
@@ -122,65 +119,45 @@ def seen_from(
     sigma_rad: tuple[float, float] = (0.0, 0.0),
     calibration: RigCovariance | None = None,
 ) -> SeenFrom:
-    """Return where a camera should show what a sight is of.
+    """Return where a camera should show what a sight is of, at true (pan, tilt).
 
     Parameters
     ----------
-    camera, joints_rad
-        The camera of the view, and the true (pan, tilt) then.
     sigma_px
         Of each coordinate of the sight's pixel.
     sigma_rad
         Of each view's readings of pan and tilt; of two views at one pose they are the same error.
     calibration
-        Covariance of the rig; without one the view is taken to be wrong by `RIG_PX`, if the head has turned.
+        Covariance of the rig; without one `RIG_PX` is assumed for a view at other joint angles.
 
     Raises
     ------
     CalibError
-        If the sight's pixel has no ray, or the camera cannot project the place.
+        If the sight's pixel has no ray, or a camera cannot project the place.
     """
-
-    def pixel(rig: Rig, sight: Sight, joints: tuple[float, float]) -> FloatArray:
-        found, seen = rig.camera_in_rover(camera, *joints).project(sight.position_m(rig))
-        if not bool(seen):
-            raise CalibError(f"{camera} cannot see what {sight.camera} sees at {sight.range_m:.3g} m")
-        return np.asarray(found)
-
-    now_px = pixel(rig, sight, joints_rad)
-    step = max(0.01 * sight.inverse_m, 1e-4)
-    farther = replace(sight, inverse_m=sight.inverse_m + step)
-    along = (pixel(rig, farther, joints_rad) - now_px) / step
-    columns = []
-    for shift in np.eye(2):
-        moved = replace(sight, pixel_px=sight.pixel_px + 0.5 * shift)
-        columns.append(sigma_px * (pixel(rig, moved, joints_rad) - now_px) / 0.5)
-    same_pose = camera == sight.camera and joints_rad == sight.joints_rad
-    if not same_pose:
-        for axis in range(2):
-            turned = replace(sight, joints_rad=_turned(sight.joints_rad, axis))
-            for then, there in ((sight, _turned(joints_rad, axis)), (turned, joints_rad)):
-                columns.append(sigma_rad[axis] * (pixel(rig, then, there) - now_px) / _STEP_RAD)
-    covariance = sum(np.outer(column, column) for column in columns)
-    if calibration is None:
-        covariance = covariance + (0.0 if same_pose else RIG_PX**2) * np.eye(2)
-    elif not same_pose:
-        known = calibration.of([sight.camera, camera])
-        rates = np.zeros((2, len(known.names)))
-        for number, (name, sigma) in enumerate(
-            zip(known.names, np.sqrt(np.diag(known.covariance)), strict=True)
-        ):
-            if sigma > 0.0:
-                step_by = _STEP_SIGMA * float(sigma)
-                other = moved_rig(rig, (name,), np.array([step_by]))
-                then, there = sight, joints_rad
-                if name.startswith("joints."):  # what was read stays
-                    read = rig.joints.read_rad
-                    then = replace(sight, joints_rad=other.joints.true_rad(read(sight.joints_rad)))
-                    there = other.joints.true_rad(read(joints_rad))
-                rates[:, number] = (pixel(other, then, there) - now_px) / step_by
-        covariance = covariance + rates @ known.covariance @ rates.T
-    return SeenFrom(now_px, along, np.asarray(covariance))
+    known = calibration.of([sight.camera, camera]) if calibration else RigCovariance((), np.zeros((0, 0)))
+    names, size = (*known.names, *JOINT_NAMES), len(known.names)
+    _, direction = _ray(rig, sight)
+    place_m = sight.position_m(rig)
+    try:
+        place = place_rates(rig, names, (sight.camera,), *sight.joints_rad, place_m)
+        view = pixel_rates(rig, names, camera, *joints_rad, place_m[None])
+        if not np.isfinite(view.pixels_px).all():
+            raise CalibError
+    except CalibError:
+        message = f"{camera} cannot see what {sight.camera} sees at {sight.range_m:.3g} m"
+        raise CalibError(message) from None
+    by_place, by_rig = view.to_points[0], view.to_rig[0]
+    along = -(sight.range_m**2) * (by_place @ direction)
+    clicked = sigma_px * (by_place @ place.to_clicks)
+    covariance = clicked @ clicked.T
+    if camera != sight.camera or joints_rad != sight.joints_rad:
+        first = by_place @ place.to_rig
+        turned = np.hstack([first[:, size:], by_rig[:, size:]]) * np.tile(sigma_rad, 2)
+        both = first[:, :size] + by_rig[:, :size]
+        covariance += turned @ turned.T + both @ known.covariance @ both.T
+        covariance += (RIG_PX**2 if calibration is None else 0.0) * np.eye(2)
+    return SeenFrom(view.pixels_px[0], along, covariance)
 
 
 def shown(
@@ -192,19 +169,10 @@ def shown(
     expected: SeenFrom,
     sigma_px: float,
 ) -> Sight:
-    """Return what is known after a view has shown the thing at a pixel: a sight by that view.
+    """Return what is known after a view has shown the thing at a pixel (2,): a sight by that view.
 
-    Parameters
-    ----------
-    pixel_px, sigma_px
-        (2,) where it was found, and one sigma of each coordinate.
-    expected
-        As `seen_from` returns it.
-
-    Raises
-    ------
-    CalibError
-        As `seen_from`.
+    ``expected`` is what `seen_from` returns, ``sigma_px`` one sigma of each coordinate of the found pixel.
+    Raises CalibError as `seen_from`.
     """
     inverse, sigma = sight.inverse_m, sight.inverse_sigma_m
     if sigma > 0.0:
@@ -219,26 +187,24 @@ def shown(
             inverse = max(inverse + step, 0.0)
         sigma = 1.0 / math.sqrt(information)
     origin, direction = _ray(rig, sight)
-    there = Sight(camera, joints_rad, pixel_px, 0.0, 0.0)
-    other_origin, other_direction = _ray(rig, there)
-    with_it = float(direction @ other_direction)
-    depth = with_it + inverse * float((origin - other_origin) @ other_direction)
-    if not (depth > 0.0 and with_it > 0.0):
+    new = Sight(camera, joints_rad, pixel_px, 0.0, 0.0)
+    new_origin, new_direction = _ray(rig, new)
+    cosine = float(direction @ new_direction)
+    depth = cosine + inverse * float((origin - new_origin) @ new_direction)
+    if not (depth > 0.0 and cosine > 0.0):
         raise CalibError(
             f"the target that {sight.camera} sees at {1 / max(inverse, 1e-5):.3g} m is not before {camera}"
         )
-    return replace(there, inverse_m=inverse / depth, inverse_sigma_m=sigma * with_it / depth**2)
+    return replace(new, inverse_m=inverse / depth, inverse_sigma_m=sigma * cosine / depth**2)
 
 
 def _ray(rig: Rig, sight: Sight) -> tuple[FloatArray, FloatArray]:
     """Origin (3,) and unit direction (3,) of a sight, rover frame."""
     rays = rig.camera_in_rover(sight.camera, *sight.joints_rad).ray(sight.pixel_px)
     if not bool(rays.valid):
-        place = ", ".join(f"{value:g}" for value in sight.pixel_px)
-        raise CalibError(f"pixel ({place}) of {sight.camera} has no ray")
+        raise CalibError(f"pixel {_text(sight.pixel_px)} of {sight.camera} has no ray")
     return np.asarray(rays.origins_m), np.asarray(rays.directions)
 
 
-def _turned(joints_rad: tuple[float, float], axis: int) -> tuple[float, float]:
-    pan, tilt = joints_rad
-    return (pan + _STEP_RAD, tilt) if axis == 0 else (pan, tilt + _STEP_RAD)
+def _text(pixel_px: FloatArray) -> str:
+    return f"({pixel_px[0]:g}, {pixel_px[1]:g})"

@@ -1,8 +1,7 @@
-"""Maps from one camera's picture to another's.
+"""Maps from one camera's picture to another's, for ``cv2.remap``.
 
-Where a map is (map_x, map_y), pixel (x, y) of the new picture is what the old one shows at (map_x[y, x],
-map_y[y, x]): what cv2.initUndistortRectifyMap makes of OpenCV's own lenses for ``cv2.remap``, here for the
-whole CAHV family, ray by ray.
+What cv2.initUndistortRectifyMap and cv2.stereoRectify make of OpenCV's lenses, for every model, ray by ray:
+pixel (x, y) of the new picture is what the old one shows at (map_x[y, x], map_y[y, x]).
 """
 
 from __future__ import annotations
@@ -22,23 +21,17 @@ NOWHERE = -1.0
 
 
 class Maps(NamedTuple):
-    """map_x and map_y (height, width), float32, for cv2.remap."""
+    """map_x and map_y (height, width), float32."""
 
     map_x: np.ndarray
     map_y: np.ndarray
 
 
 class RectifiedPair(NamedTuple):
-    """A pair whose rows are side by side.
+    """Ideal cameras (CAHV) that differ in C alone: a point has the same y in both. Maps to their pictures.
 
-    left, right
-        Ideal cameras (CAHV) with one A, H, V but for C: a point has the same y in both, and x left less x
-        right is focal length times baseline over its depth.
-    left_maps, right_maps
-        From the old pictures to theirs.
-    depth
-        (4, 4) OpenCV's Q: (x, y, disparity, 1) to a homogeneous point in the left ideal camera's axes,
-        metres.
+    ``depth`` (4, 4) is OpenCV's Q: (x, y, disparity, 1) to a homogeneous point in the left ideal camera's
+    axes, metres.
     """
 
     left: CameraModel
@@ -49,15 +42,10 @@ class RectifiedPair(NamedTuple):
 
 
 def ideal_camera(model: CameraModel, focal_px: float | None = None) -> CameraModel:
-    """Return the camera without a lens (CAHV) that stands where ``model`` does and looks along its A.
+    """Return the camera without a lens (CAHV) at the same place, with the same A, image size and centre.
 
-    Its image has the same size and centre, H and V are at right angles, and its focal lengths are the
-    model's, or ``focal_px`` both: a smaller one shows more of a wide picture.
-
-    Raises
-    ------
-    ValueError
-        If the focal length is not above zero.
+    H and V are at right angles. Its focal lengths are the model's, or ``focal_px`` both: a smaller one shows
+    more of a wide picture. Raises ValueError if that is not above zero.
     """
     if focal_px is not None and not 0.0 < focal_px < np.inf:
         raise ValueError(f"the focal length is {focal_px:g} px where a number above 0 is expected")
@@ -73,38 +61,28 @@ def ideal_camera(model: CameraModel, focal_px: float | None = None) -> CameraMod
 
 
 def maps_between(ideal: CameraModel, model: CameraModel, range_m: float = FAR_M) -> Maps:
-    """Return the maps that make of a picture of ``model`` the one that ``ideal`` would have taken.
+    """Return the maps that make of a picture of ``model`` the one that ``ideal``, in one frame, would take.
 
-    Parameters
-    ----------
-    ideal, model
-        In one frame.
-    range_m
-        How far the things are, if the two do not look from one point.
+    ``range_m`` says how far the things are, if the two are not at one point.
     """
     width, height = ideal.size_px
     x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    rays = ideal.ray(np.stack([x.ravel(), y.ravel()], axis=1))
+    rays = ideal.ray(np.stack([x, y], axis=-1))
     pixels, valid = model.project(rays.origins_m + range_m * rays.directions)
     pixels[~valid] = NOWHERE
-    both = pixels.T.reshape(2, height, width).astype(np.float32)
-    return Maps(np.ascontiguousarray(both[0]), np.ascontiguousarray(both[1]))
+    map_x, map_y = np.ascontiguousarray(np.moveaxis(pixels, -1, 0), dtype=np.float32)
+    return Maps(map_x, map_y)
 
 
 def rectified_pair(left: CameraModel, right: CameraModel, focal_px: float | None = None) -> RectifiedPair:
-    """Return a pair with rows side by side: x along the baseline, looking where the two look between them.
+    """Return a pair with rows side by side: x along the baseline, z between the two cameras' A.
 
-    Parameters
-    ----------
-    left, right
-        The cameras, in one frame, of one size.
-    focal_px
-        Of the ideal cameras; the mean of the pair's if not given.
+    ``focal_px`` is that of the ideal cameras, by default the mean of the pair's.
 
     Raises
     ------
     ValueError
-        If the sizes differ, the cameras stand in one place, or look along their baseline.
+        If the sizes differ, the cameras are at one place, or face along their baseline.
     """
     if left.size_px != right.size_px:
         raise ValueError(f"the left picture has {left.size_px} px and the right one {right.size_px}")
@@ -118,25 +96,12 @@ def rectified_pair(left: CameraModel, right: CameraModel, focal_px: float | None
     if np.linalg.norm(z) < 0.2:
         raise ValueError("the two cameras look along their baseline: there are no rows to lay side by side")
     z /= np.linalg.norm(z)
-    y = np.cross(z, x)
-    if focal_px is None:
-        sizes = [focal for one in (left, right) for focal in one.focal_px]
-        focal_px = float(np.mean(sizes))
+    focal = float(np.mean([left.focal_px, right.focal_px])) if focal_px is None else focal_px
     cx, cy = left.image_center_px
-    h, v = focal_px * x + cx * z, focal_px * y + cy * z
-    ideal = [CameraModel("CAHV", left.size_px, one.C, z, h, v) for one in (left, right)]
-    depth = np.array(
-        [
-            [1.0, 0.0, 0.0, -cx],
-            [0.0, 1.0, 0.0, -cy],
-            [0.0, 0.0, 0.0, focal_px],
-            [0.0, 0.0, 1.0 / length_m, 0.0],
-        ]
-    )
+    h, v = focal * x + cx * z, focal * np.cross(z, x) + cy * z
+    ideal, other = (CameraModel("CAHV", left.size_px, one.C, z, h, v) for one in (left, right))
+    depth = np.eye(4)
+    depth[:, 2:] = [[0.0, -cx], [0.0, -cy], [0.0, focal], [1.0 / length_m, 0.0]]
     return RectifiedPair(
-        ideal[0],
-        ideal[1],
-        maps_between(ideal[0], left),
-        maps_between(ideal[1], right),
-        frozen_array(depth, (4, 4)),
+        ideal, other, maps_between(ideal, left), maps_between(other, right), frozen_array(depth, (4, 4))
     )

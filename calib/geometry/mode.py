@@ -7,8 +7,8 @@ u' = (u + 0.5)/n - 0.5, and a flip of a picture w pixels wide u' = w - 1 - u. Ea
 axis, hence H' = s H + t A and V' likewise for every model: a pixel is (H.q, V.q) / (A.q). One flip leaves
 H x V against A, which is right: the picture is a mirror image.
 
-The lens of OpenCV's families stands in the camera's axes, y of which is V's part across A. Where V is turned
-over, these axes are turned by half a turn about A. Coefficients whose terms are even change their sign then.
+The lens of OpenCV's families has the camera's axes, y of which is V's part across A. A flip of V turns these
+axes by half a turn about A. Coefficients whose terms are even change their sign then.
 """
 
 from __future__ import annotations
@@ -49,31 +49,22 @@ class BadMode(CalibError):
 class Mode:
     """The changes of the calibrated picture, in this order.
 
-    Attributes
-    ----------
-    crop_px
-        (x, y, width, height) of the part that is read, calibrated pixels; None: all of it.
-    binning
-        (across, down): so many pixels make one.
-    flip
-        (left to right, upside down).
+    ``crop_px`` is (x, y, width, height) in calibrated pixels, None for all of it; ``binning`` and ``flip``
+    are across and down.
     """
 
     crop_px: tuple[int, int, int, int] | None = None
     binning: tuple[int, int] = (1, 1)
     flip: tuple[bool, bool] = (False, False)
 
-    @property
-    def words(self) -> str:
-        """It in words; empty for the calibrated mode itself."""
-        found = []
+    def __str__(self) -> str:
+        """It as text; empty for the calibrated mode itself."""
+        parts = []
         if self.crop_px is not None:
-            found.append("crop {2}x{3} px from ({0}, {1})".format(*self.crop_px))
+            parts.append("crop {2}x{3} px from ({0}, {1})".format(*self.crop_px))
         if self.binning != (1, 1):
-            found.append("binning {}x{}".format(*self.binning))
-        if any(self.flip):
-            found.append(_flip_words(self.flip))
-        return ", ".join(found)
+            parts.append("binning {}x{}".format(*self.binning))
+        return ", ".join([*parts, *_flips(self.flip)])
 
 
 @dataclass(frozen=True)
@@ -123,62 +114,58 @@ class SensorMode:
                 "height] is expected)"
             )
 
-    @property
-    def words(self) -> str:
-        """It in words."""
+    def __str__(self) -> str:
         part = "an unknown part of its sensor"
         if self.crop_px is not None and self.sensor_px is not None:
             part = "{2}x{3} px from ({0}, {1}) of {4}x{5} px".format(*self.crop_px, *self.sensor_px)
-        flip = f", {_flip_words(self.flip)}" if any(self.flip) else ""
-        return f"{part} as {self.size_px[0]}x{self.size_px[1]} px{flip}"
-
-    def centered(self, axis: int) -> bool:
-        """Return whether a known crop is in the middle of the sensor along x (0) or y (1)."""
-        assert self.crop_px is not None and self.sensor_px is not None
-        return 2 * self.crop_px[axis] + self.crop_px[axis + 2] == self.sensor_px[axis]
+        return ", ".join([f"{part} as {self.size_px[0]}x{self.size_px[1]} px", *_flips(self.flip)])
 
 
 def mode_between(then: SensorMode, now: SensorMode) -> Mode:
     """Return how pictures of one mode differ from those of another of the same camera.
 
-    A crop that either lacks counts as equal. Some makers count the crop of a flipped picture from the one
-    side of the sensor, and some from the other. So such a crop has to be in the middle.
+    An unknown crop is treated as equal. Makers differ in the side from which the crop of a flipped picture
+    is counted, so such a crop has to be in the middle.
 
     Raises
     ------
     BadMode
         If no crop, binning and flip of the former pictures makes the present ones.
     """
-    from fractions import Fraction  # brings `decimal`, which no command needs at its start
-
     flip = then.flip[0] != now.flip[0], then.flip[1] != now.flip[1]
-    if then.crop_px is None or now.crop_px is None:
+    if then.crop_px is None or now.crop_px is None or then.sensor_px is None or now.sensor_px is None:
         if then.size_px != now.size_px:
             raise BadMode("which part of the sensor they show is not known")
         return Mode(flip=flip)
     if then.sensor_px != now.sensor_px:
-        sizes = ["{}x{} px".format(*one.sensor_px) for one in (now, then) if one.sensor_px]
-        raise BadMode(f"the camera has a sensor of {sizes[0]} where the calibrated one had {sizes[1]}")
+        raise BadMode(
+            "the camera has a sensor of {}x{} px where the calibrated one had {}x{} px".format(
+                *now.sensor_px, *then.sensor_px
+            )
+        )
     begins, lengths, binnings = [], [], []
     for axis, side in enumerate("xy"):
         (then_begin, then_px), (begin, length) = then.crop_px[axis::2], now.crop_px[axis::2]
+        middle = [2 * at + px == now.sensor_px[axis] for at, px in ((then_begin, then_px), (begin, length))]
         moved = flip[axis] or (then_begin, then_px) != (begin, length)
-        if moved and then.flip[axis] | now.flip[axis] and not (then.centered(axis) and now.centered(axis)):
+        if moved and (then.flip[axis] or now.flip[axis]) and not all(middle):
             raise BadMode(
                 "the crop is not in the middle, and from which side of the sensor it counts in flipped "
                 "pictures is the maker's choice"
             )
-        one = Fraction(then_px, then.size_px[axis])
-        at, span, by = (begin - then_begin) / one, length / one, Fraction(length, now.size_px[axis]) / one
-        if at < 0 or at + span > then.size_px[axis]:
+        # A calibrated pixel is then_px / size sensor pixels.
+        size = then.size_px[axis]
+        (at, at_left), (span, span_left) = (divmod(px * size, then_px) for px in (begin - then_begin, length))
+        if at < 0 or (begin - then_begin + length) > then_px:
             raise BadMode(f"they show more of the sensor along {side} than was calibrated")
-        if at.denominator != 1 or span.denominator != 1:
+        if at_left or span_left:
             raise BadMode(f"their part of the calibrated picture begins or ends amid a pixel along {side}")
-        if by.denominator != 1:
-            raise BadMode(f"a scale of {1 / by} along {side} is no binning")
-        begins.append(int(at))
-        lengths.append(int(span))
-        binnings.append(int(by))
+        by, rest = divmod(span, now.size_px[axis])
+        if rest:
+            raise BadMode(f"a scale of {now.size_px[axis] / span:.3g} along {side} is no binning")
+        begins.append(at)
+        lengths.append(span)
+        binnings.append(by)
     crop = begins[0], begins[1], lengths[0], lengths[1]
     return Mode(None if crop == (0, 0, *then.size_px) else crop, (binnings[0], binnings[1]), flip)
 
@@ -188,8 +175,6 @@ def sensor_mode_after(then: SensorMode, mode: Mode) -> SensorMode | None:
 
     None where that is not known: a crop of a flipped picture that is not in its middle (`mode_between`).
     """
-    from fractions import Fraction
-
     crop = mode.crop_px or (0, 0, *then.size_px)
     if crop == (0, 0, *then.size_px):
         mode = replace(mode, crop_px=None)
@@ -197,11 +182,9 @@ def sensor_mode_after(then: SensorMode, mode: Mode) -> SensorMode | None:
     flip = then.flip[0] != mode.flip[0], then.flip[1] != mode.flip[1]
     if then.crop_px is None or then.sensor_px is None:
         return SensorMode(size_px, flip=flip)
-    by = [Fraction(length, size) for length, size in zip(then.crop_px[2:], then.size_px, strict=True)]
-    x, y, width, height = (
-        begin + px * scale for begin, px, scale in zip((*then.crop_px[:2], 0, 0), crop, by * 2, strict=True)
-    )
-    after = SensorMode(size_px, (int(x), int(y), int(width), int(height)), then.sensor_px, flip)
+    x, y, width, height = (px * then.crop_px[2 + i % 2] // then.size_px[i % 2] for i, px in enumerate(crop))
+    read = then.crop_px[0] + x, then.crop_px[1] + y, width, height
+    after = SensorMode(size_px, read, then.sensor_px, flip)
     try:
         return after if mode_between(then, after) == mode else None
     except BadMode:
@@ -213,9 +196,10 @@ def flip_name(flip: tuple[bool, bool]) -> FlipName:
     return next(name for name, one in FLIPS.items() if one == flip)
 
 
-def _flip_words(flip: tuple[bool, bool]) -> str:
-    sides = [word for word, on in zip(("horizontal", "vertical"), flip, strict=True) if on]
-    return f"flip {' and '.join(sides)}"
+def _flips(flip: tuple[bool, bool]) -> list[str]:
+    """A flip as text, if it is one."""
+    sides = [side for side, on in zip(("horizontal", "vertical"), flip, strict=True) if on]
+    return [f"flip {' and '.join(sides)}"] if sides else []
 
 
 @dataclass(frozen=True)
@@ -247,12 +231,12 @@ def pixel_change(size_px: tuple[int, int], mode: Mode) -> PixelChange:
             f"{width}x{height} px"
         )
     scale, shift, size = [], [], []
-    for begin, length, by, flip, word in zip(
+    for begin, length, by, flip, side in zip(
         (x, y), cropped, mode.binning, mode.flip, ("wide", "high"), strict=True
     ):
         if by < 1 or length % by:
             raise BadMode(
-                f"binning by {by} does not divide a picture {length} px {word}; the camera's way with the "
+                f"binning by {by} does not divide a picture {length} px {side}; how the camera treats the "
                 "pixels left over is not known"
             )
         new = length // by
@@ -264,12 +248,7 @@ def pixel_change(size_px: tuple[int, int], mode: Mode) -> PixelChange:
 
 
 def in_mode(model: CameraModel, mode: Mode) -> CameraModel:
-    """Return a camera as it is in another mode.
-
-    Raises
-    ------
-    BadMode
-        As `pixel_change`.
+    """Return a camera as it is in another mode. Raises BadMode as `pixel_change`.
 
     Examples
     --------

@@ -4,22 +4,22 @@ The paper's section V, steps 1 and 2: a ray through each picked pixel, then the 
 middle of their common normal.
 
 The paper's Table I, the error budget of a target approach, follows from its equations (1) to (4). All errors
-are 3 sigma. The printed cells come from a pixel of 4.65 µm for all three cameras, the Hazcam being taken at
-the others' 1024 x 768 pixels. The text's 4.69 µm does not give them.
+are 3 sigma. The printed cells come from a pixel of 4.65 µm for all three cameras, with 1024 x 768 pixels for
+the Hazcam as for the others. The text's 4.69 µm does not give them.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.errors import NoStereoPoint
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.rigid import FloatArray, ReadOnlyArrays, finite_float, frozen_array
+from calib.geometry.rigid import FloatArray, ReadOnlyArrays, crossed, finite_float
 
 PARALLEL_RAD = 1e-9
 """Rays that meet under a smaller angle are parallel: rounding alone would place the point."""
@@ -29,95 +29,52 @@ SIDES = ("left", "right")
 
 @dataclass(frozen=True, eq=False)
 class Triangulation(ReadOnlyArrays):
-    """A point seen by two cameras, in the frame of their models.
+    """A point seen by two cameras, or many (...) of them, in the frame of their models; read-only.
 
     Attributes
     ----------
     position_m
-        (3,) middle of the common normal of the two rays.
+        (..., 3) middle of the common normal of the two rays.
     covariance_m2
-        (3, 3) from the pixel noise alone, to first order; camera and mast errors are not in it.
+        (..., 3, 3) from the pixel noise alone, to first order; camera and mast errors are not in it.
     ray_gap_m
-        Length of the common normal: how far the rays pass each other. Large beside what the pixel noise
+        (...) length of the common normal: how far the rays pass each other. Large beside what the pixel noise
         explains, it says that the two pixels are not of one point, or that the models are off; whether it is,
         `calib.geometry.covariance` says.
     ranges_m
-        From the left and from the right ray's origin to the foot of the normal on that ray.
+        (..., 2) from the left and from the right ray's origin to the foot of the normal on that ray.
     rates_m_per_px
-        (3, 4) d position / d (left x, left y, right x, right y).
+        (..., 3, 4) d position / d (left x, left y, right x, right y).
     gap_m_per_px
-        (4,) d gap / d (the same) where the rays meet. The gap is the triple product of both directions and
-        what lies between the origins, over the sine of their angle; the rates are those of the product. It
-        is linear in each direction, so that they hold for pixels far off each other's lines too.
+        (..., 4) d gap / d (the same) where the rays meet. The gap is the triple product of both directions
+        and what lies between the origins, over the sine of their angle; the rates are those of the product.
+        It is linear in each direction, so they are right for pixels far off each other's lines too.
+    refused
+        (...) of text: empty where there is a point, else the code of `calib.errors.NoStereoPoint`; position,
+        covariance, gap and ranges are then not-a-number.
     """
 
     position_m: FloatArray
     covariance_m2: FloatArray
-    ray_gap_m: float
-    ranges_m: tuple[float, float]
+    ray_gap_m: Any
+    ranges_m: FloatArray
     rates_m_per_px: FloatArray
     gap_m_per_px: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Triangulations(ReadOnlyArrays):
-    """Many points seen by two cameras, by `triangulate` on arrays; read-only.
-
-    Attributes
-    ----------
-    position_m, covariance_m2, ray_gap_m, ranges_m
-        (..., 3), (..., 3, 3), (...) and (..., 2) as those of `Triangulation`, the ranges left and right;
-        not-a-number where there is no point.
-    refused
-        (...) of text: empty where there is a point, else the code of `calib.errors.NoStereoPoint`.
-    """
-
-    position_m: FloatArray
-    covariance_m2: FloatArray
-    ray_gap_m: FloatArray
-    ranges_m: FloatArray
     refused: NDArray[np.str_]
 
 
-class _Meeting(NamedTuple):
-    """Where n pairs of rays come nearest: sines (n,) of their angles, ranges (n, 2), gaps (n, 3).
-
-    has_ray (2, n) of the left and the right pixels; positions (n, 3) with rates (n, 3, 4) and gap rates
-    (n, 4) to (left x, left y, right x, right y). Parallel rays and missing ones leave rows that mean nothing.
-    """
-
-    has_ray: NDArray[np.bool_]
-    sines: FloatArray
-    ranges_m: FloatArray
-    gaps_m: FloatArray
-    positions_m: FloatArray
-    rates_m_per_px: FloatArray
-    gap_m_per_px: FloatArray
-
-
 def triangulate(
-    left: CameraModel,
-    right: CameraModel,
-    left_px: ArrayLike,
-    right_px: ArrayLike,
-    sigma_px: float = 0.2,
+    left: CameraModel, right: CameraModel, left_px: ArrayLike, right_px: ArrayLike, sigma_px: float = 0.2
 ) -> Triangulation:
-    """Return the point seen at one pixel in each of two cameras.
+    """Return the point seen at one pixel in each of two cameras, which are in one common frame.
 
     Parameters
     ----------
-    left, right
-        Camera models in one common frame; the result is in that frame.
     left_px, right_px
-        (2,) pixel (x, y) of the point in each image; or (..., 2) many of them, broadcast.
+        (2,) pixel (x, y) of the point in each image; or (..., 2) many of them, broadcast: then nothing is
+        raised for single points, as `triangulate_many`.
     sigma_px
         One-sigma noise of each pixel coordinate, independent in both axes and both images.
-
-    Returns
-    -------
-    Triangulation
-        For arrays of more than one axis what ``triangulate_many`` returns, which says so to a type checker
-        too.
 
     Raises
     ------
@@ -139,61 +96,39 @@ def triangulate(
     >>> round(float(seen.position_m[0]), 6), round(float(seen.covariance_m2[0, 0]) ** 0.5, 6)
     (5.0, 0.353553)
     """
-    _check_sigma(sigma_px)
     pixels = [np.asarray(pixel, dtype=np.float64) for pixel in (left_px, right_px)]
     if max(xy.ndim for xy in pixels) > 1:
-        return triangulate_many(  # type: ignore[return-value]  # a type checker cannot tell the shapes apart
-            left, right, pixels[0], pixels[1], sigma_px
-        )
+        return triangulate_many(left, right, pixels[0], pixels[1], sigma_px)
     for side, xy in zip(SIDES, pixels, strict=True):
         if xy.shape != (2,) or not np.isfinite(xy).all():
             raise NoStereoPoint("bad_pixel", f"{side} pixel {xy.tolist()} is not two finite numbers")
-    seen = _meeting(left, right, pixels[0][None], pixels[1][None])
+    seen, found = _triangulated(left, right, pixels[0], pixels[1], sigma_px)
     for side, model, xy, has_ray in zip(SIDES, (left, right), pixels, seen.has_ray, strict=True):
         if not has_ray[0]:
             raise NoStereoPoint(
                 "bad_pixel",
                 f"{side} pixel {xy.tolist()} has no ray in this {model.kind} camera{model.why_no_ray}",
             )
-    sine, (s1, s2) = float(seen.sines[0]), seen.ranges_m[0].tolist()
-    if sine < PARALLEL_RAD:
+    if found.refused == "parallel_rays":
         raise NoStereoPoint(
-            "parallel_rays", f"the two rays are parallel to {sine:.2g} rad: no point where they meet"
+            "parallel_rays", f"the two rays are parallel to {seen.sines[0]:.2g} rad: no point where they meet"
         )
-    if not (s1 > 0.0 and s2 > 0.0):
+    if found.refused:
+        s1, s2 = seen.ranges_m[0]
         raise NoStereoPoint(
             "behind_camera",
             f"the two rays diverge: they come nearest {s1:.4g} m along the left "
             f"and {s2:.4g} m along the right one, and both must be ahead",
         )
-    jacobian, gap = seen.rates_m_per_px[0], seen.gaps_m[0]
-    return Triangulation(
-        position_m=frozen_array(seen.positions_m[0], (3,)),
-        covariance_m2=frozen_array(sigma_px * sigma_px * (jacobian @ jacobian.T), (3, 3)),
-        ray_gap_m=math.sqrt(float(gap @ gap)),
-        ranges_m=(s1, s2),
-        rates_m_per_px=frozen_array(jacobian, (3, 4)),
-        gap_m_per_px=frozen_array(seen.gap_m_per_px[0], (4,)),
-    )
+    return found
 
 
 def triangulate_many(
-    left: CameraModel,
-    right: CameraModel,
-    left_px: ArrayLike,
-    right_px: ArrayLike,
-    sigma_px: float = 0.2,
-) -> Triangulations:
+    left: CameraModel, right: CameraModel, left_px: ArrayLike, right_px: ArrayLike, sigma_px: float = 0.2
+) -> Triangulation:
     """Return the points seen at many pixels of two cameras, each as ``triangulate`` gives it alone.
 
     A pair of pixels without a point does not stop the others: ``refused`` has its code.
-
-    Parameters
-    ----------
-    left, right, sigma_px
-        As ``triangulate``.
-    left_px, right_px
-        (..., 2) pixels (x, y) of the points in each image, broadcast.
 
     Raises
     ------
@@ -202,7 +137,6 @@ def triangulate_many(
     ValueError
         If the sigma is negative or not finite.
     """
-    _check_sigma(sigma_px)
     pixels = [np.asarray(pixel, dtype=np.float64) for pixel in (left_px, right_px)]
     for side, xy in zip(SIDES, pixels, strict=True):
         if xy.ndim == 0 or xy.shape[-1] != 2:
@@ -215,32 +149,49 @@ def triangulate_many(
             f"left pixels of shape {pixels[0].shape} and right pixels of shape {pixels[1].shape} "
             "do not go together",
         ) from None
-    shape = both[0].shape[:-1]
-    seen = _meeting(left, right, both[0].reshape(-1, 2), both[1].reshape(-1, 2))
+    return _triangulated(left, right, both[0], both[1], sigma_px)[1]
+
+
+class _Meeting(NamedTuple):
+    """Where n pairs of rays come nearest: sines (n,) of their angles, ranges (n, 2), gaps (n, 3).
+
+    has_ray (2, n) of the left and the right pixels; positions (n, 3) with rates (n, 3, 4) and gap rates
+    (n, 4) to (left x, left y, right x, right y). Parallel rays and missing ones leave rows that mean nothing.
+    """
+
+    has_ray: NDArray[np.bool_]
+    sines: FloatArray
+    ranges_m: FloatArray
+    gaps_m: FloatArray
+    positions_m: FloatArray
+    rates_m_per_px: FloatArray
+    gap_m_per_px: FloatArray
+
+
+def _triangulated(
+    left: CameraModel, right: CameraModel, left_px: FloatArray, right_px: FloatArray, sigma_px: float
+) -> tuple[_Meeting, Triangulation]:
+    """Where the rays of pixels (..., 2) come nearest, and the points that follow."""
+    if finite_float("sigma_px", sigma_px) < 0.0:
+        raise ValueError(f"sigma_px is {sigma_px} where 0 or more is expected")
+    seen = _meeting(left, right, left_px.reshape(-1, 2), right_px.reshape(-1, 2))
     refused = np.select(
         [~seen.has_ray.all(axis=0), seen.sines < PARALLEL_RAD, ~(seen.ranges_m > 0.0).all(axis=1)],
         ["bad_pixel", "parallel_rays", "behind_camera"],
         "",
     )
     rates = seen.rates_m_per_px
-    arrays = (
-        seen.positions_m,
-        sigma_px * sigma_px * (rates @ rates.transpose(0, 2, 1)),
-        np.sqrt(_dot(seen.gaps_m, seen.gaps_m)),
-        seen.ranges_m,
-    )
-    for array in arrays:
-        array[refused != ""] = np.nan
-    position_m, covariance_m2, ray_gap_m, ranges_m = (a.reshape((*shape, *a.shape[1:])) for a in arrays)
-    refused = refused.reshape(shape)
-    for array in (position_m, covariance_m2, ray_gap_m, ranges_m, refused):
-        array.setflags(write=False)
-    return Triangulations(position_m, covariance_m2, ray_gap_m, ranges_m, refused)
-
-
-def _check_sigma(sigma_px: float) -> None:
-    if finite_float("sigma_px", sigma_px) < 0.0:
-        raise ValueError(f"sigma_px is {sigma_px} where 0 or more is expected")
+    covariance = sigma_px * sigma_px * (rates @ rates.transpose(0, 2, 1))
+    arrays: list[Any] = [
+        np.where((refused == "").reshape(-1, *[1] * (one.ndim - 1)), one, np.nan)
+        for one in (seen.positions_m, covariance, np.sqrt(_dot(seen.gaps_m, seen.gaps_m)), seen.ranges_m)
+    ]
+    arrays += [rates, seen.gap_m_per_px, refused]
+    arrays = [one.reshape((*left_px.shape[:-1], *one.shape[1:]))[()] for one in arrays]
+    for one in arrays:
+        if isinstance(one, np.ndarray):
+            one.setflags(write=False)
+    return seen, Triangulation(*arrays)
 
 
 @np.errstate(all="ignore")
@@ -250,7 +201,7 @@ def _meeting(left: CameraModel, right: CameraModel, left_px: FloatArray, right_p
     rays2, turn2, shift2 = right.ray_jacobian(right_px)
     d1, d2, between = rays1.directions, rays2.directions, rays1.origins_m - rays2.origins_m
     # The common normal's feet o1 + s1 d1 and o2 + s2 d2: the gap between them is perpendicular to d1 and d2.
-    cosines, normals = _dot(d1, d2)[:, None], _cross(d1, d2)
+    cosines, normals = _dot(d1, d2)[:, None], crossed(d1, d2)
     sines = np.sqrt(_dot(normals, normals))
     per_sine2 = (1.0 / (sines * sines))[:, None]
     along1, along2 = _dot(d1, between)[:, None], _dot(d2, between)[:, None]
@@ -259,7 +210,7 @@ def _meeting(left: CameraModel, right: CameraModel, left_px: FloatArray, right_p
     foot1, foot2 = rays1.origins_m + s1 * d1, rays2.origins_m + s2 * d2
     gaps = foot1 - foot2
 
-    # Derivatives to the four pixel coordinates (left x, y, right x, y): the feet with s1, s2 held, then
+    # Derivatives to the four pixel coordinates (left x, y, right x, y): the feet with s1, s2 fixed, then
     # s1, s2 from d1·gap = d2·gap = 0, which the turned directions disturb as well.
     d_feet = np.concatenate([shift1 + s1[..., None] * turn1, shift2 + s2[..., None] * turn2], axis=2)
     d_gap = d_feet * [1.0, 1.0, -1.0, -1.0]
@@ -272,8 +223,8 @@ def _meeting(left: CameraModel, right: CameraModel, left_px: FloatArray, right_p
     d_feet += d2[:, :, None] * d_s2[:, None]
     d_product = np.concatenate(
         [
-            _times(normals, shift1) + _times(_cross(d2, between), turn1),
-            _times(_cross(between, d1), turn2) - _times(normals, shift2),
+            _times(normals, shift1) + _times(crossed(d2, between), turn1),
+            _times(crossed(between, d1), turn2) - _times(normals, shift2),
         ],
         axis=1,
     )
@@ -298,51 +249,23 @@ def _times(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray((a[:, None] @ b)[:, 0])
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products (n, 3); NumPy's own takes three times as long for a single one."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]).T
-
-
 PIXEL_M = 4.65e-6
 
-
-@dataclass(frozen=True)
-class StereoPair:
-    """A stereo pair as the budget sees it: focal length and baseline, metres."""
-
-    name: str
-    focal_m: float
-    baseline_m: float
+PAPER_PAIRS = (("pancam", 16.0e-3, 0.30), ("navcam", 6.0e-3, 0.20), ("hazcam", 2.3e-3, 0.10))
+"""Names, focal lengths and baselines of the paper's stereo pairs, metres."""
 
 
-@dataclass(frozen=True)
-class BudgetRow:
-    """One row of Table I: 3-sigma errors in centimetres.
+class BudgetRow(NamedTuple):
+    """One row of Table I: 3-sigma errors in centimetres, by the pair at the start of the approach.
 
-    Attributes
-    ----------
-    name
-        The camera at the start of the approach.
-    stereo_cm
-        Stereo range error where the approach starts, eq. (1).
-    untracked_cm
-        Where the target is after the approach without visual tracking, eq. (3).
-    tracked_cm
-        The same with ideal tracking and hand-off down to the last camera, eq. (4).
+    Of stereo where the approach starts, eq. (1); of the target's place after the approach without visual
+    tracking, eq. (3); the same with ideal tracking and hand-off down to the last camera, eq. (4).
     """
 
     name: str
     stereo_cm: float
     untracked_cm: float
     tracked_cm: float
-
-
-PAPER_PAIRS = (
-    StereoPair("pancam", 16.0e-3, 0.30),
-    StereoPair("navcam", 6.0e-3, 0.20),
-    StereoPair("hazcam", 2.3e-3, 0.10),
-)
 
 
 def stereo_range_error_m(
@@ -353,7 +276,7 @@ def stereo_range_error_m(
 
 
 def target_approach_budget(
-    pairs: tuple[StereoPair, ...] = PAPER_PAIRS,
+    pairs: tuple[tuple[str, float, float], ...] = PAPER_PAIRS,
     *,
     pixel_m: float = PIXEL_M,
     start_m: float = 10.0,
@@ -371,10 +294,8 @@ def target_approach_budget(
         Pixel size, metres; with the focal length it gives the focal length in pixels, eq. (2).
     start_m, end_m
         Distance to the target before and after the approach.
-    disparity_error_px
-        3-sigma disparity error of stereo at the start.
-    odometry_error
-        3-sigma navigation error as a part of the distance travelled; the paper takes 2 % of start_m.
+    disparity_error_px, odometry_error
+        3 sigma: of stereo at the start, and of navigation as a part of ``start_m``.
 
     Notes
     -----
@@ -384,12 +305,11 @@ def target_approach_budget(
     stays in eq. (4) and the baseline is the last camera's.
     """
     grown_error_px = 0.5 * disparity_error_px * start_m / end_m
-    last = pairs[-1]
     rows = []
-    for pair in pairs:
-        focal_px = pair.focal_m / pixel_m
-        stereo_m = stereo_range_error_m(start_m, focal_px, pair.baseline_m, disparity_error_px)
+    for name, focal_m, baseline_m in pairs:
+        focal_px = focal_m / pixel_m
+        stereo_m = stereo_range_error_m(start_m, focal_px, baseline_m, disparity_error_px)
         untracked_m = math.hypot(stereo_m, odometry_error * start_m)
-        tracked_m = stereo_range_error_m(end_m, focal_px, last.baseline_m, grown_error_px)
-        rows.append(BudgetRow(pair.name, 100.0 * stereo_m, 100.0 * untracked_m, 100.0 * tracked_m))
+        tracked_m = stereo_range_error_m(end_m, focal_px, pairs[-1][2], grown_error_px)
+        rows.append(BudgetRow(name, 100.0 * stereo_m, 100.0 * untracked_m, 100.0 * tracked_m))
     return tuple(rows)

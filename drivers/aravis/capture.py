@@ -204,7 +204,7 @@ class GenicamCapture:
             device = Device(self._options, self._name, self._adjusted)
             if self._streams and device.sensor_mode != self.sensor_mode:
                 device.close()
-                words = f"it came back with {device.sensor_mode.words} where it had {self.sensor_mode.words}"
+                words = f"it came back with {device.sensor_mode} where it had {self.sensor_mode}"
                 raise StreamFailed(words, device=self._name)
             self._longest_s = device.values.get(EXPOSURE.name) or device.period_s or 1.0
             self._clock = CameraClock(self._least_delay_s())

@@ -294,7 +294,7 @@ class Capture:
             stream = Stream(self._options, self._name, self._clock, exposure_s)
             if self._streams and stream.sensor_mode != self.sensor_mode:
                 stream.close()
-                words = f"it came back with {stream.sensor_mode.words} where it had {self.sensor_mode.words}"
+                words = f"it came back with {stream.sensor_mode} where it had {self.sensor_mode}"
                 raise StreamFailed(words, device=self._name)
             self._in_force = stream.in_force
         self._check = StampCheck()

@@ -15,7 +15,7 @@ from calib.geometry.handoff import Joints, hand_off
 from calib.geometry.pointing import solve, solve_many
 from calib.geometry.rig import Mast, Rig
 from calib.geometry.solutions import Solution, Solutions, choose
-from calib.geometry.stereo import Triangulations, triangulate, triangulate_many
+from calib.geometry.stereo import Triangulation, triangulate, triangulate_many
 
 LAST_BITS = 1e-12
 """Relative: sums of three terms in another order, over the two milliradians under which the rays meet."""
@@ -194,13 +194,13 @@ def test_every_pair_of_pixels_has_the_point_that_it_has_alone(eyes: tuple[Camera
 def test_triangulate_takes_arrays_as_project_does(eyes: tuple[CameraModel, CameraModel]) -> None:
     left_px, right_px = clicks(eyes, 6)
     block = triangulate(*eyes, left_px.reshape(2, 3, 2), right_px.reshape(2, 3, 2))
-    assert isinstance(block, Triangulations)
+    assert isinstance(block, Triangulation)
     assert block.position_m.shape == (2, 3, 3) and block.covariance_m2.shape == (2, 3, 3, 3)
     assert block.ray_gap_m.shape == block.refused.shape == (2, 3) and block.ranges_m.shape == (2, 3, 2)
     alone = triangulate(*eyes, left_px[5], right_px[5])
     np.testing.assert_allclose(block.position_m[1, 2], alone.position_m, rtol=LAST_BITS)
     nudged = triangulate(*eyes, left_px[0], right_px[0] + np.array([[0.0, 0.0], [0.0, 0.1]]))
-    assert isinstance(nudged, Triangulations)
+    assert isinstance(nudged, Triangulation)
     np.testing.assert_allclose(
         nudged.position_m[1],
         triangulate(*eyes, left_px[0], right_px[0] + [0.0, 0.1]).position_m,
@@ -209,7 +209,7 @@ def test_triangulate_takes_arrays_as_project_does(eyes: tuple[CameraModel, Camer
     one = triangulate_many(*eyes, left_px[5], right_px[5])  # no axis but the last: a point without one
     assert one.position_m.shape == (3,) and one.ray_gap_m.shape == one.refused.shape == ()
     nothing = triangulate(*eyes, np.zeros((0, 2)), np.zeros((0, 2)))
-    assert isinstance(nothing, Triangulations)
+    assert isinstance(nothing, Triangulation)
     assert nothing.position_m.shape == (0, 3)
 
 

@@ -58,23 +58,23 @@ def camera_mode(args: argparse.Namespace) -> int:
     rig = rig_in_mode(stored.rig, name, mode)
     size_px = rig.cameras[name].model.size_px
     if args.size is not None and size_px != tuple(args.size):
-        raise output.CommandError("bad_mode", _other_size(args.size, size_px, calibrated_px, mode.words))
-    if not mode.words:
+        raise output.CommandError("bad_mode", _other_size(args.size, size_px, calibrated_px, str(mode)))
+    if not str(mode):
         raise output.WrongUse("--crop, --bin or --flip is expected: the calibrated mode needs no other file")
     if args.out.exists() and args.out.samefile(args.file):
         raise output.WrongUse(f"--out {args.out} is MAST.yaml itself, which a second run would change again")
     before = rig.provenance.get("modes", [])  # a free place: anything may stand there
     before = before if isinstance(before, list) else [] if before is None else [before]
-    noted = [*before, {"camera": name, "of": stored.digest, "mode": mode.words}]
+    noted = [*before, {"camera": name, "of": stored.digest, "mode": str(mode)}]
     if stored.rig.cameras[name].sensor_mode is not None and rig.cameras[name].sensor_mode is None:
         output.tell(f"which part of the sensor {name} then shows is not known: its sensor_mode is left out")
     written = save_rig(replace(rig, provenance={**rig.provenance, "modes": noted}), args.out)
-    told = {"out": str(args.out), "camera": name, "size_px": list(size_px), "mode": mode.words}
+    told = {"out": str(args.out), "camera": name, "size_px": list(size_px), "mode": str(mode)}
     if args.json:
         output.print_json(told | {"digest": written.digest})
         return 0
     width, height = size_px
-    sys.stdout.write(output.one_line(f"{args.out}: {name} with {mode.words}: {width}x{height} px") + "\n")
+    sys.stdout.write(output.one_line(f"{args.out}: {name} with {mode}: {width}x{height} px") + "\n")
     return 0
 
 

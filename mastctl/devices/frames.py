@@ -82,7 +82,7 @@ def check_mode(camera: str, now: SensorMode, then: SensorMode) -> None:
     except BadMode as error:
         remedy = f"{error}: set the camera as it was, or calibrate it as it is"
     else:
-        if not change.words:
+        if not str(change):
             return
         given = ((" --crop {} {} {} {}", change.crop_px), (" --bin {} {}", change.binning))
         options = "".join(words.format(*value) for words, value in given if value not in (None, (1, 1)))
@@ -92,8 +92,8 @@ def check_mode(camera: str, now: SensorMode, then: SensorMode) -> None:
         )
         if change.binning != (1, 1):
             remedy += "; a camera that skips pixels and does not bin them has to be calibrated as it is"
-    words = f"its pictures show {now.words} where cameras.{camera}.sensor_mode of the mast file has"
-    raise BadFrame(f"{words} {then.words}; {remedy}", device=camera)
+    words = f"its pictures show {now} where cameras.{camera}.sensor_mode of the mast file has"
+    raise BadFrame(f"{words} {then}; {remedy}", device=camera)
 
 
 def checked(

@@ -232,7 +232,7 @@ def test_a_picture_changes_its_sensor_mode_as_opencv_cuts_it() -> None:
     [
         (SENSOR_MODES[3], FULL, "they show more of the sensor along x than was calibrated"),
         (SENSOR_MODES[1], FULL, "a scale of 2 along x is no binning"),
-        (FULL, replace(FULL, size_px=(64, 64)), "a scale of 2/3 along x is no binning"),
+        (FULL, replace(FULL, size_px=(64, 64)), "a scale of 0.667 along x is no binning"),
         (
             SENSOR_MODES[1],
             SensorMode((47, 32), (1, 0, 94, 64), SENSOR),
