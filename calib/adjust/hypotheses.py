@@ -3,10 +3,11 @@
 Each hypothesis has numbers beside the fitted ones, all 0 in the fit: of the mast's axes, of a joint's errors
 around the turn, of a joint that slips or is read wrong once, of a lens, of a camera that changes between two
 pictures, of joints and cameras that drift from the first picture to the last, of a board's shape, of a board
-that moved. Near the fit the problem is linear, so that the gain in chi-square follows from sums over pictures
-(`calib.adjust.score`), and no further fit is made. Surveys and benches differ only in what is tested. Where
-one defect shows in several hypotheses, the one that gains most for its numbers is the likeliest. A pan that
-slips between two placements of a bench's board is seen by nothing and does no harm.
+that moved, of a placement whose pictures say something else of cameras and axes than the others. Near the fit
+the problem is linear, so that the gain in chi-square follows from sums over pictures (`calib.adjust.score`),
+and no further fit is made. Surveys and benches differ only in what is tested. Where one defect shows in
+several hypotheses, the one that gains most for its numbers is the likeliest. A pan that slips between two
+placements of a bench's board is seen by nothing and does no harm.
 """
 
 from __future__ import annotations
@@ -176,12 +177,8 @@ class Finding:
         return (self.chance, -self.gain) < (other.chance, -other.gain)
 
 
-def survey_findings(problem: Adjustment, state: Estimate) -> tuple[Finding, ...]:
-    """Return what every hypothesis that can be tested on a survey would gain, the likeliest first.
-
-    ``problem`` and ``state`` are a fit at its minimum, with the sigmas that count.
-    """
-    fit = ScoredFit(problem, state)
+def survey_findings(fit: ScoredFit) -> tuple[Finding, ...]:
+    """Return what every hypothesis that can be tested on a survey would gain, the likeliest first."""
     found = fit.findings(_of_surveys(fit)) if fit.images else []
     # Few prisms check one another, and the rover frame hangs on their drawing.
     limits, each = {DRAWING: float(Level.MEASUREMENT)}, Level.HYPOTHESIS / max(len(found), 1)
@@ -198,23 +195,35 @@ def explaining(findings: Sequence[Finding], excess: float) -> tuple[Finding, ...
     return tuple(f for f in findings if f.significant and f.gain - f.numbers > EXPLAINS * excess)
 
 
-def find_drifts(problem: Adjustment, state: Estimate) -> tuple[Finding, ...]:
+def find_drifts(fit: ScoredFit) -> tuple[Finding, ...]:
     """Return how far each joint and each camera drifts, the least likely by chance first."""
-    fit = ScoredFit(problem, state)
-    found = fit.findings(_drifts(fit))
-    found = [replace(f, chance=min(1.0, len(found) * f.chance)) for f in found]
-    return tuple(sorted(found, key=lambda f: f.chance))
+    return _each_tested(fit, _drifts(fit))
 
 
-def find_change(problem: Adjustment, state: Estimate) -> Finding | None:
+def find_contradictions(fit: ScoredFit) -> tuple[Finding, ...]:
+    """Return what each placement would gain by cameras, axes and joints of its own, the least likely by
+    chance first."""
+    return _each_tested(fit, _placements(fit))
+
+
+def _each_tested(fit: ScoredFit, hypotheses: Iterator[Hypothesis]) -> tuple[Finding, ...]:
+    """What some hypotheses gain, their chances with all of them counted."""
+    found = fit.findings(hypotheses)
+    chances = [min(1.0, len(found) * f.chance) for f in found]
+    found = [
+        replace(f, chance=one, significant=one < Level.STATED) for f, one in zip(found, chances, strict=True)
+    ]
+    return tuple(sorted(found, key=lambda f: (f.chance, -f.gain)))
+
+
+def find_change(fit: ScoredFit) -> Finding | None:
     """Return the change between two pictures that explains most, or None if none is significant.
 
-    ``problem`` and ``state`` are a fit with pulls bounded. For every picture from which on a board may have
+    The fit is one with pulls bounded. For every picture from which on a board may have
     stood elsewhere, a joint read otherwise, or a camera had another focal length or another direction, the
     gain is found. Of changes that explain the same, that with the fewest numbers is reported; none where axes
     of the mast that do not meet at a right angle explain more.
     """
-    fit = ScoredFit(problem, state)
     tried = [(what, at, gain) for what in _changes(fit) for at, gain in fit.gains(what)]
     possible = [one for one in tried if one[2].chi2 < fit.chi2]
     if not possible:
@@ -396,6 +405,22 @@ def _drifts(fit: ScoredFit) -> Iterator[Hypothesis]:
     """Joints and cameras that change more with every picture."""
     yield from _joints(fit, "drift", "drift", _joint_drift_sentence)
     yield from _cameras(fit, "drift", ALL, "drift", _camera_drift_sentence)
+
+
+def _placements(fit: ScoredFit) -> Iterator[Hypothesis]:
+    """Placements whose pictures see other cameras, axes and joints than those of the others."""
+    compared = fit.problem.unknowns.of_kinds("mast", "joints", "camera")
+    boards = dict.fromkeys(image.board for image in fit.images)
+    for board in boards if len(boards) > 1 else ():
+
+        def own(_: ImageTerm, motions: Motions) -> FloatArray:
+            rates = np.zeros((len(motions.block.residual), len(fit.gradient)))
+            rates[:, motions.block.columns] = motions.block.jacobian
+            return rates[:, compared]
+
+        rows = fit.rows(own, lambda image, board=board: image.board == board)  # type: ignore[misc]
+        name = f"placement {board[1]} of {board[0]}"
+        yield Hypothesis(name, ("board", *board), rows, _contradiction_sentence)
 
 
 def _changes(fit: ScoredFit) -> Iterator[Hypothesis]:
@@ -611,6 +636,14 @@ def _board_sentence(found: Finding) -> str:
     return (
         f"board {board} moved during placement {placement}, between pictures {found.before} and "
         f"{found.after}, by about {_milli(found.values[3:])} mm and {_milli(found.values[:3])} mrad"
+    )
+
+
+def _contradiction_sentence(found: Finding) -> str:
+    return (
+        f"{found.name} contradicts the others: its pictures say something else of cameras, axes and joints "
+        f"(chi-square {found.gain:.0f} for {found.numbers} numbers). Check that it is the same board and "
+        "that nothing changed in between, and put it up there once more"
     )
 
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from calib.adjust.goodness import Component
 from calib.adjust.hypotheses import Finding
-from calib.adjust.left_out import LeftOutBoard
 from calib.adjust.model_terms import TermGain
 from calib.adjust.outliers import Outlier
 from calib.adjust.unknowns import Estimate
@@ -117,6 +116,9 @@ class FittedRig:
         Camera to what its check images are off by, and how likely it is that they are off by more.
     rover_from_board
         Poses by set-up, or board, and placement.
+    contradictions
+        Each placement tested against the others, the least likely first; empty where the method does not
+        weigh by sigmas.
     seconds
         How long it took.
     """
@@ -137,6 +139,7 @@ class FittedRig:
     components: tuple[Component, ...] = ()
     checks: Mapping[str, CheckExpected]
     rover_from_board: Mapping[tuple[str, str], Rigid]
+    contradictions: tuple[Finding, ...] = ()
     seconds: float
 
     def widened(self, kind: str) -> float:
@@ -158,9 +161,8 @@ class Calibration(FittedRig):
         How it was fitted; 4, 6 or 8.
     estimate
         (p,) values of the parameters; 0 for the two of an A or O, which count from the rig's own.
-    wider, left_out_boards
-        The gain of further numbers, the likeliest first, and the test of each board against the rest; empty
-        where the method does not weigh by sigmas.
+    wider
+        The gain of further numbers, the likeliest first; empty where the method does not weigh by sigmas.
     station
         The residuals of every prism and tape.
     rover_from_station
@@ -178,7 +180,6 @@ class Calibration(FittedRig):
     rover_from_station: Mapping[str, Rigid]
     prisms_in_rover_m: Mapping[str, FloatArray]
     wider: tuple[Finding, ...] = ()
-    left_out_boards: tuple[LeftOutBoard, ...] = ()
     unseen_clicks: tuple[Click, ...] = ()
 
 
@@ -192,8 +193,6 @@ class BenchCalibration(FittedRig):
         Every term that could have entered.
     gauges
         Quantities that pictures cannot determine, and how they were fixed, a sentence each.
-    placements
-        Each placement tested against the others, the least likely first.
     drifts
         How far each joint and each camera drifts, the least likely first.
     joint_rad
@@ -206,7 +205,6 @@ class BenchCalibration(FittedRig):
 
     terms: tuple[TermGain, ...]
     gauges: tuple[str, ...]
-    placements: tuple[LeftOutBoard, ...]
     drifts: tuple[Finding, ...]
     joint_rad: float
     inexact_m: float

@@ -16,8 +16,14 @@ from calib.adjust.adjustment import HUBER, SCAN_HUBER, Adjustment
 from calib.adjust.checks import checked, expected_checks
 from calib.adjust.goodness import goodness
 from calib.adjust.gross import GROSS, chance_limit
-from calib.adjust.hypotheses import Finding, explaining, find_change, survey_findings
-from calib.adjust.left_out import left_out_boards
+from calib.adjust.hypotheses import (
+    Finding,
+    ScoredFit,
+    explaining,
+    find_change,
+    find_contradictions,
+    survey_findings,
+)
 from calib.adjust.result import Calibration
 from calib.adjust.robust import Cleaned, SurveyNotFitted, Weighed, weigh, without_blunders
 from calib.adjust.scatter import own_scales
@@ -95,7 +101,7 @@ def _what_changed(cleaned: Cleaned) -> Finding | None:
     whole = with_kept(every.images, every.unseen(cleaned.fit.state))
     every = every.with_terms(whole, every.station).with_huber(SCAN_HUBER)
     fit = minimise(every, cleaned.fit.state, weak=every.weak, gain=1e-6)
-    change = find_change(every, fit.state) if np.isfinite(fit.normal.cost) else None
+    change = find_change(ScoredFit(every, fit.state)) if np.isfinite(fit.normal.cost) else None
     return change if change is not None and change.sure and change.subject[0] != "board" else None
 
 
@@ -165,6 +171,7 @@ def _calibration(
     judged = weighed.judged_fields(stated)
     of_checks = tuple(f"image {t.name} dot " for t in start.checks)
     judged["outliers"] += tuple(o for o in start.wrong if o.name.startswith(of_checks))
+    scored = ScoredFit(problem, state)
     return Calibration(
         **surveyed_fields(survey, problem, state, mine, images, notes),
         **judged,
@@ -173,18 +180,18 @@ def _calibration(
         ),
         method="joint",
         mast_parameters=mast_parameters,
-        wider=(*_left_out_for(change), *_wider(cleaned, weighed)),
-        left_out_boards=left_out_boards(problem, weighed.fit, covariance, ["mast"]),
+        wider=(*_left_out_for(change), *_wider(cleaned, weighed, scored)),
+        contradictions=find_contradictions(scored),
         seconds=time.perf_counter() - began,
     )
 
 
-def _wider(cleaned: Cleaned, weighed: Weighed) -> tuple[Finding, ...]:
+def _wider(cleaned: Cleaned, weighed: Weighed, scored: ScoredFit) -> tuple[Finding, ...]:
     """What hypotheses would gain, those first that explain why sigmas had to be widened beyond scatter."""
-    found = survey_findings(weighed.problem, weighed.fit.state)
+    found = survey_findings(scored)
     if not any(component.wrong for component in weighed.components):
         return found
-    causes = explaining(survey_findings(cleaned.problem, cleaned.fit.state), weighed.excess)
+    causes = explaining(survey_findings(ScoredFit(cleaned.problem, cleaned.fit.state)), weighed.excess)
     named = {finding.name for finding in causes}
     return (*causes, *(finding for finding in found if finding.name not in named))
 

@@ -20,6 +20,7 @@ from mastctl.calibration.verdict import (
     Grade,
     Reason,
     chi_square_grade,
+    contradiction_reasons,
     sigma_reasons,
 )
 
@@ -34,7 +35,7 @@ def judge_bench(survey: Survey, calibration: BenchCalibration) -> CalibrationVer
         *(Reason("care", note) for note in calibration.notes if " moved during placement " in note),
         *_inexact(survey, calibration),
         *_placements(calibration),
-        *_others(calibration),
+        *contradiction_reasons(calibration),
         *_drifts(calibration),
         *_checks(calibration),
         *(Reason("bad", direction.sentence) for direction in calibration.degenerate),
@@ -102,22 +103,6 @@ def _placements(calibration: BenchCalibration) -> Iterator[Reason]:
             "care",
             "all pictures show one placement: how far off things are hangs on one board at one distance; "
             "put it up once more, at another distance and turned by some 30 degrees",
-        )
-
-
-def _others(calibration: BenchCalibration) -> Iterator[Reason]:
-    """Whether placements agree with one another."""
-    placements = sorted(calibration.placements, key=lambda one: one.pull_chance)
-    odd = [one for one in placements if len(placements) * one.pull_chance < Level.STATED]
-    if len(placements) == 2:  # either contradicts the other
-        odd = odd[:1]
-    yield from (Reason("care", one.sentence) for one in odd)
-    if placements and not odd:
-        yield Reason(
-            "good",
-            f"each of {len(placements)} placements says what the others say of cameras, axes and joints; "
-            f"{placements[0].board[1]} of board {placements[0].board[0]} differs most, chi-square "
-            f"{placements[0].pull:.0f} for {placements[0].pull_freedom} numbers",
         )
 
 

@@ -15,7 +15,7 @@ from mastctl.as_json import readable
 from mastctl.calibration import drawn
 from mastctl.calibration.landing import change_map, uncertainty_map
 from mastctl.calibration.run import Calibrated
-from mastctl.calibration.tested import board_table, component_table, wider_table
+from mastctl.calibration.tested import component_table, finding_table
 from mastctl.calibration.verdict import POINTING_RANGE_M
 from mastctl.report import pages, plots
 from mastctl.report.pictures import Figure
@@ -100,8 +100,8 @@ def _page(told: Calibrated, in_use: StoredRig | None) -> str:
         mast=mast_table(calibration),
         cameras=camera_table(calibration),
         measurements=component_table(survey, calibration),
-        wider=wider_table(calibration),
-        boards=board_table(calibration),
+        wider=finding_table("wider model", calibration.wider),
+        boards=finding_table("placement", calibration.contradictions),
         notes=calibration.notes,
         held_fixed=HELD_FIXED,
         warnings=told.warnings,

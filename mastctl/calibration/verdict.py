@@ -18,7 +18,7 @@ from calib.errors import CalibError
 from calib.geometry.significance import Level
 from calib.survey.records import Survey, SurveyFinding
 from mastctl.calibration.checks import exchanged_boards
-from mastctl.calibration.tested import allowed, cross_validation_px, wrong_sentence
+from mastctl.calibration.tested import allowed, wrong_sentence
 
 Grade = Literal["good", "care", "bad"]
 
@@ -110,7 +110,7 @@ def judge_calibration(
     reasons = [
         *_noise(survey, calibration),
         *_wider(calibration),
-        *_by_the_others(calibration),
+        *contradiction_reasons(calibration),
         *_jointly(survey, jointly),
         *_odd_images(calibration),
         *_checks(calibration),
@@ -245,30 +245,20 @@ def _wider(calibration: Calibration) -> list[Reason]:
     return reasons
 
 
-def _by_the_others(calibration: Calibration) -> list[Reason]:
-    """Whether each board is where the others say, and pulls the mast no farther than it may."""
-    boards = calibration.left_out_boards
-    if not boards:
-        return []
-    odd = [one for one in boards if one.least_chance * len(boards) < Level.STATED]
-    reasons = []
-    for one in odd:
-        words = (
-            f"placement {one.board[1]} (set-up {one.board[0]}) contradicts the others: without it the mast "
+def contradiction_reasons(calibration: Calibration | BenchCalibration) -> list[Reason]:
+    """Return whether placements agree with one another."""
+    placements = calibration.contradictions
+    odd = [one for one in placements if one.significant]
+    if len(placements) == 2:  # either contradicts the other
+        odd = odd[:1]
+    if placements and not odd:
+        first = placements[0]
+        agree = (
+            f"each of {len(placements)} placements says what the others say of cameras, axes and joints; "
+            f"{first.name} differs most, chi-square {first.gain:.0f} for {first.numbers} numbers"
         )
-        words += f"would be elsewhere by {one.pull_sigmas:.1f} of its sigmas"
-        if np.isfinite(one.predicted_px):
-            words += f", and its dots are {one.predicted_px:.2f} px rms off what they say"
-        reasons.append(Reason("care", words))
-    fitted, predicted = cross_validation_px(calibration)
-    if not odd and np.isfinite(predicted):
-        tested = sum(bool(np.isfinite(one.predicted_px)) for one in boards)
-        which = f"each of {tested} boards"
-        if tested < len(boards):
-            which += f" (the others do not determine {len(boards) - tested} more)"
-        words = f"{which} is where the others say: {predicted:.3f} px rms by the others, "
-        reasons.append(Reason("good", f"{words}{fitted:.3f} px with it"))
-    return reasons
+        return [Reason("good", agree)]
+    return [Reason("care", one.sentence) for one in odd]
 
 
 def _jointly(survey: Survey, fit: Calibration | CalibError | None) -> list[Reason]:
@@ -278,7 +268,7 @@ def _jointly(survey: Survey, fit: Calibration | CalibError | None) -> list[Reaso
     if isinstance(fit, CalibError):
         words = "whether sigmas and model are right was not tested, since the survey cannot be fitted jointly"
         return [Reason("care", f"{words}: {fit}")]
-    reasons = [*sigma_reasons(survey, fit), *_wider(fit), *_by_the_others(fit)]
+    reasons = [*sigma_reasons(survey, fit), *_wider(fit), *contradiction_reasons(fit)]
     return [replace(reason, sentence=f"fitted jointly, {reason.sentence}") for reason in reasons]
 
 

@@ -188,7 +188,7 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
     from calib.files.yaml_text import plain
     from mastctl.calibration.mast_file import as_lists, mast_keys
     from mastctl.calibration.report import change_summary
-    from mastctl.calibration.tested import components_told, cross_validation_told, wider_told
+    from mastctl.calibration.tested import components_told, findings_as_json
 
     fit = done.calibration
     sigma = plain(fit.sigma)
@@ -211,8 +211,8 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
         "degrees_of_freedom": _finite(fit.degrees_of_freedom),
         "chi2_probability": _finite(fit.chi2_probability),
         "sigmas_found": components_told(done.survey, fit),
-        "wider_models": wider_told(fit),
-        "cross_validation": cross_validation_told(fit),
+        "wider_models": findings_as_json(fit.wider),
+        "cross_validation": findings_as_json(fit.contradictions),
         "outliers": [
             {"kind": o.kind, "name": o.name, "sentence": o.sentence, "size": _finite(o.size)}
             for o in fit.outliers
@@ -243,7 +243,7 @@ def _finite(number: float) -> float | None:
 def _show(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> None:
     """Tables for people."""
     from mastctl.calibration.report import camera_table, change_summary, mast_table
-    from mastctl.calibration.tested import board_table, component_table, wider_table
+    from mastctl.calibration.tested import component_table, finding_table
 
     fit = done.calibration
     output.print_table(
@@ -252,9 +252,9 @@ def _show(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> None
     output.print_table("Cameras", *camera_table(fit), fit.notes)
     if (components := component_table(done.survey, fit)) is not None:
         output.print_table("Measurements", *components)
-    if (wider := wider_table(fit, TESTS_SHOWN)) is not None:
+    if (wider := finding_table("wider model", fit.wider, TESTS_SHOWN)) is not None:
         output.print_table("Wider models, the likeliest first", *wider)
-    if (boards := board_table(fit, TESTS_SHOWN)) is not None:
+    if (boards := finding_table("placement", fit.contradictions, TESTS_SHOWN)) is not None:
         output.print_table("Boards by the others, the least likely first", *boards)
     if fit.outliers:
         shown = [[outlier.name, _off(outlier)] for outlier in fit.outliers[:OUTLIERS_SHOWN]]

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.adjust.adjustment import HUBER, SCAN_HUBER, Adjustment
 from calib.adjust.gross import gross_limit
-from calib.adjust.hypotheses import EXPLAINS, Finding, find_change, find_drifts
+from calib.adjust.hypotheses import EXPLAINS, Finding, ScoredFit, find_change, find_drifts
 from calib.adjust.model_terms import TermGain, candidate_terms, choose_terms
 from calib.adjust.result import BenchCalibration
 from calib.adjust.robust import SurveyNotFitted, judged_again, weigh, without_blunders
@@ -128,13 +128,14 @@ def _look_for_changes(
             tried = None
         if not np.isfinite(fit.normal.cost) or not left:
             break
-        change = find_change(problem, fit.state)
+        scored = ScoredFit(problem, fit.state)
+        change = find_change(scored)
         _refuse_slip(bench, fit.state)
         if change is None:
             break
         kind, *which = change.subject
         if change.sure:
-            if any(drift.likelier(change) for drift in find_drifts(problem, fit.state)):
+            if any(drift.likelier(change) for drift in find_drifts(scored)):
                 break  # the verdict names it, with its size
             if kind != "board":
                 raise SomethingChanged(change.sentence)

@@ -10,8 +10,7 @@ import numpy as np
 
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.checks import expected_checks
-from calib.adjust.hypotheses import find_drifts
-from calib.adjust.left_out import left_out_boards
+from calib.adjust.hypotheses import ScoredFit, find_contradictions, find_drifts
 from calib.adjust.model_terms import TermGain, candidate_terms, choose_terms
 from calib.adjust.result import BenchCalibration, ImageResiduals
 from calib.adjust.robust import Weighed
@@ -47,6 +46,7 @@ def bench_calibration(
     scatter = {t.name: t.scatter for t in (*weighed.images, *checks)}
     images = image_residuals(bench.survey, problem, state, bench.terms.images, bench.terms.checks, scatter)
     checked = _checked(images, bench.terms.checks)
+    scored = ScoredFit(problem, state)
     # A parameter that is not seen keeps what is weakly known of it, and is reported as open.
     kinds = ("mast", "joints", "camera")
     return BenchCalibration(
@@ -56,8 +56,8 @@ def bench_calibration(
         check_rms_px=rms_by_camera(checked),
         checks=expected_checks(problem, state, covariance, checks, checked, Level.PREDICTED),
         gauges=_gauges(bench, chosen),
-        placements=left_out_boards(problem, weighed.fit, covariance, kinds),
-        drifts=find_drifts(problem, state),
+        contradictions=find_contradictions(scored),
+        drifts=find_drifts(scored),
         joint_rad=problem.joint_rad,
         inexact_m=print_error_m(problem, state),
         bows_m=state.bows_m,

@@ -12,7 +12,7 @@ import pytest
 from calib.adjust import hypotheses
 from calib.adjust.adjustment import PAN_TILT, Motions
 from calib.adjust.checks import check_weights
-from calib.adjust.hypotheses import Finding, find_drifts
+from calib.adjust.hypotheses import Finding, ScoredFit, find_drifts
 from calib.adjust.model_terms import candidate_terms, entering_together
 from calib.adjust.result import BenchCalibration
 from calib.adjust.terms import ImageTerm
@@ -67,7 +67,7 @@ def test_a_head_without_errors_is_found_from_rough_focal_lengths_alone() -> None
     assert not [t.name for t in fit.terms if t.entered]
     assert fit.chi2_probability > 1e-3
     assert all(1e-3 < drift.chance <= 1.0 for drift in fit.drifts)
-    assert all(1e-3 < board.pull_chance <= 1.0 for board in fit.placements)
+    assert all(1e-3 < one.chance <= 1.0 for one in fit.contradictions)
     for name, truth in plan.cameras.items():
         assert np.abs(errors_in_sigmas(plan, fit, name)).max() < IN_SIGMAS
         assert fit.rms_px[name] == pytest.approx((0.1, 0.1), rel=0.1)
@@ -266,7 +266,7 @@ def test_what_drifts_is_named_with_its_size_and_is_no_slip() -> None:
     assert max(drifts["pan"].chance, drifts["navcam_right"].chance) < 1e-6 < drifts["tilt"].chance
     assert "pan drifts off its reading, by +0." in drifts["pan"].sentence
     # what the second placement says of the camera is not what the first one says
-    assert fit.placements[0].pull_chance < 1e-6
+    assert fit.contradictions[0].chance < 1e-6
 
 
 def test_a_drift_of_many_numbers_has_to_explain_more_than_a_change_of_few() -> None:
@@ -285,7 +285,7 @@ def test_a_camera_without_a_picture_left_is_asked_for_no_drift() -> None:
     bench = BenchProblem(simulate_bench(1, replace(plan, placements=plan.placements[:2])), BenchOptions())
     problem = bench.seen((), bench.start)
     left = [replace(t, keep=t.keep & (t.camera == "navcam_left")) for t in problem.images]
-    drifts = find_drifts(problem.with_terms(left, ()), bench.start)
+    drifts = find_drifts(ScoredFit(problem.with_terms(left, ()), bench.start))
     assert {drift.subject[1] for drift in drifts} == {"pan", "tilt", "navcam_left"}
 
 

@@ -46,8 +46,8 @@ def test_a_placement_with_a_little_more_noise_contradicts_nothing() -> None:
     survey = navcams(2)
     noisy = [i.name for i in survey.images if (i.setup, i.placement) == ("level", "navcam-3m-2")]
     fit = fit_joint(with_noise(survey, dict.fromkeys(noisy, 1.15), np.random.default_rng(1)))
-    (found,) = [one for one in fit.left_out_boards if one.board == ("level", "navcam-3m-2")]
-    assert found.least_chance > 1e-3
+    (found,) = [one for one in fit.contradictions if one.subject == ("board", "level", "navcam-3m-2")]
+    assert found.chance > 1e-3
 
 
 @pytest.mark.parametrize("what", ["picture", "placement"])

@@ -73,8 +73,7 @@ def test_json_has_the_contracts_keys_and_the_truth_within_its_sigmas(
     assert 0.8 < kinds["tapes"]["factor"] < 1.2
     assert "mast" in {one["name"] for one in told["wider_models"]}
     assert not any(one["significant"] for one in told["wider_models"])
-    by_others = told["cross_validation"]
-    assert by_others["fitted_px"] < by_others["predicted_px"] < 1.2 * by_others["fitted_px"]
+    assert told["cross_validation"] and not any(one["significant"] for one in told["cross_validation"])
     assert load_rig(tmp_path / "m.yaml").digest == told["mast_file"]["digest"]
 
 
