@@ -63,7 +63,8 @@ def record_until_killed(folder: Path, mast: AttachedMast, seed: int) -> None:
     recorder_module.SEGMENTS = SEGMENTS
     settings = RecordSettings.model_construct(ring_s=600.0, free_mb=0.0)
     publisher = Publisher()
-    Recorder(settings, folder, mast, [], {"hardware": "simulated"}, publisher, _not_kept, clock)
+    about = {"hardware": "simulated"}
+    Recorder(settings, folder, mast, [], about, publisher, _not_kept, lambda _, value: value, clock)
     number, next_s = 0, time.monotonic()
     while True:
         number += 1

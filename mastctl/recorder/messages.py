@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -23,7 +23,7 @@ from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import Rigid, quaternion_of
 from mastctl.as_json import as_json
 from mastctl.devices.frames import StampedFrame
-from mastctl.recorder.schemas import RecordedCamera, RecordedTarget
+from mastctl.recorder.schemas import RecordedCamera
 
 TARGET_M = 0.1
 TARGET_COLOUR = (0.9, 0.2, 0.1, 0.8)
@@ -83,7 +83,7 @@ def calibration(
         R=np.eye(3).ravel().tolist(),
         P=np.hstack([near.camera_matrix, np.zeros((3, 1))]).ravel().tolist(),
     )
-    return message, record(_distance(error_px))
+    return message, record(as_json({"rms_px": error_px.rms_px, "worst_px": error_px.worst_px}))
 
 
 @lru_cache(maxsize=64)
@@ -124,23 +124,6 @@ def _transform(parent: str, child: str, parent_from_child: Rigid, time_ns: int) 
     return message
 
 
-def residuals(operation: Mapping[str, Any]) -> Sequence[dict[str, Any]]:
-    """Return each pointing of an operation's record that measured a residual, as `ResidualRecord`."""
-    rows = enumerate((operation.get("result") or {}).get("pointings") or [], start=1)
-    records = [{"operation": operation.get("id"), "pointing": number, **row} for number, row in rows]
-    return [one for one in records if one.get("residual_px") is not None]
-
-
-def target(operation: Mapping[str, Any]) -> RecordedTarget | None:
-    """Return where an operation's target is; None if that is not known."""
-    result = operation.get("result") or {}
-    if not result.get("position_m"):
-        return None
-    return {
-        "operation": operation["id"], "position_m": result["position_m"], "range_m": result.get("range_m")
-    }  # fmt: skip
-
-
 def target_scene(position_m: Sequence[float], time_ns: int) -> Message:
     """Return a target as viewers draw it: a ball at its position in the rover frame."""
     scene = SceneUpdate()
@@ -161,12 +144,6 @@ def _model_record(model: CameraModel) -> dict[str, Any]:
     if model.kind == "CAHVORE":
         record |= {"type": int(model.cahvore_type), "linearity": float(model.linearity)}
     return record
-
-
-def _distance(error: TwinError) -> dict[str, Any]:
-    """How far the nearest camera is; null where it does not see all of the image."""
-    distance: dict[str, Any] = as_json({"rms_px": error.rms_px, "worst_px": error.worst_px})
-    return distance
 
 
 def _stamp(time_ns: int) -> Timestamp:

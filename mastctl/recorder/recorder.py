@@ -25,7 +25,7 @@ from calib.geometry.rig import Rig
 from drivers.clock import Clock
 from mastctl.answers import RecorderTold, RecordingDeleted, RecordingEnded, RecordingListed, Recordings
 from mastctl.as_json import readable
-from mastctl.control.publisher import TOPICS, Publisher, Topic
+from mastctl.control.publisher import TOPICS, Published, Publisher, Topic
 from mastctl.control.standing import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError, NotKnown, NotNow, Unable
@@ -89,6 +89,8 @@ class Recorder:
         Of each file: ``hardware``, its kind; ``version``.
     publisher, frame_by_id
         What is recorded, and where the images are; ``frame_by_id`` raises MastctlError for one that is gone.
+    event_value
+        Returns a published value of a topic as events have it.
     clock
         The daemon's, which stamps what is recorded. The disk's own times go by the machine's.
     """
@@ -102,6 +104,7 @@ class Recorder:
         facts: dict[str, str],
         publisher: Publisher,
         frame_by_id: Callable[[str], StampedFrame],
+        event_value: Callable[[Topic, Any], Any],
         clock: Clock,
     ) -> None:
         self._facts = facts
@@ -110,6 +113,7 @@ class Recorder:
         self._mast = mast
         self._clock = clock
         self._frame_by_id = frame_by_id
+        self._event_value = event_value
         self._entries = Entries(mast.rig, mast.file.digest)
         self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._requests_lock = threading.Lock()
@@ -155,13 +159,7 @@ class Recorder:
         }
 
     def listing(self) -> Recordings:
-        """Return every recording, and what is recorded now, as ``GET /recordings`` has it.
-
-        Raises
-        ------
-        Unable
-            ``unreadable``.
-        """
+        """Return every recording, and what is recorded now. Raises Unable ``unreadable``."""
         try:
             free_mb = self._folder.free_bytes() / MB
         except OSError:
@@ -183,14 +181,7 @@ class Recorder:
     def file(self, name: str, file: str) -> Path:
         """Return a file of a recording, by the names that `listing` has.
 
-        Raises
-        ------
-        NotKnown
-            ``recording_unknown``.
-        NotNow
-            ``recording`` while it is written.
-        Unable
-            ``unreadable``.
+        Raises NotKnown ``recording_unknown``, NotNow ``recording`` while it is written, Unable.
         """
         found = next((path for path in self._found(name).files if readable(path.name) == file), None)
         if found is None:
@@ -203,38 +194,22 @@ class Recorder:
     def delete(self, name: str) -> RecordingDeleted:
         """Delete a run, or what a fault kept; return the recordings that are left.
 
-        Raises
-        ------
-        NotKnown
-            ``recording_unknown``.
-        NotNow
-            ``recording`` for a run that is recorded, and for the ring.
-        Unable
-            ``unwritable`` if the disk refuses, ``unreadable``; ``slow`` if it does not answer in time.
+        Raises NotKnown ``recording_unknown``, NotNow ``recording`` for the run that is recorded and for the
+        ring, Unable ``unwritable``, ``unreadable``, ``slow``.
         """
         return self._result(lambda: self._delete(name))
 
     def start_run(self, name: str) -> RecorderTold:
         """Begin a run and return `summary`.
 
-        Raises
-        ------
-        NotNow
-            ``recording`` if one is recorded already.
-        Unable
-            ``unwritable``, ``disk_low``; ``slow`` if the disk does not answer in time.
+        Raises NotNow ``recording`` if one is recorded already, Unable ``unwritable``, ``disk_low``, ``slow``.
         """
         return self._result(lambda: self._start_run(name))
 
     def stop_run(self) -> RecordingEnded:
         """End the run and return its name and size; what is recorded then is the ring again.
 
-        Raises
-        ------
-        NotNow
-            ``not_recording``.
-        Unable
-            ``run_gone`` if its file was removed; ``slow`` if the disk does not answer in time.
+        Raises NotNow ``not_recording``, Unable ``run_gone`` if its file was removed, ``slow``.
         """
         return self._result(self._stop_run)
 
@@ -297,7 +272,7 @@ class Recorder:
             since_s, taken_s = taken_s, time.monotonic()  # these values were published between the two
             self._busy_since_s = time.monotonic(), self._clock.now_s()
             time_s = self._clock.now_s()
-            entries = [Entry(one.topic, one.key, one.value, time_s) for one in news]
+            entries = [entry for one in news if (entry := self._entry(one, time_s)) is not None]
             self._guarded(lambda: self._write(entries, since_s))  # noqa: B023
             for act, answer in requests:
                 self._answer(act, answer)
@@ -308,6 +283,16 @@ class Recorder:
                 return
             if self._news.closed and not news:
                 time.sleep(WAIT_S)  # the publisher was closed first
+
+    def _entry(self, one: Published, time_s: float) -> Entry | None:
+        """What is recorded of a published value; a value of an unexpected kind must not end the recording."""
+        try:
+            value = one.value if one.topic == "frame" else self._event_value(one.topic, one.value)
+            return Entry(one.topic, one.key, value, time_s)
+        except Exception:
+            self._dropped[one.topic] += 1
+            log.exception("the message %s %s cannot be recorded", one.topic, one.key)
+            return None
 
     def _answer(self, act: Callable[[], Any], answer: Future[Any]) -> None:
         try:
@@ -357,13 +342,14 @@ class Recorder:
         for at, one in enumerate(entries):
             try:
                 self._notice_fault(one)
-                if self._now.file is None and not self._open_ring():
+                file = self._now.file or self._open_ring()
+                if file is None:
                     self._entries.remember(one)
                     continue
-                assert self._now.file is not None
+                file.published_s = since_s
                 if one.topic == "frame" and not isinstance(one.value, StampedFrame):
                     one = replace(one, value=self._frame_by_id(one.value.frame_id))
-                self._entries.write(self._now.file, one, since_s)
+                self._entries.write(file, one)
             except MastctlError:  # the frame is gone
                 self._dropped[one.topic] += 1
             except OSError:
@@ -375,23 +361,23 @@ class Recorder:
                 self._dropped[one.topic] += 1
                 log.exception("the message %s %s cannot be recorded", one.topic, one.key)
         if (dropped := self._dropped_so_far()) and self._now.file is not None:
-            self._entries.write_dropped(self._now.file, dropped, self._clock.now_s(), time.monotonic())
+            self._entries.write_dropped(self._now.file, dropped, self._clock.now_s())
 
     def _use_mast(self, mast: AttachedMast) -> None:
         self._mast = mast
         self._entries.use_mast(mast.rig, mast.file.digest)
         file = self._now.file
         if file is not None:
-            time_s = self._clock.now_s()
+            time_s, file.published_s = self._clock.now_s(), time.monotonic()
             file.attach(mast.file, file.clocks.ns(time_s))
-            self._entries.write_cameras(file, time_s, time.monotonic())
+            self._entries.write_cameras(file, time_s)
 
     def _notice_fault(self, one: Entry) -> None:
         """Have the ring kept soon after a fault that is new."""
         if one.topic != "fault" or one.key == NAME:  # a full disk is not made to keep more
             return
         now_s = time.monotonic()
-        standing = {(one.key, fault.code) for fault in one.value}
+        standing = {(one.key, fault["code"]) for fault in one.value}
         new = standing - self._standing
         self._standing = {entry for entry in self._standing if entry[0] != one.key} | standing
         new = {entry for entry in new if now_s - self._kept_before.get(entry, -SAME_FAULT_S) >= SAME_FAULT_S}
@@ -463,29 +449,32 @@ class Recorder:
         if name := self._folder.keep_ring(now.keep_why, self._settings.kept_mb):
             log.warning("the recording around a fault is kept: %s", name)
 
-    def _open_ring(self) -> bool:
+    def _open_ring(self) -> RecordFile | None:
         """Open the ring's next segment, if there is to be one now."""
         if not self._ring_s or time.monotonic() < self._now.retry_s:
-            return False
-        return self._open(lambda: self._folder.next_segment(), None)
+            return None
+        return self._open(self._folder.next_segment, None)
 
-    def _open(self, path: Callable[[], Path], run: str | None) -> bool:
-        """Open a file and write what was known last; False if the disk is low."""
+    def _open(self, path: Callable[[], Path], run: str | None) -> RecordFile | None:
+        """Open a file and write what was known last; None if the disk is low."""
+        now = self._now
         self._folder.prepare()
-        factor = RESUME_FREE if self._now.fault is not None and self._now.fault.code == "disk_low" else 1.0
-        if self._folder.free_bytes() < factor * self._settings.free_mb * MB:
+        factor = RESUME_FREE if now.fault is not None and now.fault.code == "disk_low" else 1.0
+        least = factor * self._settings.free_mb * MB
+        if self._folder.free_bytes() < least:
             self._disk_is_low()
-            self._now.retry_s = time.monotonic() + RETRY_S
-            if self._folder.free_bytes() < factor * self._settings.free_mb * MB:
-                return False
+            now.retry_s = time.monotonic() + RETRY_S
+            if self._folder.free_bytes() < least:
+                return None
         clocks = Clocks(self._clock.now_s(), time.time_ns())
         facts = self._facts | ({} if run is None else {"run": run})
-        self._now.file = RecordFile(path(), [self._mast.file, *self._others], facts, clocks)
-        self._now.begun_s, self._now.run = time.monotonic(), run
-        if run is not None or (self._now.fault is not None and self._now.fault.until != NEXT_RUN):
-            self._now.fault = None
-        self._entries.begin(self._now.file, self._clock.now_s(), time.monotonic())
-        return True
+        now.file = RecordFile(path(), [self._mast.file, *self._others], facts, clocks)
+        now.begun_s, now.run = time.monotonic(), run
+        if run is not None or (now.fault is not None and now.fault.until != NEXT_RUN):
+            now.fault = None
+        now.file.published_s = time.monotonic()
+        self._entries.begin(now.file, self._clock.now_s())
+        return now.file
 
     def _end_file(self, *, wait: bool = True) -> None:
         """End the file that is written, if there is one; no run is recorded then."""

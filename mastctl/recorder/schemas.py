@@ -1,7 +1,7 @@
-"""What the topics of a recording hold: Foxglove's protobuf messages, and our own records as JSON.
+"""The schemas of a recording: Foxglove's protobuf messages, and JSON records, which are those of the events.
 
-The JSON schema of a record is made from its type: the one that the daemon publishes or answers with, or the
-one below that the recorder fills.
+The JSON schema of a record is made from its type: that of the daemon's answers, or one below, of what a
+recording has alone.
 """
 
 from __future__ import annotations
@@ -23,10 +23,20 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from pydantic import TypeAdapter
 from typing_extensions import TypedDict
 
-from mastctl.answers import CommandTold, Count, Json, MastTold, PointingTold
-from mastctl.control.lease import WhoSteers
-from mastctl.control.records import Operation
-from mastctl.control.standing import Standing, StandingFault
+from calib.files.records import DIALECT
+from mastctl.answers import (
+    CommandTold,
+    Count,
+    FaultTold,
+    HeadTold,
+    Json,
+    LeaseTold,
+    MastTold,
+    OperationTold,
+    PointingTold,
+    StateTold,
+    TrackTold,
+)
 from mastctl.frame_facts import FrameFacts
 
 PROTOBUF: Mapping[str, type[Message]] = {
@@ -34,20 +44,6 @@ PROTOBUF: Mapping[str, type[Message]] = {
     for kind in (CompressedImage, RawImage, CameraCalibration, FrameTransforms, SceneUpdate)
 }
 """The messages that Foxglove, Lichtblick and Rerun draw."""
-
-
-class RecordedJoints(TypedDict):
-    """A reading of the head: radians as read and true, and the side of approach (1 from smaller readings,
-    -1 from larger, 0 not known); seconds of the daemon's monotonic clock."""
-
-    pan_rad: float
-    tilt_rad: float
-    moving: bool
-    time_s: float
-    true_pan_rad: float
-    true_tilt_rad: float
-    pan_approach: float
-    tilt_approach: float
 
 
 class RecordedCamera(TypedDict):
@@ -79,7 +75,7 @@ class FaultRecord(TypedDict):
     """All that is wrong with one device."""
 
     device: str
-    faults: list[StandingFault]
+    faults: list[FaultTold]
 
 
 class DroppedRecord(TypedDict):
@@ -94,14 +90,15 @@ RECORDS: Mapping[str, Any] = {
     "command": CommandTold,
     "fault": FaultRecord,
     "frame": FrameFacts,
-    "joints": RecordedJoints,
-    "lease": WhoSteers,
+    "joints": HeadTold,
+    "lease": LeaseTold,
     "mast": MastTold,
-    "operation": Operation,
+    "operation": OperationTold,
     "recorder": DroppedRecord,
     "residual": ResidualRecord,
-    "state": Standing,
+    "state": StateTold,
     "target": RecordedTarget,
+    "track": TrackTold,
 }
 """The type of each kind of JSON message; any object where there is none."""
 
@@ -114,28 +111,23 @@ def encodings(kind: str) -> tuple[str, str, bytes]:
     """
     if kind in PROTOBUF:
         return MessageEncoding.Protobuf, SchemaEncoding.Protobuf, _file_descriptors(kind)
-    schema = json.dumps(_json_schema(kind.removeprefix("mastctl."))).encode()
-    return MessageEncoding.JSON, SchemaEncoding.JSONSchema, schema
-
-
-def _json_schema(kind: str) -> dict[str, Any]:
-    record = RECORDS.get(kind)
+    record = RECORDS.get(kind.removeprefix("mastctl."))
     schema = {"type": "object"} if record is None else TypeAdapter(record).json_schema(mode="serialization")
-    return schema | {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": f"mastctl.{kind}"}
+    data = json.dumps(schema | {"$schema": DIALECT, "title": kind}).encode()
+    return MessageEncoding.JSON, SchemaEncoding.JSONSchema, data
 
 
 def _file_descriptors(name: str) -> bytes:
     """A protobuf message's file with all that it imports, as MCAP wants its schema."""
-    seen: dict[str, FileDescriptor] = {}
+    files = FileDescriptorSet()
+    seen = set[str]()
 
     def add(file: FileDescriptor) -> None:
-        for other in file.dependencies:
-            if other.name not in seen:
+        if file.name not in seen:
+            seen.add(file.name)
+            for other in file.dependencies:
                 add(other)
-        seen[file.name] = file
+            file.CopyToProto(files.file.add())
 
     add(PROTOBUF[name].DESCRIPTOR.file)
-    files = FileDescriptorSet()
-    for file in seen.values():
-        file.CopyToProto(files.file.add())
     return bytes(files.SerializeToString())

@@ -145,7 +145,7 @@ def seen_in(
 def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) -> list[SeenAgain]:
     """The measured pointings of one operation."""
     clicked = str(record["request"]["pixel"]["camera"])
-    results = (record.get("result") or {}).get("pointings") or []
+    results = record.get("pointings") or []
     steps: dict[tuple[str, int], Mapping[str, Any]] = {}
     for step in record.get("steps") or []:
         if step["state"] == "done":

@@ -1,8 +1,8 @@
 """One MCAP file that a killed daemon leaves readable: chunks of a quarter of a second, written and synced.
 
-The library's writer buffers, does not sync, and writes its index at the end. Here the file is unbuffered,
-mast file and configuration come first with their digests, and every chunk is written whole at once and then
-synced by a worker that alone waits for the disk (`drivers.recordings.mcap_file` reads what a kill leaves).
+The library's writer makes chunks and index. Here mast file and configuration come first with their digests,
+and every chunk is written as soon as it is old enough, then synced by a worker that alone waits for the disk
+(`drivers.recordings.mcap_file` reads what a kill leaves).
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import time
+from collections import Counter
 from collections.abc import Mapping
 from concurrent import futures
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from typing import Any
 from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
+from calib.files.atomic import sync_folder
+from mastctl.as_json import as_json
 from mastctl.recorder.schemas import encodings
 
 FINISH_S = 3.0
@@ -27,8 +30,6 @@ PROFILE = "mastctl/record/1"
 CHUNK_BYTES = 4 << 20
 FLUSH_S = 0.25
 """A chunk is written when its first message is this old: a quarter of what may be lost."""
-
-_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,11 @@ class RecordFile:
     clocks
         Stamps the messages.
 
+    Attributes
+    ----------
+    published_s
+        When the messages that are added now were published, by `time.monotonic`.
+
     Raises
     ------
     OSError
@@ -82,33 +88,31 @@ class RecordFile:
     ) -> None:
         self.path = path
         self.clocks = clocks
-        self._file = path.open("xb", buffering=0)
-        self._writer = Writer(_Whole(self._file), chunk_size=1 << 40, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+        self.published_s = time.monotonic()
+        self._file = path.open("xb")
+        self._writer = Writer(self._file, chunk_size=1 << 40, compression=CompressionType.ZSTD)
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
-        self._counts: dict[int, int] = {}
+        self._counts: Counter[int] = Counter()
         self._open_since_s: float | None = None
         self._disk = futures.ThreadPoolExecutor(1, "recorder sync")
-        self._synced: futures.Future[None] = self._disk.submit(_sync_folder, path.parent)
+        self._synced: futures.Future[None] = self._disk.submit(sync_folder, path.parent)
         self._sync_since_s = time.monotonic()
         self._gathered = 0
         self._size = 0
         self._attached: set[str] = set()
         try:
-            self._begin(attached, facts)
+            self._writer.start(PROFILE, "mastctl")
+            digests = {f"sha256 {one.name}": one.digest for one in attached}
+            times = {"monotonic_s": repr(clocks.monotonic_s), "unix_ns": str(clocks.unix_ns)}
+            self._writer.add_metadata("mastctl", {**facts, **times, **digests})
+            for one in attached:
+                self.attach(one, clocks.unix_ns)
+            self.flush()
         except BaseException:
             self.abandon()
             path.unlink(missing_ok=True)  # there is nothing in it
             raise
-
-    def _begin(self, attached: list[Attached], facts: Mapping[str, str]) -> None:
-        self._writer.start(PROFILE, "mastctl")
-        digests = {f"sha256 {one.name}": one.digest for one in attached}
-        clocks = {"monotonic_s": repr(self.clocks.monotonic_s), "unix_ns": str(self.clocks.unix_ns)}
-        self._writer.add_metadata("mastctl", {**facts, **clocks, **digests})
-        for one in attached:
-            self.attach(one, self.clocks.unix_ns)
-        self.flush()
 
     def attach(self, one: Attached, time_ns: int) -> None:
         """Put a file into the recording, unless the same is in it."""
@@ -125,7 +129,7 @@ class RecordFile:
 
     @property
     def size_mb(self) -> float:
-        """`size` in 10⁶ bytes; read from any thread."""
+        """What is written, in 10⁶ bytes; read from any thread."""
         return self._size / 1e6
 
     @property
@@ -136,21 +140,22 @@ class RecordFile:
         except (FileNotFoundError, NotADirectoryError):
             return False
 
-    def add_json(self, topic: str, kind: str, record: Mapping[str, Any], time_s: float, now_s: float) -> None:
-        """Add one JSON message; ``kind`` names its schema. ``now_s`` is the flush's clock."""
-        data = json.dumps(record, allow_nan=False, separators=(",", ":")).encode()
-        self._add(topic, f"mastctl.{kind}", data, time_s, now_s)
+    def add_json(self, topic: str, kind: str, record: Mapping[str, Any], time_s: float) -> None:
+        """Add one JSON message; ``kind`` names its schema."""
+        try:
+            text = json.dumps(record, allow_nan=False, separators=(",", ":"))
+        except (TypeError, ValueError):
+            text = json.dumps(as_json(record), separators=(",", ":"))
+        self._add(topic, f"mastctl.{kind}", text.encode(), time_s)
 
-    def add_message(self, topic: str, message: Message, time_s: float, now_s: float) -> None:
+    def add_message(self, topic: str, message: Message, time_s: float) -> None:
         """Add one of Foxglove's messages."""
-        self._add(topic, message.DESCRIPTOR.full_name, message.SerializeToString(), time_s, now_s)
+        self._add(topic, message.DESCRIPTOR.full_name, message.SerializeToString(), time_s)
 
-    def flush_if_due(self, now_s: float) -> bool:
-        """Write the gathered chunk if it is old enough; return whether it was."""
-        if self._open_since_s is None or now_s - self._open_since_s < FLUSH_S:
-            return False
-        self.flush()
-        return True
+    def flush_if_due(self, now_s: float) -> None:
+        """Write the gathered chunk if it is old enough."""
+        if self._open_since_s is not None and now_s - self._open_since_s >= FLUSH_S:
+            self.flush()
 
     def flush(self) -> None:
         """Write what was gathered, and have the disk keep it."""
@@ -170,6 +175,7 @@ class RecordFile:
         """Write the index and close the file; wait until it is on the disk, some seconds at most, or not."""
         try:
             self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.flush()
             self._sync()
             if wait and futures.wait([self._synced], FINISH_S).done:
                 self._synced.result()
@@ -188,51 +194,22 @@ class RecordFile:
         self._sync_since_s = time.monotonic()
         self._synced = self._disk.submit(os.fdatasync, self._file.fileno())
 
-    def _add(self, topic: str, schema: str, data: bytes, time_s: float, now_s: float) -> None:
-        channel = self._channels.get((topic, schema))
-        if channel is None:
-            channel = self._channel(topic, schema)
+    def _add(self, topic: str, kind: str, data: bytes, time_s: float) -> None:
+        channel = self._channels.get((topic, kind)) or self._channel(topic, kind)
         if self._open_since_s is None:
-            self._open_since_s = now_s
-        number = self._counts[channel] = self._counts.get(channel, 0) + 1
-        time_ns = self.clocks.ns(time_s)
+            self._open_since_s = self.published_s
+        self._counts[channel] += 1
         self._gathered += len(data)
-        self._writer.add_message(channel, time_ns, data, time_ns, number)
+        time_ns = self.clocks.ns(time_s)
+        self._writer.add_message(channel, time_ns, data, time_ns, self._counts[channel])
         if self._gathered > CHUNK_BYTES:
             self.flush()
 
-    def _channel(self, topic: str, schema: str) -> int:
-        encoding, schema_encoding, data = encodings(schema)
-        if schema not in self._schemas:
-            self._schemas[schema] = self._writer.register_schema(schema, schema_encoding, data)
-        channel = self._writer.register_channel(topic, encoding, self._schemas[schema])
-        self._channels[topic, schema] = channel
+    def _channel(self, topic: str, kind: str) -> int:
+        encoding, schema_encoding, data = encodings(kind)
+        if kind not in self._schemas:
+            self._schemas[kind] = self._writer.register_schema(kind, schema_encoding, data)
+        channel = self._channels[topic, kind] = self._writer.register_channel(
+            topic, encoding, self._schemas[kind]
+        )
         return channel
-
-
-class _Whole:
-    """An unbuffered file whose writes are whole or an error: the kernel may take only a part of one."""
-
-    def __init__(self, file: Any) -> None:
-        self._file = file
-
-    def write(self, data: Any) -> int:
-        view = memoryview(data)
-        while view:
-            view = view[self._file.write(view) :]
-        return len(data)
-
-    def tell(self) -> int:
-        return int(self._file.tell())
-
-    def flush(self) -> None:
-        """Nothing is buffered."""
-
-
-def _sync_folder(path: Path) -> None:
-    """Have the disk keep the name of a file that was just made."""
-    folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

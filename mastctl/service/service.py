@@ -11,13 +11,14 @@ import threading
 from collections.abc import Callable
 from dataclasses import asdict
 from importlib.metadata import version
-from typing import cast
+from typing import Any, cast
 
 from calib.files.mast_file import StoredRig
 from calib.matching.handed_over import MatchedHandoff
 from drivers.clock import Clock, SystemClock
 from drivers.hardware import Hardware, clock_for, head_name
-from mastctl.answers import CalibrationTold, SelfCheck, SentinelTold, TrackTold
+from mastctl.answers import CalibrationTold, SelfCheck, SentinelTold, Status, TrackTold
+from mastctl.as_json import as_json
 from mastctl.config import Config
 from mastctl.control.audit import STRANGERS, STRANGERS_FILES, AuditLog
 from mastctl.control.entry import CommandEntry
@@ -25,6 +26,7 @@ from mastctl.control.idempotency import Answers
 from mastctl.control.lease import LeaseTable, WhoSteers
 from mastctl.control.machine import StateMachine
 from mastctl.control.operations import OperationRunner
+from mastctl.control.publisher import Topic
 from mastctl.control.records import Operation, last_frame
 from mastctl.control.standing import StandingFault
 from mastctl.devices.devices import Devices
@@ -48,7 +50,13 @@ from mastctl.safety.stop_threads import StopThreads
 from mastctl.service.masts import MastInUse, Masts, configured, read_mast
 from mastctl.service.opening import bounded, run_names
 from mastctl.service.places import Places
-from mastctl.service.state import State
+from mastctl.service.state import (
+    camera_answer,
+    event_value,
+    fault_answer,
+    joints_answer,
+    standing_answer,
+)
 from mastctl.service.steering import Steering
 from mastctl.service.stopping import SocketStops, Stopping, state_faults
 from mastctl.service_manager import ServiceManager
@@ -163,6 +171,7 @@ class Service:
             {"hardware": hardware.kind, "version": self._version},
             publisher,
             self.devices.frame_by_id,
+            self.event_value,
             clock,
         )
         people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
@@ -189,7 +198,7 @@ class Service:
             self.folder.path / SENTINEL_FOLDER, lambda: self.stored.digest, self.journals
         )
         self.metrics = Metrics(
-            lambda: self.state().told(),
+            self.status,
             self.devices.errors,
             self.devices.frame_counts,
             publisher,
@@ -288,29 +297,46 @@ class Service:
         """The mast file in use, as read."""
         return self.masts.in_use.stored
 
-    def state(self) -> State:
-        """Return what is known at this moment."""
-        mast, former = self.masts.in_use, self.masts.former
-        faults = self.devices.fault_watch.now()  # first: the machine is told of them
-        return State(
-            now_s=self.clock.now_s(),
-            started_s=self.started_s,
-            version=self._version,
-            hardware=self.hardware.kind,
-            mast=mast.told(),
-            former_mast=None if former is None else former.told(),
-            limits=self.config.limits,
-            axes=self.devices.door.axes,
-            reading=self.devices.last_reading,
-            frames=self.devices.newest_frames(),
-            standing=self.machine.standing,
-            track=self.tracker.status,
-            faults=faults,
-            control=self.leases.told(),
-            calibration=self.mast_verdict(),
-            sentinel=cast(SentinelTold | None, self.sentinel.summary()),
-            stop_socket=None if self.stop_socket is None else str(self.stop_socket.path),
-        )
+    def status(self) -> Status:
+        """Return what is known at this moment, as ``GET /status`` has it."""
+        now_s = self.clock.now_s()
+        faults = self.devices.fault_watch.now()  # first: the machine hears of them
+        former, reading, track = self.masts.former, self.devices.last_reading, self.tracker.status
+        return {
+            **standing_answer(self.machine.standing, now_s),
+            "simulated": self.hardware.kind == "simulated",
+            "hardware": self.hardware.kind,
+            "moving": reading is not None and reading.moving,
+            "joints": None if reading is None else joints_answer(reading, now_s),
+            "axes": {
+                name: {"count_rad": axis.count_rad, "one_sided": axis.rising_below_rad is not None}
+                for name, axis in self.devices.door.axes.items()
+            },
+            "limits": as_json(self.config.limits),
+            "pose": None if track.pose is None else track.pose.told(now_s),
+            "track": {"state": track.state, "reason": track.reason, "id": track.id},
+            "control": self.leases.told(),
+            "stop_socket": None if self.stop_socket is None else str(self.stop_socket.path),
+            "calibration": self.mast_verdict(),
+            "sentinel": cast(SentinelTold | None, self.sentinel.summary()),
+            "cameras": {
+                name: camera_answer(frame, now_s) for name, frame in self.devices.newest_frames().items()
+            },
+            "faults": [fault_answer(fault, now_s) for fault in faults],
+            "mast": self.masts.in_use.told(),
+            "former_mast": None if former is None else former.told(),
+            "version": self._version,
+            "now_s": now_s,
+            "uptime_s": now_s - self.started_s,
+        }
+
+    def event_value(self, topic: Topic, value: Any) -> Any:
+        """Return a published value as events and recordings have it."""
+        if topic == "track":
+            return self.track_told(value)
+        if topic == "lease":
+            return {"control": self.leases.told()}
+        return event_value(topic, value, self.clock.now_s())
 
     def mast_verdict(self) -> CalibrationTold:
         """Return whether the mast file still holds, by all three kinds of evidence."""

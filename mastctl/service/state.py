@@ -1,120 +1,19 @@
-"""What the service knows at one moment: a frozen snapshot, made anew each time, never edited.
-
-The API reads it, and whatever else shows the state later reads the same.
-"""
+"""What the daemon knows as answers, events and recordings have it: JSON, ages instead of times."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import Any
 
-from drivers.interfaces import AxisMotion
-from mastctl.answers import (
-    CalibrationTold,
-    CameraTold,
-    ControlTold,
-    FaultTold,
-    MastTold,
-    MeasuredJoints,
-    SentinelTold,
-    StandingTold,
-    Status,
-)
+from mastctl.answers import CameraTold, FaultTold, HeadTold, MeasuredJoints, StandingTold, StateTold
 from mastctl.as_json import as_json
+from mastctl.control.publisher import Topic
 from mastctl.control.standing import Standing, StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
-from mastctl.devices.limits import Limits
-from mastctl.motion.track import TrackStatus
 
 
-@dataclass(frozen=True)
-class State:
-    """One moment; times are seconds of CLOCK_MONOTONIC.
-
-    Attributes
-    ----------
-    now_s, started_s
-        When it was taken, and when the service started.
-    hardware
-        ``real``, ``simulated``, ``replayed`` or ``mixed``.
-    mast, former_mast
-        File, name and digest of the mast file in use and of the one before it.
-    axes
-        How the head's axes move, where it says so.
-    reading
-        The last good reading of the head, None before the first.
-    frames
-        Each configured camera's newest frame.
-    standing
-        What the daemon is doing.
-    track
-        The track, and the rover's pose.
-    stop_socket
-        Path of the Unix socket for stops alone.
-    calibration
-        Whether the mast file still holds (`mastctl.watch.verdict.mast_verdict`).
-    sentinel
-        What its looks say (`mastctl.watch.sentinel.findings`); None where they were not read yet.
-    control
-        Who steers, as `mastctl.control.lease.WhoSteers.told` tells it; None for nobody.
-    """
-
-    now_s: float
-    started_s: float
-    version: str
-    hardware: str
-    mast: MastTold
-    former_mast: MastTold | None
-    limits: Limits
-    axes: Mapping[str, AxisMotion]
-    reading: HeadReading | None
-    frames: Mapping[str, StampedFrame | None]
-    standing: Standing
-    track: TrackStatus
-    faults: tuple[StandingFault, ...]
-    stop_socket: str | None = None
-    calibration: CalibrationTold | None = None
-    sentinel: SentinelTold | None = None
-    control: ControlTold | None = None
-
-    @property
-    def moving(self) -> bool:
-        """Whether the head was under way when it was last read."""
-        return self.reading is not None and self.reading.moving
-
-    def told(self) -> Status:
-        """Return the snapshot as ``GET /status`` tells it: JSON, ages instead of times."""
-        reading, track = self.reading, self.track
-        return {
-            **standing_told(self.standing, self.now_s),
-            "simulated": self.hardware == "simulated",
-            "joints": None if reading is None else joints_told(reading, self.now_s),
-            "pose": None if track.pose is None else track.pose.told(self.now_s),
-            "track": {"state": track.state, "reason": track.reason, "id": track.id},
-            "control": self.control,
-            "calibration": self.calibration,
-            "sentinel": self.sentinel,
-            "axes": {
-                name: {"count_rad": axis.count_rad, "one_sided": axis.rising_below_rad is not None}
-                for name, axis in self.axes.items()
-            },
-            "cameras": {name: frame_told(frame, self.now_s) for name, frame in self.frames.items()},
-            "faults": [fault_told(fault, self.now_s) for fault in self.faults],
-            "uptime_s": self.now_s - self.started_s,
-            "hardware": self.hardware,
-            "moving": self.moving,
-            "limits": as_json(self.limits),
-            "mast": self.mast,
-            "former_mast": self.former_mast,
-            "version": self.version,
-            "now_s": self.now_s,
-            "stop_socket": self.stop_socket,
-        }
-
-
-def standing_told(now: Standing, now_s: float) -> StandingTold:
-    """Return what the daemon is doing as ``GET /status`` tells it."""
+def standing_answer(now: Standing, now_s: float) -> StandingTold:
+    """Return what the daemon is doing."""
     return {
         "state": now.word,
         "reason": now.reason,
@@ -127,8 +26,13 @@ def standing_told(now: Standing, now_s: float) -> StandingTold:
     }
 
 
-def frame_told(frame: StampedFrame | None, now_s: float) -> CameraTold:
-    """Return a camera's newest frame as ``GET /status`` tells it."""
+def state_answer(now: Standing, now_s: float) -> StateTold:
+    """Return what the daemon is doing, with its track and whether the head moves."""
+    return {**standing_answer(now, now_s), "track": now.track, "moving": now.head_moves}
+
+
+def camera_answer(frame: StampedFrame | None, now_s: float) -> CameraTold:
+    """Return the facts of a camera's newest frame."""
     if frame is None:
         return {"frame_id": None, "sequence": None, "exposure_s": None, "age_s": None}
     return {
@@ -139,8 +43,8 @@ def frame_told(frame: StampedFrame | None, now_s: float) -> CameraTold:
     }
 
 
-def joints_told(reading: HeadReading, now_s: float) -> MeasuredJoints:
-    """Return a reading of the head as ``GET /status`` tells it."""
+def joints_answer(reading: HeadReading, now_s: float) -> MeasuredJoints:
+    """Return a reading of the head."""
     return {
         "pan_rad": reading.pan_rad,
         "tilt_rad": reading.tilt_rad,
@@ -153,8 +57,13 @@ def joints_told(reading: HeadReading, now_s: float) -> MeasuredJoints:
     }
 
 
-def fault_told(fault: StandingFault, now_s: float) -> FaultTold:
-    """Return what is wrong with a device as ``GET /status`` tells it."""
+def head_answer(reading: HeadReading, now_s: float) -> HeadTold:
+    """Return a reading of the head, with whether it moves."""
+    return {**joints_answer(reading, now_s), "moving": reading.moving}
+
+
+def fault_answer(fault: StandingFault, now_s: float) -> FaultTold:
+    """Return what is wrong with a device."""
     return {
         "device": fault.device,
         "code": fault.code,
@@ -162,3 +71,25 @@ def fault_told(fault: StandingFault, now_s: float) -> FaultTold:
         "until": fault.until,
         "for_s": max(0.0, now_s - fault.since_s),
     }
+
+
+def event_value(topic: Topic, value: Any, now_s: float) -> Any:
+    """Return a published value as events and recordings have it: the answers that the routes give.
+
+    Track and lease, which need the service, are those of `mastctl.service.service.Service.event_value`.
+    """
+    match topic:
+        case "state":
+            return state_answer(value, now_s)
+        case "joints":
+            return head_answer(value, now_s)
+        case "fault":
+            return [fault_answer(one, now_s) for one in value]
+        case "frame":
+            return as_json(value) | {"age_s": max(0.0, now_s - value.mid_exposure_s)}
+        case "operation" | "bench":
+            return value.told()
+        case "command":  # without the key, by which others would get the answer, and a lease with it
+            return {name: one for name, one in value.items() if name != "key"}
+        case _:
+            return value

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from typing import Annotated, Any
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from typing import Annotated
 from weakref import WeakKeyDictionary
 
 from fastapi import FastAPI, Query, WebSocket
@@ -19,13 +19,12 @@ from starlette.requests import HTTPConnection
 from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
-from mastctl.as_json import as_json, writable
+from mastctl.as_json import writable
 from mastctl.control.caller import Caller
 from mastctl.control.publisher import LoopSubscription, Published, Topic
 from mastctl.http import PREFIX
 from mastctl.http.refusals import query_of
 from mastctl.service.service import Service
-from mastctl.service.state import fault_told, joints_told, standing_told
 from mastctl.web.models import EventsQuery
 from mastctl.web.parts import Here, Parts
 
@@ -75,7 +74,7 @@ _texts: WeakKeyDictionary[Published, tuple[str, float]] = WeakKeyDictionary()
 def _event(service: Service, one: Published, lost: int) -> str:
     now_s, known = service.clock.now_s(), _texts.get(one)
     if known is None or not (one.topic in AGELESS or 0.0 <= now_s - known[1] <= AGES_HOLD_S):
-        text = json.dumps(writable(value_told(service, one)), allow_nan=False)
+        text = json.dumps(writable(service.event_value(one.topic, one.value)), allow_nan=False)
         known = _texts[one] = text, now_s
     head = json.dumps({"topic": one.topic, "key": one.key, "sequence": one.sequence, "lost": lost})
     return f'{head[:-1]}, "value": {known[0]}}}'
@@ -151,35 +150,3 @@ def credential_of(line: HTTPConnection) -> str:
     """Return the digest of the token that opened a stream, empty for none."""
     caller: Caller = line.scope["state"]["caller"]
     return caller.credential
-
-
-def value_told(service: Service, one: Published) -> Any:
-    """Return a published value as JSON, as the routes tell the same."""
-    return _TOLD[one.topic](service, one.value, service.clock.now_s())
-
-
-def _state(service: Service, value: Any, now_s: float) -> Any:
-    return standing_told(value, now_s) | {"track": value.track, "moving": value.head_moves}
-
-
-def _frame(service: Service, value: Any, now_s: float) -> Any:
-    return as_json(value) | {"age_s": max(0.0, now_s - value.mid_exposure_s)}
-
-
-def _command(service: Service, value: Any, now_s: float) -> Any:
-    """Without the key: by it others would get the answer, and a lease with it."""
-    return {name: told for name, told in value.items() if name != "key"}
-
-
-_TOLD: Mapping[Topic, Callable[[Service, Any, float], Any]] = {
-    "state": _state,
-    "joints": lambda service, value, now_s: joints_told(value, now_s) | {"moving": value.moving},
-    "operation": lambda service, value, now_s: value.told(),
-    "track": lambda service, value, now_s: service.track_told(value),
-    "fault": lambda service, value, now_s: [fault_told(one, now_s) for one in value],
-    "frame": _frame,
-    "mast": lambda service, value, now_s: value,
-    "command": _command,
-    "bench": lambda service, value, now_s: value.told(),
-    "lease": lambda service, value, now_s: {"control": service.leases.told()},
-}

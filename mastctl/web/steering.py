@@ -82,7 +82,7 @@ def add_pointing(app: FastAPI) -> None:
 
     @app.get(f"{PREFIX}/status", summary="The present state of daemon, head, cameras and calibration")
     async def status(here: Here) -> Status:
-        return here.service.state().told()
+        return here.service.status()
 
     @command(
         app,

@@ -77,7 +77,7 @@ def test_a_stop_with_another_spelling_of_its_address_stops(net: Network, address
     answer = net.raw(f"POST {address} HTTP/1.1\r\nHost: {NAME}\r\nConnection: close\r\n\r\n")
     assert answer.startswith(b"HTTP/1.1 200"), answer[:200]
     assert ("stop",) in net.hardware.head.calls
-    assert bool(net.daemon.service.state().told()["estop"]) is latches
+    assert bool(net.daemon.service.status()["estop"]) is latches
     if latches:
         net.daemon.service.stopping.reset("the test goes on", "test")
 

@@ -79,7 +79,7 @@ def test_a_run_holds_what_was_asked_seen_and_found(client: Client, daemon: Runni
     assert [one["operation"] for one in records(path, "/target")] == [done]
     commands = [one["command"] for one in records(path, "/command")]
     assert commands.count("point") >= 2
-    assert len({one["word"] for one in records(path, "/state")}) > 1
+    assert len({one["state"] for one in records(path, "/state")}) > 1
     assert len({one["pan_rad"] for one in records(path, "/joints")}) > 1
 
 

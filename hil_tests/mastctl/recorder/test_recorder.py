@@ -362,11 +362,11 @@ def test_another_mast_file_is_attached_and_its_cameras_told_when_it_comes(tmp_pa
 
 def test_an_operations_end_leaves_its_residuals_and_target_once(tmp_path: Path) -> None:
     pointing = {"residual_px": [0.1, 0.2], "residual_sigma_px": [0.05, 0.05], "frame_id": "f"}
-    record: dict[str, Any] = {"id": "000001-ab", "state": "running", "result": None, "ended_s": None}
+    record: dict[str, Any] = {"id": "000001-ab", "state": "running", "ended_s": None}
     one = Recording(tmp_path)
     one.publish("operation", "000001-ab", record)
     done = record | {"state": "done", "ended_s": 2.0}
-    done["result"] = {"position_m": [1.0, 2.0, 3.0], "range_m": 4.0, "pointings": [pointing, pointing]}
+    done |= {"position_m": [1.0, 2.0, 3.0], "range_m": 4.0, "pointings": [pointing, pointing]}
     one.publish("operation", "000001-ab", done)
     one.publish("operation", "000001-ab", done)
     one.recorder.close()

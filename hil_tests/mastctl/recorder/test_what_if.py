@@ -59,7 +59,9 @@ def recorded(mast_file: Path, true_file: Path, folder: Path) -> Path:
         publisher, service = Publisher(), daemon.service
         facts = {"hardware": "simulated"}
         find = service.devices.frame_by_id
-        recorder = Recorder(settings, folder, mast, attached, facts, publisher, find, service.clock)
+        recorder = Recorder(
+            settings, folder, mast, attached, facts, publisher, find, service.event_value, service.clock
+        )
         recorder.start_run("")
         for x_px, y_px in CLICKS_PX:
             client.wait(client.point(pan_rad=0.0, tilt_rad=-0.1))
@@ -140,10 +142,10 @@ def test_the_command_tells_a_table_and_draws_a_page(
 
 
 def test_what_cannot_be_worked_out_is_named() -> None:
-    records = {
-        "1": {"state": "done", "request": {"position_m": [1, 2, 3]}, "result": {"pointings": [{}]}},
+    records: dict[str, dict[str, Any]] = {
+        "1": {"state": "done", "request": {"position_m": [1, 2, 3]}, "pointings": [{}]},
         "2": {"state": "failed", "request": {"pixel": {"camera": "a"}}, "error": {"message": "it was flat"}},
-        "3": {"state": "done", "request": {"pixel": {"camera": "a"}}, "result": {"pointings": [{"x": 1}]}},
+        "3": {"state": "done", "request": {"pixel": {"camera": "a"}}, "pointings": [{"x": 1}]},
     }
     seen, others = seen_in(records, {})
     assert seen == []

@@ -163,14 +163,14 @@ def test_a_daemon_whose_event_loop_is_blocked_takes_a_stop_here(
 ) -> None:
     hang = Hang()
     with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware):
-        path = Path(str(daemon.service.state().told()["stop_socket"]))
-        true = type(daemon.service).state
+        path = Path(str(daemon.service.status()["stop_socket"]))
+        true = type(daemon.service).status
 
-        def state(service: Any) -> Any:  # GET /status, on the loop
+        def status(service: Any) -> Any:  # GET /status, on the loop
             hang()
             return true(service)
 
-        monkeypatch.setattr(type(daemon.service), "state", state)
+        monkeypatch.setattr(type(daemon.service), "status", status)
         thread = threading.Thread(target=Client(daemon.url).status)
         thread.start()
         assert hang.entered.wait(NET_S)

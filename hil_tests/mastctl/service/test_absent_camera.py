@@ -130,7 +130,7 @@ def serving(folder: Path, cameras: tuple[str, ...] = CAMERAS) -> Iterator[Servic
 
 def told(service: Service, camera: str) -> list[str]:
     """The faults of a camera as the status has them."""
-    return [fault.message for fault in service.state().faults if fault.device == camera]
+    return [fault["message"] for fault in service.status()["faults"] if fault["device"] == camera]
 
 
 def test_the_service_starts_with_a_camera_absent_and_the_others_serve(bench: Bench, tmp_path: Path) -> None:
@@ -139,8 +139,8 @@ def test_the_service_starts_with_a_camera_absent_and_the_others_serve(bench: Ben
         until(lambda: told(service, "navcam_left"), "a fault, although nobody asked for a frame")
         (words,) = told(service, "navcam_left")
         assert "nothing at /dev/video7" in words and "joins by itself" in words
-        (fault,) = (fault for fault in service.state().faults if fault.device == "navcam_left")
-        assert fault.until == "the line is back", "the driver called it a lost line"
+        (fault,) = (one for one in service.status()["faults"] if one["device"] == "navcam_left")
+        assert fault["until"] == "the line is back", "the driver called it a lost line"
         with pytest.raises(DriverError, match="nothing at /dev/video7"):
             service.snapshot("navcam_left", fresh=True)
         assert len(told(service, "navcam_left")) == 1, "one thing wrong is told once"
@@ -212,8 +212,8 @@ def test_a_factory_that_blocks_is_named_and_the_service_starts_without_it(
         until(lambda: told(service, "navcam_left"), "a fault")
         (words,) = told(service, "navcam_left")
         assert "driver 'bench_of_test:eye' has been opening it for" in words and "joins" in words
-        (fault,) = (fault for fault in service.state().faults if fault.device == "navcam_left")
-        assert fault.until == "it is there, or a picture comes"
+        (fault,) = (one for one in service.status()["faults"] if one["device"] == "navcam_left")
+        assert fault["until"] == "it is there, or a picture comes"
         with pytest.raises(DriverError, match="has been opening it for"):
             service.snapshot("navcam_left", fresh=True)  # does not wait for the factory, which still hangs
         assert service.snapshot("navcam_right", fresh=True).camera == "navcam_right"

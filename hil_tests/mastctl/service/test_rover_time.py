@@ -51,7 +51,7 @@ def a_run(seed: int, pause_s: float) -> tuple[str, list[np.ndarray[Any, Any]]]:
             request = PointRequest(PixelTarget("navcam_left", frame.frame_id, u_px, v_px))
             told.append(ended(service, service.steering.point(request, {"pixel": [u_px, v_px]}).id))
             time.sleep(pause_s)
-        told.append(service.state().told())
+        told.append(service.status())
     return json.dumps(told, sort_keys=True), pictures
 
 
