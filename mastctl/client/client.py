@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, Literal, cast
-from urllib.parse import quote
 
 from mastctl.answers import (
     EstopTold,
@@ -25,7 +23,7 @@ from mastctl.answers import (
     StopTold,
     TrackTold,
 )
-from mastctl.client.connection import ClientError, DaemonHttp
+from mastctl.client.connection import ClientError, DaemonHttp, escaped, floats, given
 from mastctl.client.following import PASSING, followed
 from mastctl.client.jog import ANSWER_S, Jog
 from mastctl.client.keeping_calls import KeepingCalls
@@ -84,17 +82,13 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         self.reads_only = reads_only
         self.daemon = DaemonHttp(url, timeout_s, name, token, reads_only)
 
-    def _longest_s(self, timeout_s: float | None) -> float:
-        """Longest time of a request: the connection's, or what is left of a wait if that is less."""
-        return min(self.daemon.timeout_s, math.inf if timeout_s is None else timeout_s)
-
     def status(self, timeout_s: float | None = None) -> Status:
         """Return what the daemon knows at this moment.
 
         ``timeout_s`` shortens the longest time of this request, seconds. Another program's answer is
         ``bad_answer``.
         """
-        status = self.daemon.json(Status, "GET", "/status", timeout=self._longest_s(timeout_s))
+        status = self.daemon.json(Status, "GET", "/status", within_s=timeout_s)
         if not isinstance(status.get("state"), str) or "mast" not in status:
             raise self.daemon.bad_answer("its status has no state, or no mast")
         return status
@@ -138,16 +132,18 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         idempotency_key
             The same for each try of one command; a new one by default.
         """
-        body = _target(pixel, position_m, frame)
-        if aim is not None:
-            body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
-        others = {"pan_rad": pan_rad, "tilt_rad": tilt_rad, "pointings": pointings}
-        body |= _how_far(range_m, plane)
-        body |= {key: value for key, value in others.items() if value is not None}
-        started = self.daemon.command(
-            Started, "POST", "/point", body, key=idempotency_key, deadline_s=deadline_s
+        body = given(
+            **_target(pixel, position_m, frame, aim, range_m, plane),
+            pan_rad=pan_rad,
+            tilt_rad=tilt_rad,
+            pointings=pointings,
         )
-        return started["id"]
+        return self._started("/point", body, idempotency_key, deadline_s)
+
+    def _started(
+        self, path: str, body: dict[str, Any] | None, key: str | None, deadline_s: float | None
+    ) -> str:
+        return self.daemon.command(Started, "POST", path, body, key=key, deadline_s=deadline_s)["id"]
 
     def turn(self, pan_rad: float, tilt_rad: float, timeout_s: float = 90.0) -> OperationTold:
         """Turn to joint angles as the head reads them; return the operation's record when it has ended.
@@ -166,17 +162,13 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
             return self.wait(operation, timeout_s + STOP_ANSWER_S)
         except BaseException as error:
             refused = operation is None and isinstance(error, ClientError) and error.code not in PASSING
-            if not refused:
-                self._stop_beside(operation)
+            if not refused:  # over a connection of its own; the mast where the operation is not known
+                daemon = self.daemon.beside(STOP_ANSWER_S)
+                path = "/stop" if operation is None else f"/operations/{escaped(operation)}/stop"
+                with contextlib.suppress(ClientError):  # what ended the turn is reported
+                    daemon.json(dict[str, Any], "POST", path)
+                daemon.close()
             raise
-
-    def _stop_beside(self, operation: str | None) -> None:
-        """Stop an operation over a connection of its own, or the mast where its name is not known."""
-        daemon = self.daemon.beside(STOP_ANSWER_S)
-        path = "/stop" if operation is None else f"/operations/{quote(operation, safe='')}/stop"
-        with contextlib.suppress(ClientError):  # what ended the turn is reported, not what the stop met
-            daemon.json(dict[str, Any], "POST", path)
-        daemon.close()
 
     def preview(
         self,
@@ -192,27 +184,25 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         ``goal_rad``, and ``refused`` where the head would not be sent. ``range_m`` and ``plane`` as for
         `point`.
         """
-        body = _target(pixel, None, None) | _how_far(range_m, plane)
-        if aim is not None:
-            body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
+        body = _target(pixel, None, None, aim, range_m, plane)
         return self.daemon.json(PreviewTold, "POST", "/point/preview", json=body)
 
     def operation(self, operation_id: str, timeout_s: float | None = None) -> OperationTold:
         """Return an operation's record; ``timeout_s`` as of `status`."""
-        longest_s, word = self._longest_s(timeout_s), quote(operation_id, safe="")
-        return self.daemon.json(OperationTold, "GET", f"/operations/{word}", timeout=longest_s)
+        return self.daemon.json(
+            OperationTold, "GET", f"/operations/{escaped(operation_id)}", within_s=timeout_s
+        )
 
     def operations(self) -> list[OperationListed]:
         """Return the newest operations, newest first, without their steps."""
-        return (self.daemon.json(Operations, "GET", "/operations"))["operations"]
+        return self.daemon.json(Operations, "GET", "/operations")["operations"]
 
     def stop_operation(self, operation_id: str) -> OperationTold:
         """Stop the mast and one operation, if it still runs; what another client began goes on.
 
         Returns its record, which may not have ended yet.
         """
-        word = quote(operation_id, safe="")
-        return self.daemon.json(OperationTold, "POST", f"/operations/{word}/stop")
+        return self.daemon.json(OperationTold, "POST", f"/operations/{escaped(operation_id)}/stop")
 
     def wait(
         self,
@@ -232,16 +222,13 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         ClientError
             ``timeout``, if it has not ended in time; it goes on.
         """
-        told = 0
+        seen = 0
         query = {"topics": "operation", "key": operation_id}
-
-        def ask(within_s: float) -> OperationTold:
-            return self.operation(operation_id, within_s)
-
-        changes = followed(self.daemon, query, ask, timeout_s)
-        for record in changes:
-            for step in record["steps"][told:]:
-                told += 1
+        for record in followed(
+            self.daemon, query, lambda within_s: self.operation(operation_id, within_s), timeout_s
+        ):
+            for step in record["steps"][seen:]:
+                seen += 1
                 if on_step is not None:
                     on_step(step)
             if record["state"] in ENDED:
@@ -254,8 +241,7 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         timeout_s: float = 60.0,
         on_change: Callable[[Status | StateTold], None] | None = None,
     ) -> Status | StateTold:
-        """Wait until the daemon's state is one of some words; return ``state``, ``reason`` and what goes with
-        them in the status.
+        """Wait until the daemon's state is one of these; return it with what goes with it in the status.
 
         Parameters
         ----------
@@ -267,23 +253,21 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         ClientError
             ``timeout``, if it was none of them in time.
         """
-        word = ""
-        for told in followed(self.daemon, {"topics": "state"}, self.status, timeout_s):
-            word = told["state"]
+        state = ""
+        for now in followed(self.daemon, {"topics": "state"}, self.status, timeout_s):
+            state = now["state"]
             if on_change is not None:
-                on_change(told)
-            if word in states:
-                return told
+                on_change(now)
+            if state in states:
+                return now
         wanted = " or ".join(states)
-        raise ClientError("timeout", f"the state is {word} and not {wanted} after {timeout_s:g} s")
+        raise ClientError("timeout", f"the state is {state} and not {wanted} after {timeout_s:g} s")
 
     def events(self, *topics: str, keys: Sequence[str] = ()) -> Generator[Event, None, None]:
         """Yield each change of some topics (all without any) and keys, beginning with what is known, until
         the daemon ends: ``topic``, ``key``, ``sequence``, ``lost``, ``value``.
         """
-        query: dict[str, Any] = {"key": list(keys)} if keys else {}
-        if topics:
-            query["topics"] = ",".join(topics)
+        query = given(key=list(keys) or None, topics=",".join(topics) or None)
         for event in self.daemon.heard("/events", query):
             if event is not None:
                 yield cast(Event, event)
@@ -294,9 +278,7 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
 
     def estop(self, *, reason: str | None = None, name: str | None = None) -> EstopTold:
         """Stop the mast and let nothing move it until `reset`; ``kept`` says whether a restart would know."""
-        body = {"reason": reason, "name": name}
-        told = {key: value for key, value in body.items() if value is not None}
-        return self.daemon.json(EstopTold, "POST", "/estop", json=told)
+        return self.daemon.json(EstopTold, "POST", "/estop", json=given(reason=reason, name=name))
 
     def reset(self, *, reason: str, name: str) -> ResetTold:
         """Release the emergency stop; a later command moves again."""
@@ -328,22 +310,20 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         look
             Whether a track's target shall be looked for.
         """
-        body: dict[str, Any] = {
-            "position_m": [float(value) for value in position_m],
-            "quaternion": [float(value) for value in quaternion],
-            "look": look,
-        }
-        if covariance is not None:
-            body["covariance"] = [[float(value) for value in row] for row in covariance]
-        if sigma is not None:
-            body["sigma"] = {"position_m": sigma[0], "rotation_rad": sigma[1]}
-        if time_s is not None:
-            body["time_s"] = time_s
+        motion = None if sigma is None else {"position_m": sigma[0], "rotation_rad": sigma[1]}
+        body = given(
+            position_m=floats(position_m),
+            quaternion=floats(quaternion),
+            covariance=None if covariance is None else [floats(row) for row in covariance],
+            sigma=motion,
+            time_s=time_s,
+            look=look,
+        )
         return self.daemon.json(PoseTaken, "POST", "/pose", json=body)
 
     def track(self, timeout_s: float | None = None) -> TrackTold:
         """Return the track as it is; ``timeout_s`` as of `status`."""
-        return self.daemon.json(TrackTold, "GET", "/track", timeout=self._longest_s(timeout_s))
+        return self.daemon.json(TrackTold, "GET", "/track", within_s=timeout_s)
 
     def start_track(
         self,
@@ -355,18 +335,11 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         idempotency_key: str | None = None,
     ) -> str:
         """Start to follow a target and return the operation's id; arguments as for `point`."""
-        body = _target(pixel, position_m, frame)
-        started = self.daemon.command(
-            Started, "POST", "/track", body, key=idempotency_key, deadline_s=deadline_s
-        )
-        return started["id"]
+        return self._started("/track", _target(pixel, position_m, frame), idempotency_key, deadline_s)
 
     def look(self, *, deadline_s: float | None = None, idempotency_key: str | None = None) -> str:
         """Look for the track's target once more; return the operation's id."""
-        started = self.daemon.command(
-            Started, "POST", "/track/look", key=idempotency_key, deadline_s=deadline_s
-        )
-        return started["id"]
+        return self._started("/track/look", None, idempotency_key, deadline_s)
 
     def wait_track(
         self,
@@ -422,8 +395,8 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         try:
             from mastctl.client.pictures import live_pictures  # WebSockets, only where pictures are watched
         except ImportError:
-            words = "live pictures need the package websockets; 'pip install websockets' brings it"
-            raise ClientError("no_websockets", words) from None
+            reason = "live pictures need the package websockets; 'pip install websockets' brings it"
+            raise ClientError("no_websockets", reason) from None
         return live_pictures(self.daemon, cameras)
 
     def snapshot(
@@ -447,12 +420,8 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         format
             ``png`` is lossless.
         """
-        query: dict[str, str] = {"format": format}
-        if frame_id is None:
-            query["fresh"] = "true" if fresh else "false"
-        else:
-            query["frame_id"] = frame_id
-        answer = self.daemon.ask("GET", f"/snapshot/{quote(camera, safe='')}", params=query)
+        kept = {"fresh": "true" if fresh else "false"} if frame_id is None else {"frame_id": frame_id}
+        answer = self.daemon.request("GET", f"/snapshot/{escaped(camera)}", params={"format": format, **kept})
         try:
             return read_snapshot(answer.content, answer.headers)
         except ValueError as reason:
@@ -469,25 +438,21 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         self.close()
 
 
-def _how_far(range_m: float | None, plane: Mapping[str, Sequence[float]] | None) -> dict[str, Any]:
-    """What says how far a pixel's thing is, as a body has it."""
-    told: dict[str, Any] = {} if range_m is None else {"range_m": range_m}
-    if plane is not None:
-        told["plane"] = {key: list(values) for key, values in plane.items()}
-    return told
-
-
 def _target(
     pixel: tuple[str, str, float, float] | None,
     position_m: Sequence[float] | None,
     frame: Literal["rover", "site"] | None,
+    aim: tuple[str, float, float] | None = None,
+    range_m: float | None = None,
+    plane: Mapping[str, Sequence[float]] | None = None,
 ) -> dict[str, Any]:
-    """What a request says of its target: a pixel of a frame, or a point; what was not given is left out."""
-    body: dict[str, Any] = {}
-    if pixel is not None:
-        body["pixel"] = dict(zip(("camera", "frame_id", "x_px", "y_px"), pixel, strict=True))
-    if position_m is not None:
-        body["position_m"] = [float(value) for value in position_m]
-    if frame is not None:
-        body["frame"] = frame
-    return body
+    """A target as a body has it: a pixel of a frame, or a point; without what was left out."""
+    names = ("camera", "frame_id", "x_px", "y_px")
+    return given(
+        pixel=None if pixel is None else dict(zip(names, pixel, strict=True)),
+        position_m=None if position_m is None else floats(position_m),
+        frame=frame,
+        aim=None if aim is None else dict(zip(("camera", "x_px", "y_px"), aim, strict=True)),
+        range_m=range_m,
+        plane=None if plane is None else {key: list(values) for key, values in plane.items()},
+    )

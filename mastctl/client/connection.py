@@ -9,11 +9,11 @@ import socket
 import ssl
 import sys
 import time
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
-from urllib.parse import unquote, urlsplit
+from urllib.parse import quote, unquote, urlsplit
 
 if TYPE_CHECKING:
     import httpx
@@ -31,7 +31,7 @@ class ClientError(Exception):
     Attributes
     ----------
     code
-        The daemon's word, or the client's own: ``no_daemon``, ``bad_url``, ``timeout``, ``bad_answer``.
+        The daemon's, or the client's own: ``no_daemon``, ``bad_url``, ``timeout``, ``bad_answer``.
     detail
         Further facts from the daemon, or None.
     exit_code
@@ -48,15 +48,15 @@ class ClientError(Exception):
 
 
 def trusted() -> ssl.SSLContext:
-    """Whose certificates are taken: those of the machine, and of ``$MASTCTL_CA_FILE``. Raises ClientError."""
+    """Return the trusted certificates: the machine's, and ``$MASTCTL_CA_FILE``. Raises ClientError."""
     context = ssl.create_default_context()
     ca_file = os.environ.get("MASTCTL_CA_FILE")
     if ca_file:
         try:
             context.load_verify_locations(ca_file)
         except (OSError, ssl.SSLError) as error:
-            words = f"MASTCTL_CA_FILE: {ca_file}: no certificates can be read ({error})"
-            raise ClientError("bad_url", words, exit_code=2) from None
+            reason = f"MASTCTL_CA_FILE: {ca_file}: no certificates can be read ({error})"
+            raise ClientError("bad_url", reason, exit_code=2) from None
     return context
 
 
@@ -70,7 +70,7 @@ class DaemonHttp:
     Attributes
     ----------
     lease_id
-        Goes with whatever is asked; None for no lease.
+        Goes with each request; None for no lease.
     """
 
     def __init__(
@@ -97,9 +97,14 @@ class DaemonHttp:
         other.lease_id = self.lease_id
         return other
 
-    def json(self, kind: type[T], method: str, path: str, **options: Any) -> T:
-        """Ask, and return the answer, a JSON object of a kind."""
-        answer = self.ask(method, path, **options)
+    def json(self, kind: type[T], method: str, path: str, within_s: float | None = None, **options: Any) -> T:
+        """Send a request, and return the answer, a JSON object of a kind.
+
+        ``within_s`` shortens the longest time of this request, seconds.
+        """
+        if within_s is not None:
+            options["timeout"] = min(self.timeout_s, within_s)
+        answer = self.request(method, path, **options)
         try:
             document = answer.json()
         except ValueError:
@@ -121,10 +126,12 @@ class DaemonHttp:
     ) -> T:
         """Have something done once, and return the answer.
 
-        Where the connection breaks it is asked again with the same key, by which the daemon gives the first
-        one's answer and does nothing twice.
+        Where the connection breaks the request is sent again with the same key, by which the daemon gives the
+        first one's answer and does nothing twice.
         """
-        headers = _headers_of(key, deadline_s)
+        headers = {"Idempotency-Key": key or secrets.token_hex(16)}
+        if deadline_s is not None:
+            headers["Deadline-S"] = repr(float(deadline_s))
         if body is not None:
             options["json"] = body
         for pause_s in AGAIN_S:
@@ -134,8 +141,8 @@ class DaemonHttp:
                 self.pause(pause_s)
         return self.json(kind, method, path, headers=headers, **options)
 
-    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Ask, and return a good answer; everything else is a ClientError."""
+    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
+        """Send a request, and return a good answer; everything else is a ClientError."""
         if self.lease_id is not None:
             options["headers"] = {"Mastctl-Lease": self.lease_id, **(options.get("headers") or {})}
         answer = self.send(method, PREFIX + path, **options)
@@ -144,7 +151,7 @@ class DaemonHttp:
         raise self._refused(answer)
 
     def send(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Ask for a path of the whole address, and return the answer whatever it is."""
+        """Send a request for a path of the whole address, and return the answer whatever it is."""
         if self._reads_only and method != "GET":
             raise ClientError("reads_only", self._reads_only)
         with self._failures(f"the daemon at {self.url} took the request but did not answer"):
@@ -172,11 +179,15 @@ class DaemonHttp:
         """Return the error of an answer that no daemon of this program gives."""
         return ClientError("bad_answer", f"the program at {self.url} is no mastctl daemon: {reason}")
 
+    def no_daemon(self) -> ClientError:
+        """Return the error of an address where no program listens."""
+        return ClientError("no_daemon", f"no daemon answers at {self.url}; 'mastctl run' starts one")
+
     def _refused(self, answer: httpx.Response) -> ClientError:
         """What an answer says that is not a good one."""
         try:
-            told = answer.json()["error"]
-            code, message, detail = str(told["code"]), str(told["message"]), told.get("detail")
+            error = answer.json()["error"]
+            code, message, detail = str(error["code"]), str(error["message"]), error.get("detail")
         except (ValueError, LookupError, TypeError, AttributeError):
             return self.bad_answer(f"it says {answer.status_code}, not in the way of this program")
         exit_code = 2 if answer.status_code in _BAD_INPUT else 1
@@ -186,7 +197,7 @@ class DaemonHttp:
         return ClientError(code, message, detail if isinstance(detail, dict) else None, exit_code)
 
     def _event(self, line: str) -> dict[str, Any] | None:
-        """What a line of a stream tells, None for a sign of life."""
+        """The event of a stream's line, None for a sign of life."""
         if line.startswith(":"):
             return None
         try:
@@ -204,8 +215,7 @@ class DaemonHttp:
         except ValueError as error:  # numbers that JSON does not have
             raise ClientError("bad_request", f"the request cannot be sent: {error}", exit_code=2) from None
         except (httpx.ConnectError, httpx.ConnectTimeout):
-            words = f"no daemon answers at {self.url}; 'mastctl run' starts one"
-            raise ClientError("no_daemon", words) from None
+            raise self.no_daemon() from None
         except httpx.TimeoutException:
             raise ClientError("timeout", silent) from None
         except httpx.HTTPError as error:
@@ -259,12 +269,19 @@ class DaemonHttp:
         self._http.close()
 
 
-def _headers_of(key: str | None, deadline_s: float | None) -> dict[str, str]:
-    """The headers of a command: its key, a new one by default, and its deadline."""
-    headers = {"Idempotency-Key": key or secrets.token_hex(16)}
-    if deadline_s is not None:
-        headers["Deadline-S"] = repr(float(deadline_s))
-    return headers
+def given(**values: Any) -> dict[str, Any]:
+    """Return the values without those that were left out (None)."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def floats(values: Sequence[float]) -> list[float]:
+    """Return numbers as JSON has them; a whole number stays one, since it may exceed a float's range."""
+    return [value if isinstance(value, int) else float(value) for value in values]
+
+
+def escaped(name: str) -> str:
+    """Return a name as a part of a path."""
+    return quote(name, safe="")
 
 
 def program_name() -> str:

@@ -5,15 +5,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
-from urllib.parse import quote
 
 from mastctl.answers import JogTold, OperationTold
-from mastctl.client.connection import ClientError, DaemonHttp
+from mastctl.client.connection import ClientError, DaemonHttp, escaped, given
 
 BEAT_S = 0.12  # the daemon waits 0.5 s: three may get lost
 ANSWER_S = 1.0
-LOOK_S = 0.02
+POLL_S = 0.02
 
 
 class Jog:
@@ -41,7 +39,7 @@ class Jog:
 
     @property
     def held(self) -> dict[str, str]:
-        """Which axis a limit or a keep-out holds, in words."""
+        """The axes that a limit or a keep-out stops, and why."""
         return dict(self._held)
 
     def rates(self, pan_rad_per_s: float, tilt_rad_per_s: float) -> None:
@@ -85,7 +83,7 @@ class Jog:
             try:
                 self._send(rates)
             except ClientError as error:
-                if error.code != "timeout":  # the next heartbeat tells whether the jog still runs
+                if error.code != "timeout":  # the next heartbeat shows whether the jog runs
                     with self._changed:
                         self._error = error
                     return
@@ -99,11 +97,8 @@ class Jog:
     def _send(self, rates: tuple[float, float]) -> None:
         if rates == (0.0, 0.0) and self._id is None:
             return
-        body: dict[str, Any] = {"pan_rad_per_s": rates[0], "tilt_rad_per_s": rates[1]}
         self._sequence += 1
-        body["sequence"] = self._sequence
-        if self._id is not None:
-            body["id"] = self._id
+        body = given(pan_rad_per_s=rates[0], tilt_rad_per_s=rates[1], sequence=self._sequence, id=self._id)
         answer = self._daemon.json(JogTold, "POST", "/jog", json=body)
         self._id, self._held = answer["id"], answer["held"]
         if rates == (0.0, 0.0) and self._id is not None:
@@ -111,10 +106,10 @@ class Jog:
             self._id = None
 
     def _wait_ended(self, jog: str) -> None:
-        """Wait until the head was told to stop, so that what is asked next is not refused for this jog."""
+        """Wait for the jog's end, so that the next command is not refused for it."""
         until_s = time.monotonic() + ANSWER_S
         while time.monotonic() < until_s:
-            path = f"/operations/{quote(jog, safe='')}"
+            path = f"/operations/{escaped(jog)}"
             if self._daemon.json(OperationTold, "GET", path)["state"] not in ("queued", "running"):
                 return
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)

@@ -1,9 +1,8 @@
-"""Questions about a daemon's configuration, mast files, recordings, places and benches."""
+"""Requests about a daemon's configuration, mast files, recordings, places and benches."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
-from urllib.parse import quote
+from typing import Literal
 
 from mastctl.answers import (
     BenchBegun,
@@ -26,11 +25,11 @@ from mastctl.answers import (
     SessionTold,
     SunTold,
 )
-from mastctl.client.connection import DaemonHttp
+from mastctl.client.connection import DaemonHttp, escaped, given
 
 
 class KeepingCalls:
-    """Questions to a daemon that move no head."""
+    """Requests that move no head."""
 
     daemon: DaemonHttp
 
@@ -60,7 +59,7 @@ class KeepingCalls:
 
     def camera_settings(self, camera: str) -> CameraSettingsTold:
         """Return what of a camera can be changed: ``settings`` with bounds, and whether they are ``held``."""
-        return self.daemon.json(CameraSettingsTold, "GET", f"/cameras/{quote(camera, safe='')}/settings")
+        return self.daemon.json(CameraSettingsTold, "GET", f"/cameras/{escaped(camera)}/settings")
 
     def set_camera(
         self,
@@ -73,15 +72,13 @@ class KeepingCalls:
     ) -> CameraSettingsTold:
         """Change some of a camera's settings and return all as they are then.
 
-        The automatic of each is turned off. ``notes`` has a sentence for each that became another than asked
-        for. They hold until the daemon ends, also for a camera that is unplugged meanwhile. Each picture's
+        The automatic of each is turned off. ``notes`` has a sentence for each that became another value. They
+        hold until the daemon ends, also for a camera that is unplugged meanwhile. Each picture's
         facts have those that it was taken with.
         """
-        given = {"exposure_s": exposure_s, "gain": gain, "white_balance_k": white_balance_k, "focus": focus}
-        body = {name: value for name, value in given.items() if value is not None}
-        return self.daemon.command(
-            CameraSettingsTold, "PATCH", f"/cameras/{quote(camera, safe='')}/settings", body
-        )
+        body = given(exposure_s=exposure_s, gain=gain, white_balance_k=white_balance_k, focus=focus)
+        path = f"/cameras/{escaped(camera)}/settings"
+        return self.daemon.command(CameraSettingsTold, "PATCH", path, body)
 
     def bench(self) -> BenchTold:
         """Return the bench calibration at work or the last one (``run``), and those that are kept."""
@@ -114,25 +111,30 @@ class KeepingCalls:
         ClientError
             ``bench_runs``, ``bench_done``, ``bench_unknown``, ``bad_board``, ``unwritable``, ``disk_low``.
         """
-        told: dict[str, Any] = {"board": board, "board_file": board_file, "resume": resume}
-        told |= {"wanted_px": wanted_px, "pictures": pictures, "by_hand": by_hand}
-        body = {key: value for key, value in told.items() if value is not None}
-        return (self.daemon.command(BenchBegun, "POST", "/bench", body))["run"]
+        body = given(
+            board=board,
+            board_file=board_file,
+            resume=resume,
+            wanted_px=wanted_px,
+            pictures=pictures,
+            by_hand=by_hand,
+        )
+        return self.daemon.command(BenchBegun, "POST", "/bench", body)["run"]
 
     def board_stands(self) -> BenchRunTold:
-        """Say that the board stands where it was asked for."""
-        return (self.daemon.command(BenchBegun, "POST", "/bench/stands"))["run"]
+        """Confirm that the board is at the requested placement."""
+        return self.daemon.command(BenchBegun, "POST", "/bench/stands")["run"]
 
     def leave_bench(self) -> BenchRunTold:
         """End the bench calibration; it can go on later (`begin_bench`, ``resume``)."""
-        return (self.daemon.command(BenchBegun, "POST", "/bench/leave"))["run"]
+        return self.daemon.command(BenchBegun, "POST", "/bench/leave")["run"]
 
     def forget_bench(self, name: str) -> BenchTold:
         """Remove a bench calibration that is over, with its pictures and report; its mast file stays.
 
         Returns what is left, as `bench`. Refused with ``bench_runs``, ``bench_unknown``, ``unwritable``.
         """
-        return self.daemon.command(BenchTold, "DELETE", f"/bench/runs/{quote(name, safe='')}")
+        return self.daemon.command(BenchTold, "DELETE", f"/bench/runs/{escaped(name)}")
 
     def reports(self) -> ReportsTold:
         """Return the reports that can be read, the newest first."""
@@ -140,7 +142,7 @@ class KeepingCalls:
 
     def report(self, name: str) -> bytes:
         """Return a report, HTML."""
-        return bytes((self.daemon.ask("GET", f"/reports/{quote(name, safe='')}")).content)
+        return self.daemon.request("GET", f"/reports/{escaped(name)}").content
 
     def recordings(self) -> Recordings:
         """Return the daemon's recordings, and what it records now."""
@@ -156,16 +158,16 @@ class KeepingCalls:
 
     def recording(self, name: str, file: str) -> bytes:
         """Return a file of a recording whole, by the names that `recordings` returns."""
-        name, file = quote(name, safe=""), quote(file, safe="")
-        return bytes((self.daemon.ask("GET", f"/recordings/{name}/{file}")).content)
+        path = f"/recordings/{escaped(name)}/{escaped(file)}"
+        return self.daemon.request("GET", path).content
 
     def delete_recording(self, name: str) -> RecordingDeleted:
         """Delete a run, or what was kept at a fault; return what is left."""
-        return self.daemon.command(RecordingDeleted, "DELETE", f"/recordings/{quote(name, safe='')}")
+        return self.daemon.command(RecordingDeleted, "DELETE", f"/recordings/{escaped(name)}")
 
     def mast_file(self) -> bytes:
         """Return the mast file that the daemon uses, byte for byte."""
-        return bytes((self.daemon.ask("GET", "/mast")).content)
+        return self.daemon.request("GET", "/mast").content
 
     def use_mast(self, file: str) -> MastsTold:
         """Use another mast file of the same folder; return which is in use now, and the former one."""
@@ -177,16 +179,16 @@ class KeepingCalls:
 
     def places(self) -> dict[str, PlaceTold]:
         """Return the places of the head that are kept, by name; ``home`` is always among them."""
-        return (self.daemon.json(PlacesTold, "GET", "/places"))["places"]
+        return self.daemon.json(PlacesTold, "GET", "/places")["places"]
 
     def keep_place(self, name: str, pan_rad: float, tilt_rad: float) -> dict[str, PlaceTold]:
         """Keep a place of the head by a name, for everybody; return all."""
         body = {"pan_rad": pan_rad, "tilt_rad": tilt_rad}
-        return (self.daemon.command(PlacesTold, "POST", f"/places/{quote(name, safe='')}", body))["places"]
+        return self.daemon.command(PlacesTold, "POST", f"/places/{escaped(name)}", body)["places"]
 
     def forget_place(self, name: str) -> dict[str, PlaceTold]:
         """Forget a place; return those that are left. Raises ClientError ``place_unknown``."""
-        return (self.daemon.command(PlacesTold, "DELETE", f"/places/{quote(name, safe='')}"))["places"]
+        return self.daemon.command(PlacesTold, "DELETE", f"/places/{escaped(name)}")["places"]
 
     def sun(self) -> SunTold:
         """Return the direction that no head camera looks into: ``sun``, null where none was stated."""
@@ -210,10 +212,13 @@ class KeepingCalls:
         valid_s
             How long that holds, seconds; left out, until another is stated.
         """
-        body: dict[str, Any] = {"azimuth_rad": azimuth_rad, "elevation_rad": elevation_rad}
-        body |= {"half_angle_rad": half_angle_rad, "frame": frame}
-        if valid_s is not None:
-            body["valid_s"] = valid_s
+        body = given(
+            azimuth_rad=azimuth_rad,
+            elevation_rad=elevation_rad,
+            half_angle_rad=half_angle_rad,
+            frame=frame,
+            valid_s=valid_s,
+        )
         return self.daemon.command(SunTold, "POST", "/limits/sun", body)
 
     def forget_sun(self) -> SunTold:
@@ -221,5 +226,5 @@ class KeepingCalls:
         return self.daemon.command(SunTold, "DELETE", "/limits/sun")
 
     def session(self) -> SessionTold:
-        """Return who asks: ``name``, ``role``, ``via``, and whether the daemon asks for a token at all."""
+        """Return this client's ``name``, ``role`` and ``via``, and whether the daemon requires a token."""
         return self.daemon.json(SessionTold, "GET", "/session")

@@ -7,10 +7,9 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 from mastctl.answers import ControlTold, LeaseGranted, LeaseTold
-from mastctl.client.connection import Broken, ClientError, DaemonHttp, plain_name
+from mastctl.client.connection import Broken, ClientError, DaemonHttp, given, plain_name
 
 RENEWALS = 3  # within a lease's time, so that one may be lost
 LEAST_TIMEOUT_S = 0.5
@@ -51,13 +50,13 @@ class HeldLease:
         self._daemon.close()
 
     def _renew(self) -> None:
-        """Renew until the end; a daemon that does not answer is asked again until the lease is over."""
+        """Renew until the end; without an answer, again until the lease is over."""
         while not self._ended.wait(self._for_s / RENEWALS):
-            asked_s = time.monotonic()
+            sent_s = time.monotonic()
             try:
                 renewal = {"for_s": self._for_s}
                 self._daemon.json(LeaseGranted, "POST", "/lease/renew", json=renewal)
-                self._until_s = asked_s + self._for_s
+                self._until_s = sent_s + self._for_s
             except ClientError as error:
                 passing = isinstance(error, Broken) or error.code in ("no_daemon", "timeout")
                 if passing and time.monotonic() < self._until_s:
@@ -115,8 +114,8 @@ class LeaseCalls:
             held.end()
 
     def control(self) -> ControlTold | None:
-        """Return who steers, or None: ``holder``, ``kind`` (lease, operation), ``for_s``, ``until``."""
-        return (self.daemon.json(LeaseTold, "GET", "/lease"))["control"]
+        """Return the client that steers, or None."""
+        return self.daemon.json(LeaseTold, "GET", "/lease")["control"]
 
     def acquire_lease(
         self,
@@ -129,15 +128,9 @@ class LeaseCalls:
 
         Returns ``lease_id``, ``holder``, ``for_s`` and ``until``; `use_lease` has commands carry it.
         """
-        body: dict[str, Any] = {"for_s": float(for_s)}
-        if ends_with_stop:
-            body["ends_with_stop"] = True
-        if name is not None:
-            body["name"] = name
-        if take_over is None:
-            return self.daemon.command(LeaseGranted, "POST", "/lease", body)
-        body["reason"] = take_over
-        return self.daemon.command(LeaseGranted, "POST", "/lease/take", body)
+        body = given(for_s=float(for_s), ends_with_stop=ends_with_stop or None, name=name, reason=take_over)
+        path = "/lease" if take_over is None else "/lease/take"
+        return self.daemon.command(LeaseGranted, "POST", path, body)
 
     def use_lease(self, lease_id: str | None) -> None:
         """Have each command carry a lease from now on, or none."""
@@ -145,9 +138,8 @@ class LeaseCalls:
 
     def renew_lease(self, for_s: float | None = None) -> LeaseGranted:
         """Have the lease in use run for ``for_s`` seconds from now on, by default as long as at first."""
-        return self.daemon.command(
-            LeaseGranted, "POST", "/lease/renew", {} if for_s is None else {"for_s": float(for_s)}
-        )
+        body = given(for_s=None if for_s is None else float(for_s))
+        return self.daemon.command(LeaseGranted, "POST", "/lease/renew", body)
 
     def release_lease(self) -> None:
         """Release the lease in use."""

@@ -93,8 +93,7 @@ def live_pictures(daemon: DaemonHttp, cameras: Sequence[str]) -> Iterator[LivePi
     except (InvalidHandshake, InvalidURI) as error:
         raise ClientError("refused", f"the daemon at {daemon.url} sends no pictures: {_why(error)}") from None
     except (OSError, TimeoutError):
-        words = f"no daemon answers at {daemon.url}; 'mastctl run' starts one"
-        raise ClientError("no_daemon", words) from None
+        raise daemon.no_daemon() from None
     with line:
         yield LivePictures(line, daemon.url)
 

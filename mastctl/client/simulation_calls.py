@@ -1,10 +1,9 @@
-"""A client's questions to a simulated rover."""
+"""Requests to a simulated rover."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
-from urllib.parse import quote
 
 from mastctl.answers import (
     BoardStands,
@@ -17,7 +16,7 @@ from mastctl.answers import (
     WordsTold,
     WordTold,
 )
-from mastctl.client.connection import DaemonHttp
+from mastctl.client.connection import DaemonHttp, escaped, floats, given
 
 
 class SimulationCalls:
@@ -41,7 +40,7 @@ class SimulationCalls:
         """Return the boards held up before a simulated rover, by name: ``board``, ``position_m``,
         ``quaternion`` (rover_from_board), ``bow_m``.
         """
-        return (self.daemon.json(BoardsTold, "GET", "/simulation/boards"))["boards"]
+        return self.daemon.json(BoardsTold, "GET", "/simulation/boards")["boards"]
 
     def put_board(
         self,
@@ -73,17 +72,18 @@ class SimulationCalls:
         ClientError
             ``not_simulated``, ``bad_options``, ``bad_board``.
         """
-        body: dict[str, Any] = {"position_m": _as_sent(position_m)}
-        if board is not None:
-            body["board"] = dict(board)
-        for key, values in (("turned_rad", turned_rad), ("quaternion", quaternion), ("bow_m", bow_m)):
-            if values is not None:
-                body[key] = _as_sent(values)
-        return self.daemon.command(BoardStands, "POST", f"/simulation/boards/{quote(name, safe='')}", body)
+        body = given(
+            position_m=floats(position_m),
+            board=None if board is None else dict(board),
+            turned_rad=None if turned_rad is None else floats(turned_rad),
+            quaternion=None if quaternion is None else floats(quaternion),
+            bow_m=None if bow_m is None else floats(bow_m),
+        )
+        return self.daemon.command(BoardStands, "POST", f"/simulation/boards/{escaped(name)}", body)
 
     def take_board(self, name: str) -> None:
         """Take a board away from a simulated rover."""
-        self.daemon.command(BoardsTold, "DELETE", f"/simulation/boards/{quote(name, safe='')}")
+        self.daemon.command(BoardsTold, "DELETE", f"/simulation/boards/{escaped(name)}")
 
     def simulation_time(self) -> TimeTold:
         """Return a simulated rover's time: ``now_s``, and ``speed``, a number or ``max``."""
@@ -120,32 +120,26 @@ class SimulationCalls:
         ClientError
             ``not_simulated``; ``frame_too_old`` and such for a frame that is not kept.
         """
-        asked: dict[str, Any] = {"frame_id": frame_id}
+        query: dict[str, Any] = {"frame_id": frame_id}
         if pixel is not None:
-            asked |= dict(zip(("x_px", "y_px"), pixel, strict=True))
+            query |= dict(zip(("x_px", "y_px"), pixel, strict=True))
         if position_in_site_m is not None:
-            asked |= dict(zip(("x_m", "y_m", "z_m"), position_in_site_m, strict=True))
-        return self.daemon.json(TruthTold, "GET", "/simulation/truth", params=asked)
+            query |= dict(zip(("x_m", "y_m", "z_m"), position_in_site_m, strict=True))
+        return self.daemon.json(TruthTold, "GET", "/simulation/truth", params=query)
 
     def fault_words(self) -> dict[str, dict[str, WordTold]]:
         """Return the fault words of each simulated device: each one's ``effect``, and its ``parameters``."""
-        return (self.daemon.json(WordsTold, "GET", "/simulation/words"))["devices"]
+        return self.daemon.json(WordsTold, "GET", "/simulation/words")["devices"]
 
     def faults(self) -> list[FaultSet]:
         """Return the faults that are switched on in a simulated rover."""
-        return (self.daemon.json(FaultsSet, "GET", "/simulation/faults"))["faults"]
+        return self.daemon.json(FaultsSet, "GET", "/simulation/faults")["faults"]
 
     def set_fault(self, /, device: str, word: str, **parameters: float) -> list[FaultSet]:
         """Switch a fault of a simulated device on; return all that are on."""
         body = {"device": device, "word": word, "parameters": parameters}
-        return (self.daemon.command(FaultsSet, "POST", "/simulation/faults", body))["faults"]
+        return self.daemon.command(FaultsSet, "POST", "/simulation/faults", body)["faults"]
 
     def clear_faults(self, device: str | None = None) -> None:
         """Switch the faults of one simulated device off, or all."""
-        params = {} if device is None else {"device": device}
-        self.daemon.command(FaultsSet, "DELETE", "/simulation/faults", params=params)
-
-
-def _as_sent(values: Sequence[float]) -> list[float]:
-    """Return numbers as JSON has them; a whole number stays one, since it may exceed a float's range."""
-    return [value if isinstance(value, int) else float(value) for value in values]
+        self.daemon.command(FaultsSet, "DELETE", "/simulation/faults", params=given(device=device))
