@@ -4,68 +4,60 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Any, Literal, Self
 
+from pydantic import ConfigDict, Field, model_validator
+
+from calib.files.records import problem
 from drivers.errors import OutOfRange
+from drivers.options import DriverOptions, Ends
 
-Approach = Literal["none", "positive", "negative", "gravity"]
-APPROACHES: tuple[Approach, ...] = get_args(Approach)
-
-
-def last_turn(approach: Approach, goal_rad: float, gravity_turnover_rad: float) -> int:
-    """Return which way the axis turns on the last stretch: 1 for positive, -1 for negative, 0 for either.
-
-    Parameters
-    ----------
-    approach
-        ``positive``, ``negative``, ``none``, or ``gravity``: against the weight, so that gear and weight
-        press on the same flank.
-    gravity_turnover_rad
-        The angle at which the weight changes sides: below it the weight pulls the axis down, so that the
-        last stretch turns positive, above it up.
-    """
-    if approach == "gravity":
-        return 1 if goal_rad < gravity_turnover_rad else -1
-    return {"none": 0, "positive": 1, "negative": -1}[approach]
+_STRETCH: Any = {
+    "if": {"required": ["approach"], "properties": {"approach": {"not": {"const": "none"}}}},
+    "then": {"required": ["approach_rad"], "properties": {"approach_rad": {"exclusiveMinimum": 0}}},
+    "else": {"properties": {"approach_rad": {"const": 0}}},
+}
 
 
-@dataclass(frozen=True, kw_only=True)
-class ApproachedAxis:
-    """The options of an axis, of any driver. Angles are the mast's: pan to the right, tilt up.
+class ApproachedAxis(DriverOptions):
+    """The options of an axis, of any driver. Angles are the mast's: pan to the right, tilt up."""
 
-    Attributes
-    ----------
-    limits_rad
-        What may be commanded; set in the device too, if it can be.
-    sign
-        1 if the device counts up where the axis turns positive, else -1.
-    approach
-        From which side a goal is approached, to take the backlash up: ``none``, ``positive`` (the last
-        stretch turns positive), ``negative``, or ``gravity``: against the weight, so that gear and weight
-        press on the same flank.
-    approach_rad
-        How long the last stretch is; more than the backlash.
-    gravity_turnover_rad
-        The angle at which the weight changes sides, for ``gravity``. Below it the weight pulls the axis down
-        (the last stretch turns positive), above it up.
-    """
+    model_config = ConfigDict(json_schema_extra=_STRETCH)
 
-    limits_rad: tuple[float, float]
-    sign: int = 1
-    approach: Approach = "none"
-    approach_rad: float = 0.0
-    gravity_turnover_rad: float = math.pi / 2
+    limits_rad: Annotated[tuple[float, float], Ends()]
+    """What may be commanded; set in the device too, if it can be."""
+    sign: Literal[1, -1] = 1
+    """1 if the device counts up where the axis turns positive, else -1."""
+    approach: Literal["none", "positive", "negative", "gravity"] = "none"
+    """From which side a goal is approached, to take the backlash up: ``none``, ``positive`` (the last stretch
+    turns positive), ``negative``, or ``gravity``: against the weight, so that gear and weight press on the
+    same flank."""
+    approach_rad: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
+    """How long the last stretch is; more than the backlash."""
+    gravity_turnover_rad: Annotated[float, Field(ge=-math.pi, le=math.pi)] = math.pi / 2
+    """The angle at which the weight changes sides, for ``gravity``. Below it the weight pulls the axis down
+    (the last stretch turns positive), above it up."""
+
+    @model_validator(mode="after")
+    def _check_stretch(self) -> Self:
+        if (self.approach == "none") != (self.approach_rad == 0.0):
+            stretch = f"{self.approach_rad:g} with approach {self.approach!r}"
+            raise problem(
+                "approach_rad", f"{stretch}; a stretch above zero with a side, or neither, is expected"
+            )
+        return self
+
+    @property
+    def rising_below_rad(self) -> float | None:
+        """The angle below which the last stretch turns positive, and above which negative; None for no
+        side."""
+        ends = {"none": None, "positive": math.inf, "negative": -math.inf}
+        return self.gravity_turnover_rad if self.approach == "gravity" else ends[self.approach]
 
     def approach_sign(self, goal_rad: float) -> int:
         """Return the direction of the last stretch in counts: 1, -1, or 0 for none."""
-        return self.sign * last_turn(self.approach, goal_rad, self.gravity_turnover_rad)
-
-
-def rising_below_rad(approach: Approach, gravity_turnover_rad: float) -> float | None:
-    """Return what `drivers.interfaces.AxisMotion` says of an approach."""
-    known = {"none": None, "positive": math.inf, "negative": -math.inf, "gravity": gravity_turnover_rad}
-    return known[approach]
+        below_rad = self.rising_below_rad
+        return 0 if below_rad is None else self.sign if goal_rad < below_rad else -self.sign
 
 
 def legs_to(
@@ -76,12 +68,12 @@ def legs_to(
     Parameters
     ----------
     goal, stretch, limits
-        Where the axis is to stand, how long its last stretch is at least, and the lowest and highest goal,
-        all in the device's counts.
+        Where the axis is to come to rest, how long its last stretch is at least, and the lowest and highest
+        goal, all in the device's counts.
     turn
         Which way the counts go on the last stretch: 1, -1, or 0 for either.
     places
-        Where the axis stands or comes to rest before it can turn; None if unknown.
+        Where the axis is or comes to rest before it can turn; None if unknown.
     """
     low, high = limits
     start = min(max(goal - turn * stretch, low), high)
@@ -100,5 +92,5 @@ def check_goal(
         raise OutOfRange(f"speed {speed_rad_per_s} rad/s is not a positive number", device=device)
     for name, angle, (low, high) in zip(("pan", "tilt"), angles_rad, limits_rad, strict=True):
         if not low <= angle <= high:
-            words = f"{name} {angle:.4f} rad is outside the head's limits {low:.4f} to {high:.4f} rad"
-            raise OutOfRange(words, device=device)
+            message = f"{name} {angle:.4f} rad is outside the head's limits {low:.4f} to {high:.4f} rad"
+            raise OutOfRange(message, device=device)

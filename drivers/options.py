@@ -1,19 +1,20 @@
 """The options of a driver, and the settings of a simulation, as a configuration gives them: read strictly.
 
-The options of a camera's driver are a `DriverOptions`: its fields state keys, types, bounds, defaults and
-descriptions once, for the check, the sentence of a refusal and the JSON Schema (`calib.files.records`).
+The options of a driver are a `DriverOptions`: its fields state keys, types, bounds, defaults and descriptions
+once, for the check, the sentence of a refusal and the JSON Schema (`calib.files.records`).
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, TypeGuard, TypeVar
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, TypeGuard, TypeVar
 
-from pydantic import AfterValidator, ConfigDict
+from pydantic import AfterValidator, ConfigDict, Field
 from pydantic_core import CoreSchema
-from pydantic_core.core_schema import no_info_plain_validator_function
+from pydantic_core.core_schema import no_info_after_validator_function, no_info_plain_validator_function
 
 from calib.errors import BadFile
 from calib.files.records import Record, problem, read_record
@@ -44,22 +45,28 @@ class DriverOptions(Record):
 D = TypeVar("D", bound=DriverOptions)
 
 
-def read_options(kind: type[D], options: Mapping[str, Any], device: str = "") -> D:
+def read_options(
+    kind: type[D], options: Mapping[str, Any], device: str = "", place: str = "options", folder: Path = Path()
+) -> D:
     """Return a driver's options. Raises BadOptions with the place, the value and what would be right."""
     try:
-        return read_record(kind, dict(options), "")
+        return read_record(kind, dict(options), folder / place, place)
     except BadFile as error:
-        place = f"options.{error.place}" if error.place else "options"
-        raise BadOptions(f"{place}: {error.reason}", device=device) from None
+        raise BadOptions(f"{error.place}: {error.reason}", device=device) from None
 
 
-def one_of(known: Iterable[str]) -> AfterValidator:
-    """Return what passes the names that a driver knows, and refuses another with the nearest of them."""
+def one_of(known: Collection[Any]) -> AfterValidator:
+    """Return what passes the values that a driver knows, and refuses another with the nearest name or all."""
 
-    def check(name: str) -> str:
-        if name not in known:
-            raise problem("", f"{name!r}, which this driver does not read{nearest(name, known)}")
-        return name
+    def check(value: Any) -> Any:
+        if value not in known:
+            hint = (
+                nearest(value, known)
+                if isinstance(value, str)
+                else f"; there is {', '.join(map(str, known))}"
+            )
+            raise problem("", f"{value!r}, which this driver does not know{hint}")
+        return value
 
     return AfterValidator(check)
 
@@ -77,24 +84,49 @@ def named_values(is_name: Callable[[str], bool], kinds: tuple[type, ...], expect
 
 
 @dataclass(frozen=True)
-class TwoWholes:
-    """Annotates a pair of whole numbers within bounds, such as a picture's size."""
+class ReadBy:
+    """Annotates a value that a function reads, which raises `problem`, or BadOptions with the whole place."""
 
-    low: int
-    high: int
+    function: Callable[[Any], Any]
+    schema: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
-        return no_info_plain_validator_function(self._check)
+        return no_info_plain_validator_function(self.function)
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
-        items = {"type": "integer", "minimum": self.low, "maximum": self.high}
-        return {"type": "array", "minItems": 2, "maxItems": 2, "items": items}
+        return dict(self.schema)
 
-    def _check(self, value: Any) -> tuple[int, int]:
-        two = list(value) if isinstance(value, list | tuple) else []
-        if len(two) != 2 or not all(is_whole(one) and self.low <= one <= self.high for one in two):
-            raise problem("", f"{value!r}, expected two whole numbers from {self.low} to {self.high}")
-        return two[0], two[1]
+
+def wholes(count: int, low: int, high: int) -> ReadBy:
+    """Return what annotates some whole numbers within bounds, such as a picture's size."""
+
+    def check(value: Any) -> tuple[int, ...]:
+        found = tuple(value) if isinstance(value, list | tuple) else ()
+        if len(found) != count or not all(is_whole(one) and low <= one <= high for one in found):
+            raise problem("", f"{value!r} where {count} whole numbers from {low} to {high} are expected")
+        return found
+
+    items = {"type": "integer", "minimum": low, "maximum": high}
+    return ReadBy(check, {"type": "array", "minItems": count, "maxItems": count, "items": items})
+
+
+@dataclass(frozen=True)
+class Ends:
+    """Annotates ``[low, high]``, the lower first, both within bounds."""
+
+    low: float = -1e9
+    high: float = 1e9
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
+        number = Annotated[float, Field(ge=self.low, le=self.high)]
+        two = handler.generate_schema(Annotated[list[number], Field(min_length=2, max_length=2)])
+        return no_info_after_validator_function(self._check, two)
+
+    @staticmethod
+    def _check(two: list[float]) -> tuple[float, float]:
+        if not two[0] < two[1]:
+            raise problem("", f"{two} where [low, high] with low below high is expected")
+        return float(two[0]), float(two[1])
 
 
 def check_in_frame(key: str, exposure_s: float | None, rate_hz: float | None) -> None:
@@ -102,112 +134,6 @@ def check_in_frame(key: str, exposure_s: float | None, rate_hz: float | None) ->
     if exposure_s is not None and rate_hz is not None and exposure_s > 1 / rate_hz:
         words = f"{exposure_s:g} s, longer than a frame at rate_hz {rate_hz:g} ({1 / rate_hz:.4g} s)"
         raise problem(key, f"{words}; a shorter one, or a lower rate, is expected")
-
-
-class OptionReader:
-    """One mapping of options; a refusal names the key, the value and what would be right.
-
-    Raises BadOptions if a key is unknown or missing; its methods raise it for a value that cannot be.
-
-    Parameters
-    ----------
-    place
-        The text before a key in a refusal, such as ``options.pan.``.
-    """
-
-    def __init__(
-        self,
-        values: Mapping[str, Any],
-        known: Iterable[str],
-        needed: Iterable[str] = (),
-        place: str = "options.",
-        device: str = "",
-    ) -> None:
-        self.values = values
-        self._place = place
-        self._device = device
-        known = tuple(known)
-        for key in values:
-            if key not in known:
-                raise self.refused(key, f": there is no such option{nearest(str(key), known)}")
-        for key in needed:
-            if key not in values:
-                raise self.refused(key, " is missing")
-
-    def bad(self, key: str, expected: str) -> BadOptions:
-        """Return the refusal of a key's value."""
-        return self.refused(key, f" is {self.values.get(key)!r}, expected {expected}")
-
-    def refused(self, key: str, words: str) -> BadOptions:
-        """Return the refusal of a key, in words that follow its name."""
-        return BadOptions(f"{self._place}{key}{words}", device=self._device)
-
-    def section(
-        self, key: str, expected: str, known: Iterable[str], needed: Iterable[str] = ()
-    ) -> OptionReader:
-        """Return the reader of the mapping that a key holds."""
-        value = self.values[key]
-        if not isinstance(value, Mapping):
-            raise self.bad(key, expected)
-        return OptionReader(value, known, needed, f"{self._place}{key}.", self._device)
-
-    def text(self, key: str, expected: str, default: Any = None) -> Any:
-        """Return a text that is not blank, or the default where the key is left out."""
-        if key not in self.values:
-            return default
-        value = self.values[key]
-        if not isinstance(value, str) or not value.strip():
-            raise self.bad(key, expected)
-        return value
-
-    def number(self, key: str, default: Any, low: float, high: float) -> Any:
-        """Return a number within bounds, or the default, which may be None, where the key is left out."""
-        if key not in self.values:
-            return default
-        value = self.values[key]
-        if not is_number(value) or not low <= value <= high:
-            raise self.bad(key, f"a number from {low:g} to {high:g}")
-        return float(value)
-
-    def whole(self, key: str, default: Any, low: int, high: int) -> Any:
-        """Return a whole number within bounds, or the default where the key is left out."""
-        if key not in self.values:
-            return default
-        value = self.values[key]
-        if not is_whole(value) or not low <= value <= high:
-            raise self.bad(key, f"a whole number from {low} to {high}")
-        return value
-
-    def wholes(self, key: str, count: int, low: int, high: int) -> Any:
-        """Return ``count`` whole numbers within bounds, None where the key is left out."""
-        if key not in self.values:
-            return None
-        value = self.values[key]
-        right = isinstance(value, list | tuple) and all(is_whole(one) and low <= one <= high for one in value)
-        if not right or len(value) != count:
-            raise self.bad(key, f"{count} whole numbers from {low} to {high}")
-        return tuple(value)
-
-    def flag(self, key: str, default: bool) -> bool:
-        """Return a truth value."""
-        value = self.values.get(key, default)
-        if not isinstance(value, bool):
-            raise self.bad(key, "true or false")
-        return value
-
-    def one_of(self, key: str, default: Any, allowed: tuple[Any, ...], between: str = " or ") -> Any:
-        """Return one of a few values; ``between`` stands between them in a refusal."""
-        value = self.values.get(key, default)
-        if isinstance(value, bool) or value not in allowed:
-            raise self.bad(key, between.join(str(one) for one in allowed))
-        return allowed[allowed.index(value)]  # 1 for 1.0
-
-    def pair(self, key: str, expected: str) -> tuple[float, float]:
-        """Return two numbers."""
-        value = self.values[key]
-        if not isinstance(value, list | tuple) or len(value) != 2 or not all(is_number(one) for one in value):
-            raise self.bad(key, expected)
-        return float(value[0]), float(value[1])
 
 
 def filled(defaults: Any, values: Any, key: str) -> Any:

@@ -146,6 +146,8 @@ def schema_of(kind: type[BaseModel], title: str) -> dict[str, Any]:
 
 def _inlined(node: Any, definitions: Mapping[str, Any]) -> Any:
     """The schema with its references replaced; docstrings of Python classes are no descriptions of keys."""
+    if isinstance(node, str):
+        return " ".join(node.split())
     if isinstance(node, list):
         return [_inlined(one, definitions) for one in node]
     if not isinstance(node, dict):

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, ConfigDict, Field, WithJsonSchema, model_validator
 
 from calib.files.records import Text, problem
-from drivers.options import DriverOptions, TwoWholes, check_in_frame, named_values, one_of, read_options
+from drivers.options import DriverOptions, check_in_frame, named_values, one_of, read_options, wholes
 from drivers.pixels import GENICAM
 
 Stamped = Literal["start", "end", "either"]
@@ -49,9 +49,9 @@ class AravisOptions(DriverOptions):
     """The name that Aravis lists: maker, model, serial number."""
     format: Annotated[Text, one_of(GENICAM), WithJsonSchema({"enum": sorted(GENICAM)})] = "Mono8"
     """By GenICam's name; requested of the camera, whose answer is checked."""
-    size_px: Annotated[tuple[int, int], TwoWholes(1, 32768)] = (640, 480)
+    size_px: Annotated[tuple[int, int], wholes(2, 1, 32768)] = (640, 480)
     """As in the mast file."""
-    offset_px: Annotated[tuple[int, int], TwoWholes(0, 32768)] = (0, 0)
+    offset_px: Annotated[tuple[int, int], wholes(2, 0, 32768)] = (0, 0)
     """Where the picture begins on the sensor."""
     rate_hz: Annotated[float, Field(ge=0.1, le=1000.0)] | None = 30.0
     """Frames per second; null leaves the camera's; not beside trigger_source."""

@@ -195,8 +195,9 @@ class Servo(ServoTable):
         return sample
 
     def check_place(self) -> int:
-        """Return the count that may be the axis' goal where it stands, as `ServoAxisSettings.held_counts`."""
-        return self._settings.held_counts(self.name, self.look().counts)
+        """Return the count that may be the axis' goal where it stands, as
+        `ServoAxisSettings.goal_at_place`."""
+        return self._settings.goal_at_place(self.name, self.look().counts)
 
     def set_up(self) -> None:
         """Bring the servo's permanent settings to what the configuration says.

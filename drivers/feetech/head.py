@@ -13,11 +13,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal, Self
 
+from pydantic import Field, WithJsonSchema, model_validator
+
+from calib.files.records import ABSENT, problem
 from drivers.clock import Clock
-from drivers.errors import BadOptions, BadReply, DriverError, HardwareFault, NoReply, WrongDevice
+from drivers.errors import BadReply, DriverError, HardwareFault, NoReply, WrongDevice
 from drivers.feetech.servos import (
     BAUD_RATES,
     LOCKED,
@@ -36,7 +39,7 @@ from drivers.feetech.servos import (
     set_id,
     status_words,
 )
-from drivers.options import OptionReader
+from drivers.options import one_of, read_options
 from drivers.registry import Driver
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.bench import ServoBench
@@ -49,11 +52,7 @@ from drivers.servo_bus.session import GivenUp
 from drivers.servo_bus.settings import (
     HeadSettings,
     ServoAxisSettings,
-    axis_values,
-    check_axis,
-    check_polling,
-    head_values,
-    patience_s,
+    named_model,
 )
 
 log = logging.getLogger(__name__)
@@ -61,42 +60,54 @@ log = logging.getLogger(__name__)
 USUAL_LEASE_S, SHORTEST_LEASE_S = 0.2, 0.05
 
 
-@dataclass(frozen=True, kw_only=True)
 class FeetechAxisSettings(ServoAxisSettings):
-    """One axis, as of `ServoAxisSettings`.
+    """One axis."""
 
-    Attributes
-    ----------
-    torque_percent
-        Bound of the motor's drive; None: as much as the servo's EEPROM allows.
-    """
+    model: Annotated[FeetechModel, named_model(model_named, MODELS)]
+    """Which servo; one that is not in the table by its series: STS, SMS or SCS."""
+    torque_percent: Annotated[float, Field(ge=2.0, le=100.0)] | None = None
+    """Bound of the motor's drive; left out: as much as the servo's EEPROM allows."""
+    speed_unit_counts: Literal[1, 50] = 1
+    """Counts per second of one unit of its speed; 50 in some firmware."""
 
-    model: FeetechModel
-    torque_percent: float | None = None
+    @model_validator(mode="after")
+    def _check_series(self) -> Self:
+        if self.torque_percent is not None and self.model.is_scs:
+            raise problem("torque_percent", f"a {self.model.name} has no torque limit")
+        object.__setattr__(self, "model", self.model.with_speed_unit(self.speed_unit_counts))
+        return self
 
     @property
     def torque_limit(self) -> int | None:
         """The bound in the servo's counts, 0.1 %."""
         return None if self.torque_percent is None else round(10 * self.torque_percent)
 
-    @property
-    def speed_unit_counts(self) -> int:
-        """Counts per second of one unit of its speed."""
-        return self.model.speed_unit_counts
 
+class FeetechSettings(HeadSettings):
+    """A head of two servos on one bus."""
 
-@dataclass(frozen=True, kw_only=True)
-class FeetechSettings(HeadSettings[FeetechAxisSettings]):
-    """A head of two servos on one bus, as of `HeadSettings`.
+    poll_bytes: ClassVar[int] = POLL_BYTES
 
-    Attributes
-    ----------
-    lease_s
-        A goal is sent only so far ahead of its axis: that is what an axis goes on for, and brakes, when this
-        process is gone. 0: goals are sent as they are, and nothing stops a head whose host is gone.
-    """
+    pan: FeetechAxisSettings
+    """The pan axis."""
+    tilt: FeetechAxisSettings
+    """The tilt axis."""
+    baud: Annotated[int, one_of(BAUD_RATES), WithJsonSchema({"enum": [*BAUD_RATES]})] = 1_000_000
+    """The line's bits per second."""
+    acceleration_rad_per_s2: Annotated[float, Field(ge=0.4, le=39.0)] = 4.0
+    """Of the profile inside the servos."""
+    poll_hz: Annotated[float, Field(ge=10.0, le=250.0)] = 50.0
+    """How often the servos are read while they move, if no client reads."""
+    lease_s: Annotated[float, Field(ge=0.0, le=0.5)] = ABSENT
+    """A goal is sent only so far ahead of its axis: that is what an axis goes on for, and brakes, when this
+    process is gone. 0: goals are sent as they are, and nothing stops a head whose host is gone."""
 
-    lease_s: float = USUAL_LEASE_S
+    @model_validator(mode="after")
+    def _check_lease(self) -> Self:
+        if self.pan.model.order != self.tilt.model.order:
+            raise problem("pan.model", "it is of another series than tilt.model; one on a bus is expected")
+        self._set_patience("lease_s", USUAL_LEASE_S, SHORTEST_LEASE_S)
+        return self
 
     @property
     def silence_s(self) -> float:
@@ -104,40 +115,8 @@ class FeetechSettings(HeadSettings[FeetechAxisSettings]):
         return self.lease_s + 2 * self.speed_rad_per_s / self.acceleration_rad_per_s2 if self.lease_s else 0.0
 
 
-def feetech_settings(options: Mapping[str, Any]) -> FeetechSettings:
-    """Return the head that the options of ``driver: feetech`` describe.
-
-    Raises BadOptions for an unknown or missing key or a value that cannot be: which, what it is, what would
-    be right.
-    """
-    read = OptionReader(options, FeetechSettings.__dataclass_fields__, ("port", "pan", "tilt"))
-    values = head_values(read, _axis, 250.0, 39.0)
-    if values["pan"].model.order != values["tilt"].model.order:
-        raise BadOptions("options.pan.model and options.tilt.model are of two series, expected one on a bus")
-    baud: int = read.one_of("baud", 1_000_000, BAUD_RATES, ", ")
-    check_polling(read, baud, values["poll_hz"], POLL_BYTES)
-    return FeetechSettings(
-        **values,
-        baud=baud,
-        lease_s=patience_s(read, values, "lease_s", USUAL_LEASE_S, SHORTEST_LEASE_S),
-        reply_timeout_s=read.number("reply_timeout_s", 0.05, 0.002, 0.3),
-    )
-
-
-def _axis(options: OptionReader, name: str) -> FeetechAxisSettings:
-    """One axis of the options."""
-    read, values = axis_values(options, name, model_named, ("torque_percent", "speed_unit_counts"))
-    unit = read.one_of("speed_unit_counts", 1, (1, 50))
-    percent = read.number("torque_percent", None, 2.0, 100.0)
-    if percent is not None and values["model"].is_scs:
-        raise read.refused("torque_percent", f": a {values['model'].name} has no torque limit")
-    axis = FeetechAxisSettings(
-        **{**values, "model": values["model"].with_speed_unit(unit)},
-        torque_percent=percent,
-    )
-    check_axis(read, axis)
-    return axis
-
+feetech_settings = partial(read_options, FeetechSettings)
+"""Return the head that the options of ``driver: feetech`` describe. Raises BadOptions."""
 
 LEAST_TORQUE = 20  # room below a torque limit for the tokens of the questions
 
@@ -266,8 +245,9 @@ class FeetechServo:
         return bound
 
     def check_place(self) -> int:
-        """Return the count that may be the axis' goal where it stands, as `ServoAxisSettings.held_counts`."""
-        return self._settings.held_counts(self.name, self.look().counts)
+        """Return the count that may be the axis' goal where it stands, as
+        `ServoAxisSettings.goal_at_place`."""
+        return self._settings.goal_at_place(self.name, self.look().counts)
 
     def set_up(self) -> None:
         """Bring the servo's permanent settings to what the configuration says; the torque may be off then.

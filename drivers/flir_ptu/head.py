@@ -20,7 +20,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from drivers.absent import Absence, stop_at_last
-from drivers.approach import check_goal, rising_below_rad
+from drivers.approach import check_goal
 from drivers.clock import Clock, ClockLock, SystemClock, deadlines_on
 from drivers.errors import BadReply, DriverError, HardwareFault, LineLost, NoReply
 from drivers.flir_ptu import protocol as ask
@@ -294,7 +294,7 @@ class FlirPtu(PanTilt):
             name: AxisMotion(
                 axis.acceleration * axis.position_rad,
                 axis.options.approach_rad,
-                rising_below_rad(axis.options.approach, axis.options.gravity_turnover_rad),
+                axis.options.rising_below_rad,
                 axis.position_rad,
             )
             for name, axis in self._axes.items()

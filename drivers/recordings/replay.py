@@ -17,13 +17,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any, Self
 
+from pydantic import Field, model_validator
+
+from calib.files.records import Text, problem
 from drivers.clock import Clock
 from drivers.errors import BadOptions, DriverError, NoFreshFrame
 from drivers.faults import PAN_TILT, nearest
 from drivers.interfaces import Camera, CameraInfo, Frame, Image, PanTilt, Reading
-from drivers.options import OptionReader
+from drivers.options import DriverOptions, Ends, read_options
 from drivers.recordings.frames import RecordedPointing, read_folder, read_products, read_recording
 from drivers.registry import Context, Driver
 
@@ -32,9 +35,6 @@ TOLERANCE_RAD = 0.002
 
 PERIOD_S = 0.1
 EXPOSURE_S = 0.001
-
-OPTIONS = ("products", "camera", "frames", "recording", "tolerance_rad", "grey_range_dn")
-SOURCES = ("products", "frames", "recording")
 
 
 class NoRecording(DriverError):
@@ -52,50 +52,50 @@ class Replay:
     pointings: Sequence[RecordedPointing]
 
 
+class ReplayOptions(DriverOptions):
+    """A recording."""
+
+    recording: Text = ""
+    """An MCAP file that mastctl recorded, or a folder of them; or"""
+    products: Text | list[Text] = ""
+    """PDS3 files, or a pattern like ``opportunity/1N*.IMG``, sorted by name; or"""
+    frames: Text = ""
+    """A CSV of frames (`drivers.recordings.frames`)."""
+    camera: Text = ""
+    """The name that the products' frames go by."""
+    tolerance_rad: Annotated[float, Field(ge=1e-9, le=1000.0)] = TOLERANCE_RAD
+    """How far from a recorded pointing a move may be."""
+    grey_range_dn: Annotated[tuple[float, float], Ends()] | None = None
+    """What becomes black and white in frames of more than 8 bits."""
+
+    @model_validator(mode="after")
+    def _check_source(self) -> Self:
+        if sum(map(bool, (self.recording, self.products, self.frames))) != 1:
+            raise problem("", "one of recording, products and frames is expected")
+        if self.products and not self.camera:
+            raise problem("camera", "the key is missing: the name that the products' frames go by")
+        if self.camera and not self.products:
+            raise problem("camera", "it goes with products; recordings and the table 'frames' name their own")
+        if self.recording and self.grey_range_dn is not None:
+            raise problem("grey_range_dn", "it goes with products and frames; a recording has 8 bits")
+        return self
+
+
 def open_replay(options: Mapping[str, Any], folder: Path, clock: Clock) -> Replay:
-    """Open a recording.
+    """Open a recording; relative paths start at ``folder``.
 
-    Raises BadOptions for unknown or missing options and recordings that cannot be read.
-
-    Parameters
-    ----------
-    options
-        One of ``recording`` (an MCAP file that mastctl recorded, or a folder of them), ``products`` (a list
-        of PDS3 files, or a pattern like ``opportunity/1N*.IMG``, sorted by name) with ``camera`` (the name
-        that its frames go by), and ``frames`` (a CSV, see `drivers.recordings.frames`).
-        ``tolerance_rad``: how far from a recorded pointing a move may ask.
-        ``grey_range_dn``: [low, high], what becomes black and white in frames of more than 8 bits.
-    folder
-        Where relative paths start.
+    Raises BadOptions for options that cannot be and recordings that cannot be read.
     """
-    read = OptionReader(options, OPTIONS, device="replay")
-    if sum(source in options for source in SOURCES) != 1:
-        raise BadOptions(
-            "one of options.recording, options.products and options.frames is expected", device="replay"
-        )
-    tolerance_rad = read.number("tolerance_rad", TOLERANCE_RAD, 1e-9, 1000.0)
-    grey_range_dn = None
-    if options.get("grey_range_dn") is not None:
-        grey_range_dn = read.pair("grey_range_dn", "[low, high]")
-        if not grey_range_dn[0] < grey_range_dn[1]:
-            raise read.bad("grey_range_dn", "[low, high], low below high")
-    if "products" in options:
-        camera = read.text("camera", "the name that the products' frames go by")
-        if camera is None:
-            raise read.refused("camera", " is missing: the name that the products' frames go by")
-        pointings = read_products(_files(read, folder), camera, grey_range_dn)
-    elif "camera" in options:
-        raise read.refused("camera", " goes with products; recordings and the table 'frames' name their own")
-    elif "recording" in options:
-        if grey_range_dn is not None:
-            raise read.refused("grey_range_dn", " goes with products and frames; a recording has 8 bits")
-        pointings = read_recording(folder / read.text("recording", "the path of a recording"))
+    read = read_options(ReplayOptions, options, "replay")
+    if read.products:
+        pointings = read_products(_files(read.products, folder), read.camera, read.grey_range_dn)
+    elif read.recording:
+        pointings = read_recording(folder / read.recording)
     else:
-        table = read.text("frames", "the path of a CSV file")
-        pointings = read_folder(folder / table, grey_range_dn)
+        pointings = read_folder(folder / read.frames, read.grey_range_dn)
     if not pointings:
         raise BadOptions("the recording is empty", device="replay")
-    head = ReplayedHead(pointings, tolerance_rad, clock)
+    head = ReplayedHead(pointings, read.tolerance_rad, clock)
     names = dict.fromkeys(name for pointing in pointings for name in pointing.frames)
     cameras = {name: ReplayedCamera(name, head, clock) for name in names}
     return Replay(head, MappingProxyType(cameras), tuple(pointings))
@@ -220,18 +220,16 @@ class ReplayedCamera(Camera):
         return Frame(image, sequence, begin_s + EXPOSURE_S / 2, EXPOSURE_S)
 
 
-def _files(read: OptionReader, folder: Path) -> list[Path]:
-    """The files that the option ``products`` names: a list, or a pattern whose matches are sorted by name."""
-    products = read.values["products"]
-    if isinstance(products, str):
-        pattern = folder / products
-        found = sorted(one for one in pattern.parent.glob(pattern.name) if one.is_file())
-        if not found:
-            raise read.refused("products", f": no file matches the pattern {str(pattern)!r}")
-        return found
-    if isinstance(products, list | tuple) and all(isinstance(name, str) for name in products):
+def _files(products: str | list[str], folder: Path) -> list[Path]:
+    """The files of the option ``products``: those of a list, or those that match a pattern, by name."""
+    if isinstance(products, list):
         return [folder / name for name in products]
-    raise read.bad("products", "a list of files or a pattern")
+    pattern = folder / products
+    found = sorted(one for one in pattern.parent.glob(pattern.name) if one.is_file())
+    if not found:
+        message = f"options.products: no file matches the pattern {str(pattern)!r}"
+        raise BadOptions(message, device="replay")
+    return found
 
 
 def _device(options: Mapping[str, Any], context: Context) -> PanTilt | Camera:

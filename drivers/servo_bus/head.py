@@ -14,7 +14,7 @@ from contextlib import suppress
 from typing import Any, TypeVar
 
 from drivers.absent import LAST_STOP_S, Absence, stop_at_last
-from drivers.approach import check_goal, rising_below_rad
+from drivers.approach import check_goal
 from drivers.clock import Clock, SystemClock, deadlines_on
 from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
 from drivers.interfaces import AxisMotion, AxisReport, HeadInfo, PanTilt, Reading
@@ -48,7 +48,7 @@ class BusHead(PanTilt):
     """
 
     def __init__(
-        self, settings: HeadSettings[Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
+        self, settings: HeadSettings, clock: Clock | None = None, open_line: OpenLine = SerialLine
     ) -> None:
         self.settings = settings
         self._stamps = clock or SystemClock()
@@ -139,7 +139,7 @@ class BusHead(PanTilt):
             motion[name] = AxisMotion(
                 counts * axis.model.acceleration_unit_rad_per_s2,
                 axis.approach_rad,
-                rising_below_rad(axis.approach, axis.gravity_turnover_rad),
+                axis.rising_below_rad,
                 axis.model.count_rad,
             )
         return HeadInfo(motion=motion, settles_within_counts=SETTLES_WITHIN_COUNTS)

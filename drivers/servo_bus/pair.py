@@ -77,7 +77,7 @@ class ServoAxis(Generic[S, A]):
         What its servo has reported, in words; empty if nothing.
     """
 
-    def __init__(self, servo: S, clock: Clock, settings: A, head: HeadSettings[Any]) -> None:
+    def __init__(self, servo: S, clock: Clock, settings: A, head: HeadSettings) -> None:
         self.settings = settings
         self._clock = clock
         self.servo = servo

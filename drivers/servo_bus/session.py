@@ -55,7 +55,7 @@ class ServoSession:
     """
 
     def __init__(
-        self, pair: ServoPair[Any, Axis], watch: SessionWatch[Axis], head: HeadSettings[Any], clock: Clock
+        self, pair: ServoPair[Any, Axis], watch: SessionWatch[Axis], head: HeadSettings, clock: Clock
     ) -> None:
         self.pair = pair
         self.poll_due_s = 0.0

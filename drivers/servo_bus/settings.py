@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from drivers.approach import APPROACHES, ApproachedAxis
+from pydantic import ConfigDict, Field, InstanceOf, model_validator
+
+from calib.files.records import ABSENT, Text, problem
+from drivers.approach import ApproachedAxis
 from drivers.errors import BadOptions, WrongDevice
-from drivers.options import OptionReader
-
-Rest = Literal["hold", "torque_off"]
+from drivers.options import DriverOptions, ReadBy
 
 STANDS_WITHIN_S = 0.5  # after this process has died: the last poll's age, the patience, and braking
-RESTING_POLL_S = 0.1  # of servos that stand: an idle computer stays idle
+RESTING_POLL_S = 0.1  # of servos at rest: an idle computer stays idle
 LEAST_SLACK_COUNTS = 3
+LONGEST_REPLY_S = 0.3  # a few of them must fit into a call
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,8 +28,6 @@ class CountedModel:
     ----------
     name, number
         As its maker calls it, and as its memory does; None for a whole series, of which it is not compared.
-    registers
-        Of its table, by name.
     low_count, high_count, centre_count
         The position limits at most, and where its own angle is zero.
     count_rad, velocity_unit_rad_per_s, acceleration_unit_rad_per_s2, current_unit_A
@@ -49,23 +49,82 @@ class CountedModel:
     backlash_rad: float | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class ServoAxisSettings(ApproachedAxis):
-    """One axis of the head, as of `ApproachedAxis`; its limits are also the servo's position limits.
+def named_model(find: Callable[[str], CountedModel], names: Iterable[str]) -> ReadBy:
+    """Return what annotates a servo's model, which options give by one of its names.
 
-    Attributes
-    ----------
-    at_close
-        Whether the servo holds when the head is closed, or its torque is switched off (a tilt axis may fall).
-    settle_rad
-        How near to its goal the axis counts as in position.
+    ``find`` raises BadOptions.
     """
 
-    servo_id: int
-    model: CountedModel
-    zero_counts: int
-    at_close: Rest = "hold"
-    settle_rad: float = 0.01
+    def found(name: Any) -> CountedModel:
+        try:
+            return find(str(name))
+        except BadOptions as error:
+            raise problem("", str(error)) from None
+
+    bare = sorted(name.removesuffix("-T") for name in names)
+    letters = {"-": "[-_]"} | {one: f"[{one}{one.lower()}]" for one in map(chr, range(65, 91))}
+    spelt = "|".join("".join(letters.get(one, one) for one in name) for name in bare)
+    pattern = f"^({spelt})([-_][Tt])?([-_][Rr])?$"
+    return ReadBy(found, {"type": "string", "pattern": pattern, "examples": sorted(names)})
+
+
+class ServoAxisSettings(ApproachedAxis):
+    """One axis of the head; its limits are also the servo's position limits."""
+
+    model_config = ConfigDict(populate_by_name=False)
+
+    servo_id: Annotated[int, Field(ge=0, le=252, alias="id")]
+    """The servo's id on the line."""
+    model: InstanceOf[CountedModel]
+    """Which servo."""
+    zero_counts: Annotated[int, Field(ge=-(2**31), le=2**31 - 1)] = ABSENT
+    """The servo's position where the axis is at zero; left out: the middle of its turn."""
+    at_close: Literal["hold", "torque_off"] = "hold"
+    """Whether the servo holds when the head is closed, or its torque is switched off (a tilt axis may
+    fall)."""
+    settle_rad: Annotated[float, Field(gt=0.0, le=0.1)] = ABSENT
+    """How near to its goal the axis is in position, a count or more; left out: three counts, at least
+    0.001."""
+
+    @model_validator(mode="after")
+    def _check_servo(self) -> Self:
+        model = self.model
+        if self.zero_counts is None:
+            object.__setattr__(self, "zero_counts", model.centre_count)
+        if self.settle_rad is None:
+            object.__setattr__(self, "settle_rad", max(0.001, 3 * model.count_rad))
+        if self.settle_rad < model.count_rad:
+            raise problem(
+                "settle_rad",
+                f"{self.settle_rad:g} where a number from {model.count_rad:g} to 0.1 is expected",
+            )
+        self._check_reach()
+        least_rad = model.backlash_rad or 0.0
+        if self.approach != "none" and self.approach_rad <= least_rad:
+            backlash = f"the backlash of a {model.name}, {least_rad:.4f} rad"
+            message = f"{self.approach_rad:g} rad does not take up {backlash}; more is expected"
+            raise problem("approach_rad", message)
+        return self
+
+    def _check_reach(self) -> None:
+        """Refuse limits that the servo cannot hold."""
+        model = self.model
+        low, high = self.limit_counts
+        if low >= high:
+            raise problem(
+                "limits_rad",
+                f"[{self.limits_rad[0]:g}, {self.limits_rad[1]:g}] hold no two counts of a {model.name}, "
+                f"whose count is {model.count_rad:.2g} rad; limits further apart are expected",
+            )
+        if low < model.low_count or high > model.high_count:
+            reach = sorted((self.angle_rad(model.low_count), self.angle_rad(model.high_count)))
+            raise problem(
+                "limits_rad",
+                f"they are the servo's counts {low} to {high}, but a {model.name} in position mode holds "
+                f"{model.low_count} to {model.high_count}, which with zero_counts {self.zero_counts} is "
+                f"{reach[0]:.4f} to {reach[1]:.4f} rad. Mount the horn so that the range does not cross "
+                "the seam",
+            )
 
     def counts(self, angle_rad: float) -> int:
         """Return the nearest count to an angle."""
@@ -73,7 +132,7 @@ class ServoAxisSettings(ApproachedAxis):
 
     def angle_rad(self, counts: float) -> float:
         """Return the angle of a position."""
-        return self.sign * (counts - self.zero_counts) * self.model.count_rad
+        return float(self.sign * (counts - self.zero_counts) * self.model.count_rad)
 
     @property
     def limit_counts(self) -> tuple[int, int]:
@@ -83,24 +142,29 @@ class ServoAxisSettings(ApproachedAxis):
 
     @property
     def slack_counts(self) -> int:
-        """How far beyond a limit an axis that was sent to it may stand: it droops, or dithers."""
+        """How far beyond a limit an axis that was sent to it may be: it droops, or dithers."""
         return max(LEAST_SLACK_COUNTS, math.ceil(self.settle_rad / self.model.count_rad))
 
-    def held_counts(self, name: str, counts: int) -> int:
-        """Return the nearest goal within the limits to where an axis stands.
+    def within_limits(self, counts: int) -> int:
+        """Return the nearest count within the limits."""
+        low, high = self.limit_counts
+        return min(max(counts, low), high)
+
+    def goal_at_place(self, name: str, counts: int) -> int:
+        """Return the nearest goal within the limits to where an axis is.
 
         A few counts beyond a limit are passed (`slack_counts`): an axis that holds at its limit droops, and
-        would be locked out for good. Raises WrongDevice if it stands outside: moving from there could go the
+        would be locked out for good. Raises WrongDevice if it is outside: moving from there could go the
         wrong way round.
         """
         low, high = self.limit_counts
         if not low - self.slack_counts <= counts <= high + self.slack_counts:
             raise WrongDevice(
-                f"{name} stands at {counts} counts ({self.angle_rad(counts):.4f} rad), outside its "
+                f"{name} is at {counts} counts ({self.angle_rad(counts):.4f} rad), outside its "
                 f"limits {low} to {high} ({self.limits_rad[0]:.4f} to {self.limits_rad[1]:.4f} rad): "
                 "with torque off turn it inside by hand, or correct zero_counts or limits_rad"
             )
-        return min(max(counts, low), high)
+        return self.within_limits(counts)
 
     def acceleration_counts(self, acceleration_rad_per_s2: float) -> int:
         """Return a profile acceleration, not below the one given: braking takes no longer than promised."""
@@ -111,202 +175,79 @@ class ServoAxisSettings(ApproachedAxis):
         return max(1, math.floor(speed_rad_per_s / self.model.velocity_unit_rad_per_s + 1e-9))
 
 
-A = TypeVar("A", bound=ServoAxisSettings)
+class HeadSettings(DriverOptions):
+    """A head of two servos on one bus."""
 
+    poll_bytes: ClassVar[int] = 0  # on the wire, of one reading of both servos
 
-@dataclass(frozen=True, kw_only=True)
-class HeadSettings(Generic[A]):
-    """A head of two servos on one bus; a family of servos adds its own.
-
-    Attributes
-    ----------
-    port, baud
-        The line: a serial device or a pyserial URL, and its bits per second.
-    speed_rad_per_s, acceleration_rad_per_s2
-        Of the profile inside the servos; the speed is also the cap of every move.
-    poll_hz
-        How often the servos are read while they move, if no client asks.
-    reply_timeout_s
-        How long a reply may take beyond its time on the wire; a lost one must not trip a watchdog.
-    settle_s
-        How long both axes must stand in position to count as settled.
-    torque_off_at_start
-        Whether torque may be dropped at start-up where permanent settings must be changed.
-    """
-
-    port: str
-    pan: A
-    tilt: A
+    port: Text
+    """The line: a serial device such as /dev/ttyUSB0, or a pyserial URL."""
+    pan: ServoAxisSettings
+    """The pan axis."""
+    tilt: ServoAxisSettings
+    """The tilt axis."""
     baud: int = 1_000_000
-    speed_rad_per_s: float = 1.0
-    acceleration_rad_per_s2: float = 4.0
-    poll_hz: float = 50.0
-    reply_timeout_s: float = 0.05
-    settle_s: float = 0.1
+    """The line's bits per second."""
+    speed_rad_per_s: Annotated[float, Field(ge=0.03, le=10.0)] = 1.0
+    """Of the profile inside the servos, and the cap of every move."""
+    acceleration_rad_per_s2: Annotated[float, Field(ge=0.4, le=1000.0)] = 4.0
+    """Of the profile inside the servos."""
+    poll_hz: Annotated[float, Field(ge=10.0, le=500.0)] = 50.0
+    """How often the servos are read while they move, if no client reads."""
+    reply_timeout_s: Annotated[float, Field(ge=0.002, le=LONGEST_REPLY_S)] = 0.05
+    """How long a reply may take beyond its time on the wire."""
+    settle_s: Annotated[float, Field(ge=0.0, le=5.0)] = 0.1
+    """How long both axes must be in position to count as settled."""
     torque_off_at_start: bool = False
+    """Whether torque may be dropped at start-up where permanent settings must be changed."""
+
+    @model_validator(mode="after")
+    def _check_line(self) -> Self:
+        if self.pan.servo_id == self.tilt.servo_id:
+            raise problem("pan.id", f"{self.pan.servo_id}, as tilt.id; two ids are expected")
+        wire_s = self.poll_bytes * 10 / self.baud
+        if wire_s > 1 / self.poll_hz:
+            raise problem(
+                "baud",
+                f"{self.baud}: reading both servos takes {1000 * wire_s:.1f} ms, too long for "
+                f"poll_hz {self.poll_hz:g}; {math.ceil(self.poll_bytes * 10 * self.poll_hz)} baud or more is "
+                "expected (mastctl servo set-id has --new-baud)",
+            )
+        return self
+
+    def _set_patience(self, key: str, usual_s: float, shortest_s: float) -> None:
+        """Check how long a servo goes on after the last packet (0: for ever), or set the usual time.
+
+        It is short enough for the head to be at rest `STANDS_WITHIN_S` after the last poll, braking included.
+        """
+        speed, acceleration = self.speed_rad_per_s, self.acceleration_rad_per_s2
+        brakes_s = speed / acceleration
+        longest_s = round(STANDS_WITHIN_S - 1 / self.poll_hz - brakes_s, 9)
+        braking = f"braking from {speed:g} rad/s at {acceleration:g} rad/s2 takes {brakes_s:.3g} s"
+        value_s: float | None = getattr(self, key)
+        if longest_s < shortest_s and value_s != 0:
+            least = speed / (STANDS_WITHIN_S - 1 / self.poll_hz - shortest_s)
+            raise problem(
+                "acceleration_rad_per_s2",
+                f"{acceleration:g}: {braking}, so that no {key} stops the head within {STANDS_WITHIN_S:g} s "
+                f"in all; {least:.3g} or more, a lower speed_rad_per_s, or {key}: 0 to do without is "
+                "expected",
+            )
+        if value_s is None:
+            object.__setattr__(self, key, min(usual_s, longest_s))
+        elif value_s and not shortest_s <= value_s <= longest_s:
+            raise problem(
+                key,
+                f"{value_s:.3g} s, and {braking}; {shortest_s:g} to {longest_s:.3g} s, which with the last "
+                f"poll's age is {STANDS_WITHIN_S:g} s in all, or 0 to do without is expected",
+            )
 
     @property
     def resting_poll_s(self) -> float:
-        """How often servos that stand are read, seconds."""
+        """How often servos at rest are read, seconds."""
         return max(1 / self.poll_hz, RESTING_POLL_S)
 
     @property
     def silence_s(self) -> float:
         """How long nothing may be sent so that both axes have stopped by themselves; 0 if they never do."""
         return 0.0
-
-
-AXIS_KEYS = (
-    "id", "model", "zero_counts", "sign", "limits_rad", "approach", "approach_rad", "gravity_turnover_rad",
-    "at_close", "settle_rad",
-)  # fmt: skip
-"""What the options of an axis hold, whatever the servo."""
-
-
-def axis_values(
-    options: OptionReader, name: str, model_named: Callable[[str], CountedModel], more: tuple[str, ...] = ()
-) -> tuple[OptionReader, Mapping[str, Any]]:
-    """Return the reader of an axis' options, and the values of `AXIS_KEYS` as `ServoAxisSettings` has them.
-
-    Raises BadOptions for an unknown or missing key or a value that cannot be.
-
-    Parameters
-    ----------
-    name
-        ``pan`` or ``tilt``.
-    model_named
-        Finds a model; raises BadOptions.
-    """
-    expected = "a mapping with id, model, zero_counts ..."
-    read = options.section(name, expected, (*AXIS_KEYS, *more), ("id", "model", "limits_rad"))
-    try:
-        model = model_named(read.values["model"])
-    except BadOptions as error:
-        raise read.refused("model", f": {error}") from None
-    limits_rad = read.pair("limits_rad", "[low, high] in radians")
-    if not limits_rad[0] < limits_rad[1]:
-        raise read.bad("limits_rad", "[low, high] with low below high")
-    return read, {
-        "servo_id": read.whole("id", 1, 0, 252),
-        "model": model,
-        "zero_counts": read.whole("zero_counts", model.centre_count, -(2**31), 2**31 - 1),
-        "limits_rad": limits_rad,
-        "sign": read.one_of("sign", 1, (1, -1)),
-        "approach": read.one_of("approach", "none", APPROACHES),
-        "approach_rad": read.number("approach_rad", 0.0, 0.0, 0.5),
-        "gravity_turnover_rad": read.number("gravity_turnover_rad", math.pi / 2, -math.pi, math.pi),
-        "at_close": read.one_of("at_close", "hold", ("hold", "torque_off")),
-        "settle_rad": read.number("settle_rad", max(0.001, 3 * model.count_rad), model.count_rad, 0.1),
-    }
-
-
-def head_values(
-    read: OptionReader, axis: Callable[[OptionReader, str], A], most_poll_hz: float, steepest: float
-) -> dict[str, Any]:
-    """Return the values of a head's options as `HeadSettings` has them, without baud and patience.
-
-    Raises BadOptions for a value that cannot be.
-
-    Parameters
-    ----------
-    most_poll_hz, steepest
-        Bounds of ``poll_hz`` and ``acceleration_rad_per_s2``.
-    """
-    values = {
-        "port": read.text("port", "a serial device such as /dev/ttyUSB0 or a URL"),
-        "pan": axis(read, "pan"),
-        "tilt": axis(read, "tilt"),
-        "poll_hz": read.number("poll_hz", 50.0, 10.0, most_poll_hz),
-        "speed_rad_per_s": read.number("speed_rad_per_s", 1.0, 0.03, 10.0),
-        "acceleration_rad_per_s2": read.number("acceleration_rad_per_s2", 4.0, 0.4, steepest),
-        "settle_s": read.number("settle_s", 0.1, 0.0, 5.0),
-        "torque_off_at_start": read.flag("torque_off_at_start", False),
-    }
-    number = values["pan"].servo_id
-    if number == values["tilt"].servo_id:
-        raise BadOptions(f"options.pan.id and options.tilt.id are both {number}, expected two ids")
-    return values
-
-
-def check_polling(read: OptionReader, baud: int, poll_hz: float, poll_bytes: int) -> None:
-    """Refuse bits per second that are too few to read both servos as often as is asked."""
-    wire_s = poll_bytes * 10 / baud
-    if wire_s > 1 / poll_hz:
-        raise read.refused(
-            "baud",
-            f" {baud}: reading both servos takes {1000 * wire_s:.1f} ms, too long for "
-            f"poll_hz {poll_hz:g}; expected {math.ceil(poll_bytes * 10 * poll_hz)} baud or more "
-            "(mastctl servo set-id has --new-baud)",
-        )
-
-
-def patience_s(
-    read: OptionReader, head: Mapping[str, Any], key: str, usual_s: float, shortest_s: float
-) -> float:
-    """Return how long a servo goes on after the last packet; 0: for ever.
-
-    It is short enough for the head to stand `STANDS_WITHIN_S` after the last poll, braking included. Raises
-    BadOptions if it is too long, or none is short enough.
-    """
-    speed, acceleration = head["speed_rad_per_s"], head["acceleration_rad_per_s2"]
-    brakes_s = speed / acceleration
-    longest_s = round(STANDS_WITHIN_S - 1 / head["poll_hz"] - brakes_s, 9)
-    braking = f"braking from {speed:g} rad/s at {acceleration:g} rad/s2 takes {brakes_s:.3g} s"
-    if longest_s < shortest_s and read.values.get(key) != 0:
-        least = speed / (STANDS_WITHIN_S - 1 / head["poll_hz"] - shortest_s)
-        raise read.refused(
-            "acceleration_rad_per_s2",
-            f" is {acceleration:g}: {braking}, so that no {key} stops the head within {STANDS_WITHIN_S:g} s "
-            f"in all; expected {least:.3g} or more, a lower speed_rad_per_s, or {key}: 0 to do without",
-        )
-    value: float = read.number(key, min(usual_s, longest_s), 0.0, STANDS_WITHIN_S)
-    if value and not shortest_s <= value <= longest_s:
-        raise read.refused(
-            key,
-            f" is {value:.3g} s, and {braking}; expected {shortest_s:g} to {longest_s:.3g} s, which with the "
-            f"last poll's age is {STANDS_WITHIN_S:g} s in all, or 0 to do without",
-        )
-    return value
-
-
-def check_axis(read: OptionReader, axis: ServoAxisSettings) -> None:
-    """Refuse limits that the servo cannot hold, and an approach that takes no backlash up."""
-    _check_reach(read, axis)
-    _check_approach(read, axis)
-
-
-def _check_reach(read: OptionReader, axis: ServoAxisSettings) -> None:
-    """Refuse limits that the servo cannot hold."""
-    model = axis.model
-    low, high = axis.limit_counts
-    if low >= high:
-        raise read.refused(
-            "limits_rad",
-            f" [{axis.limits_rad[0]:g}, {axis.limits_rad[1]:g}] hold no two counts of a {model.name}, whose "
-            f"count is {model.count_rad:.2g} rad; expected limits further apart",
-        )
-    if low < model.low_count or high > model.high_count:
-        reach = sorted((axis.angle_rad(model.low_count), axis.angle_rad(model.high_count)))
-        raise read.refused(
-            "limits_rad",
-            f" are the servo's counts {low} to {high}, but a {model.name} in position mode holds "
-            f"{model.low_count} to {model.high_count}, which with zero_counts {axis.zero_counts} is "
-            f"{reach[0]:.4f} to {reach[1]:.4f} rad. Mount the horn so that the range does not cross the seam",
-        )
-
-
-def _check_approach(read: OptionReader, axis: ServoAxisSettings) -> None:
-    """Refuse an approach that takes no backlash up."""
-    if (axis.approach == "none") != (axis.approach_rad == 0.0):
-        raise read.refused(
-            "approach",
-            f" is {axis.approach!r} with approach_rad {axis.approach_rad:g}; expected a stretch above zero "
-            "with a side, and neither or both",
-        )
-    least = axis.model.backlash_rad or 0.0
-    if axis.approach != "none" and axis.approach_rad <= least:
-        raise read.refused(
-            "approach_rad",
-            f" {axis.approach_rad:g} rad does not take up the backlash of a {axis.model.name}, "
-            f"{least:.4f} rad; expected more",
-        )

@@ -33,7 +33,7 @@ from drivers.errors import BadOptions, NoFreshFrame
 from drivers.faults import FaultPanel, nearest
 from drivers.interfaces import PanTilt
 from drivers.sim.bench_boards import BenchBoard, BenchBoards, checked, facing, placed_board
-from drivers.sim.camera_settings import ClockSettings, check_cameras
+from drivers.sim.camera_settings import ClockSettings
 from drivers.sim.cameras import SelfExposedCamera, SimulatedCamera
 from drivers.sim.heads import with_joints
 from drivers.sim.kept_scenes import kept_scene
@@ -93,8 +93,10 @@ class RoverModel:
             for name, camera in self.rig.cameras.items()
         }
         for name, mode in settings.sensor_modes.items():
-            self._set_mode(name, mode)
-        check_cameras(settings.camera, max(c.model.size_px[1] for c in self.rig.cameras.values()))
+            self._set_mode(name, mode.mode)
+        rows = max(c.model.size_px[1] for c in self.rig.cameras.values())
+        if misfit := settings.camera.misfit(rows):
+            raise BadOptions(f"simulation.cameras: {misfit}")
         self.settings = settings
         self.site_from_rover = Rigid.identity()
         for name in settings.clocks:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
 
 from calib.files.records import Text, problem
-from drivers.options import DriverOptions, TwoWholes, check_in_frame, named_values, one_of, read_options
+from drivers.options import DriverOptions, check_in_frame, named_values, one_of, read_options, wholes
 from drivers.pixels import FORMATS
 from drivers.v4l2.exposure import AutoExposureSettings
 from drivers.v4l2.find import Address, check_address
@@ -41,7 +41,7 @@ class CameraOptions(DriverOptions):
     """Or its card name, its bus, or both, as mastctl camera list shows them."""
     format: Format = "YUYV"
     """Requested of the camera; its answer is checked."""
-    size_px: Annotated[tuple[int, int], TwoWholes(1, 16384)] = (640, 480)
+    size_px: Annotated[tuple[int, int], wholes(2, 1, 16384)] = (640, 480)
     """As in the mast file."""
     rate_hz: Annotated[float, Field(ge=0.1, le=1000.0)] | None = 30.0
     """Frames per second; null leaves the camera's."""

@@ -9,7 +9,7 @@ import pytest
 from drivers.absent import Absence
 from drivers.dynamixel.servo import Reboots
 from drivers.errors import BadOptions, LineLost
-from drivers.options import OptionReader
+from drivers.flir_ptu.options import options_from
 
 
 def test_each_failed_try_waits_longer_until_the_device_is_back() -> None:
@@ -42,6 +42,6 @@ def test_servos_are_rebooted_three_times_in_ten_minutes_and_no_more() -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 10**400, -(10**400), True, "1", None, [1.0]])
 def test_what_is_no_finite_number_is_refused_in_words(value: object) -> None:
-    read = OptionReader({"speed": value}, ("speed",), place="options.pan.")
-    with pytest.raises(BadOptions, match=r"options\.pan\.speed is .*, expected a number from 0 to 1"):
-        read.number("speed", None, 0.0, 1.0)
+    ends = {"limits_rad": [-0.1, 0.1]}
+    with pytest.raises(BadOptions, match=r"options\.pan\.approach_rad: .* where a number.* is expected"):
+        options_from({"port": "/dev/x", "pan": {**ends, "approach_rad": value}, "tilt": ends})

@@ -99,9 +99,13 @@ def test_a_factory_from_outside_gets_the_options_as_keywords(outside: None) -> N
 @pytest.mark.parametrize(
     ("driver", "options", "message"),
     [
-        ("dynamixel", {}, "options.port is missing"),
-        ("flir_ptu", {"prot": "x"}, "options.prot: there is no such option; did you mean 'port'"),
-        ("flir_ptu", {"port": "/dev/x", "pan": 1, "tilt": {}}, "options.pan is 1, expected a mapping with"),
+        ("dynamixel", {}, "options.port: the key is missing"),
+        ("flir_ptu", {"prot": "x"}, "options.prot: unknown key; the nearest known is 'port'"),
+        (
+            "flir_ptu",
+            {"port": "/dev/x", "pan": 1, "tilt": {}},
+            "options.pan: 1 where a mapping with limits_rad, .* is expected",
+        ),
     ],
 )
 def test_options_of_the_real_heads_are_refused_by_name(

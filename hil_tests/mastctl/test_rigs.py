@@ -19,7 +19,7 @@ from mastctl.daemon import RunningDaemon
 
 RIGS = Path(__file__).resolve().parents[2] / "configs" / "rigs"
 NAMES = sorted(one.stem for one in RIGS.glob("*.yaml") if not one.stem.endswith("_mast"))
-HEADS = {"dynamixel": dynamixel_settings, "flir_ptu": ptu_options}
+HEADS: dict[str, Any] = {"dynamixel": dynamixel_settings, "flir_ptu": ptu_options}
 STAND_INS = {"dynamixel": "dynamixel_x", "flir_ptu": "ptu_d46_70"}
 
 

@@ -19,13 +19,14 @@ from unittest.mock import patch
 
 from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.head import DynamixelHead
-from drivers.dynamixel.settings import LONGEST_REPLY_S, dynamixel_settings
+from drivers.dynamixel.settings import dynamixel_settings
 from drivers.faults import FaultPanel
 from drivers.feetech.head import FeetechHead, feetech_settings
 from drivers.flir_ptu import conversation
 from drivers.flir_ptu.head import open_head as open_flir_ptu
 from drivers.interfaces import PanTilt
 from drivers.serial_line import OpenLine, SerialLine
+from drivers.servo_bus.settings import LONGEST_REPLY_S
 from drivers.sim.axis import AxisSettings
 from drivers.sim.heads import HeadModel
 from drivers.sim.pan_tilt import SimulatedPanTilt
@@ -135,7 +136,7 @@ def dynamixel(
         }  # fmt: skip
         found = dynamixel_settings(options)
         if not (turned or watchdog_s):
-            found = replace(found, reply_timeout_s=PATIENT_S)
+            found = found.model_copy(update={"reply_timeout_s": PATIENT_S})
         head = DynamixelHead(found, clock, opens)
         stack.callback(head.close)
         yield HeadRig("Dynamixel", head, clock, panel, _truth(axes), X_COUNT_RAD, line, sent)
@@ -169,7 +170,7 @@ def feetech(
         }  # fmt: skip
         found = feetech_settings(options)
         if not (turned or lease_s):
-            found = replace(found, reply_timeout_s=PATIENT_S)
+            found = found.model_copy(update={"reply_timeout_s": PATIENT_S})
         head = FeetechHead(found, clock, opens)
         stack.callback(head.close)
         count_rad = head.settings.pan.model.count_rad

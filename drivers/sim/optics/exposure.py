@@ -11,9 +11,12 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
+from drivers.options import DriverOptions
 from drivers.sim.optics.lens import Float32
 
 FRAMES_KEPT = 64
@@ -26,39 +29,32 @@ MOST_STEP = 4.0
 """A loop changes by no more than this factor a frame."""
 
 
-@dataclass(frozen=True)
-class ExposureSettings:
-    """The ``exposure`` of every camera of a simulation.
+class ExposureSettings(DriverOptions):
+    """The ``exposure`` of every camera of a simulation."""
 
-    Attributes
-    ----------
-    reference_s
-        The exposure time that gives the scene its own brightness, at gain 1; grey levels grow with time and
-        gain. 0: they do not.
-    auto
-        Whether the camera sets time and gain itself, from ``exposure_s`` on.
-    share
-        Of the way there, in its logarithm, that a frame's decision goes.
-    lag_frames
-        From the frame that is metered to the first one with what was decided.
-    shortest_s, longest_s
-        Bounds of the time; gain rises where the longest is too short.
-    day_s, night_share
-        Length of a day that the run begins at noon of, and the brightness of midnight over that of noon; 0:
-        it stays noon.
-    """
-
-    reference_s: float = 0.0
-    gain: float = 1.0
+    reference_s: Annotated[float, Field(ge=0.0, le=1e3)] = 0.0
+    """The exposure time that gives the scene its own brightness, at gain 1; grey levels grow with time and
+    gain. 0: they do not."""
+    gain: Annotated[float, Field(ge=1.0, le=64.0)] = 1.0
+    """At the start."""
     auto: bool = False
-    target_dn: float = 110.0
-    share: float = 0.5
-    lag_frames: int = 2
-    shortest_s: float = 0.0001
-    longest_s: float = 0.03
-    most_gain: float = 8.0
-    day_s: float = 0.0
-    night_share: float = 0.1
+    """Whether the camera sets time and gain itself, from ``exposure_s`` on."""
+    target_dn: Annotated[float, Field(ge=10.0, le=245.0)] = 110.0
+    """The grey level that it aims at."""
+    share: Annotated[float, Field(ge=0.01, le=1.0)] = 0.5
+    """Of the way there, in its logarithm, that a frame's decision goes."""
+    lag_frames: Annotated[int, Field(ge=1, le=8)] = 2
+    """From the frame that is metered to the first one with what was decided."""
+    shortest_s: Annotated[float, Field(ge=1e-6, le=10.0)] = 0.0001
+    """The shortest time."""
+    longest_s: Annotated[float, Field(ge=0.0, le=1e3)] = 0.03
+    """The longest time; gain rises where it is too short."""
+    most_gain: Annotated[float, Field(ge=1.0, le=64.0)] = 8.0
+    """The highest gain."""
+    day_s: Annotated[float, Field(ge=0.0, le=1e7)] = 0.0
+    """Length of a day that the run begins at noon of; 0: it stays noon."""
+    night_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
+    """The brightness of midnight over that of noon."""
 
     def daylight(self, passed_s: float) -> float:
         """Return the brightness of a moment over that of noon."""

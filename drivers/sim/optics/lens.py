@@ -14,13 +14,16 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
+from drivers.options import DriverOptions
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -51,31 +54,23 @@ def pixels_of(x_px: Float64, y_px: Float64) -> Float64:
     return np.stack(np.meshgrid(x_px, y_px), axis=-1)
 
 
-@dataclass(frozen=True)
-class LensSettings:
-    """The ``lens`` of every camera of a simulation.
+class LensSettings(DriverOptions):
+    """The ``lens`` of every camera of a simulation."""
 
-    Attributes
-    ----------
-    falloff
-        Power of the cosine of a ray's angle to the axis by which it is dimmed: 4 by geometry, 0 for none.
-    f_number
-        Focal length over aperture; 0: a pinhole.
-    focus_m
-        Distance of what is sharp, along the axis; 0: infinitely far.
-    pitch_um
-        From pixel to pixel; with a model's focal length in pixels it makes that in metres.
-    dust_gap_um
-        From the window to the pixels.
-    """
-
-    falloff: float = 0.0
-    f_number: float = 0.0
-    focus_m: float = 0.0
-    pitch_um: float = 12.0
-    dust: int = 0
-    dust_um: float = 60.0
-    dust_gap_um: float = 1000.0
+    falloff: Annotated[float, Field(ge=0.0, le=8.0)] = 0.0
+    """Power of the cosine of a ray's angle to the axis by which it is dimmed: 4 by geometry, 0 for none."""
+    f_number: Annotated[float, Field(ge=0.0, le=1e3)] = 0.0
+    """Focal length over aperture; 0: a pinhole."""
+    focus_m: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
+    """Distance of what is sharp, along the axis; 0: infinitely far."""
+    pitch_um: Annotated[float, Field(ge=0.5, le=50.0)] = 12.0
+    """From pixel to pixel; with a model's focal length in pixels it makes that in metres."""
+    dust: Annotated[int, Field(ge=0, le=500)] = 0
+    """Specks on the window."""
+    dust_um: Annotated[float, Field(ge=1.0, le=1000.0)] = 60.0
+    """Their diameter."""
+    dust_gap_um: Annotated[float, Field(ge=0.0, le=10_000.0)] = 1000.0
+    """From the window to the pixels."""
 
 
 @dataclass(frozen=True)

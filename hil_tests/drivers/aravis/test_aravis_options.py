@@ -16,7 +16,7 @@ from drivers.errors import BadOptions
     [
         ({}, "serial, address or id is expected"),
         ({"address": "camera.local"}, "address: 'camera.local', expected an IPv4 address"),
-        ({"serial": "1", "format": "mono8"}, "format: 'mono8', which this driver does not read"),
+        ({"serial": "1", "format": "mono8"}, "format: 'mono8', which this driver does not know"),
         ({"serial": "1", "exposure_s": 0.05}, "longer than a frame at rate_hz 30"),
         ({"serial": "1", "trigger_source": "Line1", "rate_hz": 10}, "rate_hz: stands beside trigger_source"),
         ({"serial": "1", "trigger_source": "Software"}, "'Software', expected an input line"),

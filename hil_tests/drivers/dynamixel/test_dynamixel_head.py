@@ -215,7 +215,7 @@ def test_resting_servos_are_read_often_enough_for_their_watchdog() -> None:
         it.until(lambda: len(it.ear.heard) > before + 40, "two seconds of polls")
         assert 1.0 < it.now_s() - began_s < 3.0
         for reply_timeout_s in (0.01, 0.05, 0.2):
-            patient = replace(head.settings, watchdog_s=0.3, reply_timeout_s=reply_timeout_s)
+            patient = head.settings.model_copy(update={"watchdog_s": 0.3, "reply_timeout_s": reply_timeout_s})
             assert patient.resting_poll_s + reply_timeout_s + QUIET_S < 0.3  # one reply may be lost
 
 

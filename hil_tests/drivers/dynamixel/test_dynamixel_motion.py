@@ -149,13 +149,13 @@ def test_a_position_that_leaps_is_refused() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"id": 2}, "are both 2"),
+        ({"id": 2}, "2, as tilt.id; two ids are expected"),
         ({"limits_rad": [-3.2, 2.0]}, "does not cross the seam"),
         ({"approach": "positive", "approach_rad": 0.004}, "does not take up the backlash"),
         ({"model": "YM070-210-M001-RH"}, "which the Y family's are not"),
         ({"model": "XW540-T260-R"}, "(model number 1170); mastctl servo info reads it. Needed is a row"),
         ({"model": "MX-28", "current_limit_A": 1.0}, "has no current limit"),
-        ({"current_limit_A": 3.3}, "expected 0.00269 to 3.209 A for a XM430-W350"),
+        ({"current_limit_A": 3.3}, "0.00269 to 3.209 A for a XM430-W350 is expected"),
         ({"limits_rad": [0.1, 0.1012]}, "hold no two counts of a XM430-W350, whose count is 0.0015 rad"),
     ],
 )
@@ -170,9 +170,9 @@ def test_options_that_cannot_be_are_refused_in_words(change: dict[str, Any], wor
     [
         ({"baud": 57600}, "too long for poll_hz 50"),
         ({"watchdog_s": 0.3}, "braking from 1 rad/s at 4 rad/s2 takes 0.25 s"),
-        ({"reply_timeout_s": 0.2}, "one lost reply would stop the head; expected 0.18 s or less"),
+        ({"reply_timeout_s": 0.2}, "one lost reply would stop the head; 0.18 s or less is expected"),
         ({"reply_timeout_s": 0.185, "watchdog_s": 0.23}, "which the servos count as 0.22 s"),
-        ({"speed_rad_s": 1}, "did you mean 'speed_rad_per_s'"),
+        ({"speed_rad_s": 1}, "the nearest known is 'speed_rad_per_s'"),
     ],
 )
 def test_options_of_the_head_that_cannot_be_are_refused(change: dict[str, Any], words: str) -> None:

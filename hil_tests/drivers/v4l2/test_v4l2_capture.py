@@ -370,7 +370,7 @@ def test_a_given_frame_does_not_change_with_its_buffer(bench: Bench, camera: V4l
         ({}, "'device', 'card' or 'bus' is expected"),
         ({"device": "/dev/video0"}, "/dev/video0 is a number that changes when cameras are plugged in"),
         ({"device": "/dev/v4l/by-id/a", "card": "b"}, "options.device: stands beside card or bus"),
-        ({"card": "a", "format": "H264"}, "options.format: 'H264', which this driver does not read"),
+        ({"card": "a", "format": "H264"}, "options.format: 'H264', which this driver does not know"),
         (
             {"card": "a", "size_px": [640]},
             r"options.size_px: \[640\], expected two whole numbers from 1 to 16384",

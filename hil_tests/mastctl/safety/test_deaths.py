@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from calib.files.mast_file import save_rig
-from drivers.dynamixel.settings import LONGEST_REPLY_S
+from drivers.servo_bus.settings import LONGEST_REPLY_S
 from hil_tests import forks
 from hil_tests.mastctl.outside_daemon import Pipe, daemon_process, free_port, line
 from hil_tests.mastctl.service_fakes import rig

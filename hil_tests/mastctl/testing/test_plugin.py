@@ -107,7 +107,7 @@ def test_what_is_not_said_is_quick_and_what_is_said_holds(tmp_path: Path) -> Non
 REFUSED = {
     'mark("x")': "takes keywords only, found 'x'",
     "mark(picture_width_px=5)": "picture_width_px is 5, expected a whole number",
-    "mark(sped=2)": "simulation.sped: there is no such option; did you mean 'speed'",
+    "mark(sped=2)": "simulation.sped: unknown key; the nearest known is 'speed'",
     "mark(config='nowhere.yaml')": "nowhere.yaml",
 }
 
