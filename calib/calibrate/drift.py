@@ -26,7 +26,7 @@ from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
 from calib.geometry.significance import MEDIAN_OF_TWO, chance, sigmas
 from calib.matching.patch import match_patch
 from calib.matching.verdict import MatchSettings
-from calib.matching.warp import Grey, facing_plane
+from calib.matching.warp import Grey, PosedImage, facing_plane
 
 ALARM_SIGMAS = 6.0
 """A change is reported from here on, if two looks one after the other say so."""
@@ -306,7 +306,9 @@ def seen_again(camera: CameraModel, then: Grey, now: Grey) -> tuple[FloatArray, 
             continue
         try:
             plane = facing_plane(camera, corner, _RANGE_M)
-            match = match_patch(then, camera, corner, plane, now, camera, SEARCH_PX, _SETTINGS)
+            match = match_patch(
+                PosedImage(then, camera), corner, plane, PosedImage(now, camera), SEARCH_PX, _SETTINGS
+            )
         except CalibError:
             continue
         if match.verdict == "good":

@@ -15,13 +15,12 @@ from typing import Literal
 
 import numpy as np
 
-from calib.geometry.cahvor import CameraModel
 from calib.geometry.handoff import Handoff, PredictedPixel
 from calib.geometry.rigid import FloatArray
 from calib.matching.partner import find_partner
 from calib.matching.patch import match_patch
 from calib.matching.verdict import MatchSettings, PatchMatch
-from calib.matching.warp import Grey, Plane
+from calib.matching.warp import Plane, PosedImage
 
 RefinedVerdict = Literal["accepted", "ambiguous", "flat", "occluded", "unseen"]
 
@@ -63,14 +62,6 @@ class RefineSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Eye:
-    """A picture (h, w) grey, and its camera at that moment in the rover frame."""
-
-    image: Grey
-    camera: CameraModel
-
-
-@dataclass(frozen=True, eq=False)
 class RefinedPixel:
     """Where a destination camera sees the target, by its picture.
 
@@ -97,9 +88,9 @@ class RefinedPixel:
 
 def refine_handoff(
     handoff: Handoff,
-    source: tuple[Eye, Eye],
+    source: tuple[PosedImage, PosedImage],
     clicks_px: FloatArray,
-    destinations: Mapping[str, Eye],
+    destinations: Mapping[str, PosedImage],
     settings: RefineSettings | None = None,
     match_settings: MatchSettings | None = None,
 ) -> dict[str, RefinedPixel]:
@@ -137,11 +128,14 @@ def refine_handoff(
 
 
 def _surface(
-    source: tuple[Eye, Eye], clicks_px: FloatArray, sizes: MatchSettings, settings: RefineSettings
+    source: tuple[PosedImage, PosedImage],
+    clicks_px: FloatArray,
+    sizes: MatchSettings,
+    settings: RefineSettings,
 ) -> Plane | RefinedPixel:
     """The surface around the target from the source pair, or why there is none."""
     left, right = source
-    found = find_partner(left.image, left.camera, clicks_px[0], right.image, right.camera, settings=sizes)
+    found = find_partner(left, clicks_px[0], right, settings=sizes)
     if found.match.verdict != "good" or found.plane is None:
         return _none(_WORDS[found.match.verdict], f"in the source pair: {found.match.reason}")
     apart = found.match.pixel_px - clicks_px[1]
@@ -156,10 +150,10 @@ def _surface(
 
 
 def _looked_up(
-    source: Eye,
+    source: PosedImage,
     pixel_px: FloatArray,
     surface: Plane,
-    eye: Eye,
+    eye: PosedImage,
     predicted: PredictedPixel,
     settings: RefineSettings,
     sizes: MatchSettings,
@@ -167,9 +161,7 @@ def _looked_up(
     """Search one destination picture."""
     search = settings.sigmas * math.sqrt(float(np.linalg.eigvalsh(predicted.search_px2)[-1]))
     search = min(max(search, settings.least_px), settings.most_px)
-    found: PatchMatch = match_patch(
-        source.image, source.camera, pixel_px, surface, eye.image, eye.camera, search, sizes
-    )
+    found: PatchMatch = match_patch(source, pixel_px, surface, eye, search, sizes)
     scores = (found.correlation, found.second)
     if not _whole_window(found, eye, search):
         edge = f"part of the {search:.0f} px around the hand-off's pixel where it may be lies at the border"
@@ -193,7 +185,7 @@ def _looked_up(
     return RefinedPixel("accepted", "", found.pixel_px, found.covariance_px2, off, *scores)
 
 
-def _whole_window(found: PatchMatch, eye: Eye, search_px: float) -> bool:
+def _whole_window(found: PatchMatch, eye: PosedImage, search_px: float) -> bool:
     """Return whether the patch fits into the picture wherever in the window the target is."""
     reach = search_px + found.half_px
     size = np.array(eye.camera.size_px)

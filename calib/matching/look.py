@@ -28,7 +28,6 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import MOST_SIGMAS
 from calib.geometry.rigid import FloatArray, Rigid, moved_rigid
 from calib.geometry.significance import Level, chance, sigmas
-from calib.matching.handoff import Eye
 from calib.matching.partner import find_partner
 from calib.matching.patch import match_patch
 from calib.matching.track import (
@@ -45,7 +44,7 @@ from calib.matching.track import (
     outgrown,
 )
 from calib.matching.verdict import PatchMatch
-from calib.matching.warp import Plane
+from calib.matching.warp import Plane, PosedImage
 
 STEPS = 20
 """Gauss-Newton steps at most: near a camera the first ones are long..."""
@@ -198,7 +197,7 @@ class TrackLook:
     doubt: PoseDoubt | None = None
 
 
-def seen_by(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings | None = None) -> TrackLook:
+def seen_by(track: Track, eyes: Mapping[str, PosedImage], settings: TrackSettings | None = None) -> TrackLook:
     """Look for the target in one or two new pictures, and update the track.
 
     Parameters
@@ -217,7 +216,9 @@ def seen_by(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings | Non
     return look
 
 
-def _seen_elsewhere(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings) -> PoseDoubt | None:
+def _seen_elsewhere(
+    track: Track, eyes: Mapping[str, PosedImage], settings: TrackSettings
+) -> PoseDoubt | None:
     """What a wider window shows of a target that is not where the motion since the last look put it.
 
     Both cameras must know the key picture well and mean one point. The target stays lost all the same: so far
@@ -237,14 +238,17 @@ def _seen_elsewhere(track: Track, eyes: Mapping[str, Eye], settings: TrackSettin
 
 
 def _by_pictures(
-    start_m: FloatArray, good: Mapping[str, PatchMatch], eyes: Mapping[str, Eye], settings: TrackSettings
+    start_m: FloatArray,
+    good: Mapping[str, PatchMatch],
+    eyes: Mapping[str, PosedImage],
+    settings: TrackSettings,
 ) -> OnePoint | None:
     """The point that pixels mean without the prediction; ``chi2`` says how badly they meet."""
     sightings = [PixelSighting(eyes[n].camera, m.pixel_px, m.covariance_px2) for n, m in good.items()]
     return one_point(start_m, UNKNOWN_M**2 * np.eye(3), sightings, settings.model_px)
 
 
-def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings) -> TrackLook:
+def _seen(track: Track, eyes: Mapping[str, PosedImage], settings: TrackSettings) -> TrackLook:
     """Look with the track's key."""
     key = anchored(track)
     if key is None:
@@ -297,7 +301,7 @@ def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings) -> Tra
 
 
 def _matched(
-    track: Track, key: KeyPicture, plane: Plane, eyes: Mapping[str, Eye], settings: TrackSettings
+    track: Track, key: KeyPicture, plane: Plane, eyes: Mapping[str, PosedImage], settings: TrackSettings
 ) -> tuple[dict[str, PatchMatch], Plane | None]:
     """Look in every picture by the key; return also the surface of a camera asked by the other."""
     found = {name: _found(track, key, plane, eye, settings) for name, eye in eyes.items()}
@@ -335,19 +339,19 @@ def _turned(track: Track, position_m: FloatArray) -> Rigid:
     return moved_rigid(Rigid.identity(), error)
 
 
-def _found(track: Track, key: KeyPicture, plane: Plane, eye: Eye, settings: TrackSettings) -> PatchMatch:
+def _found(
+    track: Track, key: KeyPicture, plane: Plane, eye: PosedImage, settings: TrackSettings
+) -> PatchMatch:
     """Look in one picture, in the window that the prediction's covariance asks for."""
     _, rate, valid = eye.camera.project_jacobian(track.position_m)
     spread = rate @ track.covariance_m2 @ rate.T if bool(valid) else np.eye(2)
     reach = settings.sigmas * math.sqrt(max(float(np.linalg.eigvalsh(spread)[-1]), 0.0))
     search = min(max(reach + 2 * settings.model_px, settings.least_px), settings.most_px)
-    return match_patch(
-        key.eye.image, key.eye.camera, key.pixel_px, plane, eye.image, eye.camera, search, SIZES
-    )
+    return match_patch(key.view, key.pixel_px, plane, eye, search, SIZES)
 
 
 def _asked_the_other(
-    found: Mapping[str, PatchMatch], eyes: Mapping[str, Eye]
+    found: Mapping[str, PatchMatch], eyes: Mapping[str, PosedImage]
 ) -> tuple[dict[str, PatchMatch], Plane | None]:
     """Look from the camera that found the target into the one that did not; return also its surface.
 
@@ -358,7 +362,7 @@ def _asked_the_other(
     seen = next(name for name, one in found.items() if one.verdict == "good")
     other = next(name for name in found if name != seen)
     one, two = eyes[seen], eyes[other]
-    partner = find_partner(one.image, one.camera, found[seen].pixel_px, two.image, two.camera, settings=SIZES)
+    partner = find_partner(one, found[seen].pixel_px, two, settings=SIZES)
     if partner.match.verdict != "good" or partner.plane is None:
         return dict(found), None
     on_plane = on_surface(found[seen].covariance_px2, one.camera, partner.plane)

@@ -22,7 +22,7 @@ from calib.matching.patch import match_patch
 from calib.matching.relief import surface_seen
 from calib.matching.sweep import Swept, sweep
 from calib.matching.verdict import MatchSettings, PatchMatch, no_match, rivalled, worst_px2
-from calib.matching.warp import GRAZING, SIDES, Grey, Plane, PosedImage, Relief, carry
+from calib.matching.warp import GRAZING, SIDES, Plane, PosedImage, Relief, carry
 
 LAST_SEARCH_PX = 4.0
 
@@ -38,13 +38,11 @@ class StereoMatch:
     Attributes
     ----------
     match
-        The partner pixel with its verdict; nothing below counts unless it is ``good``.
-    plane
-        The local surface: a plane that fits what both cameras see near the pixel.
+        The partner pixel with its verdict; nothing below is valid unless it is ``good``.
+    plane, relief
+        A plane that fits what both cameras see near the pixel, and what stands off it.
     across_px, across_sigma_px
         Distance of the partner from the epipolar line, signed, and one sigma of the matching alone.
-    relief
-        The relief off the plane around the pixel, and the pixels that belong to no surface there.
     """
 
     match: PatchMatch
@@ -55,31 +53,16 @@ class StereoMatch:
 
 
 def find_partner(
-    image: Grey,
-    camera: CameraModel,
+    own: PosedImage,
     pixel_px: ArrayLike,
-    partner_image: Grey,
-    partner: CameraModel,
+    partner: PosedImage,
     nearest_m: float = 0.4,
     settings: MatchSettings | None = None,
 ) -> StereoMatch:
-    """Find where the partner sees what the camera sees at a pixel.
+    """Find where the partner shows what the own image, of the same moment, shows at a pixel (2,).
 
-    Parameters
-    ----------
-    image, partner_image
-        (h, w) float32 grey of one moment.
-    camera, partner
-        Their models in one common frame with z down.
-    pixel_px
-        (2,) the target in ``image``, sub-pixel.
-    nearest_m
-        Where the sweep starts, metres.
-
-    Raises
-    ------
-    ValueError
-        If it starts at no finite distance ahead.
+    Their common frame has z down. The sweep starts at ``nearest_m``; ValueError if that is no finite distance
+    ahead.
     """
     if not finite_float("nearest_m", nearest_m) > 0.0:
         raise ValueError(f"nearest_m is {nearest_m} where a distance above 0 is expected")
@@ -88,10 +71,9 @@ def find_partner(
     # Most of the patch may lie on something nearer or farther than the target: then a smaller one is tried.
     halves = (settings.half_px // part for part in (2, 3))
     sizes = [settings, *(replace(settings, half_px=half, smallest_half_px=half) for half in halves)]
-    own, other = PosedImage(image, camera), PosedImage(partner_image, partner)
     refused: PatchMatch | None = None
     for size in sizes:
-        surface = _surface(own, pixel, other, sweep(own, pixel, other, nearest_m, size), settings)
+        surface = _surface(own, pixel, partner, sweep(own, pixel, partner, nearest_m, size), settings)
         if not isinstance(surface, PatchMatch):
             break
         refused = refused or surface
@@ -101,18 +83,18 @@ def find_partner(
         assert refused is not None
         return StereoMatch(refused)
     plane, relief, second = surface
-    found = match_patch(image, camera, pixel, plane, partner_image, partner, LAST_SEARCH_PX, settings, relief)
+    found = match_patch(own, pixel, plane, partner, LAST_SEARCH_PX, settings, relief)
     if found.verdict != "good":
         return StereoMatch(found)
     try:
-        triangulate(camera, partner, pixel, found.pixel_px)
+        triangulate(own.camera, partner.camera, pixel, found.pixel_px)
     except NoStereoPoint as error:
         return StereoMatch(no_match("weak", f"the two cameras see no common point: {error}", found.pixel_px))
-    across, sigma = _across(camera, pixel, partner, plane, found)
+    across, sigma = _across(own.camera, pixel, partner.camera, plane, found)
     allowed = MATCHED_BACK_PX + abs(across) + math.sqrt(worst_px2(found.covariance_px2))
     apart = math.inf
     for size in sizes:
-        back = sweep(other, found.pixel_px, own, nearest_m, size)
+        back = sweep(partner, found.pixel_px, own, nearest_m, size)
         if not isinstance(back, PatchMatch):
             apart = min(apart, float(np.linalg.norm(back.pixel_px - pixel)))
         if apart <= allowed:
@@ -153,21 +135,12 @@ def normal_seen(
     partner: CameraModel,
     plane: Plane,
     found: PatchMatch,
-    own: PatchMatch | None = None,
+    own: PatchMatch,
 ) -> FloatArray:
-    """Return the surface's unit normal (3,) that the deformations found by two cameras show.
+    """Return the unit normal (3,) of a target's surface (3,) that the deformations found by two cameras show.
 
-    Parameters
-    ----------
-    target_m
-        (3,) the target.
-    plane
-        The surface over which the searched patches were warped; its normal is returned where the two cameras
-        see too little of a slope.
-    found
-        What was found in ``partner``.
-    own
-        What was found in ``camera``, if the patches come from a third picture and not from this one.
+    ``found`` is the match in ``partner``, ``own`` that in ``camera``, of a patch warped over ``plane``. Its
+    normal is returned where the two cameras see too little of a slope.
     """
 
     def deformed(offsets: FloatArray, match: PatchMatch) -> FloatArray:
@@ -178,8 +151,7 @@ def normal_seen(
     mine, valid = carry(found.predicted_px + offsets, partner, plane, camera)
     if not valid.all():
         return plane.normal
-    if own is not None:
-        mine = own.pixel_px + deformed(mine - own.predicted_px, own)
+    mine = own.pixel_px + deformed(mine - own.predicted_px, own)
     theirs = found.pixel_px + deformed(offsets, found)
     left, right, top, bottom = triangulate_many(camera, partner, mine, theirs).position_m
     normal = np.cross(right - left, bottom - top)

@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
-from calib.matching.least_squares import NARROW, match_least_squares
+from calib.matching.least_squares import NARROW, LeastSquaresMatch, match_least_squares
 from calib.matching.verdict import (
     MatchSettings,
-    PatchFound,
     PatchMatch,
     expected_correlation,
     judged,
@@ -26,6 +25,7 @@ from calib.matching.warp import (
     SIDES,
     Grey,
     Plane,
+    PosedImage,
     Relief,
     Template,
     blurred_to,
@@ -43,52 +43,37 @@ COUNTS_TO = 2.2  # sigmas of that weight, beyond which pixels are left out
 
 
 def match_patch(
-    source_image: Grey,
-    source: CameraModel,
+    source: PosedImage,
     source_px: ArrayLike,
     plane: Plane,
-    destination_image: Grey,
-    destination: CameraModel,
+    destination: PosedImage,
     search_px: float,
     settings: MatchSettings | None = None,
     relief: Relief | None = None,
 ) -> PatchMatch:
-    """Find the target at ``source_px`` of one picture in another.
+    """Find the target at ``source_px`` (2,) of one picture in another.
 
     Parameters
     ----------
-    source_image, destination_image
-        (h, w) float32 grey, 0..255 (`calib.matching.warp.grey`).
-    source, destination
-        The cameras at the moments of the pictures, in one common frame.
-    source_px
-        (2,) the target, sub-pixel.
     plane
-        The scene around the target, in the common frame.
+        The scene around the target, in the images' common frame.
     search_px
-        Half side of the window around the predicted place, destination pixels.
+        Half side of the window around the predicted place, destination pixels. Raises ValueError if it has no
+        finite size.
     relief
-        The relief off the plane around the target, if two cameras saw it. It is carried over as it stands,
-        and pixels that do not belong to the surface do not count.
-
-    Raises
-    ------
-    ValueError
-        If the window has no finite size.
+        The relief off the plane around the target, if two cameras saw it; pixels that do not belong to the
+        surface are left out.
     """
     if not 0.0 <= search_px < math.inf:
         raise ValueError(f"search_px is {search_px} where a finite number, 0 or more, is expected")
     settings = settings or MatchSettings()
     target = np.asarray(source_px, dtype=np.float64)
-    seen, valid = carry(target, source, plane, destination)
+    seen, valid = carry(target, source.camera, plane, destination.camera)
     if not bool(valid):
         return no_match("border", "the target cannot be seen by the other camera by its position")
-    width, height = destination.size_px
-    if not (
-        -search_px <= seen[0] <= width - 1 + search_px and -search_px <= seen[1] <= height - 1 + search_px
-    ):
+    if not destination.camera.holds(seen, 0.5 - search_px):
         return no_match("border", f"the target is expected at {_at(seen)}, outside the picture", seen)
-    cut = _template(source_image, source, target, plane, destination, seen, settings, relief)
+    cut = _template(source, target, plane, destination.camera, seen, settings, relief)
     if cut is None:
         return no_match("border", f"the patch around {_at(target)} is cut by the picture's border", seen)
     template, near_px2 = cut
@@ -96,29 +81,25 @@ def match_patch(
     lacking = texture_lacks(template.values, settings, template.counts)
     if lacking:
         return no_match("flat", lacking, seen, half_px=half)
-    found = _search(template, destination_image, search_px, settings, near_px2)
+    found = _search(template, destination.image, search_px, settings, near_px2)
     if isinstance(found, PatchMatch):
         return found
+    refined, best, second = found
     roughness = settings.roughness if relief is None or settings.rough_beside_relief else 0.0
     if settings.relief > 0:
-        explained = found.refined.correlation / expected_correlation(
-            template.values, settings, template.counts
-        )
-        roughness *= 1.0 + max(0.0, 1.0 - explained) / settings.relief
-    surface = _surface_term(source, target, plane, destination, template, near_px2, roughness)
+        expected = expected_correlation(template.values, settings, template.counts)
+        roughness *= 1.0 + max(0.0, 1.0 - refined.correlation / expected) / settings.relief
+    surface = _surface_term(source.camera, target, plane, destination.camera, template, near_px2, roughness)
     if relief is not None:
-        off = relief.sigma_inverse_m * parallax_px_m(source, target, plane, destination)
+        off = relief.sigma_inverse_m * parallax_px_m(source.camera, target, plane, destination.camera)
         surface += np.outer(off, off)
-    middle = found.refined.middle
+    middle = refined.middle
     if middle is not None:
         # The middle is noisier, but the target is nearer to its plane.
         nearer = NARROW**2 * surface
-        if worst_px2(middle.covariance_px2 + nearer) < worst_px2(found.refined.covariance_px2 + surface):
-            found, surface = (
-                replace(found, refined=replace(middle, correlation=found.refined.correlation)),
-                nearer,
-            )
-    return judged(template, found, surface, settings)
+        if worst_px2(middle.covariance_px2 + nearer) < worst_px2(refined.covariance_px2 + surface):
+            refined, surface = replace(middle, correlation=refined.correlation), nearer
+    return judged(template, refined, best, second, surface, settings)
 
 
 def _surface_term(
@@ -138,32 +119,30 @@ def _surface_term(
     ray, half = source.ray(target), template.half_px
     if near_px2 is not None:
         half = np.sqrt(3.0 * np.diag(near_px2))  # a box of this half side spreads as much
-    sides = template.target_px + half * SIDES
-    rays = destination.ray(sides)
-    ranges, range_m = plane.ranges_m(rays), float(plane.ranges_m(ray))
+    sides = destination.ray(template.target_px + half * SIDES)
+    ranges, range_m = plane.ranges_m(sides), float(plane.ranges_m(ray))
     slope = float(ray.directions @ plane.normal)
-    here = ray.origins_m + range_m * ray.directions
-    reach_m = float(np.linalg.norm(rays.origins_m + ranges[:, None] * rays.directions - here, axis=1).max())
+    on_plane = ray.origins_m + range_m * ray.directions
+    reach = sides.origins_m + ranges[:, None] * sides.directions - on_plane
+    reach_m = float(np.linalg.norm(reach, axis=1).max())
     off_m = min(roughness * reach_m / abs(slope), 0.2 * range_m)
-    places, valid = destination.project(np.array([here, here + off_m * ray.directions]))
+    places, valid = destination.project(np.array([on_plane, on_plane + off_m * ray.directions]))
     if not (np.isfinite(off_m) and valid.all()):
         return np.zeros((2, 2))
-    parallax = places[1] - places[0]
-    return np.outer(parallax, parallax)
+    return np.outer(places[1] - places[0], places[1] - places[0])
 
 
 def _template(
-    image: Grey,
-    source: CameraModel,
+    source: PosedImage,
     target: FloatArray,
     plane: Plane,
     destination: CameraModel,
     seen: FloatArray,
     settings: MatchSettings,
-    relief: Relief | None = None,
+    relief: Relief | None,
 ) -> tuple[Template, FloatArray | None] | None:
     """Warp the largest patch that both pictures hold, sized by the coarser of the two; with its weight."""
-    around, ok = carry(seen + SIDES, destination, plane, source)
+    around, ok = carry(seen + SIDES, destination, plane, source.camera)
     if not ok.all():
         return None
     # Destination pixels a source pixel, by area.
@@ -179,7 +158,7 @@ def _template(
     edge = np.minimum(seen, np.array(destination.size_px) - 1 - seen).astype(int) - 4
     half = np.minimum(half, np.maximum(edge, least))
     while True:
-        template = warp_patch(image, source, target, plane, destination, (int(half[0]), int(half[1])), relief)
+        template = warp_patch(source, target, plane, destination, (int(half[0]), int(half[1])), relief)
         if template is not None:
             return template, near_px2
         if (half == least).all():
@@ -205,8 +184,8 @@ def near_half_px(near_px2: FloatArray) -> NDArray[np.intp]:
 
 def _search(
     template: Template, image: Grey, search_px: float, settings: MatchSettings, near_px2: FloatArray | None
-) -> PatchFound | PatchMatch:
-    """Correlate over the window, then refine at the best place."""
+) -> tuple[LeastSquaresMatch, float, float] | PatchMatch:
+    """Correlate over the window, then refine at the best place; with the two best correlations."""
     half, reach = template.half_px, int(np.ceil(search_px))
     window = template.centre_px - reach - half, template.centre_px + reach + half
     low, high = np.maximum(window[0], 0), np.minimum(window[1], np.array(image.shape[::-1]) - 1)
@@ -220,17 +199,15 @@ def _search(
     inner = low - cut_low
     searched = cut[inner[1] : inner[1] + high[1] - low[1] + 1, inner[0] : inner[0] + high[0] - low[0] + 1]
     scores = correlations(searched, template.values, template.counts)
-    (x, y), best, second, _ = peaks(
+    (x, y), best, second = peaks(
         scores, max(settings.apart_px, round(settings.apart_px * template.magnification))
     )
     facts = (best, second, int(half.min()))
     by_noise = expected_correlation(template.values, settings, template.counts)
-    least = 0.8 * settings.least_correlation * by_noise
-    if best < least:
+    if best < 0.8 * settings.least_correlation * by_noise:
         reason = f"no place in the window of {reach} px correlates by more than {best:.2f}"
         return no_match("weak", reason, template.target_px, *facts)
-    best_at = np.array([x, y])
-    begins, ends = best_at == 0, best_at == np.array(scores.shape[::-1]) - 1
+    begins, ends = np.array([x, y]) == 0, np.array([x, y]) == np.array(scores.shape[::-1]) - 1
     if begins.any() or ends.any():
         reason = f"the best place is at the border of the window of {reach} px"
         # Where the picture cut the window, the target may be outside; else the window shows something else.
@@ -241,23 +218,24 @@ def _search(
     )
     shift = low + half + np.array([x, y]) + summit(before, top, after) - template.centre_px
     start = template.target_px + shift - cut_low
+    # JPEG's errors are shared within its blocks of 8, those of colour filters over some two; only some fifty
+    # pixels matter to a Gaussian weight.
+    enlarged = max(1.0, template.magnification)
     refined = match_least_squares(
         template.values,
         template.centre_px - cut_low,
         template.target_px - cut_low,
         cut,
         start,
-        block_px=block_px(template.magnification, near_px2 is not None),
+        block_px=(10.0 if near_px2 is None else 4.0) * enlarged,
         near_px2=near_px2,
         counts=template.counts,
     )
-    if refined is None or float(np.abs(refined.pixel_px - start).max()) > 2.0 * max(
-        1.0, template.magnification
-    ):
+    if refined is None or float(np.abs(refined.pixel_px - start).max()) > 2.0 * enlarged:
         reason = f"the best place (correlation {best:.2f}) does not settle to a sub-pixel position"
         return no_match("weak", reason, template.target_px, *facts)
     middle = refined.middle and replace(refined.middle, pixel_px=refined.middle.pixel_px + cut_low)
-    return PatchFound(replace(refined, pixel_px=refined.pixel_px + cut_low, middle=middle), best, second)
+    return replace(refined, pixel_px=refined.pixel_px + cut_low, middle=middle), best, second
 
 
 def correlations(image: Grey, patch: Grey, counts: FloatArray | None) -> NDArray[np.float32]:
@@ -281,32 +259,17 @@ def correlations(image: Grey, patch: Grey, counts: FloatArray | None) -> NDArray
     return scores.astype(np.float32)
 
 
-def peaks(
-    scores: NDArray[np.float32], apart_px: int
-) -> tuple[tuple[int, int], float, float, tuple[int, int] | None]:
-    """Return the best place (x, y) of a score surface, its score, the second peak's score and place.
+def peaks(scores: NDArray[np.float32], apart_px: int) -> tuple[tuple[int, int], float, float]:
+    """Return the best place (x, y) of a score surface, its score, and the second peak's.
 
-    A second peak is a local maximum more than ``apart_px`` from the best; -1 and None if there is none.
+    A second peak is a local maximum more than ``apart_px`` from the best; -1 if there is none.
     """
     scores = np.where(np.isfinite(scores), scores, np.float32(-1.0))
     y, x = (int(v) for v in np.unravel_index(int(np.argmax(scores)), scores.shape))
     local = (scores >= cv2.dilate(scores, np.ones((3, 3), np.uint8))) & (scores < 2.0)
     local[max(0, y - apart_px) : y + apart_px + 1, max(0, x - apart_px) : x + apart_px + 1] = False
-    others = np.where(local, scores, np.float32(-1.0))
-    v, u = (int(w) for w in np.unravel_index(int(np.argmax(others)), others.shape))
-    second = float(others[v, u])
-    return (x, y), float(scores[y, x]), second, (u, v) if second > -1.0 else None
-
-
-def block_px(magnification: float, near: bool) -> float:
-    """Return over how many pixels grey differences may depend on each other: more in an enlarged picture.
-
-    Ten: JPEG's errors are shared within its blocks of 8, those of colour filters over some two. Four
-    where only what is ``near`` counts, which is some fifty pixels.
-    """
-    return (4.0 if near else 10.0) * max(1.0, magnification)
+    return (x, y), float(scores[y, x]), float(scores[local].max(initial=-1.0))
 
 
 def _at(pixel_px: FloatArray) -> str:
-    """Write a pixel."""
     return f"({pixel_px[0]:.1f}, {pixel_px[1]:.1f}) px"

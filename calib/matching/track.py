@@ -27,12 +27,11 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import ray_gap, refuse_two_points
 from calib.geometry.rigid import FloatArray, Rigid, carried_covariance, rigid_rates
 from calib.geometry.stereo import triangulate
-from calib.matching.handoff import Eye
 from calib.matching.least_squares import gaussian
 from calib.matching.partner import find_partner, normal_seen
 from calib.matching.patch import match_patch, near_covariance, near_half_px
 from calib.matching.verdict import MatchSettings, PatchMatch, texture_lacks
-from calib.matching.warp import Grey, Plane, patch_grid
+from calib.matching.warp import Grey, Plane, PosedImage, patch_grid
 
 State = Literal["tracked", "lost"]
 
@@ -92,7 +91,7 @@ class KeyPicture:
         before handed on.
     """
 
-    eye: Eye
+    view: PosedImage
     pixel_px: FloatArray
     normal: FloatArray
     drift_m2: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
@@ -178,7 +177,7 @@ def motion_rate(position_m: FloatArray) -> FloatArray:
 def carried(key: KeyPicture, motion: Rigid) -> KeyPicture:
     """The key in another frame."""
     return KeyPicture(
-        replace(key.eye, camera=key.eye.camera.moved(motion)),
+        replace(key.view, camera=key.view.camera.moved(motion)),
         key.pixel_px,
         motion.vectors(key.normal),
         motion.rotation @ key.drift_m2 @ motion.rotation.T,
@@ -245,7 +244,7 @@ EYES_PX = 0.4
 is found 2 px off the epipolar line is another thing, or the mast file is off."""
 
 
-def start_track(left: Eye, right: Eye, left_px: FloatArray, sigma_px: float = 0.2) -> Track:
+def start_track(left: PosedImage, right: PosedImage, left_px: FloatArray, sigma_px: float = 0.2) -> Track:
     """Begin a track from a click in the left picture of a pair.
 
     Parameters
@@ -271,13 +270,11 @@ def start_track(left: Eye, right: Eye, left_px: FloatArray, sigma_px: float = 0.
         raise CalibError(
             f"the target pixel ({pixel[0]:.1f}, {pixel[1]:.1f}) is outside the picture of {width} x {height}"
         )
-    found = find_partner(left.image, left.camera, pixel, right.image, right.camera)
+    found = find_partner(left, pixel, right)
     if found.match.verdict != "good" or found.plane is None:
         raise CalibError(f"the target cannot be followed: {found.match.reason}")
     # The patch that tells the surface reaches beyond it on a rock: the range is that of its middle.
-    middle = match_patch(
-        left.image, left.camera, pixel, found.plane, right.image, right.camera, MIDDLE_SEARCH_PX, SIZES
-    )
+    middle = match_patch(left, pixel, found.plane, right, MIDDLE_SEARCH_PX, SIZES)
     reason = middle.reason or indistinct(left.image, left.camera, pixel, found.plane, SIZES)
     if reason:
         raise CalibError(f"the target cannot be followed: {reason}")
@@ -299,19 +296,19 @@ def anchored(track: Track) -> KeyPicture | None:
     Rover motion is never exact: what counts is how the key camera stood to the target, and the shift across
     the ray is small beside the range.
     """
-    camera = track.key.eye.camera
+    camera = track.key.view.camera
     ray = camera.ray(track.key.pixel_px)
     between = track.position_m - ray.origins_m
     along = float(between @ ray.directions)
     if not bool(ray.valid) or along <= 0:
         return None
     shift = Rigid(np.eye(3), between - along * ray.directions)
-    return replace(track.key, eye=replace(track.key.eye, camera=camera.moved(shift)))
+    return replace(track.key, view=replace(track.key.view, camera=camera.moved(shift)))
 
 
 def fresh_key(
     key: KeyPicture,
-    eyes: Mapping[str, Eye],
+    eyes: Mapping[str, PosedImage],
     good: Mapping[str, PatchMatch],
     plane: Plane,
     slope: Plane | None,
@@ -342,13 +339,13 @@ def on_surface(covariance_px2: FloatArray, camera: CameraModel, plane: Plane) ->
 
 def outgrown(
     key: KeyPicture,
-    eyes: Mapping[str, Eye],
+    eyes: Mapping[str, PosedImage],
     good: Mapping[str, PatchMatch],
     plane: Plane,
     settings: TrackSettings,
 ) -> bool:
     """Whether scale, view or light have changed so much that the key should be exchanged."""
-    scale, shape = _seen_larger(next(iter(eyes.values())).camera, key.eye.camera, plane)
+    scale, shape = _seen_larger(next(iter(eyes.values())).camera, key.view.camera, plane)
     alike = min(one.correlation for one in good.values()) >= settings.renew_below
     return not (
         settings.renew_shrunk < scale < settings.renew_grown and shape < settings.renew_shape and alike

@@ -128,56 +128,40 @@ def no_match(
 ) -> PatchMatch:
     """Return a match that is none."""
     nowhere = np.full(2, np.nan)
+    predicted = nowhere if predicted_px is None else predicted_px
     return PatchMatch(
-        verdict,
-        reason,
-        nowhere if predicted_px is None else predicted_px,
-        nowhere,
-        np.full((2, 2), np.nan),
-        correlation,
-        second,
-        half_px=half_px,
+        verdict, reason, predicted, nowhere, np.full((2, 2), np.nan), correlation, second, half_px=half_px
     )
-
-
-@dataclass(frozen=True, eq=False)
-class PatchFound:
-    """A refined place, and what the unrefined correlation says there and at the second best place."""
-
-    refined: LeastSquaresMatch
-    best: float
-    second: float
 
 
 def judged(
-    template: Template, found: PatchFound, surface_px2: FloatArray, settings: MatchSettings
+    template: Template,
+    refined: LeastSquaresMatch,
+    best: float,
+    second: float,
+    surface_px2: FloatArray,
+    settings: MatchSettings,
 ) -> PatchMatch:
-    """Return the match with its verdict, from correlation, rival and certainty."""
-    refined, half = found.refined, int(template.half_px.min())
-    facts = (refined.correlation, found.second, half)
+    """Return a refined place with its verdict, from correlation, rival and certainty.
+
+    ``best`` and ``second`` are the correlations there, before it was refined, and at the second best place.
+    """
+    half, target = int(template.half_px.min()), template.target_px
+    facts = (refined.correlation, second, half)
     least = settings.least_correlation * expected_correlation(template.values, settings, template.counts)
     if refined.correlation < least:
         reason = f"the best place correlates by {refined.correlation:.2f}, at least {least:.2f} is expected"
-        return no_match("weak", reason, template.target_px, *facts)
+        return no_match("weak", reason, target, *facts)
     # Both as correlated: only the best place has been deformed to fit.
-    if rivalled(found.best, found.second, settings):
-        reason = f"a second place fits nearly as well: {found.second:.2f} beside {found.best:.2f}"
-        return no_match("ambiguous", reason, template.target_px, *facts)
+    if rivalled(best, second, settings):
+        reason = f"a second place fits nearly as well: {second:.2f} beside {best:.2f}"
+        return no_match("ambiguous", reason, target, *facts)
     worst_px = math.sqrt(worst_px2(refined.covariance_px2))
     if worst_px > settings.worst_sigma_px:
         reason = f"the place is certain to {worst_px:.2f} px only, {settings.worst_sigma_px} px is expected"
-        return no_match("weak", reason, template.target_px, *facts)
-    return PatchMatch(
-        "good",
-        "",
-        template.target_px,
-        refined.pixel_px,
-        refined.covariance_px2 + surface_px2,
-        refined.correlation,
-        found.second,
-        refined.deformation,
-        half,
-    )
+        return no_match("weak", reason, target, *facts)
+    covariance = refined.covariance_px2 + surface_px2
+    return PatchMatch("good", "", target, refined.pixel_px, covariance, *facts[:2], refined.deformation, half)
 
 
 def rivalled(best: float, second: float, settings: MatchSettings) -> bool:

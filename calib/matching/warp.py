@@ -240,8 +240,7 @@ def parallax_px_m(camera: CameraModel, pixel_px: FloatArray, plane: Plane, other
 
 
 def warp_patch(
-    source_image: Grey,
-    source: CameraModel,
+    source: PosedImage,
     source_px: ArrayLike,
     plane: Plane,
     destination: CameraModel,
@@ -253,31 +252,25 @@ def warp_patch(
     A destination pixel that covers several source pixels averages them (area sampling), as its sensor would.
     Sixteen knots of the patch are carried exactly, the pixels between them by the cubic through them.
 
-    Parameters
-    ----------
-    half_px
-        Half of the patch's side, or of its sides in x and y, destination pixels.
-    relief
-        Of the source camera around ``source_px``, beside the plane; a plane if not given.
-
-    Returns
-    -------
-    template
-        None if part of the patch is not in the source image or not on the plane's visible side.
+    ``half_px`` is half of the patch's side, or of its sides in x and y, destination pixels; ``relief`` that
+    of the source camera around ``source_px``, beside the plane. None if part of the patch is not in the
+    source image or not on the plane's visible side.
     """
-    target, seen = carry(source_px, source, plane, destination)
+    target, seen = carry(source_px, source.camera, plane, destination)
     if not bool(seen):
         return None
     half = (half_px, half_px) if isinstance(half_px, int) else half_px
     centre = np.rint(target).astype(np.intp)
-    parallax = np.zeros(2) if relief is None else parallax_px_m(source, relief.pixel_px, plane, destination)
+    parallax = (
+        np.zeros(2) if relief is None else parallax_px_m(source.camera, relief.pixel_px, plane, destination)
+    )
     if relief is not None:
         target = target + parallax * float(relief.inverse_m[relief.half_px, relief.half_px])
     reach = np.array(half) + 0.5  # to the outer pixels' far sides
     knots, ok = carry(
-        centre + reach * np.stack(np.meshgrid(KNOTS, KNOTS), axis=-1), destination, plane, source
+        centre + reach * np.stack(np.meshgrid(KNOTS, KNOTS), axis=-1), destination, plane, source.camera
     )
-    if not ok.all() or not _inside(knots, source_image.shape):
+    if not ok.all() or not _inside(knots, source.image.shape):
         return None
     across, down = (np.linalg.norm(np.diff(knots, axis=a), axis=-1).max() for a in (1, 0))
     steps = np.array([across, down]) / (reach * (KNOTS[1] - KNOTS[0]))  # source pixels a destination pixel
@@ -289,7 +282,7 @@ def warp_patch(
     if relief is not None:
         maps, counts = _lifted(maps, relief, span / (2.0 * reach) @ parallax)
         counts = counts.reshape(2 * half[1] + 1, tall, 2 * half[0] + 1, many).mean(axis=(1, 3))
-    values = sample(source_image, maps)
+    values = sample(source.image, maps)
     if many > 1 or tall > 1:
         values = values.reshape(2 * half[1] + 1, tall, 2 * half[0] + 1, many).mean(axis=(1, 3))
     shrink = float(np.sqrt(max(abs(np.linalg.det(span / (2.0 * reach))), 1e-6)))

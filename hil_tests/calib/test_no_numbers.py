@@ -28,7 +28,7 @@ from calib.geometry.solutions import Solution, choose
 from calib.geometry.stereo import triangulate
 from calib.matching.partner import find_partner
 from calib.matching.patch import match_patch
-from calib.matching.warp import Plane, facing_plane
+from calib.matching.warp import Plane, PosedImage, facing_plane
 from calib.survey.alignment import NotAligned, align, mirrored
 from calib.survey.find_dots import find_in_file
 from calib.targets.boards import Dots
@@ -150,14 +150,14 @@ def test_a_sigma_that_is_none_gives_no_covariance(bad: float) -> None:
 
 @pytest.mark.parametrize("bad", [*NO_NUMBERS, 0.0, -1.0])
 def test_ranges_and_windows_that_are_none_are_refused(bad: float) -> None:
-    grey = np.zeros((101, 101), np.float32)
+    one = PosedImage(np.zeros((101, 101), np.float32), HEAD)
     with pytest.raises(CalibError, match="no plane at range"):
         facing_plane(HEAD, [50, 50], bad)
     with pytest.raises(ValueError, match="nearest_m is"):
-        find_partner(grey, HEAD, [50, 50], grey, HEAD, bad)
+        find_partner(one, [50, 50], one, bad)
     if bad != 0.0:
         with pytest.raises(ValueError, match="search_px is"):
-            match_patch(grey, HEAD, [50, 50], facing_plane(HEAD, [50, 50], 3.0), grey, HEAD, bad)
+            match_patch(one, [50, 50], facing_plane(HEAD, [50, 50], 3.0), one, bad)
 
 
 @pytest.mark.parametrize("bad", [*NO_NUMBERS, -1.0])

@@ -11,7 +11,7 @@ import pytest
 from calib.geometry.pointing import solve
 from calib.geometry.stereo import triangulate
 from calib.matching.patch import match_patch
-from calib.matching.warp import Plane, grey
+from calib.matching.warp import Plane, PosedImage, grey
 from drivers.clock import ManualClock
 from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.open_hardware import open_hardware
@@ -58,12 +58,10 @@ def test_pointing_at_a_feature_goes_to_the_recorded_angles_and_finds_it(
         frame = camera.next_frame(moved_s, 1.0)
         assert frame.mid_exposure_s - frame.exposure_s / 2 > moved_s
         found = match_patch(
-            clicked,
-            clicked_camera,
+            PosedImage(clicked, clicked_camera),
             clicked_px,
             Plane(target, np.array([0.0, 0.0, -1.0])),
-            grey(frame.image),
-            rover.camera_in_rover(CAMERA, there.pan_rad, there.tilt_rad),
+            PosedImage(grey(frame.image), rover.camera_in_rover(CAMERA, there.pan_rad, there.tilt_rad)),
             search_px=12.0,
         )
         assert found.verdict == "good", found.reason

@@ -20,7 +20,7 @@ from calib.geometry.rigid import FloatArray
 from calib.geometry.solutions import Solution, choose
 from calib.geometry.stereo import triangulate
 from calib.matching.partner import find_partner
-from calib.matching.warp import grey
+from calib.matching.warp import PosedImage, grey
 from drivers.interfaces import Image
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.client.answers import OperationTold
@@ -94,7 +94,8 @@ def target_at(
     pixel: FloatArray,
 ) -> Target | None:
     """Return the target at a pixel (2,) of the left picture; None where the right one has no good match."""
-    found = find_partner(grey(left.image), left_in_rover, pixel, grey(right.image), right_in_rover)
+    own, other = PosedImage(grey(left.image), left_in_rover), PosedImage(grey(right.image), right_in_rover)
+    found = find_partner(own, pixel, other)
     if found.match.verdict != "good":
         return None
     try:

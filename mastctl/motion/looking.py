@@ -18,7 +18,7 @@ from calib.matching.partner import StereoMatch, find_partner
 from calib.matching.patch import match_patch
 from calib.matching.sweep import UP
 from calib.matching.verdict import MatchSettings, PatchMatch
-from calib.matching.warp import Grey, Plane, Relief, carry, facing_plane, grey
+from calib.matching.warp import Plane, PosedImage, Relief, carry, facing_plane, grey
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.motion.results import PointingError, rounded
@@ -38,12 +38,10 @@ class FramesLike(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class CameraView:
+class CameraView(PosedImage):
     """A frame as the geometry needs it: grey values, and the camera in the rover frame at its moment."""
 
     frame: StampedFrame
-    image: Grey
-    camera: CameraModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,9 +132,7 @@ class RigCameras:
         here = max(abs(view.frame.pan_rad - now.frame.pan_rad), abs(view.frame.tilt_rad - now.frame.tilt_rad))
         planes = [_plane_at(view.camera, pixel_px, range_m) for range_m in (1.0, 2.0, 1e3)]
         if here <= settings.same_pose_rad:
-            return _good(match_patch(view.image, view.camera, pixel_px, planes[1], now.image, now.camera,
-            12.0,
-                               settings.match), now)  # fmt: skip
+            return _good(match_patch(view, pixel_px, planes[1], now, 12.0, settings.match), now)
         places = np.array([carry(pixel_px, view.camera, plane, now.camera)[0] for plane in planes])
         size = np.array(now.camera.size_px)
         if not np.isfinite(places).all() or (places[1] < 0).any() or (places[1] > size - 1).any():
@@ -147,15 +143,10 @@ class RigCameras:
             )
         spread = float(np.ptp(places, axis=0).max())
         search = min(settings.wide_search_px, settings.search_px / 2 + spread)
-        normals: list[FloatArray | None] = [None, UP]
         found = [
-            match_patch(
-                view.image, view.camera, pixel_px,
-                planes[1] if normal is None else Plane(planes[1].point_m, normal),
-                now.image, now.camera, search, settings.match,
-            )
-            for normal in normals
-        ]  # fmt: skip
+            match_patch(view, pixel_px, plane, now, search, settings.match)
+            for plane in (planes[1], Plane(planes[1].point_m, UP))
+        ]
         return _good(_best(found), now)
 
     def stereo(self, view: CameraView, pixel_px: FloatArray, other: CameraView) -> StereoMatch:
@@ -167,9 +158,7 @@ class RigCameras:
             ``target_...`` if the match is not good, ``eyes_disagree`` if it lies off the line.
         """
         settings = self._settings
-        found = find_partner(
-            view.image, view.camera, pixel_px, other.image, other.camera, settings.nearest_m, settings.match
-        )
+        found = find_partner(view, pixel_px, other, settings.nearest_m, settings.match)
         if found.match.verdict in ("weak", "ambiguous", "flat"):
             raise _refusal(found.match, other, BESIDE)
         _good(found.match, other)
@@ -198,12 +187,7 @@ class RigCameras:
         for search in (settings.search_px, settings.wide_search_px):
             for plane, sizes in product(planes, self._sizes()):
                 relief = clicked.relief if plane is clicked.plane else None
-                found.append(
-                    match_patch(
-                        clicked.view.image, clicked.view.camera, clicked.pixel_px, plane,
-                        now.image, now.camera, search, sizes, relief,
-                    )
-                )  # fmt: skip
+                found.append(match_patch(clicked.view, clicked.pixel_px, plane, now, search, sizes, relief))
                 if found[-1].verdict == "good":
                     return found[-1]
             if found[0].verdict in ("flat", "ambiguous"):
@@ -277,7 +261,7 @@ class RigCameras:
         if not all(map(math.isfinite, (frame.pan_rad, frame.tilt_rad, *frame.true_rad))):
             raise PointingError("bad_reading", f"frame {frame.frame_id} has no finite joint angles")
         camera = self._rig.camera_in_rover(frame.camera, *frame.true_rad)
-        return CameraView(frame, grey(frame.image), camera)
+        return CameraView(grey(frame.image), camera, frame)
 
 
 def match_facts(found: PatchMatch) -> Mapping[str, Any]:

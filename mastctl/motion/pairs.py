@@ -19,7 +19,7 @@ from calib.geometry.rigid import FloatArray
 from calib.geometry.solutions import Solution, choose
 from calib.geometry.stereo import stereo_range_error_m
 from calib.matching.handed_over import MatchedHandoff, matched_handoff
-from calib.matching.handoff import Eye, RefineSettings, refine_handoff
+from calib.matching.handoff import RefineSettings, refine_handoff
 from calib.matching.verdict import PatchMatch
 from mastctl.devices.keep_out import KeptOut
 from mastctl.devices.limits import Limits
@@ -235,20 +235,13 @@ def record_of(
         )  # fmt: skip
     except CalibError as error:
         return " ".join(str(error).split())
-    destinations = {name: _camera_of(view) for name, view in to.items()}
-    refined = refine_handoff(
-        handed, (_camera_of(left), _camera_of(right)), clicks, destinations, HANDOFF_SETTINGS
-    )
+    refined = refine_handoff(handed, (left, right), clicks, to, HANDOFF_SETTINGS)
     return matched_handoff(left.frame.mast_digest, pair, joints, clicks, sigma_px, to_joints, handed, refined)
 
 
 def _joints(view: CameraView) -> Joints:
     frame = view.frame
     return Joints(*frame.true_rad, JOINT_SIGMA_RAD, (frame.pan_approach, frame.tilt_approach))
-
-
-def _camera_of(view: CameraView) -> Eye:
-    return Eye(view.image, view.camera)
 
 
 STEP_M = 1e-3  # of the differences; a camera's curvature over it is far below a pixel

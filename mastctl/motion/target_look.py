@@ -21,7 +21,6 @@ from calib.errors import CalibError
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.matching.handed_over import MatchedHandoff
-from calib.matching.handoff import Eye
 from calib.matching.look import TrackLook, seen_by
 from calib.matching.track import Track, start_track
 from calib.matching.verdict import PatchMatch
@@ -250,8 +249,7 @@ class Looker:
 
     def _find(self, taken: _Taken, track: Track) -> _Sight:
         with self._steps.step("find") as detail:
-            eyes = {name: Eye(view.image, view.camera) for name, view in taken.views.items()}
-            look = self._steps.unless_stopped(seen_by, track, eyes)
+            look = self._steps.unless_stopped(seen_by, track, taken.views)
             pixels = {name: EyePixel("", "no_frame", reason) for name, reason in taken.missing.items()}
             pixels |= {name: _eye_pixel(taken.views[name], found) for name, found in look.found.items()}
             seen = self._told(taken.choice, look, pixels, taken.settled)
@@ -328,9 +326,7 @@ class Looker:
         with self._steps.step("start") as detail:
             detail.update(self._steps.one_moment(one, pixel_px, [other], resting))
             try:
-                track = self._steps.unless_stopped(
-                    start_track, Eye(one.image, one.camera), Eye(other.image, other.camera), pixel_px
-                )
+                track = self._steps.unless_stopped(start_track, one, other, pixel_px)
             except CalibError as error:
                 raise NotTrackable(" ".join(str(error).split())) from None
             sigma_m = np.sqrt(np.diag(track.covariance_m2))

@@ -30,10 +30,10 @@ from calib.geometry.covariance import RigCovariance, moved_rig, stored_covarianc
 from calib.geometry.handoff import Joints, PredictedPixel, hand_off
 from calib.geometry.rig import Rig
 from calib.geometry.solutions import choose
-from calib.matching.handoff import Eye, RefinedPixel, RefineSettings, refine_handoff
+from calib.matching.handoff import RefinedPixel, RefineSettings, refine_handoff
 from calib.matching.partner import find_partner
 from calib.matching.verdict import MatchSettings
-from calib.matching.warp import Plane, warp_patch
+from calib.matching.warp import Plane, PosedImage, warp_patch
 from drivers.sim import ground
 from drivers.sim.compiled import kernels
 from drivers.sim.render import compile_renderer
@@ -261,10 +261,10 @@ def _outcome(
     one: RefinedPixel,
     predicted: PredictedPixel | None,
     true: Float64,
-    source: Eye,
+    source: PosedImage,
     click: Float64,
     plane: Plane,
-    to: Eye,
+    to: PosedImage,
 ) -> HandoffOutcome:
     if predicted is None:
         return HandoffOutcome(one.verdict, math.inf, math.inf)
@@ -273,19 +273,21 @@ def _outcome(
     return HandoffOutcome(one.verdict, refined_px, best_px)
 
 
-def _surface(source: tuple[Eye, Eye], clicks: Float64, seen_m: Float64) -> Plane:
+def _surface(source: tuple[PosedImage, PosedImage], clicks: Float64, seen_m: Float64) -> Plane:
     """What the source pair sees, without thresholds; level ground at the clicks' point where it sees none."""
     left, right = source
-    found = find_partner(left.image, left.camera, clicks[0], right.image, right.camera, settings=ANYTHING)
+    found = find_partner(left, clicks[0], right, settings=ANYTHING)
     return found.plane or Plane(seen_m, np.array([0.0, 0.0, -1.0]))
 
 
-def correlated(source: Eye, click: Float64, plane: Plane, predicted: PredictedPixel, to: Eye) -> Float64:
+def correlated(
+    source: PosedImage, click: Float64, plane: Plane, predicted: PredictedPixel, to: PosedImage
+) -> Float64:
     """Return where the warped patch correlates best in the window; the geometric pixel if there is none."""
     settings = RefineSettings()
     reach = settings.sigmas * math.sqrt(float(np.linalg.eigvalsh(predicted.search_px2)[-1]))
     reach = math.ceil(min(max(reach, settings.least_px), settings.most_px))
-    template = warp_patch(source.image, source.camera, click, plane, to.camera, HALF_PX)
+    template = warp_patch(source, click, plane, to.camera, HALF_PX)
     if template is None:
         return predicted.pixel_px
     low = np.rint(predicted.pixel_px).astype(int) - reach - HALF_PX

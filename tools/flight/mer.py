@@ -32,7 +32,7 @@ from calib.geometry.stereo import triangulate
 from calib.matching.partner import find_partner
 from calib.matching.patch import match_patch
 from calib.matching.verdict import MatchSettings, rivalled
-from calib.matching.warp import Grey, Plane, grey
+from calib.matching.warp import Plane, PosedImage, grey
 from drivers.clock import ManualClock
 from drivers.recordings.pds3 import PdsProduct, read_product
 from drivers.recordings.replay import Replay, open_replay
@@ -52,13 +52,11 @@ NEIGHBOURS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class FlightView:
+class FlightView(PosedImage):
     """One replayed frame: grey picture, measured angles, and the camera there in the rover frame."""
 
-    image: Grey
     pan_rad: float
     tilt_rad: float
-    camera: CameraModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +131,7 @@ def views(recording: Replay, clock: ManualClock, rover: Rig) -> list[FlightView]
         frame = recording.cameras[CAMERA].next_frame(clock.now_s(), 1.0)
         reading = recording.pan_tilt.read()
         camera = rover.camera_in_rover(CAMERA, reading.pan_rad, reading.tilt_rad)
-        found.append(FlightView(grey(frame.image), reading.pan_rad, reading.tilt_rad, camera))
+        found.append(FlightView(grey(frame.image), camera, reading.pan_rad, reading.tilt_rad))
     return found
 
 
@@ -169,16 +167,7 @@ def carry(first: FlightView, pixel_px: FloatArray, second: FlightView) -> Carrie
     for inverse_range in steps:
         point = ray.origins_m + ray.directions / inverse_range
         for normal in (UP, -ray.directions):
-            found = match_patch(
-                first.image,
-                first.camera,
-                pixel_px,
-                Plane(point, normal),
-                second.image,
-                second.camera,
-                WINDOW_PX,
-                settings,
-            )
+            found = match_patch(first, pixel_px, Plane(point, normal), second, WINDOW_PX, settings)
             if found.verdict == "good":
                 good.append(found)
     if not good:
@@ -223,10 +212,7 @@ def pair_result(
     """
     across = np.array([one.across_px for one in carried])
     _, left = turned(first, second, carried)
-    on_line = [
-        find_partner(first.image, first.camera, corner, second.image, second.camera, NEAREST_M)
-        for corner in features(first, second)
-    ]
+    on_line = [find_partner(first, corner, second, NEAREST_M) for corner in features(first, second)]
     on_line_px = [one.across_px for one in on_line if one.match.verdict == "good"]
     ranges = [float(np.linalg.norm(one.position_m - first.camera.C)) for one in carried]
     return {

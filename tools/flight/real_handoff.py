@@ -35,7 +35,6 @@ from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import triangulate
-from calib.matching.handoff import Eye
 from calib.matching.look import TrackLook, seen_by
 from calib.matching.track import KeyPicture, Track, TrackSettings
 from calib.matching.warp import Plane, carry
@@ -145,10 +144,8 @@ def carried(
     point = ray.origins_m + range_m * ray.directions
     along = np.outer(ray.directions, ray.directions)
     covariance = (range_sigma * range_m) ** 2 * along + (1e-5 * range_m) ** 2 * np.eye(3)
-    track = Track(
-        "tracked", point, covariance, KeyPicture(Eye(first.image, first.camera), pixel_px, plane.normal)
-    )
-    look = seen_by(track, {"second": Eye(second.image, second.camera)}, SETTINGS)
+    track = Track("tracked", point, covariance, KeyPicture(first, pixel_px, plane.normal))
+    look = seen_by(track, {"second": second}, SETTINGS)
     predicted, _ = second.camera.project(point)
     match = look.found["second"]
     good = match.verdict == "good"

@@ -144,7 +144,7 @@ def run_approach(true: Rig, believed: Rig, seed: int) -> ApproachRun:
             return ApproachRun(seed, (), begun)
         track, target = begun
         there = world.site_from_rover.inverse.points(target)
-        start_m = _axes(there - track.key.eye.camera.C) @ (track.position_m - there)
+        start_m = _axes(there - track.key.view.camera.C) @ (track.position_m - there)
         world.read_windows()
         stops = _drive(world, track, target, light, rng)
         return ApproachRun(seed, tuple(stops), "", _tuple(start_m))

@@ -15,8 +15,7 @@ import numpy as np
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
-from calib.matching.handoff import Eye
-from calib.matching.warp import Grey
+from calib.matching.warp import Grey, PosedImage
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene
 
@@ -155,7 +154,7 @@ class ApproachWorld:
         # The motion's error moves what was ahead, not the whole rover frame: it is of the displacement.
         return wrong.inverse @ true, np.diag(sigma**2)
 
-    def look(self, pair: Sequence[str], pan_rad: float, tilt_rad: float) -> dict[str, Eye]:
+    def look(self, pair: Sequence[str], pan_rad: float, tilt_rad: float) -> dict[str, PosedImage]:
         """Point the head and take both pictures; the cameras are where the mast file says they are."""
         at = self._turned(pan_rad, tilt_rad)
         read = at + self._rng.normal(0.0, self.errors.joint_rad, 2)
@@ -166,7 +165,9 @@ class ApproachWorld:
             if camera.on == "head":
                 frame = frame @ self.true.mast.rover_from_head(float(at[0]), float(at[1]))
             image = self._exposed(camera.model, frame)
-            eyes[name] = Eye(image, self.believed.camera_in_rover(name, float(read[0]), float(read[1])))
+            eyes[name] = PosedImage(
+                image, self.believed.camera_in_rover(name, float(read[0]), float(read[1]))
+            )
         return eyes
 
     def _turned(self, pan_rad: float, tilt_rad: float) -> FloatArray:

@@ -20,8 +20,8 @@ from calib.geometry.handoff import Joints, PredictedPixel, hand_off
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.matching.handed_over import MatchedHandoff, matched_handoff
-from calib.matching.handoff import Eye, RefinedPixel, refine_handoff
-from calib.matching.warp import grey
+from calib.matching.handoff import RefinedPixel, refine_handoff
+from calib.matching.warp import PosedImage, grey
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.experiment.pointing import ClickTruth
 from mastctl.experiment.targets import VIEWS_PER_TARGET, Target, TargetViews
@@ -179,8 +179,8 @@ class _HandoffRun:
         )
         return HandoffRecord(self._step, index, tuple(handed), matched=matched)
 
-    def _camera(self, shot: Snapshot) -> Eye:
-        return Eye(grey(shot.image), self.rig.camera_in_rover(shot.camera, *shot.true_rad))
+    def _camera(self, shot: Snapshot) -> PosedImage:
+        return PosedImage(grey(shot.image), self.rig.camera_in_rover(shot.camera, *shot.true_rad))
 
     def _true(self, target: Target, shot: Snapshot) -> tuple[float, float] | None:
         """Where the target is, that the clicks miss by their noise."""

@@ -8,7 +8,7 @@ import numpy as np
 from calib.geometry.cahvor import CameraModel
 from calib.matching.patch import match_patch
 from calib.matching.verdict import MatchSettings
-from calib.matching.warp import facing_plane
+from calib.matching.warp import PosedImage, facing_plane
 
 SIZE_PX = (160, 160)
 CAMERA = CameraModel("CAHV", SIZE_PX, C=[0, 0, 0], A=[1, 0, 0], H=[79.5, 600, 0], V=[79.5, 0, 600])
@@ -34,7 +34,8 @@ def test_dust_beside_a_target_hardly_shifts_it() -> None:
             (light + rng.normal(0.0, NOISE_DN, SIZE_PX)).astype(np.float32) for light in (scene, scene * dust)
         )
         plane = facing_plane(CAMERA, target, 5.0)
-        found = match_patch(first, CAMERA, target, plane, second, CAMERA, 8.0, MatchSettings(roughness=0.0))
+        images = PosedImage(first, CAMERA), PosedImage(second, CAMERA)
+        found = match_patch(images[0], target, plane, images[1], 8.0, MatchSettings(roughness=0.0))
         assert found.verdict == "good", found.reason
         errors.append(found.pixel_px - target)
     assert np.sqrt(np.mean(np.square(errors))) < SHIFTED_PX

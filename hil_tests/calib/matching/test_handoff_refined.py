@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from calib.geometry.covariance import RigCovariance, moved_rig
 from calib.geometry.handoff import Handoff, Joints, hand_off
 from calib.geometry.rig import Mast, Rig, RigCamera
-from calib.matching.handoff import Eye, RefinedPixel, RefineSettings, refine_handoff
+from calib.matching.handoff import RefinedPixel, RefineSettings, refine_handoff
+from calib.matching.warp import PosedImage
 from hil_tests.calib.matching.textured_planes import Pinhole, TexturedPlane, picture, random_texture
 
 TARGET = np.array([2.0, 0.05, 0.3])
@@ -44,8 +45,8 @@ class Case:
     clicks_px: NDArray[np.float64]
 
     def refined(self, settings: RefineSettings | None = None) -> dict[str, RefinedPixel]:
-        def view(name: str) -> Eye:
-            return Eye(self.images[name], CAMERAS[name].model)
+        def view(name: str) -> PosedImage:
+            return PosedImage(self.images[name], CAMERAS[name].model)
 
         source = (view(SOURCE[0]), view(SOURCE[1]))
         return refine_handoff(self.handoff, source, self.clicks_px, {n: view(n) for n in NEXT}, settings)
@@ -233,13 +234,13 @@ def test_a_window_that_the_picture_cuts_is_no_search(good: Case, cut: str) -> No
             "right": (0, x + 27, height),
             "below": (0, width, y + 27),
         }[cut]
-        eyes[name] = Eye(
+        eyes[name] = PosedImage(
             np.ascontiguousarray(good.images[name][:down, low:right]),
             replace(model, H=model.H - low * model.A, size_px=(right - low, down)),
         )
     rig = replace(RIG, cameras={**RIG.cameras, **{n: RigCamera("rover", eyes[n].camera) for n in NEXT}})
     done = hand_off(rig, SOURCE, NEXT, Joints(0.0, 0.0), *good.clicks_px, sigma_px=3.0)
-    source = (Eye(good.images[n], CAMERAS[n].model) for n in SOURCE)
+    source = (PosedImage(good.images[n], CAMERAS[n].model) for n in SOURCE)
     refined = refine_handoff(done, (next(source), next(source)), good.clicks_px, eyes)
     assert {one.verdict for one in refined.values()} == {"unseen"}
     assert all("border of the picture" in one.reason for one in refined.values())
@@ -256,8 +257,8 @@ def test_what_both_eyes_share_may_be_off_but_not_one_against_the_other(good: Cas
     done = hand_off(
         rig, SOURCE, NEXT, Joints(0.0, 0.0), *good.clicks_px, sigma_px=0.2, calibration=covariance
     )
-    source = tuple(Eye(good.images[name], CAMERAS[name].model) for name in SOURCE)
-    eyes = {name: Eye(good.images[name], rig.cameras[name].model) for name in NEXT}
+    source = tuple(PosedImage(good.images[name], CAMERAS[name].model) for name in SOURCE)
+    eyes = {name: PosedImage(good.images[name], rig.cameras[name].model) for name in NEXT}
     refined = refine_handoff(done, (source[0], source[1]), good.clicks_px, eyes)
     for name in NEXT:
         assert (refined[name].verdict == "accepted") == together, refined[name].reason

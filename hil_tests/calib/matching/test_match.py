@@ -16,13 +16,12 @@ from calib.matching.partner import find_partner
 from calib.matching.patch import correlations, match_patch
 from calib.matching.verdict import (
     MatchSettings,
-    PatchFound,
     PatchMatch,
     expected_correlation,
     judged,
     texture_lacks,
 )
-from calib.matching.warp import Plane, Relief, Surface, Template, carry, facing_plane, grey
+from calib.matching.warp import Plane, PosedImage, Relief, Surface, Template, carry, facing_plane, grey
 from hil_tests.calib.matching.textured_planes import Edge, Pinhole, TexturedPlane, picture, random_texture
 
 FOCAL_PX = 1290.0  # the paper's Navcam
@@ -52,6 +51,10 @@ def seen(camera: Pinhole, seed: int, noise_dn: float = NOISE_DN, contrast_dn: fl
     return picture(camera, plane, noise_dn=noise_dn, seed=hash((camera.azimuth_rad, seed)) % 2**31)
 
 
+def shot(camera: Pinhole, *what: float) -> PosedImage:
+    return camera.posed(seen(camera, *what))
+
+
 def errors_of(matches: list[tuple[PatchMatch, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Errors (n, 2) in pixels and the same over their own sigmas."""
     errors = np.array([found.pixel_px - truth for found, truth in matches])
@@ -71,9 +74,7 @@ def test_patch_warped_over_a_guessed_plane_is_found_where_geometry_says() -> Non
             pixel = np.array([rng.uniform(90, 270), rng.uniform(70, 210)])
             point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
             guess = facing_plane(LEFT.model, pixel, 1.01 * float(np.linalg.norm(point)))
-            found = match_patch(
-                seen(LEFT, seed), LEFT.model, pixel, guess, seen(TURNED, seed), TURNED.model, 15, PLANE
-            )
+            found = match_patch(shot(LEFT, seed), pixel, guess, shot(TURNED, seed), 15, PLANE)
             assert found.verdict == "good", f"seed 3, scene {seed}, pixel {pixel}: {found.reason}"
             matches.append((found, TURNED.pixel(point)))
     errors, normalised = errors_of(matches)
@@ -89,9 +90,8 @@ def test_sigma_grows_with_noise_and_stays_honest() -> None:
         pixel = np.array([rng.uniform(90, 270), rng.uniform(70, 210)])
         point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
         found = match_patch(
-            seen(LEFT, 2, 8.0), LEFT.model, pixel, Plane(point, plane.normal), seen(TURNED, 2, 8.0),
-            TURNED.model, 15, PLANE,
-        )  # fmt: skip
+            shot(LEFT, 2, 8.0), pixel, Plane(point, plane.normal), shot(TURNED, 2, 8.0), 15, PLANE
+        )
         assert found.verdict == "good", found.reason
         matches.append((found, TURNED.pixel(point)))
     errors, normalised = errors_of(matches)
@@ -115,7 +115,7 @@ def test_noise_that_hangs_together_over_several_pixels_is_in_the_sigma() -> None
         pixel = np.array([rng.uniform(90, 270), rng.uniform(70, 210)])
         point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
         found = match_patch(
-            first, LEFT.model, pixel, Plane(point, plane.normal), second, TURNED.model, 5, PLANE
+            LEFT.posed(first), pixel, Plane(point, plane.normal), TURNED.posed(second), 5, PLANE
         )
         assert found.verdict == "good", found.reason
         matches.append((found, TURNED.pixel(point)))
@@ -137,7 +137,7 @@ def test_cameras_of_different_focal_length_match(zoom: float) -> None:
         pixel = np.array([180.0, 140.0]) + rng.uniform(-reach, reach, 2)
         point = plane.hit(source.position_m, source.rays(pixel))
         guess = facing_plane(source.model, pixel, float(np.linalg.norm(point)))
-        found = match_patch(first, source.model, pixel, guess, second, other.model, search_px=12)
+        found = match_patch(source.posed(first), pixel, guess, other.posed(second), search_px=12)
         assert found.verdict == "good", f"seed 4, pixel {pixel}: {found.reason}"
         matches.append((found, other.pixel(point)))
     errors, _ = errors_of(matches)
@@ -149,7 +149,7 @@ def test_partner_is_found_along_the_line_with_range_and_slope() -> None:
     for _ in range(15):
         pixel = np.array([rng.uniform(120, 330), rng.uniform(40, 240)])
         point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
-        found = find_partner(seen(LEFT, 5), LEFT.model, pixel, seen(RIGHT, 5), RIGHT.model, settings=PLANE)
+        found = find_partner(shot(LEFT, 5), pixel, shot(RIGHT, 5), settings=PLANE)
         assert found.match.verdict == "good", f"seed 5, pixel {pixel}: {found.match.reason}"
         assert found.plane is not None
         assert np.linalg.norm(found.plane.point_m - point) < 0.02
@@ -166,7 +166,7 @@ def test_partner_is_found_along_the_line_with_range_and_slope() -> None:
 
 def test_picture_shifted_across_the_line_shows_as_that_offset() -> None:
     shifted = np.roll(seen(RIGHT, 5), 2, axis=0)
-    found = find_partner(seen(LEFT, 5), LEFT.model, (200.0, 140.0), shifted, RIGHT.model)
+    found = find_partner(shot(LEFT, 5), (200.0, 140.0), RIGHT.posed(shifted))
     assert found.match.verdict == "good", found.match.reason
     assert abs(abs(found.across_px) - 2.0) < 0.1
     assert found.across_sigma_px < 0.05
@@ -174,7 +174,7 @@ def test_picture_shifted_across_the_line_shows_as_that_offset() -> None:
 
 def test_surface_without_texture_is_flat() -> None:
     plain = seen(LEFT, 0, NOISE_DN, 0.001), seen(RIGHT, 0, NOISE_DN, 0.001)
-    found = find_partner(plain[0], LEFT.model, (180.0, 140.0), plain[1], RIGHT.model)
+    found = find_partner(LEFT.posed(plain[0]), (180.0, 140.0), RIGHT.posed(plain[1]))
     assert found.match.verdict == "flat"
     assert np.isnan(found.match.pixel_px).all()
 
@@ -198,7 +198,7 @@ def test_straight_edge_is_flat_along_itself() -> None:
     edge[:, 180:] = 180.0
     edge += np.random.default_rng(0).normal(scale=NOISE_DN, size=edge.shape).astype(np.float32)  # type: ignore[attr-defined]
     found = match_patch(
-        edge, LEFT.model, (180.0, 140.0), facing_plane(LEFT.model, (180, 140), 4), edge, LEFT.model, 10
+        LEFT.posed(edge), (180.0, 140.0), facing_plane(LEFT.model, (180, 140), 4), LEFT.posed(edge), 10
     )
     assert found.verdict == "flat"
     assert "one direction" in found.reason
@@ -210,16 +210,14 @@ def test_repeated_texture_is_ambiguous() -> None:
     first = picture(LEFT, repeated, noise_dn=NOISE_DN, seed=1)
     second = picture(TURNED, repeated, noise_dn=NOISE_DN, seed=2)
     guess = facing_plane(LEFT.model, (180.0, 140.0), 4.0)
-    found = match_patch(first, LEFT.model, (180.0, 140.0), guess, second, TURNED.model, search_px=40)
+    found = match_patch(LEFT.posed(first), (180.0, 140.0), guess, TURNED.posed(second), search_px=40)
     assert found.verdict == "ambiguous", found
 
 
 def test_something_else_in_the_picture_is_weak() -> None:
     guess = facing_plane(LEFT.model, (180.0, 140.0), 4.0)
     for seed in (0, 1, 2):
-        found = match_patch(
-            seen(LEFT, seed), LEFT.model, (180.0, 140.0), guess, seen(TURNED, 9), TURNED.model, 40
-        )
+        found = match_patch(shot(LEFT, seed), (180.0, 140.0), guess, shot(TURNED, 9), 40)
         assert found.verdict == "weak", f"scene {seed}: {found}"
 
 
@@ -229,14 +227,14 @@ def test_target_hidden_from_one_eye_is_refused() -> None:
     point = wall(5).hit(LEFT.position_m, LEFT.rays(np.array([230.0, 140.0])))
     x, y = np.rint(RIGHT.pixel(point)).astype(int)
     right[y - 45 : y + 45, x - 45 : x + 45] = seen(RIGHT, 9)[y - 45 : y + 45, x - 45 : x + 45]
-    found = find_partner(seen(LEFT, 5), LEFT.model, (230.0, 140.0), right, RIGHT.model)
+    found = find_partner(shot(LEFT, 5), (230.0, 140.0), RIGHT.posed(right))
     assert found.match.verdict in ("weak", "ambiguous", "border")
 
 
 def test_a_faint_target_is_matched_as_far_as_it_is_certain() -> None:
     point = wall(6).hit(LEFT.position_m, LEFT.rays(np.array([200.0, 140.0])))
     left, right = (seen(camera, 6, contrast_dn=4.0) for camera in (LEFT, RIGHT))
-    found = find_partner(left, LEFT.model, (200.0, 140.0), right, RIGHT.model).match
+    found = find_partner(LEFT.posed(left), (200.0, 140.0), RIGHT.posed(right)).match
     assert found.verdict == "good", found.reason
     assert (np.abs(found.pixel_px - RIGHT.pixel(point)) < 3.0 * found.sigma_px).all()
 
@@ -244,14 +242,14 @@ def test_a_faint_target_is_matched_as_far_as_it_is_certain() -> None:
 def test_target_outside_the_other_picture_is_at_the_border() -> None:
     away = Pinhole(np.zeros(3), 1.2, 0.0, FOCAL_PX, SIZE_PX)
     guess = facing_plane(LEFT.model, (180.0, 140.0), 4.0)
-    found = match_patch(seen(LEFT, 0), LEFT.model, (180.0, 140.0), guess, seen(TURNED, 0), away.model, 20)
+    found = match_patch(shot(LEFT, 0), (180.0, 140.0), guess, away.posed(seen(TURNED, 0)), 20)
     assert found.verdict == "border"
     assert (found.correlation, found.second, found.half_px) == (0.0, 0.0, 0)  # nothing was compared
 
 
 def test_a_line_that_leaves_the_other_picture_altogether_has_no_partner() -> None:
     turned = Pinhole(RIGHT.position_m, 1.2, 0.0, FOCAL_PX, SIZE_PX)
-    found = find_partner(seen(LEFT, 5), LEFT.model, (200.0, 140.0), seen(RIGHT, 5), turned.model)
+    found = find_partner(shot(LEFT, 5), (200.0, 140.0), turned.posed(seen(RIGHT, 5)))
     assert found.match.verdict == "border"
     assert found.match.reason == "nothing that this pixel may show lies in the other camera's picture"
 
@@ -261,9 +259,7 @@ def test_a_line_too_short_for_a_second_place_has_no_rival() -> None:
     pixel = np.array([200.0, 140.0])
     point = wall(5).hit(LEFT.position_m, LEFT.rays(pixel))
     near = Pinhole(np.array([0.0, 0.02, 0.0]), 0.0, 0.0, FOCAL_PX, SIZE_PX)
-    found = find_partner(
-        seen(LEFT, 5), LEFT.model, pixel, seen(near, 5), near.model, float(np.linalg.norm(point)) * 0.9
-    )
+    found = find_partner(shot(LEFT, 5), pixel, shot(near, 5), float(np.linalg.norm(point)) * 0.9)
     assert found.match.verdict == "good", found.match.reason
     assert np.linalg.norm(found.match.pixel_px - near.pixel(point)) < 4 * RMS_PX
     assert found.match.second < found.match.correlation
@@ -274,7 +270,7 @@ def test_small_shift_of_the_window_does_not_hide_a_target_at_its_edge() -> None:
     point = wall(0).hit(LEFT.position_m, LEFT.rays(np.array([180.0, 140.0])))
     guess = facing_plane(LEFT.model, (180.0, 140.0), float(np.linalg.norm(point)))
     moved = np.roll(seen(TURNED, 0), 12, axis=1)
-    found = match_patch(seen(LEFT, 0), LEFT.model, (180.0, 140.0), guess, moved, TURNED.model, search_px=11)
+    found = match_patch(shot(LEFT, 0), (180.0, 140.0), guess, TURNED.posed(moved), search_px=11)
     assert found.verdict in ("border", "weak")
 
 
@@ -301,13 +297,13 @@ def test_a_partner_beyond_infinity_is_no_match() -> None:
     point = wall(5).hit(LEFT.position_m, LEFT.rays(pixel))
     far_px = RIGHT.pixel(LEFT.position_m + 1e6 * (point - LEFT.position_m))
     beyond = np.roll(seen(RIGHT, 5), round(far_px[0] - RIGHT.pixel(point)[0]) + 1, axis=1)
-    found = find_partner(seen(LEFT, 5), LEFT.model, pixel, beyond, RIGHT.model)
+    found = find_partner(shot(LEFT, 5), pixel, RIGHT.posed(beyond))
     assert found.match.verdict == "weak" and "see no common point" in found.match.reason, found.match
 
 
 def test_a_picture_that_is_nothing_but_not_a_number_matches_nowhere() -> None:
     nothing = np.full_like(seen(RIGHT, 5), np.nan)
-    found = find_partner(seen(LEFT, 5), LEFT.model, (200.0, 140.0), nothing, RIGHT.model)
+    found = find_partner(shot(LEFT, 5), (200.0, 140.0), RIGHT.posed(nothing))
     assert found.match.verdict == "weak" and "line" in found.match.reason
 
 
@@ -317,7 +313,7 @@ def test_a_rough_surface_adds_uncertainty_along_the_parallax_only() -> None:
     sigmas = []
     for roughness in (0.0, 0.05):
         found = match_patch(
-            seen(LEFT, 5), LEFT.model, pixel, Plane(point, wall(5).normal), seen(RIGHT, 5), RIGHT.model, 10,
+            shot(LEFT, 5), pixel, Plane(point, wall(5).normal), shot(RIGHT, 5), 10,
             MatchSettings(roughness=roughness),
         )  # fmt: skip
         sigmas.append(found.sigma_px)
@@ -330,9 +326,7 @@ def test_a_rough_surface_adds_uncertainty_along_the_parallax_only() -> None:
 def test_beside_the_border_a_lower_patch_finds_the_place_as_well(pixel_px: tuple[float, float]) -> None:
     pixel = np.array(pixel_px)
     point = wall(5).hit(LEFT.position_m, LEFT.rays(pixel))
-    found = match_patch(
-        seen(LEFT, 5), LEFT.model, pixel, Plane(point, wall(5).normal), seen(RIGHT, 5), RIGHT.model, 10, PLANE
-    )
+    found = match_patch(shot(LEFT, 5), pixel, Plane(point, wall(5).normal), shot(RIGHT, 5), 10, PLANE)
     assert found.verdict == "good", found.reason
     assert found.half_px < PLANE.half_px
     assert np.abs(found.pixel_px - RIGHT.pixel(point)).max() < 0.15
@@ -347,7 +341,7 @@ def test_what_is_left_unexplained_makes_the_surface_term_larger() -> None:
         variances = []
         for roughness, relief in ((0.0, 0.0), (0.05, 0.0), (0.05, 0.1)):
             found = match_patch(
-                seen(LEFT, 5), LEFT.model, pixel, Plane(point, wall(5).normal), image, RIGHT.model, 10,
+                shot(LEFT, 5), pixel, Plane(point, wall(5).normal), RIGHT.posed(image), 10,
                 MatchSettings(roughness=roughness, relief=relief),
             )  # fmt: skip
             assert found.verdict == "good", found.reason
@@ -364,8 +358,8 @@ def test_best_and_second_place_are_compared_before_the_best_is_deformed() -> Non
     template = Template(values, np.array([50, 50]), np.array([50.0, 50.0]), 1.0)
     refined = LeastSquaresMatch(np.array([50.0, 50.0]), 1e-4 * np.eye(2), np.zeros((2, 2)), 0.81)
     none = np.zeros((2, 2))
-    assert judged(template, PatchFound(refined, 0.6, 0.4), none, PLANE).verdict == "ambiguous"
-    assert judged(template, PatchFound(refined, 0.8, 0.4), none, PLANE).verdict == "good"
+    assert judged(template, refined, 0.6, 0.4, none, PLANE).verdict == "ambiguous"
+    assert judged(template, refined, 0.8, 0.4, none, PLANE).verdict == "good"
 
 
 @pytest.mark.parametrize(("contrast_dn", "correlation", "verdict"), [
@@ -379,7 +373,7 @@ def test_a_faint_patch_may_correlate_by_as_much_less_as_noise_explains(
     values = (120.0 + contrast_dn * (values - values.mean()) / values.std()).astype(np.float32)
     template = Template(values, np.array([50, 50]), np.array([50.0, 50.0]), 1.0)
     refined = LeastSquaresMatch(np.array([50.0, 50.0]), 1e-4 * np.eye(2), np.zeros((2, 2)), correlation)
-    judgement = judged(template, PatchFound(refined, 0.8, 0.0), np.zeros((2, 2)), PLANE)
+    judgement = judged(template, refined, 0.8, 0.0, np.zeros((2, 2)), PLANE)
     assert judgement.verdict == verdict, judgement.reason
 
 
@@ -405,7 +399,7 @@ def test_what_lies_far_from_the_target_does_not_pull_it() -> None:
     for near_px in (0.0, 6.0):
         settings = MatchSettings(half_px=12, near_px=near_px, roughness=0.05)
         surface = Plane(point, plane.normal)
-        found = match_patch(seen(LEFT, 4), LEFT.model, pixel, surface, mixed, TURNED.model, 8, settings)
+        found = match_patch(shot(LEFT, 4), pixel, surface, TURNED.posed(mixed), 8, settings)
         assert found.verdict == "good", found.reason
         off[near_px] = float(np.linalg.norm(found.pixel_px - there))
     assert off[0.0] > 0.6
@@ -438,12 +432,12 @@ def test_what_lies_behind_an_edge_does_not_pull_a_place_beside_it(seed: int) -> 
     matches = []
     for pixel in np.column_stack([rng.uniform(150, 176, 16), rng.uniform(60, 180, 16)]):
         point = scene.hit(LEFT.position_m, LEFT.rays(pixel))
-        stereo = find_partner(left, LEFT.model, pixel, right, RIGHT.model)
+        stereo = find_partner(LEFT.posed(left), pixel, RIGHT.posed(right))
         assert stereo.match.verdict == "good", stereo.match.reason
         assert stereo.plane is not None
         assert abs(stereo.match.pixel_px[0] - RIGHT.pixel(point)[0]) < 1.0
         found = match_patch(
-            left, LEFT.model, pixel, stereo.plane, tilted, TILTED.model, 20, relief=stereo.relief
+            LEFT.posed(left), pixel, stereo.plane, TILTED.posed(tilted), 20, relief=stereo.relief
         )
         assert found.verdict == "good", found.reason
         matches.append((found, TILTED.pixel(point)))
@@ -474,7 +468,7 @@ def test_what_is_as_good_as_infinitely_far_has_a_partner(range_m: float) -> None
     )
     left, right = (picture(camera, hill, 2, NOISE_DN, k) for k, camera in enumerate((LEFT, RIGHT)))
     pixel = np.array([170.3, 140.2])
-    found = find_partner(left, LEFT.model, pixel, right, RIGHT.model).match
+    found = find_partner(LEFT.posed(left), pixel, RIGHT.posed(right)).match
     assert found.verdict == "good", found.reason
     off_px = found.pixel_px - RIGHT.pixel(hill.hit(LEFT.position_m, LEFT.rays(pixel)))
     assert (np.abs(off_px) < 3.0 * found.sigma_px).all()
@@ -504,10 +498,10 @@ def test_a_wide_camera_searches_a_rocks_edge_as_far_as_the_pair_saw() -> None:
     images = [picture(camera, scene, 2, NOISE_DN, 4 + k) for k, camera in enumerate((narrow, partner, wide))]
     for _ in range(8):
         pixel = np.array([rng.uniform(130, 180), rng.uniform(90, 190)])
-        stereo = find_partner(images[0], narrow.model, pixel, images[1], partner.model)
+        stereo = find_partner(narrow.posed(images[0]), pixel, partner.posed(images[1]))
         assert stereo.plane is not None, stereo.match.reason
         found = match_patch(
-            images[0], narrow.model, pixel, stereo.plane, images[2], wide.model, 20,
+            narrow.posed(images[0]), pixel, stereo.plane, wide.posed(images[2]), 20,
             MatchSettings(least_lead=0.03), stereo.relief,
         )  # fmt: skip
         assert found.verdict == "good", found.reason

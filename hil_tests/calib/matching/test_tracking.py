@@ -12,12 +12,11 @@ from scipy import ndimage
 
 from calib.errors import CalibError
 from calib.geometry.rigid import Rigid, rot_y, rot_z
-from calib.matching.handoff import Eye
 from calib.matching.look import OnePoint, TrackLook, pose_doubt, seen_by
 from calib.matching.partner import find_partner
 from calib.matching.patch import match_patch
 from calib.matching.track import SIZES, Track, TrackSettings, indistinct, moved_track, start_track
-from calib.matching.warp import Plane
+from calib.matching.warp import Plane, PosedImage
 from hil_tests.calib.matching.textured_planes import Pinhole, TexturedPlane, picture, random_texture
 
 TARGET = np.array([3.0, 0.1, 0.0])
@@ -40,11 +39,13 @@ def pinholes(rover_x_m: float, heading_rad: float = 0.0) -> dict[str, Pinhole]:
 
 def eyes(
     rover_x_m: float, heading_rad: float = 0.0, plane: TexturedPlane = GROUND, seed: int = 0
-) -> dict[str, Eye]:
+) -> dict[str, PosedImage]:
     """Pictures with their cameras in the rover frame."""
     rover_from_site = pose(rover_x_m, heading_rad).inverse
     return {
-        name: Eye(picture(camera, plane, noise_dn=1.5, seed=seed + i), camera.model.moved(rover_from_site))
+        name: PosedImage(
+            picture(camera, plane, noise_dn=1.5, seed=seed + i), camera.model.moved(rover_from_site)
+        )
         for i, (name, camera) in enumerate(pinholes(rover_x_m, heading_rad).items())
     }
 
@@ -183,7 +184,7 @@ def test_each_change_of_key_adds_to_the_uncertainty_of_the_target(
 
 def test_a_target_behind_its_key_camera_is_lost_and_says_so(begun: Track) -> None:
     """The pose jumps so far that the believed place lies behind where the key picture was taken."""
-    behind = replace(begun, position_m=2.0 * begun.key.eye.camera.C - begun.position_m)
+    behind = replace(begun, position_m=2.0 * begun.key.view.camera.C - begun.position_m)
     look = seen_by(behind, eyes(0.0, seed=3))
     assert look.track.state == "lost"
     assert "not visible from where its key picture was taken" in look.reason
@@ -275,7 +276,7 @@ def test_a_place_that_is_partly_alike_is_not_taken_for_a_lost_target(begun: Trac
     alike, other = np.roll(random_texture(5), (30, 20), (0, 1)) - 120.0, random_texture(77) - 120.0
     world = replace(GROUND, grey=120.0 + 0.72 * alike + np.sqrt(1.0 - 0.72**2) * other)
     both = {
-        name: Eye(picture(camera, world, noise_dn=noise_dn, seed=seed), camera.model)
+        name: PosedImage(picture(camera, world, noise_dn=noise_dn, seed=seed), camera.model)
         for (name, camera), noise_dn, seed in zip(pinholes(0.0).items(), (1.5, 12.0), (50, 51), strict=True)
     }
     spread = np.diag(np.array([0.01] * 3 + [0.02] * 3) ** 2)
@@ -368,7 +369,7 @@ def test_the_range_at_the_start_is_that_of_the_middle_of_the_patch() -> None:
         hit = top.hit(camera.position_m, camera.rays(grid))
         on_disc = np.linalg.norm(hit - top.point_m, axis=-1) < wide_m
         image = np.where(on_disc, picture(camera, top, noise_dn=1.5), picture(camera, GROUND, noise_dn=1.5))
-        both[name] = Eye(image.astype(np.float32), camera.model)
+        both[name] = PosedImage(image.astype(np.float32), camera.model)
     track = start_track(both["left"], both["right"], pinholes(0.0)["left"].pixel(top.point_m))
     sight = top.point_m - both["left"].camera.C
     off_m = (track.position_m - top.point_m) @ sight / np.linalg.norm(sight)
@@ -400,7 +401,7 @@ def test_a_pose_that_jumps_is_said_and_nothing_else_is_taken(begun: Track) -> No
             position = turned @ np.array([0.0, y, -1.2]) + site_from_rover.translation_m
             camera = Pinhole(position, 0.08, -down, 900.0, (321, 241))
             image = picture(camera, GROUND, noise_dn=1.5, seed=40 + index)
-            seen[name] = Eye(image, camera.model.moved(site_from_rover.inverse))
+            seen[name] = PosedImage(image, camera.model.moved(site_from_rover.inverse))
         look = seen_by(track, seen)
         assert look.track.state == "lost" and look.track.misses == index + 1
         assert look.reason
@@ -419,7 +420,7 @@ def test_a_found_target_tells_how_the_rover_was_turned(begun: Track) -> None:
     exact = pinholes(0.0)["left"].model.moved(now.inverse)
 
     def turned_rad(one: Track) -> float:
-        return float(np.arccos(np.clip(one.key.eye.camera.A @ exact.A, -1.0, 1.0)))
+        return float(np.arccos(np.clip(one.key.view.camera.A @ exact.A, -1.0, 1.0)))
 
     assert turned_rad(track) == pytest.approx(0.010, rel=0.05)
     assert turned_rad(look.track) < 0.003
@@ -438,15 +439,7 @@ def test_an_eye_that_sees_the_surface_otherwise_is_asked_through_the_other(begun
     both = eyes(0.0, seed=3)
     right = both["right"]
     key = begun.key
-    alone = match_patch(
-        key.eye.image,
-        key.eye.camera,
-        key.pixel_px,
-        Plane(begun.position_m, normal),
-        right.image,
-        right.camera,
-        5.0,
-    )
+    alone = match_patch(key.view, key.pixel_px, Plane(begun.position_m, normal), right, 5.0)
     assert alone.verdict == "weak"
     look = seen_by(doubtful, both)
     assert look.track.state == "tracked"
@@ -463,13 +456,13 @@ def test_a_first_eye_found_through_the_second_hands_on_the_errors_of_both(begun:
     """The key is as if taken by the second eye, and its slope believed far off; the second eye is noisy."""
     normal = np.array([0.0, 1.0, -0.3]) / np.hypot(1.0, 0.3)
     second = eyes(0.0)["right"]
-    key = replace(begun.key, eye=second, pixel_px=pinholes(0.0)["right"].pixel(TARGET), normal=normal)
+    key = replace(begun.key, view=second, pixel_px=pinholes(0.0)["right"].pixel(TARGET), normal=normal)
     both = eyes(0.0, seed=3)
     noisy = picture(pinholes(0.0)["right"], GROUND, noise_dn=15.0, seed=9)
     both["right"] = replace(both["right"], image=noisy)
     believed = Plane(begun.position_m, normal)
     left = both["left"]
-    alone = match_patch(second.image, second.camera, key.pixel_px, believed, left.image, left.camera, 5.0)
+    alone = match_patch(second, key.pixel_px, believed, left, 5.0)
     assert alone.verdict == "weak"
     look = seen_by(replace(begun, key=key), both)
     assert look.track.state == "tracked" and look.renewed, look.reason
@@ -485,7 +478,7 @@ def test_a_first_eye_found_through_the_second_hands_on_the_errors_of_both(begun:
     drift = rates[0] @ left_px2 @ rates[0].T
     np.testing.assert_allclose(look.track.key.drift_m2, drift, atol=0.02 * np.trace(drift))
     images = both["right"].image, both["right"].camera, look.found["right"].pixel_px
-    stereo = find_partner(*images, both["left"].image, both["left"].camera, settings=SIZES).match
+    stereo = find_partner(PosedImage(*images[:2]), images[2], both["left"], settings=SIZES).match
     handed = rates[0] @ (left_px2 - stereo.covariance_px2) @ rates[0].T
     seen = rates[1] @ right_px2 @ rates[1].T
     np.testing.assert_allclose(handed, seen, atol=0.02 * np.trace(seen))
@@ -511,7 +504,7 @@ def test_a_changed_look_from_nearer_is_less_certain_than_a_plane() -> None:
     larger, sigmas_px = [], []
     for image in (same, (same + 0.55 * (other - other.mean())).astype(np.float32)):
         told, flat = (
-            match_patch(left.image, left.camera, pixel, plane, image, near.model, 6.0, sizes)
+            match_patch(left, pixel, plane, PosedImage(image, near.model), 6.0, sizes)
             for sizes in (SIZES, replace(SIZES, relief=0.0))
         )
         assert told.verdict == flat.verdict == "good", told.reason
@@ -527,7 +520,7 @@ def test_weights_so_narrow_that_one_row_counts_end_in_a_verdict(near_px: float) 
     both, narrow = eyes(0.0), replace(SIZES, near_px=near_px, flat_sigma_px=5.0, worst_sigma_px=50.0)
     left, right, plane = both["left"], both["right"], Plane(TARGET, GROUND.normal)
     pixel = pinholes(0.0)["left"].pixel(TARGET)
-    found = match_patch(left.image, left.camera, pixel, plane, right.image, right.camera, 6.0, narrow)
+    found = match_patch(left, pixel, plane, right, 6.0, narrow)
     assert found.verdict in ("good", "weak")
 
 
@@ -537,7 +530,7 @@ def test_what_the_key_does_not_show_any_more_is_found_by_the_standby(begun: Trac
     track = seen_by(step(begun, pose(0.0), near), eyes(0.2, seed=40)).track
     assert track.standby is not None
     image = picture(pinholes(0.0)["left"], replace(GROUND, grey=random_texture(77)))
-    changed = replace(track, key=replace(track.key, eye=replace(track.key.eye, image=image)))
+    changed = replace(track, key=replace(track.key, view=replace(track.key.view, image=image)))
     spread = np.diag(np.array([0.004] * 3 + [0.005] * 3) ** 2)
     now = eyes(0.4, seed=50)
     look = seen_by(step(changed, near, nearer, spread), now)

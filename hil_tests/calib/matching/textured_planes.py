@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from calib.geometry.cahvor import CameraModel
+from calib.matching.warp import PosedImage
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +54,9 @@ class Pinhole:
             self.focal_px * right + x * forward,
             self.focal_px * down + y * forward,
         )
+
+    def posed(self, image: NDArray[np.float32]) -> PosedImage:
+        return PosedImage(image, self.model)
 
     def pixel(self, point_m: ArrayLike) -> NDArray[np.float64]:
         x, y, z = self.axes @ (np.asarray(point_m) - self.position_m)

@@ -57,7 +57,7 @@ def taken(rig: Rig, drawing: Renderer, rng: np.random.Generator) -> dict[str, Ca
         image = photograph(picture, BLUR_PX, NOISE_DN, rng)
         facts = (f"{name}-{number}", name, number, 0.0, 0.0, pan, tilt, False, "")
         frame = StampedFrame(*facts, image=image, true_pan_rad=pan, true_tilt_rad=tilt)
-        views[name] = CameraView(frame, grey(image), rig.camera_in_rover(name, pan, tilt))
+        views[name] = CameraView(grey(image), rig.camera_in_rover(name, pan, tilt), frame)
     return views
 
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.matching.handoff import Eye
 from calib.matching.track import KeyPicture, Track
+from calib.matching.warp import PosedImage
 from drivers.errors import NoReply
 from hil_tests.mastctl.service_fakes import (
     CONFIG,
@@ -52,7 +52,7 @@ class ScriptedLooker:
             type(self).begin()
         camera = rig().cameras["navcam_left"].model
         key = KeyPicture(
-            Eye(np.zeros((48, 64), np.float32), camera), np.array([32.0, 24.0]), np.array([0.0, 0, -1])
+            PosedImage(np.zeros((48, 64), np.float32), camera), np.array([32.0, 24.0]), np.array([0.0, 0, -1])
         )
         track = Track("tracked", np.array(TARGET_M), 1e-4 * np.eye(3), key)
         return track, seen(track)
