@@ -32,14 +32,8 @@ MODEL_PX = RefineSettings().model_px
 class Landed:
     """Where one destination camera was to see the target, and where its picture shows it.
 
-    Attributes
-    ----------
-    geometric_px, geometric_covariance_px2
-        (2,) and (2, 2), of the clicks alone.
-    verdict, reason
-        Of the match; only ``accepted`` is a measurement.
-    found_px, found_covariance_px2
-        (2,) and (2, 2); None unless accepted.
+    ``geometric_px`` (2,) with the covariance (2, 2) of the clicks alone; ``found_px`` with its own, None
+    unless the match is ``accepted``.
     """
 
     geometric_px: FloatArray
@@ -60,18 +54,14 @@ class MatchedHandoff:
         ISO 8601, UTC.
     mast_digest
         Of the mast file that was believed.
-    pair
-        The source's left and right camera.
     joints, to_joints
         Joint readings of the source's and of the destination's pictures.
-    clicks_px
-        (2, 2) the target in the source's left and right picture.
-    sigma_px
-        Sigma of each coordinate of those.
+    clicks_px, sigma_px
+        (2, 2) the target in the pictures of the pair, left one first, and the sigma of each coordinate.
     landed
         By destination camera that was to see it.
     name
-        Where it is written down, for messages; empty if nowhere.
+        Where it is stored, for messages; empty if nowhere.
     """
 
     time: str
@@ -101,16 +91,9 @@ def matched_handoff(
     refined: Mapping[str, RefinedPixel],
     time: datetime | None = None,
 ) -> MatchedHandoff:
-    """Return the record of a geometric hand-off and its refinement.
+    """Return the record of a geometric hand-off, with what it was made of, and its refinement.
 
-    Parameters
-    ----------
-    mast_digest, pair, joints, clicks_px, sigma_px, to_joints
-        As in `MatchedHandoff`; what ``handoff`` was made of.
-    handoff, refined
-        Its result; destination cameras that do not see the target, or were not looked at, are left out.
-    time
-        When; now if left out.
+    Destination cameras that do not see the target, or were not searched, are left out.
     """
     landed = {}
     for name, predicted in handoff.pixels.items():
@@ -133,12 +116,10 @@ def matched_handoff(
 
 @dataclass(frozen=True, eq=False)
 class HandoffBias:
-    """The mean offset of one camera.
+    """The mean offset of one camera against the pair that handed over.
 
     Attributes
     ----------
-    source, camera
-        The pair that handed over, and the camera that looked.
     handoffs, left_out
         Accepted matches that were averaged, and those too far from the median.
     offset_px, covariance_px2
@@ -163,11 +144,11 @@ class HandoffBias:
 
     @property
     def sentence(self) -> str:
-        """The offset in words."""
+        """The offset as a sentence."""
         sigma = np.sqrt(np.diag(self.covariance_px2))
         x, y = (
-            f"{abs(off):.2f} +- {s:.2f} px {words[int(off < 0)]}"
-            for off, s, words in zip(
+            f"{abs(off):.2f} +- {s:.2f} px {sides[int(off < 0)]}"
+            for off, s, sides in zip(
                 self.offset_px, sigma, (("right", "left"), ("lower", "higher")), strict=True
             )
         )
@@ -178,14 +159,9 @@ class HandoffBias:
 
 
 def handoff_bias(handoffs: Sequence[MatchedHandoff], model_px: float = MODEL_PX) -> tuple[HandoffBias, ...]:
-    """Return the mean offset of each destination camera with at least two accepted matches.
+    """Return the mean offset of each destination camera with at least two accepted matches of one mast file.
 
-    Parameters
-    ----------
-    handoffs
-        Of one mast file: an offset is against what that file predicts.
-    model_px
-        One sigma, each axis, of what a match is wrong by beyond its own covariance.
+    ``model_px`` is one sigma, each axis, of what a match is wrong by beyond its own covariance.
     """
     groups: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
     for one in handoffs:

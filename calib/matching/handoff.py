@@ -1,8 +1,8 @@
-"""Hand-off refined by image: the geometric hand-off's pixels, looked up in the destination's pictures.
+"""Hand-off refined by image: the geometric hand-off's pixels, searched in the destination's pictures.
 
 The source pair gives the surface around the target (`calib.matching.partner`); the source patch is warped
 over it into each destination camera and correlated inside the ellipse that the geometric hand-off leaves
-(`calib.matching.patch`). What is found there counts only if it is the one thing that fits, and if the
+(`calib.matching.patch`). What is found there is accepted only if it is the one thing that fits, and if the
 destination's two cameras and the source's range mean the same point.
 """
 
@@ -19,12 +19,12 @@ from calib.geometry.handoff import Handoff, PredictedPixel
 from calib.geometry.rigid import FloatArray
 from calib.matching.partner import find_partner
 from calib.matching.patch import match_patch
-from calib.matching.verdict import MatchSettings, PatchMatch
+from calib.matching.verdict import MatchSettings, PatchMatch, worst_px2
 from calib.matching.warp import Plane, PosedImage
 
 RefinedVerdict = Literal["accepted", "ambiguous", "flat", "occluded", "unseen"]
 
-_WORDS: Mapping[str, RefinedVerdict] = {
+_VERDICTS: Mapping[str, RefinedVerdict] = {
     "good": "accepted",
     "ambiguous": "ambiguous",
     "flat": "flat",
@@ -39,11 +39,9 @@ class RefineSettings:
 
     Attributes
     ----------
-    sigmas
-        Half axes of the search ellipse in standard deviations.
-    least_px, most_px
-        Bounds of the search window's half side; below, the ellipse would be smaller than what the warp can
-        be wrong by.
+    sigmas, least_px, most_px
+        Half axes of the search ellipse in standard deviations, and bounds of the window's half side; below,
+        the ellipse would be smaller than what the warp can be wrong by.
     model_px
         One sigma of what camera models are wrong by, for comparing what cameras see. Flight cameras: 0.2 to
         0.5.
@@ -94,37 +92,32 @@ def refine_handoff(
     settings: RefineSettings | None = None,
     match_settings: MatchSettings | None = None,
 ) -> dict[str, RefinedPixel]:
-    """Look a handed-over target up in the destination's pictures.
+    """Search a handed-over target in the destination's pictures, by camera as in ``handoff.pixels``.
 
-    Parameters
-    ----------
-    handoff
-        The geometric hand-off of the same target.
-    source
-        Left and right camera of the pair that sees the target.
-    clicks_px
-        (2, 2) the target in both.
-    destinations
-        By name as in ``handoff.pixels``; all those there that see the target.
-
-    Returns
-    -------
-    refined
-        By destination camera.
+    ``source`` are the pictures of the pair that sees the target, left one first, ``clicks_px`` (2, 2) the
+    target in both; ``destinations`` all those pictures that should show it.
     """
-    settings = settings or RefineSettings()
-    sizes = match_settings or MatchSettings()
-    surface = _surface(source, np.asarray(clicks_px, dtype=np.float64), sizes, settings)
+    settings, sizes = settings or RefineSettings(), match_settings or MatchSettings()
+    clicks = np.asarray(clicks_px, dtype=np.float64)
+    surface = _surface(source, clicks, sizes, settings)
     refined: dict[str, RefinedPixel] = {}
-    for name, eye in destinations.items():
+    for name, image in destinations.items():
         predicted = handoff.pixels.get(name)
         if predicted is None:
             refined[name] = _none("unseen", handoff.reasons.get(name, "the hand-off has no such camera"))
-        elif not isinstance(surface, Plane):
-            refined[name] = surface
+        elif isinstance(surface, Plane):
+            refined[name] = _searched(source[0], clicks[0], surface, image, predicted, settings, sizes)
         else:
-            refined[name] = _looked_up(source[0], clicks_px[0], surface, eye, predicted, settings, sizes)
-    return _agreeing(refined, handoff, settings)
+            refined[name] = surface
+    accepted = {name: one for name, one in refined.items() if one.verdict == "accepted"}
+    against = _not_confirmed(refined, accepted, handoff, settings) if accepted else ""
+    if not against:
+        return refined
+    taken_back = _none("occluded", against)
+    return refined | {
+        name: replace(taken_back, off_px=one.off_px, correlation=one.correlation, second=one.second)
+        for name, one in accepted.items()
+    }
 
 
 def _surface(
@@ -137,41 +130,42 @@ def _surface(
     left, right = source
     found = find_partner(left, clicks_px[0], right, settings=sizes)
     if found.match.verdict != "good" or found.plane is None:
-        return _none(_WORDS[found.match.verdict], f"in the source pair: {found.match.reason}")
-    apart = found.match.pixel_px - clicks_px[1]
-    worst = settings.click_px + 4.0 * math.sqrt(float(np.linalg.eigvalsh(found.match.covariance_px2)[-1]))
-    if np.linalg.norm(apart) > worst:
+        return _none(_VERDICTS[found.match.verdict], f"in the source pair: {found.match.reason}")
+    apart_px = float(np.linalg.norm(found.match.pixel_px - clicks_px[1]))
+    worst = settings.click_px + 4.0 * math.sqrt(worst_px2(found.match.covariance_px2))
+    if apart_px > worst:
         return _none(
             "ambiguous",
-            f"in the source pair: the right camera's pixel lies {np.linalg.norm(apart):.1f} px from where "
+            f"in the source pair: the right camera's pixel lies {apart_px:.1f} px from where "
             f"the pictures put the left camera's target, at most {worst:.1f} px is expected",
         )
     return found.plane
 
 
-def _looked_up(
+def _searched(
     source: PosedImage,
     pixel_px: FloatArray,
     surface: Plane,
-    eye: PosedImage,
+    image: PosedImage,
     predicted: PredictedPixel,
     settings: RefineSettings,
     sizes: MatchSettings,
 ) -> RefinedPixel:
     """Search one destination picture."""
-    search = settings.sigmas * math.sqrt(float(np.linalg.eigvalsh(predicted.search_px2)[-1]))
+    search = settings.sigmas * math.sqrt(worst_px2(predicted.search_px2))
     search = min(max(search, settings.least_px), settings.most_px)
-    found: PatchMatch = match_patch(source, pixel_px, surface, eye, search, sizes)
+    found: PatchMatch = match_patch(source, pixel_px, surface, image, search, sizes)
     scores = (found.correlation, found.second)
-    if not _whole_window(found, eye, search):
+    # Whether the patch fits into the picture wherever in the window the target is.
+    if not image.camera.holds(found.predicted_px, search + found.half_px + 0.5):
         edge = f"part of the {search:.0f} px around the hand-off's pixel where it may be lies at the border"
-        words = found.reason if found.verdict == "border" else f"{edge} of the picture"
-        return _none("unseen", words, *scores)
+        reason = found.reason if found.verdict == "border" else f"{edge} of the picture"
+        return _none("unseen", reason, *scores)
     if found.verdict == "border":
-        # All of the window could be searched: what it holds best is not the target.
+        # All of the window could be searched: what it shows best is not the target.
         return _none("occluded", found.reason, *scores)
     if found.verdict != "good":
-        return _none(_WORDS[found.verdict], found.reason, *scores)
+        return _none(_VERDICTS[found.verdict], found.reason, *scores)
     off = found.pixel_px - predicted.pixel_px
     allowed = predicted.search_px2 + found.covariance_px2 + settings.model_px**2 * np.eye(2)
     distance = math.sqrt(float(off @ np.linalg.solve(allowed, off)))
@@ -185,42 +179,18 @@ def _looked_up(
     return RefinedPixel("accepted", "", found.pixel_px, found.covariance_px2, off, *scores)
 
 
-def _whole_window(found: PatchMatch, eye: PosedImage, search_px: float) -> bool:
-    """Return whether the patch fits into the picture wherever in the window the target is."""
-    reach = search_px + found.half_px
-    size = np.array(eye.camera.size_px)
-    return bool((found.predicted_px >= reach).all() and (found.predicted_px <= size - 1 - reach).all())
-
-
-def _agreeing(
-    refined: dict[str, RefinedPixel],
+def _not_confirmed(
+    refined: Mapping[str, RefinedPixel],
+    accepted: Mapping[str, RefinedPixel],
     handoff: Handoff,
     settings: RefineSettings,
-) -> dict[str, RefinedPixel]:
-    """Take back what the other destination cameras, or the source's range, do not confirm."""
-    accepted = {name: one for name, one in refined.items() if one.verdict == "accepted"}
-    doubting = [name for name, one in refined.items() if one.verdict in ("ambiguous", "occluded", "flat")]
-    if not accepted:
-        return refined
-    if doubting:
-        words = f"{doubting[0]} does not confirm it: {refined[doubting[0]].reason}"
-        return {**refined, **{name: _taken_back(one, words) for name, one in accepted.items()}}
-    chi2 = _misfit(accepted, handoff, settings)
-    if chi2 > settings.worst_chi2:
-        words = (
-            f"{' and '.join(accepted)} and the source pair do not mean one point: weighted misfit "
-            f"{chi2:.0f}, at most {settings.worst_chi2:g} is expected"
-        )
-        return {**refined, **{name: _taken_back(one, words) for name, one in accepted.items()}}
-    return refined
-
-
-def _misfit(accepted: Mapping[str, RefinedPixel], handoff: Handoff, settings: RefineSettings) -> float:
-    """Weighted square of how far the found pixels lie from the hand-off's, all together.
-
-    What the cameras share (a range or a calibration that is off) may move them together as far as that is
-    uncertain; against each other they may be wrong only by what each alone can.
-    """
+) -> str:
+    """Return why the other destination cameras, or the source's range, do not confirm what was found."""
+    for name, one in refined.items():
+        if one.verdict in ("ambiguous", "occluded", "flat"):
+            return f"{name} does not confirm it: {one.reason}"
+    # What the cameras share (a range or a calibration that is off) may move them together as far as that is
+    # uncertain; against each other they may be wrong only by what each alone can.
     order = [name for name, predicted in handoff.pixels.items() if predicted is not None]
     rows = np.concatenate([2 * order.index(name) + np.arange(2) for name in accepted])
     allowed = handoff.joint_px2[np.ix_(rows, rows)] + settings.model_px**2 * np.eye(len(rows))
@@ -228,12 +198,13 @@ def _misfit(accepted: Mapping[str, RefinedPixel], handoff: Handoff, settings: Re
         part = slice(2 * index, 2 * index + 2)
         allowed[part, part] += one.covariance_px2
     off = np.concatenate([one.off_px for one in accepted.values()])
-    return float(off @ np.linalg.solve(allowed, off))
-
-
-def _taken_back(one: RefinedPixel, words: str) -> RefinedPixel:
-    nothing = _none("occluded", words)
-    return replace(nothing, off_px=one.off_px, correlation=one.correlation, second=one.second)
+    chi2 = float(off @ np.linalg.solve(allowed, off))
+    if chi2 <= settings.worst_chi2:
+        return ""
+    return (
+        f"{' and '.join(accepted)} and the source pair do not mean one point: weighted misfit "
+        f"{chi2:.0f}, at most {settings.worst_chi2:g} is expected"
+    )
 
 
 def _none(

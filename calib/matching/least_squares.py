@@ -14,7 +14,7 @@ McCaffrey 2002), with N = WᵀJ:
 Differences of neighbours are not independent: interpolation, blur and colour filters spread noise over two or
 three pixels, relief and a wrong plane over more, and all along an edge alike. The usual σ²N⁻¹ would call such
 a position too good. So would the sum of W_i r_i (W_k r_k)ᵀ over near pairs (White 1980, Newey and West 1987)
-where few strong edges hold the place, since these are what the fit has fitted.
+where few strong edges fix the place, since these are what the fit has fitted.
 """
 
 from __future__ import annotations
@@ -48,10 +48,8 @@ class LeastSquaresMatch:
 
     Attributes
     ----------
-    pixel_px
-        (2,) the target in the destination image.
-    covariance_px2
-        (2, 2) of that position.
+    pixel_px, covariance_px2
+        (2,) the target in the destination image, and (2, 2) of that position.
     deformation
         (2, 2) D: what the warp did not foresee, as a linear map of offsets from the target.
     correlation
@@ -73,12 +71,13 @@ def match_least_squares(
     target_px: FloatArray,
     image: Grey,
     start_px: FloatArray,
-    deforming: bool = True,
-    block_px: float = 10.0,
+    block_px: float,
     near_px2: FloatArray | None = None,
     counts: FloatArray | None = None,
 ) -> LeastSquaresMatch | None:
-    """Find where the image shows the template, from a start good to about a pixel.
+    """Find where the image (h, w) shows the template, from a start (2,) good to about a pixel.
+
+    None if it did not settle, left the image, or found nothing to fix a place by.
 
     Parameters
     ----------
@@ -86,23 +85,12 @@ def match_least_squares(
         (h, w) grey, its middle on the whole pixel ``centre_px`` (2,).
     target_px
         (2,) the target's place in the template's own pixel grid.
-    image
-        (h, w) grey.
-    start_px
-        (2,) about where the target is in the image.
-    deforming
-        Whether D is free; else it stays zero.
     block_px
         Side of the blocks of pixels: over how many grey differences may depend on each other.
     near_px2
-        (2, 2) covariance of a Gaussian around the target by which pixels count; all alike if not given.
+        (2, 2) covariance of a Gaussian around the target by which pixels are weighted; all alike by default.
     counts
-        (h, w) by how much the template's pixels count, 0 to 1, beside that; all alike if not given.
-
-    Returns
-    -------
-    refined
-        None if it did not settle, left the image, or found nothing to hold on to.
+        (h, w) weights of the template's pixels, 0 to 1, beside that; all alike by default.
     """
     from scipy import ndimage  # slow to load, and a daemon that starts does not need it
 
@@ -118,38 +106,40 @@ def match_least_squares(
     surface = Surface.around(image, start + q.min(axis=(0, 1)), start + q.max(axis=(0, 1)), margin_px=3)
 
     def settled(fit: _PatchFit, counts: FloatArray, deforms: bool, enough_px: float) -> _PatchFit | None:
-        part = _counting(counts)
-        if part is None:
+        heavy = np.asarray(counts > LEAST_COUNT)
+        rows, columns = (np.flatnonzero(heavy.any(axis=axis)) for axis in (1, 0))
+        if not len(rows):
             return None
+        part = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
         free = slice(None) if deforms else _RIGID
         rates, steps = (one[part][..., free].reshape(-1, 8 if deforms else 4) for one in (jacobian, weights))
         return _settled(fit, surface, q[part], t[part], rates, steps, counts[part], enough_px)
 
     first = _PatchFit(start, np.zeros((2, 2)))
-    held = np.ones(t.shape) if counts is None else np.asarray(counts, dtype=np.float64)[inner]
-    wide = held if near_px2 is None else held * gaussian(q, near_px2)
+    own = np.ones(t.shape) if counts is None else np.asarray(counts, dtype=np.float64)[inner]
+    wide = own if near_px2 is None else own * gaussian(q, near_px2)
     if near_px2 is None and counts is None:
-        whole = settled(first, wide, deforming, STEP_ENOUGH_PX)
+        whole = settled(first, wide, True, STEP_ENOUGH_PX)
     else:
         begun = settled(first, wide, False, 0.05)
         # What bends and hides more than the deformation can follow still has a place.
-        whole = (settled(begun, wide, deforming, 10 * STEP_ENOUGH_PX) or begun) if begun else None
-    if whole is not None and near_px2 is None:
+        whole = (settled(begun, wide, True, 10 * STEP_ENOUGH_PX) or begun) if begun else None
+    if whole is None:
+        return None
+    if near_px2 is None:
         alike = wide * _alike(whole, surface, q, t, wide)
-        better = settled(whole, alike, deforming, 10 * STEP_ENOUGH_PX)
-        refined = _refined(better or whole, block_px)
+        refined = _refined(settled(whole, alike, True, 10 * STEP_ENOUGH_PX) or whole, block_px)
         # What looks different moves the place less, but it must not make a false place look right.
-        refined = replace(refined, correlation=whole.correlation) if refined else None
-    else:
-        refined = _refined(whole, block_px) if whole else None
-    if whole is None or refined is None or near_px2 is None:
-        return refined
-    middle = settled(whole, held * gaussian(q, NARROW**2 * near_px2), False, 10 * STEP_ENOUGH_PX)
+        return replace(refined, correlation=whole.correlation) if refined else None
+    refined = _refined(whole, block_px)
+    if refined is None:
+        return None
+    middle = settled(whole, own * gaussian(q, NARROW**2 * near_px2), False, 10 * STEP_ENOUGH_PX)
     return replace(refined, middle=_refined(middle, block_px) if middle else None)
 
 
 def _alike(fit: _PatchFit, surface: Surface, q: FloatArray, t: FloatArray, counts: FloatArray) -> FloatArray:
-    """By how much pixels (h, w) count: less where the picture shows something else all around them.
+    """Weights (h, w) of pixels: less where the picture shows something else all around them.
 
     Dust on the lens, a reflection, a shadow's edge: smooth and as wide as some blocks, so that leaving out
     single blocks does not show what they shift.
@@ -167,20 +157,33 @@ def _alike(fit: _PatchFit, surface: Surface, q: FloatArray, t: FloatArray, count
     return np.asarray(1.0 / (1.0 + (mean / max(BLOT_SIGMAS * usual, 1e-6)) ** 2) ** 2)
 
 
-def _counting(counts: FloatArray) -> tuple[slice, slice] | None:
-    """The rows and columns of weights (h, w) that count; None if none does."""
-    held = counts > LEAST_COUNT
-    if not held.any():
-        return None
-    rows, columns = np.flatnonzero(held.any(axis=1)), np.flatnonzero(held.any(axis=0))
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-
-
 def gaussian(q: FloatArray, covariance_px2: FloatArray) -> FloatArray:
     """Return the weights (h, w) of offsets (h, w, 2), px, by a Gaussian of this (2, 2) covariance: 1 at 0."""
     weights, (x, y) = np.linalg.inv(covariance_px2), (q[..., 0], q[..., 1])
     squares = weights[0, 0] * x * x + (weights[0, 1] + weights[1, 0]) * x * y + weights[1, 1] * y * y
     return np.asarray(np.exp(-0.5 * squares), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _PatchFit:
+    """A state of the iteration: place and deformation; once settled also what its covariance is made of."""
+
+    position: FloatArray
+    deformation: FloatArray
+    gain: float = 1.0
+    template: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    rest: FloatArray = field(default_factory=lambda: np.empty(0))
+    counts: FloatArray = field(default_factory=lambda: np.empty(0))
+    weights: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    rates: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def correlation(self) -> float:
+        """Normalized correlation of template and image, pixels weighted as in the fit."""
+        t, counts = self.template.reshape(-1), self.counts.reshape(-1)
+        a, b = (one - float(counts @ one) / float(counts.sum()) for one in (t, self.rest + self.gain * t))
+        weighted = counts * a
+        return float(weighted @ b) / math.sqrt(max(float(weighted @ a) * float((counts * b) @ b), 1e-12))
 
 
 def _refined(fit: _PatchFit, block_px: float) -> LeastSquaresMatch | None:
@@ -202,29 +205,10 @@ def _refined(fit: _PatchFit, block_px: float) -> LeastSquaresMatch | None:
         return None
     place = moved[:, :2] / fit.gain
     covariance = (1.0 - 1.0 / len(place)) * place.T @ place + FLOOR_PX**2 * np.eye(2)
-    if not np.isfinite(covariance).all() or not np.isfinite(fit.correlation):
+    correlation = fit.correlation
+    if not np.isfinite(covariance).all() or not np.isfinite(correlation):
         return None
-    return LeastSquaresMatch(fit.position, covariance, fit.deformation, fit.correlation)
-
-
-@dataclass(frozen=True, eq=False)
-class _PatchFit:
-    """A state of the iteration: place and deformation; once settled also what its covariance is made of."""
-
-    position: FloatArray
-    deformation: FloatArray
-    gain: float = 1.0
-    template: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    rest: FloatArray = field(default_factory=lambda: np.empty(0))
-    counts: FloatArray = field(default_factory=lambda: np.empty(0))
-    weights: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    rates: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-
-    @property
-    def correlation(self) -> float:
-        """Normalized correlation of template and image, pixels weighted as in the fit."""
-        t = self.template.reshape(-1)
-        return _correlation(t, self.rest + self.gain * t, self.counts.reshape(-1))
+    return LeastSquaresMatch(fit.position, covariance, fit.deformation, correlation)
 
 
 def _settled(
@@ -279,16 +263,14 @@ def _gradient(values: FloatArray) -> FloatArray:
     from scipy import ndimage  # slow to load, and a daemon that starts does not need it
 
     taps = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12.0
-    return np.stack(
-        [ndimage.correlate1d(values, taps, axis=axis, mode="nearest") for axis in (1, 0)], axis=-1
-    )
+    both = [ndimage.correlate1d(values, taps, axis=axis, mode="nearest") for axis in (1, 0)]
+    return np.stack(both, axis=-1)
 
 
 def _columns(gradient: FloatArray, q: FloatArray, t: FloatArray) -> FloatArray:
     """Return the derivatives (h, w, 8) of image minus model: position, deformation by rows, gain, offset."""
-    columns = [gradient[..., 0], gradient[..., 1]]
-    columns += [gradient[..., a] * q[..., b] for a in (0, 1) for b in (0, 1)]
-    return np.stack([*columns, -t, -np.ones_like(t)], axis=-1)
+    deformed = (gradient[..., :, None] * q[..., None, :]).reshape(*t.shape, 4)
+    return np.concatenate([gradient, deformed, -t[..., None], -np.ones_like(t)[..., None]], axis=-1)
 
 
 class _Photometry:
@@ -304,11 +286,3 @@ class _Photometry:
         """Return gain and offset of a seen patch (h, w)."""
         gain = float(self._weights @ seen.reshape(-1)) / self._variance
         return gain, float(self._shares @ seen.reshape(-1)) - gain * self._mean
-
-
-def _correlation(a: FloatArray, b: FloatArray, counts: FloatArray) -> float:
-    """Normalised correlation of two grey vectors (n,), weighted."""
-    total = float(counts.sum())
-    a, b = a - float(counts @ a) / total, b - float(counts @ b) / total
-    weighted = counts * a
-    return float(weighted @ b) / math.sqrt(max(float(weighted @ a) * float((counts * b) @ b), 1e-12))

@@ -1,19 +1,19 @@
-"""Follow one target while the rover moves: predicted, found in both cameras, filtered, or said to be lost.
+"""Follow one target while the rover moves: predicted, found in both cameras, filtered, or reported as lost.
 
-The state is the target's position in the rover frame with its covariance (`calib.matching.track`). A look
-(`seen_by`) warps the key picture of the target through its surface into each camera as that camera would see
-it now (`calib.matching.patch`), so that neither scale nor slant nor the change to another camera spoils the
-correlation; finds it near the prediction; and takes it only if both cameras, the prediction and the picture
+The state is the target's position in the rover frame with its covariance (`calib.matching.track`). Each time
+(`seen_by`) the key picture of the target is warped through its surface into each camera as that camera would
+see it now (`calib.matching.patch`), so that neither scale nor slant nor the change to another camera spoils
+the correlation; found near the prediction; and accepted only if both cameras, the prediction and the picture
 mean the same point.
 
 A target that is not found is ``lost``: the state goes on by rover motion alone, its covariance grows, and
-with it the window of the next look. It is found again by the same rules, so that another rock does not take
+with it the window of the next search. It is found again by the same rules, so that another rock does not take
 its place.
 
 Whether pictures contradict the motion that a track was carried over: it has the covariance that was stated of
 the motion; the pictures after it show where the target is without that. How far the two lie apart, against
-the covariance of both, is chi-square. Once in a thousand looks an honest motion is off by so much; below that
-nothing is said.
+the covariance of both, is chi-square. Once in a thousand times an honest motion is off by so much; below that
+nothing is reported.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from calib.matching.track import (
     on_surface,
     outgrown,
 )
-from calib.matching.verdict import PatchMatch
+from calib.matching.verdict import PatchMatch, worst_px2
 from calib.matching.warp import Plane, PosedImage
 
 STEPS = 20
@@ -51,14 +51,17 @@ STEPS = 20
 ENOUGH = 1e-4
 """...and the step, in sigmas of the point, after which no more are made."""
 
+ONE_CAMERA_CHI2 = 13.8
+"""As `TrackSettings.worst_chi2`, of the two pixel coordinates of one camera."""
 
-@dataclass(frozen=True, eq=False)
-class PixelSighting:
-    """A pixel (2,) with its covariance (2, 2), px², in a camera of the point's frame."""
+UNKNOWN_M = 100.0
+"""One sigma of where a target is of which only the pictures show."""
 
-    camera: CameraModel
-    pixel_px: FloatArray
-    covariance_px2: FloatArray
+PixelSighting = tuple[CameraModel, FloatArray, FloatArray]
+"""A camera in the point's frame, a pixel (2,), and its covariance (2, 2), px²."""
+
+Images = Mapping[str, PosedImage]
+"""By camera name, left first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,34 +76,23 @@ class OnePoint:
 def one_point(
     believed_m: FloatArray, covariance_m2: FloatArray, sightings: Iterable[PixelSighting], model_px: float
 ) -> OnePoint | None:
-    """Return the point that fits a believed position and pixels best, by least squares.
+    """Return the point that fits a believed position (3,), with its covariance, and pixels best.
 
-    Parameters
-    ----------
-    believed_m, covariance_m2
-        (3,) and (3, 3), in the cameras' common frame.
-    sightings
-        What the cameras see.
-    model_px
-        One sigma of what each camera's model is wrong by, added to each pixel.
-
-    Returns
-    -------
-    point
-        None if a camera cannot see where the point comes to lie, or the steps do not settle.
+    ``model_px`` is one sigma of what each camera's model is wrong by, added to each pixel. None if a camera
+    cannot see where the point comes to lie, or the steps do not settle.
     """
-    seen = list(sightings)
-    weights = [np.linalg.inv(one.covariance_px2 + model_px**2 * np.eye(2)) for one in seen]
+    model_px2 = model_px**2 * np.eye(2)
+    seen = [(camera, pixel, np.linalg.inv(noise + model_px2)) for camera, pixel, noise in sightings]
     prior = np.linalg.inv(covariance_m2 + 1e-12 * np.eye(3))
-    position, normal, chi2 = believed_m.copy(), prior, 0.0
+    position = believed_m.copy()
     for _ in range(STEPS):
         off = believed_m - position
         normal, right, chi2 = prior.copy(), prior @ off, float(off @ prior @ off)
-        for one, weight in zip(seen, weights, strict=True):
-            pixel, rate, valid = one.camera.project_jacobian(position)
+        for camera, found_px, weight in seen:
+            pixel, rate, valid = camera.project_jacobian(position)
             if not bool(valid):
                 return None
-            rest = one.pixel_px - pixel
+            rest = found_px - pixel
             normal += rate.T @ weight @ rate
             right += rate.T @ weight @ rest
             chi2 += float(rest @ weight @ rest)
@@ -122,7 +114,7 @@ class PoseDoubt:
     sigmas
         How unlikely that is by chance, as a normal error's number of sigmas.
     sure
-        Whether what was found is the track's target by the rules of a look; else it may be another thing.
+        Whether what was found is the track's target by the rules of `seen_by`; else it may be another thing.
     """
 
     off_m: FloatArray
@@ -131,32 +123,23 @@ class PoseDoubt:
 
     @property
     def sentence(self) -> str:
-        """It in words."""
+        """It as a sentence."""
         off = f"{100 * float(np.linalg.norm(self.off_m)):.1f} cm ({self.sigmas:.1f} sigma)"
+        wrong = "the pose is wrong by more than its covariance says"
         if self.sure:
-            return (
-                f"the pictures put the target {off} from where the pose does: the pose is wrong by more than "
-                "its covariance says"
-            )
+            return f"the pictures put the target {off} from where the pose does: {wrong}"
         return (
-            f"the pictures show what looks like the target {off} from where the pose puts it: the pose is "
-            "wrong by more than its covariance says, or that is another thing"
+            f"the pictures show what looks like the target {off} from where the pose puts it: {wrong}, "
+            "or that is another thing"
         )
 
 
 def pose_doubt(
     believed_m: FloatArray, covariance_m2: FloatArray, seen: OnePoint, sure: bool = True
 ) -> PoseDoubt | None:
-    """Return what a seen place says against a believed one; None if it says nothing that chance does not.
+    """Return what a place by the pictures alone says against a believed one, as the motion carried it.
 
-    Parameters
-    ----------
-    believed_m, covariance_m2
-        (3,) and (3, 3) of the target as the motion carried it.
-    seen
-        The target by the pictures alone.
-    sure
-        As `PoseDoubt.sure`.
+    ``sure`` as in `PoseDoubt`. None if it says nothing that chance does not.
     """
     off = seen.position_m - believed_m
     statistic = float(off @ np.linalg.solve(covariance_m2 + seen.covariance_m2, off))
@@ -164,13 +147,9 @@ def pose_doubt(
     return PoseDoubt(off, sigmas(probability), sure) if probability < Level.STATED else None
 
 
-UNKNOWN_M = 100.0
-"""One sigma of where a target is of which only the pictures show."""
-
-
 @dataclass(frozen=True, eq=False)
 class TrackLook:
-    """The result of one look.
+    """The result of one search.
 
     Attributes
     ----------
@@ -179,14 +158,14 @@ class TrackLook:
     found
         By camera name: the match in that camera, with its verdict.
     reason
-        Why the target counts as lost, one sentence; empty while it is tracked.
+        Why the target is lost, one sentence; empty while it is tracked.
     chi2
         The weighted misfit of pixels and prediction; not-a-number if nothing was found.
     renewed
-        Whether the key picture is now from this look.
+        Whether the key picture is now one of these.
     doubt
-        The evidence of both cameras against the motion since the last look, if any; the target may be tracked
-        all the same.
+        The evidence of both cameras against the motion since the last search, if any; the target may be
+        tracked all the same.
     """
 
     track: Track
@@ -197,131 +176,122 @@ class TrackLook:
     doubt: PoseDoubt | None = None
 
 
-def seen_by(track: Track, eyes: Mapping[str, PosedImage], settings: TrackSettings | None = None) -> TrackLook:
-    """Look for the target in one or two new pictures, and update the track.
+def seen_by(track: Track, images: Images, settings: TrackSettings | None = None) -> TrackLook:
+    """Search for the target in one or two new pictures of one moment, and update the track.
 
-    Parameters
-    ----------
-    eyes
-        By camera name: one picture, or those of a stereo pair (left first) of one moment, cameras in the
-        rover frame. A frame that is missing is left out; one camera alone serves while the target is tracked.
+    The cameras are in the rover frame. One camera alone serves while the target is tracked.
     """
     settings = settings or TrackSettings()
-    look = _seen(track, eyes, settings)
-    if look.track.state == "lost" and track.standby is not None and eyes:
-        again = _seen(replace(track, key=track.standby, standby=None), eyes, settings)
+    look = _seen(track, images, settings)
+    if look.track.state == "lost" and track.standby is not None and images:
+        again = _seen(replace(track, key=track.standby, standby=None), images, settings)
         look = replace(again, renewed=True) if again.track.state == "tracked" else look
     if look.track.state == "lost" and look.doubt is None and track.state == "tracked":
-        look = replace(look, doubt=_seen_elsewhere(track, eyes, settings))
+        look = replace(look, doubt=_seen_elsewhere(track, images, settings))
     return look
 
 
-def _seen_elsewhere(
-    track: Track, eyes: Mapping[str, PosedImage], settings: TrackSettings
-) -> PoseDoubt | None:
-    """What a wider window shows of a target that is not where the motion since the last look put it.
+def _seen_elsewhere(track: Track, images: Images, settings: TrackSettings) -> PoseDoubt | None:
+    """What a wider window shows of a target that is not where the motion since the last search put it.
 
     Both cameras must know the key picture well and mean one point. The target stays lost all the same: so far
     off, the next rock may look like it.
     """
     key = anchored(track)
-    if key is None or len(eyes) < 2 or not track.motion_covariance.any():
+    if key is None or len(images) < 2 or not track.motion_covariance.any():
         return None
     plane, wide = Plane(track.position_m, track.key.normal), replace(settings, least_px=settings.most_px)
-    found = {name: _found(track, key, plane, eye, wide) for name, eye in eyes.items()}
+    found = {name: _found(track, key, plane, image, wide) for name, image in images.items()}
     if any(m.verdict != "good" or m.correlation < settings.renew_below for m in found.values()):
         return None
-    seen = _by_pictures(track.position_m, found, eyes, settings)
+    seen = one_point(track.position_m, UNKNOWN_M**2 * np.eye(3), _pixels(found, images), settings.model_px)
     if seen is None or seen.chi2 > MOST_SIGMAS**2:
         return None
     return pose_doubt(track.position_m, track.covariance_m2, seen, sure=False)
 
 
-def _by_pictures(
-    start_m: FloatArray,
-    good: Mapping[str, PatchMatch],
-    eyes: Mapping[str, PosedImage],
-    settings: TrackSettings,
-) -> OnePoint | None:
-    """The point that pixels mean without the prediction; ``chi2`` says how badly they meet."""
-    sightings = [PixelSighting(eyes[n].camera, m.pixel_px, m.covariance_px2) for n, m in good.items()]
-    return one_point(start_m, UNKNOWN_M**2 * np.eye(3), sightings, settings.model_px)
+def _pixels(good: Mapping[str, PatchMatch], images: Images) -> list[PixelSighting]:
+    return [(images[name].camera, one.pixel_px, one.covariance_px2) for name, one in good.items()]
 
 
-def _seen(track: Track, eyes: Mapping[str, PosedImage], settings: TrackSettings) -> TrackLook:
-    """Look with the track's key."""
+def _seen(track: Track, images: Images, settings: TrackSettings) -> TrackLook:
+    """Search by the track's key."""
     key = anchored(track)
     if key is None:
         return _lost(
             track, {}, "the surface of the target is not visible from where its key picture was taken"
         )
     plane = Plane(track.position_m, track.key.normal)
-    found, slope = _matched(track, key, plane, eyes, settings)
+    found, slope = _matched(track, key, plane, images, settings)
     good = {name: one for name, one in found.items() if one.verdict == "good"}
     reason = _not_confirmed(track, found, good)
     if reason:
         return _lost(track, found, reason)
-    point = one_point(
-        track.position_m,
-        track.covariance_m2,
-        [PixelSighting(eyes[n].camera, m.pixel_px, m.covariance_px2) for n, m in good.items()],
-        settings.model_px,
-    )
+    sightings = _pixels(good, images)
+    point = one_point(track.position_m, track.covariance_m2, sightings, settings.model_px)
     if point is None:
         return _lost(track, found, "the found pixels and the prediction have no point in common")
-    chi2 = point.chi2
-    against = None
+    doubt = None
     if len(good) > 1 and track.motion_covariance.any():
-        seen = _by_pictures(point.position_m, good, eyes, settings)
-        against = None if seen is None else pose_doubt(track.position_m, track.covariance_m2, seen)
-    # Each eye beyond the first adds a constraint; one eye alone has two.
-    allowed = settings.worst_chi2 if len(good) > 1 else 13.8
-    if chi2 > allowed:
-        words = (
-            f"the match does not fit the prediction: weighted misfit {chi2:.0f}, at most "
+        seen = one_point(point.position_m, UNKNOWN_M**2 * np.eye(3), sightings, settings.model_px)
+        doubt = None if seen is None else pose_doubt(track.position_m, track.covariance_m2, seen)
+    allowed = settings.worst_chi2 if len(good) > 1 else ONE_CAMERA_CHI2
+    if point.chi2 > allowed:
+        reason = (
+            f"the match does not fit the prediction: weighted misfit {point.chi2:.0f}, at most "
             f"{allowed:g} is expected"
         )
-        unsure = against and replace(against, sure=False)
-        return replace(_lost(track, found, words), chi2=chi2, doubt=unsure)
+        unsure = doubt and replace(doubt, sure=False)
+        return replace(_lost(track, found, reason), chi2=point.chi2, doubt=unsure)
     turned = _turned(track, point.position_m)
-    corrected = carried(track.key, turned)
-    fresh = fresh_key(track.key, eyes, good, plane, slope)
-    renewed = fresh is not None and outgrown(track.key, eyes, good, plane, settings)
-    chosen = fresh if fresh is not None and renewed else corrected
+    fresh = fresh_key(track.key, images, good, plane, slope)
+    renewed = fresh is not None and outgrown(track.key, images, good, plane, settings)
+    chosen = fresh if fresh is not None and renewed else carried(track.key, turned)
     drift_m = drifted_m(chosen)
     if drift_m > settings.worst_drift_m:
-        words = (
+        reason = (
             f"the place that is followed may have drifted by {100 * drift_m:.0f} cm from the one picked, at "
             f"most {100 * settings.worst_drift_m:g} cm are allowed: the surface around it is no plane"
         )
-        return replace(_lost(track, found, words), chi2=chi2, doubt=against)
+        return replace(_lost(track, found, reason), chi2=point.chi2, doubt=doubt)
     standby = None if renewed else fresh or (track.standby and carried(track.standby, turned))
     after = Track("tracked", point.position_m, point.covariance_m2, chosen, standby)
-    return TrackLook(after, found, "", chi2, renewed, against)
+    return TrackLook(after, found, "", point.chi2, renewed, doubt)
 
 
 def _matched(
-    track: Track, key: KeyPicture, plane: Plane, eyes: Mapping[str, PosedImage], settings: TrackSettings
+    track: Track, key: KeyPicture, plane: Plane, images: Images, settings: TrackSettings
 ) -> tuple[dict[str, PatchMatch], Plane | None]:
-    """Look in every picture by the key; return also the surface of a camera asked by the other."""
-    found = {name: _found(track, key, plane, eye, settings) for name, eye in eyes.items()}
-    alone = [one for one in found.values() if one.verdict == "good"]
-    # Stereo confirms whatever one eye has found: of a lost target that eye must know the key picture well.
-    if len(alone) == 1 < len(found) and (
-        track.state == "tracked" or alone[0].correlation >= settings.renew_below
-    ):
-        return _asked_the_other(found, eyes)
-    return found, None
+    """Search every picture by the key; return also the surface, where one camera was searched by the other.
+
+    On a rock the two cameras see the surface more differently than one camera sees it before and after a
+    step. Stereo confirms whatever one camera has found: of a lost target it must know the key picture well.
+    """
+    found = {name: _found(track, key, plane, image, settings) for name, image in images.items()}
+    alone = [name for name, one in found.items() if one.verdict == "good"]
+    if len(alone) != 1 or len(found) == 1:
+        return found, None
+    first, one = alone[0], images[alone[0]]
+    if track.state == "lost" and found[first].correlation < settings.renew_below:
+        return found, None
+    other = next(name for name in found if name != first)
+    partner = find_partner(one, found[first].pixel_px, images[other], settings=SIZES)
+    if partner.match.verdict != "good" or partner.plane is None:
+        return found, None
+    # As uncertain as the place in the first camera, seen over the surface, and its own match.
+    on_plane = on_surface(found[first].covariance_px2, one.camera, partner.plane)
+    _, rate, _ = images[other].camera.project_jacobian(partner.plane.point_m)
+    covariance = partner.match.covariance_px2 + rate @ on_plane @ rate.T
+    return found | {other: replace(partner.match, covariance_px2=covariance)}, partner.plane
 
 
 def _not_confirmed(track: Track, found: Mapping[str, PatchMatch], good: Mapping[str, PatchMatch]) -> str:
-    """Return why what was found does not count; empty if it does."""
+    """Return why what was found is not accepted; empty if it is."""
     if not good:
-        words = "; ".join(f"{name}: {one.reason}" for name, one in found.items())
-        return words or "no picture was given"
-    doubt = next((f"{n}: {m.reason}" for n, m in found.items() if m.verdict in ("weak", "ambiguous")), "")
-    if doubt:
-        return f"one camera does not confirm the other: {doubt}"
+        return "; ".join(f"{name}: {one.reason}" for name, one in found.items()) or "no picture was given"
+    for name, one in found.items():
+        if one.verdict in ("weak", "ambiguous"):
+            return f"one camera does not confirm the other: {name}: {one.reason}"
     if len(good) == 1 and track.state == "lost":
         return "one camera alone does not find a lost target again"
     return ""
@@ -331,7 +301,7 @@ def _turned(track: Track, position_m: FloatArray) -> Rigid:
     """The motion's error that a found position shows, as far as it is the motion's.
 
     A heading off by half a degree puts a target 10 m away 9 cm off. Were the key camera shifted by as much
-    instead of turned, it would look at flat ground under another angle, and steps would add up.
+    instead of turned, it would see flat ground under another angle, and steps would add up.
     """
     weight = track.motion_covariance @ motion_rate(track.position_m).T
     spread = track.covariance_m2 + 1e-12 * np.eye(3)
@@ -340,35 +310,14 @@ def _turned(track: Track, position_m: FloatArray) -> Rigid:
 
 
 def _found(
-    track: Track, key: KeyPicture, plane: Plane, eye: PosedImage, settings: TrackSettings
+    track: Track, key: KeyPicture, plane: Plane, image: PosedImage, settings: TrackSettings
 ) -> PatchMatch:
-    """Look in one picture, in the window that the prediction's covariance asks for."""
-    _, rate, valid = eye.camera.project_jacobian(track.position_m)
+    """Search one picture, in the window that the prediction's covariance needs."""
+    _, rate, valid = image.camera.project_jacobian(track.position_m)
     spread = rate @ track.covariance_m2 @ rate.T if bool(valid) else np.eye(2)
-    reach = settings.sigmas * math.sqrt(max(float(np.linalg.eigvalsh(spread)[-1]), 0.0))
+    reach = settings.sigmas * math.sqrt(max(worst_px2(spread), 0.0))
     search = min(max(reach + 2 * settings.model_px, settings.least_px), settings.most_px)
-    return match_patch(key.view, key.pixel_px, plane, eye, search, SIZES)
-
-
-def _asked_the_other(
-    found: Mapping[str, PatchMatch], eyes: Mapping[str, PosedImage]
-) -> tuple[dict[str, PatchMatch], Plane | None]:
-    """Look from the camera that found the target into the one that did not; return also its surface.
-
-    The place in the other camera is as uncertain as that in the first, seen over the surface, and its own
-    match. On a rock the two cameras see the surface more differently than one camera sees it before and after
-    a step.
-    """
-    seen = next(name for name, one in found.items() if one.verdict == "good")
-    other = next(name for name in found if name != seen)
-    one, two = eyes[seen], eyes[other]
-    partner = find_partner(one, found[seen].pixel_px, two, settings=SIZES)
-    if partner.match.verdict != "good" or partner.plane is None:
-        return dict(found), None
-    on_plane = on_surface(found[seen].covariance_px2, one.camera, partner.plane)
-    _, rate, _ = two.camera.project_jacobian(partner.plane.point_m)
-    covariance = partner.match.covariance_px2 + rate @ on_plane @ rate.T
-    return dict(found) | {other: replace(partner.match, covariance_px2=covariance)}, partner.plane
+    return match_patch(key.view, key.pixel_px, plane, image, search, SIZES)
 
 
 def _lost(track: Track, found: Mapping[str, PatchMatch], reason: str) -> TrackLook:

@@ -2,7 +2,7 @@
 
 What `calib.matching.patch` does for one target with care, this does for some twenty places at once in a
 millisecond or two: enough to find which view a picture shows, not enough to measure a target. Pictures are
-reduced to some 256 columns by area, so that noise hardly counts and differences of scale and slope stay
+reduced to some 256 columns by area, so that noise hardly matters and differences of scale and slope stay
 small.
 
 Each found patch is a vote for pan and tilt; most of them are right, and the view is that on which they agree.
@@ -11,7 +11,6 @@ Each found patch is a vote for pan and tilt; most of them are right, and the vie
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -47,6 +46,11 @@ class Reduced:
         cut = image[: height * step, : width * step]
         return cls(np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA)), step)
 
+    @property
+    def size(self) -> NDArray[np.intp]:
+        """(2,) width and height."""
+        return np.array(self.grey.shape[::-1])
+
     def from_full(self, pixels_px: FloatArray) -> FloatArray:
         """Return places (..., 2) of the full picture as places of the reduced one."""
         return np.asarray((pixels_px - (self.step - 1) / 2) / self.step)
@@ -56,34 +60,31 @@ class Reduced:
         return np.asarray(places * self.step + (self.step - 1) / 2)
 
     def holds(self, places: FloatArray, margin: float) -> Mask:
-        """Return which places (n, 2) lie at least ``margin`` inside the reduced picture."""
-        size = np.array(self.grey.shape[::-1])
+        """Return which places (..., 2) lie at least ``margin`` inside the reduced picture."""
         with np.errstate(invalid="ignore"):
-            return np.asarray(((places >= margin) & (places <= size - 1 - margin)).all(axis=1))
+            return np.asarray(((places >= margin) & (places <= self.size - 1 - margin)).all(axis=-1))
 
 
-def textured(picture: Reduced) -> tuple[FloatArray, FloatArray]:
-    """Return the best textured place of each cell (n, 2), reduced pixels, and its strength (n,), row by row.
+def textured(picture: Reduced) -> FloatArray:
+    """Return the best textured place of each cell that holds one (n, 2), reduced pixels, row by row.
 
-    The strength is the smaller eigenvalue of the patch's summed gradient products over what `FLAT_SIGMA`
-    asks for: below 1 a patch is too plain to hold a place.
+    Texture enough means that the smaller eigenvalue of the patch's summed gradient products is at least what
+    `FLAT_SIGMA` needs.
     """
     side = 2 * HALF + 1
     eigen = cv2.cornerMinEigenVal(picture.grey, side, ksize=3)
     # OpenCV scales its Sobel by 1 / (4 side), which is a difference per pixel times 8 / (4 side).
     summed = eigen * (side**2 / 4.0) - 0.1875 * NOISE_DN**2 * side**2
-    wanted = 2.0 * NOISE_DN**2 / FLAT_SIGMA**2
-    inner = summed[HALF:-HALF, HALF:-HALF] / wanted
-    rows, columns = (n // CELL for n in inner.shape)
+    strength = summed[HALF:-HALF, HALF:-HALF] / (2.0 * NOISE_DN**2 / FLAT_SIGMA**2)
+    rows, columns = (n // CELL for n in strength.shape)
     if min(rows, columns) == 0:
-        return np.empty((0, 2)), np.empty(0)
-    cells = inner[: rows * CELL, : columns * CELL].reshape(rows, CELL, columns, CELL)
+        return np.empty((0, 2))
+    cells = strength[: rows * CELL, : columns * CELL].reshape(rows, CELL, columns, CELL)
     flat = cells.transpose(0, 2, 1, 3).reshape(rows * columns, CELL * CELL)
     best = np.argmax(flat, axis=1)
     corner_y, corner_x = np.divmod(np.arange(rows * columns), columns)
     places = np.stack([corner_x * CELL + best % CELL, corner_y * CELL + best // CELL], axis=1) + float(HALF)
-    strength = flat[np.arange(len(flat)), best].astype(np.float64)
-    return places, strength
+    return np.asarray(places[flat.max(axis=1) >= 1.0])
 
 
 def cut(
@@ -106,16 +107,15 @@ def cut(
 
 
 def found(
-    patch: NDArray[np.float32], picture: Reduced, centre: NDArray[np.intp], reach: tuple[int, int]
+    patch: NDArray[np.float32], picture: Reduced, centre: NDArray[np.intp], reach: NDArray[np.intp]
 ) -> tuple[FloatArray, float]:
     """Return the place (2,) where the picture shows a patch best, reduced pixels, and the correlation there.
 
     Searched are whole pixels up to ``reach`` (x, y) from the centre, as far as the picture goes; the summit
     is a parabola's. Not-a-number and -1 if the picture holds no place.
     """
-    size = np.array(picture.grey.shape[::-1])
     low = np.maximum(centre - reach - HALF, 0)
-    high = np.minimum(centre + reach + HALF + 1, size)
+    high = np.minimum(centre + reach + HALF + 1, picture.size)
     if (high - low < 2 * HALF + 1).any():
         return np.full(2, np.nan), -1.0
     searched = picture.grey[low[1] : high[1], low[0] : high[0]]
@@ -130,9 +130,6 @@ def found(
     return low + HALF + place, float(best)
 
 
-AGREEING = {"reported": (5, 0.25), "any": (6, 0.4)}
-"""How many patches, and which share of those that a view should show, must agree on it: the reported view
-needs fewer, since a large thing may have moved in the picture, than one that is searched for everywhere."""
 AGREE = 1.2
 """Patches agree whose places differ by no more, reduced pixels: relief, shape, and the search itself."""
 SEARCH_SIGMA = 0.15
@@ -145,10 +142,8 @@ class AgreedView:
 
     Attributes
     ----------
-    angles_rad, sigma_rad
-        (2,) pan and tilt with one sigma.
-    parallax_rad
-        (2,) the largest error by ranges that are not known.
+    angles_rad, sigma_rad, parallax_rad
+        (2,) pan and tilt, one sigma, and the largest error by ranges that are not known.
     rate_px_per_rad
         (n, 2, 2) of the agreeing patches.
     agreeing, expected
@@ -164,11 +159,6 @@ class AgreedView:
     agreeing: int
     expected: int
     correlation: float
-
-    def holds(self, view: Literal["reported", "any"]) -> bool:
-        """Return whether enough patches agree."""
-        least, share = AGREEING[view]
-        return self.agreeing >= max(least, share * self.expected)
 
 
 def agreed_view(

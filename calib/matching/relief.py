@@ -82,25 +82,11 @@ def surface_seen(
     half_px: int,
     noise_dn: float,
 ) -> tuple[Plane, Relief] | None:
-    """Return the surface around a pixel as two cameras see it, or None where they see none.
+    """Return the plane that fits the surface around a pixel (2,) of the own image, and what stands off it.
 
-    Parameters
-    ----------
-    own, partner
-        Images of one moment.
-    pixel_px
-        (2,) in the own one, sub-pixel.
-    plane
-        About where the surface is: good to a pixel or two in the partner's picture.
-    half_px
-        Half side of the patch.
-    noise_dn
-        Grey noise of one picture, one sigma.
-
-    Returns
-    -------
-    plane, relief
-        The plane that fits the surface near the pixel, and what stands off it.
+    None where the two images, of one moment, show no common surface. ``plane`` is about where it is: good to
+    a pixel or two in the partner's picture. ``half_px`` is half the patch's side, ``noise_dn`` one sigma of
+    one picture's grey noise.
     """
     for fits in range(PASSES + 1):
         seen = _off_plane(own, pixel_px, partner, plane, half_px, noise_dn)

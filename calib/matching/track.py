@@ -1,7 +1,7 @@
 """A followed target: its place with covariance, the picture it is known by, and how motion carries both.
 
-A motion of the rover carries the target over and adds the motion's own covariance (`moved_track`). Begun by
-`calib.matching.track`, seen again by `calib.matching.look`.
+A motion of the rover carries the target over and adds the motion's own covariance (`moved_track`).
+`calib.matching.look` finds it again.
 
 A place is followed only if it differs from its surroundings. A place that correlates with its own
 neighbourhood will be confused with it: an edge along its length, a pattern with its repetition. And a patch
@@ -48,24 +48,21 @@ class TrackSettings:
 
     Attributes
     ----------
-    sigmas
-        Half width of the search window in standard deviations of the prediction.
-    least_px, most_px
-        Bounds of the window's half side.
+    sigmas, least_px, most_px
+        Half width of the search window in standard deviations of the prediction, and its bounds.
     model_px
         One sigma of what the cameras' models are wrong by between two cameras and two pairs.
     worst_chi2
-        Of the innovation, four pixel coordinates against the prior: 1 in 1000 good looks with both cameras is
+        Of the innovation, four pixel coordinates against the prior: 1 in 1000 good matches of both cameras is
         above 18.5.
-    renew_grown, renew_shrunk
-        The key picture is renewed when the target's surface is seen this much larger or smaller...
-    renew_shape
-        ...or foreshortened this much otherwise: seen flat, a step nearer shows much that it did not.
+    renew_grown, renew_shrunk, renew_shape
+        The key picture is renewed when the target's surface is seen this much larger or smaller, or
+        foreshortened this much otherwise: seen flat, a step nearer shows much that it did not.
     renew_below
         Or when the correlation falls below this: what is seen now is no longer what the key picture shows.
         One camera that sees so little of it does not find a lost target again.
     worst_drift_m
-        One sigma of the drift from the picked place; beyond it the target counts as lost.
+        One sigma of the drift from the picked place; beyond it the target is reported as lost.
     """
 
     sigmas: float = 3.5
@@ -82,13 +79,10 @@ class TrackSettings:
 
 @dataclass(frozen=True, eq=False)
 class KeyPicture:
-    """The picture that templates are cut from, its camera in the rover frame, the target's place in it.
+    """The picture that templates are cut from, in the rover frame, and the target's place in it.
 
-    Attributes
-    ----------
-    drift_m2
-        (3, 3) covariance, along the surface, of the place followed from the place picked: what the keys
-        before handed on.
+    ``drift_m2`` (3, 3) is the covariance, along the surface, of the place followed from the place picked:
+    what the keys before handed on.
     """
 
     view: PosedImage
@@ -104,16 +98,14 @@ class Track:
     Attributes
     ----------
     state
-        ``tracked``: the last look found it. ``lost``: it did not.
+        ``tracked``: the last pictures showed it. ``lost``: they did not.
     position_m, covariance_m2
         (3,) and (3, 3) of the place that is followed, in the rover frame of the last motion.
-    key
-        The key picture.
     standby
-        The key that the last look with both cameras would have given: what is looked for where a look by the
-        key loses the target, since the light has changed or another side shows. None after a renewal.
+        The key that the last pictures of both cameras would have given: what is searched for where the key
+        loses the target, since the light has changed or another side shows. None after a renewal.
     misses
-        Looks since it was last found.
+        Searches since it was last found.
     motion_covariance
         (6, 6) of the rover's motion since then, as `moved_track` takes it; it is part of ``covariance_m2``.
     """
@@ -131,7 +123,7 @@ class Track:
         """(3, 3) of the target that was picked: of the followed place, and of its drift from the picked one.
 
         What pixels and motions show; an error that all cameras of the mast file share is not in it, and one
-        that two cameras do not share is averaged by looks from one place as if it were noise.
+        that two cameras do not share is averaged by pictures from one place as if it were noise.
         """
         return self.covariance_m2 + self.key.drift_m2
 
@@ -139,18 +131,8 @@ class Track:
 def moved_track(track: Track, now_from_then: Rigid, covariance: FloatArray) -> Track:
     """Carry a track over a motion of the rover.
 
-    Parameters
-    ----------
-    now_from_then
-        The rover frame of before in the one of now.
-    covariance
-        (6, 6) of that motion: small rotation (radians), then translation (metres), both in the frame of now:
-        true = (1 + rotation) believed + translation.
-
-    Raises
-    ------
-    CalibError
-        If the covariance is not (6, 6), finite and without negative variances.
+    ``covariance`` (6, 6) of that motion: small rotation (radians), then translation (metres), both in the
+    frame of now: true = (1 + rotation) believed + translation. CalibError if it is none.
     """
     spread = np.asarray(covariance, dtype=np.float64)
     if spread.shape != (6, 6) or not np.isfinite(spread).all() or (np.diag(spread) < 0).any():
@@ -196,18 +178,9 @@ WORST_SIGMA_PX = 0.2
 def indistinct(
     image: Grey, camera: CameraModel, pixel_px: FloatArray, plane: Plane, settings: MatchSettings
 ) -> str:
-    """Return why a target cannot be distinguished from its surroundings, empty if it can.
+    """Return why a target (2,) cannot be distinguished from its surroundings, empty if it can.
 
-    Parameters
-    ----------
-    image
-        (h, w) float32 grey.
-    pixel_px
-        (2,) the target.
-    plane
-        The surface there, at an angle to the pixel's ray.
-    settings
-        Of the matching that will look for it; ``near_px`` sizes and weighs the patch.
+    ``plane`` is the surface there; the ``near_px`` of the settings sizes and weighs the patch.
     """
     near_px2 = near_covariance(plane, camera, pixel_px, settings.near_px)
     half = near_half_px(near_px2)
@@ -239,22 +212,15 @@ def indistinct(
 MIDDLE_SEARCH_PX = 4.0
 """How far the range of a patch's middle may put it from where the whole patch puts it, at the start."""
 
-EYES_PX = 0.4
+CAMERAS_PX = 0.4
 """One sigma, each pixel coordinate, of what two cameras' models may be wrong by where a track is begun: what
 is found 2 px off the epipolar line is another thing, or the mast file is off."""
 
 
 def start_track(left: PosedImage, right: PosedImage, left_px: FloatArray, sigma_px: float = 0.2) -> Track:
-    """Begin a track from a click in the left picture of a pair.
+    """Begin a track from a click (2,) in the left picture of a pair, of one moment, in the rover frame.
 
-    Parameters
-    ----------
-    left, right
-        Pictures of one moment with their cameras in the rover frame.
-    left_px
-        (2,) the target.
-    sigma_px
-        Of the click; it says how well the place of what was meant is known.
+    ``sigma_px`` of the click says how well the place of what was meant is known.
 
     Raises
     ------
@@ -273,17 +239,17 @@ def start_track(left: PosedImage, right: PosedImage, left_px: FloatArray, sigma_
     found = find_partner(left, pixel, right)
     if found.match.verdict != "good" or found.plane is None:
         raise CalibError(f"the target cannot be followed: {found.match.reason}")
-    # The patch that tells the surface reaches beyond it on a rock: the range is that of its middle.
+    # The patch that shows the surface reaches beyond it on a rock: the range is that of its middle.
     middle = match_patch(left, pixel, found.plane, right, MIDDLE_SEARCH_PX, SIZES)
     reason = middle.reason or indistinct(left.image, left.camera, pixel, found.plane, SIZES)
     if reason:
         raise CalibError(f"the target cannot be followed: {reason}")
     noise = max(sigma_px, float(middle.sigma_px.max()))
     seen = triangulate(left.camera, right.camera, pixel, middle.pixel_px, noise)
-    gap = ray_gap(seen, (noise**2 + EYES_PX**2) * np.eye(4))
-    by = f"a match good to {noise:.2g} px and cameras good to {EYES_PX:g} px"
+    gap = ray_gap(seen, (noise**2 + CAMERAS_PX**2) * np.eye(4))
+    by = f"a match good to {noise:.2g} px and cameras good to {CAMERAS_PX:g} px"
     try:
-        refuse_two_points(gap, ("the left eye", "the right eye"), by)
+        refuse_two_points(gap, ("the left camera", "the right camera"), by)
     except CalibError as error:
         raise CalibError(f"the target cannot be followed: {error}") from None
     key = KeyPicture(left, pixel, found.plane.normal)
@@ -308,26 +274,26 @@ def anchored(track: Track) -> KeyPicture | None:
 
 def fresh_key(
     key: KeyPicture,
-    eyes: Mapping[str, PosedImage],
+    images: Mapping[str, PosedImage],
     good: Mapping[str, PatchMatch],
     plane: Plane,
     slope: Plane | None,
 ) -> KeyPicture | None:
-    """A key from the pictures of this look; None if one camera alone saw the target.
+    """A key from new pictures; None if one camera alone saw the target.
 
-    ``slope`` is the surface that one camera, asked through the other, gave. Without it both were asked
-    through the key, over ``plane``, and show the surface together.
+    ``slope`` is the surface from a search of one camera by the other. Without it both were searched by the
+    key, over ``plane``, and show the surface together.
     """
     if len(good) < 2:
         return None
-    first, second = list(eyes)[:2]
+    first, second = list(images)[:2]
     left, right = good[first], good[second]
     surface = slope or plane
     normal = surface.normal
     if slope is None:
-        normal = normal_seen(plane.point_m, eyes[first].camera, eyes[second].camera, plane, right, left)
-    drift = key.drift_m2 + on_surface(left.covariance_px2, eyes[first].camera, surface)
-    return KeyPicture(eyes[first], left.pixel_px, normal, drift)
+        normal = normal_seen(plane.point_m, images[first].camera, images[second].camera, plane, right, left)
+    drift = key.drift_m2 + on_surface(left.covariance_px2, images[first].camera, surface)
+    return KeyPicture(images[first], left.pixel_px, normal, drift)
 
 
 def on_surface(covariance_px2: FloatArray, camera: CameraModel, plane: Plane) -> FloatArray:
@@ -339,13 +305,13 @@ def on_surface(covariance_px2: FloatArray, camera: CameraModel, plane: Plane) ->
 
 def outgrown(
     key: KeyPicture,
-    eyes: Mapping[str, PosedImage],
+    images: Mapping[str, PosedImage],
     good: Mapping[str, PatchMatch],
     plane: Plane,
     settings: TrackSettings,
 ) -> bool:
     """Whether scale, view or light have changed so much that the key should be exchanged."""
-    scale, shape = _seen_larger(next(iter(eyes.values())).camera, key.view.camera, plane)
+    scale, shape = _seen_larger(next(iter(images.values())).camera, key.view.camera, plane)
     alike = min(one.correlation for one in good.values()) >= settings.renew_below
     return not (
         settings.renew_shrunk < scale < settings.renew_grown and shape < settings.renew_shape and alike

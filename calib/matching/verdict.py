@@ -30,17 +30,12 @@ class MatchSettings:
 
     Attributes
     ----------
-    half_px
-        Half of the patch's side in the coarser of the two pictures. 20 (41 px) holds 0.02 px with usual
-        texture and is still nearly plane on a rock (facts: 41 and 61 px differ by a quarter only). With
-        ``near_px`` a match's patch is as large as its Gaussian; this says how far an enlarged one may shrink.
-    smallest_half_px
-        How far the patch may shrink at the border of a picture.
-    most_half_px
-        How far it may grow in an enlarged picture.
+    half_px, smallest_half_px, most_half_px
+        Half of the patch's side in the coarser picture, and how far it may shrink at a picture's border and
+        grow in an enlarged one. 20 (41 px) fixes a place to 0.02 px with usual texture and is still
+        nearly plane on a rock. With ``near_px`` a patch is as large as its Gaussian.
     noise_dn
-        Grey noise of one picture, one sigma; used to distinguish texture from noise, and for the expected
-        correlation.
+        Grey noise of one picture, one sigma.
     flat_sigma_px
         A patch whose gradient cannot hold this sigma in its worst direction is flat. Edges fail here too.
     least_correlation
@@ -54,10 +49,10 @@ class MatchSettings:
         A position less certain than this is no measurement.
     roughness
         How far the target may lie off the patch's plane, one sigma, as a part of the patch's half extent on
-        it. It counts as far as the two cameras stand apart. 0 for what is known to be plane; the default
+        it. It matters as far as the two cameras are apart. 0 for what is known to be plane; the default
         is what makes sigmas true on the simulated rover's ground and rocks.
     rough_beside_relief
-        Whether ``roughness`` counts too where two cameras saw what stands off the plane.
+        Whether ``roughness`` is added too where two cameras saw what stands off the plane.
     near_px
         By how much nearer pixels count more in the refinement: one sigma of a Gaussian that is round on the
         surface and as large as a circle of this radius in the destination. 0: all of the patch alike.

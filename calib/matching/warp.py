@@ -25,7 +25,7 @@ Mask = NDArray[np.bool_]
 SIDES = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])  # left, right, top, bottom
 GRAZING = 0.03  # sine of the flattest view of a plane that is still believed (1.7 degrees)
 KNOTS = np.array([-1.0, -1 / 3, 1 / 3, 1.0])  # across a patch, in units of its half side
-MOST_SAMPLES = 8  # per axis and destination pixel; shrinking further than 8 times is not asked of this module
+MOST_SAMPLES = 8  # per axis and destination pixel; shrinking further than 8 times is not needed
 LIFT_STEPS = 3  # a relief changes slowly against the pixels it shifts
 SPLINE_MARGIN_PX = 12  # a cubic spline's memory of its border is below 1e-6 after 11 samples
 
@@ -61,13 +61,7 @@ class Plane(ReadOnlyArrays):
 
 
 def grey(image: ArrayLike) -> Grey:
-    """Return an image (h, w) or (h, w, 3) BGR, uint8 or float, as float32 grey (h, w).
-
-    Raises
-    ------
-    CalibError
-        If the array is no image, or holds what is not finite.
-    """
+    """Return an image (h, w) or (h, w, 3) BGR, uint8 or float, as float32 grey (h, w). Raises CalibError."""
     array = np.asarray(image)
     if array.ndim == 3 and array.shape[2] == 3:
         array = array.astype(np.float32) @ np.array([0.114, 0.587, 0.299], np.float32)
@@ -81,10 +75,7 @@ def grey(image: ArrayLike) -> Grey:
 def facing_plane(camera: CameraModel, pixel_px: ArrayLike, range_m: float) -> Plane:
     """Return the plane across the ray of ``pixel_px`` (2,), ``range_m`` metres from the ray's origin.
 
-    Raises
-    ------
-    CalibError
-        If the pixel has no ray or the range is not a finite number above zero.
+    Raises CalibError if the pixel has no ray or the range is not a finite number above zero.
     """
     rays = camera.ray(np.asarray(pixel_px, dtype=np.float64))
     if not bool(rays.valid) or not 0.0 < range_m < math.inf:
@@ -95,14 +86,10 @@ def facing_plane(camera: CameraModel, pixel_px: ArrayLike, range_m: float) -> Pl
 def carry(
     pixels_px: ArrayLike, from_camera: CameraModel, plane: Plane, to_camera: CameraModel
 ) -> tuple[FloatArray, Mask]:
-    """Carry pixels (..., 2) of one camera over the plane into another.
+    """Carry pixels (..., 2) of one camera over the plane into another; return which are valid (...) too.
 
-    Returns
-    -------
-    pixels_px, valid
-        (..., 2) and (...,): where the other camera sees the same points of the plane. Rays that miss the
-        plane, meet it behind the camera or at a grazing angle, and points the other camera cannot project
-        are not-a-number and False.
+    Rays that miss the plane, meet it behind the camera or at a grazing angle, and points the other camera
+    cannot project come out as not-a-number and False.
     """
     rays = from_camera.ray(np.asarray(pixels_px, dtype=np.float64))
     ranges_m = plane.ranges_m(rays)
@@ -151,16 +138,15 @@ class Template:
 
     Attributes
     ----------
-    values
-        float32 (h, w) grey values, h and w odd; rows and columns are the destination's.
+    values, counts
+        float32 (h, w) grey values, h and w odd; rows and columns are the destination's. (h, w) weights of the
+        pixels, 0 to 1; None if all are alike.
     centre_px
         (2,) whole pixel of the destination on which the middle of the patch lies.
     target_px
         (2,) where the plane's geometry puts the target in the destination; within half a pixel of the centre.
     magnification
         Destination pixels per source pixel: above 1 the template is blurred against the destination.
-    counts
-        (h, w) by how much each pixel counts, 0 to 1; None if all do alike.
     """
 
     values: Grey
@@ -183,13 +169,11 @@ class Relief:
     ----------
     pixel_px
         (2,) the pixel of a camera that the patch surrounds.
-    inverse_m
+    inverse_m, sigma_inverse_m
         (n, n) float32, n odd: by how much the inverse range of each of the camera's pixels there is larger
-        than the plane's, 1/m.
+        than the plane's, 1/m; and one sigma of it at ``pixel_px``.
     counts
         (n, n) float32, 1 for pixels that belong to the surface, 0 for others.
-    sigma_inverse_m
-        One sigma of ``inverse_m`` at ``pixel_px``, 1/m.
     """
 
     pixel_px: FloatArray
@@ -225,12 +209,7 @@ class Relief:
 def parallax_px_m(camera: CameraModel, pixel_px: FloatArray, plane: Plane, other: CameraModel) -> FloatArray:
     """Return by how much (2,) px another camera sees a pixel's point elsewhere for each 1/m of inverse range.
 
-    Parameters
-    ----------
-    pixel_px
-        (2,) of ``camera``.
-    plane
-        Where the pixel's ray meets it the point is.
+    The point is where the ray of ``pixel_px`` (2,) of ``camera`` meets the plane.
     """
     ray = camera.ray(pixel_px)
     inverse_m = float(ray.directions @ plane.normal) / float((plane.point_m - ray.origins_m) @ plane.normal)

@@ -182,7 +182,7 @@ def test_a_body_pose(true_rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_one_point_of_many_pixels(navcams: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     target = np.array([3.0, 0.2, -0.3])
     cameras = [navcams.camera_in_rover(name, 0.0, -0.3) for name in navcams.cameras]
-    seen = [one_point.PixelSighting(c, c.project(target)[0], 0.01 * np.eye(2)) for c in cameras]
+    seen = [(c, c.project(target)[0], 0.01 * np.eye(2)) for c in cameras]
     find: Callable[[], one_point.OnePoint | None] = partial(
         one_point.one_point, far(target), 25.0 * np.eye(3), seen, 0.1
     )

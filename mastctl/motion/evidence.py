@@ -9,8 +9,7 @@ import numpy as np
 
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from calib.matching.same_patches import Posed
-from calib.matching.shown_view import ShownView, ViewLimits, overlap, shown_view
+from calib.matching.shown_view import Posed, ShownView, ViewLimits, overlap, shown_view
 from calib.matching.verdict import PatchMatch
 from drivers.errors import BadFrame
 from mastctl.devices.joint_history import HeadReading

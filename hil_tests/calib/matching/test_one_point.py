@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares
 
-from calib.matching.look import PixelSighting, one_point
+from calib.matching.look import one_point
 from hil_tests.calib.matching.textured_planes import Pinhole
 
 CAMERAS = [
@@ -20,7 +20,7 @@ def test_point_covariance_and_misfit_are_those_of_least_squares() -> None:
     rng = np.random.default_rng(1)
     pixels = [c.pixel(BELIEVED + np.array([0.03, -0.01, 0.02])) + rng.normal(0.0, 0.7, 2) for c in CAMERAS]
     noise = [np.array([[0.5, 0.1], [0.1, 0.3]]), np.array([[0.2, 0.0], [0.0, 0.4]])]
-    seen = [PixelSighting(c.model, p, n) for c, p, n in zip(CAMERAS, pixels, noise, strict=True)]
+    seen = [(c.model, p, n) for c, p, n in zip(CAMERAS, pixels, noise, strict=True)]
     found = one_point(BELIEVED, SPREAD, seen, 0.3)
     assert found is not None
     roots = [np.linalg.inv(np.linalg.cholesky(n + 0.09 * np.eye(2))) for n in noise]
@@ -36,5 +36,5 @@ def test_point_covariance_and_misfit_are_those_of_least_squares() -> None:
 
 
 def test_a_point_behind_a_camera_is_none() -> None:
-    seen = [PixelSighting(CAMERAS[0].model, np.array([400.0, 300.0]), np.eye(2))]
+    seen = [(CAMERAS[0].model, np.array([400.0, 300.0]), np.eye(2))]
     assert one_point(np.array([-3.0, 0.0, 0.0]), 1e-6 * np.eye(3), seen, 0.3) is None

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Mast, Rig, RigCamera
 from calib.matching.patch_search import HALF, Reduced, agreed_view, cut, found
-from calib.matching.same_patches import Posed
-from calib.matching.shown_view import shown_view
+from calib.matching.shown_view import Posed, shown_view
 from hil_tests.calib.matching.textured_planes import Pinhole, TexturedPlane, picture, random_texture
 
 FOCAL_PX, SIZE_PX = 420.0, (300, 226)
@@ -90,7 +89,7 @@ def test_a_patch_is_found_where_the_picture_was_moved_to() -> None:
     place = np.array([[120.0, 100.0]])
     [patch] = cut(earlier, place, np.eye(2)[None], place.astype(int), place)
     assert patch.shape == (2 * HALF + 1, 2 * HALF + 1)
-    seen, score = found(patch, later, place[0].astype(int), (20, 20))
+    seen, score = found(patch, later, place[0].astype(int), np.array([20, 20]))
     np.testing.assert_allclose(seen, [133.0, 91.0], atol=0.03)
     assert score > 0.999
 

@@ -14,8 +14,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from calib.matching.same_patches import Posed
-from calib.matching.shown_view import shown_view
+from calib.matching.shown_view import Posed, shown_view
 from drivers.errors import NoReply
 from hil_tests.mastctl.motion.pointing_world import SIZE_PX, World, clean, click, moving_world, rig, run
 from mastctl.devices.frames import StampedFrame
