@@ -137,9 +137,9 @@ def when(key: str, value: object, then: dict[str, Any]) -> dict[str, Any]:
     return {"if": {"required": [key], "properties": {key: {"const": value}}}, "then": then}
 
 
-def schema_of(kind: type[BaseModel], title: str) -> dict[str, Any]:
-    """Return the JSON Schema of a file of these records, without references."""
-    found: dict[str, Any] = kind.model_json_schema(schema_generator=_Schema)
+def schema_of(kind: Any, title: str) -> dict[str, Any]:
+    """Return the JSON Schema of a file of these records, or of a value, without references."""
+    found = TypeAdapter(kind).json_schema(schema_generator=_Schema)
     whole: dict[str, Any] = _inlined(found, found.get("$defs", {}))
     return {"$schema": DIALECT, **whole, "title": title}
 
@@ -186,16 +186,27 @@ def read_record(kind: type[Kind], document: object, path: str | Path, place: str
 
 def read_value(kind: Any, value: object, path: str | Path, place: str) -> Any:
     """Return one value of a file, of an annotated type that is no record. Raises BadFile as `read_record`."""
-    adapter: TypeAdapter[Any] = TypeAdapter(kind, config=ConfigDict(strict=True))
     try:
-        return adapter.validate_python(value)
+        return TypeAdapter(kind, config=ConfigDict(strict=True)).validate_python(value)
     except ValidationError as error:
-        raise _refusal(error, adapter.json_schema(schema_generator=_Schema), path, place) from None
+        raise _refusal(error, schema_of(kind, ""), path, place) from None
 
 
 def _refusal(error: ValidationError, schema: dict[str, Any], path: str | Path, place: str) -> BadFile:
-    """The first mistake as a sentence; ``schema`` says what would be right."""
-    mistake = min(error.errors(include_url=False), key=_order)
+    """The first mistake as a sentence."""
+    (first_place, reason), *_ = mistakes_in(error.errors(include_url=False), schema, place)
+    return BadFile(path, first_place, reason)
+
+
+def mistakes_in(errors: Sequence[Any], schema: dict[str, Any], place: str = "") -> list[tuple[str, str]]:
+    """Return the place and the reason of each of pydantic's errors, the first to be mended first.
+
+    ``schema`` (`schema_of`) says what would be right; ``place`` is that of the whole value.
+    """
+    return [_mistake(one, schema, place) for one in sorted(errors, key=_order)]
+
+
+def _mistake(mistake: Any, schema: dict[str, Any], place: str) -> tuple[str, str]:
     steps: list[int | str] = [step for step in mistake["loc"] if step != "[key]"]
     value = mistake["input"]
     if mistake["type"].startswith("union_tag"):
@@ -207,23 +218,26 @@ def _refusal(error: ValidationError, schema: dict[str, Any], path: str | Path, p
         case "problem":
             place_steps += [mistake["ctx"]["key"]] if mistake["ctx"]["key"] else []
             reason = mistake["ctx"]["reason"]
+        case "value_error":
+            reason = mistake["msg"].removeprefix("Value error, ")
         case "missing":
-            reason = "the key is missing"
+            reason = "the key is missing" if steps else "nothing where a mapping is expected"
         case "union_tag_not_found":
             reason = f"the key is missing; {', '.join(expected['enum'])} are known"
-        case "extra_forbidden":
+        case "extra_forbidden" | "unexpected_keyword_argument":
             known = tuple(_part(schema, steps[:-1])[0].get("properties", {}))
             reason = f"unknown key; {nearest(str(steps[-1]), known)}"
         case _:
             reason = f"{kind_of(value)} where {_expected(expected, value)} is expected"
-    return BadFile(path, _joined([place, *place_steps]), reason)
+    return _joined([place, *place_steps]), reason
 
 
 def _order(mistake: Any) -> tuple[int, bool, bool]:
     """The outermost mistakes come first; of those unknown keys, then missing ones."""
     depth = sum(step != "[key]" for step in mistake["loc"])
     kind = mistake["type"]
-    return depth, kind not in ("extra_forbidden", "missing"), kind != "extra_forbidden"
+    unknown = kind in ("extra_forbidden", "unexpected_keyword_argument")
+    return depth, not unknown and kind != "missing", not unknown
 
 
 def _joined(steps: Sequence[int | str]) -> str:
@@ -279,16 +293,18 @@ def _expected(schema: dict[str, Any], value: object) -> str:
                 return "at least one entry"
             keys = ", ".join(schema.get("properties", ()))
             return f"a mapping with {keys}" if keys else "a mapping"
+    if isinstance(value, str) and len(value) > schema.get("maxLength", len(value)):
+        return f"text of up to {schema['maxLength']} characters"
     return "text on one line" if isinstance(value, str) else "text"
 
 
 def _number_expected(schema: dict[str, Any], value: object) -> str:
-    low, high = schema.get("minimum"), schema["maximum"]
+    low, high = schema.get("minimum"), schema.get("maximum", math.inf)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return "a number"
     if "exclusiveMinimum" in schema and value <= schema["exclusiveMinimum"]:
         return f"a number above {schema['exclusiveMinimum']:g}"
-    if low is None or (low == -high and (high > 1e4 or not math.isfinite(value))):
+    if low is None or (low == -high and (high > 1e4 or not abs(value) < math.inf)):
         return f"a finite number up to {high:g}"
     return f"a number from {low:g} to {high:g}"
 

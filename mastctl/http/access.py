@@ -14,18 +14,7 @@ log = logging.getLogger(__name__)
 
 
 class Access:
-    """The tokens of a daemon, read again by `reread` when they have changed.
-
-    Parameters
-    ----------
-    tokens
-        The list; made at the first run.
-
-    Raises
-    ------
-    BadFile
-        If the list cannot be read or made.
-    """
+    """The tokens of a daemon, made at the first run, read again by `reread`. Raises BadFile."""
 
     def __init__(self, tokens: TokenList) -> None:
         self._list = tokens

@@ -23,14 +23,9 @@ from mastctl.http.tokens import Token
 
 @dataclass(frozen=True)
 class HostNames:
-    """The names that a daemon answers to.
+    """The names that a daemon answers to, beside the loopback ones, in lower case.
 
-    Attributes
-    ----------
-    hosts
-        Beside the loopback ones, in lower case.
-    any_address
-        Whether any IP address will do as one: no name server can point it elsewhere.
+    ``any_address``: any IP address too, which no name server can point elsewhere.
     """
 
     hosts: frozenset[str] = frozenset()
@@ -65,17 +60,9 @@ class HostNames:
 
 
 def check_site(headers: Mapping[str, str], *, page: bool = False) -> None:
-    """Pass a request that no browser marks as one of another site's page.
+    """Pass a request that no browser marks as one of another site's page; to a ``page`` others may link.
 
-    Parameters
-    ----------
-    page
-        Whether it is for a page, to which others may link.
-
-    Raises
-    ------
-    GuardError
-        ``foreign_origin``.
+    Raises GuardError ``foreign_origin``.
     """
     site = headers.get("sec-fetch-site", "none").lower()
     if site in ("same-origin", "none"):
@@ -103,27 +90,12 @@ SCHEMES = ("http", "https")
 """Of a page of the daemon's own; https by a reverse proxy."""
 
 
-@dataclass(frozen=True)
-class Shown:
-    """The token that a request shows, and whether it came as the page's cookie."""
-
-    token: str | None
-    cookie: bool = False
-
-
 @dataclass
 class EntryRules:
     """A daemon's rules for its clients.
 
-    Attributes
-    ----------
-    names
-        The names it answers to.
-    access
-        Its tokens; None where every client that reaches it may do everything: this machine's loopback address
-        under loopback names, or a Unix socket.
-    via
-        The way of such a client: ``loopback`` or ``unix``.
+    Without ``access`` every client that reaches it may do everything, ``via`` this machine's ``loopback``
+    address under loopback names, or a ``unix`` socket.
     """
 
     names: HostNames = field(default_factory=HostNames)
@@ -133,12 +105,8 @@ class EntryRules:
     def caller(self, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
         """Return the caller of a request.
 
-        Raises
-        ------
-        NotLetIn
-            ``no_token``, ``wrong_token``.
-        GuardError
-            ``foreign_origin`` for a page's cookie without an Origin where something is changed.
+        Raises NotLetIn ``no_token``, ``wrong_token``, GuardError ``foreign_origin`` for a page's cookie
+        without an Origin where something is changed.
         """
         if self.access is None:
             if by := forwarded(headers):
@@ -149,11 +117,11 @@ class EntryRules:
                 raise NotLetIn("no_token", message)
             name = client_name(headers.get("mastctl-client"))
             return Caller(name, "admin", self.via, address_of(scope))
-        shown = shown_token(scope, headers)
-        if shown.token is None:
+        text, by_cookie = shown_token(scope, headers)
+        if text is None:
             raise NotLetIn("no_token", "a token is expected: Authorization: Bearer TOKEN, or a cookie")
-        token = self.access.token_of(shown.token)
-        if shown.cookie and changes(scope) and "origin" not in headers:
+        token = self.access.token_of(text)
+        if by_cookie and changes(scope) and "origin" not in headers:
             raise GuardError(403, "foreign_origin", "a request with the page's cookie carries its Origin")
         return _named(token, scope, headers)
 
@@ -161,8 +129,8 @@ class EntryRules:
         """Return the caller of a stop or of a health check, which every client may request."""
         if self.access is None:
             return self.stranger(scope, headers) if forwarded(headers) else self.caller(scope, headers)
-        shown = shown_token(scope, headers)
-        token = None if shown.token is None else self.access.known(shown.token)
+        text, _ = shown_token(scope, headers)
+        token = None if text is None else self.access.known(text)
         return self.stranger(scope, headers) if token is None else _named(token, scope, headers)
 
     def stranger(self, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
@@ -177,15 +145,15 @@ def _named(token: Token, scope: Mapping[str, Any], headers: Mapping[str, str]) -
     return Caller(name, token.role, "token", address_of(scope), token.sha256)
 
 
-def shown_token(scope: Mapping[str, Any], headers: Mapping[str, str]) -> Shown:
-    """Return the token that a request shows; one in a header goes before the page's cookie."""
+def shown_token(scope: Mapping[str, Any], headers: Mapping[str, str]) -> tuple[str | None, bool]:
+    """Return the token of a request, and whether it is the page's cookie; a header goes first."""
     header = headers.get("authorization", "")
     if header[: len(SCHEME)].lower() == SCHEME:
-        return Shown(header[len(SCHEME) :].strip())
+        return header[len(SCHEME) :].strip(), False
     name = cookie_name(scope)
     parts = [part.strip().partition("=") for part in headers.get("cookie", "").split(";")]
     tokens = [value for key, _, value in parts if key == name]
-    return Shown(tokens[0], cookie=True) if tokens else Shown(None)
+    return (tokens[0], True) if tokens else (None, False)
 
 
 def cookie_name(scope: Mapping[str, Any]) -> str:

@@ -19,7 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from mastctl.control.caller import Caller
 from mastctl.errors import MastctlError, one_line
 from mastctl.http import PREFIX
-from mastctl.http.entrance import EntryRules, changes, check_site
+from mastctl.http.entrance import EntryRules, changes, check_site, shown_token
 from mastctl.http.refusals import GuardError, error_response, marked, refusal_response
 
 log = logging.getLogger(__name__)
@@ -55,16 +55,8 @@ async def _at_once() -> None:
 class Guard:
     """ASGI middleware around the API.
 
-    Parameters
-    ----------
-    app
-        What it guards.
-    entrance
-        The daemon's rules for its clients.
-    records
-        Gets what is refused before it is a command; dropped by default.
-    turn
-        Awaited before each request that is no stop.
+    ``records`` gets what is refused before it is a command; ``turn`` is awaited before each request that is
+    no stop.
     """
 
     def __init__(
@@ -127,8 +119,10 @@ class Guard:
             headers = _headers(scope)
             self._let_in(scope, headers)
             self._entrance.names.check_origin(headers)
-            if "cookie" in headers and "authorization" not in headers and self._entrance.access is not None:
-                _check_has_origin(headers)
+            by_cookie = self._entrance.access is not None and shown_token(scope, headers)[1]
+            if by_cookie and "origin" not in headers:
+                message = "a WebSocket with the page's cookie carries its Origin"
+                raise GuardError(403, "foreign_origin", message)
         except (GuardError, MastctlError) as refused:
             self._record(scope, bytes(refusal_response(refused).body))
             await _refuse_websocket(refused, scope, receive, send)
@@ -200,11 +194,6 @@ def _check_no_secret(scope: Scope) -> None:
         raise GuardError(400, "token_in_address", message)
 
 
-def _check_has_origin(headers: Mapping[str, str]) -> None:
-    if "origin" not in headers:
-        raise GuardError(403, "foreign_origin", "a WebSocket with the page's cookie carries its Origin")
-
-
 async def _refuse_websocket(refused: Exception, scope: Scope, receive: Receive, send: Send) -> None:
     """Give the reason where the server can."""
     if "websocket.http.response" not in scope.get("extensions", {}):
@@ -240,10 +229,7 @@ def _too_large() -> NoReturn:
 def read_json(body: bytes, headers: Mapping[str, str]) -> Any:
     """Return the content of a body: JSON with finite numbers and each key once; None for nothing.
 
-    Raises
-    ------
-    GuardError
-        ``not_json``; ``bad_request`` for a number that is JSON and larger than any float.
+    Raises GuardError ``not_json``, ``bad_request`` for a number that is larger than any float.
     """
     if not body.strip():
         return None

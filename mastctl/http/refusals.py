@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager
-from typing import Any, TypeVar, get_args
+from functools import cache
+from typing import Annotated, Any, TypeVar
 
 from fastapi import FastAPI, Request, WebSocket
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 from starlette.exceptions import HTTPException
 
 from calib.errors import CalibError
-from calib.files.yaml_text import nearest
+from calib.files.records import mistakes_in, schema_of
+from calib.files.yaml_text import kind_of
 from drivers.errors import BadOptions, DriverError, NoFreshFrame, NoReply
 from mastctl.as_json import as_json
 from mastctl.errors import (
@@ -45,9 +47,6 @@ PAGE = (
     "form-action 'self'; frame-ancestors 'none'"
 )
 """The Content-Security-Policy of a page: its own files only, no script inside it, in no frame."""
-
-RENAMED = {"goes_on": "resume"}
-"""Keys of bodies by their names before version 0.1."""
 
 Headers = list[tuple[bytes, bytes]]
 Query = TypeVar("Query", bound=BaseModel)
@@ -96,8 +95,7 @@ async def query_of(line: WebSocket, model: type[Query], listed: str) -> AsyncIte
     try:
         yield model.model_validate(query | ({listed: given.getlist(listed)} if listed in given else {}))
     except ValidationError as error:
-        first = error.errors()[0]
-        message = sentence({**first, "loc": ("query", *first["loc"])}, model)
+        message = sentences(error.errors(), model, "query")[0]
         await line.send_denial_response(error_response(422, "bad_request", message))
     except MastctlError as error:
         await line.send_denial_response(refusal_response(error))
@@ -113,82 +111,16 @@ def marked(headers: Iterable[tuple[bytes, bytes]]) -> Headers:
     return given + [(n.encode(), v.encode()) for n, v in wanted.items() if n.encode() not in names]
 
 
-def sentence(problem: Mapping[str, Any], model: object) -> str:
-    """Return one validation problem of pydantic as a plain sentence: place, value, what is expected.
-
-    Parameters
-    ----------
-    problem
-        One entry of pydantic's list of errors.
-    model
-        The model of the body or the query, for its keys and for the description of what is expected; of a
-        path, the parameter's own facts. None if not known.
-    """
-    where = tuple(str(step) for step in problem["loc"])
-    place = _place(where)
-    kind = problem["type"]
-    message = str(problem["msg"])
-    if kind == "value_error":
-        return message.removeprefix("Value error, ")
-    if kind == "missing":
-        return f"{place} is missing" if len(where) > 1 else "the body is missing; a JSON object is expected"
-    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        if new := RENAMED.get(where[-1]):
-            return f"{place} is called {new} since version 0.1"
-        known = _keys(model, where[1:-1])
-        return f"{place}: unknown key; {nearest(where[-1], known)}" if known else f"{place}: unknown key"
-    value = _short(problem.get("input"))
-    if kind == "string_pattern_mismatch" and (expected := _described(model, where[1:])):
-        return f"{place}: {value} where {expected} is expected"
-    if kind in ("too_short", "too_long"):
-        size = 4 if where[-1] == "quaternion" else 3
-        return f"{place}: {value} where a list of {size} numbers is expected"
-    if kind in ("model_attributes_type", "model_type", "dict_type", "dataclass_type"):
-        return f"{place}: {value} where an object with keys is expected"
-    for start in ("Input should be ", "String should have "):
-        if message.startswith(start):
-            expected = message.removeprefix(start).partition(", unable to")[0]
-            return f"{place}: {value} where {expected} is expected"
-    return f"{place}: {value}: {message}"
+def sentences(errors: Sequence[Any], kind: Any, part: str) -> list[str]:
+    """Return pydantic's errors in the body or the query, a value of a kind, as sentences."""
+    whole = not errors[0]["loc"] and errors[0]["type"] != "value_error"
+    found = mistakes_in(errors, _schema_of(kind), f"the {part}" if whole else "")
+    return [f"{place[:120]}: {reason}" if place else reason for place, reason in found]
 
 
-def _keys(model: object, place: Sequence[str]) -> list[str]:
-    """The keys of a model or dataclass, or of the one at a place inside it."""
-    for candidate in (model, *get_args(model)):
-        fields = getattr(candidate, "model_fields", None) or getattr(candidate, "__pydantic_fields__", None)
-        if fields is None:
-            continue
-        if not place:
-            return list(fields)
-        if place[0] in fields:
-            return _keys(fields[place[0]].annotation, place[1:])
-    return []
-
-
-def _described(model: object, place: Sequence[str]) -> str | None:
-    """What is expected at a place, by the description of the model, or of a path's parameter itself."""
-    for candidate in (model, *get_args(model)):
-        fields = getattr(candidate, "model_fields", None) or {}
-        if place and place[0] in fields:
-            return fields[place[0]].description or _described(fields[place[0]].annotation, place[1:])
-    return getattr(model, "description", None)
-
-
-def _place(where: tuple[str, ...]) -> str:
-    """``("body", "position_m", "0")`` as ``position_m[0]``."""
-    place = ""
-    for step in where[1:]:
-        place += f"[{step}]" if step.isdecimal() else f".{step}" if place else step
-    return place[:120] or f"the {where[0]}"
-
-
-def _short(value: Any) -> str:
-    """A value as JSON, cut short."""
-    try:
-        text = json.dumps(value)
-    except (TypeError, ValueError):
-        text = str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+@cache
+def _schema_of(kind: Any) -> dict[str, Any]:
+    return schema_of(kind, "")
 
 
 STATUS_OF_KIND: Mapping[type[Exception], int] = {
@@ -237,8 +169,8 @@ def add_errors(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
-        sentences = [sentence(problem, _read_by(request, problem)) for problem in error.errors()[:10]]
-        return error_response(422, "bad_request", sentences[0], {"problems": sentences})
+        found = _sentences(request, error.errors()[:10])
+        return error_response(422, "bad_request", found[0], {"problems": found})
 
     @app.exception_handler(HTTPException)
     async def http(request: Request, error: HTTPException) -> JSONResponse:
@@ -267,13 +199,27 @@ def _methods_of(app: FastAPI, request: Request) -> list[str]:
     return sorted(found)
 
 
-def _read_by(request: Request, problem: Mapping[str, Any]) -> object:
-    """The model by which the route reads its body or its query, wherever the problem is."""
-    route = request.scope.get("route")
-    if not isinstance(route, APIRoute):
-        return None
-    if problem["loc"][0] == "path":
-        named = (one for one in route.dependant.path_params if one.name == problem["loc"][1])
-        return next((one.field_info for one in named), None)
-    params = route.dependant.body_params if problem["loc"][0] == "body" else route.dependant.query_params
-    return params[0].field_info.annotation if params else None
+def _sentences(request: Request, errors: Sequence[Any]) -> list[str]:
+    """What is wrong with the part of a request whose error comes first."""
+    part = errors[0]["loc"][0]
+    inside = [{**one, "loc": one["loc"][1:]} for one in errors if one["loc"][0] == part]
+    dependant = request.scope["route"].dependant
+    if part in ("body", "query"):
+        params = dependant.body_params if part == "body" else dependant.query_params
+        return sentences(inside, params[0].field_info.annotation, part)
+    known = {
+        one.alias: one.field_info
+        for each in (dependant, *dependant.dependencies)
+        for one in (*each.path_params, *each.header_params)
+    }
+    return [_of_parameter(one, known[one["loc"][0]]) for one in inside]
+
+
+def _of_parameter(error: Mapping[str, Any], facts: FieldInfo) -> str:
+    """What is wrong with a parameter; of a name's pattern only the description says what is right."""
+    name = error["loc"][0]
+    if error["type"] == "string_pattern_mismatch":
+        return f"{name}: {kind_of(error['input'])} where {facts.description} is expected"
+    schema = schema_of(Annotated[facts.annotation, facts], "")
+    ((place, reason),) = mistakes_in([{**error, "loc": ()}], schema, name)
+    return f"{place}: {reason}"

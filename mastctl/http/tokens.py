@@ -61,13 +61,7 @@ def digest_of(token: str) -> str:
 
 
 class TokenList:
-    """The tokens of one daemon, in its state folder. Each call reads the file anew.
-
-    Parameters
-    ----------
-    folder
-        The state folder.
-    """
+    """The tokens of one daemon, in its state folder. Each call reads the file anew."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -81,10 +75,7 @@ class TokenList:
     def read(self) -> tuple[Token, ...] | None:
         """Return the tokens; None before the first run.
 
-        Raises
-        ------
-        BadFile
-            If the list, or a token beside it, is damaged or open to other users of this machine.
+        Raises BadFile if the list, or a token beside it, is damaged or open to other users of this machine.
         """
         for path in (self.path, *(self.file_of(role) for role in ROLES)):
             _check_private(path)
@@ -97,13 +88,7 @@ class TokenList:
         return tokens
 
     def first_run(self) -> tuple[Token, ...]:
-        """Return the tokens, after making one for each role if there is no list yet.
-
-        Raises
-        ------
-        BadFile
-            As `read`, or if they cannot be saved.
-        """
+        """Return the tokens, after making one for each role if there is no list yet. Raises BadFile."""
         with self._locked():
             tokens = self.read()
             if tokens is not None:
@@ -117,15 +102,7 @@ class TokenList:
             return tuple(made)
 
     def new(self, name: str, role: Role) -> str:
-        """Make a token and return it; it is kept nowhere else.
-
-        Raises
-        ------
-        TokenRefused
-            If the name is none or is taken, or there are too many.
-        BadFile
-            As `first_run`.
-        """
+        """Make a token and return it; it is kept nowhere else. Raises TokenRefused, BadFile."""
         if not name or len(name) > LONGEST_NAME or not all(c.isalnum() or c in "._-" for c in name):
             expected = f"1 to {LONGEST_NAME} letters, digits, dots, dashes are expected"
             raise TokenRefused(f"'{name[:60]}' where {expected}")
@@ -140,15 +117,7 @@ class TokenList:
             return text
 
     def revoke(self, name: str) -> Token:
-        """Revoke a token; it is valid no longer.
-
-        Raises
-        ------
-        TokenRefused
-            If there is none of this name.
-        BadFile
-            As `first_run`.
-        """
+        """Revoke a token; it is valid no longer. Raises TokenRefused, BadFile."""
         with self._locked():
             tokens = self.read() or ()
             found = next((one for one in tokens if one.name == name), None)
@@ -193,10 +162,8 @@ def _check_private(path: Path) -> None:
     except OSError as error:
         raise BadFile(path, "", f"cannot be read: {error.strerror or error}") from None
     if mode & _OTHERS_MAY:
-        words = (
-            f"other users of this machine may touch it (mode {stat.S_IMODE(mode):04o}); 'chmod 600' mends it"
-        )
-        raise BadFile(path, "", words)
+        found = f"mode {stat.S_IMODE(mode):04o}"
+        raise BadFile(path, "", f"other users of this machine may touch it ({found}); 'chmod 600' mends it")
 
 
 def _save(path: Path, data: bytes) -> None:

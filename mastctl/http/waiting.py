@@ -12,7 +12,7 @@ import asyncio
 import os
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -65,42 +65,26 @@ class Waiting:
     def encode(self, function: Callable[[], T]) -> T:
         """Return what ``function()`` returns, which computes for long: a few at a time, after all other work.
 
-        For a worker thread of `run` or `image`.
-
-        Raises
-        ------
-        Unable
-            ``closing`` if the daemon ends.
+        For a worker thread of `run` or `image`. Raises Unable ``closing``.
         """
         try:
             encoded = self._encoders.submit(function)
         except RuntimeError:  # the daemon ends
-            encoded = Future[T]()
-            encoded.cancel()
+            raise _closing() from None
         try:
             return encoded.result()
         except CancelledError:
             raise _closing() from None
 
     async def run(self, function: Callable[[], T]) -> T:
-        """Return what ``function()`` returns, run in a worker thread.
-
-        Raises
-        ------
-        Unable
-            ``closing`` if the daemon ends before it returns.
-        """
+        """Return what ``function()`` returns, run in a worker thread. Raises Unable ``closing``."""
         return await self._unless_ending(function, self._workers)
 
     async def image(self, camera: str, function: Callable[[], T], kept: bool = False) -> T:
         """Return what ``function()`` returns, which takes an image with a (known) camera, or encodes one that
         is ``kept``: as many of these at once, and none of them waits for the camera.
 
-        Raises
-        ------
-        Unable
-            ``too_many`` if so many others wait for this camera that it does not come to this one's turn in
-            2 s; else as `run`.
+        Raises Unable ``too_many`` if this one's turn does not come in 2 s, ``closing``.
         """
         limiter = self._images.setdefault((camera, kept), CapacityLimiter(IMAGES_AT_ONCE))
         return await self._unless_ending(function, limiter, camera)
@@ -155,15 +139,7 @@ END_S = 1.5  # for the last events to be sent
 
 
 class Streams:
-    """The open event streams of one daemon; used on its event loop only.
-
-    Parameters
-    ----------
-    publisher
-        The source of their events.
-    most
-        How many there may be at once.
-    """
+    """The open event streams of one daemon, ``most`` at once; used on its event loop only."""
 
     def __init__(self, publisher: Publisher, most: int = MOST_STREAMS) -> None:
         self._publisher = publisher
@@ -177,12 +153,8 @@ class Streams:
     ) -> Iterator[LoopSubscription]:
         """Listen inside the block to topics (empty: all) of some keys (None: all).
 
-        ``credential`` is the digest of the client's token, with which the stream ends; empty for none.
-
-        Raises
-        ------
-        Unable
-            ``too_many`` listen already, ``closing``.
+        ``credential`` is the digest of the client's token, with which the stream ends; empty for none. Raises
+        Unable ``too_many``, ``closing``.
         """
         if self._ended:
             raise Unable("closing", "the daemon ends; no more events follow")

@@ -22,7 +22,7 @@ def add_sessions(app: FastAPI) -> None:
 
     @app.post(f"{PREFIX}/session", summary="Keep the token of this request in the page's cookie")
     async def keep(request: Request, response: Response, here: Here) -> SessionTold:
-        token = shown_token(request.scope, request.headers).token
+        token, _ = shown_token(request.scope, request.headers)
         if here.entrance.access is not None and token is not None:
             response.set_cookie(
                 cookie_name(request.scope),

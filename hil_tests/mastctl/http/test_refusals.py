@@ -15,8 +15,6 @@ import drivers
 import mastctl
 from calib.errors import CalibError
 from drivers.errors import BadOptions, DriverError, NoFreshFrame, NoReply
-from hil_tests.mastctl.service_fakes import HTTP, FakeHardware
-from mastctl.daemon import RunningDaemon
 from mastctl.errors import (
     BadRequest,
     MastctlError,
@@ -105,11 +103,3 @@ def test_each_error_class_has_a_code_of_the_table(
 )
 def test_a_family_answers_with_one_status(error: Exception, status: int) -> None:
     assert status_of(error) == status
-
-
-def test_a_renamed_key_is_refused_with_its_new_name(
-    standing: tuple[RunningDaemon, FakeHardware],
-) -> None:
-    answer = HTTP.post(f"{standing[0].url}/api/v1/bench", json={"goes_on": True})
-    message = answer.json()["error"]["message"]
-    assert (answer.status_code, message) == (422, "goes_on is called resume since version 0.1")

@@ -124,13 +124,13 @@ P = {"camera": "navcam_left", "frame_id": "f", "x_px": 1.0, "y_px": 2.0}
 BAD_POINTS: list[tuple[Any, str]] = [
     ({}, "0 targets where exactly one of pixel, position_m, pan_rad with tilt_rad is expected"),
     ({"pixle": P}, "pixle: unknown key; the nearest known is 'pixel'"),
-    ({"pixel": {"camera": "navcam_left", "x_px": 1, "y_px": 2}}, "pixel.frame_id is missing"),
-    ({"pixel": {**P, "x_px": "12"}}, 'pixel.x_px: "12" where a valid number is expected'),
-    ({"position_m": [1, 2]}, "position_m: [1, 2] where a list of 3 numbers is expected"),
+    ({"pixel": {"camera": "navcam_left", "x_px": 1, "y_px": 2}}, "pixel.frame_id: the key is missing"),
+    ({"pixel": {**P, "x_px": "12"}}, "pixel.x_px: the text '12' where a number is expected"),
+    ({"position_m": [1, 2]}, "position_m: a list of 2 where a list of 3 numbers is expected"),
     ({**ANGLES, "frame": "rover"}, "frame goes with position_m only"),
     ({**ANGLES, "aim": {"camera": "navcam_left", "x_px": 1, "y_px": 1}}, "aim goes with pixel or position_m"),
     ({**ANGLES, "pointings": 2}, "pointings is 2, which goes with pixel only"),
-    ([], "the body: [] where an object with keys is expected"),
+    ([], "the body: a list of 0 where a mapping with deadline_s, "),
 ]
 
 
