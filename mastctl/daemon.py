@@ -42,7 +42,7 @@ from mastctl.safety.stop_threads import StopsHang
 from mastctl.service.service import Service
 from mastctl.service_manager import Heartbeat, ServiceManager
 from mastctl.web.app import create_app
-from mastctl.web.pictures import WatchedCameras
+from mastctl.web.pictures import CameraFeeds
 
 log = logging.getLogger(__name__)
 
@@ -262,8 +262,8 @@ async def _serve(
     loop = asyncio.get_running_loop()
     waiting = Waiting(service.clock)
     streams = Streams(service.machine.publisher)
-    watched = WatchedCameras(service.devices, service.clock)
-    server = uvicorn.Server(_settings(create_app(service, waiting, entrance, streams, watched)))
+    feeds = CameraFeeds(service.devices, service.clock)
+    server = uvicorn.Server(_settings(create_app(service, waiting, entrance, streams, feeds)))
     ending = asyncio.Event()
 
     def end() -> None:
@@ -315,7 +315,7 @@ async def _serve(
     log.info("ending: the mast is stopped first")
     await stopped
     await streams.end()
-    watched.close()
+    feeds.close()
     server.should_exit = True
     await serving
     for task in beside:

@@ -29,7 +29,7 @@ from mastctl.web.images import add_cameras, add_images
 from mastctl.web.keeping import add_bench, add_masts, add_places, add_recordings
 from mastctl.web.page import add_page, add_site, text_answer
 from mastctl.web.parts import Here, Parts
-from mastctl.web.pictures import WatchedCameras
+from mastctl.web.pictures import CameraFeeds
 from mastctl.web.sessions import add_sessions
 from mastctl.web.simulation import add_simulation
 from mastctl.web.steering import add_estop, add_lease, add_limits, add_pointing, add_tracking
@@ -41,7 +41,7 @@ def create_app(
     waiting: Waiting | None = None,
     entrance: EntryRules | None = None,
     streams: Streams | None = None,
-    watched: WatchedCameras | None = None,
+    feeds: CameraFeeds | None = None,
 ) -> ASGIApp:
     """Return the ASGI application that serves one service.
 
@@ -53,14 +53,14 @@ def create_app(
         What it asks of who comes in; nothing but a loopback name by default.
     streams
         Ends who listens to events when the daemon ends.
-    watched
-        Takes pictures for who watches cameras.
+    feeds
+        Pictures of cameras that have viewers.
     """
     waiting = waiting or Waiting(service.clock)
     entrance = entrance or EntryRules()
     streams = streams or Streams(service.machine.publisher)
-    watched = watched or WatchedCameras(service.devices, service.clock)
-    parts = Parts(service, waiting, streams, entrance, watched)
+    feeds = feeds or CameraFeeds(service.devices, service.clock)
+    parts = Parts(service, waiting, streams, entrance, feeds)
     routes = api()
 
     async def served(scope: Scope, receive: Receive, send: Send) -> None:

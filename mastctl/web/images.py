@@ -2,9 +2,9 @@
 what the cameras are set to.
 
 A message is 4 bytes (the length of what follows, little-endian), the picture's facts as JSON, and the
-picture as JPEG. Whoever has shown one sends ``CAMERA`` or ``CAMERA MOST_BYTES`` back, and is sent another one
-then: one of a camera is on its way, and none waits. ``? WORDS`` is answered with the clock by which pictures
-are stamped when they are sent: whoever asks can tell how long they were on their way.
+picture as JPEG. A client that has shown one sends ``CAMERA`` or ``CAMERA MOST_BYTES`` back, and gets another
+one then: one of a camera is on its way, and none waits. ``? TEXT`` is answered with the clock by which
+pictures are stamped when they are sent, which shows how long they were on their way.
 """
 
 from __future__ import annotations
@@ -17,20 +17,21 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Query, Response, WebSocket
 from starlette.websockets import WebSocketDisconnect
 
-from calib.geometry.mode import SensorMode, flip_name
+from calib.geometry.mode import flip_name
 from drivers.interfaces import SETTINGS
-from mastctl.answers import CameraSettingsTold, SensorModeTold
+from mastctl.answers import CameraSettingsTold
 from mastctl.as_json import as_json
 from mastctl.control.entry import CAMERA_SETTINGS
-from mastctl.frame_facts import headers_of
+from mastctl.frame_facts import described_headers, headers_of
 from mastctl.http import PREFIX
 from mastctl.http.refusals import query_of
 from mastctl.report.pictures import encoded
 from mastctl.web.commands import command
+from mastctl.web.described import file_of
 from mastctl.web.events import UNSUPPORTED, close_ended, credential_of
 from mastctl.web.models import CameraSettingsBody, ImagesQuery, SnapshotQuery
 from mastctl.web.parts import Here, Parts
-from mastctl.web.pictures import Picture, Watcher
+from mastctl.web.pictures import Picture, Viewer
 
 IMAGES = f"{PREFIX}/images"
 TIME = "?"
@@ -44,7 +45,7 @@ def add_images(app: FastAPI) -> None:
         f"{PREFIX}/snapshot/{{camera}}",
         summary="A picture; its facts are in Mastctl headers",
         response_class=Response,
-        responses={200: {"content": {"image/png": {}, "image/jpeg": {}}}},
+        responses=file_of("image/png", "image/jpeg", headers=described_headers()),
     )
     async def snapshot(camera: str, query: Annotated[SnapshotQuery, Query()], here: Here) -> Response:
         service, waiting = here.service, here.waiting
@@ -68,7 +69,8 @@ def add_images(app: FastAPI) -> None:
                 here.service.check_camera(camera)
             with here.streams.listening((), frozenset(), credential_of(line)) as ending:
                 await line.accept()
-                await _Line(here, line, query).run(asyncio.ensure_future(ending.wait()))
+                with here.feeds.viewer(query.camera, not query.on_request, query.every) as viewer:
+                    await _Line(here, line, viewer).run(asyncio.ensure_future(ending.wait()))
 
 
 def add_cameras(app: FastAPI) -> None:
@@ -77,7 +79,7 @@ def add_cameras(app: FastAPI) -> None:
     @app.get(f"{PREFIX}/cameras/{{camera}}/settings", summary="The settings of a camera, with their bounds")
     async def settings(camera: str, here: Here) -> CameraSettingsTold:
         here.service.check_camera(camera)
-        return await here.waiting.run(lambda: _told(here, camera, []))
+        return await here.waiting.run(lambda: _settings(here, camera, []))
 
     @command(
         app,
@@ -86,53 +88,29 @@ def add_cameras(app: FastAPI) -> None:
         "Change some of a camera's settings, each with its automatic turned off",
     )
     def change(camera: str, body: CameraSettingsBody, here: Here) -> CameraSettingsTold:
-        return _told(here, camera, here.service.devices.set_camera(camera, body.wanted))
+        return _settings(here, camera, here.service.devices.set_camera(camera, body.wanted))
 
 
-def _told(here: Parts, camera: str, notes: list[str]) -> CameraSettingsTold:
-    found, held = here.service.devices.camera_settings(camera)
-    mode = here.service.devices.sensor_modes.get(camera)
+def _settings(here: Parts, camera: str, notes: list[str]) -> CameraSettingsTold:
+    devices = here.service.devices
+    found, fixed = devices.camera_settings(camera)
+    mode = devices.sensor_modes.get(camera)
     return {
         "camera": camera,
         "settings": [
-            {
-                "name": one.name,
-                "value": one.value,
-                "minimum": one.minimum,
-                "maximum": one.maximum,
-                "step": one.step,
-                "unit": SETTINGS[one.name],
-                "automatic": one.automatic,
-                "refusal": one.refusal or None,
-            }
-            for one in found
+            as_json(one) | {"unit": SETTINGS[one.name], "refusal": one.refusal or None} for one in found
         ],
-        "held": held,
-        "sensor_mode": None if mode is None else _mode_told(mode),
+        "held": fixed,
+        "sensor_mode": None if mode is None else as_json(mode) | {"flip": flip_name(mode.flip)},
         "notes": notes,
-    }
-
-
-def _mode_told(mode: SensorMode) -> SensorModeTold:
-    return {
-        "size_px": list(mode.size_px),
-        "sensor_px": None if mode.sensor_px is None else list(mode.sensor_px),
-        "crop_px": None if mode.crop_px is None else list(mode.crop_px),
-        "flip": flip_name(mode.flip),
     }
 
 
 class _Line:
     """One WebSocket of pictures, until the daemon or the client ends."""
 
-    def __init__(self, here: Parts, line: WebSocket, query: ImagesQuery) -> None:
-        self._here = here
-        self._line = line
-        self._there = asyncio.Event()
-        self._loop = asyncio.get_running_loop()
-        self._watcher: Watcher = here.watched.watch(
-            query.camera, self._wake, not query.on_request, query.every
-        )
+    def __init__(self, here: Parts, line: WebSocket, viewer: Viewer) -> None:
+        self._here, self._line, self._viewer = here, line, viewer
 
     async def run(self, ending: asyncio.Future[Any]) -> None:
         """Send pictures until ``ending`` is done."""
@@ -146,7 +124,6 @@ class _Line:
             for job in jobs:
                 job.cancel()
             await asyncio.gather(*jobs, return_exceptions=True)
-            self._watcher.end()
 
     async def _receive(self) -> None:
         """Take which images were shown, and answer requests for the time."""
@@ -155,20 +132,19 @@ class _Line:
                 text = message.get("text") or ""
                 name, _, more = text.partition(" ")
                 if name == TIME and len(text) <= LONGEST_MESSAGE:
-                    await self._line.send_text(json.dumps({"asked": more, "now_s": self._loop.time()}))
+                    await self._line.send_text(json.dumps({"asked": more, "now_s": _now_s()}))
                 elif not 0 < len(text) <= LONGEST_MESSAGE or (more and not more.isdecimal()):
-                    await self._line.close(UNSUPPORTED, "CAMERA, CAMERA MOST_BYTES or ? WORDS are taken here")
+                    await self._line.close(UNSUPPORTED, "CAMERA, CAMERA MOST_BYTES or ? TEXT is expected")
                     return
                 else:
-                    self._watcher.shown(name, int(more) if more else None)
+                    self._viewer.want(name, int(more) if more else None)
+                    self._here.feeds.stir()
 
     async def _send(self) -> None:
         """Send each image that is ready."""
         with contextlib.suppress(WebSocketDisconnect):
-            while True:
-                await self._there.wait()
-                self._there.clear()
-                for picture in self._watcher.take():
+            while await self._viewer.news.wait():
+                for picture in self._viewer.take():
                     await self._line.send_bytes(self._message(picture))
 
     def _message(self, picture: Picture) -> bytes:
@@ -176,11 +152,11 @@ class _Line:
         height, width = frame.image.shape[:2]
         age_s = max(0.0, self._here.service.clock.now_s() - frame.mid_exposure_s)
         facts = as_json(frame.facts) | {"size_px": [width, height], "reduced": picture.reduced}
-        facts |= {"age_s": age_s, "sent_s": self._loop.time()}
-        facts["track"] = self._here.service.track_in(frame)
+        facts |= {"age_s": age_s, "sent_s": _now_s(), "track": self._here.service.track_in(frame)}
         head = json.dumps(facts, allow_nan=False).encode()
         return b"".join((len(head).to_bytes(4, "little"), head, picture.jpeg))
 
-    def _wake(self) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop has ended
-            self._loop.call_soon_threadsafe(self._there.set)
+
+def _now_s() -> float:
+    """The clock that stamps what is sent: the event loop's, seconds."""
+    return asyncio.get_running_loop().time()

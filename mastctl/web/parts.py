@@ -14,7 +14,7 @@ from fastapi.requests import HTTPConnection
 from mastctl.http.entrance import EntryRules
 from mastctl.http.waiting import Streams, Waiting
 from mastctl.service.service import Service
-from mastctl.web.pictures import WatchedCameras
+from mastctl.web.pictures import CameraFeeds
 
 
 @dataclass(frozen=True)
@@ -31,15 +31,15 @@ class Parts:
         Who listens to events.
     entrance
         What is asked of who comes in.
-    watched
-        Pictures for who watches cameras by a page.
+    feeds
+        Pictures of cameras that have viewers.
     """
 
     service: Service
     waiting: Waiting
     streams: Streams
     entrance: EntryRules
-    watched: WatchedCameras
+    feeds: CameraFeeds
 
 
 async def _parts(line: HTTPConnection) -> Parts:

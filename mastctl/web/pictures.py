@@ -1,21 +1,24 @@
-"""Cameras that somebody watches: each asked for its newest picture once for all who are ready for one.
+"""Live pictures: the newest of each camera, taken once for all its viewers that are ready for one.
 
-Nothing is queued, and no frame that somebody needs waits for one that is only watched. A watcher says for
-each camera when it is ready for another picture, and is given the newest when there is one; one that was not
-fetched yet is replaced. A camera that nobody is ready for is not asked.
+Nothing is queued, and no frame that an operation needs waits for one that is only watched. A viewer says for
+each camera when it is ready for another picture, and gets the newest when there is one; one that was not
+sent yet is replaced. A camera for which no viewer is ready takes none.
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import math
-import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import cv2
+from anyio import CapacityLimiter
+from anyio.to_thread import run_sync
 
 from drivers.clock import Clock
 from drivers.errors import DriverError
@@ -24,27 +27,27 @@ from mastctl.errors import MastctlError
 from mastctl.report.pictures import encoded
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 JPEG_QUALITY = 80  # 110 kB of 1024x768 gravel; a pixel's own grey is off by 2 of 255
 APART_S = 0.045  # least time between two pictures: more than 15 a second from cameras of 15, 20, 30 or 60
-NEXT_S = 1e-3  # the same where somebody watches every picture
+NEXT_S = 1e-3  # the same where a viewer wants every picture
 NEW_S = 0.05  # a picture that was exposed this long ago is still new
 STANDS_S = 0.25  # and one this long ago where the clock may stand: two frames of 15 Hz, and their read-out
 AGAIN_S = 0.25  # a picture that stays the newest, since its clock stands, is shown again so often, real time
 TIMEOUT_S = 1.0
 FAILING_S = 0.5  # how long a camera is left alone that gave none
-HELD = 4  # pictures of a camera that each watcher may click though newer ones came
-HELD_OF_EVERY, HELD_BYTES = (
-    32,
-    64_000_000,
-)  # the same where every picture is watched: a second of 30 Hz, at most
+KEPT = 4  # pictures of a camera that each viewer may click though newer ones came
+KEPT_OF_EVERY, KEPT_BYTES = 32, 64_000_000
+"""The same where every picture is watched: a second of 30 Hz, at most."""
 REDUCED = ((1, 55), (1, 35), (2, 70), (2, 45), (2, 25), (4, 60), (4, 30))
 """By what a picture's sides are divided, and the quality of its JPEG, the largest first: some 110 kB of
 gravel become 70, 50, 28, 18, 12, 7 and 4."""
+MOST_THREADS = 64
 
 
-class CamerasLike(Protocol):
-    """Who takes pictures, and keeps those that are looked at."""
+class LiveCameras(Protocol):
+    """The cameras, and the frames that are kept for viewers."""
 
     def glance(
         self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float
@@ -76,8 +79,58 @@ class Picture:
         return Picture(self.frame, jpeg, reduced=True)
 
 
-class WatchedCameras:
-    """Pictures of cameras for as long as somebody watches them; safe to use from any thread.
+class Viewer:
+    """One client's view of some cameras; `CameraFeeds.viewer` makes one.
+
+    Attributes
+    ----------
+    every
+        Whether at the cameras' own rate.
+    news
+        Set when a picture came.
+    most_bytes
+        Of each camera's next picture; None: any number.
+    """
+
+    def __init__(self, name: str, cameras: Sequence[str], ready: bool, every: bool) -> None:
+        self.name = name
+        self.every = every
+        self.news = asyncio.Event()
+        self.most_bytes: dict[str, int | None] = dict.fromkeys(cameras)
+        self._wanted = set(cameras) if ready else set[str]()
+        self._pictures: dict[str, Picture] = {}
+
+    def want(self, camera: str, most_bytes: int | None = None) -> None:
+        """Be ready for a picture of a camera, of at most so many bytes; another camera changes nothing."""
+        if camera in self.most_bytes:
+            self._wanted.add(camera)
+            self.most_bytes[camera] = most_bytes
+
+    def ready(self, camera: str) -> bool:
+        """Return whether a picture of a camera would be taken."""
+        return camera in self._wanted or camera in self._pictures
+
+    def kept_of(self, frame: StampedFrame) -> int:
+        """Return how many pictures of a camera may be clicked."""
+        return max(KEPT, min(KEPT_OF_EVERY, KEPT_BYTES // frame.image.nbytes)) if self.every else KEPT
+
+    def put(self, picture: Picture) -> None:
+        """Leave a picture to be taken, in the place of one that was not."""
+        camera = picture.frame.camera
+        if self.ready(camera):
+            self._wanted.discard(camera)
+            self._pictures[camera] = picture
+            self.news.set()
+
+    def take(self) -> list[Picture]:
+        """Return the newest picture of each camera since the last call."""
+        self.news.clear()
+        pictures, self._pictures = self._pictures, {}
+        return list(pictures.values())
+
+
+class CameraFeeds:
+    """Pictures of cameras for as long as they have viewers; for the event loop.
 
     Parameters
     ----------
@@ -85,219 +138,105 @@ class WatchedCameras:
         The daemon's.
     """
 
-    def __init__(self, cameras: CamerasLike, clock: Clock) -> None:
+    def __init__(self, cameras: LiveCameras, clock: Clock) -> None:
         self._cameras = cameras
-        self._clock = clock
-        self._changed = threading.Condition()
-        self._watchers: set[Watcher] = set()
-        self._at_work: set[str] = set()
-        self._closed = False
+        self._stands = clock.stands_for_work
+        self._viewers: set[Viewer] = set()
+        self._feeds: dict[str, asyncio.Task[None]] = {}
+        self._changed = asyncio.Event()
         self._numbers = count(1)
+        self._threads = CapacityLimiter(MOST_THREADS)
 
-    def watch(
-        self, cameras: Sequence[str], wake: Callable[[], None], ready: bool = True, every: bool = False
-    ) -> Watcher:
-        """Begin to watch some cameras. Whoever does ends it by `Watcher.end`.
+    @contextmanager
+    def viewer(self, cameras: Sequence[str], ready: bool = True, every: bool = False) -> Iterator[Viewer]:
+        """View some configured cameras inside the block.
 
         Parameters
         ----------
-        cameras
-            Names of configured cameras.
-        wake
-            Called from another thread when a picture is there; must return at once.
         ready
-            Whether a first picture of each is wanted before `Watcher.shown` asks for one.
+            Whether a first picture of each is wanted before `Viewer.want`.
         every
             Whether pictures are wanted at the cameras' own rate, and not only as a person sees them move.
-
-        Raises
-        ------
-        RuntimeError
-            If the system gives no thread; nobody watches then.
         """
-        watcher = Watcher(self, f"watcher {next(self._numbers)}", cameras, wake, ready, every)
-        with self._changed:
-            self._watchers.add(watcher)
-            self._changed.notify_all()  # a camera's thread may be waiting for a viewer that is ready
+        viewer = Viewer(f"viewer {next(self._numbers)}", cameras, ready, every)
+        self._viewers.add(viewer)
+        for camera in cameras:
+            if camera not in self._feeds:
+                self._feeds[camera] = asyncio.create_task(self._feed(camera))
+        self.stir()
         try:
-            for camera in watcher.cameras:
-                self._begin(camera)
-        except BaseException:
-            self.leave(watcher)
-            raise
-        return watcher
-
-    def _begin(self, camera: str) -> None:
-        """Have a thread at work for a camera."""
-        with self._changed:
-            if camera not in self._at_work and not self._closed:
-                name = f"pictures of {camera}"
-                threading.Thread(target=self._work, args=(camera,), name=name, daemon=True).start()
-                self._at_work.add(camera)  # it waits for this lock before it looks whether anybody watches
-
-    def close(self) -> None:
-        """Ask no camera any more."""
-        with self._changed:
-            self._closed = True
-            self._watchers.clear()
-            self._changed.notify_all()
-
-    # What watchers call
+            yield viewer
+        finally:
+            self._viewers.discard(viewer)
+            self._cameras.let_go(viewer.name)
+            self.stir()
 
     def stir(self) -> None:
-        """Somebody is ready for another picture."""
-        with self._changed:
-            self._changed.notify_all()
+        """Have every feed see which viewers are ready."""
+        self._changed.set()
 
-    def leave(self, watcher: Watcher) -> None:
-        """Somebody watches no longer."""
-        with self._changed:
-            self._watchers.discard(watcher)
-            self._changed.notify_all()
-        self._cameras.let_go(watcher.name)
+    def close(self) -> None:
+        """Take no more pictures."""
+        for feed in self._feeds.values():
+            feed.cancel()
 
-    # In a camera's own thread, which ends when nobody watches
-
-    def _work(self, camera: str) -> None:
-        stands = self._clock.stands_for_work
+    async def _feed(self, camera: str) -> None:
+        """Hand out a camera's pictures until it has no viewer."""
         made: Picture | None = None
-        pause_s = 0.0
-        while self._wanted(camera, pause_s):
+        while await self._wanted(camera):
             try:
-                after_s = (
-                    -math.inf
-                    if made is None or stands
-                    else made.frame.exposure_began_s + self._apart_s(camera)
-                )
-                frame = self._cameras.glance(camera, after_s, STANDS_S if stands else NEW_S, TIMEOUT_S)
-                if made is not None and made.frame is frame:
-                    pause_s = AGAIN_S
-                else:
-                    made = Picture(frame, frame.jpeg or encoded(frame.image, "jpeg", JPEG_QUALITY))
-                    pause_s = 0.0
-                for watcher in self._ready(camera):
-                    self._hand_to(watcher, made)
-            except (DriverError, MastctlError) as error:  # its fault tells more
+                before = made
+                made = await self._in_thread(lambda: self._next(camera, before))  # noqa: B023
+                for viewer in self._of(camera):
+                    if viewer.ready(camera):
+                        await self._hand_to(viewer, made)
+                pause_s = AGAIN_S if made is before else 0.0
+            except (DriverError, MastctlError) as error:  # its fault says more
                 log.debug("no picture of %s for its viewers: %s", camera, error)
                 made, pause_s = None, FAILING_S
-            except Exception:  # a defect must not end the thread
+            except Exception:  # a defect must not end the feed
                 log.exception("pictures of %s met a defect of the program", camera)
                 made, pause_s = None, FAILING_S
-
-    def _hand_to(self, watcher: Watcher, made: Picture) -> None:
-        """Hand a picture to a watcher; one that fails is left out from then on, and no other waits for it."""
-        camera = made.frame.camera
-        try:
-            self._cameras.hold(made.frame, watcher.name, watcher.held_of(made.frame))
-            if self._is_there(watcher):
-                watcher.put(made.within(watcher.most_bytes(camera)))
-            else:  # it left before the frame was stored for it, which would be kept for ever
-                self._cameras.let_go(watcher.name)
-        except Exception:
-            log.exception("%s of %s met a defect of the program", watcher.name, camera)
-            self.leave(watcher)
-
-    def _wanted(self, camera: str, pause_s: float) -> bool:
-        """Wait until somebody is ready for a picture; False if nobody watches any more."""
-        with self._changed:
             if pause_s:
-                self._changed.wait_for(lambda: not self._watch(camera), pause_s)
-            self._changed.wait_for(
-                lambda: not self._watch(camera) or any(one.ready(camera) for one in self._watchers)
-            )
-            if self._watch(camera):
+                await asyncio.sleep(pause_s)
+
+    def _next(self, camera: str, before: Picture | None) -> Picture:
+        """Take and encode the next picture; the one before where it is still the newest."""
+        after_s = -math.inf
+        if before is not None and not self._stands:
+            every = any(one.every for one in self._of(camera))
+            after_s = before.frame.exposure_began_s + (NEXT_S if every else APART_S)
+        frame = self._cameras.glance(camera, after_s, STANDS_S if self._stands else NEW_S, TIMEOUT_S)
+        if before is not None and before.frame is frame:
+            return before
+        return Picture(frame, frame.jpeg or encoded(frame.image, "jpeg", JPEG_QUALITY))
+
+    async def _hand_to(self, viewer: Viewer, made: Picture) -> None:
+        """Hand a picture to a viewer, which may click it from then on."""
+        frame, most_bytes = made.frame, viewer.most_bytes[made.frame.camera]
+
+        def prepared() -> Picture:
+            self._cameras.hold(frame, viewer.name, viewer.kept_of(frame))
+            return made.within(most_bytes)
+
+        picture = await self._in_thread(prepared)
+        if viewer in self._viewers:
+            viewer.put(picture)
+        else:  # it left before the frame was kept for it, which would be kept for ever
+            self._cameras.let_go(viewer.name)
+
+    async def _wanted(self, camera: str) -> bool:
+        """Wait until a viewer is ready for a picture; False if there is no viewer any more."""
+        while viewers := self._of(camera):
+            if any(one.ready(camera) for one in viewers):
                 return True
-            self._at_work.discard(camera)
-            return False
+            self._changed.clear()
+            await self._changed.wait()
+        del self._feeds[camera]
+        return False
 
-    def _apart_s(self, camera: str) -> float:
-        with self._changed:
-            every = any(one.every for one in self._watchers if camera in one.cameras)
-        return NEXT_S if every else APART_S
+    def _of(self, camera: str) -> list[Viewer]:
+        return [one for one in tuple(self._viewers) if camera in one.most_bytes]
 
-    def _watch(self, camera: str) -> bool:
-        return not self._closed and any(camera in one.cameras for one in self._watchers)
-
-    def _is_there(self, watcher: Watcher) -> bool:
-        with self._changed:
-            return watcher in self._watchers
-
-    def _ready(self, camera: str) -> list[Watcher]:
-        with self._changed:
-            return [one for one in self._watchers if one.ready(camera)]
-
-
-class Watcher:
-    """Somebody who watches; made by `WatchedCameras.watch`.
-
-    Attributes
-    ----------
-    name
-        Nobody else's.
-    cameras
-        What is watched.
-    every
-        Whether at the cameras' own rate.
-    """
-
-    def __init__(
-        self,
-        owner: WatchedCameras,
-        name: str,
-        cameras: Sequence[str],
-        wake: Callable[[], None],
-        ready: bool,
-        every: bool = False,
-    ) -> None:
-        self.name = name
-        self.cameras = frozenset(cameras)
-        self.every = every
-        self._owner = owner
-        self._wake = wake
-        self._lock = threading.Lock()
-        self._wanted = dict.fromkeys(self.cameras, ready)
-        self._most_bytes: dict[str, int | None] = dict.fromkeys(self.cameras)
-        self._pictures: dict[str, Picture] = {}
-
-    def shown(self, camera: str, most_bytes: int | None = None) -> None:
-        """A picture of a camera was shown: another is wanted, of at most so many bytes (None: any).
-
-        What is not watched counts nothing.
-        """
-        with self._lock:
-            if camera not in self._wanted:
-                return
-            self._wanted[camera], self._most_bytes[camera] = True, most_bytes
-        self._owner.stir()
-
-    def ready(self, camera: str) -> bool:
-        """Whether a picture of a camera would be taken."""
-        return self._wanted.get(camera, False) or camera in self._pictures
-
-    def most_bytes(self, camera: str) -> int | None:
-        """Of a camera's next picture; None: any number."""
-        return self._most_bytes[camera]
-
-    def held_of(self, frame: StampedFrame) -> int:
-        """How many pictures of a camera may be clicked."""
-        return max(HELD, min(HELD_OF_EVERY, HELD_BYTES // frame.image.nbytes)) if self.every else HELD
-
-    def put(self, picture: Picture) -> None:
-        """Leave a picture to be taken, in the place of one that was not; none if that was taken meanwhile."""
-        camera = picture.frame.camera
-        with self._lock:
-            if not self.ready(camera):
-                return
-            self._wanted[camera] = False
-            self._pictures[camera] = picture
-        self._wake()
-
-    def take(self) -> list[Picture]:
-        """Return what is there, the newest of each camera."""
-        with self._lock:
-            pictures, self._pictures = self._pictures, {}
-        return list(pictures.values())
-
-    def end(self) -> None:
-        """Watch no longer."""
-        self._owner.leave(self)
+    async def _in_thread(self, work: Callable[[], T]) -> T:
+        return await run_sync(work, abandon_on_cancel=True, limiter=self._threads)
