@@ -64,8 +64,3 @@ def _worded(value: Any) -> Any:
     if value is None or isinstance(value, (str, int)) or (isinstance(value, float) and math.isfinite(value)):
         return value
     return str(value)
-
-
-def picked(value: object, *names: str) -> dict[str, Any]:
-    """Return some fields and properties of an object as `as_json` has them; all null for None."""
-    return {name: None if value is None else as_json(getattr(value, name)) for name in names}

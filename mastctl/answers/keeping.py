@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from annotated_types import Len
+from annotated_types import Ge, Gt, Len
 from typing_extensions import TypedDict
 
 from mastctl.answers.status import CalibrationTold, MastTold, SentinelTold
@@ -52,10 +52,14 @@ class TurnedTold(TypedDict):
     log10_evidence: float
 
 
-class MeasuredTold(TypedDict):
-    """A pointing that counts: where, the residual, the part that joints do not explain, its predicted sigma.
+class MeasuredPointing(TypedDict):
+    """A pointing of which a new picture was taken.
 
-    ``time_s`` since 1970 (UTC); ``chi_square``: of ``off_px`` over all that is expected, 2 on average.
+    ``time_s`` since 1970 (UTC); ``source``, ``partner``: the pair that gave the position, the clicked camera
+    first; ``camera``: the one that was aimed. ``from_rad``, ``to_rad``: true pan and tilt at the pair's
+    images and at the new image. ``position_m`` in the rover frame, ``range_m`` from the aimed camera.
+    ``off_px``: the part of the residual that measured joints do not explain; ``count_rad``: one count of each
+    encoder.
     """
 
     time_s: float
@@ -71,21 +75,35 @@ class MeasuredTold(TypedDict):
     range_m: float
     residual_px: Pixel
     off_px: Pixel
+    match_sigma_px: Annotated[list[Annotated[float, Gt(0.0)]], Len(2, 2)]
+    count_rad: Annotated[list[Annotated[float, Ge(0.0)]], Len(2, 2)]
+
+
+class MeasuredTold(MeasuredPointing):
+    """A pointing that counts: ``sigma_px`` of all that is expected, ``chi_square`` of ``off_px`` over that (2
+    on average)."""
+
     sigma_px: Pixel
-    match_sigma_px: Pixel
-    count_rad: Angles
     chi_square: float
 
 
-class CalibrationHealthTold(CalibrationTold):
-    """``GET /calibration/health``: the verdict, its figures, the newest pointings that count, and what the
-    drift sentinel's looks say."""
+class ResidualsTold(CalibrationTold):
+    """The verdict of residuals alone, with its figures.
+
+    ``times_expected``: residuals over what is expected, rms, all that is common taken out.
+    """
 
     times_expected: float | None
     log10_evidence: float | None
     log10_threshold: float
     false_alarms_per_day: float
     cameras: dict[str, TurnedTold]
+
+
+class CalibrationHealthTold(ResidualsTold):
+    """``GET /calibration/health``: the verdict, its figures, the newest pointings that count, and the result
+    of the drift sentinel's looks."""
+
     write_error: str | None
     newest: list[MeasuredTold]
     sentinel: SentinelTold | None

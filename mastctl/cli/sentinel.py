@@ -124,17 +124,11 @@ def _tell(args: argparse.Namespace, look: dict[str, Any] | None) -> int:
 
     reference = read_reference(args.folder)
     now = standing(reference, read_looks(args.folder, reference), now_utc())
-    result = {
-        "level": now.level,
-        "sentence": now.sentence,
-        "since": now.since,
-        "looks": now.looks,
-        "look": look,
-    }
-    tell_result(args, result, now.sentence)
+    result = {name: now[name] for name in ("level", "sentence", "since", "looks")} | {"look": look}
+    tell_result(args, result, now["sentence"])
     for which, why in (look or {}).get("missing", {}).items():
         output.tell(f"{which}: no picture: {why}")
-    return 1 if now.level == "bad" else 0
+    return 1 if now["level"] == "bad" else 0
 
 
 def _watch(args: argparse.Namespace) -> int:

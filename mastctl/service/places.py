@@ -6,7 +6,7 @@ import math
 import threading
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from calib.errors import BadFile
 from mastctl.answers import PlacesTold, PlaceTold
@@ -19,18 +19,7 @@ HOME = "home"
 MOST = 50
 
 
-class KeptPlace(NamedTuple):
-    """Pan and tilt as the head reads them, radians."""
-
-    pan_rad: float
-    tilt_rad: float
-
-    def told(self) -> PlaceTold:
-        """Return it as JSON."""
-        return {"pan_rad": self.pan_rad, "tilt_rad": self.tilt_rad}
-
-
-AT_HOME = KeptPlace(0.0, 0.0)
+AT_HOME: PlaceTold = {"pan_rad": 0.0, "tilt_rad": 0.0}
 """Home, until somebody keeps another one."""
 
 
@@ -49,13 +38,13 @@ class Places:
         self._file = StateFile(folder / FILE, SCHEMA)
         self._writing = threading.Lock()
 
-    def told(self) -> PlacesTold:
+    def all(self) -> PlacesTold:
         """Return every place by its name as JSON, home first. Raises Unable ``unreadable``."""
         kept = self._read()
         ordered = {HOME: kept.pop(HOME, AT_HOME), **dict(sorted(kept.items()))}
-        return {"places": {name: place.told() for name, place in ordered.items()}}
+        return {"places": ordered}
 
-    def keep(self, name: str, place: KeptPlace) -> PlacesTold:
+    def keep(self, name: str, place: PlaceTold) -> PlacesTold:
         """Keep a place by a name, in the place of a former one, and return all.
 
         Raises
@@ -72,7 +61,7 @@ class Places:
                     "too_many_places", f"{MOST} places are kept already; forget one of them first"
                 )
             self._write({**kept, name: place})
-        return self.told()
+        return self.all()
 
     def forget(self, name: str) -> PlacesTold:
         """Forget a place and return all that are left; a forgotten home is 0, 0 again.
@@ -89,9 +78,9 @@ class Places:
             if name not in kept:
                 raise NotKnown("place_unknown", f"no place is kept by the name {name!r}")
             self._write({one: place for one, place in kept.items() if one != name})
-        return self.told()
+        return self.all()
 
-    def _read(self) -> dict[str, KeptPlace]:
+    def _read(self) -> dict[str, PlaceTold]:
         try:
             document = self._file.read() or {}
             places = document.get("places", {})
@@ -102,16 +91,16 @@ class Places:
             words = f"{self._file.path}: places: {error!r} where pan_rad and tilt_rad of each are expected"
             raise Unable("unreadable", words) from None
 
-    def _write(self, places: Mapping[str, KeptPlace]) -> None:
+    def _write(self, places: Mapping[str, PlaceTold]) -> None:
         try:
-            self._file.write({"places": {name: place.told() for name, place in places.items()}})
+            self._file.write({"places": dict(places)})
         except BadFile as error:
             raise Unable("not_saved", str(error)) from None
 
 
-def _place(told: Any) -> KeptPlace:
+def _place(kept: Any) -> PlaceTold:
     """A place as it was written. Raises KeyError, TypeError, ValueError."""
-    place = KeptPlace(float(told["pan_rad"]), float(told["tilt_rad"]))
-    if not all(map(math.isfinite, place)):
+    place: PlaceTold = {"pan_rad": float(kept["pan_rad"]), "tilt_rad": float(kept["tilt_rad"])}
+    if not (math.isfinite(place["pan_rad"]) and math.isfinite(place["tilt_rad"])):
         raise ValueError(f"{place} is not finite")
     return place

@@ -11,13 +11,13 @@ import threading
 from collections.abc import Callable
 from dataclasses import asdict
 from importlib.metadata import version
-from typing import Any, cast
+from typing import Any
 
 from calib.files.mast_file import StoredRig
 from calib.matching.handed_over import MatchedHandoff
 from drivers.clock import Clock, SystemClock
 from drivers.hardware import Hardware, clock_for, head_name
-from mastctl.answers import CalibrationTold, SelfCheck, SentinelTold, Status, TrackTold
+from mastctl.answers import CalibrationTold, Status, TrackTold
 from mastctl.as_json import as_json
 from mastctl.config import Config
 from mastctl.control.audit import STRANGERS, STRANGERS_FILES, AuditLog
@@ -318,7 +318,7 @@ class Service:
             "control": self.leases.told(),
             "stop_socket": None if self.stop_socket is None else str(self.stop_socket.path),
             "calibration": self.mast_verdict(),
-            "sentinel": cast(SentinelTold | None, self.sentinel.summary()),
+            "sentinel": self.sentinel.summary(),
             "cameras": {
                 name: camera_answer(frame, now_s) for name, frame in self.devices.newest_frames().items()
             },
@@ -345,7 +345,7 @@ class Service:
     def track_told(self, status: TrackStatus | None = None) -> TrackTold:
         """Return the track, as it is or was, and the self-check of now as ``GET /track`` tells them."""
         told = (status or self.tracker.status).told(self.clock.now_s())
-        return {**told, "self_check": cast(SelfCheck, self.handoffs.summary())}
+        return {**told, "self_check": self.handoffs.summary()}
 
     def track_in(self, frame: StampedFrame) -> dict[str, float] | None:
         """Return where a frame should show the track's target, pixels, with one sigma as an ellipse.

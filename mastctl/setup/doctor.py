@@ -97,9 +97,10 @@ def _sentinel(folder: Path) -> Iterator[DoctorFinding]:
     if reference is None:
         return
     now = standing(reference, looks, datetime.now(UTC))
-    advice = "" if now.level == "good" else "look again: mastctl sentinel look; if it stays, calibrate again"
-    level: Level = "unsure" if now.level != "good" else "good"  # the daemon works all the same
-    yield DoctorFinding("drift", level, now.sentence, advice)
+    good = now["level"] == "good"
+    advice = "" if good else "look again: mastctl sentinel look; if it stays, calibrate again"
+    level: Level = "good" if good else "unsure"  # the daemon works all the same
+    yield DoctorFinding("drift", level, now["sentence"], advice)
 
 
 def _daemon(config: Config, status: Mapping[str, Any] | None) -> Iterator[DoctorFinding]:

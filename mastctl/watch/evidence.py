@@ -104,7 +104,7 @@ class Evidence:
     turned: dict[str, Turned]
 
 
-def sums_of(one: Expected, off_px: tuple[float, float], time_s: float) -> Sums:
+def sums_of(one: Expected, off_px: Sequence[float], time_s: float) -> Sums:
     """Return what a single pointing says."""
     whole = np.concatenate([one.rates, one.turned], axis=1)
     weight = np.linalg.inv(one.noise_px2)
@@ -222,23 +222,10 @@ class Expected(ReadOnlyArrays):
 def expected(rig: Rig, parameters: Sequence[str], cameras: Sequence[str], one: Measured) -> Expected:
     """Return what a pointing's residual depends on.
 
-    Parameters
-    ----------
-    rig
-        The mast file in use.
-    parameters
-        (p,) names, as `calib.geometry.covariance` has them.
-    cameras
-        (c,) whose turns are of interest.
-    one
-        The pointing.
-
-    Raises
-    ------
-    CalibError
-        If the rig lacks a camera of it, or cannot have seen the target so.
+    ``parameters`` (p,) are names as `calib.geometry.covariance` has them; ``cameras`` (c,) those whose turns
+    are of interest. Raises CalibError if the rig lacks a camera of it, or cannot have seen the target so.
     """
-    pair, involved = (one.source, one.partner), {one.source, one.partner, one.camera}
+    pair, involved = (one["source"], one["partner"]), {one["source"], one["partner"], one["camera"]}
     if missing := involved - set(rig.cameras):
         raise CalibError(f"the mast file has no camera {min(missing)}")
     known = set(parameters)
@@ -248,15 +235,17 @@ def expected(rig: Rig, parameters: Sequence[str], cameras: Sequence[str], one: M
         for part in parameter_names(rig.cameras[name].model.kind)
     ]
     names = (*parameters, *(name for name in free if name not in known), *JOINT_NAMES)
-    point = np.array(one.position_m)
-    position_rates = _rates_of_position(rig, pair, one.from_rad, point)
-    by_click = rig.camera_in_rover(one.camera, *one.to_rad).project_jacobian(point)[1] @ position_rates
-    before = by_click @ click_rates(rig, names, pair, *one.from_rad, point)
-    after = pixel_rates(rig, names, one.camera, *one.to_rad, point[None]).to_rig[0]
+    point = np.array(one["position_m"])
+    (from_pan, from_tilt), (to_pan, to_tilt) = one["from_rad"], one["to_rad"]
+    position_rates = _rates_of_position(rig, pair, (from_pan, from_tilt), point)
+    by_click = rig.camera_in_rover(one["camera"], to_pan, to_tilt).project_jacobian(point)[1] @ position_rates
+    before = by_click @ click_rates(rig, names, pair, from_pan, from_tilt, point)
+    after = pixel_rates(rig, names, one["camera"], to_pan, to_tilt, point[None]).to_rig[0]
     joints = np.concatenate([before[:, -2:], after[:, -2:]], axis=1)
-    sigma_rad = np.array(2 * one.count_rad) / math.sqrt(12.0)
+    sigma_rad = np.array(2 * one["count_rad"]) / math.sqrt(12.0)
     noise = (
-        np.diag(np.square(one.match_sigma_px) + UNMODELLED_PX**2) + CLICK_SIGMA_PX**2 * by_click @ by_click.T
+        np.diag(np.square(one["match_sigma_px"]) + UNMODELLED_PX**2)
+        + CLICK_SIGMA_PX**2 * by_click @ by_click.T
     )
     noise = noise + (joints * sigma_rad) @ (joints * sigma_rad).T
     rates = before + after

@@ -32,7 +32,7 @@ from calib.matching.handed_over import HandoffBias, Landed, MatchedHandoff, hand
 from calib.matching.handoff import RefinedVerdict
 from drivers.clock import Clock
 from drivers.recordings.mcap_file import BadRecording, is_mcap, read_messages
-from mastctl.as_json import picked
+from mastctl.answers import OffsetTold, SelfCheck
 from mastctl.control.standing import StandingFault
 from mastctl.watch.journal import Journal, JournalThread
 
@@ -138,11 +138,18 @@ def line_of(handoff: MatchedHandoff) -> dict[str, Any]:
     return dict(plain(document))
 
 
-def bias_record(bias: HandoffBias) -> dict[str, Any]:
+def bias_record(bias: HandoffBias) -> OffsetTold:
     """Return a camera's mean offset as JSON."""
-    sigma_px = np.sqrt(np.diag(bias.covariance_px2)).tolist()
-    names = ("source", "camera", "handoffs", "left_out", "offset_px", "sigmas", "sentence")
-    return picked(bias, *names) | {"sigma_px": sigma_px}
+    return {
+        "source": bias.source,
+        "camera": bias.camera,
+        "handoffs": bias.handoffs,
+        "left_out": bias.left_out,
+        "offset_px": bias.offset_px.tolist(),
+        "sigma_px": np.sqrt(np.diag(bias.covariance_px2)).tolist(),
+        "sigmas": bias.sigmas,
+        "sentence": bias.sentence,
+    }
 
 
 def read_log(path: str | Path) -> ReadLog:
@@ -240,8 +247,8 @@ class HandoffCheck:
         self._digest = digest
         self._judge(lambda: None)
 
-    def summary(self) -> dict[str, Any]:
-        """Return how many hand-offs of the mast file count, and the significant offsets, as JSON."""
+    def summary(self) -> SelfCheck:
+        """Return how many hand-offs of the mast file count, and the significant offsets."""
         counted, offsets = self._judged
         return {"handoffs": counted, "offsets": [bias_record(one) for one in offsets]}
 

@@ -21,7 +21,7 @@ from prometheus_client.core import (
 )
 from prometheus_client.process_collector import ProcessCollector
 
-from mastctl.answers import Word
+from mastctl.answers import Status, Word
 from mastctl.control.publisher import Published, Publisher
 from mastctl.control.records import Operation
 
@@ -35,7 +35,6 @@ STEP_S = (0.005, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 READING_S = (0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.2, 0.5, 1.0)
 ENDED = frozenset({"done", "failed", "stopped"})
 
-Status = Callable[[], Mapping[str, Any]]
 Errors = Callable[[], Mapping[tuple[str, str, str], int]]
 FrameCounts = Callable[[], Mapping[str, tuple[int, int]]]
 
@@ -43,23 +42,13 @@ FrameCounts = Callable[[], Mapping[str, tuple[int, int]]]
 class Metrics:
     """The figures of one daemon, in a registry of their own.
 
-    Parameters
-    ----------
-    status
-        Returns the answer of ``GET /status``.
-    errors
-        Returns how often calls to devices have failed: by device, call, and the error's code.
-    frame_counts
-        Returns how many frames were received and missed, by camera.
-    publisher
-        Whose news are counted.
-    temperatures_c
-        Returns the temperatures that the head's axes report now, degrees Celsius.
+    ``errors``: how often calls to devices have failed, by device, call, and the error's code;
+    ``frame_counts``: how many frames were received and missed, by camera.
     """
 
     def __init__(
         self,
-        status: Status,
+        status: Callable[[], Status],
         errors: Errors,
         frame_counts: FrameCounts,
         publisher: Publisher,
@@ -149,7 +138,7 @@ class _NowMetrics:
 
     def __init__(
         self,
-        status: Status,
+        status: Callable[[], Status],
         errors: Errors,
         frame_counts: FrameCounts,
         temperatures_c: Callable[[], Mapping[str, float]],
@@ -166,39 +155,24 @@ class _NowMetrics:
     def collect(self) -> Iterable[Metric]:
         """Yield the gauges."""
         status = self._status()
-        mast = status["mast"]
-        yield InfoMetricFamily(
-            "mastctl",
-            "The program and what it drives.",
-            {
-                "version": status["version"], "hardware": status["hardware"],
-                "mast_file": mast["file"], "mast_digest": mast["digest"],
-            },
-        )  # fmt: skip
+        mast, joints, control = status["mast"], status["joints"], status["control"]
+        about = {"version": status["version"], "hardware": status["hardware"]}
+        about |= {"mast_file": mast["file"], "mast_digest": mast["digest"]}
+        yield InfoMetricFamily("mastctl", "The program and what it drives.", about)
         states = StateSetMetricFamily("mastctl_state", "The state in one word.")
         states.add_metric([], {word: word == status["state"] for word in get_args(Word)})
         yield states
-        yield GaugeMetricFamily("mastctl_uptime_seconds", "Since the daemon started.", status["uptime_s"])
-        joints = status["joints"]
+        yield _gauge("uptime_seconds", "Since the daemon started.", {(): status["uptime_s"]})
         if joints is not None:
-            angle = GaugeMetricFamily("mastctl_joint_radians", "Measured joint angle.", labels=["axis"])
-            angle.add_metric(["pan"], joints["pan_rad"])
-            angle.add_metric(["tilt"], joints["tilt_rad"])
-            yield angle
-            yield GaugeMetricFamily("mastctl_joints_age_seconds", "Since the head was read.", joints["age_s"])
-        warm = GaugeMetricFamily("mastctl_axis_temperature_celsius", "As the axis reports.", labels=["axis"])
-        for name, value in self._temperatures_c().items():
-            warm.add_metric([name], value)
-        yield warm
-        age = GaugeMetricFamily("mastctl_frame_age_seconds", "Of the newest frame.", labels=["camera"])
-        for name, camera in status["cameras"].items():
-            if camera["age_s"] is not None:
-                age.add_metric([name], camera["age_s"])
-        yield age
-        faults = GaugeMetricFamily("mastctl_fault", "1 for each fault.", labels=["device", "code"])
-        for device, code in {(fault["device"], fault["code"]) for fault in status["faults"]}:
-            faults.add_metric([device, code], 1.0)
-        yield faults
+            angles = {("pan",): joints["pan_rad"], ("tilt",): joints["tilt_rad"]}
+            yield _gauge("joint_radians", "Measured joint angle.", angles, "axis")
+            yield _gauge("joints_age_seconds", "Since the head was read.", {(): joints["age_s"]})
+        warm = {(name,): value for name, value in self._temperatures_c().items()}
+        yield _gauge("axis_temperature_celsius", "As the axis reports.", warm, "axis")
+        ages = {(name,): camera["age_s"] for name, camera in status["cameras"].items()}
+        yield _gauge("frame_age_seconds", "Of the newest frame.", ages, "camera")
+        faults = {(fault["device"], fault["code"]): 1.0 for fault in status["faults"]}
+        yield _gauge("fault", "1 for each fault.", faults, "device", "code")
         failed = CounterMetricFamily(
             "mastctl_device_errors", "Calls to devices that failed.", labels=["device", "call", "code"]
         )
@@ -211,46 +185,32 @@ class _NowMetrics:
         missed = CounterMetricFamily(
             "mastctl_frames_missed", "Frames of a camera that were lost or damaged.", labels=["camera"]
         )
-        for camera, (good, lost) in self._frame_counts().items():
-            received.add_metric([camera], good)
-            missed.add_metric([camera], lost)
+        for name, (good, lost) in self._frame_counts().items():
+            received.add_metric([name], good)
+            missed.add_metric([name], lost)
         yield received
         yield missed
-        yield from _steering(status.get("control"))
-        yield from _calibration(status.get("calibration"))
-        yield from _drift(status.get("sentinel"))
+        # The holder of a lease is no label, since clients choose their names.
+        steers = {} if control is None else {(control["kind"],): 1.0}
+        yield _gauge("lease", "1 for what steers: lease, operation.", steers, "kind")
+        left_s = None if control is None else control["for_s"]
+        yield _gauge("lease_left_seconds", "Until the lease is over.", {(): left_s})
+        if (calibration := status["calibration"]) is not None:
+            drifts = float(calibration["verdict"] == "drifts")
+            drift = "1 if anything says that the mast file does not hold."
+            yield _gauge("calibration_drifts", drift, {(): drifts})
+            judged = float(calibration["pointings"])
+            yield _gauge("calibration_pointings", "Of the last days, that are judged.", {(): judged})
+        if (sentinel := status["sentinel"]) is not None and sentinel["reference"] is not None:
+            bad = float(sentinel["level"] == "bad")
+            yield _gauge("sentinel_drift", "1 if looks found a change.", {(): bad})
+            yield _gauge("sentinel_look_age_seconds", "Since the last look.", {(): sentinel["age_s"]})
 
 
-def _steering(control: Mapping[str, Any] | None) -> Iterable[Metric]:
-    """What steers, and for how long; the holder is no label, since clients choose their names."""
-    lease = GaugeMetricFamily("mastctl_lease", "1 for what steers: lease, operation.", labels=["kind"])
-    left = GaugeMetricFamily("mastctl_lease_left_seconds", "Until the lease is over.")
-    if control is not None:
-        lease.add_metric([str(control["kind"])], 1.0)
-        if control.get("for_s") is not None:
-            left.add_metric([], float(control["for_s"]))
-    yield lease
-    yield left
-
-
-def _drift(record: Mapping[str, Any] | None) -> Iterable[Metric]:
-    """What the drift sentinel's looks say; nothing without a reference."""
-    if record is not None and record["reference"] is not None:
-        bad = float(record["level"] == "bad")
-        yield GaugeMetricFamily("mastctl_sentinel_drift", "1 if looks found a change.", bad)
-        if record["age_s"] is not None:
-            yield GaugeMetricFamily(
-                "mastctl_sentinel_look_age_seconds", "Since the last look.", record["age_s"]
-            )
-
-
-def _calibration(record: Mapping[str, Any] | None) -> Iterable[Metric]:
-    """Whether the mast file still holds."""
-    if record is not None:
-        drifts = float(record["verdict"] == "drifts")
-        yield GaugeMetricFamily(
-            "mastctl_calibration_drifts", "1 if anything says that the mast file does not hold.", drifts
-        )
-        yield GaugeMetricFamily(
-            "mastctl_calibration_pointings", "Of the last days, that are judged.", float(record["pointings"])
-        )
+def _gauge(name: str, summary: str, values: Mapping[Any, float | None], *labels: str) -> GaugeMetricFamily:
+    """A gauge with its values by labels; what is not known is left out."""
+    family = GaugeMetricFamily(f"mastctl_{name}", summary, labels=labels)
+    for each, value in values.items():
+        if value is not None:
+            family.add_metric(each, value)
+    return family

@@ -9,71 +9,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import ConfigDict, Field, TypeAdapter, with_config
+from pydantic import ConfigDict, TypeAdapter, with_config
 
 from calib.files.mast_file import StoredRig
 from drivers.interfaces import COARSE_COUNT_RAD
-from mastctl.as_json import as_json
+from mastctl.answers import MeasuredPointing
 from mastctl.control.records import Operation
 from mastctl.watch.journal import Journal
 
 DISAGREE = "eyes_disagree"
 
-Pair = tuple[float, float]
-
 
 @with_config(ConfigDict(extra="forbid", allow_inf_nan=False))
-@dataclass(frozen=True)
-class Measured:
-    """A pointing of which a new picture was taken.
-
-    Attributes
-    ----------
-    time_s
-        When, seconds of the wall clock since 1970 (UTC).
-    operation, mast_digest
-        Which one, and the mast file in use.
-    confirmed
-        Whether the other cameras confirmed the measurement.
-    source, partner, camera
-        The pair that gave the position, the clicked camera first, and the camera that was aimed.
-    from_rad, to_rad
-        True (pan, tilt) at the pair's images, and at the new image.
-    position_m, range_m
-        The target in the rover frame, and its range from the aimed camera.
-    residual_px, off_px, match_sigma_px
-        (x, y) the residual; the part of it that measured joints do not explain; one sigma of the match.
-    count_rad
-        (pan, tilt) one count of each encoder.
-    """
-
-    time_s: float
-    operation: str
-    confirmed: bool
-    mast_digest: str
-    source: str
-    partner: str
-    camera: str
-    from_rad: Pair
-    to_rad: Pair
-    position_m: tuple[float, float, float]
-    range_m: float
-    residual_px: Pair
-    off_px: Pair
-    match_sigma_px: tuple[Annotated[float, Field(gt=0.0)], Annotated[float, Field(gt=0.0)]]
-    count_rad: tuple[Annotated[float, Field(ge=0.0)], Annotated[float, Field(ge=0.0)]]
+class Measured(MeasuredPointing):
+    """A pointing of which a new picture was taken, as the journal has it."""
 
 
 _MEASURED = TypeAdapter(Measured)
 
 
-def measured_of(record: Mapping[str, Any]) -> Measured:
+def measured_of(record: Any) -> Measured:
     """Return the pointing of a line of the journal. Raises ValueError for anything else."""
-    return _MEASURED.validate_python(dict(record))
+    return _MEASURED.validate_python(record)
 
 
 def measured_by(operation: Operation, mast: StoredRig, time_s: float) -> Measured | None:
@@ -92,7 +52,7 @@ def measured_by(operation: Operation, mast: StoredRig, time_s: float) -> Measure
     try:
         rest, seen, settled, found = (steps[name] for name in ("rest", "triangulate", "settle", "measure"))
         found = steps.get("repeat", found)
-        to_rad = settled["true_pan_rad"], settled["true_tilt_rad"]
+        to_rad = [settled["true_pan_rad"], settled["true_tilt_rad"]]
         view = rig.camera_in_rover(found["camera"], *to_rad)
         predicted = view.project(seen["position_m"])[0].tolist()
         counts = settled.get("count_rad", {})
@@ -105,14 +65,14 @@ def measured_by(operation: Operation, mast: StoredRig, time_s: float) -> Measure
                 "source": source,
                 "partner": partners[0],
                 "camera": found["camera"],
-                "from_rad": (rest["true_pan_rad"], rest["true_tilt_rad"]),
+                "from_rad": [rest["true_pan_rad"], rest["true_tilt_rad"]],
                 "to_rad": to_rad,
                 "position_m": seen["position_m"],
                 "range_m": math.dist(seen["position_m"], view.C.tolist()),
                 "residual_px": found["residual_px"],
-                "off_px": tuple(a - b for a, b in zip(found["pixel_px"], predicted, strict=True)),
+                "off_px": [a - b for a, b in zip(found["pixel_px"], predicted, strict=True)],
                 "match_sigma_px": found["sigma_px"],
-                "count_rad": tuple(counts.get(axis, COARSE_COUNT_RAD) for axis in ("pan", "tilt")),
+                "count_rad": [counts.get(axis, COARSE_COUNT_RAD) for axis in ("pan", "tilt")],
             }
         )
     except (LookupError, TypeError, ValueError):  # it did not come so far, or could not measure a number
@@ -126,4 +86,4 @@ MOST_BYTES = 4 << 20
 
 def pointing_journal(folder: Path) -> Journal[Measured]:
     """Return the journal of pointings in a state folder."""
-    return Journal(folder / FILE, "pointings", as_json, measured_of, most_bytes=MOST_BYTES)
+    return Journal(folder / FILE, "pointings", dict, measured_of, most_bytes=MOST_BYTES)

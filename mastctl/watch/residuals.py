@@ -13,12 +13,12 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import reduce
 from operator import add, sub
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from calib.files.mast_file import StoredRig
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from mastctl.as_json import as_json
+from mastctl.answers import MeasuredTold, ResidualsTold
 from mastctl.control.records import Operation
 from mastctl.watch.evidence import Evidence, Expected, Judge, Sums, expected, sums_of
 from mastctl.watch.journal import JournalThread
@@ -93,18 +93,18 @@ class Windows:
 
     def add(self, one: Measured) -> Judged | None:
         """Count a pointing; None if it is of another mast file, or cannot be judged by this one."""
-        if one.mast_digest != self._digest:
+        if one["mast_digest"] != self._digest:
             return None
         try:
             depends = expected(self._rig, self._parameters, self._cameras, one)
         except CalibError:
             return None
         total = depends.noise_px2 + depends.rates @ self._covariance @ depends.rates.T
-        off = np.array(one.off_px)
+        off = np.array(one["off_px"])
         sigma = np.sqrt(np.diag(total)).tolist()
         square = float(off @ np.linalg.solve(total, off))
         judged = Judged(one, depends, (sigma[0], sigma[1]), square)
-        span = math.floor(one.time_s / SPAN_S)
+        span = math.floor(one["time_s"] / SPAN_S)
         sums = _sums(judged)
         self._sums[span] = self._sums[span] + sums if span in self._sums else sums
         self._spans.setdefault(span, []).append(judged)
@@ -128,7 +128,7 @@ class Windows:
             if sums.count < FEWEST:
                 continue
             worst = max((one for span in window for one in self._spans[span]), key=lambda one: one.square)
-            doubtful = [one for span in window for one in self._spans[span] if not one.measured.confirmed]
+            doubtful = [one for span in window for one in self._spans[span] if not one.measured["confirmed"]]
             kept = sums - _sums(worst)
             without = (_sums(one) for one in doubtful if one is not worst)
             now = self._judge.weigh(kept, reduce(sub, without, kept))
@@ -138,89 +138,56 @@ class Windows:
 
 
 def _sums(one: Judged) -> Sums:
-    return sums_of(one.expected, one.measured.off_px, one.measured.time_s)
+    return sums_of(one.expected, one.measured["off_px"], one.measured["time_s"])
 
-
-VerdictWord = Literal["good", "drifts", "few", "unknown"]
 
 AS_LIKELY = math.log(20.0)
 """Cameras whose evidence is nearer than this to the strongest one's cannot be distinguished from it."""
 
 
-@dataclass(frozen=True)
-class ResidualVerdict:
-    """Whether pointings come out as the mast file predicts.
+def residuals_told(
+    verdict: Literal["good", "drifts", "few", "unknown"],
+    sentence: str,
+    pointings: int = 0,
+    since: str | None = None,
+    evidence: Evidence | None = None,
+) -> ResidualsTold:
+    """Return a verdict with the figures of its evidence.
 
-    Attributes
-    ----------
-    word
-        ``good``; ``drifts``; ``few`` pointings yet; ``unknown``: the mast file does not say how sure it is.
-    sentence
-        What that means.
-    pointings
-        How many count.
-    since
-        When the first of those was that speak against it (ISO 8601, UTC); None unless it drifts.
-    times
-        As how many times as large as expected residuals are, rms, all that is common taken out.
-    turned
-        By camera: how far it seems turned about each axis of the frame that it is mounted on, with one
-        sigma, and the decimal logarithm of the evidence for that.
+    ``since``: when the first of those pointings was that speak against the mast file (ISO 8601, UTC).
     """
-
-    word: VerdictWord
-    sentence: str
-    pointings: int = 0
-    since: str | None = None
-    times: float | None = None
-    log10_evidence: float | None = None
-    turned: dict[str, dict[str, Any]] = field(default_factory=dict)
-
-    def short(self) -> dict[str, Any]:
-        """Return the short form, of ``GET /status``."""
-        return {
-            "verdict": self.word,
-            "sentence": self.sentence,
-            "pointings": self.pointings,
-            "since": self.since,
-        }
-
-    def as_json(self) -> dict[str, Any]:
-        """Return all of it."""
-        return self.short() | {
-            "times_expected": self.times,
-            "log10_evidence": self.log10_evidence,
-            "log10_threshold": LOG_THRESHOLD / math.log(10),
-            "false_alarms_per_day": FALSE_ALARMS_PER_DAY,
-            "cameras": self.turned,
-        }
-
-
-NOTHING_YET = ResidualVerdict("few", f"fewer than {FEWEST} pointings with this mast file have a residual")
-
-
-def verdict_of(evidence: Evidence | None, pointings: int) -> ResidualVerdict:
-    """Return the verdict on the evidence of the strongest window."""
-    if evidence is None:
-        return ResidualVerdict("few", NOTHING_YET.sentence, pointings)
-    since = datetime.fromtimestamp(evidence.since_s, UTC).isoformat(timespec="seconds")
-    drifts = evidence.log_evidence >= LOG_THRESHOLD
-    return ResidualVerdict(
-        "drifts" if drifts else "good",
-        _what_drifts(evidence, since) if drifts else "residuals are as the mast file predicts",
-        pointings,
-        since if drifts else None,
-        evidence.times,
-        evidence.log_evidence / math.log(10),
-        {
+    turned = {} if evidence is None else evidence.turned
+    return {
+        "verdict": verdict,
+        "sentence": sentence,
+        "pointings": pointings,
+        "since": since,
+        "times_expected": None if evidence is None else evidence.times,
+        "log10_evidence": None if evidence is None else evidence.log_evidence / math.log(10),
+        "log10_threshold": LOG_THRESHOLD / math.log(10),
+        "false_alarms_per_day": FALSE_ALARMS_PER_DAY,
+        "cameras": {
             name: {
                 "turn_rad": list(one.turn_rad),
                 "sigma_rad": list(one.sigma_rad),
                 "log10_evidence": one.log_evidence / math.log(10),
             }
-            for name, one in evidence.turned.items()
+            for name, one in turned.items()
         },
-    )
+    }
+
+
+TOO_FEW = f"fewer than {FEWEST} pointings with this mast file have a residual"
+
+
+def verdict_of(evidence: Evidence | None, pointings: int) -> ResidualsTold:
+    """Return the verdict on the evidence of the strongest window."""
+    if evidence is None:
+        return residuals_told("few", TOO_FEW, pointings)
+    if evidence.log_evidence < LOG_THRESHOLD:
+        return residuals_told("good", "residuals are as the mast file predicts", pointings, None, evidence)
+    since = datetime.fromtimestamp(evidence.since_s, UTC).isoformat(timespec="seconds")
+    return residuals_told("drifts", _what_drifts(evidence, since), pointings, since, evidence)
 
 
 def _what_drifts(evidence: Evidence, since: str) -> str:
@@ -277,7 +244,7 @@ class CalibrationHealth:
         self._judges_by = mast  # in the thread: it comes to the one in use by and by
         self._newest: tuple[Judged, ...] = ()
         self._not_kept = ""
-        self.verdict = NOTHING_YET
+        self.verdict = residuals_told("few", TOO_FEW)
         thread.put(self._read)
         thread.put(lambda: self._judge_by(mast))
 
@@ -290,22 +257,20 @@ class CalibrationHealth:
     def use_mast(self, mast: StoredRig) -> None:
         """Judge by this mast file from now on."""
         self._mast = mast
-        self.verdict, self._newest = NOTHING_YET, ()
+        self.verdict, self._newest = residuals_told("few", TOO_FEW), ()
         self._thread.put(lambda: self._judge_by(mast))
 
-    def summary(self) -> dict[str, Any]:
-        """Return all that is known, as ``GET /calibration/health`` has it."""
-        return self.verdict.as_json() | {
-            "write_error": self._not_kept or None,
-            "newest": [
-                {
-                    **as_json(one.measured),
-                    "sigma_px": list(one.sigma_px),
-                    "chi_square": one.square,
-                }
-                for one in reversed(self._newest)
-            ],
-        }
+    def newest(self) -> list[MeasuredTold]:
+        """Return the newest pointings that count, the newest first."""
+        return [
+            {**one.measured, "sigma_px": list(one.sigma_px), "chi_square": one.square}
+            for one in reversed(self._newest)
+        ]
+
+    @property
+    def write_error(self) -> str | None:
+        """Why pointings are not kept over a restart, None if they are."""
+        return self._not_kept or None
 
     # In the journals' thread
 
@@ -329,7 +294,7 @@ class CalibrationHealth:
         except CalibError as error:
             self._windows = None
             sentence = f"residuals are kept, and judged by nothing: {error}"
-            self._set_verdict(ResidualVerdict("unknown", sentence), ())
+            self._set_verdict(residuals_told("unknown", sentence), ())
             return
         for one in self._known:
             self._windows.add(one)
@@ -342,19 +307,19 @@ class CalibrationHealth:
         verdict = verdict_of(self._windows.evidence(), len(pointings))
         self._set_verdict(verdict, tuple(pointings[-SHOWN:]))
 
-    def _set_verdict(self, verdict: ResidualVerdict, newest: tuple[Judged, ...]) -> None:
+    def _set_verdict(self, verdict: ResidualsTold, newest: tuple[Judged, ...]) -> None:
         """Publish a verdict, unless another mast file is in use by now."""
         if self._judges_by is not self._mast:
             return
         before, self.verdict, self._newest = self.verdict, verdict, newest
-        if verdict.word == "drifts" and before.word != "drifts":
-            log.warning("the calibration drifts: %s", verdict.sentence)
-        elif before.word == "drifts" and verdict.word != "drifts":
-            log.info("the calibration does not drift any more: %s", verdict.sentence)
+        if verdict["verdict"] == "drifts" and before["verdict"] != "drifts":
+            log.warning("the calibration drifts: %s", verdict["sentence"])
+        elif before["verdict"] == "drifts" and verdict["verdict"] != "drifts":
+            log.info("the calibration does not drift any more: %s", verdict["sentence"])
 
     def _keep(self, one: Measured) -> None:
         """Write a pointing to the journal; a failure is logged once."""
-        counting = [kept for kept in self._known if kept.time_s > self._wall_s() - DAYS * DAY_S]
+        counting = [kept for kept in self._known if kept["time_s"] > self._wall_s() - DAYS * DAY_S]
         try:
             self._journal.append(one, counting)
         except BadFile as error:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from calib.errors import BadFile
+from mastctl.answers import SentinelTold
 from mastctl.watch.journal import JournalThread
 from mastctl.watch.reference import LOOKS, REFERENCE, Reference, read_looks, read_reference
 
@@ -25,28 +26,23 @@ SILENT = 3
 """So many looks since the last that knew anything, and it is not known any more that all is well."""
 
 
-@dataclass(frozen=True)
-class SentinelStanding:
-    """What the looks say together.
+def standing(reference: Reference, looks: Sequence[Mapping[str, Any]], now: datetime) -> SentinelTold:
+    """Return what the looks at a reference say together; ``now`` for how long ago.
 
-    level
-        ``good``, ``bad`` for a change that two looks see, ``unsure`` for no look, one, or silent ones.
-    sentence
-        For a person.
-    looks
-        How many there were.
-    since
-        The first look that saw the change (ISO 8601); None without a change.
+    ``bad`` for a change that two looks see, ``unsure`` for no look, one, or silent ones.
     """
+    level, sentence, since = _judged(reference, looks, now)
+    last = looks[-1]["time"] if looks else None
+    return {
+        "level": level, "sentence": sentence, "looks": len(looks), "since": since, "last_look": last,
+        "age_s": _age_of(last, now), "reference": reference.time,
+    }  # fmt: skip
 
-    level: str
-    sentence: str
-    looks: int
-    since: str | None
 
-
-def standing(reference: Reference, looks: Sequence[Mapping[str, Any]], now: datetime) -> SentinelStanding:
-    """Return what the looks at a reference say together; ``now`` for how long ago."""
+def _judged(
+    reference: Reference, looks: Sequence[Mapping[str, Any]], now: datetime
+) -> tuple[Literal["good", "unsure", "bad"], str, str | None]:
+    """The level, its sentence, and the first look that saw the change (ISO 8601)."""
     telling = [look for look in looks if look["views"]]
     if not telling:
         sentence = (
@@ -55,31 +51,43 @@ def standing(reference: Reference, looks: Sequence[Mapping[str, Any]], now: date
             else f"{_looks(len(looks))} saw nothing they knew: night, fog, other light, another place? "
             f"The last {ago(looks[-1]['time'], now)}"
         )
-        return SentinelStanding("unsure", sentence, len(looks), None)
+        return "unsure", sentence, None
     last = telling[-1]
     silent = len(looks) - 1 - max(at for at, look in enumerate(looks) if look["views"])
     blind = f"; {_looks(silent)} since then saw nothing they knew" if silent else ""
     seen = f"last looked {ago(last['time'], now)}"
     if not last["changed"]:
         sentence = f"nothing has changed, {_looks(len(telling))}, {seen}{blind}"
-        return SentinelStanding("good" if silent < SILENT else "unsure", sentence, len(looks), None)
-    alike = 0
-    for look in reversed(telling):
-        if not look["changed"]:
-            break
-        alike += 1
+        return "good" if silent < SILENT else "unsure", sentence, None
+    alike = len(list(takewhile(lambda look: look["changed"], reversed(telling))))
     first = telling[-alike]["time"]
     if alike < CONFIRMED:
-        sentence = f"{last['sentence']}, seen once {ago(first, now)}: look again{blind}"
-        return SentinelStanding("unsure", sentence, len(looks), first)
+        return "unsure", f"{last['sentence']}, seen once {ago(first, now)}: look again{blind}", first
     old = (age := age_s(last["time"], now)) is not None and age > 86400.0 * OLD_DAYS
     sentence = f"{last['sentence']}, since {for_long(first, now)}{f' ({seen})' if old else ''}{blind}"
-    return SentinelStanding("bad", sentence, len(looks), first)
+    return "bad", sentence, first
 
 
-def findings(folder: Path, mast_digest: str) -> dict[str, Any]:
+def _age_of(look: str | None, now: datetime) -> float | None:
+    """How long ago a look was, seconds."""
+    age = None if look is None else age_s(look, now)
+    return None if age is None else max(age, 0.0)
+
+
+def findings(folder: Path, mast_digest: str, now: datetime | None = None) -> SentinelTold:
     """Return what a folder says, as ``GET /sentinel`` has it; ``mast_digest``: of the mast file in use."""
-    return summary(*read_folder(folder), mast_digest, datetime.now(UTC))
+    reference, looks, wrong = read_folder(folder)
+    if reference is None:
+        return {
+            "level": "unsure" if wrong else "none",
+            "sentence": wrong or "no reference pictures have been taken",
+            "looks": 0, "since": None, "last_look": None, "age_s": None, "reference": None,
+        }  # fmt: skip
+    found = standing(reference, looks, now or datetime.now(UTC))
+    if reference.mast_digest != mast_digest:
+        sentence = f"the reference is of another mast file: take a new one ({found['sentence']})"
+        found |= {"level": "unsure", "sentence": sentence}
+    return found
 
 
 def read_folder(folder: Path) -> tuple[Reference | None, list[dict[str, Any]], str]:
@@ -91,34 +99,6 @@ def read_folder(folder: Path) -> tuple[Reference | None, list[dict[str, Any]], s
         return reference, read_looks(folder, reference), ""
     except BadFile as error:
         return None, [], str(error)
-
-
-def summary(
-    reference: Reference | None,
-    looks: Sequence[Mapping[str, Any]],
-    wrong: str,
-    mast_digest: str,
-    now: datetime,
-) -> dict[str, Any]:
-    """Return the result of `read_folder` as ``GET /sentinel`` has it."""
-    found: dict[str, Any] = {
-        "level": "none", "sentence": "no reference pictures have been taken", "looks": 0, "since": None,
-        "last_look": None, "age_s": None, "reference": None,
-    }  # fmt: skip
-    if wrong:
-        return {**found, "level": "unsure", "sentence": wrong}
-    if reference is None:
-        return found
-    says = standing(reference, looks, now)
-    level, sentence = says.level, says.sentence
-    if reference.mast_digest != mast_digest:
-        level, sentence = "unsure", f"the reference is of another mast file: take a new one ({sentence})"
-    last = looks[-1]["time"] if looks else None
-    return {
-        "level": level, "sentence": sentence, "looks": says.looks, "since": says.since, "last_look": last,
-        "age_s": None if last is None or (age := age_s(last, now)) is None else max(age, 0.0),
-        "reference": reference.time,
-    }  # fmt: skip
 
 
 def _looks(count: int) -> str:
@@ -173,18 +153,15 @@ class SentinelFindings:
     def __init__(self, folder: Path, mast_digest: Callable[[], str], thread: JournalThread) -> None:
         self._folder = folder
         self._mast_digest = mast_digest
-        self._found: dict[str, Any] | None = None
+        self._found: SentinelTold | None = None
         self._level = "none"
         self._read: object = None
         thread.poll(self._poll)
 
-    def summary(self) -> dict[str, Any] | None:
+    def summary(self) -> SentinelTold | None:
         """Return the answer of ``GET /sentinel``, None before the folder was read for the first time."""
         found = self._found
-        if found is None or found["last_look"] is None:
-            return found
-        age = age_s(found["last_look"], datetime.now(UTC))
-        return {**found, "age_s": None if age is None else max(age, 0.0)}
+        return found and {**found, "age_s": _age_of(found["last_look"], datetime.now(UTC))}
 
     # In the journals' thread
 
@@ -206,7 +183,7 @@ class SentinelFindings:
                 marks.append((about.st_mtime_ns, about.st_size))
         return tuple(marks)
 
-    def _publish(self, found: dict[str, Any]) -> None:
+    def _publish(self, found: SentinelTold) -> None:
         """Publish findings; a change that comes or goes is logged."""
         before, self._level, self._found = self._level, found["level"], found
         if self._level == "bad" and before != "bad":

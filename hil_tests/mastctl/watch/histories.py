@@ -71,22 +71,23 @@ def pointing(
         after = aimed.pan_rad + rng.uniform(-1e-3, 1e-3), aimed.tilt_rad + rng.uniform(-1e-3, 1e-3)
         found = true.camera_in_rover(camera, *after).project(target)[0] + rng.normal(0.0, MATCH_PX, 2)
         off = found - rig.camera_in_rover(camera, *_read(after)).project(point.position_m)[0]
-        return Measured(
-            time_s,
-            "000001-aaaa",
-            True,
-            believed.digest,
-            *source,
-            camera,
-            read,
-            _read(after),
-            tuple(point.position_m.tolist()),
-            aimed.range_m,
-            tuple((found - rig.cameras[camera].model.image_center_px).tolist()),
-            tuple(off.tolist()),
-            (MATCH_PX, MATCH_PX),
-            (COUNT_RAD, COUNT_RAD),
-        )
+        return {
+            "time_s": time_s,
+            "operation": "000001-aaaa",
+            "confirmed": True,
+            "mast_digest": believed.digest,
+            "source": source[0],
+            "partner": source[1],
+            "camera": camera,
+            "from_rad": list(read),
+            "to_rad": list(_read(after)),
+            "position_m": point.position_m.tolist(),
+            "range_m": aimed.range_m,
+            "residual_px": (found - rig.cameras[camera].model.image_center_px).tolist(),
+            "off_px": off.tolist(),
+            "match_sigma_px": [MATCH_PX, MATCH_PX],
+            "count_rad": [COUNT_RAD, COUNT_RAD],
+        }
 
 
 def _read(angles: tuple[float, float]) -> tuple[float, float]:

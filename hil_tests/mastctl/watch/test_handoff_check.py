@@ -84,13 +84,13 @@ def test_a_turned_body_pair_is_told_after_enough_hand_offs(
     summary = selfcheck.summary()
     assert summary["handoffs"] == 20
     assert [one["camera"] for one in summary["offsets"]] == list(HAZCAMS)
-    for one in summary["offsets"]:
-        model = rig.cameras[one["camera"]].model
+    for offset in summary["offsets"]:
+        model = rig.cameras[offset["camera"]].model
         focal_px = float(np.linalg.norm(np.cross(model.A, model.H)))
-        assert one["offset_px"] == pytest.approx([-0.004 * focal_px, 0.0], abs=0.5)
-        assert one["sigmas"] > 5.0
-        assert f"{one['camera']} sees targets" in one["sentence"]
-        assert "px left" in one["sentence"] and "of where navcam puts them" in one["sentence"]
+        assert offset["offset_px"] == pytest.approx([-0.004 * focal_px, 0.0], abs=0.5)
+        assert offset["sigmas"] > 5.0
+        assert f"{offset['camera']} sees targets" in offset["sentence"]
+        assert "px left" in offset["sentence"] and "of where navcam puts them" in offset["sentence"]
     assert sum("show an offset: hazcam_left" in words for words in caplog.messages) == 1, "told once"
     thread.close()
     assert len(read_log(tmp_path / "h.jsonl").handoffs) == 20

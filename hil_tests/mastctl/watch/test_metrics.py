@@ -14,7 +14,7 @@ from mastctl.control.publisher import Publisher
 from mastctl.control.records import Operation
 from mastctl.watch.metrics import Metrics
 
-STATUS: dict[str, Any] = {
+STATUS: Any = {
     "state": "ready",
     "version": "1.2.3",
     "hardware": "simulated",
@@ -27,6 +27,8 @@ STATUS: dict[str, Any] = {
         {"device": "navcam_right", "code": "no_reply"},
     ],
     "control": {"holder": "a", "kind": "lease", "for_s": 4.0},
+    "calibration": None,
+    "sentinel": None,
 }
 
 DONE = FakeResult((6.0, 1.0, 0.0), 6.2, (FakePointing((0.3, -0.1), (0.1, 0.1), "navcam_left-1"),))
@@ -48,7 +50,7 @@ def scraped(metrics: Metrics) -> Found:
 
 
 def test_the_status_is_told_as_it_is_when_somebody_asks(publisher: Publisher) -> None:
-    status = dict(STATUS)
+    status: Any = dict(STATUS)
     errors = {("pan_tilt", "read", "no_reply"): 3}
     metrics = Metrics(lambda: status, lambda: errors, dict, publisher, lambda: {"pan": 41.5})
     found = scraped(metrics)

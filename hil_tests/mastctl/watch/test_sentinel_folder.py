@@ -135,13 +135,13 @@ def test_two_looks_must_see_a_change_before_it_is_reported(
     looks: list[dict[str, Any]], level: str, phrase: str
 ) -> None:
     now = standing(REFERENCE_OF_A_WEEK, looks, NOW)
-    assert now.level == level
-    assert phrase in now.sentence
+    assert now["level"] == level
+    assert phrase in now["sentence"]
 
 
 def test_a_clock_that_was_set_back_does_not_stop_the_looks() -> None:
     reference = Reference((NOW + timedelta(days=3)).isoformat(), "d" * 64, (), (), Path())
-    assert "at a time 3 days ahead of this clock" in standing(reference, [], NOW).sentence
+    assert "at a time 3 days ahead of this clock" in standing(reference, [], NOW)["sentence"]
     assert is_due(reference, (NOW + timedelta(days=3, hours=1)).isoformat(), 86400.0, NOW)
     assert not is_due(reference, NOW.isoformat(), 86400.0, NOW + timedelta(minutes=1))
 

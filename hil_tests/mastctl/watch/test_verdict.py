@@ -6,10 +6,12 @@ from typing import Any
 
 import pytest
 
-from mastctl.watch.residuals import NOTHING_YET, ResidualVerdict
+from mastctl.answers import ResidualsTold
+from mastctl.watch.residuals import residuals_told
 from mastctl.watch.verdict import mast_verdict
 
-DRIFTS = ResidualVerdict("drifts", "navcam_left looks 2 mrad beside", 9, "2026-05-02T00:00:00+00:00")
+NOTHING_YET = residuals_told("few", "few pointings")
+DRIFTS = residuals_told("drifts", "navcam_left looks 2 mrad beside", 9, "2026-05-02T00:00:00+00:00")
 SLIPPED = {"level": "bad", "sentence": "pan slipped by 4 mrad", "since": "2026-05-01T00:00:00+00:00"}
 OFFSET = {"sentence": "hazcam_left sees targets 2 px right"}
 
@@ -17,22 +19,23 @@ OFFSET = {"sentence": "hazcam_left sees targets 2 px right"}
 @pytest.mark.parametrize(
     ("residuals", "looks", "offsets", "verdict", "sentence", "since"),
     [
-        (NOTHING_YET, None, [], "few", NOTHING_YET.sentence, None),
-        (NOTHING_YET, {**SLIPPED, "level": "unsure"}, [], "few", NOTHING_YET.sentence, None),
-        (DRIFTS, None, [], "drifts", DRIFTS.sentence, DRIFTS.since),
+        (NOTHING_YET, None, [], "few", NOTHING_YET["sentence"], None),
+        (NOTHING_YET, {**SLIPPED, "level": "unsure"}, [], "few", NOTHING_YET["sentence"], None),
+        (DRIFTS, None, [], "drifts", DRIFTS["sentence"], DRIFTS["since"]),
         (NOTHING_YET, SLIPPED, [], "drifts", f"reference pictures: {SLIPPED['sentence']}", SLIPPED["since"]),
         (NOTHING_YET, None, [OFFSET], "drifts", f"hand-offs: {OFFSET['sentence']}", None),
         (
             DRIFTS, SLIPPED, [OFFSET], "drifts",
-            f"{DRIFTS.sentence}; reference pictures: {SLIPPED['sentence']}; hand-offs: {OFFSET['sentence']}",
+            f"{DRIFTS['sentence']}; reference pictures: {SLIPPED['sentence']}; "
+            f"hand-offs: {OFFSET['sentence']}",
             SLIPPED["since"],
         ),
     ],
 )  # fmt: skip
 def test_the_mast_file_holds_as_long_as_nothing_speaks_against_it(
-    residuals: ResidualVerdict, looks: Any, offsets: Any, verdict: str, sentence: str, since: str | None
+    residuals: ResidualsTold, looks: Any, offsets: Any, verdict: str, sentence: str, since: str | None
 ) -> None:
     told = mast_verdict(residuals, looks, {"handoffs": 3, "offsets": offsets})
     assert told == {
-        "verdict": verdict, "sentence": sentence, "pointings": residuals.pointings, "since": since
+        "verdict": verdict, "sentence": sentence, "pointings": residuals["pointings"], "since": since
     }  # fmt: skip
