@@ -52,22 +52,14 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         The name of this program, for the daemon's record and for other clients that want to steer; by default
         ``program@host:pid``. Clients of one name are one party.
     token
-        The token that a daemon expects from other machines; by default that of ``$MASTCTL_TOKEN``. Others
-        can read it on the way without TLS. The file ``$MASTCTL_CA_FILE`` may name further certificates.
+        Expected by a daemon from other machines; by default ``$MASTCTL_TOKEN``. Others can read it on the way
+        without TLS. The file ``$MASTCTL_CA_FILE`` may name further certificates.
     reads_only
         Why this client sends no command (``reads_only``, one sentence); empty if it does.
 
-    Attributes
-    ----------
-    daemon
-        The connection, for a request that no method sends.
-
     Where the connection breaks, the client sends a command again; its key lets the daemon execute it once.
-
-    Raises
-    ------
-    ClientError
-        ``bad_url``, if the address is of neither form. Every method raises it for whatever goes wrong.
+    Every method raises ClientError for whatever goes wrong. ``daemon`` is the connection, for a request that
+    no method sends.
     """
 
     def __init__(
@@ -83,10 +75,9 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         self.daemon = DaemonHttp(url, timeout_s, name, token, reads_only)
 
     def status(self, timeout_s: float | None = None) -> Status:
-        """Return what the daemon knows at this moment.
+        """Return what the daemon knows now; ``timeout_s`` shortens the longest time of this request.
 
-        ``timeout_s`` shortens the longest time of this request, seconds. Another program's answer is
-        ``bad_answer``.
+        Another program's answer is ``bad_answer``.
         """
         status = self.daemon.json(Status, "GET", "/status", within_s=timeout_s)
         if not isinstance(status.get("state"), str) or "mast" not in status:
@@ -125,7 +116,7 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         range_m, plane
             How far what the pixel shows is from its camera, metres, or a plane of the rover frame in which it
             lies: ``{"point_m": (x, y, z), "normal": (x, y, z)}``, level without ``normal``. The pair's other
-            camera is not asked then.
+            camera is not used then.
         deadline_s
             How long it is given, seconds of the daemon's clock; then the head is stopped and the operation
             fails with ``deadline_passed``. By default from the longest way and the speed.
@@ -148,13 +139,8 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
     def turn(self, pan_rad: float, tilt_rad: float, timeout_s: float = 90.0) -> OperationTold:
         """Turn to joint angles as the head reads them; return the operation's record when it has ended.
 
-        A turn of which this program loses sight, or whose time is over, is stopped: it leaves no head behind
-        that turns.
-
-        Parameters
-        ----------
-        timeout_s
-            What the daemon gives it, seconds of the daemon's clock, and how long it is waited for.
+        A turn that this program cannot follow any more, or whose time is over, is stopped. ``timeout_s`` is
+        what the daemon gives it, seconds of the daemon's clock, and how long it is waited for.
         """
         operation = None
         try:
@@ -212,15 +198,8 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
     ) -> OperationTold:
         """Wait until an operation has ended (done, failed or stopped) and return its record.
 
-        Parameters
-        ----------
-        on_step
-            Called with each step as it comes.
-
-        Raises
-        ------
-        ClientError
-            ``timeout``, if it has not ended in time; it goes on.
+        ``on_step`` is called with each step as it comes. Raises ClientError ``timeout`` if it has not ended
+        in time; it goes on.
         """
         seen = 0
         query = {"topics": "operation", "key": operation_id}
@@ -243,15 +222,8 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
     ) -> Status | StateTold:
         """Wait until the daemon's state is one of these; return it with what goes with it in the status.
 
-        Parameters
-        ----------
-        on_change
-            Called with the same at the beginning and at each change.
-
-        Raises
-        ------
-        ClientError
-            ``timeout``, if it was none of them in time.
+        ``on_change`` is called with the same at the beginning and at each change. Raises ClientError
+        ``timeout``.
         """
         state = ""
         for now in followed(self.daemon, {"topics": "state"}, self.status, timeout_s):
@@ -407,18 +379,14 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         frame_id: str | None = None,
         format: Literal["png", "jpeg"] = "png",
     ) -> Snapshot:
-        """Return a picture with its facts.
+        """Return a picture with its facts; ``png`` is lossless.
 
         Parameters
         ----------
-        camera
-            The camera's name.
         fresh
             Whether it must be exposed after the daemon got the request; else it is at most a second old.
         frame_id
             A frame that the daemon still keeps, instead of a new one.
-        format
-            ``png`` is lossless.
         """
         kept = {"fresh": "true" if fresh else "false"} if frame_id is None else {"frame_id": frame_id}
         answer = self.daemon.request("GET", f"/snapshot/{escaped(camera)}", params={"format": format, **kept})

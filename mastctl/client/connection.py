@@ -28,14 +28,8 @@ _BAD_INPUT = frozenset({400, 404, 413, 415, 422})
 class ClientError(Exception):
     """The daemon refused, failed, or did not answer.
 
-    Attributes
-    ----------
-    code
-        The daemon's, or the client's own: ``no_daemon``, ``bad_url``, ``timeout``, ``bad_answer``.
-    detail
-        Further facts from the daemon, or None.
-    exit_code
-        The exit code of a command: 2 for bad input, 1 for a failure.
+    ``code`` is the daemon's, or the client's own: ``no_daemon``, ``bad_url``, ``timeout``, ``bad_answer``;
+    ``exit_code`` that of a command: 2 for bad input, 1 for a failure.
     """
 
     def __init__(
@@ -67,10 +61,7 @@ class Broken(ClientError):
 class DaemonHttp:
     """A connection to one daemon; parameters and errors as of `mastctl.client.Client`.
 
-    Attributes
-    ----------
-    lease_id
-        Goes with each request; None for no lease.
+    ``lease_id`` goes with each request; None for no lease.
     """
 
     def __init__(
@@ -138,7 +129,7 @@ class DaemonHttp:
             try:
                 return self.json(kind, method, path, headers=headers, **options)
             except Broken:
-                self.pause(pause_s)
+                time.sleep(pause_s)
         return self.json(kind, method, path, headers=headers, **options)
 
     def request(self, method: str, path: str, **options: Any) -> httpx.Response:
@@ -259,10 +250,6 @@ class DaemonHttp:
                 f"'{self.url}' is no address of a daemon; http://127.0.0.1:8420 or unix:/path is expected",
                 exit_code=2,
             ) from None
-
-    def pause(self, seconds: float) -> None:
-        """Wait for some seconds."""
-        time.sleep(seconds)
 
     def close(self) -> None:
         """Close the connection."""

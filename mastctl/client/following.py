@@ -16,38 +16,29 @@ SILENT_S = 10.0  # the daemon shows every 2 s that it is there
 LAST_S = 3.0  # of a wait: then it ends to the moment, and not with the next sign of life
 PASSING = ("no_daemon", "timeout", "closing")
 LEAST_S = 1.0  # for a request, on a machine that is busy
-ASK_S = 0.25  # between questions to a daemon that has no stream left
+POLL_S = 0.25  # between requests to a daemon that has no stream left
 
 
 def followed(
     daemon: DaemonHttp,
     query: Mapping[str, Any],
-    ask: Callable[[float], T],
+    request: Callable[[float], T],
     timeout_s: float,
 ) -> Generator[T, None, None]:
     """Yield a value as it is, then at each change, for some seconds.
 
-    The value is asked for before each stream, and each stream begins with what is known, so that no end of
-    anything is missed. A stream that breaks is begun again; where the daemon has none left, it is asked.
+    The value is requested before each stream, and each stream begins with what is known, so that no end of
+    anything is missed. A stream that breaks is begun again; where the daemon has none left, it is polled.
 
-    Parameters
-    ----------
-    query
-        Which events, of one topic and key.
-    ask
-        Returns the value by a request of its own that may take so many seconds.
-
-    Raises
-    ------
-    ClientError
-        The error that ``ask`` raises: ``no_daemon`` if the daemon is gone, ``operation_unknown`` if it is
-        another one.
+    ``query`` selects events of one topic and key. ``request`` returns the value by a request of its own that
+    may take so many seconds; its ClientError passes: ``no_daemon`` if the daemon is gone,
+    ``operation_unknown`` if it is another one.
     """
     until_s = time.monotonic() + timeout_s
-    pauses: list[float] = []  # a daemon that does not answer at the beginning is told at once
+    pauses: list[float] = []  # a daemon that does not answer at the beginning is reported at once
     while True:
         try:
-            yield ask(max(until_s - time.monotonic(), LEAST_S))
+            yield request(max(until_s - time.monotonic(), LEAST_S))
             pauses = pauses or list(AGAIN_S)  # it answers
             with closing(_stream(daemon, query, until_s)) as values:
                 for value in values:
@@ -55,12 +46,12 @@ def followed(
                     yield cast(T, value)
         except ClientError as error:
             if error.code == "too_many":
-                pauses = [ASK_S, *AGAIN_S]
+                pauses = [POLL_S, *AGAIN_S]
             elif not (isinstance(error, Broken) or error.code in PASSING):
                 raise
             if not pauses:
                 raise
-            daemon.pause(max(0.0, min(pauses.pop(0), until_s - time.monotonic())))
+            time.sleep(max(0.0, min(pauses.pop(0), until_s - time.monotonic())))
         if time.monotonic() >= until_s:
             return
 

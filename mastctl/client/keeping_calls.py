@@ -34,10 +34,8 @@ class KeepingCalls:
     daemon: DaemonHttp
 
     def reload(self) -> ReloadTold:
-        """Have the daemon read its configuration again; return ``changed``, ``mast`` and ``notes``.
-
-        All of what it says comes into use while the head rests, or nothing (``restart_needed``,
-        ``bad_config``, ``bad_mast_file``, ``busy``, ``moving``).
+        """Have the daemon read its configuration again: all of it comes into use while the head rests, or
+        nothing (``restart_needed``, ``bad_config``, ``bad_mast_file``, ``busy``, ``moving``).
         """
         return self.daemon.command(ReloadTold, "POST", "/reload")
 

@@ -33,20 +33,14 @@ class Recording:
 
     Attributes
     ----------
-    path, files
-        As it was named, and the files that it is.
     found
-        What each of them holds, and how it ended.
+        What each of its files holds, and how it ended.
     facts
         The metadata at its start.
     masts
         Attached mast files by digest, the first one first.
-    config
-        The attached configuration, None if there is none.
     operations
         The last record of each operation, by id, oldest first.
-    handoffs
-        Lines of the record of hand-offs.
     frames
         Frames by id.
     """
@@ -91,97 +85,61 @@ class Recording:
 
 
 def read_whole(path: Path) -> Recording:
-    """Read a recording: a file, or a folder of the ring's segments.
-
-    Raises
-    ------
-    BadRecording
-        If there is none, or it cannot be read.
-    """
-    files = recording_files(path)
-    reader = _Reader()
+    """Read a recording: a file, or a folder of the ring's segments. Raises BadRecording."""
+    files = tuple(recording_files(path))
+    found, facts, masts = [], dict[str, str](), dict[str, tuple[Attached, StoredRig]]()
+    configs: list[Attached] = []
+    operations, handoffs = dict[str, Mapping[str, Any]](), list[Mapping[str, Any]]()
     for file in files:
-        reader.read(file)
-    frames = {str(frame.facts["frame_id"]): frame for frame in read_frames(path)}
-    return Recording(
-        path,
-        tuple(files),
-        tuple(reader.found),
-        reader.facts,
-        reader.masts,
-        reader.config,
-        reader.operations,
-        tuple(reader.handoffs),
-        frames,
-    )
-
-
-class _Reader:
-    """Gathers what the files hold."""
-
-    def __init__(self) -> None:
-        self.found: list[McapContents] = []
-        self.facts: dict[str, str] = {}
-        self.masts: dict[str, tuple[Attached, StoredRig]] = {}
-        self.config: Attached | None = None
-        self.operations: dict[str, Mapping[str, Any]] = {}
-        self.handoffs: list[Mapping[str, Any]] = []
-
-    def read(self, file: Path) -> None:
-        found = McapContents()
-        self.found.append(found)
-        for item in read_items(file, found):
+        found.append(McapContents())
+        for item in read_items(file, found[-1]):
             if isinstance(item, Metadata):
-                self.facts |= item.metadata
+                facts |= item.metadata
             elif isinstance(item, Attachment):
-                self._attached(file, Attached(item.name, bytes(item.data), item.media_type))
+                one = Attached(item.name, bytes(item.data), item.media_type)
+                expected = facts.get(f"sha256 {one.name}", one.digest)
+                if one.digest != expected and one.digest not in masts:
+                    log.warning("%s: %s is not what it was when the recording began", file, one.name)
+                _attach(file, one, masts, configs)
             elif isinstance(item, McapEntry) and item.channel.topic in ("/operation", "/handoff"):
-                self._record(item)
+                record = _record(item.message.data)
+                if item.channel.topic == "/handoff" and record:
+                    handoffs.append(record)
+                elif isinstance(record.get("id"), str):
+                    operations[record["id"]] = record
+    frames = {str(frame.facts["frame_id"]): frame for frame in read_frames(path)}
+    config = configs[0] if configs else None
+    return Recording(path, files, tuple(found), facts, masts, config, operations, tuple(handoffs), frames)
 
-    def _attached(self, file: Path, one: Attached) -> None:
-        digest = self.facts.get(f"sha256 {one.name}")
-        if digest is not None and digest != one.digest and one.digest not in self.masts:
-            log.warning("%s: %s is not what it was when the recording began", file, one.name)
-        try:
-            schema = parse_mapping(one.data, one.name).get("schema")
-            if schema == MAST_SCHEMA:
-                self.masts.setdefault(one.digest, (one, parse_rig(one.data, one.name)))
-            elif schema == CONFIG_SCHEMA:
-                self.config = self.config or one
-        except BadFile as error:
-            log.warning("%s: an attached file cannot be used: %s", file, error)
 
-    def _record(self, item: McapEntry) -> None:
-        try:
-            record = json.loads(item.message.data)
-        except (ValueError, RecursionError):
-            return
-        if not isinstance(record, dict):
-            return
-        if item.channel.topic == "/handoff":
-            self.handoffs.append(record)
-        elif isinstance(record.get("id"), str):
-            self.operations[record["id"]] = record
+def _attach(
+    file: Path, one: Attached, masts: dict[str, tuple[Attached, StoredRig]], configs: list[Attached]
+) -> None:
+    """Keep an attached file by its schema; one that cannot be read is logged."""
+    try:
+        schema = parse_mapping(one.data, one.name).get("schema")
+        if schema == MAST_SCHEMA:
+            masts.setdefault(one.digest, (one, parse_rig(one.data, one.name)))
+        elif schema == CONFIG_SCHEMA:
+            configs.append(one)
+    except BadFile as error:
+        log.warning("%s: an attached file cannot be used: %s", file, error)
+
+
+def _record(data: bytes) -> dict[str, Any]:
+    """A record of JSON; empty where another program wrote something else."""
+    try:
+        record = json.loads(data)
+    except (ValueError, RecursionError):
+        return {}
+    return record if isinstance(record, dict) else {}
 
 
 def replay_files(recording: Recording, folder: Path, listen: dict[str, Any]) -> Path:
     """Write the mast file and a configuration that serves a recording; return the configuration's path.
 
-    Parameters
-    ----------
-    recording
-        With at least one picture of a head at rest.
-    folder
-        Where both are written.
-    listen
-        The configuration's section of that name.
-
-    Raises
-    ------
-    BadRecording
-        If no mast file is attached, or there is no picture that a camera of it took.
-    OSError
-        If the folder cannot be written.
+    ``listen`` is the configuration's section of that name. Raises BadRecording if no mast file is attached or
+    no camera of it took a picture, OSError.
     """
     mast, stored = recording.first_mast
     known = {str(frame.facts["camera"]) for frame in recording.frames.values()} & set(stored.rig.cameras)
@@ -194,7 +152,7 @@ def replay_files(recording: Recording, folder: Path, listen: dict[str, Any]) -> 
         "options": {"recording": str(recording.path.resolve())},
     }
     config = {
-        "schema": "mastctl/config/1",
+        "schema": CONFIG_SCHEMA,
         "mast_file": name,
         "listen": listen,
         "pan_tilt": device,

@@ -79,16 +79,12 @@ class Recorder:
 
     Parameters
     ----------
-    settings, folder
-        How much, and where.
-    mast
-        The mast file in use.
     others
-        What else is attached: the configuration.
+        What is attached beside the mast file: the configuration.
     facts
         Of each file: ``hardware``, its kind; ``version``.
-    publisher, frame_by_id
-        What is recorded, and where the images are; ``frame_by_id`` raises MastctlError for one that is gone.
+    frame_by_id
+        Where the images are; raises MastctlError for one that is gone.
     event_value
         Returns a published value of a topic as events have it.
     clock
@@ -144,7 +140,7 @@ class Recorder:
         self._request(lambda: self._write([entry], time.monotonic()))
 
     def summary(self) -> RecorderTold:
-        """Return what is recorded now, as JSON: the run's name, sizes in 10⁶ bytes, what was dropped."""
+        """Return what is recorded now."""
         now = self._now
         file = now.file
         return {

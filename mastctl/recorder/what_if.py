@@ -13,7 +13,7 @@ and of what the servos leave, as scattered over the recording.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -39,25 +39,19 @@ class SeenAgain:
 
     Attributes
     ----------
-    operation, pointing, mast_digest
-        Which one, and with which mast file.
-    pair, pair_px, pair_sigma_px, pair_rad
-        The two cameras, (2, 2) pixels of the target in them, their sigma, and (pan, tilt) read at it.
-    pair_approach, measured_approach
-        From which side pan and tilt had come to it, and to the new picture.
+    pair, pair_px, pair_sigma_px, pair_rad, pair_approach
+        The two cameras, (2, 2) pixels of the target in them, their sigma, and (pan, tilt) as read, with the
+        side from which each had come.
     aim_camera, aim_px
         Where the target was wanted.
-    commanded_rad, measured_rad
-        (pan, tilt) sent and reached, as the head reads them.
-    target_px, target_sigma_px
+    commanded_rad, measured_rad, measured_approach
+        (pan, tilt) sent and reached, as the head reads them, and from which side.
+    target_px, target_sigma_px, frame_id
         (2,) where the new picture showed the target.
-    frame_id
-        The new picture.
     """
 
     operation: str
     pointing: int
-    mast_digest: str
     pair: tuple[str, str]
     pair_px: FloatArray
     pair_sigma_px: FloatArray
@@ -103,7 +97,6 @@ class WouldBe:
 class HandedAgain:
     """A hand-off to one camera: found less predicted pixel, as recorded and with another mast file."""
 
-    name: str
     time: str
     camera: str
     recorded_px: FloatArray
@@ -117,12 +110,7 @@ def seen_in(
 ) -> tuple[list[SeenAgain], dict[str, str]]:
     """Return the pointings of a recording that can be worked out again, and why the others cannot.
 
-    Parameters
-    ----------
-    operations
-        Records by id.
-    frames
-        Facts of recorded frames by id, for their joint angles and mast file.
+    ``operations`` are records by id, ``frames`` facts of recorded frames by id.
     """
     found: list[SeenAgain] = []
     others: dict[str, str] = {}
@@ -178,7 +166,6 @@ def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) 
             SeenAgain(
                 operation=name,
                 pointing=number,
-                mast_digest="" if facts is None else str(facts["mast_digest"]),
                 pair=pair,
                 pair_px=np.array(pixels, dtype=float),
                 pair_sigma_px=np.maximum(np.array(sigmas, dtype=float), LEAST_PX),
@@ -209,19 +196,23 @@ def _would_be(rig: Rig, seen: SeenAgain, servo_rad: FloatArray) -> WouldBe:
     if missing:
         return WouldBe(seen, error=f"the mast file has no camera {missing[0]}")
     try:
-        commanded, range_m, residual = _residual(rig, seen)
-        sigma = _sigma(rig, seen, servo_rad)
+        commanded, range_m, residual = _residual(rig, seen, seen.pair_px, seen.left_rad)
+        sigma = _sigma(rig, seen, residual, servo_rad)
     except CalibError as error:
         return WouldBe(seen, error=" ".join(str(error).split()))
     return WouldBe(seen, commanded, range_m, residual, sigma)
 
 
-def _residual(rig: Rig, seen: SeenAgain) -> tuple[tuple[float, float], float, FloatArray]:
-    """Commanded angles, range and residual of a pointing with a mast file. Raises CalibError."""
+def _residual(
+    rig: Rig, seen: SeenAgain, pair_px: FloatArray, left_rad: FloatArray
+) -> tuple[tuple[float, float], float, FloatArray]:
+    """Commanded angles, range and residual of a pointing with a mast file, of the pair's pixels (2, 2) and
+    what the servos leave (2,). Raises CalibError.
+    """
     joints, came = rig.joints, seen.measured_approach
     at = joints.true_rad(seen.pair_rad, seen.pair_approach)
     one, other = (rig.camera_in_rover(name, *at) for name in seen.pair)
-    target = triangulate(one, other, seen.pair_px[0], seen.pair_px[1]).position_m
+    target = triangulate(one, other, pair_px[0], pair_px[1]).position_m
     aim = rig.cameras[seen.aim_camera].model
     solutions = solve(rig.mast, aim, target, seen.aim_px)
     pan, tilt = seen.commanded_rad
@@ -230,31 +221,23 @@ def _residual(rig: Rig, seen: SeenAgain) -> tuple[tuple[float, float], float, Fl
     range_m = float(np.linalg.norm(target - ray.origins_m))
     position_m = ray.origins_m + range_m * ray.directions
     commanded = joints.read_rad((chosen.pan_rad, chosen.tilt_rad), came)
-    reached = commanded[0] + float(seen.left_rad[0]), commanded[1] + float(seen.left_rad[1])
+    reached = commanded[0] + float(left_rad[0]), commanded[1] + float(left_rad[1])
     camera = rig.camera_in_rover(seen.aim_camera, *joints.true_rad(reached, came))
     pixel, _ = camera.project(position_m)
     return commanded, range_m, np.asarray(pixel - seen.aim_px, dtype=float)
 
 
-def _sigma(rig: Rig, seen: SeenAgain, servo_rad: FloatArray) -> FloatArray:
+def _sigma(rig: Rig, seen: SeenAgain, residual_px: FloatArray, servo_rad: FloatArray) -> FloatArray:
     """(2,) one sigma of another run's residual, by what each measured number moves it."""
-    _, _, residual_px = _residual(rig, seen)
-
-    def moved(change: Callable[[], SeenAgain], step: float) -> FloatArray:
-        _, _, changed_px = _residual(rig, change())
-        return (changed_px - residual_px) / step
-
+    measured = np.concatenate([seen.pair_px.ravel(), seen.left_rad])
+    # What the servos leave differs in this run and in the other one.
+    sigmas = np.concatenate([seen.pair_sigma_px.ravel(), np.sqrt(2.0) * servo_rad])
     variance = np.square(seen.target_sigma_px)
-    for camera, axis in np.ndindex(2, 2):
-        pixels = seen.pair_px.copy()
-        pixels[camera, axis] += STEP_PX
-        rate = moved(lambda pixels=pixels: replace(seen, pair_px=pixels), STEP_PX)  # type: ignore[misc]
-        variance = variance + np.square(rate * seen.pair_sigma_px[camera, axis])
-    for joint in range(2):
-        commanded = list(seen.commanded_rad)
-        commanded[joint] -= STEP_RAD
-        rate = moved(lambda c=commanded: replace(seen, commanded_rad=(c[0], c[1])), STEP_RAD)  # type: ignore[misc]
-        variance = variance + 2.0 * np.square(rate * servo_rad[joint])  # this run's, and the other one's
+    for at, (sigma, step) in enumerate(zip(sigmas, [STEP_PX] * 4 + [STEP_RAD] * 2, strict=True)):
+        changed = measured.copy()
+        changed[at] += step
+        _, _, moved_px = _residual(rig, seen, changed[:4].reshape(2, 2), changed[4:])
+        variance = variance + np.square((moved_px - residual_px) / step * sigma)
     return np.sqrt(variance)
 
 
@@ -267,14 +250,11 @@ def _servo_scatter(seen: Sequence[SeenAgain]) -> FloatArray:
 def handoffs_with(rig: Rig, handoffs: Sequence[MatchedHandoff]) -> list[HandedAgain]:
     """Return each hand-off that was found, as it would have been predicted with another mast file."""
     rows: list[HandedAgain] = []
-    for number, one in enumerate(handoffs, start=1):
+    for one in handoffs:
         for camera, landed in one.found.items():
             assert landed.found_px is not None and landed.found_covariance_px2 is not None
-            both = landed.found_covariance_px2 + landed.geometric_covariance_px2
-            sigma = np.sqrt(np.diag(both))
-            row = HandedAgain(
-                str(number), one.time, camera, landed.found_px - landed.geometric_px, None, sigma
-            )
+            sigma = np.sqrt(np.diag(landed.found_covariance_px2 + landed.geometric_covariance_px2))
+            row = HandedAgain(one.time, camera, landed.found_px - landed.geometric_px, None, sigma)
             try:
                 again = hand_off(
                     rig, one.pair, [camera], one.joints, *one.clicks_px,

@@ -45,10 +45,7 @@ class WhatIf:
                 key: {"recorded": rms(was), "would_be": rms(would)} for key, was, would in self.columns()
             },
             "pointings": [_pointing_record(one) for one in self.pointings],
-            "handoffs": [
-                {name: value for name, value in as_json(one).items() if name != "name"}
-                for one in self.handoffs
-            ],
+            "handoffs": as_json(self.handoffs),
             "not_worked_out": dict(self.others),
         }
 

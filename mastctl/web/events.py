@@ -25,18 +25,19 @@ from mastctl.control.publisher import LoopSubscription, Published, Topic
 from mastctl.http import PREFIX
 from mastctl.http.refusals import query_of
 from mastctl.service.service import Service
+from mastctl.web.described import stream_of
 from mastctl.web.models import EventsQuery
 from mastctl.web.parts import Here, Parts
 
 EVENTS = f"{PREFIX}/events"
 ALIVE_S = 2.0  # between signs of life where nothing changes
 GOING_AWAY, UNSUPPORTED, NOT_ALLOWED = 1001, 1003, 1008  # RFC 6455, 7.4.1
-TOLD_AT_ONCE = 16  # events, in one turn of the event loop
-AGES_HOLD_S = 0.02  # for how long a text that tells an age is told to others too
+AT_ONCE = 16  # events, in one turn of the event loop
+AGES_HOLD_S = 0.02  # for how long a text that has an age is sent to other listeners too
 AGELESS: frozenset[Topic] = frozenset({"operation", "mast", "command", "bench"})
-"""Topics whose values are told the same whenever it is."""
+"""Topics whose values have no age."""
 
-Telling = Callable[[Service, Published, int], str]
+AsText = Callable[[Service, Published, int], str]
 
 
 def add_events(app: FastAPI) -> None:
@@ -46,7 +47,7 @@ def add_events(app: FastAPI) -> None:
         EVENTS,
         summary="Each change as server-sent events, or through a WebSocket at the same address",
         response_class=StreamingResponse,
-        responses={200: {"content": {"text/event-stream": {}}}},
+        responses=stream_of("Event"),
     )
     async def events(query: Annotated[EventsQuery, Query()], here: Here) -> StreamingResponse:
         return _Lines(here, query.names, query.keys, _event)
@@ -55,7 +56,7 @@ def add_events(app: FastAPI) -> None:
         f"{PREFIX}/track/stream",
         summary="The track as server-sent events: now, and at each change",
         response_class=StreamingResponse,
-        responses={200: {"content": {"text/event-stream": {}}}},
+        responses=stream_of("TrackTold"),
     )
     async def track(here: Here) -> StreamingResponse:
         return _Lines(here, ("track",), None, _track)
@@ -64,11 +65,11 @@ def add_events(app: FastAPI) -> None:
     async def socket(line: WebSocket, here: Here) -> None:
         async with query_of(line, EventsQuery, "key") as query:
             with here.streams.listening(query.names, query.keys, credential_of(line)) as news:
-                await _tell(line, news, here)
+                await _send(line, news, here)
 
 
 _texts: WeakKeyDictionary[Published, tuple[str, float]] = WeakKeyDictionary()
-"""The values of events as JSON, made once for all who listen, and when."""
+"""The values of events as JSON, made once for all listeners, and when."""
 
 
 def _event(service: Service, one: Published, lost: int) -> str:
@@ -88,10 +89,10 @@ class _Lines(StreamingResponse):
     """Events as server-sent ones, until the daemon or the client ends."""
 
     def __init__(
-        self, here: Parts, topics: tuple[Topic, ...], keys: frozenset[str] | None, tell: Telling
+        self, here: Parts, topics: tuple[Topic, ...], keys: frozenset[str] | None, as_text: AsText
     ) -> None:
         super().__init__(self._lines(), media_type="text/event-stream")
-        self._here, self._topics, self._keys, self._tell = here, topics, keys, tell
+        self._here, self._topics, self._keys, self._as_text = here, topics, keys, as_text
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         credential = credential_of(HTTPConnection(scope))
@@ -104,7 +105,7 @@ class _Lines(StreamingResponse):
             found = await news.wait(ALIVE_S)
             for some in _by_few(found):
                 await self._here.waiting.turn()
-                lines = [(one.sequence, self._tell(self._here.service, one, news.lost)) for one in some]
+                lines = [(one.sequence, self._as_text(self._here.service, one, news.lost)) for one in some]
                 yield "".join(f"id: {number}\ndata: {text}\n\n" for number, text in lines)
             if not found:
                 if news.closed:
@@ -113,11 +114,11 @@ class _Lines(StreamingResponse):
 
 
 def _by_few(found: Sequence[Published]) -> Iterator[Sequence[Published]]:
-    """What there is to be told in pieces that keep a stop waiting for a moment only."""
-    return (found[begin : begin + TOLD_AT_ONCE] for begin in range(0, len(found), TOLD_AT_ONCE))
+    """Events in pieces that keep a stop waiting for a moment only."""
+    return (found[begin : begin + AT_ONCE] for begin in range(0, len(found), AT_ONCE))
 
 
-async def _tell(line: WebSocket, news: LoopSubscription, here: Parts) -> None:
+async def _send(line: WebSocket, news: LoopSubscription, here: Parts) -> None:
     """Send events through a WebSocket until the daemon or the client ends."""
     await line.accept()
     gone = asyncio.ensure_future(line.receive())  # a client's only message is its end

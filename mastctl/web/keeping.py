@@ -38,9 +38,9 @@ from mastctl.control.entry import (
 from mastctl.guided.runs import NAME
 from mastctl.http import PREFIX
 from mastctl.service.masts import MastInUse, Masts
-from mastctl.service.places import KeptPlace
 from mastctl.service.reload import reload
 from mastctl.web.commands import Asks, command
+from mastctl.web.described import file_of
 from mastctl.web.models import BenchBody, MastBody, PlaceBody, RecordBody
 from mastctl.web.parts import Here
 
@@ -71,7 +71,12 @@ ReportName = Annotated[
 def add_masts(app: FastAPI) -> None:
     """The mast file in use, another one, and the configuration read again."""
 
-    @app.get(f"{PREFIX}/mast", summary="The mast file in use, byte for byte", response_class=Response)
+    @app.get(
+        f"{PREFIX}/mast",
+        summary="The mast file in use, byte for byte",
+        response_class=Response,
+        responses={200: {"content": {"application/yaml": {"schema": {"type": "object"}}}}},
+    )
     async def mast(here: Here) -> Response:
         in_use = here.service.masts.in_use
         return Response(
@@ -106,12 +111,12 @@ def add_places(app: FastAPI) -> None:
     """Places of the head by a name; who goes there asks `POST /point` for its angles."""
 
     @app.get(f"{PREFIX}/places", summary="The places of the head that are kept by a name")
-    async def told(here: Here) -> PlacesTold:
-        return await here.waiting.run(here.service.places.told)
+    async def places(here: Here) -> PlacesTold:
+        return await here.waiting.run(here.service.places.all)
 
     @command(app, "POST /places/{name}", PLACE_KEEP, "Keep a place by a name")
     def keep(name: PlaceName, body: PlaceBody, here: Here) -> PlacesTold:
-        return here.service.places.keep(name, KeptPlace(body.pan_rad, body.tilt_rad))
+        return here.service.places.keep(name, {"pan_rad": body.pan_rad, "tilt_rad": body.tilt_rad})
 
     @command(app, "DELETE /places/{name}", PLACE_FORGET, "Forget a place")
     def forget(name: PlaceName, here: Here) -> PlacesTold:
@@ -136,7 +141,10 @@ def add_recordings(app: FastAPI) -> None:
         return here.service.recorder.stop_run()
 
     @app.get(
-        f"{PREFIX}/recordings/{{name}}/{{file}}", summary="A recording's file", response_class=FileResponse
+        f"{PREFIX}/recordings/{{name}}/{{file}}",
+        summary="A recording's file",
+        response_class=FileResponse,
+        responses=file_of("application/octet-stream"),
     )
     async def read(name: str, file: str, request: Request, here: Here) -> FileResponse:
         path = await here.waiting.run(lambda: here.service.recorder.file(name, file))
@@ -193,7 +201,12 @@ def add_bench(app: FastAPI) -> None:
         found = await here.waiting.run(reports.all)
         return {"reports": [one.told() for one in found], "folder": str(reports.folder)}
 
-    @app.get(f"{PREFIX}/reports/{{name}}", summary="A report", response_class=Response)
+    @app.get(
+        f"{PREFIX}/reports/{{name}}",
+        summary="A report",
+        response_class=Response,
+        responses=file_of("text/html"),
+    )
     async def report(name: ReportName, here: Here) -> Response:
         page = await here.waiting.run(lambda: here.service.reports.page(name))
         headers = {"Content-Security-Policy": REPORT, "Cross-Origin-Opener-Policy": "same-origin"}

@@ -34,30 +34,24 @@ from mastctl.service.service import Service
 from mastctl.web.parts import Here
 
 ASK_AGAIN = "no-cache"
-"""A browser keeps it, and asks each time whether it is still so."""
+"""A browser keeps it, and checks each time whether it is still so."""
 FOR_GOOD = "public, max-age=31536000, immutable"
 """What stands at this address will never be another text."""
 PACKED = {"Content-Encoding": "gzip"}
 
 
-def text_answer(asked: Mapping[str, str], data: bytes, kind: str, keep: str = ASK_AGAIN) -> Response:
+def text_answer(sent: Mapping[str, str], data: bytes, kind: str, keep: str = ASK_AGAIN) -> Response:
     """Return a text that stays the same while the daemon runs; 304 without it where the client has it.
 
-    Parameters
-    ----------
-    asked
-        The request's headers, names in lower case.
-    data, kind
-        The text, and its media type.
-    keep
-        What the browser may do with it, as Cache-Control.
+    ``sent`` are the request's headers, names in lower case; ``kind`` is the media type, ``keep`` the answer's
+    Cache-Control.
     """
     tag = f'W/"{digest(data)}"'  # the same for both forms
     headers = {"Cache-Control": keep, "ETag": tag, "Vary": "Accept-Encoding"}
-    if tag in asked.get("if-none-match", ""):
+    if tag in sent.get("if-none-match", ""):
         # A browser takes its headers for those of what it has, the policy that goes by the kind too.
         return Response(status_code=304, headers=headers, media_type=kind)
-    if _takes_packed(asked):
+    if _takes_packed(sent):
         return Response(_packed(data), media_type=kind, headers=headers | PACKED)
     return Response(data, media_type=kind, headers=headers)
 
@@ -68,8 +62,8 @@ def digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:16]
 
 
-def _takes_packed(asked: Mapping[str, str]) -> bool:
-    return "gzip" in asked.get("accept-encoding", "")
+def _takes_packed(sent: Mapping[str, str]) -> bool:
+    return "gzip" in sent.get("accept-encoding", "")
 
 
 @cache

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
 from fastapi import FastAPI, Path, Query
@@ -11,7 +11,7 @@ from fastapi import FastAPI, Path, Query
 from calib.errors import BadFile
 from calib.geometry.rigid import FloatArray, Rigid, quaternion_of
 from calib.targets.board_file import board_of, document_of
-from drivers.faults import BOUNDS, WHEN, FaultPanel
+from drivers.faults import BOUNDS, WHEN, FaultPanel, Word
 from drivers.faults import Fault as SetFault
 from drivers.simulation_clock import MAX, SimulationClock
 from mastctl.answers import (
@@ -37,7 +37,6 @@ from mastctl.control.entry import (
 )
 from mastctl.errors import BadRequest, NoLonger, NotKnown, NotNow
 from mastctl.http import PREFIX
-from mastctl.motion.track import RoverPose
 from mastctl.service.service import Service
 from mastctl.web.commands import command
 from mastctl.web.models import BoardBody, FaultBody, FaultsQuery, StandBody, TimeBody, TruthQuery
@@ -61,17 +60,17 @@ def add_simulation(app: FastAPI) -> None:
 
     @app.get(f"{PREFIX}/simulation/pose", summary="Where the simulated rover truly stands")
     async def true_pose(here: Here) -> StandTold:
-        return await here.waiting.run(lambda: _stand_told(_rover(here.service, "true poses")))
+        return await here.waiting.run(lambda: _pose(_rover(here.service, "true poses").site_from_rover))
 
     @command(app, "POST /simulation/pose", SIMULATION_POSE, "Put the simulated rover somewhere on its ground")
     def stand(body: StandBody, here: Here) -> StandTold:
         rover = _rover(here.service, "true poses")
         rover.stand(body.x_m, body.y_m, body.heading_rad, body.pitch_rad, body.roll_rad)
-        return _stand_told(rover)
+        return _pose(rover.site_from_rover)
 
     @app.get(f"{PREFIX}/simulation/boards", summary="The boards held up before the simulated rover")
     async def boards(here: Here) -> BoardsTold:
-        return await here.waiting.run(lambda: _boards_told(_rover(here.service, "boards")))
+        return await here.waiting.run(lambda: _boards(_rover(here.service, "boards")))
 
     @command(app, "POST /simulation/boards/{name}", SIMULATION_BOARD, "Hold up a board, or move it")
     def put_board(name: BoardName, body: BoardBody, here: Here) -> BoardStands:
@@ -91,7 +90,7 @@ def add_simulation(app: FastAPI) -> None:
             rotation=body.rotation,
             bow_m=(body.bow_m[0], body.bow_m[1]) if body.bow_m is not None else None,
         )
-        return _board_told(rover, stands)
+        return _board(rover, stands)
 
     @command(
         app,
@@ -102,20 +101,20 @@ def add_simulation(app: FastAPI) -> None:
     def take_board(name: BoardName, here: Here) -> BoardsTold:
         rover = _rover(here.service, "boards")
         rover.take_board(name)
-        return _boards_told(rover)
+        return _boards(rover)
 
     @app.get(f"{PREFIX}/simulation/time", summary="The simulated rover's time, and how fast it goes")
     async def time(here: Here) -> TimeTold:
-        return await here.waiting.run(lambda: _time_told(here.service))
+        return await here.waiting.run(lambda: _time(here.service))
 
     @command(app, "POST /simulation/time", SIMULATION_TIME, "Let time pass where it does not pass by itself")
     def advance(body: TimeBody, here: Here) -> TimeTold:
-        speed = _time_told(here.service)["speed"]
+        speed = _time(here.service)["speed"]
         if speed != MAX:
-            words = f"at simulation.speed {speed:g} time passes by itself; it is let pass only at {MAX}"
-            raise NotNow("time_passes", words)
+            message = f"at simulation.speed {speed:g} time passes by itself; it is let pass only at {MAX}"
+            raise NotNow("time_passes", message)
         here.service.clock.sleep(body.advance_s)
-        return _time_told(here.service)
+        return _time(here.service)
 
     @app.get(
         f"{PREFIX}/simulation/truth",
@@ -126,17 +125,17 @@ def add_simulation(app: FastAPI) -> None:
 
     @app.get(f"{PREFIX}/simulation/words", summary="The fault words of each device, with their parameters")
     async def words(here: Here) -> WordsTold:
-        return await here.waiting.run(lambda: {"devices": _words_told(_panel(here.service))})
+        return await here.waiting.run(lambda: {"devices": _words(_panel(here.service))})
 
     @app.get(f"{PREFIX}/simulation/faults", summary="The faults that are switched on")
     async def faults(here: Here) -> FaultsSet:
-        return await here.waiting.run(lambda: _faults_told(_panel(here.service)))
+        return await here.waiting.run(lambda: _faults(_panel(here.service)))
 
     @command(app, "POST /simulation/faults", SIMULATION_FAULT, "Switch a fault on")
     def set_fault(body: FaultBody, here: Here) -> FaultsSet:
         panel = _panel(here.service)
         panel.set(body.device, body.word, **body.parameters)
-        return _faults_told(panel)
+        return _faults(panel)
 
     @command(
         app,
@@ -147,15 +146,15 @@ def add_simulation(app: FastAPI) -> None:
     def clear_faults(query: Annotated[FaultsQuery, Query()], here: Here) -> FaultsSet:
         panel = _panel(here.service)
         panel.clear(query.device)
-        return _faults_told(panel)
+        return _faults(panel)
 
 
 def _rover(service: Service, what: str) -> RoverModel:
     """The simulated rover, whose ``what`` are asked for. Raises NotKnown."""
     if service.hardware.simulation is None:
         kind = service.hardware.kind
-        words = f"{what} are for this program's own simulated rover only; the hardware is {kind}"
-        raise NotKnown("not_simulated", words)
+        message = f"{what} are for this program's own simulated rover only; the hardware is {kind}"
+        raise NotKnown("not_simulated", message)
     return service.hardware.simulation
 
 
@@ -163,26 +162,20 @@ def _panel(service: Service) -> FaultPanel:
     return _rover(service, "faults").faults
 
 
-def _stand_told(rover: RoverModel) -> StandTold:
-    pose = RoverPose(rover.site_from_rover).told(0.0)
-    return {"position_m": pose["position_m"], "quaternion": pose["quaternion"]}
+def _pose(frame: Rigid) -> StandTold:
+    return {"position_m": frame.translation_m.tolist(), "quaternion": quaternion_of(frame.rotation)}
 
 
-def _board_told(rover: RoverModel, stands: BenchBoard) -> BoardStands:
-    pose = rover.site_from_rover.inverse @ stands.site_from_board
-    return {
-        "board": document_of(stands.board),
-        "position_m": pose.translation_m.tolist(),
-        "quaternion": quaternion_of(pose.rotation),
-        "bow_m": list(stands.bow_m),
-    }
+def _board(rover: RoverModel, one: BenchBoard) -> BoardStands:
+    rover_from_board = rover.site_from_rover.inverse @ one.site_from_board
+    return {"board": document_of(one.board), "bow_m": list(one.bow_m), **_pose(rover_from_board)}
 
 
-def _boards_told(rover: RoverModel) -> BoardsTold:
-    return {"boards": {name: _board_told(rover, one) for name, one in rover.boards.items()}}
+def _boards(rover: RoverModel) -> BoardsTold:
+    return {"boards": {name: _board(rover, one) for name, one in rover.boards.items()}}
 
 
-def _time_told(service: Service) -> TimeTold:
+def _time(service: Service) -> TimeTold:
     _rover(service, "clocks")
     clock = service.clock
     speed = clock.speed if isinstance(clock, SimulationClock) else 1.0
@@ -197,14 +190,14 @@ def _truth(service: Service, query: TruthQuery) -> TruthTold:
         site_from_rover = rover.frame_truth(frame.camera, frame.sequence).site_from_rover
         if query.pixel_px is not None:
             point = rover.true_point(frame.camera, frame.sequence, query.pixel_px)
-            return _truth_told(site_from_rover, point, query.pixel_px)
+            return _truth_of(site_from_rover, point, query.pixel_px)
         point = site_from_rover.inverse.points(np.array(query.position_in_site_m))
-        return _truth_told(site_from_rover, point, rover.true_pixel(frame.camera, frame.sequence, point))
+        return _truth_of(site_from_rover, point, rover.true_pixel(frame.camera, frame.sequence, point))
     except LookupError as error:
         raise NoLonger("frame_too_old", str(error.args[0])) from None
 
 
-def _truth_told(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: Any) -> TruthTold:
+def _truth_of(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: Any) -> TruthTold:
     """A point of the rover frame and its pixel as JSON; without a point nothing is known."""
     if point_m is None:
         return {"position_in_site_m": None, "position_m": None, "pixel_px": None}
@@ -216,38 +209,28 @@ def _truth_told(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: An
     }
 
 
-def _words_told(panel: FaultPanel) -> dict[str, dict[str, WordTold]]:
-    """What each device takes as JSON; what has no end is null."""
+def _words(panel: FaultPanel) -> dict[str, dict[str, WordTold]]:
+    """The fault words of each device; what has no end is null."""
 
     def parameter(name: str, usual: float) -> ParameterTold:
         least, most = BOUNDS[name]
         return {"default": as_json(usual), "least": least, "most": as_json(most)}
 
-    return {
-        device: {
-            name: {
-                "effect": word.does,
-                "parameters": {
-                    one: parameter(one, usual) for one, usual in {**word.parameters, **WHEN}.items()
-                },
-            }
-            for name, word in words.items()
+    def word(one: Word) -> WordTold:
+        parameters = {**one.parameters, **WHEN}
+        return {
+            "effect": one.does,
+            "parameters": {name: parameter(name, parameters[name]) for name in parameters},
         }
-        for device, words in panel.words.items()
-    }
+
+    return {device: {name: word(one) for name, one in words.items()} for device, words in panel.words.items()}
 
 
-def _faults_told(panel: FaultPanel) -> FaultsSet:
-    return {"faults": [_fault_told(fault) for fault in panel.active()]}
+def _faults(panel: FaultPanel) -> FaultsSet:
+    return {"faults": [_fault(one) for one in panel.active()]}
 
 
-def _fault_told(fault: SetFault) -> FaultSet:
-    """A set fault as JSON; one without an end has ``end_s`` null."""
+def _fault(fault: SetFault) -> FaultSet:
+    """A set fault; one without an end has ``end_s`` null."""
     finite = {name: value for name, value in fault.parameters.items() if math.isfinite(value)}
-    return {
-        "device": fault.device,
-        "word": fault.word,
-        "parameters": finite,
-        "begin_s": fault.begin_s,
-        "end_s": as_json(fault.end_s),
-    }
+    return cast(FaultSet, as_json(fault) | {"parameters": finite})

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 from fastapi import FastAPI, Request, Response
 
 from mastctl.answers import CalibrationHealthTold, LiveTold, ReadyTold, SentinelTold
@@ -15,13 +13,19 @@ from mastctl.watch.metrics import CONTENT_TYPE
 from mastctl.watch.reference import SENTINEL_FOLDER
 from mastctl.watch.sentinel import findings
 from mastctl.web.commands import caller_of
+from mastctl.web.described import file_of
 from mastctl.web.parts import Here
 
 
 def add_watching(app: FastAPI) -> None:
     """Metrics, health, that of the calibration, and the drift sentinel's findings."""
 
-    @app.get("/metrics", summary="Figures in the text format of Prometheus", response_class=Response)
+    @app.get(
+        "/metrics",
+        summary="Figures in the text format of Prometheus",
+        response_class=Response,
+        responses=file_of("text/plain"),
+    )
     async def metrics(here: Here) -> Response:
         text = await here.waiting.run(here.service.metrics.text)  # it reads /proc
         return Response(text, media_type=CONTENT_TYPE)
@@ -50,11 +54,17 @@ def add_watching(app: FastAPI) -> None:
     )
     async def calibration(here: Here) -> CalibrationHealthTold:
         service = here.service
-        told = {**service.health.summary(), **service.mast_verdict(), "sentinel": service.sentinel.summary()}
-        return cast(CalibrationHealthTold, told)
+        health = service.health
+        return {
+            **health.verdict,
+            **service.mast_verdict(),
+            "write_error": health.write_error,
+            "newest": health.newest(),
+            "sentinel": service.sentinel.summary(),
+        }
 
     @app.get(f"{PREFIX}/sentinel", summary="The findings of the drift sentinel, and the age of its last look")
     async def sentinel(here: Here) -> SentinelTold:
         service = here.service
         folder = service.folder.path / SENTINEL_FOLDER
-        return cast(SentinelTold, await here.waiting.run(lambda: findings(folder, service.stored.digest)))
+        return await here.waiting.run(lambda: findings(folder, service.stored.digest))
