@@ -84,7 +84,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 FIRST = (
     "test_on_a_real_driver", "test_closed_loop", "test_bench_suite", "test_packaging", "test_camera_sync",
-    "test_campaign_tasks", "test_guided_bench", "test_page_bench", "test_soak",
+    "test_campaign_tasks", "test_bench_worker", "test_page_bench", "test_soak",
 )  # fmt: skip
 
 

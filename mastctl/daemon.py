@@ -31,7 +31,6 @@ from drivers.hardware import Hardware
 from mastctl import signals
 from mastctl.config import Config, Listen
 from mastctl.errors import MastctlError, Unable
-from mastctl.guided.guide import WayIn
 from mastctl.http.access import Access
 from mastctl.http.entrance import EntryRules, HostNames
 from mastctl.http.tokens import TokenList
@@ -368,12 +367,12 @@ def _entry_rules(service: Service, url: str) -> EntryRules:
     """Return the rules for clients, by the address that the daemon listens at. Raises BadFile."""
     listen = service.config.listen
     names = HostNames(frozenset(listen.hosts), any_address=listen.needs_token)
-    service.guide.door = WayIn(url)
+    service.bench.serve(url)
     if not listen.needs_token:
         return EntryRules(names, None, "loopback" if listen.socket is None else "unix")
     tokens = TokenList(service.folder.path)
     access = Access(tokens)
-    service.guide.door = WayIn(url, access.lend)
+    service.bench.serve(url, access.lend)
     service.leases.stands = access.stands
     log.warning("%s requires a token, except for a stop; the tokens are in %s", url, tokens.folder)
     if listen.socket is None:

@@ -28,12 +28,11 @@ from hil_tests.calib.survey import test_survey
 from hil_tests.calib.survey.survey_case import FILES as FILES_OF_A_SURVEY
 from hil_tests.calib.targets import test_board_file
 from hil_tests.mastctl import test_config
-from mastctl.bench.simulated import PlacementsRecord
 from mastctl.cli.main import main
 from mastctl.config import ConfigRecord
 from mastctl.packaged import config_folder, schema_files
 
-FILES = ("board", "camera", "config", "faults", "mast", "placements", "survey")
+FILES = ("board", "camera", "config", "faults", "mast", "survey")
 OF_OTHERS = ("monitoring", "ros2")
 """Folders with files of other programs."""
 CONFIGS = sorted(
@@ -85,7 +84,6 @@ OF_RECORDS: dict[str, tuple[type[BaseModel], str]] = {
     "camera": (CameraFileRecord, "A camera file"),
     "board": (BoardFileRecord, "A board"),
     "survey": (SurveyRecord, "A survey's survey.yaml, of a station or of a bench"),
-    "placements": (PlacementsRecord, "Where the board of a simulated bench stands in turn"),
     "config": (ConfigRecord, "A daemon's configuration, with the options of our own drivers"),
 }
 """Schemas that are those of the records by which their files are read."""

@@ -1,4 +1,4 @@
-"""Answers about guided bench calibrations and reports."""
+"""Answers about bench calibrations and reports."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Annotated, Literal
 from annotated_types import Len
 from typing_extensions import TypedDict
 
-from mastctl.answers.words import MOST_CELLS, Angles, BenchState, BenchStep, Count, MaybePixel, Pixel
+from mastctl.answers.words import MOST_CELLS, Angles, BenchState, BenchStep, Count, Json, MaybePixel
 
 Cells = Annotated[list[Count], Len(MOST_CELLS, MOST_CELLS)]
 Pair = Annotated[list[float], Len(2, 2)]
 
 
-class PlacementAsked(TypedDict):
-    """Where a board is asked for, from the head's axes; ``needs_confirmation``: by an operator.
+class RequestedPlacement(TypedDict):
+    """Where a board is to be placed, from the head's axes; ``needs_confirmation``: by an operator.
 
     ``bearing_deg`` to the right of pan zero, ``height_deg`` above the axes, ``turned_deg``: its face, to the
     head's right and upwards.
@@ -29,59 +29,64 @@ class PlacementAsked(TypedDict):
     needs_confirmation: bool
 
 
-class CoverageTold(TypedDict):
-    """How many corners were seen in each cell of a camera's picture, 8 in a row, 6 rows."""
+class Coverage(TypedDict):
+    """How many corners were seen in each cell of a camera's image, 8 in a row, 6 rows."""
 
     size_px: Annotated[list[Count], Len(2, 2)]
     cells: Cells
 
 
-class ReasonTold(TypedDict):
+class VerdictReason(TypedDict):
     """One reason of a verdict."""
 
     grade: str
     sentence: str
 
 
-class VerdictTold(TypedDict):
+class VerdictAnswer(TypedDict):
     """Whether to trust a calibration: ``good``, ``care``, ``bad``, and why."""
 
     grade: str
     words: str
-    reasons: list[ReasonTold]
+    reasons: list[VerdictReason]
 
 
-class ResidualTold(TypedDict):
-    """Rms of a camera's corners: fitted, not fitted, and what was promised of those that were not."""
+class BenchCheck(TypedDict):
+    """Rms of corners that were not fitted, as promised, by camera; corners that were pointed at, measured and
+    promised."""
 
-    camera: str
-    rms_px: Pixel | None
-    check_rms_px: MaybePixel | None
-    promised_px: float | None
+    promised_px: dict[str, float]
+    pointings: list[Json]
+    pointing_rms_px: MaybePixel | None
+    pointing_promised_px: float | None
 
 
 class BenchResult(TypedDict):
-    """The result of a bench calibration.
+    """The result of a bench calibration, as ``mastctl calibrate bench --json`` has it.
 
-    ``pointing_...``: corners that were pointed at, measured and promised; ``calibrated_px``, ``counts_px``:
-    what the calibration, and the encoders' counts alone, leave of a first pointing, rms an axis.
+    ``rms_px``, ``check_rms_px``: of each camera's corners, fitted and not fitted; ``calibrated_px``,
+    ``counts_px``: what the calibration, and the encoders' counts alone, leave of a first pointing, rms an
+    axis.
     """
 
-    verdict: VerdictTold
-    cameras: list[ResidualTold]
-    pointing_rms_px: Pixel | None
-    pointing_promised_px: float | None
-    pointings: Count
+    verdict: VerdictAnswer
+    rms_px: dict[str, MaybePixel | None]
+    check_rms_px: dict[str, MaybePixel | None]
+    check: BenchCheck
     calibrated_px: float | None
     counts_px: float | None
     pictures: Count
     placements: Count
-    rover_s: float | None
-    notes: list[str]
+    rover_seconds: float | None
 
 
-class BenchRunTold(TypedDict):
-    """A bench calibration as far as it is known; ``asking`` waits for a placement."""
+class BenchRecord(TypedDict):
+    """A bench calibration as far as it is known; ``asking`` waits for a placement.
+
+    ``pictures``, ``most``: of the camera with most, and at most; ``predicted_px``, ``target_px``,
+    ``counts_px``: what the calibration leaves of a first pointing, may leave, and what counts alone leave;
+    ``expected_px``: what it leaves after a picture at ``next_rad``; ``curve``: pictures and ``predicted_px``.
+    """
 
     name: str
     begun: str
@@ -90,11 +95,11 @@ class BenchRunTold(TypedDict):
     step: BenchStep
     code: str | None
     sentence: str
-    simulated: bool | None
+    simulated: bool
     by_hand: bool
     wanted_px: float
     board_m: Pair | None
-    asked: PlacementAsked | None
+    asked: RequestedPlacement | None
     placements: Count
     pictures: Count
     most: Count
@@ -103,16 +108,15 @@ class BenchRunTold(TypedDict):
     counts_px: float | None
     expected_px: float | None
     next_rad: Angles | None
-    cameras: dict[str, CoverageTold]
+    cameras: dict[str, Coverage]
     curve: list[Pair]
     sentences: list[str]
-    unread_lines: Count
     result: BenchResult | None
     mast_file: str | None
     report: str | None
 
 
-class BenchListed(TypedDict):
+class BenchSummary(TypedDict):
     """A bench calibration whose folder is there; ``size_mb``: of its pictures."""
 
     name: str
@@ -128,24 +132,24 @@ class BenchListed(TypedDict):
     report: str | None
 
 
-class BenchTold(TypedDict):
+class BenchRuns(TypedDict):
     """The bench calibration at work or the last one, those whose folders are there, and packaged boards."""
 
-    run: BenchRunTold | None
-    runs: list[BenchListed]
+    run: BenchRecord | None
+    runs: list[BenchSummary]
     boards: list[str]
     folder: str
     masts_folder: str
     simulated: bool
 
 
-class BenchBegun(TypedDict):
+class BenchAnswer(TypedDict):
     """A bench calibration that has begun or goes on, is answered, or has ended."""
 
-    run: BenchRunTold
+    run: BenchRecord
 
 
-class ReportListed(TypedDict):
+class ReportSummary(TypedDict):
     """A report that can be read."""
 
     name: str
@@ -153,8 +157,8 @@ class ReportListed(TypedDict):
     written: str
 
 
-class ReportsTold(TypedDict):
+class ReportList(TypedDict):
     """The reports, the newest first, and the folder where others may be put."""
 
-    reports: list[ReportListed]
+    reports: list[ReportSummary]
     folder: str

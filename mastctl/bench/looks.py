@@ -14,11 +14,10 @@ import numpy as np
 from calib.plan.knowledge import BenchShot
 from calib.plan.placements import Placement
 from calib.plan.poses import AttitudeChoice, next_shot
-from mastctl.bench.events import BenchProgress
 from mastctl.bench.eyes import BenchEyes, BenchLook, NotThere
 from mastctl.bench.known import BenchKnowledge
+from mastctl.bench.reporter import BenchProgress, Reporter
 from mastctl.bench.search import BoardSearch
-from mastctl.bench.teller import Teller
 from mastctl.errors import MastctlError
 
 FEWEST_LOOKS = 8
@@ -108,14 +107,14 @@ class Looks:
         The head and its cameras.
     known
         What is known, and learns by every look.
-    teller
-        Is told how it goes.
+    reporter
+        Shows how it goes.
     wanted
         What to reach.
     """
 
-    def __init__(self, eyes: BenchEyes, known: BenchKnowledge, teller: Teller, wanted: BenchGoal) -> None:
-        self._eyes, self._known, self._teller, self._wanted = eyes, known, teller, wanted
+    def __init__(self, eyes: BenchEyes, known: BenchKnowledge, reporter: Reporter, wanted: BenchGoal) -> None:
+        self._eyes, self._known, self._reporter, self._wanted = eyes, known, reporter, wanted
         self.here = ""
         """The placement that was worked at, and whose board so stands there."""
 
@@ -127,8 +126,8 @@ class Looks:
         BoardNotFound
             With what the pictures showed instead.
         """
-        self._teller.step("search")
-        search = BoardSearch(self._eyes, self._known.now, self._known.sought, self._teller)
+        self._reporter.step("search")
+        search = BoardSearch(self._eyes, self._known.now, self._known.sought, self._reporter)
         self._known.take(name, search.find(placement))
 
     def work_at(self, name: str, most: int) -> None:
@@ -140,7 +139,7 @@ class Looks:
             If it is not there any more.
         """
         known, self.here = self._known, name
-        self._teller.step("pictures")
+        self._reporter.step("pictures")
         in_vain: list[tuple[float, float]] = []
         missed = 0
         while True:
@@ -161,7 +160,7 @@ class Looks:
             if look is None:
                 continue
             missed += 1
-            self._teller.say(f"the board is not seen here: {_whys(look)}")
+            self._reporter.say(f"the board is not seen here: {_whys(look)}")
             if missed >= UNSEEN_IN_A_ROW:
                 raise BoardLost(
                     f"the board of placement {name} was not seen in {missed} looks in a row where it stood "
@@ -179,7 +178,7 @@ class Looks:
         try:
             return self._look(shot, self._known.cameras_for(shot, check))
         except NotThere as reason:
-            self._teller.say(f"not looked there: {reason}")
+            self._reporter.say(f"not looked there: {reason}")
             return None
 
     def stands_still(self, name: str) -> bool:
@@ -215,7 +214,7 @@ class Looks:
         now = self._again(then)
         apart_px = corners_apart_px(then, now)
         if apart_px is not None and apart_px > self._allowed_px():
-            self._teller.say(
+            self._reporter.say(
                 f"placement {name}: its first picture taken again shows the board {apart_px:.1f} px aside: "
                 "the board or the head moved meanwhile; the fit will show which, and when"
             )
@@ -231,7 +230,7 @@ class Looks:
 
     def _tell(self, name: str, choice: AttitudeChoice) -> None:
         known = self._known
-        self._teller.progress(
+        self._reporter.progress(
             BenchProgress(
                 name,
                 known.pictures(),

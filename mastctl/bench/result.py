@@ -18,12 +18,11 @@ from calib.geometry.rig import Rig
 from calib.plan.knowledge import Knowledge, Workspace, pointing
 from calib.survey.records import Survey
 from mastctl.bench.drawn import cells_seen
-from mastctl.bench.events import px
 from mastctl.bench.frame import RoverFrame, fit_in_frame
 from mastctl.bench.known import first_cameras
 from mastctl.bench.report import BenchPage, write_bench_report
+from mastctl.bench.reporter import Reporter, px
 from mastctl.bench.run import BenchRun, Checked
-from mastctl.bench.teller import Teller
 from mastctl.calibration.bench_verdict import judge_bench, predicted_pointing_px
 from mastctl.calibration.mast_file import as_lists, mast_keys, with_fit
 from mastctl.calibration.run import checked_survey, save_new
@@ -83,8 +82,8 @@ class BenchDone:
         cameras = sorted({image.camera for image in self.calibration.images})
         return {name: float((cells_seen(self.calibration, name)[0] > 0).mean()) for name in cameras}
 
-    def told(self) -> dict[str, Any]:
-        """Return it as JSON."""
+    def as_json(self) -> dict[str, Any]:
+        """Return it as the command prints it."""
         fit = self.calibration
         document: dict[str, Any] = {
             "rms_px": as_lists(fit.rms_px),
@@ -190,7 +189,7 @@ class BenchDone:
         yield from (f"{reason.grade}: {reason.sentence}" for reason in self.verdict.reasons)
 
 
-def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> BenchDone:
+def finish(bench: BenchRun, reporter: Reporter, out: Path, report: Path | None) -> BenchDone:
     """Run a bench to its end, check it, and save what came of it.
 
     Raises
@@ -199,9 +198,9 @@ def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> B
         As `BenchRun.run`; no mast file is written.
     """
     bench.run()
-    teller.step("check")
+    reporter.step("check")
     checked = bench.check()
-    teller.step("fit")
+    reporter.step("fit")
     known = bench.known
     calibration = known.fit().calibration
     assert calibration is not None

@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -23,13 +24,17 @@ from calib.geometry.stereo import triangulate
 from calib.plan.knowledge import BenchShot, Knowledge
 from calib.plan.placements import Advice, Placement, advise, advise_for_body, first_placement
 from calib.plan.poses import Sought, candidates, next_shot
+from calib.survey.records import Sigma
 from calib.targets.boards import AnyBoard
+from mastctl.bench.daemon_eyes import DaemonEyes
 from mastctl.bench.eyes import BenchEyes, BenchLook, NotThere, SeenBoard
-from mastctl.bench.folder import RunFolder
-from mastctl.bench.frame import FitSurvey, FittedBench
+from mastctl.bench.folder import RunFolder, survey_cameras
+from mastctl.bench.frame import FitSurvey, FittedBench, RoverFrame, fit_in_rover, frame_of
 from mastctl.bench.known import BenchKnowledge
 from mastctl.bench.looks import FEWEST_LOOKS, BenchGoal, Looks, deg
-from mastctl.bench.teller import Teller
+from mastctl.bench.reporter import Reporter
+from mastctl.bench.simulated import SimulatedBoard
+from mastctl.client import Client
 from mastctl.errors import MastctlError
 
 POINTINGS = 4
@@ -217,12 +222,14 @@ class BenchRun:
         The survey's folder and the run's journal.
     board_name, board
         What is looked for.
-    teller
-        Who places the board, and is told how it goes.
+    reporter
+        Shows the operator how it goes, and has the board placed.
     fit
         Makes a rig of the survey.
     wanted
         What to reach.
+    simulated
+        The board of a simulated rover.
 
     Attributes
     ----------
@@ -236,13 +243,15 @@ class BenchRun:
         kept: RunFolder,
         board_name: str,
         board: AnyBoard,
-        teller: Teller,
+        reporter: Reporter,
         fit: FitSurvey,
         wanted: BenchGoal,
+        simulated: SimulatedBoard | None = None,
     ) -> None:
-        self.wanted, self._eyes, self._teller, self._kept = wanted, eyes, teller, kept
-        self.known = BenchKnowledge(eyes.head, kept, board_name, board, fit, teller.say)
-        self._looks = Looks(eyes, self.known, teller, wanted)
+        self.wanted, self._eyes, self._reporter, self._kept = wanted, eyes, reporter, kept
+        self._simulated = simulated
+        self.known = BenchKnowledge(eyes.head, kept, board_name, board, fit, reporter.say)
+        self._looks = Looks(eyes, self.known, reporter, wanted)
 
     def run(self) -> FittedBench:
         """Take pictures until they suffice, and return the fit of all of them.
@@ -260,7 +269,9 @@ class BenchRun:
             self._take_up()
             while not self._enough():
                 name, placement = self._next_placement()
-                self._teller.place(name, placement, self._eyes.head)
+                self._reporter.place(name, placement)
+                if self._simulated is not None:
+                    self._simulated.stand(placement)
                 self._kept.note(event="placement", name=name, asked=asdict(placement))
                 self._looks.find(name, placement)
                 self._looks.work_at(name, self._share())
@@ -287,12 +298,12 @@ class BenchRun:
         """
         known, name = self.known, self.known.placements()[-1]
         if self._looks.here != name and not self._looks.stands_still(name):
-            self._teller.say(f"not checked: the board does not stand any more as in placement {name}")
+            self._reporter.say(f"not checked: the board does not stand any more as in placement {name}")
             return Checked({}, ())
         left = self.wanted.checks - sum(1 for _, check, _ in known.looks if check)
         here = [shot for shot in known.shots if shot.placement == name]
         for shot in unvisited(known.now, known.sought, here, name, left):
-            self._teller.say(
+            self._reporter.say(
                 f"a picture that is not fitted, at pan {deg(shot.pan_rad)}, tilt {deg(shot.tilt_rad)}"
             )
             look = self._looks.look_at(shot, check=True)
@@ -311,7 +322,7 @@ class BenchRun:
             known.sought.sigma_px,
         ):
             x, y = told.residual_px
-            self._teller.say(
+            self._reporter.say(
                 f"pointed at corner {told.corner}, {told.turned_deg:.0f} degrees off: residual {x:+.2f}, "
                 f"{y:+.2f} px (promised {told.promised_px:.2f})"
             )
@@ -323,22 +334,26 @@ class BenchRun:
         known = self.known
         if not known.looks:
             return
-        self._teller.say(f"going on with {self._kept.path}: {known.pictures()} pictures a camera are there")
-        self._teller.step("fit")
+        self._reporter.say(f"going on with {self._kept.path}: {known.pictures()} pictures a camera are there")
+        self._reporter.step("fit")
         try:
             known.fit()
         except CalibError as reason:
-            self._teller.say(f"not yet enough for a fit: {reason}")
+            self._reporter.say(f"not yet enough for a fit: {reason}")
             known.believe_boards()
         name = known.placements()[-1]
-        self._teller.stands(name, self._kept.asked(name), self._eyes.head)
+        placement = self._kept.asked(name)
+        if self._simulated is not None and placement is not None and not self._simulated.is_there:
+            self._simulated.stand(placement)
         if self._kept.is_over(name):
             return
         if self._looks.stands_still(name):
-            self._teller.say(f"the board stands as it stood in placement {name}")
+            self._reporter.say(f"the board stands as it stood in placement {name}")
             self._looks.work_at(name, self._share())
         else:
-            self._teller.say(f"the board does not stand any more as in placement {name}: that one is closed")
+            self._reporter.say(
+                f"the board does not stand any more as in placement {name}: that one is closed"
+            )
             self._kept.note(event="closed", name=name)
 
     def _enough(self) -> bool:
@@ -352,7 +367,7 @@ class BenchRun:
         except SomethingChanged:
             raise  # no other placement mends it
         except CalibError as reason:
-            self._teller.say(f"no fit yet: {reason}")
+            self._reporter.say(f"no fit yet: {reason}")
         if len(over) < self.wanted.placements[0] or self._body_advice() is not None:
             return False
         return self.known.predicted_px() <= self.wanted.at_least_px(self.known.counts_px)
@@ -379,3 +394,38 @@ class BenchRun:
         if advice is None:
             raise MastctlError("no place for the board can be seen within the head's limits")
         return name, advice.placement
+
+
+def open_run(
+    client: Client,
+    board: AnyBoard,
+    folder: Path,
+    reporter: Reporter,
+    wanted: BenchGoal,
+    cameras: Sequence[str] = (),
+    frame: RoverFrame | None = None,
+) -> BenchRun:
+    """Return a run on a daemon's head, which ``client`` may steer, with a new or former survey ``folder``.
+
+    Raises
+    ------
+    BadFile
+        If the folder holds something else, or another run keeps its looks there.
+    ClientError
+        If the daemon refuses a question.
+    """
+    status = client.status()
+    eyes = DaemonEyes(client, cameras or list(status["cameras"]), board)
+    head = eyes.head
+    sizes = {name: camera.model.size_px for name, camera in head.rig.cameras.items()}
+    sigma = Sigma(0.0, 0.0, joint_rad=head.count_rad / 12**0.5, corner_px=0.1)
+    kept = RunFolder(folder, {"board": board}, sigma, survey_cameras(head.rig, sizes), head.rig.stereo)
+    kept.begin(client.mast_file(), frame or RoverFrame())
+    fit = fit_in_rover(frame_of(kept.notes), head.rig, kept.moved)
+    simulated = SimulatedBoard(client, board, head.rig) if status["simulated"] else None
+    run = BenchRun(eyes, kept, "board", board, reporter, fit, wanted, simulated)
+    pointing = run.known.workspace.cameras
+    took_s = eyes.seconds_each() if len(head.rig.cameras) > len(pointing) else {}
+    if set(pointing) <= took_s.keys():
+        reporter.say(wanted.will_take(took_s, pointing, run.choice_s()))
+    return run

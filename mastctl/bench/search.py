@@ -13,7 +13,7 @@ from calib.plan.knowledge import Knowledge
 from calib.plan.placements import Placement
 from calib.plan.poses import Sought, readings
 from mastctl.bench.eyes import BenchEyes, BenchLook, NoLight, NotThere
-from mastctl.bench.teller import Teller
+from mastctl.bench.reporter import Reporter
 from mastctl.errors import MastctlError
 
 OVERLAP = 0.7
@@ -43,8 +43,8 @@ class BoardNotFound(MastctlError):
 class BoardSearch:
     """Looks for the board within the head's limits."""
 
-    def __init__(self, eyes: BenchEyes, known: Knowledge, sought: Sought, teller: Teller) -> None:
-        self._eyes, self._known, self._sought, self._teller = eyes, known, sought, teller
+    def __init__(self, eyes: BenchEyes, known: Knowledge, sought: Sought, reporter: Reporter) -> None:
+        self._eyes, self._known, self._sought, self._reporter = eyes, known, sought, reporter
         self._on_head = {name for name, camera in known.rig.cameras.items() if camera.on == "head"}
 
     def find(self, placement: Placement) -> BenchLook:
@@ -74,7 +74,7 @@ class BoardSearch:
             if instead.looks == 1:
                 most = min(len(attitudes), MOST_LOOKS) - 1
                 words = f"({instead.told}); looking around, {most} looks at most"
-                self._teller.say(f"the board is not where it was asked for {words}")
+                self._reporter.say(f"the board is not where it was asked for {words}")
             if instead.another_board or instead.looks == MOST_LOOKS:
                 everywhere = "" if instead.another_board else " around where it was asked for"
                 break

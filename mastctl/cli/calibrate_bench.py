@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import logging
-import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -17,21 +15,15 @@ from mastctl.cli import output
 from mastctl.cli.output import CommandError, WrongUse, check_file, check_folder
 
 if TYPE_CHECKING:
+    from calib.plan.placements import Placement
+    from mastctl.answers import BenchStep
     from mastctl.bench.frame import RoverFrame
+    from mastctl.bench.reporter import BenchProgress, Reporter
     from mastctl.bench.result import BenchDone
     from mastctl.bench.run import BenchRun
-    from mastctl.bench.teller import Teller
     from mastctl.client import Client
 
-log = logging.getLogger(__name__)
-
 COMMAND = "calibrate bench"
-
-FOLLOWED = "bench calibration"
-"""What a run calls itself that a program follows."""
-
-BESIDE = 5
-"""Niceness of a run that a program follows: the daemon beside it comes first."""
 
 
 def add_commands(subparsers: Any) -> None:
@@ -72,17 +64,8 @@ def add_commands(subparsers: Any) -> None:
         "--cameras", nargs="+", metavar="NAME", help="which cameras (default: all that the daemon has)"
     )
     parser.add_argument(
-        "--placements", type=Path, metavar="FILE",
-        help="of a simulated bench: where the board stands in turn (default: where it is asked for)",
-    )  # fmt: skip
-    parser.add_argument(
         "--by-hand", action="store_true",
-        help="of a simulated bench: ask for each placement as at a real one, before the board goes there",
-    )  # fmt: skip
-    parser.add_argument(
-        "--lines", action="store_true",
-        help="for a program that shows the run: everything as lines of JSON on stdout, 'stands' on stdin as "
-        "its answer; the run ends with stdin. Steers under $MASTCTL_LEASE, which the program renews",
+        help="of a simulated bench: wait for Enter at each placement as at a real one",
     )  # fmt: skip
     where = parser.add_argument_group(
         "where the rover frame is, which pictures cannot show (default: where the mast file in use has it; "
@@ -114,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
     check_file(args.out, "--out")
     check_folder(args.report, "--report")
     if args.folder is not None:
-        for option in ("config", "url", "board", "survey", "cameras", "placements", "by_hand", "lines"):
+        for option in ("config", "url", "board", "survey", "cameras", "by_hand"):
             if getattr(args, option) not in (None, False):
                 name = option.replace("_", "-")
                 raise WrongUse(f"--{name} drives a head; with FOLDER nothing is driven")
@@ -123,11 +106,11 @@ def run(args: argparse.Namespace) -> int:
         raise WrongUse("--model and --compare-models are for fitting a folder again; name a bench's FOLDER")
     if args.board is None:
         raise WrongUse("--board is missing; the BOARD.yaml that 'mastctl board make' wrote is expected")
-    return _drive_in_lines(args) if args.lines else _drive(args)
+    return _drive(args)
 
 
 def survey_folder(out: Path) -> Path:
-    """Return where a run keeps what it sees if nobody says where."""
+    """Return where a run keeps its images by default."""
     return out.with_name(f"{out.stem}.bench")
 
 
@@ -151,21 +134,21 @@ def _again(args: argparse.Namespace) -> int:
     with output.waiting(args.json, f"fitting {len(survey.images)} images"):
         former, moved = former_rig(args.folder), kept_moved(args.folder)
         done = save_bench(survey, args.out, args.report, options, frame, former, moved)
-    told, lines = done.told(), list(done.lines())
+    document, lines = done.as_json(), list(done.lines())
     if args.compare_models:
         from mastctl.calibration import families
 
         survey = survey if args.model is None else survey.as_model(args.model)
         with output.waiting(args.json, "comparing camera models"):
             found = families.compared(survey)
-        told |= {"models": families.families_told(survey, found)}
+        document |= {"models": families.families_told(survey, found)}
         lines += families.families_lines(survey, found)
-    _tell(args, told, done, lines)
+    _show(args, document, done, lines)
     return 0
 
 
 def _frame(args: argparse.Namespace) -> RoverFrame:
-    """What the rover frame hangs on, as far as it was said."""
+    """What the rover frame hangs on, as far as it was stated."""
     import math
 
     from calib.files.mast_file import load_rig
@@ -182,59 +165,43 @@ def _frame(args: argparse.Namespace) -> RoverFrame:
     return RoverFrame(mast_at, args.board_at, args.body_stays)
 
 
-def _drive_in_lines(args: argparse.Namespace) -> int:
-    """Drive for a program: results and refusals are lines of its stream."""
-    from mastctl.bench.teller import Lines
-
-    os.nice(BESIDE)
-    args.lines = Lines(sys.stdout, sys.stdin)
-    try:
-        return _drive(args)
-    except Exception as error:  # whatever it is, the program hears of it
-        known = output.as_command_error(error)
-        args.lines.failed(known.code, output.one_line(str(known)) or known.code)
-        if known.code == "internal":
-            log.exception("the calibration met a defect of the program")
-        return known.exit_code
-
-
 def _drive(args: argparse.Namespace) -> int:
     from calib.calibrate.starts.bench import BenchNotFitted
     from calib.survey.writer import NotWritten
     from calib.targets.board_file import load_board
     from mastctl.bench.eyes import BenchInterrupted
     from mastctl.bench.looks import BoardLost
+    from mastctl.bench.reporter import NoOperator
     from mastctl.bench.result import finish
     from mastctl.bench.search import BoardNotFound
-    from mastctl.bench.teller import NobodyThere
 
     board = load_board(args.board)
     folder = args.survey or survey_folder(args.out)
     kept = f"everything seen is kept in {folder}: the same command goes on"
     while True:
         try:
-            with _bench(args, board, folder) as (bench, teller):
-                done = finish(bench, teller, args.out, args.report)
+            with _bench(args, board, folder) as (bench, reporter):
+                done = finish(bench, reporter, args.out, args.report)
             break
-        except (BenchInterrupted, BoardNotFound, BoardLost, NobodyThere) as reason:
+        except (BenchInterrupted, BoardNotFound, BoardLost, NoOperator) as reason:
             if not _go_on(args, reason, folder):
                 raise CommandError(reason.code, f"{reason}; {kept}") from None
         except (BenchNotFitted, NotWritten) as reason:
-            told = output.as_command_error(reason)
+            error = output.as_command_error(reason)
             if isinstance(reason, BenchNotFitted):
                 kept += " with it, and --survey NEW begins anew"
-            raise CommandError(told.code, f"{reason}; {kept}", told.exit_code, told.detail) from None
+            raise CommandError(error.code, f"{reason}; {kept}", error.exit_code, error.detail) from None
         except KeyboardInterrupt as interrupt:
             number = getattr(interrupt, "number", signal.SIGINT)
-            words = f"interrupted; {kept}" if folder.exists() else "interrupted"
-            raise CommandError("interrupted", words, 128 + number) from None
-    _tell(args, done.told(), done, done.lines())
+            sentence = f"interrupted; {kept}" if folder.exists() else "interrupted"
+            raise CommandError("interrupted", sentence, 128 + number) from None
+    _show(args, done.as_json(), done, done.lines())
     return 0
 
 
 def _go_on(args: argparse.Namespace, reason: Exception, folder: Path) -> bool:
     """Ask the person at the terminal, if there is one, whether to go on now."""
-    if args.json or args.lines or not signals.can_ask():
+    if args.json or not signals.can_ask():
         return False
     output.tell(f"{reason}. Everything seen is kept in {folder}")
     sys.stderr.write("Enter to go on, Ctrl-C to leave it for later. ")
@@ -246,59 +213,70 @@ def _go_on(args: argparse.Namespace, reason: Exception, folder: Path) -> bool:
         return False
 
 
+class Terminal:
+    """Shows a run line by line on stderr, and has an operator place the board; see `Reporter`.
+
+    ``by_hand``: whether the operator does; the board of a simulated bench goes by itself.
+    """
+
+    def __init__(self, by_hand: bool) -> None:
+        self._by_hand = by_hand
+
+    def say(self, sentence: str) -> None:
+        """Write a line."""
+        sys.stderr.write(sentence + "\n")
+        sys.stderr.flush()
+
+    def step(self, step: BenchStep) -> None:
+        """Write nothing: sentences and progress show it."""
+
+    def progress(self, now: BenchProgress) -> None:
+        """Write a line."""
+        self.say(now.sentence())
+
+    def place(self, name: str, placement: Placement) -> None:
+        """Request the placement, and wait for Enter. Raises NoOperator."""
+        from mastctl.bench.reporter import NoOperator
+
+        if not self._by_hand:
+            self.say(f"placement {name}: the board {placement.words()}")
+            return
+        if not signals.may_read_stdin():
+            raise NoOperator("no operator can place the board: the command runs in its terminal's background")
+        self.say(f"\nPlacement {name}: put the board {placement.words()}.")
+        sys.stderr.write("It need not be exact. Enter when it stands still (Ctrl-C: later). ")
+        sys.stderr.flush()
+        if not sys.stdin.readline():
+            raise NoOperator("no operator can place the board: standard input has ended")
+
+
 @contextmanager
-def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple[BenchRun, Teller]]:
+def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple[BenchRun, Reporter]]:
     """A run on a daemon that runs, or on one that is started for it, under a lease."""
-    from calib.survey.records import Sigma
-    from mastctl.bench.daemon_eyes import DaemonEyes
     from mastctl.bench.eyes import BenchInterrupted
-    from mastctl.bench.folder import RunFolder, kept_frame, survey_cameras
-    from mastctl.bench.frame import fit_in_rover
     from mastctl.bench.looks import BenchGoal
-    from mastctl.bench.run import BenchRun
-    from mastctl.bench.simulated import SimulatedPerson
-    from mastctl.bench.teller import Terminal
+    from mastctl.bench.run import open_run
     from mastctl.client import ClientError
 
     with ExitStack() as stack:
         client = stack.enter_context(_daemon(args))
-        granted = os.environ.get("MASTCTL_LEASE") if args.lines else None
         try:
-            if granted:
-                client.use_lease(granted)
-            else:
-                stack.enter_context(client.lease(name="calibrate bench", ends_with_stop=True))
+            stack.enter_context(client.lease(name=COMMAND, ends_with_stop=True))
         except ClientError as error:
             raise BenchInterrupted(f"the head cannot be steered: {error}") from None
-        served = list(client.status()["cameras"])
-        cameras = args.cameras or served
-        for name in cameras:
+        status = client.status()
+        served = list(status["cameras"])
+        for name in args.cameras or ():
             if name not in served:
                 raise WrongUse(f"--cameras names {name}; the daemon has {', '.join(served)}")
-        eyes = DaemonEyes(client, cameras, board)
-        head = eyes.head
-        sizes = {name: camera.model.size_px for name, camera in head.rig.cameras.items()}
-        sigma = Sigma(0.0, 0.0, joint_rad=head.count_rad / 12**0.5, corner_px=0.1)
-        kept = RunFolder(folder, {"board": board}, sigma, survey_cameras(head.rig, sizes), head.rig.stereo)
-        simulated = client.status()["simulated"]
-        teller: Teller = args.lines or Terminal(max(board.size_m))
-        if args.lines:
-            args.lines.begun(head, board.size_m, str(folder), simulated, args.by_hand or not simulated)
-        if simulated:
-            asks = args.by_hand or bool(args.lines)
-            teller = SimulatedPerson(client, board, head.rig, teller, args.placements, asks)
-        elif args.placements is not None or args.by_hand:
-            option = "--by-hand" if args.placements is None else "--placements"
-            raise WrongUse(f"{option} is of a simulated bench, and this one is real")
+        if args.by_hand and not status["simulated"]:
+            raise WrongUse("--by-hand is of a simulated bench, and this one is real")
+        reporter = Terminal(args.by_hand or not status["simulated"])
         wanted = BenchGoal(args.wanted_px, args.pictures)
-        kept.begin(client.mast_file(), _frame(args))
-        fit = fit_in_rover(kept_frame(folder), head.rig, kept.moved)
-        bench = BenchRun(eyes, kept, "board", board, teller, fit, wanted)
-        pointing = bench.known.workspace.cameras
-        took_s = eyes.seconds_each() if len(cameras) > len(pointing) else {}
-        if set(pointing) <= took_s.keys():
-            teller.say(wanted.will_take(took_s, pointing, bench.choice_s()))
-        yield bench, teller
+        yield (
+            open_run(client, board, folder, reporter, wanted, args.cameras or served, _frame(args)),
+            reporter,
+        )
 
 
 @contextmanager
@@ -313,14 +291,14 @@ def _daemon(args: argparse.Namespace) -> Iterator[Client]:
     from mastctl.packaged import config_folder
 
     if args.url is not None:
-        with Client(args.url, name=FOLLOWED if args.lines else "calibrate bench") as client:
+        with Client(args.url, name=COMMAND) as client:
             client.status()
             yield client
         return
     config = load_config(args.config or str(config_folder() / "bench.yaml"))
     listen = config.listen
     if listen.socket is not None or listen.port:
-        with Client(listen.url, timeout_s=5.0, name="calibrate bench") as client:
+        with Client(listen.url, timeout_s=5.0, name=COMMAND) as client:
             try:
                 running = client.status()
             except ClientError:
@@ -335,19 +313,16 @@ def _daemon(args: argparse.Namespace) -> Iterator[Client]:
                 yield client
                 return
     if config.hardware.simulation and "speed" not in config.hardware.simulation:
-        # A simulated bench waits for nobody.
         simulation = {**config.hardware.simulation, "speed": "max"}
         config = replace(config, hardware=replace(config.hardware, simulation=simulation))
     with output.waiting(args.json, "starting the daemon"):
         daemon = RunningDaemon(replace(config, listen=Listen(port=0)))
-    with daemon, Client(daemon.url, name="calibrate bench") as client:
+    with daemon, Client(daemon.url, name=COMMAND) as client:
         yield client
 
 
-def _tell(args: argparse.Namespace, document: dict[str, Any], done: BenchDone, lines: list[str]) -> None:
-    if args.lines:
-        args.lines.done(document)
-    elif args.json:
+def _show(args: argparse.Namespace, document: dict[str, Any], done: BenchDone, lines: list[str]) -> None:
+    if args.json:
         output.print_json(document)
     else:
         output.print_lines(lines, done.verdict_line(), COLOURS[done.verdict.grade])

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 from mastctl.answers import (
-    BenchBegun,
-    BenchRunTold,
-    BenchTold,
+    BenchAnswer,
+    BenchRecord,
+    BenchRuns,
     CalibrationHealthTold,
     CameraSettingsTold,
     LiveTold,
@@ -19,7 +19,7 @@ from mastctl.answers import (
     RecordingEnded,
     Recordings,
     ReloadTold,
-    ReportsTold,
+    ReportList,
     RigTold,
     SentinelTold,
     SessionTold,
@@ -78,9 +78,9 @@ class KeepingCalls:
         path = f"/cameras/{escaped(camera)}/settings"
         return self.daemon.command(CameraSettingsTold, "PATCH", path, body)
 
-    def bench(self) -> BenchTold:
+    def bench(self) -> BenchRuns:
         """Return the bench calibration at work or the last one (``run``), and those that are kept."""
-        return self.daemon.json(BenchTold, "GET", "/bench")
+        return self.daemon.json(BenchRuns, "GET", "/bench")
 
     def begin_bench(
         self,
@@ -91,7 +91,7 @@ class KeepingCalls:
         wanted_px: float | None = None,
         pictures: int | None = None,
         by_hand: bool | None = None,
-    ) -> BenchRunTold:
+    ) -> BenchRecord:
         """Have the daemon begin a bench calibration, or go on with one, and return it as it is then.
 
         Parameters
@@ -117,26 +117,26 @@ class KeepingCalls:
             pictures=pictures,
             by_hand=by_hand,
         )
-        return self.daemon.command(BenchBegun, "POST", "/bench", body)["run"]
+        return self.daemon.command(BenchAnswer, "POST", "/bench", body)["run"]
 
-    def board_stands(self) -> BenchRunTold:
+    def board_stands(self) -> BenchRecord:
         """Confirm that the board is at the requested placement."""
-        return self.daemon.command(BenchBegun, "POST", "/bench/stands")["run"]
+        return self.daemon.command(BenchAnswer, "POST", "/bench/stands")["run"]
 
-    def leave_bench(self) -> BenchRunTold:
+    def leave_bench(self) -> BenchRecord:
         """End the bench calibration; it can go on later (`begin_bench`, ``resume``)."""
-        return self.daemon.command(BenchBegun, "POST", "/bench/leave")["run"]
+        return self.daemon.command(BenchAnswer, "POST", "/bench/leave")["run"]
 
-    def forget_bench(self, name: str) -> BenchTold:
+    def forget_bench(self, name: str) -> BenchRuns:
         """Remove a bench calibration that is over, with its pictures and report; its mast file stays.
 
         Returns what is left, as `bench`. Refused with ``bench_runs``, ``bench_unknown``, ``unwritable``.
         """
-        return self.daemon.command(BenchTold, "DELETE", f"/bench/runs/{escaped(name)}")
+        return self.daemon.command(BenchRuns, "DELETE", f"/bench/runs/{escaped(name)}")
 
-    def reports(self) -> ReportsTold:
+    def reports(self) -> ReportList:
         """Return the reports that can be read, the newest first."""
-        return self.daemon.json(ReportsTold, "GET", "/reports")
+        return self.daemon.json(ReportList, "GET", "/reports")
 
     def report(self, name: str) -> bytes:
         """Return a report, HTML."""

@@ -19,6 +19,8 @@ from drivers.clock import Clock, SystemClock
 from drivers.hardware import Hardware, clock_for, head_name
 from mastctl.answers import CalibrationTold, Status, TrackTold
 from mastctl.as_json import as_json
+from mastctl.bench.operation import BenchOperation
+from mastctl.bench.reports import Reports
 from mastctl.config import Config
 from mastctl.control.audit import STRANGERS, STRANGERS_FILES, AuditLog
 from mastctl.control.entry import CommandEntry
@@ -33,8 +35,6 @@ from mastctl.devices.devices import Devices
 from mastctl.devices.frames import OPERATIONS, StampedFrame, check_known
 from mastctl.devices.opening import open_rig
 from mastctl.errors import MastctlError
-from mastctl.guided.guide import Guide
-from mastctl.guided.reports import Reports
 from mastctl.motion.jog import Jogs
 from mastctl.motion.pairs import in_picture
 from mastctl.motion.requests import wrong_camera
@@ -126,8 +126,8 @@ class Service:
         The emergency stops that are latched.
     places
         Where the head is sent by a name.
-    guide, reports
-        Bench calibrations that a program beside the daemon carries out, and the reports that are shown.
+    bench, reports
+        Bench calibrations, and the reports that are shown.
     manager
         What started this process, and hears when the configuration is read again; nobody by default.
     reloading
@@ -184,16 +184,14 @@ class Service:
         self.entry = CommandEntry(
             clock, self.leases, answers, self.audit, self.operations, publisher, self.strangers
         )
-        self.guide = Guide(
+        self.bench = BenchOperation(
             self.folder.path,
             lambda: self.masts.in_use.path.parent,
             self.leases,
-            self.stopping,
-            self.operations,
             publisher,
             hardware.kind == "simulated",
         )
-        self.reports = Reports(self.folder.path, self.guide.runs)
+        self.reports = Reports(self.folder.path, self.bench.runs)
         self.sentinel = SentinelFindings(
             self.folder.path / SENTINEL_FOLDER, lambda: self.stored.digest, self.journals
         )
@@ -410,7 +408,7 @@ class Service:
         first_to_last: tuple[Callable[[], object], ...] = (
             self.leases.close,
             self.operations.close,
-            self.guide.close,
+            self.bench.close,
             self.devices.close,
             self.machine.publisher.close,
             self.metrics.close,

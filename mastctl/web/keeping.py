@@ -9,8 +9,8 @@ from fastapi import FastAPI, Path, Request
 from fastapi.responses import FileResponse, Response
 
 from mastctl.answers import (
-    BenchBegun,
-    BenchTold,
+    BenchAnswer,
+    BenchRuns,
     MastsTold,
     PlacesTold,
     RecorderTold,
@@ -18,9 +18,10 @@ from mastctl.answers import (
     RecordingEnded,
     Recordings,
     ReloadTold,
-    ReportsTold,
+    ReportList,
 )
 from mastctl.as_json import readable
+from mastctl.bench.runs import NAME
 from mastctl.control.entry import (
     BENCH,
     BENCH_FORGET,
@@ -35,7 +36,6 @@ from mastctl.control.entry import (
     RECORD_STOP,
     RELOAD,
 )
-from mastctl.guided.runs import NAME
 from mastctl.http import PREFIX
 from mastctl.service.masts import MastInUse, Masts
 from mastctl.service.reload import reload
@@ -161,8 +161,8 @@ def add_bench(app: FastAPI) -> None:
     """A bench calibration begun, answered, ended; reports."""
 
     @app.get(f"{PREFIX}/bench", summary="The bench calibration at work, and those that are kept")
-    async def bench(here: Here) -> BenchTold:
-        return await here.waiting.run(here.service.guide.told)
+    async def bench(here: Here) -> BenchRuns:
+        return await here.waiting.run(here.service.bench.answer)
 
     @command(
         app,
@@ -172,19 +172,19 @@ def add_bench(app: FastAPI) -> None:
         status_code=202,
         recorded=lambda body, **_: _without_file(body),
     )
-    def begin(body: BenchBody, here: Here, asked: Asks) -> BenchBegun:
-        started = here.service.guide.start(body.wanted(), asked.caller.name, asked.last_stop)
-        return {"run": started.told()}
+    def begin(body: BenchBody, here: Here, asked: Asks) -> BenchAnswer:
+        bench = here.service.bench
+        return {"run": bench.start(asked.caller.name, asked.last_stop, **body.model_dump())}
 
     @command(app, "POST /bench/stands", BENCH_STANDS, "Say that the board stands where it was asked for")
-    def stands(here: Here) -> BenchBegun:
-        return {"run": here.service.guide.stands().told()}
+    def stands(here: Here) -> BenchAnswer:
+        return {"run": here.service.bench.stands()}
 
     @command(
         app, "POST /bench/leave", BENCH_LEAVE, "End the bench calibration; it can go on later", beside=True
     )
-    def leave(here: Here, asked: Asks) -> BenchBegun:
-        return {"run": here.service.guide.leave(asked.caller.name).told()}
+    def leave(here: Here, asked: Asks) -> BenchAnswer:
+        return {"run": here.service.bench.leave(asked.caller.name)}
 
     @command(
         app,
@@ -192,14 +192,14 @@ def add_bench(app: FastAPI) -> None:
         BENCH_FORGET,
         "Remove a bench calibration that is over, pictures and report",
     )
-    def forget(name: RunName, here: Here) -> BenchTold:
-        return here.service.guide.forget(name)
+    def forget(name: RunName, here: Here) -> BenchRuns:
+        return here.service.bench.forget(name)
 
     @app.get(f"{PREFIX}/reports", summary="The reports that can be read")
-    async def listed(here: Here) -> ReportsTold:
+    async def listed(here: Here) -> ReportList:
         reports = here.service.reports
         found = await here.waiting.run(reports.all)
-        return {"reports": [one.told() for one in found], "folder": str(reports.folder)}
+        return {"reports": [one.summary() for one in found], "folder": str(reports.folder)}
 
     @app.get(
         f"{PREFIX}/reports/{{name}}",

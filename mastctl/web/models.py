@@ -15,7 +15,6 @@ from mastctl.control.entry import LONGEST_DEADLINE_S
 from mastctl.control.lease import LONGEST_S, SHORTEST_S, USUAL_S
 from mastctl.control.publisher import TOPICS, Topic
 from mastctl.devices.limits import LEAST_CONE_RAD, WIDEST_CONE_RAD, SunDirection, direction_of
-from mastctl.guided.guide import RunRequest
 from mastctl.motion.jog import Beat
 from mastctl.motion.requests import (
     LARGEST_M,
@@ -410,10 +409,6 @@ class BenchBody(_Strict):
         if sum(one is not None for one in (self.board, self.board_file, self.resume)) != 1:
             raise ValueError("board, board_file or resume is expected, and one of them")
         return self
-
-    def wanted(self) -> RunRequest:
-        """Return it as the guide takes it."""
-        return RunRequest(**self.model_dump())
 
 
 class FaultBody(_Strict):

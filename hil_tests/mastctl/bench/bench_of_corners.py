@@ -137,7 +137,7 @@ class CornerBench:
 
 @dataclass
 class SelfPlacing:
-    """A teller who places the board of a `CornerBench` as asked, and keeps what it was told."""
+    """Places the board of a `CornerBench` where it is requested, and keeps what is reported."""
 
     bench: CornerBench
     told: list[str] = field(default_factory=list)
@@ -151,12 +151,9 @@ class SelfPlacing:
 
     def progress(self, now: object) -> None:
         """Keep it."""
-        self.told.append(now.words())  # type: ignore[attr-defined]
+        self.told.append(now.sentence())  # type: ignore[attr-defined]
 
-    def stands(self, name: str, placement: Placement | None, head: BenchHead) -> None:
-        """It stands there still."""
-
-    def place(self, name: str, placement: Placement, head: BenchHead) -> None:
+    def place(self, name: str, placement: Placement) -> None:
         """Put the board there."""
         self.told.append(f"{name}: {placement.words()}")
         self.bench.stand(placement)

@@ -18,8 +18,8 @@ from mastctl.bench.eyes import BenchEyes, BenchHead
 from mastctl.bench.folder import RunFolder, survey_cameras
 from mastctl.bench.frame import RoverFrame, fit_in_rover
 from mastctl.bench.looks import BenchGoal
+from mastctl.bench.reporter import Reporter
 from mastctl.bench.run import BenchRun
-from mastctl.bench.teller import Teller
 
 BOARD = Charuco(10, 7, 0.055, 0.042)
 PAIR = ("navcam_left", "navcam_right")
@@ -70,11 +70,11 @@ def run_of(
     folder: Path,
     wanted: BenchGoal | None = None,
     eyes: BenchEyes | None = None,
-    teller: Teller | None = None,
+    reporter: Reporter | None = None,
 ) -> tuple[BenchRun, SelfPlacing]:
-    """A run, and who places the board for it; ``eyes`` and ``teller`` instead of the bench's own."""
+    """A run, and who places the board for it; ``eyes`` and ``reporter`` instead of the bench's own."""
     person = SelfPlacing(bench)
     kept = kept_in(folder, bench)
     fit = fit_in_rover(RoverFrame(), bench.head.rig, kept.moved)
-    run = BenchRun(eyes or bench, kept, "board", BOARD, teller or person, fit, wanted or BenchGoal())
+    run = BenchRun(eyes or bench, kept, "board", BOARD, reporter or person, fit, wanted or BenchGoal())
     return run, person

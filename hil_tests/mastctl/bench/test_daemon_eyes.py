@@ -17,8 +17,7 @@ from mastctl.bench import daemon_eyes
 from mastctl.bench.daemon_eyes import DaemonEyes
 from mastctl.bench.eyes import BenchInterrupted, NoLight, NotThere
 from mastctl.bench.folder import survey_cameras
-from mastctl.bench.simulated import SimulatedPerson
-from mastctl.bench.teller import Terminal
+from mastctl.bench.simulated import SimulatedBoard
 from mastctl.client import Client
 from mastctl.config import Config, Listen, load_config
 from mastctl.daemon import RunningDaemon
@@ -46,8 +45,7 @@ def eyes(client: Client, monkeypatch: pytest.MonkeyPatch) -> Iterator[DaemonEyes
     monkeypatch.setattr(daemon_eyes, "PATIENCE_S", 0.2)
     monkeypatch.setattr(daemon_eyes, "AGAIN_S", 0.05)
     eyes = DaemonEyes(client, CAMERAS, BOARD)
-    person = SimulatedPerson(client, BOARD, eyes.head.rig, Terminal(0.55), None)
-    person.stand(Placement(1.2, 0.0, 0.0, (15.0, 0.0)))
+    SimulatedBoard(client, BOARD, eyes.head.rig).stand(Placement(1.2, 0.0, 0.0, (15.0, 0.0)))
     yield eyes
     client.clear_faults()
 

@@ -3,51 +3,66 @@
 from __future__ import annotations
 
 import json
-import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from hil_tests.mastctl.guided.guided_world import BEGUN, DONE, HEAD, PLACE, lines
+from hil_tests.mastctl.bench.operation_world import (
+    BEGUN,
+    DONE,
+    PLACE,
+    answered,
+    script,
+)
 from hil_tests.mastctl.service_fakes import HTTP, FakeHardware, ScriptedLoop
 from hil_tests.mastctl.web.network import network_daemon
 from hil_tests.waiting import NET_S, until
+from mastctl.answers import BenchRecord
+from mastctl.bench.runs import BenchJob
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
-from mastctl.guided.guide import WayIn
-from mastctl.guided.runs import GuidedFolder
-from mastctl.guided.told import GuidedRun
 
 Pair = tuple[RunningDaemon, FakeHardware]
-STEERS = """
-from mastctl.client import Client, ClientError
-client = Client(URL, name="bench calibration")
-client.use_lease(os.environ["MASTCTL_LEASE"])
-"""
-"""As the real program does: by what it finds in its environment."""
 
 
-def scripted(daemon: RunningDaemon, script: str) -> None:
-    """Have a daemon's guide run a script of the test."""
-
-    def command(run: GuidedFolder, asked: dict[str, Any], door: WayIn, mast_file: Path) -> list[str]:
-        names = f"URL, MAST, REPORT = {door.url!r}, {str(mast_file)!r}, {str(run.report)!r}\n"
-        return [sys.executable, "-c", HEAD + names + script]
-
-    daemon.service.guide._command = command
+def steers(job: BenchJob) -> Client:
+    """A client as the real worker has it."""
+    client = Client(job.url, name="bench calibration", token=job.token)
+    client.use_lease(job.lease_id)
+    return client
 
 
-def ended(daemon: RunningDaemon) -> GuidedRun:
-    def over() -> GuidedRun | None:
-        run = daemon.service.guide.run
-        return run if run is not None and run.over else None
+def points(job: BenchJob, link: Connection) -> Mapping[str, Any]:
+    client = steers(job)
+    client.wait(client.point(pan_rad=0.2, tilt_rad=0.1))
+    return {}
 
-    until(over, "the run is over")
-    run = daemon.service.guide.run
+
+def never_gives_up(job: BenchJob, link: Connection) -> Mapping[str, Any]:
+    client, k = steers(job), 0
+    while True:
+        k += 1
+        with suppress(ClientError):
+            client.wait(client.point(pan_rad=0.01 * (k % 50), tilt_rad=0.0))
+
+
+def says_its_session(job: BenchJob, link: Connection) -> Mapping[str, Any]:
+    session = steers(job).session()
+    return {"sentences": [json.dumps([session["name"], session["role"], job.token])]}
+
+
+def ended(daemon: RunningDaemon) -> BenchRecord:
+    def over() -> BenchRecord | None:
+        run = daemon.service.bench.run
+        return run if run is not None and run["step"] == "over" else None
+
+    run = until(over, "the run is over")
     assert run is not None
     return run
 
@@ -75,8 +90,7 @@ def test_a_bench_run_takes_the_lease_of_the_client_that_begins_it(
     pair: Pair, ana: Client, bo: Client
 ) -> None:
     daemon, hardware = pair
-    point = STEERS + "client.wait(client.point(pan_rad=0.2, tilt_rad=0.1))\n"
-    scripted(daemon, lines(BEGUN) + point + lines(PLACE) + "answered()\n" + lines(DONE))
+    daemon.service.bench.work = script(BEGUN, points, PLACE, answered, DONE)
     lease = ana.acquire_lease()
     ana.use_lease(lease["lease_id"])
     run = ana.begin_bench("charuco_a3", wanted_px=0.3, pictures=20)
@@ -94,9 +108,9 @@ def test_a_bench_run_takes_the_lease_of_the_client_that_begins_it(
     assert any(call[0] == "move" for call in hardware.head.calls), "the program steered"
     assert bo.board_stands()["name"] == run["name"]
     over = ended(daemon)
-    assert over.state == "done" and over.mast_file is not None
+    assert over["state"] == "done" and over["mast_file"] is not None
     assert bo.control() is None and bo.bench()["runs"][0]["by"] == "Ana"
-    refused("nothing_asked" if not over.over else "bench_idle", bo.board_stands)
+    refused("bench_idle", bo.board_stands)
     refused("bench_idle", bo.leave_bench)
     assert ana.point(pan_rad=0.0, tilt_rad=0.0)
 
@@ -105,7 +119,7 @@ def test_no_bench_run_begins_while_steered_busy_or_latched(
     pair: Pair, ana: Client, bo: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     daemon, _ = pair
-    scripted(daemon, lines(BEGUN))
+    daemon.service.bench.work = script(BEGUN)
     with bo.lease():
         refused("leased", lambda: ana.begin_bench("charuco_a3"))
     resume = threading.Event()
@@ -125,28 +139,13 @@ def test_no_bench_run_begins_while_steered_busy_or_latched(
     ana.reset(name="Ana", reason="away")
 
 
-TIRELESS = (
-    lines(BEGUN)
-    + STEERS
-    + """
-k = 0
-while True:
-    k += 1
-    try:
-        client.wait(client.point(pan_rad=0.01 * (k % 50), tilt_rad=0.0))
-    except ClientError:
-        pass
-"""
-)
-
-
 @pytest.mark.parametrize("how", ["stop", "leave"])
 def test_nothing_moves_after_a_stop_though_the_program_never_gives_up(
     pair: Pair, ana: Client, how: str
 ) -> None:
     """It takes no notice of refusals: between two of its moves the stop finds nothing that it could end."""
     daemon, hardware = pair
-    scripted(daemon, TIRELESS)
+    daemon.service.bench.work = script(BEGUN, never_gives_up)
     for _ in range(2):
         ana.begin_bench("charuco_a3")
         before = len(hardware.head.calls)
@@ -156,7 +155,7 @@ def test_nothing_moves_after_a_stop_though_the_program_never_gives_up(
         else:
             ana.stop()
         run = ended(daemon)
-        assert run.code == ("left" if how == "leave" else "stopped"), run.sentence
+        assert run["code"] == ("left" if how == "leave" else "stopped"), run["sentence"]
         until(lambda: daemon.service.operations.running is None, "nothing runs")
         moves = [call for call in hardware.head.calls if call[0] == "move"]
         newest = ana.operations()[0]["id"]
@@ -167,7 +166,7 @@ def test_nothing_moves_after_a_stop_though_the_program_never_gives_up(
 
 def test_a_board_file_is_judged_and_kept_and_not_written_into_the_record(pair: Pair, ana: Client) -> None:
     daemon, _ = pair
-    scripted(daemon, lines(BEGUN, DONE))
+    daemon.service.bench.work = script(BEGUN, DONE)
     refused("bad_board", lambda: ana.begin_bench(board_file="kind: [charuco"))
     text = "schema: mastctl/board/1\nkind: charuco\ncolumns: 9\nrows: 6\nsquare_m: 0.03\n"
     text += "marker_m: 0.022\ndictionary: DICT_5X5_100\n# printed on a Tuesday\n"
@@ -183,20 +182,17 @@ def test_a_bench_program_has_a_token_that_ends_with_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     with network_daemon(monkeypatch, tmp_path) as net:
-        script = STEERS + "seen = client.session()\n"
-        script += "known = [seen['name'], seen['role'], os.environ['MASTCTL_TOKEN']]\n"
-        script += "tell(event='said', sentence=json.dumps(known))\n"
-        scripted(net.daemon, lines(BEGUN) + script + lines(PLACE) + "answered()\n")
+        net.daemon.service.bench.work = script(BEGUN, says_its_session, PLACE, answered)
         for path in ("/bench", "/reports"):
             assert net.ask("GET", path).status_code == 401
             assert net.ask("GET", path, "view").status_code == 200
         for path in ("/bench", "/bench/stands", "/bench/leave"):
             assert net.ask("POST", path, "view", json={}).status_code == 403
         assert net.ask("POST", "/bench", "operate", json={"board": "charuco_a4"}).status_code == 202
-        guide = net.daemon.service.guide
-        until(lambda: guide.run and guide.run.state == "asking", "it came in")
-        assert guide.run is not None
-        name, role, token = json.loads(guide.run.sentences[0])
+        bench = net.daemon.service.bench
+        until(lambda: bench.run and bench.run["state"] == "asking", "it came in")
+        assert bench.run is not None
+        name, role, token = json.loads(bench.run["sentences"][0])
         assert (name, role) == ("bench calibration/bench calibration", "operate")
         shown = {"Authorization": f"Bearer {token}"}
         assert net.ask("GET", "/status", headers=shown).status_code == 200

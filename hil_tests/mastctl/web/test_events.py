@@ -18,14 +18,14 @@ from websockets.frames import Frame, Opcode
 from websockets.sync.client import ClientConnection, connect
 
 from hil_tests.described_answers import closed
+from hil_tests.mastctl.bench.operation_world import BEGUN, PLACE
 from hil_tests.mastctl.service_fakes import HTTP, PLAIN, FakeHardware, ScriptedLoop, fake_daemon
 from hil_tests.waiting import NET_S, joined, until
 from mastctl import daemon as daemon_module
+from mastctl.bench.runs import new_record
 from mastctl.control.publisher import TOPICS
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped
-from mastctl.guided.told import GuidedRun
-from mastctl.guided.told import heard as bench_heard
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 UPGRADE = (
@@ -76,7 +76,13 @@ def test_it_begins_with_what_is_known_and_then_tells_each_change(pair: BOTH) -> 
         assert [step["name"] for step in ended["value"]["steps"]] == ["look", "measure"]
 
 
-BENCH_BEGUN = b'{"event": "begun", "board_m": [0.5, 0.3], "cameras": {"a": [64, 48]}, "simulated": true}'
+REQUEST = {
+    "begun": "2026-11-22T12:00:00+00:00",
+    "by": "Ana",
+    "by_hand": True,
+    "wanted_px": 0.2,
+    "pictures": 60,
+}
 
 
 def test_each_topic_is_told_by_the_model_that_openapi_describes(pair: BOTH) -> None:
@@ -91,8 +97,7 @@ def test_each_topic_is_told_by_the_model_that_openapi_describes(pair: BOTH) -> N
         http.get("/api/v1/snapshot/navcam_left")
     publisher = daemon.service.machine.publisher
     publisher.publish("fault", "a device", ())
-    run = bench_heard(GuidedRun("20261122-120000", "2026-11-22T12:00:00+00:00", "Ana"), BENCH_BEGUN)
-    publisher.publish("bench", "run", run)
+    publisher.publish("bench", "run", {**new_record("20261122-120000", REQUEST, True), **BEGUN, **PLACE})
     seen: set[str] = set()
     with socket_of(daemon.url) as line:
         for _ in range(200):

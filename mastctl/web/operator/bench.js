@@ -7,6 +7,7 @@ import { asSeen, coverage, curve, fromAbove } from "./bench_drawn.js";
 const STEPS = [["place", "Place the board"], ["search", "Look for it"], ["pictures", "Take pictures"], ["check", "Check"], ["fit", "Fit"], ["over", "Verdict"]];
 const GRADES = { good: "good", care: "warn", bad: "bad" };
 const px = (value) => (value === null || value === undefined ? "–" : `${number(value, value < 10 ? 2 : 0)} px`);
+const short = (value) => (value === null || value === undefined ? "–" : number(value, 3));
 const two = (pair) => (pair ? pair.map((one) => number(one, 3)).join(", ") : "–");
 const paper = (name) => (name.startsWith("charuco_") ? `ChArUco, ${name.slice(8).toUpperCase()} paper, as drawn` : name.replaceAll("_", " "));
 const clock = (iso) => iso.slice(0, 16).replace("T", " ");
@@ -196,17 +197,18 @@ export class Bench {
     if (run.state === "interrupted") return put(this.verdict, h("p", {}, h("strong", { class: "warn" }, "Interrupted. "), `${sentence(run.sentence)}.`));
     if (!run.result) return put(this.verdict);
     const { result } = run;
+    const { check } = result;
     const cell = (value) => h("td", { class: "n" }, value);
     const head = (...names) => h("tr", {}, names.map((name) => h("th", { scope: "col" }, name)));
     const using = this.inUse === run.mast_file;
     return put(this.verdict,
       h("p", { class: `bench-grade ${GRADES[result.verdict.grade] ?? ""}` }, sentence(result.verdict.words)),
-      h("ul", {}, result.verdict.reasons.map((one) => h("li", {}, sentence(one.sentence)))),
+      h("ul", {}, result.verdict.reasons.map((reason) => h("li", {}, sentence(reason.sentence)))),
       h("table", { class: "figures residual-table" },
         head("rms x, y, px", "fitted", "not fitted", "promised"),
-        result.cameras.map((one) => h("tr", {}, h("th", { scope: "row" }, called(one.camera)), cell(two(one.rms_px)), cell(two(one.check_rms_px)), cell(one.promised_px === null ? "–" : number(one.promised_px, 3)))),
-        h("tr", {}, h("th", { scope: "row" }, `pointing at ${result.pointings} corners`), cell(""), cell(two(result.pointing_rms_px)), cell(result.pointing_promised_px === null ? "–" : number(result.pointing_promised_px, 3)))),
-      h("p", { class: "quiet" }, `A first pointing is left ${px(result.calibrated_px)} by the calibration, ${px(result.counts_px)} by the encoders' counts alone. ${result.placements} placements, ${result.pictures} pictures a camera, ${result.rover_s === null ? "" : `${forTime(result.rover_s)} of the rover's time`}.`),
+        Object.entries(result.rms_px).map(([name, rms]) => h("tr", {}, h("th", { scope: "row" }, called(name)), cell(two(rms)), cell(two(result.check_rms_px[name])), cell(short(check.promised_px[name])))),
+        h("tr", {}, h("th", { scope: "row" }, `pointing at ${check.pointings.length} corners`), cell(""), cell(two(check.pointing_rms_px)), cell(short(check.pointing_promised_px)))),
+      h("p", { class: "quiet" }, `A first pointing is left ${px(result.calibrated_px)} by the calibration, ${px(result.counts_px)} by the encoders' counts alone. ${result.placements} placements, ${result.pictures} pictures a camera, ${result.rover_seconds === null ? "" : `${forTime(result.rover_seconds)} of the rover's time`}.`),
       h("div", { class: "buttons" },
         h("button", { type: "button", class: "go", id: "bench-use", disabled: !this.may || using, onclick: () => this.use(run.mast_file) }, using ? "This mast file is in use" : "Use this mast file"),
         run.report ? this.link(run.report, "Read the report") : null),

@@ -11,10 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.mastctl.guided.guided_world import BEGUN, DONE, PROGRESS, lines
+from hil_tests.mastctl.bench.operation_world import BEGUN, DONE, PROGRESS, answered, script, writes_files
 from hil_tests.mastctl.service_fakes import FakeHardware, fake_daemon
 from hil_tests.mastctl.web.page.conftest import Visit
-from hil_tests.mastctl.web.test_bench_routes import scripted
 from hil_tests.waiting import present
 from mastctl.client import Client
 from mastctl.config import Listen, load_config
@@ -22,13 +21,6 @@ from mastctl.daemon import RunningDaemon
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 Visits = Callable[..., Visit]
-
-ENDS = (
-    "import shutil\nshutil.copy(os.path.join(os.path.dirname(MAST), 'little.yaml'), MAST)\n"
-    "os.mkdir(REPORT)\nopen(os.path.join(REPORT, 'bench.html'), 'w').write("
-    "'<title>Bench</title><h1>Residuals</h1><script>document.title = 1</script>')\n"
-)
-AT_WORK = lines(BEGUN, PROGRESS) + "time.sleep(60)\n"
 
 
 @pytest.fixture
@@ -63,28 +55,29 @@ def shown(one: Visit) -> str:
 
 def test_stop_ends_it_says_so_and_it_goes_on_from_there(pair: BOTH, visit: Visits) -> None:
     daemon, hardware = pair
-    scripted(daemon, AT_WORK)
+    bench = daemon.service.bench
+    bench.work = script(BEGUN, PROGRESS, answered)
     one = visit(daemon.url)
     begin(one)
     one.page.wait_for_selector(".curve")
-    work = daemon.service.guide._work
-    assert work is not None and work.child is not None
+    pid = bench.pid
+    assert pid is not None
     one.page.locator("#bench").press("Escape")
     one.page.wait_for_selector(".bench-verdict:has-text('pressed stop; the head stands still')")
     assert any(call[0] == "stop" for call in hardware.head.calls)
     with pytest.raises(ProcessLookupError):
-        os.kill(work.child.pid, 0)
-    (kept,) = daemon.service.guide.runs.all()
+        os.kill(pid, 0)
+    (kept,) = bench.runs.all()
     next_words = one.page.locator(".bench-next").inner_text()
     assert f"are kept in {kept.path}: 3 pictures a camera" in next_words
     assert "Go on continues" in next_words and "Begin another starts anew" in next_words
     assert not one.page.locator(".bench-place").is_visible(), "no board is asked for"
     assert not one.page.locator(".bench-steps").is_visible(), "no step is ticked that was not taken"
-    scripted(daemon, lines(BEGUN) + ENDS + lines(DONE))
+    bench.work = script(BEGUN, writes_files, DONE)
     one.page.click("#bench button:has-text('Go on')")
     one.page.wait_for_selector(".bench-grade")
     assert not one.page.locator(".bench-next").is_visible()
-    assert len(daemon.service.guide.runs.all()) == 1, "the same run"
+    assert len(bench.runs.all()) == 1, "the same run"
 
 
 @pytest.mark.long(

@@ -1,6 +1,6 @@
 """The reports that a daemon shows: those of its runs, and what lies in ``reports`` of its state folder.
 
-A report is found by its name in the list of what is there; no path is ever made of a name that was asked for.
+A report is found by its name in the list of what is there; no path is ever made of a requested name.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from pathlib import Path
 
 from calib.errors import BadFile
 from calib.files import is_plain_file, read_bytes
-from mastctl.answers import ReportListed
+from mastctl.answers import ReportSummary
+from mastctl.bench.runs import Runs
 from mastctl.errors import NotKnown
-from mastctl.guided.runs import Runs
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 SHOWN = 100
@@ -33,7 +33,7 @@ class Report:
     title: str
     written: str
 
-    def told(self) -> ReportListed:
+    def summary(self) -> ReportSummary:
         """Return it as JSON, without its place."""
         return {"name": self.name, "title": self.title, "written": self.written}
 
@@ -68,7 +68,7 @@ class Reports:
             raise NotKnown("report_unknown", f"report '{name[:60]}': {error.reason}") from None
 
     def _files(self) -> Iterator[tuple[str, Path]]:
-        """Each report's name and file; later ones of a name that was there are passed over by who asks."""
+        """Each report's name and file; later ones of a name that was there are passed over by the caller."""
         for run in self._runs.all():
             yield run.name, run.page
         for path in _entries(self.folder):
@@ -102,5 +102,5 @@ def _report(name: str, path: Path) -> Report | None:
     except OSError:
         return None
     title = _TITLE.search(head)
-    words = html.unescape(title[1].decode(errors="replace")) if title else name
-    return Report(name, path, " ".join(words.split()), written)
+    text = html.unescape(title[1].decode(errors="replace")) if title else name
+    return Report(name, path, " ".join(text.split()), written)

@@ -1,6 +1,6 @@
-"""The folders of runs, below ``bench`` in the daemon's state folder: what was asked, seen, and came of it.
+"""The folders of runs, below ``bench`` in the daemon's state folder: request, pictures and result.
 
-20261122-184501/run.json       who began it, when, what is wanted, which mast file it is to make
+20261122-184501/run.json       the request: its client and time, what is wanted, the mast file to make
                 board.yaml     the board
                 seen/          the survey, and the run's journal
                 report/        bench.html
@@ -11,20 +11,20 @@ from __future__ import annotations
 
 import re
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from calib.errors import BadFile
 from calib.files import read_bytes
 from calib.files.atomic import replace_bytes
 from calib.targets.board_file import parse_board
 from calib.targets.boards import AnyBoard
-from mastctl.answers import BenchListed
+from mastctl.answers import BenchRecord, BenchSummary
 from mastctl.errors import BadRequest, NotKnown, Unable
-from mastctl.guided.told import GuidedRun
 from mastctl.packaged import config_folder
 from mastctl.safety.state_file import StateFile
 
@@ -34,15 +34,45 @@ SHOWN = 50
 MOST_BOARD_BYTES = 100_000
 
 
+HOLDER = "bench calibration"
+"""The name of a worker as a client of its daemon."""
+
+
 @dataclass(frozen=True)
-class GuidedFolder:
+class BenchJob:
+    """What a worker needs: the run as it begins, the daemon with the lease and token to steer it, files."""
+
+    run: BenchRecord
+    url: str
+    lease_id: str
+    token: str | None
+    board: Path
+    survey: Path
+    out: Path
+    report: Path
+
+
+def new_record(name: str, request: Mapping[str, Any], simulated: bool) -> BenchRecord:
+    """Return a run as it begins; ``request`` as in its folder's run.json."""
+    return {
+        "name": name, "begun": request["begun"], "by": request["by"], "state": "running", "step": "begin",
+        "code": None, "sentence": "", "simulated": simulated, "by_hand": request["by_hand"],
+        "wanted_px": request["wanted_px"], "board_m": None, "asked": None, "placements": 0, "pictures": 0,
+        "most": request["pictures"], "predicted_px": None, "target_px": None, "counts_px": None,
+        "expected_px": None, "next_rad": None, "cameras": {}, "curve": [], "sentences": [], "result": None,
+        "mast_file": None, "report": None,
+    }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RunFiles:
     """The folder of one run."""
 
     path: Path
 
     @property
     def name(self) -> str:
-        """Its name, by which it is asked for."""
+        """Its name, by which clients request it."""
         return self.path.name
 
     @property
@@ -65,51 +95,53 @@ class GuidedFolder:
         """The report."""
         return self.report / "bench.html"
 
-    def asked(self) -> dict[str, Any]:
-        """Return what was asked for. Raises BadFile."""
-        told = StateFile(self.path / "run.json", SCHEMA).read()
-        if told is None:
-            raise BadFile(self.path / "run.json", "", "is not there: this is no run's folder")
-        return told
+    def request(self) -> dict[str, Any]:
+        """Return what was requested. Raises BadFile."""
+        request = StateFile(self.path / "run.json", SCHEMA).read()
+        if request is None:
+            raise BadFile(self.path / "run.json", "", "is missing: this is no run's folder")
+        return request
 
     def end(self) -> dict[str, Any] | None:
         """Return how it ended, None if it was cut off. Raises BadFile."""
         return StateFile(self.path / "end.json", END_SCHEMA).read()
 
-    def keep_asked(self, told: Mapping[str, Any]) -> None:
-        """Write down what is asked for. Raises BadFile."""
-        StateFile(self.path / "run.json", SCHEMA).write(told)
+    def save_request(self, request: Mapping[str, Any]) -> None:
+        """Write down what is requested. Raises BadFile."""
+        StateFile(self.path / "run.json", SCHEMA).write(request)
 
-    def keep_end(self, run: GuidedRun) -> None:
+    def save_end(self, run: BenchRecord) -> None:
         """Write down how it ended. Raises BadFile."""
-        told = {
-            "state": run.state,
-            "code": run.code,
-            "sentence": run.sentence,
-            "pictures": run.pictures,
-            "grade": None if run.result is None else run.result["verdict"]["grade"],
+        end = {
+            **{key: run[key] for key in ("state", "code", "sentence", "pictures")},
+            "grade": None if run["result"] is None else run["result"]["verdict"]["grade"],
             "ended": datetime.now(UTC).isoformat(timespec="seconds"),
         }
-        StateFile(self.path / "end.json", END_SCHEMA).write(told)
+        StateFile(self.path / "end.json", END_SCHEMA).write(end)
 
-    def listed(self) -> BenchListed:
-        """Return the run as the list of runs has it. Raises BadFile."""
-        asked, end = self.asked(), self.end() or {}
-        state: Any = str(end.get("state", "interrupted"))
+    def summary(self) -> BenchSummary:
+        """Return the run as the list of runs has it; of a damaged one that it is."""
+        empty = {"begun": "", "by": "", "board": "", "grade": None, "mast_file": None, "report": None}
+        found: dict[str, Any] = {"name": self.name, "pictures": 0, "size_mb": 0.0, **empty}
+        try:
+            request, end = self.request(), self.end() or {}
+        except BadFile as error:
+            return cast(BenchSummary, {**found, "state": "damaged", "sentence": str(error)})
+        state = str(end.get("state", "interrupted"))
         cut = "it was cut off: the daemon or its machine ended meanwhile"
-        return {
-            "name": self.name,
-            "begun": str(asked.get("begun", "")),
-            "by": str(asked.get("by", "")),
-            "board": str(asked.get("board", "")),
+        sizes = _image_sizes(self.seen)
+        cameras = Counter(name.removesuffix(".png").split("-", 2)[-1] for name in sizes)
+        found |= {
+            **{key: str(request.get(key, "")) for key in ("begun", "by", "board")},
             "state": state,
             "sentence": str(end.get("sentence", cut)),
-            "pictures": _pictures(self.seen),
-            "size_mb": _size_mb(self.seen),
+            "pictures": max(cameras.values(), default=0),
+            "size_mb": sum(sizes.values()) / 1e6,
             "grade": end.get("grade"),
-            "mast_file": asked.get("mast_file") if state == "done" else None,
+            "mast_file": request.get("mast_file") if state == "done" else None,
             "report": self.name if self.page.is_file() else None,
         }
+        return cast(BenchSummary, found)
 
 
 class Runs:
@@ -118,7 +150,7 @@ class Runs:
     def __init__(self, state: Path) -> None:
         self.folder = state / "bench"
 
-    def new(self) -> GuidedFolder:
+    def new(self) -> RunFiles:
         """Make a folder for a run that begins now. Raises Unable ``unwritable``."""
         stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
         for name in (stamp, *(f"{stamp}-{k}" for k in range(2, 1000))):
@@ -127,12 +159,12 @@ class Runs:
             except FileExistsError:
                 continue
             except OSError as error:
-                words = f"a run's folder cannot be made in {self.folder}: {error.strerror or error}"
-                raise Unable("unwritable", words) from None
-            return GuidedFolder(self.folder / name)
+                reason = f"a run's folder cannot be made in {self.folder}: {error.strerror or error}"
+                raise Unable("unwritable", reason) from None
+            return RunFiles(self.folder / name)
         raise Unable("unwritable", f"no name is free in {self.folder}")
 
-    def named(self, name: str) -> GuidedFolder:
+    def named(self, name: str) -> RunFiles:
         """Return a run that is there, by its name. Raises NotKnown ``bench_unknown``."""
         for one in self.all():
             if one.name == name:
@@ -150,29 +182,21 @@ class Runs:
             left = going if going.exists() else folder
             raise Unable("unwritable", f"{left} cannot be removed: {error.strerror or error}") from None
 
-    def all(self) -> list[GuidedFolder]:
+    def all(self) -> list[RunFiles]:
         """Return all, the newest first. What is no run's folder, or a link, is passed over."""
         try:
             found = [one for one in self.folder.iterdir() if NAME.fullmatch(one.name)]
         except OSError:
             return []
         return [
-            GuidedFolder(one)
+            RunFiles(one)
             for one in sorted(found, reverse=True)
             if one.is_dir() and not one.is_symlink() and (one / "run.json").is_file()
         ]
 
-    def listed(self) -> Iterator[BenchListed]:
-        """Yield the newest as JSON; of a damaged one that it is."""
-        for one in self.all()[:SHOWN]:
-            try:
-                yield one.listed()
-            except BadFile as error:
-                yield {
-                    "name": one.name, "begun": "", "by": "", "board": "", "state": "damaged",
-                    "sentence": str(error), "pictures": 0, "size_mb": 0.0, "grade": None,
-                    "mast_file": None, "report": None,
-                }  # fmt: skip
+    def summaries(self) -> Iterator[BenchSummary]:
+        """Yield the newest runs as the list of runs has them."""
+        return (one.summary() for one in self.all()[:SHOWN])
 
 
 def known_boards() -> dict[str, Path]:
@@ -194,8 +218,8 @@ def board_bytes(known: str | None, text: str | None) -> tuple[bytes, AnyBoard]:
         else:
             boards = known_boards()
             if known not in boards:
-                words = f"there is no board '{str(known)[:60]}'; there are {', '.join(boards)}"
-                raise BadRequest("bad_board", words)
+                reason = f"there is no board '{str(known)[:60]}'; there are {', '.join(boards)}"
+                raise BadRequest("bad_board", reason)
             place = boards[known]
             data = read_bytes(place, MOST_BOARD_BYTES)
         return data, parse_board(data, place)
@@ -203,30 +227,18 @@ def board_bytes(known: str | None, text: str | None) -> tuple[bytes, AnyBoard]:
         raise BadRequest("bad_board", " ".join(f"{error.place or 'board'}: {error.reason}".split())) from None
 
 
-def keep_board(folder: GuidedFolder, data: bytes) -> None:
+def save_board(folder: RunFiles, data: bytes) -> None:
     """Write a board's file into a run's folder. Raises Unable ``unwritable``."""
     try:
         replace_bytes(folder.board, data, 0o644)
     except OSError as error:
-        words = f"{folder.board} cannot be written: {error.strerror or error}"
-        raise Unable("unwritable", words) from None
+        reason = f"{folder.board} cannot be written: {error.strerror or error}"
+        raise Unable("unwritable", reason) from None
 
 
-def _size_mb(seen: Path) -> float:
-    """How large the pictures are, which are nearly all of a run."""
+def _image_sizes(seen: Path) -> dict[str, int]:
+    """The image files of a survey and their sizes, bytes: nearly all of a run's."""
     try:
-        return sum(one.stat().st_size for one in (seen / "images").iterdir()) / 1e6
+        return {one.name: one.stat().st_size for one in (seen / "images").iterdir()}
     except OSError:
-        return 0.0
-
-
-def _pictures(seen: Path) -> int:
-    """How many pictures the camera with most has, by the names of what lies there."""
-    counts: dict[str, int] = {}
-    try:
-        for one in (seen / "images").iterdir():
-            camera = one.stem.split("-", 2)[-1]
-            counts[camera] = counts.get(camera, 0) + 1
-    except OSError:
-        return 0
-    return max(counts.values(), default=0)
+        return {}

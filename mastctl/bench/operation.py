@@ -1,0 +1,452 @@
+"""One bench calibration at a time, carried out by a worker process under a lease of its own.
+
+The daemon starts the worker, publishes what it sends, passes on that a board stands, renews the lease, and
+ends the worker: when a client requests it, after a stop, or when another client takes over. A stop waits for
+none of this: it is noticed after the head has stopped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import shutil
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from typing import Any, cast
+
+from calib.errors import BadFile
+from drivers.errors import DriverError
+from mastctl.answers import BenchRecord, BenchRuns, BenchState
+from mastctl.bench.runs import (
+    HOLDER,
+    BenchJob,
+    RunFiles,
+    Runs,
+    board_bytes,
+    known_boards,
+    new_record,
+    save_board,
+)
+from mastctl.control.caller import Caller
+from mastctl.control.lease import Lease, LeaseTable, StopCame
+from mastctl.control.publisher import Published, Publisher, ThreadSubscription
+from mastctl.errors import BadRequest, MastctlError, NotNow, Unable
+
+log = logging.getLogger(__name__)
+
+LEASE_S, RENEW_S = 30.0, 8.0
+TICK_S = 0.25
+STOP_KNOWN_S = 2.0
+"""How long to wait for the record of a stop that has ended the lease already."""
+
+ENDS_S = 5.0
+FREE_BYTES = 500_000_000
+"""Sixty pictures of two cameras take a tenth of it."""
+
+GOES_ON = "everything seen is kept, and the run can go on"
+
+
+def carry_out(job: BenchJob, link: Connection) -> None:
+    """Do a job: only the worker's process loads what planning and fitting need."""
+    from mastctl.bench.worker import work
+
+    work(job, link)
+
+
+@dataclass(eq=False)
+class _Work:
+    """A run that is at work, or was."""
+
+    folder: RunFiles
+    lease: Lease
+    revoke_token: Callable[[], None]
+    run: BenchRecord
+    process: SpawnProcess
+    link: Connection
+    over: threading.Event = field(default_factory=threading.Event)
+
+
+class BenchOperation:
+    """The bench calibrations of one daemon; safe to use from any thread.
+
+    Parameters
+    ----------
+    state
+        The daemon's state folder.
+    masts_folder
+        Returns the folder of the daemon's mast files.
+    leases, publisher
+        Where the worker's right to steer comes from; where each change is published (topic ``bench``) and
+        stops are read.
+    simulated
+        Whether the rover is: only there the board may go where it is requested by itself.
+    work
+        What the worker process does.
+    """
+
+    def __init__(
+        self,
+        state: Path,
+        masts_folder: Callable[[], Path],
+        leases: LeaseTable,
+        publisher: Publisher,
+        simulated: bool,
+        work: Callable[[BenchJob, Connection], None] = carry_out,
+    ) -> None:
+        self.runs = Runs(state)
+        self.work = work
+        self._masts_folder, self._leases, self._publisher = masts_folder, leases, publisher
+        self._simulated = simulated
+        self._url = ""
+        self._lend: Callable[[str], tuple[str, Callable[[], None]]] | None = None
+        self._starting = threading.Lock()
+        self._changing = threading.Lock()
+        self._work: _Work | None = None
+        self._closed = False
+
+    def serve(self, url: str, lend: Callable[[str], tuple[str, Callable[[], None]]] | None = None) -> None:
+        """Let runs begin at an address; ``lend`` returns a token and what revokes it, where one is needed."""
+        self._url, self._lend = url, lend
+
+    @property
+    def run(self) -> BenchRecord | None:
+        """The run that is at work, or the last of this daemon; takes no lock."""
+        work = self._work
+        return None if work is None else work.run
+
+    @property
+    def pid(self) -> int | None:
+        """The process of the newest worker."""
+        return None if self._work is None else self._work.process.pid
+
+    def answer(self) -> BenchRuns:
+        """Return the answer of ``GET /bench``; reads the folders."""
+        now, runs = self.run, list(self.runs.summaries())
+        for one in runs:
+            if now is not None and now["step"] != "over" and one["name"] == now["name"]:
+                one["state"], one["sentence"] = "running", ""
+        return {
+            "run": now,
+            "runs": runs,
+            "boards": list(known_boards()),
+            "folder": str(self.runs.folder),
+            "masts_folder": str(self._masts_folder()),
+            "simulated": self._simulated,
+        }
+
+    def start(self, by: str, last_stop: StopCame | None = None, **wanted: Any) -> BenchRecord:
+        """Begin a run, or go on with one, and return it.
+
+        Parameters
+        ----------
+        by
+            The name of the client.
+        last_stop
+            `mastctl.control.lease.LeaseTable.last_stop` at its request: the next stop ends the worker's right
+            to steer, before the worker itself is ended. None: that of now.
+        wanted
+            The fields of `mastctl.web.models.BenchBody`.
+
+        Raises
+        ------
+        NotNow
+            ``bench_runs``; ``bench_done`` if the run that is to go on has its verdict.
+        NotKnown
+            ``bench_unknown``.
+        BadRequest
+            ``bad_board``, ``bad_run``.
+        Unable
+            ``unwritable``, ``disk_low``, ``no_process``, ``closing``.
+        """
+        with self._alone():
+            now = self.run
+            if now is not None and now["step"] != "over":
+                raise NotNow(
+                    "bench_runs", f"{now['by']} has a bench calibration running since {now['begun']}"
+                )
+            if self._closed or not self._url:
+                raise Unable("closing", "a bench calibration begins only while the daemon serves")
+            masts = self._masts_folder()
+            _check_space(masts, self.runs.folder.parent)
+            folder, request = self._request(by, **wanted)
+            return self._begin(folder, request, masts, last_stop or self._leases.last_stop)
+
+    def stands(self) -> BenchRecord:
+        """Pass on that the board stands where it was requested.
+
+        Raises
+        ------
+        NotNow
+            ``bench_idle``; ``nothing_asked`` if no placement is waited for.
+        Unable
+            ``no_process`` if the worker has ended.
+        """
+        work = self._working()
+        if work.run["state"] != "asking":
+            raise NotNow("nothing_asked", "no placement is waited for just now")
+        try:
+            work.link.send(True)
+        except OSError:
+            raise Unable("no_process", "the calibration program has ended") from None
+        return work.run
+
+    def leave(self, by: str) -> BenchRecord:
+        """End the run and its motion; it can go on later. Raises NotNow ``bench_idle``."""
+        work = self._working()
+        self._end(work, "interrupted", "left", f"{by} ended the run; {GOES_ON}")
+        return work.run
+
+    def forget(self, name: str) -> BenchRuns:
+        """Remove a run that is over, with its pictures and report, and return what is left.
+
+        Its mast file stays where it is.
+
+        Raises
+        ------
+        NotNow
+            ``bench_runs`` for the run that is at work, or while one begins.
+        NotKnown
+            ``bench_unknown``.
+        Unable
+            ``unwritable``.
+        """
+        with self._alone():
+            now = self.run
+            if now is not None and now["step"] != "over" and now["name"] == name:
+                raise NotNow("bench_runs", f"run {name} is at work; end it first")
+            self.runs.forget(name)
+        return self.answer()
+
+    def close(self) -> None:
+        """End the worker, if one is at work, and begin no other; never raises."""
+        self._closed = True
+        work = self._work
+        if work is not None:
+            self._end(work, "interrupted", "closing", f"the daemon ended; {GOES_ON}")
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Let nothing else begin or be removed meanwhile. Raises NotNow."""
+        if not self._starting.acquire(blocking=False):
+            raise NotNow("bench_runs", "another bench calibration begins just now")
+        try:
+            yield
+        finally:
+            self._starting.release()
+
+    def _working(self) -> _Work:
+        work = self._work
+        if work is None or work.over.is_set():
+            raise NotNow("bench_idle", "no bench calibration is at work")
+        return work
+
+    def _request(
+        self,
+        by: str,
+        board: str | None = None,
+        board_file: str | None = None,
+        resume: str | None = None,
+        wanted_px: float | None = None,
+        pictures: int | None = None,
+        by_hand: bool | None = None,
+    ) -> tuple[RunFiles, dict[str, Any]]:
+        """Return the run's folder with all that it needs, and what is requested of it."""
+        if resume is not None:
+            folder = self.runs.named(resume)
+            try:
+                before, end = folder.request(), folder.end()
+                before |= {"begun": str(before["begun"]), "mast_file": str(before["mast_file"])}
+            except BadFile as error:
+                raise BadRequest("bad_run", str(error)) from None
+            except KeyError as error:
+                place = folder.path / "run.json"
+                raise BadRequest(
+                    "bad_run", f"{place}: {error.args[0]} is missing; begin another run"
+                ) from None
+            if end is not None and end.get("state") == "done":
+                raise NotNow("bench_done", f"run {folder.name} has its verdict; begin another")
+        else:
+            data, described = board_bytes(board, board_file)
+            folder = self.runs.new()
+            save_board(folder, data)
+            width_mm, height_mm = (1000 * size_m for size_m in described.size_m)
+            before = {
+                "begun": datetime.now(UTC).isoformat(timespec="seconds"),
+                "mast_file": f"bench-{folder.name}.yaml",
+                "board": f"{board or described.kind}, {width_mm:.0f} x {height_mm:.0f} mm",
+            }
+        usual = {"wanted_px": 0.2, "pictures": 60, "by_hand": False}
+        now = {"wanted_px": wanted_px, "pictures": pictures, "by_hand": by_hand}
+        request = {**usual, **before, **{key: one for key, one in now.items() if one is not None}, "by": by}
+        request["by_hand"] = request["by_hand"] or not self._simulated
+        try:
+            folder.save_request(request)
+            (folder.path / "end.json").unlink(missing_ok=True)
+        except (BadFile, OSError) as error:
+            raise Unable("unwritable", str(error)) from None
+        return folder, request
+
+    def _begin(
+        self, folder: RunFiles, request: dict[str, Any], masts: Path, last_stop: StopCame
+    ) -> BenchRecord:
+        inside = Caller(HOLDER, "operate", "inside")
+        lease = self._leases.take(inside, f"{request['by']} began it", HOLDER, LEASE_S, last_stop)
+        token, revoke_token = (None, lambda: None) if self._lend is None else self._lend(HOLDER)
+        run = new_record(folder.name, request, self._simulated)
+        files = folder.board, folder.seen, masts / request["mast_file"], folder.report
+        job = BenchJob(run, self._url, lease.id, token, *files)
+        context = get_context("spawn")  # a fork would copy the daemon's threads half
+        ours, its = context.Pipe()
+        process = context.Process(target=self.work, args=(job, its), name=HOLDER, daemon=True)
+        work = self._work = _Work(folder, lease, revoke_token, run, process, ours)
+        try:
+            process.start()
+            its.close()
+            threading.Thread(target=self._follow, args=(work,), name="bench", daemon=True).start()
+        except (OSError, RuntimeError) as error:
+            sentence = f"the calibration program cannot be started: {error}"
+            self._end(work, "interrupted", "no_process", sentence)
+            raise Unable("no_process", sentence) from None
+        log.info("bench calibration %s begins, requested by %s", folder.name, request["by"])
+        self._publish(work)
+        return run
+
+    def _follow(self, work: _Work) -> None:
+        """Publish what the worker sends, renew its lease, and end the run where it must end."""
+        renew_s = time.monotonic() + RENEW_S
+        with work.link, self._publisher.subscribe("command", known=False) as commands:
+            while not work.over.is_set():
+                if wait([work.link], TICK_S):
+                    try:
+                        run = work.link.recv()
+                    except (EOFError, OSError):
+                        return self._died(work)
+                    if run["step"] == "over":
+                        work.process.join(ENDS_S)  # published afterwards: the next client may steer then
+                        return self._end(work, run["state"], run["code"], run["sentence"], run)
+                    self._change(work, run)
+                stopped = next(filter(None, map(_stop_in, commands.wait(0.0))), None)
+                if stopped is None and self._leases.was_stopped(work.lease):
+                    stopped = _stop_of(commands)
+                if stopped is not None:
+                    return self._end(work, "interrupted", "stopped", f"{stopped}, {GOES_ON}")
+                try:
+                    if time.monotonic() >= renew_s or not self._leases.holds(work.lease.id):
+                        self._leases.renew(work.lease.id, LEASE_S)
+                        renew_s = time.monotonic() + RENEW_S
+                except MastctlError as error:
+                    return self._end(work, "interrupted", "taken", f"{error}; {GOES_ON}")
+        return None
+
+    def _died(self, work: _Work) -> None:
+        """End a run whose worker is over and has not said why."""
+        work.process.join(ENDS_S)
+        code = work.process.exitcode
+        how = f"ended with exit code {code}"
+        if code is not None and code < 0:
+            how = f"was ended by {_signal(-code)}"
+        self._end(work, "interrupted", "program_ended", f"the calibration program {how}; {GOES_ON}")
+
+    def _change(self, work: _Work, run: BenchRecord) -> None:
+        with self._changing:
+            if work.over.is_set():
+                return
+            work.run = run
+        self._publish(work)
+
+    def _end(
+        self,
+        work: _Work,
+        state: BenchState,
+        code: str | None,
+        sentence: str,
+        run: BenchRecord | None = None,
+    ) -> None:
+        """End a run, once: the worker first, then its right to steer with what moves by it.
+
+        ``run`` is the worker's own last record, which has the sentence already.
+        """
+        with self._changing:
+            if work.over.is_set():
+                return
+            work.over.set()
+        with contextlib.suppress(ValueError, AttributeError):  # it has not been started
+            work.process.kill()
+        with contextlib.suppress(MastctlError):  # taken over, or over by time
+            try:
+                self._leases.release(work.lease.id)
+            except DriverError as error:
+                log.error("the head did not confirm the stop as a bench calibration ended: %s", error)
+        work.revoke_token()
+        if work.process.pid is not None:
+            work.process.join(ENDS_S)
+        said = [*work.run["sentences"], sentence] if run is None else run["sentences"]
+        last = {"state": state, "step": "over", "code": code, "sentence": sentence, "sentences": said}
+        if state == "done":
+            last["mast_file"] = f"bench-{work.folder.name}.yaml"
+        if work.folder.page.is_file():
+            last["report"] = work.folder.name
+        run = cast(BenchRecord, {**(run or work.run), **last})
+        try:
+            work.folder.save_end(run)
+        except BadFile as error:
+            log.error("how the bench calibration ended is not kept: %s", error)
+        work.run = run
+        (log.info if state == "done" else log.warning)("bench calibration %s: %s", run["name"], sentence)
+        self._publish(work)
+
+    def _publish(self, work: _Work) -> None:
+        with self._changing:  # so that no older state is published after a newer one
+            self._publisher.publish("bench", "run", work.run)
+
+
+def _stop_in(one: Published) -> str | None:
+    """Return the sentence of a stop, if that is what was published: its client and whether it worked."""
+    if one.value.get("command") not in ("stop", "estop") or "ended" in one.value:
+        return None
+    what = "stop" if one.value["command"] == "stop" else "the emergency stop"
+    stands = "the head stands still" if one.value.get("result") == "ok" else "the head did not confirm it"
+    return f"{one.value.get('who', 'a client')} pressed {what}; {stands}"
+
+
+def _stop_of(commands: ThreadSubscription) -> str:
+    """Return the sentence of the stop that has ended the lease: its record follows the head's answer."""
+    until_s = time.monotonic() + STOP_KNOWN_S
+    while (left_s := until_s - time.monotonic()) > 0.0 and not commands.closed:
+        stopped = next(filter(None, map(_stop_in, commands.wait(left_s))), None)
+        if stopped is not None:
+            return stopped
+    return "a stop was requested"
+
+
+def _check_space(masts: Path, state: Path) -> None:
+    """Pass if the mast file and the pictures can be written. Raises Unable."""
+    try:
+        with tempfile.TemporaryFile(dir=masts):
+            pass
+    except OSError as error:
+        sentence = f"the mast file would go to {masts}, where this daemon cannot write"
+        raise Unable("unwritable", f"{sentence}: {error.strerror or error}") from None
+    try:
+        free = shutil.disk_usage(state).free
+    except OSError as error:
+        raise Unable("unwritable", f"{state}: {error.strerror or error}") from None
+    if free < FREE_BYTES:
+        sentence = f"{free / 1e6:.0f} MB are free in {state} where {FREE_BYTES / 1e6:.0f} are needed"
+        raise Unable("disk_low", sentence)
+
+
+def _signal(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

@@ -1,0 +1,135 @@
+"""The process that carries a bench calibration out beside its daemon, whose head it turns as a client.
+
+Choosing poses and fitting keep a processor busy for minutes. In a process of their own they hold up no stop,
+and the daemon can end them at once.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import signal
+import threading
+from collections.abc import Mapping
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from typing import Any, cast
+
+from calib.plan.placements import Placement
+from calib.targets.board_file import load_board
+from mastctl.answers import MOST_CELLS, BenchRecord, BenchResult, BenchStep
+from mastctl.as_json import as_json
+from mastctl.bench.looks import BenchGoal
+from mastctl.bench.reporter import BenchProgress
+from mastctl.bench.result import finish
+from mastctl.bench.run import open_run
+from mastctl.bench.runs import HOLDER, BenchJob
+from mastctl.client import Client
+from mastctl.errors import error_body, one_line
+
+log = logging.getLogger(__name__)
+
+BESIDE = 5
+"""Niceness: the daemon comes first."""
+
+MOST_SENTENCES, LONGEST_SENTENCE = 40, 400
+MOST_ON_CURVE = 600
+
+
+def work(job: BenchJob, link: Connection) -> None:
+    """Carry a run out. Sends it through ``link`` at each change; receives True when a board stands."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C of the daemon's terminal is the daemon's
+    os.nice(BESIDE)
+    reporter = LinkReporter(job.run, link)
+    try:
+        with Client(job.url, name=HOLDER, token=job.token) as client:
+            client.use_lease(job.lease_id)
+            board = load_board(job.board)
+            goal = BenchGoal(job.run["wanted_px"], job.run["most"])
+            bench = open_run(client, board, job.survey, reporter, goal)
+            sizes = {name: camera.model.size_px for name, camera in bench.known.head.rig.cameras.items()}
+            reporter.change(
+                simulated=bool(client.status()["simulated"]),
+                board_m=list(board.size_m),
+                cameras={
+                    name: {"size_px": list(size), "cells": [0] * MOST_CELLS} for name, size in sizes.items()
+                },
+            )
+            reporter.done(finish(bench, reporter, job.out, job.report).as_json())
+    except Exception as error:
+        body = error_body(error)
+        if body["code"] == "internal":
+            log.exception("the calibration met a defect of the program")
+        reporter.end("interrupted", body["code"], body["message"])
+
+
+class LinkReporter:
+    """Keeps a run up to date and sends it to the daemon at each change; see `Reporter`.
+
+    The process ends with the link: there is nobody left that renews the lease.
+    """
+
+    def __init__(self, run: BenchRecord, link: Connection) -> None:
+        self.run, self._link = run, link
+        self._stands: SimpleQueue[bool] = SimpleQueue()
+        threading.Thread(target=self._receive, name="bench answers", daemon=True).start()
+
+    def change(self, **changed: Any) -> None:
+        """Send the run with some of its fields changed."""
+        self.run = cast(BenchRecord, {**self.run, **changed})
+        self._link.send(self.run)
+
+    def say(self, sentence: str) -> None:
+        """Add a sentence."""
+        said = [*self.run["sentences"], one_line(sentence, LONGEST_SENTENCE)]
+        self.change(sentences=said[-MOST_SENTENCES:])
+
+    def step(self, step: BenchStep) -> None:
+        """Send what is done from now on."""
+        self.change(step=step, state="running")
+
+    def progress(self, now: BenchProgress) -> None:
+        """Send how far the run is."""
+        curve = [one for one in self.run["curve"] if one[0] < now.pictures]
+        if math.isfinite(now.predicted_px):
+            curve.append([float(now.pictures), now.predicted_px])
+        seen = {name: {**self.run["cameras"][name], "cells": list(c)} for name, c in now.cells.items()}
+        fields = as_json(now)
+        del fields["placement"], fields["cells"]
+        cameras = {**self.run["cameras"], **seen}
+        self.change(state="running", step="pictures", curve=curve[-MOST_ON_CURVE:], cameras=cameras, **fields)
+
+    def place(self, name: str, placement: Placement) -> None:
+        """Request a placement, and wait until a client confirms that the board stands."""
+        by_hand = self.run["by_hand"]
+        while by_hand and not self._stands.empty():
+            self._stands.get()  # of a placement before
+        described = {**as_json(placement), "description": placement.words(), "needs_confirmation": by_hand}
+        self.change(
+            asked={"name": name, **described},
+            placements=self.run["placements"] + 1,
+            step="place",
+            state="asking" if by_hand else "running",
+        )
+        if by_hand:
+            self._stands.get()
+        self.change(state="running", step="search")
+
+    def done(self, document: Mapping[str, Any]) -> None:
+        """Send the result; ``document`` is what the command prints with ``--json``."""
+        result = {key: document.get(key) for key in BenchResult.__annotations__}
+        self.change(result=result, pictures=document["pictures"])
+        self.end("done", None, f"verdict: {document['verdict']['words']}")
+
+    def end(self, state: str, code: str | None, sentence: str) -> None:
+        """Send the end."""
+        self.say(sentence)
+        self.change(state=state, step="over", code=code, sentence=self.run["sentences"][-1])
+
+    def _receive(self) -> None:
+        try:
+            while True:
+                self._stands.put(self._link.recv())
+        except (EOFError, OSError):
+            os._exit(1)
