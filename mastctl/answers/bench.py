@@ -80,7 +80,7 @@ class BenchResult(TypedDict):
     rover_seconds: float | None
 
 
-class BenchRecord(TypedDict):
+class BenchRunRecord(TypedDict):
     """A bench calibration as far as it is known; ``asking`` waits for a placement.
 
     ``pictures``, ``most``: of the camera with most, and at most; ``predicted_px``, ``target_px``,
@@ -135,7 +135,7 @@ class BenchSummary(TypedDict):
 class BenchRuns(TypedDict):
     """The bench calibration at work or the last one, those whose folders are there, and packaged boards."""
 
-    run: BenchRecord | None
+    run: BenchRunRecord | None
     runs: list[BenchSummary]
     boards: list[str]
     folder: str
@@ -146,7 +146,7 @@ class BenchRuns(TypedDict):
 class BenchAnswer(TypedDict):
     """A bench calibration that has begun or goes on, is answered, or has ended."""
 
-    run: BenchRecord
+    run: BenchRunRecord
 
 
 class ReportSummary(TypedDict):

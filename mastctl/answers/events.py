@@ -6,7 +6,7 @@ from typing import Literal, NotRequired
 
 from typing_extensions import TypedDict
 
-from mastctl.answers.bench import BenchRecord
+from mastctl.answers.bench import BenchRunRecord
 from mastctl.answers.motion import OperationTold, TrackTold
 from mastctl.answers.status import FaultTold, LeaseTold, MastTold, MeasuredJoints, StandingTold
 from mastctl.answers.words import Count, Json, Role, Seconds
@@ -142,7 +142,7 @@ class BenchEvent(_Event):
     """A bench calibration went on, asks for a placement, or has ended."""
 
     topic: Literal["bench"]
-    value: BenchRecord
+    value: BenchRunRecord
 
 
 Event = (

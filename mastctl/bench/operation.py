@@ -25,7 +25,7 @@ from typing import Any, cast
 
 from calib.errors import BadFile
 from drivers.errors import DriverError
-from mastctl.answers import BenchRecord, BenchRuns, BenchState
+from mastctl.answers import BenchRunRecord, BenchRuns, BenchState
 from mastctl.bench.runs import (
     HOLDER,
     BenchJob,
@@ -69,7 +69,7 @@ class _Work:
     folder: RunFiles
     lease: Lease
     revoke_token: Callable[[], None]
-    run: BenchRecord
+    run: BenchRunRecord
     process: SpawnProcess
     link: Connection
     over: threading.Event = field(default_factory=threading.Event)
@@ -118,7 +118,7 @@ class BenchOperation:
         self._url, self._lend = url, lend
 
     @property
-    def run(self) -> BenchRecord | None:
+    def run(self) -> BenchRunRecord | None:
         """The run that is at work, or the last of this daemon; takes no lock."""
         work = self._work
         return None if work is None else work.run
@@ -143,7 +143,7 @@ class BenchOperation:
             "simulated": self._simulated,
         }
 
-    def start(self, by: str, last_stop: StopCame | None = None, **wanted: Any) -> BenchRecord:
+    def start(self, by: str, last_stop: StopCame | None = None, **wanted: Any) -> BenchRunRecord:
         """Begin a run, or go on with one, and return it.
 
         Parameters
@@ -180,7 +180,7 @@ class BenchOperation:
             folder, request = self._request(by, **wanted)
             return self._begin(folder, request, masts, last_stop or self._leases.last_stop)
 
-    def stands(self) -> BenchRecord:
+    def stands(self) -> BenchRunRecord:
         """Pass on that the board stands where it was requested.
 
         Raises
@@ -199,7 +199,7 @@ class BenchOperation:
             raise Unable("no_process", "the calibration program has ended") from None
         return work.run
 
-    def leave(self, by: str) -> BenchRecord:
+    def leave(self, by: str) -> BenchRunRecord:
         """End the run and its motion; it can go on later. Raises NotNow ``bench_idle``."""
         work = self._working()
         self._end(work, "interrupted", "left", f"{by} ended the run; {GOES_ON}")
@@ -297,7 +297,7 @@ class BenchOperation:
 
     def _begin(
         self, folder: RunFiles, request: dict[str, Any], masts: Path, last_stop: StopCame
-    ) -> BenchRecord:
+    ) -> BenchRunRecord:
         inside = Caller(HOLDER, "operate", "inside")
         lease = self._leases.take(inside, f"{request['by']} began it", HOLDER, LEASE_S, last_stop)
         token, revoke_token = (None, lambda: None) if self._lend is None else self._lend(HOLDER)
@@ -356,7 +356,7 @@ class BenchOperation:
             how = f"was ended by {_signal(-code)}"
         self._end(work, "interrupted", "program_ended", f"the calibration program {how}; {GOES_ON}")
 
-    def _change(self, work: _Work, run: BenchRecord) -> None:
+    def _change(self, work: _Work, run: BenchRunRecord) -> None:
         with self._changing:
             if work.over.is_set():
                 return
@@ -369,7 +369,7 @@ class BenchOperation:
         state: BenchState,
         code: str | None,
         sentence: str,
-        run: BenchRecord | None = None,
+        run: BenchRunRecord | None = None,
     ) -> None:
         """End a run, once: the worker first, then its right to steer with what moves by it.
 
@@ -395,7 +395,7 @@ class BenchOperation:
             last["mast_file"] = f"bench-{work.folder.name}.yaml"
         if work.folder.page.is_file():
             last["report"] = work.folder.name
-        run = cast(BenchRecord, {**(run or work.run), **last})
+        run = cast(BenchRunRecord, {**(run or work.run), **last})
         try:
             work.folder.save_end(run)
         except BadFile as error:

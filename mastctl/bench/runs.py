@@ -23,7 +23,7 @@ from calib.files import read_bytes
 from calib.files.atomic import replace_bytes
 from calib.targets.board_file import parse_board
 from calib.targets.boards import AnyBoard
-from mastctl.answers import BenchRecord, BenchSummary
+from mastctl.answers import BenchRunRecord, BenchSummary
 from mastctl.errors import BadRequest, NotKnown, Unable
 from mastctl.packaged import config_folder
 from mastctl.safety.state_file import StateFile
@@ -42,7 +42,7 @@ HOLDER = "bench calibration"
 class BenchJob:
     """What a worker needs: the run as it begins, the daemon with the lease and token to steer it, files."""
 
-    run: BenchRecord
+    run: BenchRunRecord
     url: str
     lease_id: str
     token: str | None
@@ -52,7 +52,7 @@ class BenchJob:
     report: Path
 
 
-def new_record(name: str, request: Mapping[str, Any], simulated: bool) -> BenchRecord:
+def new_record(name: str, request: Mapping[str, Any], simulated: bool) -> BenchRunRecord:
     """Return a run as it begins; ``request`` as in its folder's run.json."""
     return {
         "name": name, "begun": request["begun"], "by": request["by"], "state": "running", "step": "begin",
@@ -110,7 +110,7 @@ class RunFiles:
         """Write down what is requested. Raises BadFile."""
         StateFile(self.path / "run.json", SCHEMA).write(request)
 
-    def save_end(self, run: BenchRecord) -> None:
+    def save_end(self, run: BenchRunRecord) -> None:
         """Write down how it ended. Raises BadFile."""
         end = {
             **{key: run[key] for key in ("state", "code", "sentence", "pictures")},

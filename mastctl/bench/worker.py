@@ -18,7 +18,7 @@ from typing import Any, cast
 
 from calib.plan.placements import Placement
 from calib.targets.board_file import load_board
-from mastctl.answers import MOST_CELLS, BenchRecord, BenchResult, BenchStep
+from mastctl.answers import MOST_CELLS, BenchResult, BenchRunRecord, BenchStep
 from mastctl.as_json import as_json
 from mastctl.bench.looks import BenchGoal
 from mastctl.bench.reporter import BenchProgress
@@ -70,14 +70,14 @@ class LinkReporter:
     The process ends with the link: there is nobody left that renews the lease.
     """
 
-    def __init__(self, run: BenchRecord, link: Connection) -> None:
+    def __init__(self, run: BenchRunRecord, link: Connection) -> None:
         self.run, self._link = run, link
         self._stands: SimpleQueue[bool] = SimpleQueue()
         threading.Thread(target=self._receive, name="bench answers", daemon=True).start()
 
     def change(self, **changed: Any) -> None:
         """Send the run with some of its fields changed."""
-        self.run = cast(BenchRecord, {**self.run, **changed})
+        self.run = cast(BenchRunRecord, {**self.run, **changed})
         self._link.send(self.run)
 
     def say(self, sentence: str) -> None:

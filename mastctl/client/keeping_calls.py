@@ -6,7 +6,7 @@ from typing import Literal
 
 from mastctl.answers import (
     BenchAnswer,
-    BenchRecord,
+    BenchRunRecord,
     BenchRuns,
     CalibrationHealthTold,
     CameraSettingsTold,
@@ -91,7 +91,7 @@ class KeepingCalls:
         wanted_px: float | None = None,
         pictures: int | None = None,
         by_hand: bool | None = None,
-    ) -> BenchRecord:
+    ) -> BenchRunRecord:
         """Have the daemon begin a bench calibration, or go on with one, and return it as it is then.
 
         Parameters
@@ -119,11 +119,11 @@ class KeepingCalls:
         )
         return self.daemon.command(BenchAnswer, "POST", "/bench", body)["run"]
 
-    def board_stands(self) -> BenchRecord:
+    def board_stands(self) -> BenchRunRecord:
         """Confirm that the board is at the requested placement."""
         return self.daemon.command(BenchAnswer, "POST", "/bench/stands")["run"]
 
-    def leave_bench(self) -> BenchRecord:
+    def leave_bench(self) -> BenchRunRecord:
         """End the bench calibration; it can go on later (`begin_bench`, ``resume``)."""
         return self.daemon.command(BenchAnswer, "POST", "/bench/leave")["run"]
 

@@ -14,7 +14,7 @@ listener that counts may request every value, up to a bound beyond which it lose
     mast        "in_use"            the mast file in use, as `GET /mast` tells it
     command     its number          the record of a command; under NUMBER.end how what it began has ended
     lease       "lease"             who steers
-    bench       "run"               `mastctl.answers.BenchRecord`, the bench calibration as it is known
+    bench       "run"               `mastctl.answers.BenchRunRecord`, the bench calibration as it is known
 """
 
 from __future__ import annotations

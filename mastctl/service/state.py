@@ -87,7 +87,7 @@ def event_value(topic: Topic, value: Any, now_s: float) -> Any:
             return [fault_answer(one, now_s) for one in value]
         case "frame":
             return as_json(value) | {"age_s": max(0.0, now_s - value.mid_exposure_s)}
-        case "operation" | "bench":
+        case "operation":
             return value.told()
         case "command":  # without the key, by which others would get the answer, and a lease with it
             return {name: one for name, one in value.items() if name != "key"}

@@ -15,7 +15,7 @@ from typing import Any
 
 from drivers.clock import SystemClock
 from hil_tests.waiting import NET_S, until
-from mastctl.answers import BenchRecord
+from mastctl.answers import BenchRunRecord
 from mastctl.bench.operation import BenchOperation
 from mastctl.bench.runs import BenchJob
 from mastctl.control.lease import LeaseTable
@@ -130,7 +130,7 @@ class World:
     publisher: Publisher
     stops: FakeStops
     masts: Path
-    published: list[BenchRecord] = field(default_factory=list)
+    published: list[BenchRunRecord] = field(default_factory=list)
     lent: list[str] = field(default_factory=list)
 
     @property
@@ -139,13 +139,13 @@ class World:
         assert lease is not None
         return lease.id
 
-    def begin(self, **wanted: Any) -> BenchRecord:
+    def begin(self, **wanted: Any) -> BenchRunRecord:
         return self.bench.start("Ana", **({"board": "charuco_a4"} | wanted))
 
-    def until(self, state: str) -> BenchRecord:
+    def until(self, state: str) -> BenchRunRecord:
         """The run, once it is in a state."""
 
-        def there() -> BenchRecord | None:
+        def there() -> BenchRunRecord | None:
             run = self.bench.run
             return run if run is not None and run["state"] == state else None
 

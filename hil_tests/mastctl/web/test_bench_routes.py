@@ -23,7 +23,7 @@ from hil_tests.mastctl.bench.operation_world import (
 from hil_tests.mastctl.service_fakes import HTTP, FakeHardware, ScriptedLoop
 from hil_tests.mastctl.web.network import network_daemon
 from hil_tests.waiting import NET_S, until
-from mastctl.answers import BenchRecord
+from mastctl.answers import BenchRunRecord
 from mastctl.bench.runs import BenchJob
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
@@ -57,8 +57,8 @@ def says_its_session(job: BenchJob, link: Connection) -> Mapping[str, Any]:
     return {"sentences": [json.dumps([session["name"], session["role"], job.token])]}
 
 
-def ended(daemon: RunningDaemon) -> BenchRecord:
-    def over() -> BenchRecord | None:
+def ended(daemon: RunningDaemon) -> BenchRunRecord:
+    def over() -> BenchRunRecord | None:
         run = daemon.service.bench.run
         return run if run is not None and run["step"] == "over" else None
 
