@@ -33,6 +33,7 @@ from mastctl.config import Config, Listen
 from mastctl.errors import MastctlError, Unable
 from mastctl.http.access import Access
 from mastctl.http.entrance import EntryRules, HostNames
+from mastctl.http.silent import Listener, SilentConnections
 from mastctl.http.tokens import TokenList
 from mastctl.http.waiting import Streams, Waiting
 from mastctl.logs import stall_while
@@ -262,7 +263,9 @@ async def _serve(
     waiting = Waiting(service.clock)
     streams = Streams(service.machine.publisher)
     feeds = CameraFeeds(service.devices, service.clock)
-    server = uvicorn.Server(_settings(create_app(service, waiting, entrance, streams, feeds)))
+    silent = SilentConnections()
+    app = silent.around(create_app(service, waiting, entrance, streams, feeds))
+    server = uvicorn.Server(_settings(app))
     ending = asyncio.Event()
 
     def end() -> None:
@@ -283,6 +286,8 @@ async def _serve(
         if signal.getsignal(signal.SIGTSTP) is not signal.SIG_IGN:
             loop.add_signal_handler(signal.SIGTSTP, _suspend, service)
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    if isinstance(listener, Listener):
+        listener.silent = silent
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     while not server.started and not serving.done():
         await asyncio.sleep(0.005)
@@ -290,7 +295,7 @@ async def _serve(
         await serving
         raise MastctlError("the web server ended before it answered a request")
     listener.listen(WAITING_IN_KERNEL)  # asyncio has one number for this and for how many it takes at once
-    beside = [asyncio.create_task(_report_state(service, manager))]
+    beside = [asyncio.create_task(_report_state(service, manager)), asyncio.create_task(silent.watch())]
     if entrance.access is not None:
         beside.append(asyncio.create_task(_reread_tokens(entrance.access, waiting, streams)))
     if in_process:
@@ -416,7 +421,7 @@ def _listening(listen: Listen) -> Iterator[tuple[socket.socket, str]]:
 def _tcp_socket(listen: Listen) -> socket.socket:
     family = socket.AF_INET6 if ":" in listen.host else socket.AF_INET
     # The protocol is named because asyncio switches Nagle's delay off only where it stands: 40 ms an answer.
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listener = Listener(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         # Inherited by each connection, which a client that stops reading would otherwise keep for ever.
