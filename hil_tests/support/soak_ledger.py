@@ -29,7 +29,7 @@ OF_A_STOP = {"stopped", "estopped", "stopping", "jog_ended"}
 OF_LOAD = {"too_many"}
 """Refusals that a client is told to come back after."""
 
-OF_THE_DISK = {"latch_not_kept"}
+OF_THE_DISK = {"latch_not_kept", "slow"}
 """Told while a busy disk has not confirmed yet; at rest it must be gone."""
 
 EVERYTHING = frozenset({
