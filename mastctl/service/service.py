@@ -64,9 +64,8 @@ from mastctl.watch.handoffs import HandoffCheck, line_of
 from mastctl.watch.journal import JournalThread
 from mastctl.watch.metrics import Metrics
 from mastctl.watch.reference import SENTINEL_FOLDER
-from mastctl.watch.residuals import CalibrationHealth
+from mastctl.watch.residuals import CalibrationHealth, mast_verdict
 from mastctl.watch.sentinel import SentinelFindings
-from mastctl.watch.verdict import mast_verdict
 
 log = logging.getLogger(__name__)
 

@@ -27,7 +27,7 @@ from calib.files.mast_file import StoredRig
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from mastctl.answers import MeasuredTold, ResidualsTold
+from mastctl.answers import CalibrationTold, MeasuredTold, ResidualsTold, SelfCheck, SentinelTold
 from mastctl.control.records import Operation
 from mastctl.watch.evidence import Evidence, Expected, Judge, Sums, expected, sums_of
 from mastctl.watch.journal import JournalThread
@@ -211,6 +211,28 @@ def _what_drifts(evidence: Evidence, since: str) -> str:
         f"{cameras} looks {size} beside where the mast file has it ({which}): look at its mount, then "
         "calibrate again"
     )
+
+
+def mast_verdict(
+    residuals: ResidualsTold, looks: SentinelTold | None, handoffs: SelfCheck
+) -> CalibrationTold:
+    """Return the verdict as ``GET /status`` has it under ``calibration``.
+
+    ``drifts`` if any of the three says so, else that of the residuals; ``sentence``: of each that speaks
+    against the mast file; ``since``: when the first of these began, where one says.
+    """
+    against: list[tuple[str, str | None]] = []
+    if residuals["verdict"] == "drifts":
+        against.append((residuals["sentence"], residuals["since"]))
+    if looks is not None and looks["level"] == "bad":
+        against.append((f"reference pictures: {looks['sentence']}", looks["since"]))
+    against += [(f"hand-offs: {one['sentence']}", None) for one in handoffs["offsets"]]
+    return {
+        "verdict": "drifts" if against else residuals["verdict"],
+        "sentence": "; ".join(reason for reason, _ in against) or residuals["sentence"],
+        "pointings": residuals["pointings"],
+        "since": min((moment for _, moment in against if moment is not None), default=None),
+    }
 
 
 SHOWN = 50

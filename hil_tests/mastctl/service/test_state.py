@@ -1,9 +1,15 @@
-"""The answers about head, cameras and faults: ages against one moment, null for what is not known."""
+"""The answers about head, cameras and faults, and faults of the daemon's own files."""
 
 from __future__ import annotations
 
-import numpy as np
+from pathlib import Path
 
+import numpy as np
+import pytest
+
+from hil_tests.mastctl.service_fakes import fake_daemon
+from hil_tests.waiting import until
+from mastctl.client import Client
 from mastctl.control.standing import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
@@ -11,6 +17,7 @@ from mastctl.service.state import camera_answer, fault_answer, joints_answer
 
 READING = HeadReading(0.1, -0.2, False, 99.75, true_rad=(0.103, -0.198), approach=(1.0, 0.0))
 FAULT = StandingFault("navcam_left", "no_reply", "the camera is silent", 98.5, "it answers")
+FULL = StandingFault("a file", "full", "the disk is full", 1.0, "it is not")
 FACTS = ("id", "navcam_left", 7, 99.5, 0.01, 0.0, 0.0, False, "digest", np.zeros((2, 2), np.uint8))
 FRAME = StampedFrame(*FACTS, true_pan_rad=0.0, true_tilt_rad=0.0)
 
@@ -24,3 +31,17 @@ def test_ages_count_to_one_moment_and_are_never_below_zero() -> None:
 
 def test_what_is_not_known_of_a_camera_yet_is_null() -> None:
     assert set(camera_answer(None, 100.0).values()) == {None}
+
+
+@pytest.mark.parametrize("part", ["handoffs", "recorder", "audit"])
+def test_each_own_fault_is_published_and_in_the_status(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, part: str
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _), Client(daemon.url) as client:
+        publisher = daemon.service.machine.publisher
+        with monkeypatch.context() as patch:
+            patch.setattr(getattr(daemon.service, part), "faults", lambda: (FULL,))
+            until(lambda: publisher.newest("fault", "a file") == (FULL,), "the fault")
+            assert ("a file", "full") in [(one["device"], one["code"]) for one in client.status()["faults"]]
+            assert client.status()["state"] != "fault", "the head is well"
+        until(lambda: publisher.newest("fault", "a file") == (), "the fault's end")

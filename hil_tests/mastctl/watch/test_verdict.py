@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from mastctl.answers import ResidualsTold
-from mastctl.watch.residuals import residuals_told
-from mastctl.watch.verdict import mast_verdict
+from mastctl.watch.residuals import mast_verdict, residuals_told
 
 NOTHING_YET = residuals_told("few", "few pointings")
 DRIFTS = residuals_told("drifts", "navcam_left looks 2 mrad beside", 9, "2026-05-02T00:00:00+00:00")
