@@ -221,7 +221,7 @@ class _Limits:
         return chance_limit(Level.MEASUREMENT, self.dots) * self.dot_scales[camera]
 
     def image(self, camera: str, freedom: int, own: float) -> float:
-        limit = chance_limit(Level.WHOLE_IMAGE, self.images, max(freedom, 1))
+        limit = chance_limit(Level.WHOLE, self.images, max(freedom, 1))
         return limit * max(self.dot_scales[camera], own)
 
     def point(self, freedom: int) -> float:

@@ -19,7 +19,7 @@ from calib.adjust.adjustment import HUBER, Adjustment
 from calib.adjust.goodness import Component, found_sigmas, goodness, variance_components
 from calib.adjust.outliers import judge, name_outliers
 from calib.adjust.scatter import with_scales
-from calib.adjust.solver import Minimum, Normal, covariance_of, minimise
+from calib.adjust.solver import Minimum, covariance_of, minimise
 from calib.adjust.terms import ImageTerm, StationTerm, scattered_images, widened_images
 from calib.adjust.uncertainty import open_directions
 from calib.adjust.unknowns import Estimate
@@ -123,7 +123,7 @@ def weigh(cleaned: Cleaned, *, narrows: bool = True) -> Weighed:
             break
         weighed |= wanted
         images = widened_images(images, change)
-        problem, fit = _judged(problem.with_sigmas(change), fit, images)
+        problem, fit = judged(problem.with_sigmas(change), fit.state, images)
     wrong = {c.kind for c in components if c.wrong}
     excess = sum(((c.factor / c.weighed) ** 2 - 1) * c.redundancy for c in first if c.kind in wrong)
     return Weighed(problem, fit, covariance, tuple(images), components, excess)
@@ -147,23 +147,26 @@ def without_blunders(
     _refuse_lost(fit)
     problem, images, found = with_scales(problem, fit.state, all_images, order_px)
     for huber in (HUBER, None):
-        problem, fit = _judged(problem.with_huber(huber), fit, images)
+        problem, fit = judged(problem.with_huber(huber), fit.state, images)
     return Cleaned(problem, fit, images, found.cameras)
 
 
 def judged_again(cleaned: Cleaned, problem: Adjustment, start: Estimate) -> Cleaned:
     """Return what comes of another problem of the same images, whose sigmas are those of ``cleaned``."""
-    began = Minimum(start, Normal(np.inf, np.zeros((0, 0)), np.zeros(0)), False, 0)
-    problem, fit = _judged(problem.with_huber(None), began, cleaned.images)
+    problem, fit = judged(problem.with_huber(None), start, cleaned.images)
     return replace(cleaned, problem=problem, fit=fit)
 
 
-def _judged(
-    problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTerm]
+def judged(
+    problem: Adjustment, start: Estimate, images: Sequence[ImageTerm]
 ) -> tuple[Adjustment, Minimum[Estimate]]:
-    """Fit, judge, and fit again until nothing fails."""
+    """Fit, judge every measurement by the rest (`calib.adjust.outliers`), and fit again until nothing fails.
+
+    ``images`` are those of the problem with every dot.
+    """
     gain = 1e-7 if problem.huber else 1e-11
-    fit = minimise(problem, fit.state, weak=problem.weak, gain=gain)
+    fit = minimise(problem, start, weak=problem.weak, gain=gain)
+    _refuse_lost(fit)
     kept = {_kept(problem.images, problem.station)}
     for _ in range(ROUNDS):
         verdict = judge(problem, fit.state, covariance_of(fit.normal.matrix, problem.weak), images)

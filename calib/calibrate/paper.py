@@ -30,8 +30,8 @@ from calib.adjust.solver import covariance_of, minimise
 from calib.adjust.terms import ImageTerm, StationTerm
 from calib.adjust.uncertainty import image_residuals, open_directions, surveyed_fields
 from calib.adjust.unknowns import MAST, Estimate
-from calib.calibrate.starts.mast import References
-from calib.calibrate.starts.survey import Start, mast_fit, start_values
+from calib.calibrate.starts.mast import References, fit_mast
+from calib.calibrate.starts.survey import Start, start_values
 from calib.geometry.rig import mast_of
 from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import Level
@@ -106,7 +106,7 @@ def _cameras_by_mast(start: Start, mast_parameters: int) -> Start:
     head = {name: mast_of(mast).rover_from_head(*setting) for name, setting in settings.items()}
     in_rover = {name: model.moved(head[name]) for name, model in fitted.items()}
     references = References({**start.references.in_rover, **in_rover}, settings)
-    again = mast_fit(of_mast, boards, references, mast_parameters, start.expected_px, mast)
+    again = fit_mast(of_mast, boards, references, mast_parameters, expected_px=start.expected_px, rough=mast)
     kept = {t.name: t.keep for t in again.images}
     mast = again.fit.state.mast
     return replace(

@@ -31,7 +31,7 @@ class Level(float, Enum):
     THREE_SIGMAS = 0.0027, "of 370 single numbers that are nothing, one is beyond three sigma"
     STATED = 0.001, "of a thousand right statements, as of a sigma or of one pose, one is called wrong"
     HYPOTHESIS = 0.0003, "of 3000 surveys that are as modelled, one asks for another hypothesis"
-    WHOLE_IMAGE = 1e-4, "of 10,000 surveys, one loses a right image: noise is not quite normal"
+    WHOLE = 1e-4, "of 10,000 right images, set-ups or boards, one is doubted: noise is not quite normal"
     PREDICTED = 3e-5, "of 30,000 right cameras, one is said not to predict its check images"
     CHANGED = 1e-7, "of ten million right fits, one is said to have changed half-way"
     GROSS = 1e-9, "of a hundred placements whose stated sigma is twice too small, one fails"

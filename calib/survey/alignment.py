@@ -18,10 +18,8 @@ from scipy.special import chdtri
 
 from calib.errors import CalibError
 from calib.geometry.rigid import FloatArray, Rigid, rigid_rates
+from calib.geometry.significance import Level
 from calib.survey.records import Survey
-
-FALSE_ALARM = 1e-4
-"""How often points without a blunder are called in doubt."""
 
 ON_A_LINE = 1e-3
 """Points are on one line if they spread less across it than so much of their spread along it."""
@@ -67,7 +65,7 @@ def align(
     sigma_m: ArrayLike,
     names: Sequence[str],
     *,
-    false_alarm: float = FALSE_ALARM,
+    false_alarm: float = Level.WHOLE,
 ) -> Alignment:
     """Fit the pose between two sets of points, and leave out those that were mis-measured.
 
@@ -138,11 +136,11 @@ def mirrored(points_in_a_m: ArrayLike, points_in_b_m: ArrayLike, sigma_m: float)
         fits = [_chi2(_pose(c, b, sigma, []), c, b, sigma) for c in (a, image)]
     except NotAligned:
         return False
-    return fits[1] <= _limit(3 * len(a) - 6, FALSE_ALARM) < fits[0]
+    return fits[1] <= _limit(3 * len(a) - 6, Level.WHOLE) < fits[0]
 
 
 def poses(
-    survey: Survey, kind: Literal["prism", "tape"], false_alarm: float = FALSE_ALARM
+    survey: Survey, kind: Literal["prism", "tape"], false_alarm: float = Level.WHOLE
 ) -> dict[tuple[str, str], Alignment | NotAligned]:
     """Return by set-up and placement how its prisms lie in the rover, or its board's tapes in the station.
 
@@ -166,7 +164,7 @@ def poses(
     return found
 
 
-def rover_from_station(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> dict[str, Alignment]:
+def rover_from_station(survey: Survey, *, false_alarm: float = Level.WHOLE) -> dict[str, Alignment]:
     """Return the pose of every set-up from its prisms, by the set-up's name.
 
     Raises
@@ -183,7 +181,7 @@ def rover_from_station(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> d
 
 
 def station_from_board(
-    survey: Survey, *, false_alarm: float = FALSE_ALARM
+    survey: Survey, *, false_alarm: float = Level.WHOLE
 ) -> dict[tuple[str, str], Alignment]:
     """Return the pose of every placement with three tapes, by set-up and placement.
 

@@ -30,6 +30,7 @@ from calib.calibrate.bench.problem import MOVES, BenchOptions, BenchProblem, bes
 from calib.calibrate.bench.statements import bench_calibration
 from calib.calibrate.refusals import refuse_far, refuse_unsettled
 from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged
+from calib.calibrate.starts.wrong_dots import without_wrong
 from calib.survey.records import Survey
 
 WRONG_MINIMUM = 3.0
@@ -111,7 +112,7 @@ def _look_for_changes(
     tried: tuple[Finding, BenchProblem, Adjustment, Minimum[Estimate]] | None = None
     for left in range(MOVES, -1, -1):
         problem = bench.seen(chosen, bench.start)
-        problem = problem.with_terms([replace(t, keep=t.keep & ~wrong[t.name]) for t in problem.images], ())
+        problem = problem.with_terms([without_wrong(t, wrong) for t in problem.images], ())
         fit = minimise(problem, bench.start, weak=problem.weak, gain=1e-4)
         if np.isfinite(fit.normal.cost):
             order_px = bench.survey.sigma.corner_px

@@ -20,7 +20,7 @@ from calib.adjust.terms import ImageTerm, scattered_images, widened_images
 from calib.adjust.uncertainty import fitted_fields, image_residuals, rms_by_camera
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.bench.problem import BenchProblem
-from calib.calibrate.starts.wrong_dots import wrong_points
+from calib.calibrate.starts.wrong_dots import wrong_dots
 from calib.geometry.significance import Level
 
 
@@ -106,9 +106,10 @@ def _gauges(bench: BenchProblem, chosen: Sequence[str]) -> tuple[str, ...]:
 
 def _checked(images: Sequence[ImageResiduals], checks: Sequence[ImageTerm]) -> list[ImageResiduals]:
     """The check images, less corners that disagree with the rest of their own image."""
-    wrong = {t.name: wrong_points(t.in_board_m[:, :2], t.pixels_px, t.sigma_px) for t in checks}
+    wrong, _ = wrong_dots(checks)
+    none = {t.name: np.zeros_like(t.keep) for t in checks}
     return [
-        replace(i, used=np.isfinite(i.residuals_px).all(axis=1) & ~wrong[i.name])
+        replace(i, used=np.isfinite(i.residuals_px).all(axis=1) & ~wrong.get(i.name, none[i.name]))
         for i in images
-        if i.name in wrong
+        if i.name in none
     ]

@@ -14,11 +14,11 @@ import numpy as np
 
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.gross import GROSS
+from calib.adjust.robust import SurveyNotFitted
 from calib.adjust.solver import Normal
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import MAST, Estimate
 from calib.calibrate.starts.agreeing import Agreed, fit_agreeing
-from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.parameters import carried_errors, twist_rates
 from calib.geometry.rig import gimbal, mast_of
@@ -29,10 +29,6 @@ LEAN_STARTS_RAD = ((0.0, 0.0), (0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3))
 
 HEIGHT_STARTS_M = (0.0, 0.2, -0.2)
 """Where the head's origin may be below the mean of its cameras, metres."""
-
-
-class MastNotFitted(CalibError):
-    """No mast explains the images: too few of them, or every start ended far from the noise."""
 
 
 class References:
@@ -98,7 +94,6 @@ def fit_mast(
     *,
     expected_px: float = 1.0,
     rough: FloatArray | None = None,
-    keep_all: bool = False,
 ) -> Agreed:
     """Fit 4, 6 or 8 numbers of the mast to images at many joint angles, the cameras taken as known.
 
@@ -107,21 +102,22 @@ def fit_mast(
     images
         Of cameras with references; those at their camera's reference angles say nothing.
     mast_parameters
-        4 for a mast that stands upright (θx = θy = 0), 6 for the paper's, 8 for two skew axes.
+        4 for a mast that stands upright (θx = θy = 0), which need not explain anything: no image is left out
+        and no fit refused; 6 for the paper's, 8 for two skew axes.
     expected_px
         Residual of a coordinate to expect.
     rough
         (8,) where to start; else an upright mast under the cameras.
-    keep_all
-        Leave no image out and refuse no fit: for a mast of four parameters, which need not explain anything.
 
     Raises
     ------
-    MastNotFitted
+    SurveyNotFitted
         If no start leads to a mast at which the fit settles and that explains most images.
     """
     if not images:
-        raise MastNotFitted("no image was taken away from the angles at which its camera is calibrated")
+        raise SurveyNotFitted(
+            "mast: no image was taken away from the angles at which its camera is calibrated"
+        )
     best: Agreed | None = None
     for mast in [rough] if rough is not None else _starts(images, references):
         if mast_parameters == 4 and mast[3:5].any() and rough is None:
@@ -129,18 +125,18 @@ def fit_mast(
         state = Estimate(references.in_head(mast), mast, {}, boards, {}, np.zeros((0, 2)))
         problem = MastAlone(images, (), state, mast_parameters=mast_parameters, fixed=tuple(boards))
         problem.references = references
-        fit = fit_agreeing(problem, state, expected_px, keep_all=keep_all)
+        fit = fit_agreeing(problem, state, expected_px, keep_all=mast_parameters == 4)
         if fit is not None and (best is None or fit.typical_px < best.typical_px):
             best = fit
         if best is not None and best.typical_px < 3 * expected_px:
             break
     if best is None:
-        raise MastNotFitted(
-            "no start led to a mast at which the fit settled; check pan and tilt "
+        raise SurveyNotFitted(
+            "mast: no start led to a mast at which the fit settled; check pan and tilt "
             "(radians, right and up positive), and take images at more joint angles"
         )
-    if best.typical_px > GROSS * expected_px and not keep_all:
-        raise MastNotFitted(
+    if best.typical_px > GROSS * expected_px and mast_parameters != 4:
+        raise SurveyNotFitted(
             f"no mast explains the images: the best one leaves {best.typical_px:.1f} px where some "
             f"{expected_px:.2g} px are expected. Check pan and tilt (radians, right and up positive) and "
             "each image's placement; axes that do not meet at a right angle need eight parameters"

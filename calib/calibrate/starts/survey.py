@@ -21,12 +21,12 @@ from calib.adjust.robust import SurveyNotFitted
 from calib.adjust.terms import ImageTerm, StationTerm, image_terms, station_terms
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.agreeing import Agreed
-from calib.calibrate.starts.camera import CameraNotFitted, fit_camera
-from calib.calibrate.starts.mast import MastNotFitted, References, fit_mast
+from calib.calibrate.starts.camera import fit_camera
+from calib.calibrate.starts.mast import References, fit_mast
 from calib.calibrate.starts.station import StationPoses, station_poses
-from calib.calibrate.starts.wrong_dots import wrong_dots
+from calib.calibrate.starts.wrong_dots import without_wrong, wrong_dots
 from calib.geometry.rig import MAST_NAMES
-from calib.geometry.rigid import FloatArray, Rigid
+from calib.geometry.rigid import Rigid
 from calib.survey.alignment import NotAligned
 from calib.survey.records import Survey
 
@@ -84,15 +84,15 @@ def start_values(survey: Survey, mast_parameters: int, *, by_purpose: bool = Fal
     SurveyNotFitted
         If a set-up, a camera or the mast cannot be started; the sentence says what is missing.
     """
-    wrong, outliers = wrong_dots(survey)
     try:
         poses = station_poses(survey)
     except NotAligned as error:
         raise SurveyNotFitted(str(error)) from None
     notes, boards = list(poses.notes), poses.rover_from_board
     images, checks, joints = image_terms(survey, boards, notes)
+    wrong, outliers = wrong_dots([*images, *checks])
     purposes = {i.name: i.purpose for i in survey.images}
-    clean = [replace(t, keep=~wrong[t.name]) if t.name in wrong else t for t in images]
+    clean = [without_wrong(t, wrong) for t in images]
     if by_purpose:
         clean = [replace(t, sigma_px=np.full(len(t.rows), survey.sigma.dot_px)) for t in clean]
     usable = [t for t in clean if t.board not in poses.bent]
@@ -105,7 +105,16 @@ def start_values(survey: Survey, mast_parameters: int, *, by_purpose: bool = Fal
             continue
         setting, group = _largest_setting(mine, survey.sigma.joint_rad)
         expected[name] = _expected_px(survey, name, group, boards)
-        fits.append(_camera(survey, name, group, boards, expected[name]))
+        if not group:
+            raise SurveyNotFitted(
+                f"camera {name} has no image of purpose camera: take some at one joint setting"
+            )
+        fits.append(
+            fit_camera(
+                group, boards, kind=camera.kind, size_px=camera.size_px, focal_px=camera.focal_px,
+                expected_px=expected[name],
+            )
+        )  # fmt: skip
         in_rover[name] = fits[-1].fit.state.cameras[name]
         if camera.on == "head":
             settings[name] = setting
@@ -122,7 +131,7 @@ def start_values(survey: Survey, mast_parameters: int, *, by_purpose: bool = Fal
         and (purposes[t.name] == "mast" if by_purpose else _apart(t, settings[t.camera]) > SAME_ANGLE_RAD)
     ]  # fmt: skip
     if away:
-        fits.append(mast_fit(away, boards, references, mast_parameters, most))
+        fits.append(fit_mast(away, boards, references, mast_parameters, expected_px=most))
         mast = fits[-1].fit.state.mast
         doubtful |= fits[-1].left_out
     elif settings:
@@ -189,52 +198,3 @@ def _expected_px(
     typical = float(np.median(ranges)) if ranges else 1.0
     seen = focal_px * sigma.station_m / max(typical, 0.5)
     return float(np.sqrt(sigma.dot_px**2 + 1.5 * seen**2 + (focal_px * sigma.joint_rad) ** 2))
-
-
-def _camera(
-    survey: Survey,
-    name: str,
-    group: Sequence[ImageTerm],
-    boards: Mapping[tuple[str, str], Rigid],
-    expected_px: float,
-) -> Agreed:
-    """A camera in the rover frame at its reference setting."""
-    camera = survey.cameras[name]
-    placements = {t.board for t in group}
-    if len(placements) < 2:
-        where = " at one joint setting" if camera.on == "head" else ""
-        raise SurveyNotFitted(
-            f"camera {name} sees {len(placements)} boards{where} where at least 2, better 8, are expected: "
-            "take more images of boards at two distances without moving the head"
-        )
-    try:
-        return fit_camera(
-            group, boards,
-            kind=camera.kind, size_px=camera.size_px, focal_px=camera.focal_px, expected_px=expected_px,
-        )  # fmt: skip
-    except CameraNotFitted as error:
-        raise SurveyNotFitted(f"camera {name}: {error}") from None
-
-
-def mast_fit(
-    images: Sequence[ImageTerm],
-    boards: Mapping[tuple[str, str], Rigid],
-    references: References,
-    mast_parameters: int,
-    expected_px: float,
-    rough: FloatArray | None = None,
-) -> Agreed:
-    """Return the mast fitted; a mast taken as upright need not explain the images.
-
-    Raises
-    ------
-    SurveyNotFitted
-        If no mast explains the images.
-    """
-    try:
-        return fit_mast(
-            images, boards, references, mast_parameters,
-            expected_px=expected_px, rough=rough, keep_all=mast_parameters == 4,
-        )  # fmt: skip
-    except MastNotFitted as error:
-        raise SurveyNotFitted(f"mast: {error}") from None

@@ -14,12 +14,11 @@ import cv2
 import numpy as np
 
 from calib.adjust.adjustment import HUBER, Adjustment
-from calib.adjust.gross import MANY, gross_limit
+from calib.adjust.gross import gross_limit
 from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
-from calib.calibrate.starts.camera import centred_camera
-from calib.calibrate.starts.wrong_dots import wrong_points
+from calib.calibrate.starts.wrong_dots import without_wrong, wrong_dots
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel, Kind
 from calib.geometry.rigid import Rigid
@@ -46,7 +45,7 @@ class ViewPoses:
     poses
         By image name camera_from_board: the likeliest, and the other one if it is nearly as good.
     wrong
-        By image name which of its points (n,) disagree with the rest of it.
+        By image name which of its points (n,) disagree with the rest of it, where any do.
     doubtful
         Images that no pose explains.
     """
@@ -81,9 +80,8 @@ def view_poses(
     ViewsTooFew
         If no camera explains the images.
     """
-    wrong = {t.name: _wrong(t) for t in images}
-    clean = [replace(t, keep=t.keep & ~wrong[t.name]) for t in images]
-    clean = [t for t in clean if t.keep.sum() >= FEWEST_POINTS]
+    wrong, _ = wrong_dots(images)
+    clean = [t for t in (without_wrong(t, wrong) for t in images) if t.keep.sum() >= FEWEST_POINTS]
     if not clean:
         raise ViewsTooFew(f"{len(images)} images, none of which shows {FEWEST_POINTS} corners of a board")
     best: tuple[float, CameraModel] | None = None
@@ -107,12 +105,6 @@ def view_poses(
     limit = gross_limit(list(off.values()), 1.0) if off else 0.0
     doubtful = {t.name for t in images if t.name not in off or off[t.name] > limit}
     return ViewPoses(model, poses, wrong, frozenset(doubtful))
-
-
-def _wrong(term: ImageTerm) -> np.ndarray:
-    """Which points are not where the rest of their image says; none where so many are that it cannot tell."""
-    bad = wrong_points(term.in_board_m[:, :2], term.pixels_px, term.sigma_px)
-    return bad if bad.mean() <= MANY else np.zeros_like(bad)
 
 
 def _focal_lengths(
@@ -158,6 +150,18 @@ def _lens(images: Sequence[ImageTerm], start: CameraModel, most: int) -> tuple[f
     model = fit.state.cameras[terms[0].camera]
     # Boards that are free leave the camera's place open: put it back to where it began.
     return float(np.median(np.linalg.norm(off, axis=1))), model.moved(model.pose.inverse)
+
+
+def centred_camera(
+    kind: Kind, size_px: tuple[int, int], focal_px: float, cahvore_type: int = 0
+) -> CameraModel:
+    """Return a camera without distortion at the origin, its axis along z (``cahvore_type`` 2: equidistant)."""
+    x, y, z = np.eye(3)
+    cx, cy = (np.array(size_px) - 1) / 2
+    return CameraModel.normalised(
+        kind, size_px, np.zeros(3), z, focal_px * x + cx * z, focal_px * y + cy * z, z,
+        cahvore_type=cahvore_type,
+    )[0]  # fmt: skip
 
 
 def poses_of(model: CameraModel, term: ImageTerm) -> list[tuple[float, Rigid]]:

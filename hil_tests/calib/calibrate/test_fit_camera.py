@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calib.adjust.robust import SurveyNotFitted
 from calib.adjust.solver import covariance_of, minimise
 from calib.adjust.terms import ImageTerm, lens_notes
 from calib.calibrate.starts import agreeing, camera
 from calib.calibrate.starts.agreeing import Agreed
-from calib.calibrate.starts.camera import CameraNotFitted
-from calib.calibrate.starts.mast import MastNotFitted, References, fit_mast
+from calib.calibrate.starts.mast import References, fit_mast
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.parameters import parameter_part
 from calib.geometry.rig import Rig, RigCamera
@@ -154,7 +154,7 @@ def test_one_board_is_not_enough(true_rig: Rig) -> None:
     model = true_rig.cameras["navcam_left"].model
     points, pixels, images = boards(model, RANGES_M["navcam"], 1)
     one = images == 0
-    with pytest.raises(CameraNotFitted, match="1 boards"):
+    with pytest.raises(SurveyNotFitted, match="1 boards"):
         fit_camera(
             points[one], pixels[one], images[one], kind="CAHVOR", size_px=model.size_px, focal_px=1290.0
         )
@@ -164,12 +164,12 @@ def test_pixels_of_nothing_are_refused(true_rig: Rig) -> None:
     model = true_rig.cameras["navcam_left"].model
     points, pixels, images = boards(model, RANGES_M["navcam"], 1)
     shuffled = np.random.default_rng(0).permutation(pixels)
-    with pytest.raises(CameraNotFitted, match="placement"):
+    with pytest.raises(SurveyNotFitted, match="placement"):
         fit_camera(points, shuffled, images, kind="CAHVOR", size_px=model.size_px, focal_px=1290.0)
 
 
 def test_no_image_away_from_the_reference_fits_no_mast() -> None:
-    with pytest.raises(MastNotFitted, match="no image"):
+    with pytest.raises(SurveyNotFitted, match="no image"):
         fit_mast([], {}, References({}, {}))
 
 

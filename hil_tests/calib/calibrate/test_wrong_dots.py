@@ -8,7 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib.adjust.outliers import Outlier
+from calib.adjust.terms import image_terms
 from calib.calibrate.paper import fit_paper
+from calib.calibrate.starts.station import station_poses
 from calib.calibrate.starts.wrong_dots import wrong_dots
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
@@ -25,6 +28,12 @@ def rig() -> Rig:
     return load_rig(ROOT / "configs/sim/rocky8.yaml").rig
 
 
+def wrong_in(survey: Survey) -> tuple[dict[str, np.ndarray], tuple[Outlier, ...]]:
+    """The wrong dots of all images, check images among them."""
+    images, checks, _ = image_terms(survey, station_poses(survey).rover_from_board, [])
+    return wrong_dots([*images, *checks])
+
+
 @pytest.fixture(scope="module")
 def good(rig: Rig) -> Survey:
     return simulate_survey(rig, 1)[0]
@@ -33,7 +42,7 @@ def good(rig: Rig) -> Survey:
 @pytest.mark.parametrize("seed", range(4))
 def test_a_good_survey_loses_nothing(rig: Rig, seed: int) -> None:
     survey = simulate_survey(rig, seed)[0]
-    assert wrong_dots(survey) == ({}, ())
+    assert wrong_in(survey) == ({}, ())
 
 
 @pytest.mark.parametrize("camera", ["pancam_left", "navcam_right", "hazcam_left"])
@@ -41,7 +50,7 @@ def test_a_good_survey_loses_nothing(rig: Rig, seed: int) -> None:
 def test_wrong_dots_are_named_and_taken_out(good: Survey, camera: str, distance_px: float) -> None:
     image = next(i.name for i in good.images if i.camera == camera and i.purpose != "check")
     spoiled, places = with_outlier_dots(good, image, 2, distance_px, np.random.default_rng(2))
-    found, wrong = wrong_dots(spoiled)
+    found, wrong = wrong_in(spoiled)
     assert {s.name for s in wrong} == {f"image {image} dot (row {r}, column {c})" for r, c in places}
     assert all(s.kind == "dot" and s.size == pytest.approx(distance_px, abs=0.6) for s in wrong)
     dots = spoiled.dots[image]
@@ -51,28 +60,28 @@ def test_wrong_dots_are_named_and_taken_out(good: Survey, camera: str, distance_
 
 def test_a_shifted_image_is_not_its_matter(good: Survey) -> None:
     shifted = {n: replace(d, pixels_px=d.pixels_px + 3.0) for n, d in good.dots.items()}
-    assert wrong_dots(replace(good, dots=shifted))[1] == ()
+    assert wrong_in(replace(good, dots=shifted))[1] == ()
 
 
 def test_check_images_lose_theirs_too(good: Survey) -> None:
     check = next(i.name for i in good.images if i.purpose == "check")
     spoiled, places = with_outlier_dots(good, check, 2, 20.0, np.random.default_rng(2))
-    assert {s.name for s in wrong_dots(spoiled)[1]} == {
+    assert {s.name for s in wrong_in(spoiled)[1]} == {
         f"image {check} dot (row {r}, column {c})" for r, c in places
     }
 
 
 def test_of_few_dots_the_gross_ones_are_named_and_of_fewer_none(good: Survey) -> None:
     few = with_fewer_dots(good, 2)  # 25 an image, check images among them
-    assert wrong_dots(few)[1] == ()
+    assert wrong_in(few)[1] == ()
     wrong, spoiled = set[str](), few
     for image in good.images:
         spoiled, places = with_scattered_dots(spoiled, image.name, 1, np.random.default_rng(image.row))
         wrong |= {f"image {image.name} dot (row {r}, column {c})" for r, c in places}
-    assert {s.name for s in wrong_dots(spoiled)[1]} == wrong
+    assert {s.name for s in wrong_in(spoiled)[1]} == wrong
     fewer = {n: Dots(d.rows[:15], d.columns[:15], d.pixels_px[:15]) for n, d in spoiled.dots.items()}
-    assert wrong_dots(replace(good, dots=fewer))[1] == ()
-    assert wrong_dots(replace(good, dots={}))[1] == ()
+    assert wrong_in(replace(good, dots=fewer))[1] == ()
+    assert wrong_in(replace(good, dots={}))[1] == ()
 
 
 def test_the_papers_fit_names_them_and_is_as_good_without(rig: Rig) -> None:
