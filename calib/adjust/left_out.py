@@ -60,7 +60,7 @@ class LeftOut:
             rates = self.rates[rows]
             spread = np.linalg.inv(np.eye(rates.shape[1]) + rates.T @ rates)
             residual = self.residual - self.rates @ (spread @ (rates.T @ self.residual[rows]))
-            statistic = dot_statistics(residual, self.rates, spread, good)
+            statistic, _ = statistics(residual, self.rates, spread, good)
             if (statistic[good] <= limit).all():
                 break
             good = good & (statistic <= limit)
@@ -92,23 +92,25 @@ def left_out(block: ResidualBlock, covariance: FloatArray, keep: np.ndarray, hub
     return LeftOut(block.residual + rates[:, known] @ step, rates / np.sqrt(np.maximum(left, SOLE)))
 
 
-def dot_statistics(
+def statistics(
     residual: FloatArray, jacobian: FloatArray, covariance: FloatArray, fitted: np.ndarray
-) -> FloatArray:
-    """Return chi-square of each dot by itself (n,), infinite where it has no pixel.
+) -> tuple[FloatArray, np.ndarray]:
+    """Return chi-square of each measurement by itself (n,), infinite where a dot has no pixel, and how many
+    numbers of it the others check (n,).
 
     Parameters
     ----------
     residual, jacobian
-        (2n,) and (2n, k), in sigmas.
+        (wn,) and (wn, k), in sigmas, of measurements of w numbers each.
     covariance
         (k, k) of the unknowns.
     fitted
-        Which dots (n,) were.
+        Which of the measurements (n,) were.
     """
-    rates = jacobian.reshape(len(fitted), 2, -1)
+    rates = jacobian.reshape(len(fitted), -1, jacobian.shape[1])
     spread = np.einsum("nik,nkj->nij", rates @ covariance, rates.transpose(0, 2, 1))
     sign = np.where(fitted, -1.0, 1.0)[:, None, None]
-    values, vectors = np.linalg.eigh(np.eye(2) + sign * np.nan_to_num(spread))
-    along = np.einsum("nji,nj->ni", vectors, residual.reshape(-1, 2))
-    return np.asarray(np.nan_to_num((along**2 / np.maximum(values, REDUNDANT)).sum(axis=1), nan=np.inf))
+    values, vectors = np.linalg.eigh(np.eye(rates.shape[1]) + sign * np.nan_to_num(spread))
+    along = np.einsum("nji,nj->ni", vectors, residual.reshape(len(fitted), -1))
+    squares = (along**2 / np.maximum(values, REDUNDANT)).sum(axis=1)
+    return np.nan_to_num(squares, nan=np.inf), (values > REDUNDANT).sum(axis=1)

@@ -30,11 +30,11 @@ import numpy as np
 
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.gross import GROSS, MANY, at_least_stated, chance_limit
-from calib.adjust.left_out import REDUNDANT, LeftOut, dot_statistics, left_out
+from calib.adjust.left_out import LeftOut, left_out, statistics
 from calib.adjust.scatter import scatter
 from calib.adjust.terms import ImageTerm, StationTerm
 from calib.adjust.unknowns import Estimate, ResidualBlock
-from calib.geometry.rigid import FloatArray, moved_rigid
+from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import Level, typical_scale
 
 
@@ -76,19 +76,8 @@ class Outlier:
 TELL_APART = 8
 """With more images of a board than this, the rest says which of two is wrong."""
 
-BOARD_STEPS = 4
-"""Gauss-Newton steps of a board's pose: it starts within millimetres."""
-
 PRISMS_LEFT = 3
 """A set-up keeps at least so many prisms: with fewer nothing says which of them is wrong."""
-
-
-@dataclass(frozen=True, eq=False)
-class OutlierVerdict:
-    """Terms with what failed left out and what passed readmitted."""
-
-    images: tuple[ImageTerm, ...]
-    station: tuple[StationTerm, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,18 +103,10 @@ class JudgedImage:
         return good, statistic, limit, many_bad or statistic > limit
 
 
-@dataclass(frozen=True)
-class JudgedPoint:
-    """A station point: chi-square, and its degrees of freedom."""
-
-    statistic: float
-    freedom: int
-
-
 def judge(
     problem: Adjustment, state: Estimate, covariance: FloatArray, all_images: Sequence[ImageTerm]
-) -> OutlierVerdict:
-    """Test every measurement at a fitted state and leave out the worst; readmit what passes.
+) -> tuple[list[ImageTerm], list[StationTerm]]:
+    """Return the terms at a fitted state with the worst left out and what passes readmitted.
 
     Parameters
     ----------
@@ -151,10 +132,10 @@ def judge(
             bad_dots.append((index, good))
     readmitted = []
     image_failed, worst_ratio = worst is not None, 1.0
-    for index, (point, tested) in enumerate(zip(problem.station, points, strict=True)):
-        if not tested.freedom:
+    for index, (point, (statistic, freedom)) in enumerate(zip(problem.station, points, strict=True)):
+        if not freedom:
             continue
-        ratio = tested.statistic / limits.point(tested.freedom)
+        ratio = statistic / limits.point(freedom)
         # A tape or prism cannot pull hundreds of dots along: where an image fails, it goes first.
         if point.keep and not image_failed and ratio > worst_ratio and _may_go(problem, point):
             worst, worst_ratio = ("station", index), ratio
@@ -170,7 +151,7 @@ def judge(
         station[worst[1]] = replace(station[worst[1]], keep=False)
     for index, good in bad_dots:
         images[index] = replace(images[index], keep=good)
-    return OutlierVerdict(tuple(images), tuple(station))
+    return images, station
 
 
 def name_outliers(
@@ -194,13 +175,13 @@ def name_outliers(
             name = f"image {term.name} {term.part(int(row))}"
             size = float(np.linalg.norm(residual[row]))
             found.append(Outlier("dot", name, float(judged.dots[row]), limits.dot(term.camera), size))
-    for point, tested in zip(problem.station, points, strict=True):
+    for point, (statistic, freedom) in zip(problem.station, points, strict=True):
         if point.keep:
             continue
-        limit = limits.point(tested.freedom or 3)
+        limit = limits.point(freedom or 3)
         size = float(np.linalg.norm(problem.station_residual(state, point)) * point.sigma_m)
         kind: Literal["prism", "tape"] = "prism" if point.board is None else "tape"
-        found.append(Outlier(kind, point.name, tested.statistic, limit, size))
+        found.append(Outlier(kind, point.name, statistic, limit, size))
     return tuple(found)
 
 
@@ -230,24 +211,30 @@ class _Limits:
 
 def _tested(
     problem: Adjustment, state: Estimate, covariance: FloatArray, all_images: Sequence[ImageTerm]
-) -> tuple[list[JudgedImage], list[JudgedPoint], _Limits]:
-    """Every image and every station point, and the limits."""
+) -> tuple[list[JudgedImage], list[tuple[float, int]], _Limits]:
+    """Every image; every station point's chi-square and its degrees of freedom; and the limits."""
+
+    def tested(block: ResidualBlock, fitted: np.ndarray) -> tuple[FloatArray, np.ndarray]:
+        mine = covariance[np.ix_(block.columns, block.columns)]
+        return statistics(block.residual, block.jacobian, mine, fitted)
+
     seen = [
-        _image(covariance, block, term, problem.huber)
+        JudgedImage(
+            term,
+            tested(block, term.keep)[0],
+            left_out(block, covariance[np.ix_(block.columns, block.columns)], term.keep, problem.huber),
+        )
         for block, term in zip(problem.image_blocks(state, all_images), problem.images, strict=True)
     ]
     points = [
-        _point(covariance, block, term)
+        (float(statistic[0]), int(freedom[0]))
         for block, term in zip(problem.station_blocks(state, problem.station), problem.station, strict=True)
+        for statistic, freedom in [tested(block, np.array([term.keep]))]
     ]
-    whole = [
-        np.array([p.statistic])
-        for p, t in zip(points, problem.station, strict=True)
-        if t.keep and p.freedom == 3
-    ]
+    whole = [s for (s, freedom), t in zip(points, problem.station, strict=True) if t.keep and freedom == 3]
     count = sum(len(one.dots) for one in seen)
     dot_scales = _typical_dots(zip(seen, problem.images, strict=True))
-    point_scale = at_least_stated(np.concatenate(whole or [np.ones(0)]), 3)
+    point_scale = at_least_stated(np.array(whole), 3)
     return seen, points, _Limits(count, len(seen), len(points), dot_scales, point_scale)
 
 
@@ -266,78 +253,42 @@ def _typical_dots(seen: Iterable[tuple[JudgedImage, ImageTerm]]) -> dict[str, fl
     }
 
 
-def _image(covariance: FloatArray, block: ResidualBlock, term: ImageTerm, huber: float | None) -> JudgedImage:
-    """An image with all its dots, of which some may be fitted."""
-    mine = covariance[np.ix_(block.columns, block.columns)]
-    return JudgedImage(
-        term,
-        dot_statistics(block.residual, block.jacobian, mine, term.keep),
-        left_out(block, mine, term.keep, huber),
-    )
-
-
-def _point(covariance: FloatArray, block: ResidualBlock, term: StationTerm) -> JudgedPoint:
-    """The statistic of a prism or tape, in the directions in which the rest of the survey checks it."""
-    mine = covariance[np.ix_(block.columns, block.columns)]
-    spread = block.jacobian @ mine @ block.jacobian.T
-    values, vectors = np.linalg.eigh(np.eye(3) + (-spread if term.keep else spread))
-    tested = values > REDUNDANT
-    along = vectors.T @ block.residual
-    return JudgedPoint(float(np.sum(along[tested] ** 2 / values[tested])), int(tested.sum()))
-
-
 def _culprit(problem: Adjustment, state: Estimate, suspect: int) -> int:
     """Which image of the suspect's board is to blame: the one without which the others and the tapes agree.
 
-    Two images that contradict each other look equally bad where the fit has ended between them.
+    Two images that contradict each other look equally bad where the fit has ended between them. A tape may be
+    the wrong one as well: without it the sum of squares counts, and what a good tape may be off by.
     """
     board = problem.images[suspect].board
     together = [i for i, t in enumerate(problem.images) if t.board == board and t.keep.any()]
     if not 2 <= len(together) <= TELL_APART or board in problem.fixed:
         return suspect
-    misfits = {i: _board_misfit(problem, state, board, [j for j in together if j != i]) for i in together}
-    best = min(misfits, key=lambda i: misfits[i])
-    return best if misfits[best] < misfits[suspect] else suspect
-
-
-def _board_misfit(
-    problem: Adjustment, state: Estimate, board: tuple[str, str], images: Sequence[int]
-) -> float:
-    """Sum of squares of a board's tapes and some of its images with its pose fitted to these alone.
-
-    A tape may be the wrong one as well: without it the sum counts, and what a good tape may be off by.
-    """
     tapes = [p for p in problem.station if p.board == board and p.keep]
-    shown = [problem.images[i] for i in images]
+    images = problem.image_blocks(state, [problem.images[i] for i in together])
+    blocks = images + problem.station_blocks(state, tapes)
+    rates = [block.rates(("board", board)) for block in blocks]
+    matrices = np.array([r.T @ r for r in rates])
+    pulls = np.array([r.T @ block.residual for r, block in zip(rates, blocks, strict=True)])
+    squares = np.array([block.residual @ block.residual for block in blocks])
     allowed = chance_limit(Level.MEASUREMENT, len(problem.station), 3)
-    without = ([p for p in tapes if p is not one] for one in tapes)
-    return min(
-        _misfit(problem, state, board, shown, tapes),
-        *(_misfit(problem, state, board, shown, rest) + allowed for rest in without),
-        float("inf"),
-    )
 
+    def misfit(left_out: list[int]) -> float:
+        """Sum of squares of the others with the board's pose fitted to them alone."""
+        used = np.setdiff1d(np.arange(len(blocks)), left_out)
+        pull = pulls[used].sum(axis=0)
+        step = np.linalg.lstsq(matrices[used].sum(axis=0), pull, rcond=None)[0]
+        return float(squares[used].sum() - pull @ step)
 
-def _misfit(
-    problem: Adjustment,
-    state: Estimate,
-    board: tuple[str, str],
-    images: Sequence[ImageTerm],
-    tapes: Sequence[StationTerm],
-) -> float:
-    """Sum of squares of some images and tapes of a board with its pose fitted to them."""
-    cost = float("inf")
-    for _ in range(BOARD_STEPS):
-        blocks = problem.image_blocks(state, images) + problem.station_blocks(state, tapes)
-        cost = float(sum(b.residual @ b.residual for b in blocks))
-        if not np.isfinite(cost):
-            return float("inf")
-        jacobian = np.concatenate([b.rates(("board", board)) for b in blocks])
-        residual = np.concatenate([b.residual for b in blocks])
-        step = np.linalg.lstsq(jacobian, -residual, rcond=None)[0]
-        moved = moved_rigid(state.rover_from_board[board], step)
-        state = replace(state, rover_from_board={**state.rover_from_board, board: moved})
-    return cost
+    misfits = {
+        image: min(
+            misfit([at]),
+            *(misfit([at, tape]) + allowed for tape in range(len(together), len(blocks))),
+            np.inf,
+        )
+        for at, image in enumerate(together)
+    }
+    best = min(misfits, key=lambda image: misfits[image])
+    return best if misfits[best] < misfits[suspect] else suspect
 
 
 def _may_go(problem: Adjustment, point: StationTerm) -> bool:

@@ -169,12 +169,13 @@ def judged(
     _refuse_lost(fit)
     kept = {_kept(problem.images, problem.station)}
     for _ in range(ROUNDS):
-        verdict = judge(problem, fit.state, covariance_of(fit.normal.matrix, problem.weak), images)
-        pattern = _kept(verdict.images, verdict.station)
+        covariance = covariance_of(fit.normal.matrix, problem.weak)
+        seen, station = judge(problem, fit.state, covariance, images)
+        pattern = _kept(seen, station)
         if pattern in kept:  # nothing new, or a measurement on its limit that comes and goes
             break
         kept.add(pattern)
-        problem = problem.with_terms(verdict.images, verdict.station)
+        problem = problem.with_terms(seen, station)
         fit = minimise(problem, fit.state, weak=problem.weak, gain=gain)
         _refuse_lost(fit)
     return problem, fit

@@ -6,7 +6,6 @@ import copy
 import math
 import pickle
 import struct
-import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,7 +32,6 @@ from calib.survey.find_dots import find_in_file
 from calib.targets.boards import Dots
 from calib.targets.dot_order import PredictedBoard
 from hil_tests.calib.adjust.small_surveys import survey_of, with_shifted_dots
-from hil_tests.calib.calibrate.test_fit_camera import farthest_px, fit_camera
 from hil_tests.calib.targets.boards import BOARD, COLUMNS, ROWS, SIZE_PX, camera, gravel, pose
 from hil_tests.support.sim_survey.board import draw_board, photograph
 from tools.flight.difference import model_difference
@@ -195,23 +193,6 @@ def test_frozen_geometry_stays_frozen_through_pickles_and_copies(true_rig: Rig) 
     for same in again(model):
         assert isinstance(same, CameraModel)
         np.testing.assert_array_equal(same.project(point)[0], model.project(point)[0])
-
-
-def test_thirty_samples_of_many_images_cost_no_list_of_all_triples() -> None:
-    """Of 300 images there are 4.5 million triples: listed they took 329 MB."""
-    count = 300
-    rng = np.random.default_rng(0)
-    model = CameraModel("CAHV", (641, 481), np.zeros(3), [0, 0, 1], [500, 0, 320], [0, 500, 240])
-    pixels = rng.uniform(20, 460, (count * 3, 2))
-    rays = model.ray(pixels)
-    points = rays.origins_m + rng.uniform(2, 5, count * 3)[:, None] * rays.directions
-    images = np.repeat(np.arange(count), 3)
-    tracemalloc.start()
-    fit = fit_camera(points, pixels, images, kind="CAHV", size_px=(641, 481), focal_px=510.0)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 60e6, f"{peak / 1e6:.0f} MB"
-    assert farthest_px(fit) < 1e-3
 
 
 def test_the_limit_told_of_an_outlier_is_the_one_it_failed(navcams: Rig) -> None:

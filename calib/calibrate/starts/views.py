@@ -155,7 +155,7 @@ def _lens(images: Sequence[ImageTerm], start: CameraModel, most: int) -> tuple[f
 def centred_camera(
     kind: Kind, size_px: tuple[int, int], focal_px: float, cahvore_type: int = 0
 ) -> CameraModel:
-    """Return a camera without distortion at the origin, its axis along z (``cahvore_type`` 2: equidistant)."""
+    """Return a camera without distortion at the origin, its axis along z (``cahvore_type`` 2: a fish-eye)."""
     x, y, z = np.eye(3)
     cx, cy = (np.array(size_px) - 1) / 2
     return CameraModel.normalised(

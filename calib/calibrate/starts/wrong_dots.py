@@ -14,16 +14,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.adjust.gross import MANY, at_least_stated
+from calib.adjust.gross import GROSS, MANY, at_least_stated
 from calib.adjust.outliers import Outlier
 from calib.adjust.scatter import off_smooth
 from calib.adjust.terms import ImageTerm
 
 DEGREES = ((60, 4), (30, 3), (16, 2))
 """Fewest dots for a polynomial of that degree; of fewer nothing is tested."""
-
-FAR = 50.0
-"""A square beyond so many times the typical one is gross: seven sigma."""
 
 POLYNOMIAL_PX = 0.08
 """What a polynomial of the fourth degree may miss, at the corners of a near board in a wide lens."""
@@ -45,7 +42,7 @@ def wrong_dots(images: Sequence[ImageTerm]) -> tuple[dict[str, np.ndarray], tupl
         statistic, off_px = off_smooth(
             places / max(np.abs(places).max(), 1e-9), image.pixels_px, sigma_px, degree
         )
-        limit = FAR * at_least_stated(statistic)
+        limit = GROSS**2 * at_least_stated(statistic)
         bad = np.asarray(statistic > limit)
         if bad.any() and bad.mean() <= MANY:
             wrong[image.name] = bad

@@ -182,8 +182,8 @@ def test_a_dot_that_few_others_check_is_judged_by_what_the_fit_leaves_of_it(
     term = ImageTerm(
         "one", "left", ("s", "p"), None, 0, 0, counts, counts, places, residual, np.ones(23), keep
     )
-    left = judge(problem_of([term], [block]), None, np.eye(2) / keep[20:].sum(), [term])  # type: ignore[arg-type]
-    assert left.images[0].keep.tolist() == [True] * 22 + [good]
+    left, _ = judge(problem_of([term], [block]), None, np.eye(2) / keep[20:].sum(), [term])  # type: ignore[arg-type]
+    assert left[0].keep.tolist() == [True] * 22 + [good]
 
 
 @pytest.mark.parametrize(
@@ -211,8 +211,8 @@ def test_an_image_left_out_is_judged_by_what_its_dots_share_beyond_noise(
     term = ImageTerm(
         "one", "left", ("s", "p"), None, 0, 0, counts, counts, places, residual, np.ones(20), none
     )
-    left = judge(problem_of([term], [block]), None, 25.0 * np.eye(2), [term])  # type: ignore[arg-type]
-    assert left.images[0].keep.tolist() == [comes_back] * 20
+    left, _ = judge(problem_of([term], [block]), None, 25.0 * np.eye(2), [term])  # type: ignore[arg-type]
+    assert left[0].keep.tolist() == [comes_back] * 20
 
 
 @pytest.mark.parametrize(("shift_sigmas", "stays"), [(0.0, True), (1.5, False)])
@@ -230,8 +230,8 @@ def test_an_image_with_two_noisy_rows_fails_by_a_common_shift_alone(shift_sigmas
     ]
     rates = np.tile(np.eye(2), (88, 1))
     blocks = [ResidualBlock(off.ravel(), rates, np.arange(2), 2) for off in residual]
-    left = judge(problem_of(terms, blocks), None, 1e-6 * np.eye(2), terms)  # type: ignore[arg-type]
-    assert [bool(image.keep.any()) for image in left.images] == [stays, True, True, True, True]
+    left, _ = judge(problem_of(terms, blocks), None, 1e-6 * np.eye(2), terms)  # type: ignore[arg-type]
+    assert [bool(image.keep.any()) for image in left] == [stays, True, True, True, True]
 
 
 def problem_of(terms: list[ImageTerm], blocks: list[ResidualBlock]) -> Any:
