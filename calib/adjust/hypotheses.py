@@ -31,7 +31,7 @@ from calib.geometry.rigid import FloatArray, rigid_rates
 from calib.geometry.significance import Level, chance
 
 EXPLAINS = 0.5
-"""A hypothesis explains what a fit leaves, or a change mends it, if it takes away this part."""
+"""A hypothesis explains what a fit leaves if it takes away this part."""
 
 FEWEST = 4
 """Of images or standstills, for a change among them to be looked for."""
@@ -55,9 +55,6 @@ boards to the rover: tapes show a slip that sharp images alone leave to their bo
 
 LARGEST = 0.5
 """Radians, or part of the focal length: what is larger is no slip, knock or other focus."""
-
-ALL, FOCUS, TURN = (0, 1, 2, 3), (0,), (1, 2, 3)
-"""Places of a camera's focal length and turn among its motions."""
 
 Course = Literal["always", "once", "each", "from", "drift"]
 Rates = Callable[[ImageTerm, Motions], FloatArray]
@@ -96,9 +93,9 @@ class Hypothesis:
     ----------
     name
         ``mast``, ``harmonics of pan``, ``slip of tilt``, ``drift of tilt``, ``attitude``,
-        ``joint readings``, ``lens of CAMERA``, ``change of CAMERA``, ``focus of CAMERA``,
-        ``knock of CAMERA``, ``drift of CAMERA``, ``bow of the board``, ``spacing of the board``,
-        ``board moved`` or ``drawing`` (of the prisms).
+        ``joint readings``, ``lens of CAMERA``, ``change of CAMERA``, ``drift of CAMERA``,
+        ``bow of the board``, ``spacing of the board``, ``board moved``, ``placement P of BOARD`` or
+        ``drawing`` (of the prisms).
     subject
         ``("joint", NAME)``, ``("camera", NAME)`` or ``("board", NAME, PLACEMENT)``, where it is one's.
     rows
@@ -137,8 +134,8 @@ class Finding:
     name, subject, sentence
         Of the hypothesis; what the finding says, and what to do.
     values, sigma
-        (k,) of its numbers: radians (1) of a joint; a part of the focal length and a turn (1, 3 or 4) of a
-        camera; turn and shift (6) of a board.
+        (k,) of its numbers: radians (1) of a joint; a part of the focal length and a turn (4) of a camera;
+        turn and shift (6) of a board.
     numbers, gain
         How many numbers count, and by how much the sum of squares would fall.
     chance
@@ -150,8 +147,6 @@ class Finding:
         Names of the pictures between which it changed; ``after`` alone where it is one's.
     significant
         Whether chance does not explain it, all hypotheses counted.
-    sure
-        Whether little would be left then; else only another fit shows it, for far from it nothing is linear.
     """
 
     name: str
@@ -166,7 +161,6 @@ class Finding:
     before: str = ""
     after: str = ""
     significant: bool = False
-    sure: bool = True
 
     def likelier(self, other: Finding) -> bool:
         """Whether chance explains this finding less than another one.
@@ -231,13 +225,13 @@ def find_change(fit: ScoredFit) -> Finding | None:
     most = max(gain.chi2 for _, _, gain in possible)
     as_good = [one for one in possible if one[2].chi2 >= AS_GOOD * most]
     what, at, gain = min(as_good, key=lambda one: (len(one[2].values), -one[2].chi2))
-    sure = fit.left(gain) <= STILL_FAR or gain.chi2 >= EXPLAINS * fit.chi2
-    if not what.subject or (not sure and what.subject[0] == "camera"):  # it is the model that is wrong
+    explained = fit.left(gain) <= STILL_FAR or gain.chi2 >= EXPLAINS * fit.chi2
+    if what.subject[:1] != ("board",) and not (what.subject and explained):  # it is the model that is wrong
         return None
     found = fit.finding(what, at, gain, len(tried))
     if found.chance > Level.CHANGED or (len(gain.values) > 1 and gain.chi2 < LEAST_PART * fit.chi2):
         return None
-    return replace(found, sure=sure)
+    return found
 
 
 class ScoredFit:
@@ -395,7 +389,7 @@ def _of_surveys(fit: ScoredFit) -> Iterator[Hypothesis]:
         yield from _joints(fit, "slip", "from", _slip_sentence)
     yield from _drifts(fit)
     yield from _lenses(fit)
-    yield from _cameras(fit, "change", ALL, "from", _change_sentence)
+    yield from _cameras(fit, "change", "from", _change_sentence)
     yield from _board_shape(fit)
     yield from _moved_before_tapes(fit)
     yield from _drawing(fit)
@@ -404,7 +398,7 @@ def _of_surveys(fit: ScoredFit) -> Iterator[Hypothesis]:
 def _drifts(fit: ScoredFit) -> Iterator[Hypothesis]:
     """Joints and cameras that change more with every picture."""
     yield from _joints(fit, "drift", "drift", _joint_drift_sentence)
-    yield from _cameras(fit, "drift", ALL, "drift", _camera_drift_sentence)
+    yield from _cameras(fit, "drift", "drift", _camera_drift_sentence)
 
 
 def _placements(fit: ScoredFit) -> Iterator[Hypothesis]:
@@ -432,8 +426,7 @@ def _changes(fit: ScoredFit) -> Iterator[Hypothesis]:
     if not fit.problem.upright:
         yield from _axes(fit)
     yield from _joints(fit, "slip", "from", _slip_sentence, side=2)
-    yield from _cameras(fit, "focus", FOCUS, "from", _focus_sentence, side=2)
-    yield from _cameras(fit, "knock", TURN, "from", _knock_sentence, side=2)
+    yield from _cameras(fit, "change", "from", _change_sentence, side=2)
 
 
 def _joints(
@@ -446,16 +439,11 @@ def _joints(
 
 
 def _cameras(
-    fit: ScoredFit,
-    what: str,
-    numbers: Sequence[int],
-    course: Course,
-    sentence: Callable[[Finding], str],
-    side: int = 1,
+    fit: ScoredFit, what: str, course: Course, sentence: Callable[[Finding], str], side: int = 1
 ) -> Iterator[Hypothesis]:
-    """Of each camera that has images left that its focal length or direction is another."""
+    """Of each camera that has images left that its focal length and direction are others."""
     for name in fit.cameras:
-        rows = fit.of_camera(name, lambda _, motions: motions.camera[:, numbers])
+        rows = fit.of_camera(name, lambda _, motions: motions.camera)
         yield Hypothesis(f"{what} of {name}", ("camera", name), rows, sentence, course, side)
 
 
@@ -659,21 +647,6 @@ def _joint_drift_sentence(found: Finding) -> str:
     return (
         f"{found.subject[1]} drifts off its reading, by {1e3 * found.values[0]:+.2f} mrad from the first "
         "picture to the last: a mount or an encoder creeps; fasten it and take the pictures again"
-    )
-
-
-def _focus_sentence(found: Finding) -> str:
-    return (
-        f"camera {found.subject[1]} was refocused between pictures {found.before} and {found.after}: its "
-        f"focal length changed by about {100 * abs(found.values[0]):.2f} %; fix the lens and take the "
-        "pictures again"
-    )
-
-
-def _knock_sentence(found: Finding) -> str:
-    return (
-        f"camera {found.subject[1]} was knocked between pictures {found.before} and {found.after}: it turned "
-        f"by about {_milli(found.values)} mrad in its mount; fasten it and take the pictures again"
     )
 
 

@@ -56,10 +56,6 @@ class Scales(NamedTuple):
     cameras: Mapping[str, float]
     images: Mapping[str, float]
 
-    def of(self, image: ImageTerm) -> float:
-        """Return what an image's sigmas have to be multiplied by in all."""
-        return self.cameras.get(image.kind, 1.0) * self.images.get(image.name, 1.0)
-
 
 def scatter(image: ImageTerm, residual: FloatArray, judged: np.ndarray | None = None) -> Scatter | None:
     """Return how much an image's dots scatter, their residuals (2n,) being in its sigmas; None of too few.

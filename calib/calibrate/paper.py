@@ -26,19 +26,15 @@ from calib.adjust.adjustment import Adjustment
 from calib.adjust.checks import checked, expected_checks
 from calib.adjust.outliers import Outlier
 from calib.adjust.result import Calibration, ImageResiduals
-from calib.adjust.solver import covariance_of, minimise
+from calib.adjust.solver import covariance_of
 from calib.adjust.terms import ImageTerm, StationTerm
 from calib.adjust.uncertainty import image_residuals, open_directions, surveyed_fields
 from calib.adjust.unknowns import MAST, Estimate
-from calib.calibrate.starts.mast import References, fit_mast
+from calib.calibrate.starts.mast import References
 from calib.calibrate.starts.survey import Start, start_values
-from calib.geometry.rig import mast_of
 from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import Level
 from calib.survey.records import Survey
-
-SAME_SETTING_RAD = 1e-9
-"""Cameras are fitted once more, by the mast, if the joint angles of their images differ by more."""
 
 
 def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
@@ -57,7 +53,7 @@ def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
         If the survey does not determine a camera or the mast, or no start leads near the noise.
     """
     began = time.perf_counter()
-    start = _cameras_by_mast(start_values(survey, mast_parameters, by_purpose=True), mast_parameters)
+    start = start_values(survey, mast_parameters, by_purpose=True)
     state = start.estimate
     blunders = {o.name for o in start.poses.blunders}
     problem = Adjustment(
@@ -87,34 +83,6 @@ def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
         degrees_of_freedom=float(count - len(order)),
         chi2_probability=float("nan"),
         seconds=time.perf_counter() - began,
-    )
-
-
-def _cameras_by_mast(start: Start, mast_parameters: int) -> Start:
-    """The steps once more, small differences of the camera images' joint angles taken out by the mast."""
-    settings, state, mast = start.references.joints_rad, start.estimate, start.estimate.mast
-    of_cameras = [t for t in start.fitted if t.name in start.camera_images and t.camera in settings]
-    of_mast = [t for t in start.fitted if t.name not in start.camera_images and t.keep.any()]
-    apart = [np.subtract((t.pan_rad, t.tilt_rad), settings[t.camera]) for t in of_cameras]
-    if not of_mast or np.abs(apart).max(initial=0.0) <= SAME_SETTING_RAD:
-        return start
-    boards = state.rover_from_board
-    cameras = {name: state.cameras[name] for name in settings}
-    alone = Estimate(cameras, mast, {}, boards, {}, np.zeros((0, 2)))
-    problem = Adjustment(of_cameras, (), alone, mast_parameters=0, fixed=tuple(boards))
-    fitted = minimise(problem, alone, weak=problem.weak, gain=1e-13).state.cameras
-    head = {name: mast_of(mast).rover_from_head(*setting) for name, setting in settings.items()}
-    in_rover = {name: model.moved(head[name]) for name, model in fitted.items()}
-    references = References({**start.references.in_rover, **in_rover}, settings)
-    again = fit_mast(of_mast, boards, references, mast_parameters, expected_px=start.expected_px, rough=mast)
-    kept = {t.name: t.keep for t in again.images}
-    mast = again.fit.state.mast
-    return replace(
-        start,
-        fitted=tuple(replace(t, keep=kept.get(t.name, t.keep)) for t in start.fitted),
-        estimate=replace(state, mast=mast, cameras=references.in_head(mast)),
-        references=references,
-        doubtful={**start.doubtful, **again.left_out},
     )
 
 

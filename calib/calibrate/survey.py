@@ -102,7 +102,7 @@ def _what_changed(cleaned: Cleaned) -> Finding | None:
     every = every.with_terms(whole, every.station).with_huber(SCAN_HUBER)
     fit = minimise(every, cleaned.fit.state, weak=every.weak, gain=1e-6)
     change = find_change(ScoredFit(every, fit.state)) if np.isfinite(fit.normal.cost) else None
-    return change if change is not None and change.sure and change.subject[0] != "board" else None
+    return change if change is not None and change.subject[0] != "board" else None
 
 
 def _left_out_for(change: Finding | None) -> tuple[Finding, ...]:

@@ -104,14 +104,13 @@ def test_a_mast(navcams: Rig, stopped: Callable[..., None], parameters: int) -> 
 
 
 def test_a_mast_is_judged_by_where_its_last_fit_ended(navcams: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    far = np.array([0.5, 0.2, -1.7, 0.1, -0.1, 0.1, 0.0, 0.0])
-    fit = fitted_mast(navcams, 6, expected_px=0.3, rough=far)
+    fit = fitted_mast(navcams, 6, expected_px=0.3)
 
     def minimise(*arguments: object, steps: int = 200, **options: object) -> object:
         return least_squares.minimise(*arguments, steps=steps if steps >= 100 else 0, **options)  # type: ignore
 
     monkeypatch.setattr(agreeing, "minimise", minimise)  # what leads there does not
-    late = fitted_mast(navcams, 6, expected_px=0.3, rough=far)
+    late = fitted_mast(navcams, 6, expected_px=0.3)
     assert not late.left_out
     assert np.abs(late.fit.state.mast - fit.fit.state.mast).max() < 1e-6
 

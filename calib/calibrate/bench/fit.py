@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from calib.adjust.adjustment import HUBER, SCAN_HUBER, Adjustment
 from calib.adjust.gross import gross_limit
-from calib.adjust.hypotheses import EXPLAINS, Finding, ScoredFit, find_change, find_drifts
+from calib.adjust.hypotheses import ScoredFit, find_change, find_drifts
 from calib.adjust.model_terms import TermGain, candidate_terms, choose_terms
 from calib.adjust.result import BenchCalibration
 from calib.adjust.robust import SurveyNotFitted, judged_again, weigh, without_blunders
 from calib.adjust.scatter import with_scales
-from calib.adjust.solver import Minimum, minimise
+from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.bench.problem import MOVES, BenchOptions, BenchProblem, best_cut, without_terms
@@ -100,8 +100,7 @@ def _look_for_changes(
 ) -> tuple[BenchProblem, Adjustment, Estimate]:
     """Return the bench, its problem with some terms, lone wrong corners left out, and its fit.
 
-    A board that moved counts as two placements. A change that is not sure is tried, and counts if the fit is
-    the better for it.
+    A board that moved counts as two placements.
 
     Raises
     ------
@@ -109,7 +108,6 @@ def _look_for_changes(
         If a joint slipped, or a camera changed: nothing says which of its two states is the one to come.
     """
     wrong = {n: s for view in bench.views.values() for n, s in view.wrong.items()}
-    tried: tuple[Finding, BenchProblem, Adjustment, Minimum[Estimate]] | None = None
     for left in range(MOVES, -1, -1):
         problem = bench.seen(chosen, bench.start)
         problem = problem.with_terms([without_wrong(t, wrong) for t in problem.images], ())
@@ -120,33 +118,17 @@ def _look_for_changes(
             fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-4)
         problem = _without_lone_strays(problem, fit.state).with_huber(SCAN_HUBER)
         fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-6)
-        if tried is not None:
-            if not fit.normal.cost < (1.0 - EXPLAINS) * tried[3].normal.cost:
-                _, bench, problem, fit = tried
-                break
-            if tried[0].subject[0] != "board":
-                raise SomethingChanged(tried[0].sentence)
-            tried = None
         if not np.isfinite(fit.normal.cost) or not left:
             break
         scored = ScoredFit(problem, fit.state)
         change = find_change(scored)
         _refuse_slip(bench, fit.state)
-        if change is None:
-            break
-        kind, *which = change.subject
-        if change.sure:
-            if any(drift.likelier(change) for drift in find_drifts(scored)):
-                break  # the verdict names it, with its size
-            if kind != "board":
-                raise SomethingChanged(change.sentence)
-        else:
-            tried, bench = (change, bench, problem, fit), bench.copied()
-        if kind != "board":
-            bench.read_otherwise(which[0], change.after, float(change.values[0]))
-        else:
-            bench.notes.append(f"{change.sentence}; from there on it counts as another placement")
-            bench.split_placement((which[0], which[1]), change.after)
+        if change is None or any(drift.likelier(change) for drift in find_drifts(scored)):
+            break  # the verdict names what drifts, with its size
+        if change.subject[0] != "board":
+            raise SomethingChanged(change.sentence)
+        bench.notes.append(f"{change.sentence}; from there on it counts as another placement")
+        bench.split_placement((change.subject[1], change.subject[2]), change.after)
         bench.begin()
     return bench, problem.with_huber(HUBER), fit.state
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from copy import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -146,12 +145,6 @@ class BenchProblem:
         self.views = self._views()
         self.begin()
 
-    def copied(self) -> BenchProblem:
-        """Return the same bench; a board that moves there has not moved here."""
-        other = copy(self)
-        other.notes, other.split = [*self.notes], [*self.split]
-        return other
-
     def begin(self) -> None:
         """Find where to start, and leave out placements that no head camera shows.
 
@@ -199,21 +192,10 @@ class BenchProblem:
         """Give the images of a board from one on a placement of their own."""
         moved = (board[0], f"{board[1]} from {after} on")
         self.split.append((board, moved, after))
-        self._change_from(after, lambda t: replace(t, board=moved) if t.board == board else t)
-
-    def read_otherwise(self, joint: str, after: str, step_rad: float) -> None:
-        """Take a joint to have been further on than it read, in the images from one on."""
-        key = f"{joint}_rad"
-        self._change_from(
-            after, lambda t: t if t.attitude is None else replace(t, **{key: getattr(t, key) + step_rad})
-        )
-
-    def _change_from(self, after: str, change: Callable[[ImageTerm], ImageTerm]) -> None:
-        """Change the terms of images from one on."""
         names = [i.name for i in self.survey.images]
         later = set(names[names.index(after) :])
         images, checks = (
-            tuple(change(t) if t.name in later else t for t in terms)
+            tuple(replace(t, board=moved) if t.board == board and t.name in later else t for t in terms)
             for terms in (self.terms.images, self.terms.checks)
         )
         self.terms = replace(self.terms, images=images, checks=checks)

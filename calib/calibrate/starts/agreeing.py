@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,7 +56,7 @@ def fit_agreeing(
     few = [thinned(t, POINTS) for t in images]
     for steps in ROUNDS:
         offs = distances_px(problem, state, few)
-        every = np.concatenate(offs)
+        every = np.concatenate([np.zeros(0), *offs])
         seen = every[np.isfinite(every)]
         if len(seen) < 8:
             return None
@@ -84,6 +84,20 @@ def fit_agreeing(
             return None
         state, offs = fit.state, distances_px(problem, fit.state, images)
     return Agreed(fit, tuple(kept), float(np.median(typical_sizes(offs))), limit_px)
+
+
+def best_agreeing(
+    starts: Iterable[tuple[Adjustment, Estimate]], expected_px: float, *, keep_all: bool = False
+) -> Agreed | None:
+    """Return the best of the fits from several starts, or the first that leaves what is expected."""
+    best: Agreed | None = None
+    for problem, start in starts:
+        fit = fit_agreeing(problem, start, expected_px, keep_all=keep_all)
+        if fit is not None and (best is None or fit.typical_px < best.typical_px):
+            best = fit
+        if best is not None and best.typical_px < 3 * expected_px:
+            break
+    return best
 
 
 def distances_px(problem: Adjustment, state: Estimate, images: Sequence[ImageTerm]) -> list[FloatArray]:

@@ -17,7 +17,7 @@ from calib.adjust.gross import GROSS
 from calib.adjust.robust import SurveyNotFitted
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
-from calib.calibrate.starts.agreeing import Agreed, fit_agreeing, thinned
+from calib.calibrate.starts.agreeing import Agreed, best_agreeing, thinned
 from calib.calibrate.starts.views import centred_camera, poses_of
 from calib.geometry.cahvor import CameraModel, Kind
 from calib.geometry.rig import MAST_NAMES
@@ -64,15 +64,12 @@ def fit_camera(
             "without moving the head"
         )
     still = [replace(t, attitude=None) for t in images]
-    best: Agreed | None = None
-    for model in _starts(still, boards, kind, size_px, focal_px):
+
+    def start(model: CameraModel) -> tuple[Adjustment, Estimate]:
         state = Estimate({name: model}, np.zeros(len(MAST_NAMES)), {}, boards, {}, np.zeros((0, 2)))
-        problem = Adjustment(still, (), state, mast_parameters=0, fixed=tuple(boards))
-        fit = fit_agreeing(problem, state, expected_px)
-        if fit is not None and (best is None or fit.typical_px < best.typical_px):
-            best = fit
-        if best is not None and best.typical_px < 3 * expected_px:
-            break
+        return Adjustment(still, (), state, mast_parameters=0, fixed=tuple(boards)), state
+
+    best = best_agreeing(map(start, _starts(still, boards, kind, size_px, focal_px)), expected_px)
     if best is None or best.typical_px > GROSS * expected_px:
         how = (
             "no start led to a camera at which the fit settled"

@@ -18,7 +18,7 @@ from calib.adjust.robust import SurveyNotFitted
 from calib.adjust.solver import Normal
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import MAST, Estimate
-from calib.calibrate.starts.agreeing import Agreed, fit_agreeing
+from calib.calibrate.starts.agreeing import Agreed, best_agreeing
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.parameters import carried_errors, twist_rates
 from calib.geometry.rig import gimbal, mast_of
@@ -93,7 +93,6 @@ def fit_mast(
     mast_parameters: int = 6,
     *,
     expected_px: float = 1.0,
-    rough: FloatArray | None = None,
 ) -> Agreed:
     """Fit 4, 6 or 8 numbers of the mast to images at many joint angles, the cameras taken as known.
 
@@ -106,8 +105,6 @@ def fit_mast(
         and no fit refused; 6 for the paper's, 8 for two skew axes.
     expected_px
         Residual of a coordinate to expect.
-    rough
-        (8,) where to start; else an upright mast under the cameras.
 
     Raises
     ------
@@ -118,24 +115,21 @@ def fit_mast(
         raise SurveyNotFitted(
             "mast: no image was taken away from the angles at which its camera is calibrated"
         )
-    best: Agreed | None = None
-    for mast in [rough] if rough is not None else _starts(images, references):
-        if mast_parameters == 4 and mast[3:5].any() and rough is None:
-            continue
+
+    def start(mast: FloatArray) -> tuple[Adjustment, Estimate]:
         state = Estimate(references.in_head(mast), mast, {}, boards, {}, np.zeros((0, 2)))
         problem = MastAlone(images, (), state, mast_parameters=mast_parameters, fixed=tuple(boards))
         problem.references = references
-        fit = fit_agreeing(problem, state, expected_px, keep_all=mast_parameters == 4)
-        if fit is not None and (best is None or fit.typical_px < best.typical_px):
-            best = fit
-        if best is not None and best.typical_px < 3 * expected_px:
-            break
+        return problem, state
+
+    upright = mast_parameters == 4
+    best = best_agreeing(map(start, _starts(images, references, upright)), expected_px, keep_all=upright)
     if best is None:
         raise SurveyNotFitted(
             "mast: no start led to a mast at which the fit settled; check pan and tilt "
             "(radians, right and up positive), and take images at more joint angles"
         )
-    if best.typical_px > GROSS * expected_px and mast_parameters != 4:
+    if best.typical_px > GROSS * expected_px and not upright:
         raise SurveyNotFitted(
             f"no mast explains the images: the best one leaves {best.typical_px:.1f} px where some "
             f"{expected_px:.2g} px are expected. Check pan and tilt (radians, right and up positive) and "
@@ -144,11 +138,11 @@ def fit_mast(
     return best
 
 
-def _starts(images: Sequence[ImageTerm], references: References) -> list[FloatArray]:
+def _starts(images: Sequence[ImageTerm], references: References, upright: bool) -> list[FloatArray]:
     """Upright and leaning masts with the head's origin near the cameras."""
     x, y, z = np.mean([references.in_rover[t.camera].C for t in images], axis=0)
     return [
         np.array([x, y, z + height, *lean, 0.0, 0.0, 0.0])
-        for lean in LEAN_STARTS_RAD
+        for lean in (LEAN_STARTS_RAD[:1] if upright else LEAN_STARTS_RAD)
         for height in HEIGHT_STARTS_M
     ]

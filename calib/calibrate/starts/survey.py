@@ -51,8 +51,6 @@ class Start:
         The state, and the cameras in the rover frame at the joint setting at which they were calibrated.
     doubtful
         Images that did not agree, by name how far off (rms of distances, pixels) they may be.
-    expected_px
-        Residual of a coordinate to expect of the head cameras' images.
     poses
         Of set-ups and boards.
     wrong
@@ -67,7 +65,6 @@ class Start:
     estimate: Estimate
     references: References
     doubtful: Mapping[str, float]
-    expected_px: float
     poses: StationPoses
     wrong: tuple[Outlier, ...]
     notes: tuple[str, ...]
@@ -156,7 +153,6 @@ def start_values(survey: Survey, mast_parameters: int, *, by_purpose: bool = Fal
         ),
         references,
         doubtful,
-        most,
         poses,
         outliers,
         tuple(notes),

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from calib.adjust.adjustment import HUBER, Adjustment
+from calib.adjust.adjustment import Adjustment
 from calib.adjust.gross import gross_limit
-from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
+from calib.calibrate.starts.agreeing import best_agreeing
 from calib.calibrate.starts.wrong_dots import without_wrong, wrong_dots
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel, Kind
@@ -84,18 +84,19 @@ def view_poses(
     clean = [t for t in (without_wrong(t, wrong) for t in images) if t.keep.sum() >= FEWEST_POINTS]
     if not clean:
         raise ViewsTooFew(f"{len(images)} images, none of which shows {FEWEST_POINTS} corners of a board")
-    best: tuple[float, CameraModel] | None = None
-    for focal in _focal_lengths(clean, size_px, focal_px):
-        found = _lens(
-            clean, centred_camera(kind, size_px, focal, 2 if kind == "CAHVORE" else 0), images_for_lens
-        )
-        if found is not None and (best is None or found[0] < best[0]):
-            best = found
-        if best is not None and best[0] < 3.0:
-            break
+    spread = np.linspace(0, len(clean) - 1, min(images_for_lens, len(clean))).astype(int)
+    some = [clean[i] for i in np.unique(spread)]
+    models = (
+        centred_camera(kind, size_px, focal, 2 if kind == "CAHVORE" else 0)
+        for focal in _focal_lengths(clean, size_px, focal_px)
+    )
+    stated_px = float(np.median(np.concatenate([t.sigma_px for t in some])))
+    best = best_agreeing((_free_boards(some, model) for model in models), stated_px)
     if best is None:
         raise ViewsTooFew("no lens explains where the corners are: check the board and its measures")
-    model = best[1]
+    # Boards that are free leave the camera's place open: put it back to where it began.
+    model = best.fit.state.cameras[images[0].camera]
+    model = model.moved(model.pose.inverse)
     poses, off = {}, {}
     for term in clean:
         found_poses = poses_of(model, term)
@@ -129,27 +130,13 @@ def _focal_of_homographies(images: Sequence[ImageTerm], size_px: tuple[int, int]
     return float(np.median(good)) if good else None
 
 
-def _lens(images: Sequence[ImageTerm], start: CameraModel, most: int) -> tuple[float, CameraModel] | None:
-    """Typical residual in sigmas, and the camera with the lens fitted, its boards free."""
-    some = np.unique(np.linspace(0, len(images) - 1, min(most, len(images))).astype(int))
-    placed = [(images[i], poses[0]) for i in some if (poses := poses_of(start, images[i]))]
-    if not placed:
-        return None
-    limit = gross_limit([size for _, (size, _) in placed], 1.0)
-    terms, boards = [], {}
-    for term, (size, pose) in placed:
-        if size <= limit:
-            terms.append(replace(term, board=(term.name, ""), attitude=None))
-            boards[term.name, ""] = pose
-    state = Estimate({terms[0].camera: start}, np.zeros(8), {}, boards, {}, np.zeros((0, 2)))
-    problem = Adjustment(terms, (), state, mast_parameters=0, huber=HUBER)
-    fit = minimise(problem, state, weak=problem.weak, steps=60, gain=1e-6)
-    if not np.isfinite(fit.normal.cost):
-        return None
-    off = np.concatenate(problem.image_residuals(fit.state, problem.images)).reshape(-1, 2)
-    model = fit.state.cameras[terms[0].camera]
-    # Boards that are free leave the camera's place open: put it back to where it began.
-    return float(np.median(np.linalg.norm(off, axis=1))), model.moved(model.pose.inverse)
+def _free_boards(images: Sequence[ImageTerm], start: CameraModel) -> tuple[Adjustment, Estimate]:
+    """A camera and boards of which every image shows one of its own, where a first guess of it has them."""
+    placed = [(t, poses[0][1]) for t in images if (poses := poses_of(start, t))]
+    terms = [replace(t, board=(t.name, ""), attitude=None) for t, _ in placed]
+    boards = {(t.name, ""): pose for t, pose in placed}
+    state = Estimate({images[0].camera: start}, np.zeros(8), {}, boards, {}, np.zeros((0, 2)))
+    return Adjustment(terms, (), state, mast_parameters=0), state
 
 
 def centred_camera(

@@ -14,13 +14,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.adjust.gross import GROSS, MANY, at_least_stated
+from calib.adjust.gross import MANY, at_least_stated
 from calib.adjust.outliers import Outlier
 from calib.adjust.scatter import off_smooth
 from calib.adjust.terms import ImageTerm
 
-DEGREES = ((60, 4), (30, 3), (16, 2))
-"""Fewest dots for a polynomial of that degree; of fewer nothing is tested."""
+DEGREES = ((60, 4, 6.0), (30, 3, 6.0), (16, 2, 10.0))
+"""Fewest dots for a polynomial of that degree, and how many times farther off than the typical one a dot is
+gross then; of fewer nothing is tested."""
 
 POLYNOMIAL_PX = 0.08
 """What a polynomial of the fourth degree may miss, at the corners of a near board in a wide lens."""
@@ -34,15 +35,16 @@ def wrong_dots(images: Sequence[ImageTerm]) -> tuple[dict[str, np.ndarray], tupl
     """
     wrong, outliers = dict[str, np.ndarray](), list[Outlier]()
     for image in images:
-        degree = next((degree for fewest, degree in DEGREES if len(image.keep) >= fewest), 0)
-        if not degree:
+        found = next((rest for fewest, *rest in DEGREES if len(image.keep) >= fewest), None)
+        if found is None:
             continue
+        degree, gross = found
         places = image.in_board_m[:, :2] - image.in_board_m[:, :2].mean(axis=0)
         sigma_px = np.hypot(image.sigma_px, POLYNOMIAL_PX)
         statistic, off_px = off_smooth(
-            places / max(np.abs(places).max(), 1e-9), image.pixels_px, sigma_px, degree
+            places / max(np.abs(places).max(), 1e-9), image.pixels_px, sigma_px, int(degree)
         )
-        limit = GROSS**2 * at_least_stated(statistic)
+        limit = gross**2 * at_least_stated(statistic)
         bad = np.asarray(statistic > limit)
         if bad.any() and bad.mean() <= MANY:
             wrong[image.name] = bad

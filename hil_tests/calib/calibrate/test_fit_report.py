@@ -16,7 +16,7 @@ from calib.calibrate.survey import fit_joint
 from calib.geometry.rig import Rig
 from calib.survey.records import Sigma, Survey
 from hil_tests.calib.adjust.small_surveys import rings, survey_of, with_shifted_dots
-from hil_tests.support.sim_survey.plan import Ring, SurveyPlan, rover_from_head
+from hil_tests.support.sim_survey.plan import SurveyPlan, rover_from_head
 
 SMALL = SurveyPlan(rings=rings(2), mast_boards=5, check_boards=1)
 NEAR_M, NEAR_RAD = 0.01, 0.02
@@ -100,15 +100,6 @@ def test_the_papers_fit_tells_how_far_an_image_was_off_that_it_left_out(navcams:
     assert outlier.size == pytest.approx(30.0, abs=1.0)
     assert outlier.statistic == pytest.approx(100 * (outlier.size / 0.1) ** 2)
     assert 100 * (0.1 / 0.1) ** 2 < outlier.limit < outlier.statistic
-
-
-def test_the_papers_cameras_take_out_small_differences_of_their_joints(navcams: Rig) -> None:
-    """0.5 mrad beside the others are 0.6 px of a Navcam; the readings tell it, and nothing else is wrong."""
-    apart = (Ring("navcam", 3.0, head_tilt_rad=-0.17), Ring("navcam", 6.0, head_tilt_rad=-0.1705))
-    sigma = Sigma(1e-6, 0.1, joint_rad=0.001)
-    fit = fit_paper(survey_of(navcams, 25, SMALL, rings=apart, sigma=sigma, noise=0.0))
-    for name, rms in fit.rms_px.items():
-        assert max(rms) < 0.02, name
 
 
 def test_a_camera_without_dots_is_left_out_and_one_without_camera_images_refused(survey: Survey) -> None:
