@@ -27,7 +27,6 @@ file, with one fitted without joints' errors, and with the truth for a file: wha
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -37,7 +36,6 @@ from scipy.stats import chi2
 from calib.adjust.result import BenchCalibration, Calibration
 from calib.adjust.uncertainty import pixel_covariance
 from calib.calibrate.bench.fit import fit_bench
-from calib.calibrate.bench.problem import BenchOptions
 from calib.errors import CalibError
 from calib.files.mast_file import load_rig
 from calib.geometry.cahvor import CameraModel
@@ -95,9 +93,6 @@ BENCH_SKEW = {"driven": (0.02, 0.01)}
 TARGETS = 12
 """Pointings at each range."""
 
-PLAIN = 5
-"""Every so many benches are also fitted without joints' errors."""
-
 
 class Gross(NamedTuple):
     """What came of gross errors: how many, how many of them were not named, and what else was; squares of the
@@ -114,7 +109,7 @@ class Score(NamedTuple):
     """Errors in sigmas, of parameters and pixels by camera; chi-square per degree of freedom; seconds.
 
     Of a survey the squared distance of the mast from the truth, errors from prisms alone, and gross
-    errors; of a bench how far pointings land (3 files, ranges, targets, 2), pictures and those left out, and
+    errors; of a bench how far pointings land (2 files, ranges, targets, 2), pictures and those left out, and
     whether each camera's check pictures are bad."""
 
     parameters: dict[str, float]
@@ -256,21 +251,8 @@ def bench_score(task: BenchTask) -> Score | str:
         fit = fit_bench(survey)
     except CalibError as refused:
         return f"seed {task.seed}: {refused}"
-    plain: BenchCalibration | None = fit
-    entered = [term.name for term in fit.terms if term.entered]
-    without = [name for name in entered if not name.startswith(("pan ", "tilt "))]
-    if len(without) < len(entered):
-        plain = None
-        if task.seed % PLAIN == 0:
-            with suppress(CalibError):  # joints' errors of a driven head are more than such a fit takes
-                plain = fit_bench(survey, BenchOptions(terms=without))
     true = task.plan.rig
-    landed = [
-        np.full((len(RANGES_M), TARGETS, 2), np.nan)
-        if rig is None
-        else pointings(true, rig, task.plan.count_rad, task.seed)
-        for rig in (fit.rig, None if plain is None else plain.rig, true)
-    ]
+    landed = [pointings(true, rig, task.plan.count_rad, task.seed) for rig in (fit.rig, true)]
     off = errors_of(true, fit.rig)
     sigmas = np.sqrt(np.diag(fit.covariance))
     return Score(
@@ -429,11 +411,7 @@ def report_bench(scores: Sequence[Score]) -> None:
     """Print where first pointings land, and what became of pictures."""
     print("first pointing, rms px an axis, exact clicks, at 10, 6 and 2 m, and in all:")
     landed = np.array([s.landed_px for s in scores])
-    labels = ("the fitted file", "without joints' errors", "counts alone")
-    for label, each_px in zip(labels, landed.swapaxes(0, 1), strict=True):
-        if np.isnan(each_px).all():
-            print(f"  {label:24s} every fit is refused")
-            continue
+    for label, each_px in zip(("the fitted file", "counts alone"), landed.swapaxes(0, 1), strict=True):
         by_range = np.sqrt(np.nanmean(each_px**2, axis=(0, 2, 3)))
         row = "".join(f"{value:8.3f}" for value in (*by_range, np.sqrt(np.nanmean(each_px**2))))
         print(f"  {label:24s}{row}")

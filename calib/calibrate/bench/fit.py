@@ -10,7 +10,7 @@ Start (``calib.calibrate.starts.bench``), pulls bounded, what changed half-way f
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from calib.adjust.adjustment import HUBER, SCAN_HUBER, Adjustment
 from calib.adjust.gross import gross_limit
 from calib.adjust.hypotheses import ScoredFit, find_change, find_drifts
-from calib.adjust.model_terms import TermGain, candidate_terms, choose_terms
+from calib.adjust.model_terms import choose_terms
 from calib.adjust.result import BenchCalibration
 from calib.adjust.robust import SurveyNotFitted, judged_again, weigh, without_blunders
 from calib.adjust.scatter import with_scales
@@ -70,23 +70,14 @@ def fit_bench(survey: Survey, options: BenchOptions | None = None) -> BenchCalib
 
 def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     """Fit everything, choose, fit again, and put together what it says."""
-    chosen = tuple(bench.options.terms or ())
-    tests: dict[str, TermGain] = {}
-    every = bench.candidates()
-    bench, problem, start = _look_for_changes(bench, every)
+    candidates = bench.candidates()
+    bench, problem, start = _look_for_changes(bench, candidates)
     _refuse_far(bench, problem, start)  # before blunders are looked for one by one where nothing fits
-    chooses = bench.options.terms is None
-    if not chooses:
-        start = without_terms(start, set(every) - set(chosen))
-        problem = bench.problem(chosen, start).with_terms(problem.images, ())
     cleaned = without_blunders(problem, start, bench.terms.images, bench.survey.sigma.corner_px)
-    if chooses:
-        start, terms = cleaned.fit.state, candidate_terms(bench.boards)
-        candidates = {name: terms[name] for name in every}
-        chosen, tests = choose_terms(cleaned.problem, cleaned.fit, candidates)
-        start = without_terms(start, set(every) - set(chosen))
-        last = bench.problem(chosen, start).with_terms(cleaned.problem.images, ())
-        cleaned = judged_again(cleaned, last, start)
+    chosen, tests = choose_terms(cleaned.problem, cleaned.fit, candidates)
+    start = without_terms(cleaned.fit.state, set(candidates) - set(chosen))
+    last = bench.problem(chosen, start).with_terms(cleaned.problem.images, ())
+    cleaned = judged_again(cleaned, last, start)
     _refuse_part(cleaned.problem)
     _refuse_far(bench, cleaned.problem, cleaned.fit.state)
     # counts and the least of corners are known; what a simulated or lucky bench has less is no knowledge
@@ -96,7 +87,7 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
 
 
 def _look_for_changes(
-    bench: BenchProblem, chosen: Sequence[str]
+    bench: BenchProblem, chosen: Collection[str]
 ) -> tuple[BenchProblem, Adjustment, Estimate]:
     """Return the bench, its problem with some terms, lone wrong corners left out, and its fit.
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.adjust.adjustment import HUBER, Adjustment
-from calib.adjust.model_terms import axis_numbers, bow_of, candidate_terms, joint_numbers
+from calib.adjust.model_terms import ModelTerm, axis_numbers, bow_of, candidate_terms, joint_numbers
 from calib.adjust.terms import ImageTerm, with_kept
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.bench import BenchNotFitted, BenchStart, SomethingChanged, bench_start
@@ -105,8 +105,6 @@ class BenchOptions:
     ----------
     kind
         Camera model of all cameras; None: as the survey says for each.
-    terms
-        The terms that enter; None: those that are significant.
     rover_from_mast
         Where the rover frame is: the mast's frame at zero angles in it, as a level and a tape give it.
         Default: it is the mast's.
@@ -115,7 +113,6 @@ class BenchOptions:
     """
 
     kind: Kind | None = None
-    terms: Sequence[str] | None = None
     rover_from_mast: Rigid | None = None
     rover_from_board: tuple[tuple[str, str], Rigid] | None = None
 
@@ -238,7 +235,7 @@ class BenchProblem:
             boards[known[0]] = known[1]
         return replace(state, cameras=cameras, mast=mast, rover_from_board=boards)
 
-    def problem(self, chosen: Sequence[str], state: Estimate) -> Adjustment:
+    def problem(self, chosen: Collection[str], state: Estimate) -> Adjustment:
         """The least-squares problem with some terms."""
         known = self.options.rover_from_board
         return Adjustment(
@@ -253,14 +250,14 @@ class BenchProblem:
             huber=HUBER,
         )
 
-    def seen(self, chosen: Sequence[str], start: Estimate) -> Adjustment:
+    def seen(self, chosen: Collection[str], start: Estimate) -> Adjustment:
         """The problem without images whose corners have no pixel at the start."""
         problem = self.problem(chosen, start)
         return problem.with_terms(with_kept(problem.images, problem.unseen(start)), ())
 
-    def candidates(self) -> tuple[str, ...]:
+    def candidates(self) -> dict[str, ModelTerm]:
         """Terms that pictures could determine: backlash only where the axis came from both sides."""
-        found = []
+        found = {}
         approaches = np.array([t.approach for t in self.terms.images if t.attitude is not None])
         for name, term in candidate_terms(self.boards).items():
             if term.kind == "backlash":
@@ -268,8 +265,8 @@ class BenchProblem:
                 if not {-1, 1} <= sides:
                     self.notes.append(_one_sided(name, term.of, sides))
                     continue
-            found.append(name)
-        return tuple(found)
+            found[name] = term
+        return found
 
 
 def _one_sided(term: str, joint: str, sides: set[int]) -> str:
