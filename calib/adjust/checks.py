@@ -37,30 +37,25 @@ def expected_checks(
     checks
         Check images, with sigmas as large as their dots scatter.
     residuals
-        Of the same images; ``used`` says which dots count.
+        Of all images; dots that have no pixel do not count.
     level
         The chance with which the largest allowed size is passed.
     """
-    used = {image.name: image for image in residuals if image.used.any()}
-    terms = [replace(t, keep=used[t.name].used) for t in checks if t.name in used]
+    off_px = {image.name: image.residuals_px for image in residuals}
+    terms = [replace(t, keep=np.asarray(np.isfinite(off_px[t.name]).all(axis=1))) for t in checks]
+    terms = [t for t in terms if t.keep.any()]
     expected = {}
     for camera in dict.fromkeys(t.camera for t in terms):
         mine = [t for t in terms if t.camera == camera]
         weights = check_weights(problem, state, covariance, mine)
-        off_px = np.concatenate([used[t.name].residuals_px[t.keep] for t in mine])
+        off = np.concatenate([off_px[t.name][t.keep] for t in mine])
         expected[camera] = CheckExpected(
-            float(np.sqrt(np.mean(off_px**2))),
+            float(np.sqrt(np.mean(off**2))),
             float(np.sqrt(weights.mean())),
             float(np.sqrt(rare_sum(level, weights) / len(weights))),
-            chance_of_sum(float(np.sum(off_px**2)), weights),
+            chance_of_sum(float(np.sum(off**2)), weights),
         )
     return expected
-
-
-def checked(images: Sequence[ImageResiduals]) -> list[ImageResiduals]:
-    """Return the check images that their camera, as fitted, can see, with all their dots."""
-    seen = [i for i in images if i.purpose == "check" and np.isfinite(i.residuals_px).all()]
-    return [replace(image, used=np.ones_like(image.used)) for image in seen]
 
 
 def check_weights(

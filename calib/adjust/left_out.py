@@ -57,10 +57,11 @@ class LeftOut:
         the cause."""
         for _ in range(REPEATS):
             rows = np.repeat(good, 2)
-            rates = self.rates[rows]
-            spread = np.linalg.inv(np.eye(rates.shape[1]) + rates.T @ rates)
-            residual = self.residual - self.rates @ (spread @ (rates.T @ self.residual[rows]))
-            statistic, _ = statistics(residual, self.rates, spread, good)
+            unit = np.eye(self.rates.shape[1])
+            # Not (I + AᵀA)⁻¹ itself: of a board that stands anywhere, the rates are as large as they like.
+            rates = self.rates @ np.linalg.inv(np.linalg.qr(np.vstack([self.rates[rows], unit]), mode="r"))
+            residual = self.residual - rates @ (rates[rows].T @ self.residual[rows])
+            statistic, _ = statistics(residual, rates, unit, good)
             if (statistic[good] <= limit).all():
                 break
             good = good & (statistic <= limit)

@@ -17,15 +17,17 @@ from scipy.special import chdtrc
 
 from calib.adjust.adjustment import HUBER, Adjustment
 from calib.adjust.goodness import Component, found_sigmas, goodness, variance_components
+from calib.adjust.hypotheses import ScoredFit, find_contradictions
 from calib.adjust.outliers import judge, name_outliers
-from calib.adjust.scatter import with_scales
+from calib.adjust.scatter import own_scales, with_scales
 from calib.adjust.solver import Minimum, covariance_of, minimise
 from calib.adjust.terms import ImageTerm, StationTerm, scattered_images, widened_images
-from calib.adjust.uncertainty import open_directions
+from calib.adjust.uncertainty import fitted_fields, image_residuals, open_directions
 from calib.adjust.unknowns import Estimate
 from calib.errors import CalibError
 from calib.geometry.rigid import FloatArray
-from calib.geometry.significance import typical_scale
+from calib.geometry.significance import Level, typical_scale
+from calib.survey.records import Survey
 
 
 class SurveyNotFitted(CalibError):
@@ -85,24 +87,47 @@ class Weighed:
         """By kind what stated sigmas count times."""
         return {c.kind: c.weighed for c in self.components}
 
-    def part(self, *kinds: str) -> FloatArray:
-        """Return the covariance of the numbers of some kinds of unknowns, the kinds in this order."""
-        numbers = self.problem.unknowns.of_kinds(*kinds)
-        return np.asarray(self.covariance[np.ix_(numbers, numbers)])
 
-    def judged_fields(self, stated: tuple[Adjustment, Minimum[Estimate]]) -> dict[str, Any]:
-        """Return the fields of a `FittedRig` that say how good it is, chi-square by the ``stated`` sigmas."""
-        problem, fit = stated
-        covariance = covariance_of(fit.normal.matrix, problem.weak)
-        chi2, freedom = goodness(problem, fit.state, covariance)
-        return {
-            "chi2": chi2,
-            "degrees_of_freedom": freedom,
-            "chi2_probability": float(chdtrc(freedom, chi2)) if freedom > 0 else float("nan"),
-            "components": self.components,
-            "outliers": name_outliers(self.problem, self.fit.state, self.covariance, self.images),
-            "degenerate": open_directions(self.problem, self.part("camera", "mast")),
-        }
+def weighed_fields(
+    survey: Survey,
+    stated: tuple[Adjustment, Minimum[Estimate]],
+    weighed: Weighed,
+    images: Sequence[ImageTerm],
+    checks: Sequence[ImageTerm],
+    kinds: Sequence[str],
+    level: Level,
+    notes: Sequence[str],
+    widened: float = 1.0,
+) -> dict[str, Any]:
+    """Return the fields of a `FittedRig` that follow from a weighed fit.
+
+    Parameters
+    ----------
+    stated
+        The fit by the stated sigmas, whose chi-square counts.
+    images, checks
+        All images with every dot, and the check images, with stated sigmas.
+    kinds, level, notes, widened
+        As of `calib.adjust.uncertainty.fitted_fields`.
+    """
+    problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
+    order_px = survey.sigma.corner_px if survey.boards else survey.sigma.dot_px
+    own = own_scales(problem, state, checks, weighed.factors, order_px)
+    sized = widened_images(scattered_images(checks, own), weighed.factors)
+    scatter = {t.name: t.scatter for t in (*weighed.images, *sized)}
+    residuals = image_residuals(survey, problem, state, images, checks, scatter)
+    by_stated = covariance_of(stated[1].normal.matrix, stated[0].weak)
+    chi2, freedom = goodness(stated[0], stated[1].state, by_stated)
+    return {
+        **fitted_fields(survey, problem, state, covariance, residuals, sized, kinds, level, notes, widened),
+        "chi2": chi2,
+        "degrees_of_freedom": freedom,
+        "chi2_probability": float(chdtrc(freedom, chi2)) if freedom > 0 else float("nan"),
+        "components": weighed.components,
+        "outliers": name_outliers(problem, state, covariance, weighed.images),
+        "degenerate": open_directions(problem, covariance),
+        "contradictions": find_contradictions(ScoredFit(problem, state)),
+    }
 
 
 def weigh(cleaned: Cleaned, *, narrows: bool = True) -> Weighed:

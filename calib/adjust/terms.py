@@ -53,6 +53,13 @@ class ImageTerm:
             return f"corner {self.ids[index]}"
         return f"dot (row {self.rows[index]}, column {self.columns[index]})"
 
+    def only(self, good: np.ndarray) -> ImageTerm:
+        """Return the image with some of its dots (n,), as if it had no others."""
+        names = ("rows", "columns", "in_board_m", "pixels_px", "sigma_px", "keep", "bend", "ids")
+        arrays = {name: getattr(self, name) for name in names}
+        mine = {n: a[good] for n, a in arrays.items() if a is not None and len(a) == len(good)}
+        return replace(self, **mine)
+
     @property
     def kind(self) -> str:
         """Which measurements have the same sigma."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
+from calib.adjust.checks import expected_checks
 from calib.adjust.result import (
     Calibration,
     Degenerate,
@@ -24,6 +25,7 @@ from calib.geometry.landing import landing_rates
 from calib.geometry.parameters import parameter_names, parameter_part
 from calib.geometry.rig import Rig, gimbal
 from calib.geometry.rigid import FloatArray, tangents
+from calib.geometry.significance import Level
 from calib.survey.records import Click, Survey
 
 Rms = dict[str, tuple[float, float]]
@@ -79,39 +81,39 @@ def fitted_fields(
     state: Estimate,
     covariance: FloatArray,
     images: tuple[ImageResiduals, ...],
+    checks: Sequence[ImageTerm],
     kinds: Sequence[str],
+    level: Level,
     notes: Iterable[str],
+    widened: float = 1.0,
 ) -> dict[str, Any]:
-    """Return the fields of a `FittedRig` that follow from a state and the covariance of the numbers of its
-    ``kinds`` of unknowns."""
+    """Return the fields of a `FittedRig` that follow from a state and the covariance (p, p) of its unknowns.
+
+    ``checks`` are the check images with sigmas as large as their dots scatter, ``kinds`` those of the
+    unknowns that are the rig's numbers, whose covariance is ``widened`` by a factor.
+    """
     rig, names = rig_of(survey, state), tuple(problem.values(state, *kinds))
-    sigma = sigma_by_key(rig, names, covariance)
+    numbers = problem.unknowns.of_kinds(*kinds)
+    of_rig = widened * covariance[np.ix_(numbers, numbers)]
+    sigma = sigma_by_key(rig, names, of_rig)
     return {
         "rig": rig,
         "parameter_names": names,
-        "covariance": covariance,
+        "covariance": of_rig,
         "sigma": sigma,
-        "rms_px": rms_by_camera(images),
+        "rms_px": _rms((i.camera, i.residuals_px[i.used]) for i in images if i.used.any()),
+        "check_rms_px": check_rms(survey, state, images),
+        "checks": expected_checks(problem, state, covariance, checks, images, level),
         "images": images,
         "notes": (*notes, *lens_notes(rig, sigma)),
         "rover_from_board": state.rover_from_board,
     }
 
 
-def surveyed_fields(
-    survey: Survey,
-    problem: Adjustment,
-    state: Estimate,
-    covariance: FloatArray,
-    images: tuple[ImageResiduals, ...],
-    notes: Iterable[str],
-) -> dict[str, Any]:
-    """Return the same of a survey's `Calibration`; the covariance is of mast and cameras."""
-    kinds = ("mast", "camera")
+def station_fields(survey: Survey, problem: Adjustment, state: Estimate) -> dict[str, Any]:
+    """Return the fields of a `Calibration` that a survey has beyond those of a fitted rig."""
     return {
-        **fitted_fields(survey, problem, state, covariance, images, kinds, notes),
-        "estimate": np.array(list(problem.values(state, *kinds).values())),
-        "check_rms_px": check_rms(survey, state, images),
+        "estimate": np.array(list(problem.values(state, "mast", "camera").values())),
         "unseen_clicks": unseen_clicks(survey, state),
         "station": station_residuals(problem, state),
         "rover_from_station": state.rover_from_station,
@@ -129,16 +131,15 @@ def _seen_from(problem: Adjustment, state: Estimate, term: ImageTerm) -> tuple[F
     return board.translation_m - centre, board.rotation[:, 2]
 
 
-def rms_by_camera(images: Iterable[ImageResiduals]) -> Rms:
-    """Return the (x, y) rms of the fitted dots of each camera, pixels."""
-    return _rms((i.camera, i.residuals_px[i.used]) for i in images if i.used.any())
-
-
 def check_rms(survey: Survey, state: Estimate, images: Iterable[ImageResiduals]) -> Rms:
-    """Return the (x, y) rms over check images and clicks of each camera, pixels: none was fitted."""
+    """Return the (x, y) rms over check images and clicks of each camera, pixels: none was fitted.
+
+    What has no pixel does not count.
+    """
     parts = [(i.camera, i.residuals_px) for i in images if i.purpose == "check"]
     parts += [(camera, off) for _, camera, off in _check_clicks(survey, state)]
-    return _rms((camera, residual) for camera, residual in parts if np.isfinite(residual).all())
+    seen = [(camera, off[np.isfinite(off).all(axis=1)]) for camera, off in parts]
+    return _rms((camera, off) for camera, off in seen if len(off))
 
 
 def unseen_clicks(survey: Survey, state: Estimate) -> tuple[Click, ...]:
@@ -296,16 +297,14 @@ def open_parameters(
 
 
 def open_directions(problem: Adjustment, covariance: FloatArray) -> tuple[Degenerate, ...]:
-    """Return the directions of cameras and mast that a survey leaves open, in words.
+    """Return the directions of cameras and mast that a survey leaves open, each with a sentence.
 
-    ``covariance`` is of the numbers of the problem's cameras and mast, in this order, with its weak knowledge
-    added.
+    ``covariance`` (p, p) is of all the problem's numbers, with its weak knowledge added.
     """
     rig = problem.unknowns.of_kinds("camera", "mast")
-    tested = ~problem.unknowns.usual[rig]
-    shown = rig[tested]
+    shown = rig[~problem.unknowns.usual[rig]]
     names = [problem.names[i] for i in shown]
-    found = open_parameters(names, covariance[np.ix_(tested, tested)], problem.weak[shown])
+    found = open_parameters(names, covariance[np.ix_(shown, shown)], problem.weak[shown])
     return tuple(Degenerate(parts, _reason(problem, parts)) for parts in found)
 
 

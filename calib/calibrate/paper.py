@@ -23,12 +23,11 @@ from dataclasses import replace
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
-from calib.adjust.checks import checked, expected_checks
 from calib.adjust.outliers import Outlier
 from calib.adjust.result import Calibration, ImageResiduals
 from calib.adjust.solver import covariance_of
 from calib.adjust.terms import ImageTerm, StationTerm
-from calib.adjust.uncertainty import image_residuals, open_directions, surveyed_fields
+from calib.adjust.uncertainty import fitted_fields, image_residuals, open_directions, station_fields
 from calib.adjust.unknowns import MAST, Estimate
 from calib.calibrate.starts.mast import References
 from calib.calibrate.starts.survey import Start, start_values
@@ -71,16 +70,16 @@ def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
         np.sum((i.residuals_px[i.used] / i.sigma_px[i.used, None]) ** 2) for i in images if i.used.any()
     ]
     count = sum(2 * int(i.used.sum()) for i in images)
-    order, notes = problem.unknowns.of_kinds("mast", "camera"), (*start.notes, *_bent_notes(start))
+    kinds, notes = ("mast", "camera"), (*start.notes, *_bent_notes(start))
     return Calibration(
-        **surveyed_fields(survey, problem, state, whole[np.ix_(order, order)], images, notes),
-        checks=expected_checks(problem, state, whole, start.checks, checked(images), Level.STATED),
+        **fitted_fields(survey, problem, state, whole, images, start.checks, kinds, Level.STATED, notes),
+        **station_fields(survey, problem, state),
         method="paper",
         mast_parameters=mast_parameters,
         outliers=(*start.poses.blunders, *_left_out(images, start), *start.wrong),
         degenerate=open_directions(problem, mast_alone),
         chi2=float(sum(in_sigmas)),
-        degrees_of_freedom=float(count - len(order)),
+        degrees_of_freedom=float(count - len(problem.unknowns.of_kinds(*kinds))),
         chi2_probability=float("nan"),
         seconds=time.perf_counter() - began,
     )
@@ -89,7 +88,7 @@ def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
 def two_step_covariance(
     problem: Adjustment, state: Estimate, references: References, camera_images: frozenset[str]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance of all unknowns, and that of cameras and mast for noise of dots alone."""
+    """Return the covariance of all unknowns, and the same of cameras and mast for noise of dots alone."""
     total = len(problem.names)
     first, second, station = np.zeros((total, total)), np.zeros((total, total)), np.diag(problem.weak)
     for what, block in problem.blocks(state):
@@ -118,8 +117,9 @@ def two_step_covariance(
     errors[np.ix_(rig, s)] = by_s @ of_station
     errors[np.ix_(s, rig)] = errors[np.ix_(rig, s)].T
     errors[np.ix_(s, s)] = of_station
-    to_head = rates[np.ix_(rig, rig)]
-    return rates @ errors @ rates.T, to_head @ dots @ to_head.T
+    alone = np.zeros((total, total))
+    alone[np.ix_(rig, rig)] = dots
+    return rates @ errors @ rates.T, rates @ alone @ rates.T
 
 
 def _bent_notes(start: Start) -> list[str]:

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calib.adjust.adjustment import HUBER, SCAN_HUBER, Adjustment
-from calib.adjust.checks import checked, expected_checks
 from calib.adjust.goodness import goodness
 from calib.adjust.gross import GROSS, chance_limit
 from calib.adjust.hypotheses import (
@@ -21,15 +20,13 @@ from calib.adjust.hypotheses import (
     ScoredFit,
     explaining,
     find_change,
-    find_contradictions,
     survey_findings,
 )
 from calib.adjust.result import Calibration
-from calib.adjust.robust import Cleaned, SurveyNotFitted, Weighed, weigh, without_blunders
-from calib.adjust.scatter import own_scales
+from calib.adjust.robust import Cleaned, SurveyNotFitted, Weighed, weigh, weighed_fields, without_blunders
 from calib.adjust.solver import minimise
-from calib.adjust.terms import scattered_images, widened_images, with_kept
-from calib.adjust.uncertainty import image_residuals, surveyed_fields
+from calib.adjust.terms import with_kept
+from calib.adjust.uncertainty import station_fields
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.refusals import refuse_far, refuse_unsettled
 from calib.calibrate.starts.survey import Start, start_values
@@ -153,42 +150,35 @@ def _calibration(
 ) -> Calibration:
     """Put together what the fit says, with the stated sigmas and with those that were found."""
     problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
-    notes = list(start.notes)
-    mine = weighed.part("mast", "camera")
+    notes, widened = list(start.notes), 1.0
     chi_square, freedom = goodness(problem, state, covariance)
     if freedom > 0 and chdtrc(freedom, chi_square) < Level.STATED:
         notes.append(
             f"the residuals are {np.sqrt(chi_square / freedom):.2f} times what their sigmas allow "
             f"(chi-square {chi_square:.0f} for {freedom:.0f}); uncertainties are scaled up by as much"
         )
-        mine = mine * chi_square / freedom
+        widened = chi_square / freedom
     stated = cleaned.as_stated()
     notes += _prism_notes(stated[0], stated[1].state, mast_parameters)
-    own = own_scales(problem, state, start.checks, weighed.factors, survey.sigma.dot_px)
-    checks = scattered_images(start.checks, own)
-    scatter = {t.name: t.scatter for t in (*weighed.images, *checks)}
-    images = image_residuals(survey, problem, state, start.images, start.checks, scatter)
-    judged = weighed.judged_fields(stated)
+    kinds = ("mast", "camera")
+    fields = weighed_fields(
+        survey, stated, weighed, start.images, start.checks, kinds, Level.STATED, notes, widened
+    )
     of_checks = tuple(f"image {t.name} dot " for t in start.checks)
-    judged["outliers"] += tuple(o for o in start.wrong if o.name.startswith(of_checks))
-    scored = ScoredFit(problem, state)
+    fields["outliers"] += tuple(o for o in start.wrong if o.name.startswith(of_checks))
     return Calibration(
-        **surveyed_fields(survey, problem, state, mine, images, notes),
-        **judged,
-        checks=expected_checks(
-            problem, state, covariance, widened_images(checks, weighed.factors), checked(images), Level.STATED
-        ),
+        **fields,
+        **station_fields(survey, problem, state),
         method="joint",
         mast_parameters=mast_parameters,
-        wider=(*_left_out_for(change), *_wider(cleaned, weighed, scored)),
-        contradictions=find_contradictions(scored),
+        wider=(*_left_out_for(change), *_wider(cleaned, weighed)),
         seconds=time.perf_counter() - began,
     )
 
 
-def _wider(cleaned: Cleaned, weighed: Weighed, scored: ScoredFit) -> tuple[Finding, ...]:
+def _wider(cleaned: Cleaned, weighed: Weighed) -> tuple[Finding, ...]:
     """What hypotheses would gain, those first that explain why sigmas had to be widened beyond scatter."""
-    found = survey_findings(scored)
+    found = survey_findings(ScoredFit(weighed.problem, weighed.fit.state))
     if not any(component.wrong for component in weighed.components):
         return found
     causes = explaining(survey_findings(ScoredFit(cleaned.problem, cleaned.fit.state)), weighed.excess)

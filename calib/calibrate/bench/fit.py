@@ -10,7 +10,7 @@ Start (``calib.calibrate.starts.bench``), pulls bounded, what changed half-way f
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,18 +19,26 @@ from scipy.spatial.transform import Rotation
 from calib.adjust.adjustment import HUBER, SCAN_HUBER, Adjustment
 from calib.adjust.gross import gross_limit
 from calib.adjust.hypotheses import ScoredFit, find_change, find_drifts
-from calib.adjust.model_terms import choose_terms
+from calib.adjust.model_terms import TermGain, candidate_terms, choose_terms
 from calib.adjust.result import BenchCalibration
-from calib.adjust.robust import SurveyNotFitted, judged_again, weigh, without_blunders
-from calib.adjust.scatter import with_scales
+from calib.adjust.robust import (
+    Cleaned,
+    SurveyNotFitted,
+    Weighed,
+    judged_again,
+    weigh,
+    weighed_fields,
+    without_blunders,
+)
+from calib.adjust.scatter import print_error_m, with_scales
 from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.bench.problem import MOVES, BenchOptions, BenchProblem, best_cut, without_terms
-from calib.calibrate.bench.statements import bench_calibration
 from calib.calibrate.refusals import refuse_far, refuse_unsettled
 from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged
 from calib.calibrate.starts.wrong_dots import without_wrong
+from calib.geometry.significance import Level
 from calib.survey.records import Survey
 
 WRONG_MINIMUM = 3.0
@@ -83,7 +91,7 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     # counts and the least of corners are known; what a simulated or lucky bench has less is no knowledge
     weighed = weigh(cleaned, narrows=False)
     refuse_unsettled(weighed.fit, "pan and tilt angles and distances")
-    return bench_calibration(bench, cleaned.as_stated(), weighed, chosen, tests, began)
+    return _calibration(bench, cleaned, weighed, chosen, tests, began)
 
 
 def _look_for_changes(
@@ -188,3 +196,77 @@ def _refuse_far(bench: BenchProblem, problem: Adjustment, state: Estimate) -> No
         scatter="they are found badly, the board is printed inexactly, or corner_px is far too small",
         coherent="the board's measures are wrong",
     )
+
+
+def _calibration(
+    bench: BenchProblem,
+    cleaned: Cleaned,
+    weighed: Weighed,
+    chosen: Sequence[str],
+    tests: Mapping[str, TermGain],
+    began: float,
+) -> BenchCalibration:
+    """Put together what the fit says."""
+    problem, state = weighed.problem, weighed.fit.state
+    for one in weighed.components:
+        if one.wrong or one.generous:
+            bench.notes.append(
+                f"{one.kind} scatter by {one.factor:.2f} ± {one.factor_sigma:.2f} times the stated "
+                "sigma; they count with that"
+            )
+    # A parameter that is not seen keeps what is weakly known of it, and is reported as open.
+    kinds = ("mast", "joints", "camera")
+    images, checks = bench.terms.images, bench.terms.checks
+    fields = weighed_fields(
+        bench.survey, cleaned.as_stated(), weighed, images, checks, kinds, Level.PREDICTED, bench.notes
+    )
+    fields["outliers"] += bench.wrong
+    return BenchCalibration(
+        **fields,
+        terms=_gains(bench, chosen, tests, weighed),
+        gauges=_gauges(bench, chosen),
+        drifts=find_drifts(ScoredFit(problem, state)),
+        joint_rad=problem.joint_rad,
+        inexact_m=print_error_m(problem, state),
+        bows_m=state.bows_m,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _gains(
+    bench: BenchProblem, chosen: Sequence[str], tests: Mapping[str, TermGain], weighed: Weighed
+) -> tuple[TermGain, ...]:
+    """Every term with what it gains; those of the model beside one another."""
+    every = candidate_terms(bench.boards)
+    _, gains = choose_terms(weighed.problem, weighed.fit, {name: every[name] for name in chosen})
+    entered = {name: replace(gain, entered=True) for name, gain in gains.items()}
+    return tuple({**tests, **entered}.values())
+
+
+def _gauges(bench: BenchProblem, chosen: Sequence[str]) -> tuple[str, ...]:
+    """What pictures cannot know, and how it was fixed."""
+    known = bench.options.rover_from_board
+    if known is not None:
+        where = (
+            f"the rover frame hangs on placement {known[0][1]} of board {known[0][0]}, whose pose was stated"
+        )
+    elif bench.options.rover_from_mast is not None:
+        where = "the mast stands in the rover frame as was stated, with no uncertainty"
+    else:
+        where = (
+            "the rover frame is the mast's at zero angles (z down along the pan axis): where the "
+            "vehicle is, pictures cannot show"
+        )
+    gauges = [
+        where,
+        "its origin is where the pan axis is nearest to the tilt axis: pictures determine no other height "
+        "along it",
+        "pan is zero where the tilt axis points to y, tilt where the head's x lies square to pan. An "
+        "offset of either would turn the frame or all head cameras, and is none",
+        "every length is as long as the boards were measured: 0.1 % there is 0.1 % of every range",
+    ]
+    if "tilt harmonic 1" in chosen:
+        gauges.append(
+            "the first harmonic of tilt is encoder and an arm's sag together: pictures cannot separate them"
+        )
+    return tuple(gauges)

@@ -14,6 +14,7 @@ from calib.adjust.terms import ImageTerm, with_kept
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.bench import BenchNotFitted, BenchStart, SomethingChanged, bench_start
 from calib.calibrate.starts.views import ViewPoses, ViewsTooFew, view_poses
+from calib.calibrate.starts.wrong_dots import wrong_dots
 from calib.geometry.cahvor import Kind
 from calib.geometry.rigid import Rigid
 from calib.survey.records import Survey
@@ -128,7 +129,10 @@ class BenchProblem:
 
     def __init__(self, survey: Survey, options: BenchOptions) -> None:
         self.survey, self.options = survey, options
-        self.terms: BenchTerms = bench_terms(survey)
+        terms = bench_terms(survey)
+        wrong, self.wrong = wrong_dots(terms.checks)
+        checks = tuple(t.only(~wrong[t.name]) if t.name in wrong else t for t in terms.checks)
+        self.terms = replace(terms, checks=checks)
         self.notes = list(self.terms.notes)
         self.joint_rad = survey.sigma.joint_rad
         if not any(t.attitude is not None for t in self.terms.images):

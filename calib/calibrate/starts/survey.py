@@ -140,7 +140,7 @@ def start_values(survey: Survey, mast_parameters: int, *, by_purpose: bool = Fal
     return Start(
         tuple(images),
         tuple(replace(t, keep=kept[t.name]) for t in clean if t.camera in in_rover),
-        tuple(_without(t, wrong) for t in checks if t.camera in in_rover),
+        tuple(t.only(~wrong[t.name]) if t.name in wrong else t for t in checks if t.camera in in_rover),
         station_terms(survey, boards),
         camera_images,
         Estimate(
@@ -157,13 +157,6 @@ def start_values(survey: Survey, mast_parameters: int, *, by_purpose: bool = Fal
         outliers,
         tuple(notes),
     )
-
-
-def _without(check: ImageTerm, wrong: Mapping[str, np.ndarray]) -> ImageTerm:
-    """A check image without its wrong dots, which it loses for good."""
-    good = ~wrong.get(check.name, np.zeros_like(check.keep))
-    names = ("rows", "columns", "in_board_m", "pixels_px", "sigma_px", "keep")
-    return replace(check, **{name: getattr(check, name)[good] for name in names})
 
 
 def _apart(image: ImageTerm, setting_rad: tuple[float, float]) -> float:

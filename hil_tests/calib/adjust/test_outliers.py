@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from calib.adjust.left_out import LeftOut
 from calib.adjust.outliers import judge
 from calib.adjust.result import Calibration
 from calib.adjust.robust import SurveyNotFitted
@@ -213,6 +214,14 @@ def test_an_image_left_out_is_judged_by_what_its_dots_share_beyond_noise(
     )
     left, _ = judge(problem_of([term], [block]), None, 25.0 * np.eye(2), [term])  # type: ignore[arg-type]
     assert left[0].keep.tolist() == [comes_back] * 20
+
+
+def test_dots_of_a_board_that_stands_anywhere_are_judged_by_one_another() -> None:
+    """Two unknowns that move all dots alike, and that no other measurement limits."""
+    residual = np.tile([5.0, 5.0], 20)
+    residual[6] += 40.0
+    image = LeftOut(residual, np.full((40, 2), 1e9))
+    assert image.agreeing(np.ones(20, dtype=bool), 15.5).tolist() == [True] * 3 + [False] + [True] * 16
 
 
 @pytest.mark.parametrize(("shift_sigmas", "stays"), [(0.0, True), (1.5, False)])
